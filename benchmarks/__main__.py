@@ -12,7 +12,7 @@ from wepose_pin.errors import BadOption, ExistingOutput, WeposeError
 
 from .tables import Section, document, print_table, read_document
 
-KINDS = ("filters", "calibration", "live", "batch", "long", "headings")
+KINDS = ("filters", "calibration", "live", "batch", "long", "headings", "protocols")
 DEFAULT = ("filters", "calibration")
 
 
@@ -33,10 +33,14 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "others; live: five sensors at 1 kHz for five minutes, and again with the page; batch: a study of 500 "
         "sessions on one worker, two, and two of which one is killed (stopped, the same command goes on from there); "
         "long: recordings of up to 24 hours in chunks; headings: relative headings of simulated people with and "
-        f"without their correction, half an hour. Without any: {' and '.join(DEFAULT)}",
+        "without their correction, half an hour; protocols: what each calibration protocol is worth on simulated "
+        f"people, an hour for eight. Without any: {' and '.join(DEFAULT)}",
     )
     add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 12 sessions, up to one hour")
     add("--sessions", type=int, metavar="N", help="number of sessions of batch")
+    add("--persons", type=int, default=8, metavar="N", help="number of simulated people of protocols")
+    add("--results", type=Path, metavar="FILE", help="where protocols keeps what it has measured, to go on from there")
+    add("--page", type=Path, metavar="FILE", help="write the page of protocols there, in Markdown")
     add("--data", type=Path, help="real recordings (broad/, wepose_hr/) on which filters are measured; or WEPOSE_DATA")
     add("--save", type=Path, metavar="FILE", help="write the figures there with versions, machine and date, as JSON")
     add("--compare", type=Path, metavar="FILE", help="show each ratio of a file that --save wrote by that of this run")
@@ -75,6 +79,10 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
             from . import headings
 
             chosen |= headings.sections(options.quick)
+        elif kind == "protocols":
+            from . import protocols
+
+            chosen |= protocols.sections(options.persons, options.results, options.page)
         else:
             from . import long_recordings
 

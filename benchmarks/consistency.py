@@ -43,7 +43,7 @@ def measure_sessions(seed: int, preset: str, sessions: int) -> list[dict[str, An
         )
         recording = replace(simulation.recording(), remounted=session > 0)
         subject = calibrate_lengths(recording, measured=measured, prior=prior, measured_std=person.measured_std).subject
-        results.append({"seed": seed, **_compare_subject(subject, person, simulation)})
+        results.append({"seed": seed, **compare_subject(subject, person, simulation)})
         prior, measured = subject, {}  # a length is measured once
     return results
 
@@ -68,14 +68,15 @@ def measure_simulation(person: Person, simulation: Simulation, protocol: str = "
         return {"error": str(error)}
     compared = {
         "quality": assess(calibration).quality,
-        **_compare_subject(calibration.subject, person, simulation),
+        **compare_subject(calibration.subject, person, simulation),
     }
     if not {"circles", "tasks"} & set(recording.phases):
         return compared
     return compared | _compare_pose(track(recording, calibration.subject), simulation)
 
 
-def _compare_subject(subject: Subject, person: Person, simulation: Simulation) -> dict[str, Any]:
+def compare_subject(subject: Subject, person: Person, simulation: Simulation) -> dict[str, Any]:
+    """Errors and standard deviations of a calibrated subject, by quantity: lists of pairs."""
     lengths = [(subject.lengths[name] - person.lengths[name], subject.std(name)) for name in CLOSED]
     arms = []
     for side in ("left", "right"):

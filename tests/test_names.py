@@ -33,6 +33,7 @@ ALLOWED = {
     "simulation/arm_tasks.py": "a simulated activity",
     "simulation/motion.py": "a simulated activity",
     "simulation/people.py": "a simulated person",
+    "simulation/sequence.py": "a simulated activity",
     "simulation/soft_tissue.py": "a simulated person",
     "simulation/subject.py": "a simulated activity",
     "simulation/tasks.py": "a simulated activity",

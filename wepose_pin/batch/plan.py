@@ -34,6 +34,7 @@ STEPS: dict[str, type] = {
     "evaluate": EvaluateJob,
 }
 _PATHS = ("session", "out", "result", "truth")
+# Follow from an item's session and subject, or are not of one session.
 _ITEM_OPTIONS = (
     *_PATHS,
     "subject",
@@ -42,7 +43,7 @@ _ITEM_OPTIONS = (
     "stature",
     "sex",
     "force",
-)  # follow from an item's session and subject
+)
 _NAMES_OR_FILES = ("protocol", "robot")
 _FORMATS = "formats"  # of export: a list, in place of --format
 _COLUMNS = ("session", "name", "subject", "truth", "stature", "sex")

@@ -21,8 +21,8 @@ from .protocols import Protocol
 from .result import Calibration
 from .sessions import fuse_sessions, separate_mounts
 
-# Standard deviations between two sessions' sums of a limb's lengths, from which on they are not of one person. Nearly
-# all of a session's error comes again in the next one: on simulated people two differ by 0.2 of their joint one.
+# Standard deviations between two sessions' whole arms, from which on they are not of one person. Nearly all of a
+# session's error comes again in the next one: on simulated people two sessions differ by up to 0.5.
 DIFFERENT = 2.0
 
 

@@ -78,7 +78,6 @@ class CalibrateJob:
 
     session: Path
     out: Path
-    further: tuple[Path, ...] = ()
     protocol: str | None = None
     model: str | None = None
     measured: Mapping[str, float] = field(default_factory=dict)
@@ -90,6 +89,7 @@ class CalibrateJob:
     gaps: bool = False
     report: bool = True
     force: bool = False
+    further: tuple[Path, ...] = ()
 
     def check(self) -> None:
         """Raise `WeposeError` where an option is wrong whatever the session holds."""
