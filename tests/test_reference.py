@@ -282,7 +282,7 @@ def test_what_cannot_be_aligned_is_said(pose: Pose) -> None:
         register(brief, Pose(time, quats, {}))
     tilted = Rotation.from_rotvec([0.7, 0.0, 0.7])
     leaning = {name: (tilted * Rotation.from_quat(q)).as_quat() for name, q in quats.items()}
-    with pytest.raises(BadData, match=r"no axis of the reference's world is up: .* --align segments"):
+    with pytest.raises(BadData, match=r"no axis of the reference's world is up: .* --fit segments"):
         register(pose, Pose(time, leaning, {}))
 
 
@@ -322,7 +322,7 @@ def test_wepose_evaluate_says_what_was_fitted(
     time, quats, points = in_laboratory(whole)
     build_pose_table(Pose(time + LATE_S, quats, points)).write_parquet(tmp_path / "laboratory.parquet")
     build_pose_table(whole).write_parquet(tmp_path / "truth.parquet")
-    aligned = run(capsys, result, tmp_path / "laboratory.parquet", "--align", "world", "--interval", "20", "40")
+    aligned = run(capsys, result, tmp_path / "laboratory.parquet", "--fit", "world", "--interval", "20", "40")
     assert "The reference was aligned by 2 to 16." in aligned
     assert "s, which are not scored:" in aligned
     assert "its clock -3.217 s (speeds correlate by " in aligned
@@ -336,15 +336,15 @@ def test_wepose_evaluate_says_what_was_fitted(
         for out in (aligned, plain)
     ]
     assert rows_of[0].split()[-4:] == rows_of[1].split()[-4:]
-    stated = run(capsys, result, tmp_path / "laboratory.parquet", "--align", "world", "--time-offset", f"{-LATE_S}")
+    stated = run(capsys, result, tmp_path / "laboratory.parquet", "--fit", "world", "--time-offset", f"{-LATE_S}")
     assert "its clock -3.217 s (stated)" in stated
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--no-align", "--align", "world"), "--no-align"),
-        (("--align", "world", "--interval", "1", "5"), "seconds after"),
+        (("--no-align", "--fit", "world"), "nothing is fitted with --no-align"),
+        (("--fit", "world", "--interval", "1", "5"), "seconds after"),
         (("--markers", "m.toml"), "has no markers"),
     ],
 )
