@@ -26,6 +26,7 @@ from wepose_pin.writers import write_result
 R_VW = Rotation.from_euler("x", -90, degrees=True) * Rotation.from_euler("z", -70, degrees=True)
 PLACE_V = np.array([1.2, 0.93, -0.4])
 LATE_S = 3.217
+LAB_HZ = 60.0
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 
 
@@ -41,8 +42,16 @@ def pose(simulation: Simulation) -> Pose:
     )
 
 
+@pytest.fixture(scope="module")
+def brief(pose: Pose) -> Pose:
+    """Ten seconds of it."""
+    rows = slice(0, 500)
+    quats = {name: quat[rows] for name, quat in pose.quat_WL.items()}
+    return Pose(pose.time[rows], quats, {name: p[rows] for name, p in pose.points.items()})
+
+
 def in_laboratory(
-    pose: Pose, rate_hz: float = 120.0
+    pose: Pose, rate_hz: float = LAB_HZ
 ) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Times, orientations and points as the laboratory's system samples them; it saw less of the beginning."""
     time = np.arange(pose.time[0] + 2.0, pose.time[-1], 1.0 / rate_hz)
@@ -87,7 +96,7 @@ def c3d(path: Path, pose: Pose, unit: str = "mm", **parameters: list[object]) ->
     file = ezc3d.c3d()
     group = file["parameters"]["POINT"]
     group["UNITS"]["value"] = [unit]
-    group["RATE"]["value"] = [120.0]
+    group["RATE"]["value"] = [LAB_HZ]
     group["LABELS"]["value"] = [f"Anna:{name}" for name in found]
     for name, value in parameters.items():
         group[name]["value"] = value
@@ -118,8 +127,8 @@ def theia(path: Path, pose: Pose) -> Path:
     for k, segment in enumerate(names, 1):
         other = Rotation.from_rotvec([0.3 * k, 1.0, -0.5 * k])
         transforms[:3, :3, k] = (Rotation.from_quat(quats[segment]) * other).as_matrix().transpose(1, 2, 0)
-    file["parameters"]["POINT"]["RATE"]["value"] = [120.0]
-    file.add_parameter("ROTATION", "RATE", [120.0])
+    file["parameters"]["POINT"]["RATE"]["value"] = [LAB_HZ]
+    file.add_parameter("ROTATION", "RATE", [LAB_HZ])
     file.add_parameter("ROTATION", "LABELS", [f"{name}_4X4" for name in ("worldbody", *names.values())])
     file["data"]["points"] = np.ones((4, 0, transforms.shape[3]))
     file["data"]["rotations"] = transforms
@@ -133,7 +142,7 @@ def trc(path: Path, pose: Pose) -> Path:
     n = len(time)
     head = ["PathFileType\t4\t(X/Y/Z)\ta.trc"]
     head += ["DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"]
-    head += [f"120\t120\t{n}\t{len(found)}\tmm\t120\t1\t{n}"]
+    head += [f"60\t60\t{n}\t{len(found)}\tmm\t60\t1\t{n}"]
     head += ["Frame#\tTime\t" + "\t\t\t".join(found) + "\t\t"]
     head += ["\t\t" + "\t".join(f"{a}{k}" for k in range(1, len(found) + 1) for a in "XYZ"), ""]
     rows = []
@@ -141,7 +150,7 @@ def trc(path: Path, pose: Pose) -> Path:
         cells = [f"{1e3 * v:.5f}" for p in found.values() for v in p[k]]
         if 300 <= k < 360:
             cells[15:18] = ["", "", ""]
-        rows.append("\t".join([str(k + 1), f"{k / 120.0:.6f}", *cells]) + "\t")
+        rows.append("\t".join([str(k + 1), f"{k / LAB_HZ:.6f}", *cells]) + "\t")
     path.write_text("\n".join(head + rows) + "\n")
     return path
 
@@ -189,10 +198,10 @@ def test_numbers_of_each_processor(processor: int, whole: bool, tmp_path: Path) 
 
 @pytest.mark.parametrize(("write", "name"), [(c3d, "a.c3d"), (trc, "a.trc")])
 def test_joints_and_segments_follow_from_markers(
-    write: Callable[[Path, Pose], Path], name: str, pose: Pose, tmp_path: Path
+    write: Callable[[Path, Pose], Path], name: str, brief: Pose, tmp_path: Path
 ) -> None:
-    reference = read_reference(write(tmp_path / name, pose))
-    time, quats, points = in_laboratory(pose)
+    reference = read_reference(write(tmp_path / name, brief))
+    time, quats, points = in_laboratory(brief)
     np.testing.assert_allclose(reference.time, time - time[0], atol=1e-5)
     for segment in SEGMENTS:
         known = np.isfinite(reference.quat_VT[segment]).all(axis=1)
@@ -282,7 +291,7 @@ def test_what_cannot_be_aligned_is_said(pose: Pose) -> None:
         register(brief, Pose(time, quats, {}))
     tilted = Rotation.from_rotvec([0.7, 0.0, 0.7])
     leaning = {name: (tilted * Rotation.from_quat(q)).as_quat() for name, q in quats.items()}
-    with pytest.raises(BadData, match=r"no axis of the reference's world is up: .* --align segments"):
+    with pytest.raises(BadData, match=r"no axis of the reference's world is up: .* --fit segments"):
         register(pose, Pose(time, leaning, {}))
 
 
@@ -322,7 +331,7 @@ def test_wepose_evaluate_says_what_was_fitted(
     time, quats, points = in_laboratory(whole)
     build_pose_table(Pose(time + LATE_S, quats, points)).write_parquet(tmp_path / "laboratory.parquet")
     build_pose_table(whole).write_parquet(tmp_path / "truth.parquet")
-    aligned = run(capsys, result, tmp_path / "laboratory.parquet", "--align", "world", "--interval", "20", "40")
+    aligned = run(capsys, result, tmp_path / "laboratory.parquet", "--fit", "world", "--interval", "20", "40")
     assert "The reference was aligned by 2 to 16." in aligned
     assert "s, which are not scored:" in aligned
     assert "its clock -3.217 s (speeds correlate by " in aligned
@@ -336,15 +345,15 @@ def test_wepose_evaluate_says_what_was_fitted(
         for out in (aligned, plain)
     ]
     assert rows_of[0].split()[-4:] == rows_of[1].split()[-4:]
-    stated = run(capsys, result, tmp_path / "laboratory.parquet", "--align", "world", "--time-offset", f"{-LATE_S}")
+    stated = run(capsys, result, tmp_path / "laboratory.parquet", "--fit", "world", "--time-offset", f"{-LATE_S}")
     assert "its clock -3.217 s (stated)" in stated
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--no-align", "--align", "world"), "--no-align"),
-        (("--align", "world", "--interval", "1", "5"), "seconds after"),
+        (("--no-align", "--fit", "world"), "nothing is fitted with --no-align"),
+        (("--fit", "world", "--interval", "1", "5"), "seconds after"),
         (("--markers", "m.toml"), "has no markers"),
     ],
 )
@@ -354,8 +363,8 @@ def test_options_that_do_not_go_together(
     assert says in run(capsys, result, result / "pose.parquet", *options, code=2)
 
 
-def test_a_table_of_markers_of_ones_own(pose: Pose, tmp_path: Path) -> None:
-    path = trc(tmp_path / "a.trc", pose)
+def test_a_table_of_markers_of_ones_own(brief: Pose, tmp_path: Path) -> None:
+    path = trc(tmp_path / "a.trc", brief)
     path.write_text(path.read_text().replace("LSHO", "Schulter li"))
     assert "left_shoulder" not in read_reference(path).points
     (tmp_path / "m.toml").write_text('[points]\nleft_shoulder = [["Schulter li"]]\n')
@@ -406,18 +415,18 @@ def test_a_real_mvnx_agrees_with_what_is_tracked_of_it(
 SPOILED_TRC = {
     "no TRC": (("PathFileType", "Path"), "does not begin with PathFileType"),
     "an unknown unit": (("\tmm\t", "\tinch\t"), "Units 'inch'; there is: mm, cm, m"),
-    "text": (("2\t0.008333\t", "2\tnow\t"), "line 8 holds something else than numbers"),
+    "text": (("2\t0.016667\t", "2\tnow\t"), "line 8 holds something else than numbers"),
     "a marker twice": (("\tCLAV\t", "\tC7\t"), "names a marker twice"),
-    "a cell too many": (("3\t0.016667\t", "3\t0.016667\t1\t"), "line 9 has 45 cells; 44 are needed for 14 markers"),
-    "time that goes back": (("3\t0.016667\t", "3\t0.000001\t"), "times of its rows do not increase"),
+    "a cell too many": (("3\t0.033333\t", "3\t0.033333\t1\t"), "line 9 has 45 cells; 44 are needed for 14 markers"),
+    "time that goes back": (("3\t0.033333\t", "3\t0.000001\t"), "times of its rows do not increase"),
     "markers of nobody": (("\t" + "C7", "\tA"), ""),
 }
 
 
 @pytest.mark.parametrize("spoil", [name for name in SPOILED_TRC if SPOILED_TRC[name][1]])
-def test_a_spoiled_trc_is_one_line(spoil: str, pose: Pose, tmp_path: Path) -> None:
+def test_a_spoiled_trc_is_one_line(spoil: str, brief: Pose, tmp_path: Path) -> None:
     change, says = SPOILED_TRC[spoil]
-    path = trc(tmp_path / "a.trc", pose)
+    path = trc(tmp_path / "a.trc", brief)
     text = path.read_text()
     assert change[0] in text
     path.write_text(text.replace(*change, 1))
@@ -434,7 +443,7 @@ def spoil_bytes(path: Path, old: bytes, new: bytes) -> None:
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (lambda path, pose: spoil_bytes(c3d(path, pose), struct.pack("<f", 120.0), bytes(4)), "POINT:RATE is 0"),
+        (lambda path, pose: spoil_bytes(c3d(path, pose), struct.pack("<f", LAB_HZ), bytes(4)), "POINT:RATE is 0"),
         (lambda path, pose: c3d(path, pose, unit="furlong"), "POINT:UNITS is furlong; there is: mm, cm, m"),
         (lambda path, pose: c3d(path, pose, LABELS=[f"M{k}" for k in range(14)]), "no joint follows from its markers"),
         (lambda path, _: path.write_bytes(b"\x02\x50" + bytes(2000)), "is a damaged C3D: .* no processor's number"),
@@ -449,9 +458,9 @@ def spoil_bytes(path: Path, old: bytes, new: bytes) -> None:
     ],
 )
 def test_a_spoiled_c3d_is_one_line(
-    spoil: Callable[[Path, Pose], object], says: str, pose: Pose, tmp_path: Path
+    spoil: Callable[[Path, Pose], object], says: str, brief: Pose, tmp_path: Path
 ) -> None:
-    spoil(tmp_path / "a.c3d", pose)
+    spoil(tmp_path / "a.c3d", brief)
     with pytest.raises(WeposeError, match=says) as error:
         read_reference(tmp_path / "a.c3d")
     assert "\n" not in str(error.value)

@@ -211,6 +211,113 @@ def apdm() -> list[bytes]:
     return [newer.encode(), (older + rows(TIME, ACCEL, GYRO)).encode()]
 
 
+def wild_csv() -> bytes:
+    """As a spreadsheet writes it: remarks, semicolons, decimal commas, units in a line of their own."""
+    units = ";".join(["s", *["rad/s"] * 3, *["m/s^2"] * 3])
+    return f"remark;1\n\n{';'.join(['time', *NAMES])}\n{units}\n{tabled(';', ',', TIME, GYRO, ACCEL)}".encode()
+
+
+def tabled(separator: str, decimal: str, *columns: np.ndarray) -> str:
+    return rows(*columns).replace(",", separator).replace(".", decimal)
+
+
+def shimmer() -> bytes:
+    names = ["Timestamp_Unix", *(f"{kind}_{a}" for kind in ("Accel_LN", "Accel_WR", "Gyro") for a in "XYZ")]
+    units = ["ms", *["m/(s^2)"] * 6, *["deg/s"] * 3]
+    head = f'"sep=;"\n{";".join(f"Shimmer_1_{name}_CAL" for name in names)}\n{";".join(units)}\n'
+    return (head + tabled(";", ".", 1000 * TIME, ACCEL, ACCEL, GYRO)).encode()
+
+
+def noraxon() -> bytes:
+    segment = "Noraxon MyoMotion-Segments-Upper spine-"
+    names = [
+        f"{segment}{kind}"
+        for kind in (*(f"Gyroscope-{a} (deg/s)" for a in "xyz"), *(f"Acceleration-{a} (mG)" for a in "xyz"))
+    ]
+    return f"time,{','.join(names)}\n{rows(TIME, GYRO, 102.0 * ACCEL)}".encode()
+
+
+def delsys() -> list[bytes]:
+    channels = [*(f"ACC {a} (G)" for a in "XYZ"), *(f"GYRO {a} (deg/s)" for a in "XYZ")]
+    names = ", ".join(f"{channel.partition(' (')[0]} Time Series (s), {channel}" for channel in channels)
+    columns = [column for axis in (*ACCEL.T / 9.8, *GYRO.T) for column in (TIME, axis)]
+    text = f"Application:,a\n\n\nChest (1)\nsensor mode: 1\n{names}\n,1 Hz\n{rows(*columns)}"
+    labels = "".join(
+        f"Label: {kind}1.{a}  Sampling frequency: 100 Unit: g  Domain: T\n" for kind in ("ACC", "GYRO") for a in "XYZ"
+    )
+    labels = labels.replace("GYRO1.X  Sampling frequency: 100 Unit: g", "GYRO1.X  Sampling frequency: 100 Unit: deg/s")
+    names = ",".join(f"X[s],{kind}1.{a}" for kind in ("ACC", "GYRO") for a in "XYZ")
+    return [text.encode(), f"{labels}\n{names}\n{rows(*columns)}".encode()]
+
+
+def sensor_logger() -> bytes:
+    entries = [
+        {
+            "sensor": name,
+            "time": str(10**16 + 10**7 * k),
+            "seconds_elapsed": "0",
+            **dict(zip("xyz", map(str, row), strict=True)),
+        }
+        for name, values in (("Gyroscope", GYRO), ("TotalAcceleration", ACCEL))
+        for k, row in enumerate(values)
+    ]
+    return json.dumps([{"sensor": "Metadata", "platform": "ios"}, *entries]).encode()
+
+
+def xdf() -> bytes:
+    def chunk(tag: int, content: bytes) -> bytes:
+        return b"\x04" + struct.pack("<IH", len(content) + 2, tag) + content
+
+    labels = "".join(f"<channel><label>{name}</label><unit/></channel>" for name in NAMES)
+    info = "<channel_count>6</channel_count><nominal_srate>100</nominal_srate><channel_format>double64</channel_format>"
+    head = f"<info><name>torso</name>{info}<desc><channels>{labels}</channels></desc></info>".encode()
+    samples = b"".join(b"\x08" + struct.pack("<7d", *row) for row in np.column_stack([TIME, GYRO, ACCEL]))
+    data = chunk(1, b"<info/>") + chunk(2, struct.pack("<I", 1) + head)
+    data += chunk(3, struct.pack("<IBB", 1, 1, N) + samples) + chunk(4, struct.pack("<Idd", 1, 0.0, 0.1))
+    return b"XDF:" + data + chunk(6, struct.pack("<I", 1) + b"<info><sample_count>12</sample_count></info>")
+
+
+def trc() -> bytes:
+    names = "\t\t\t".join(("LSHO", "RSHO", "LELB"))
+    keys = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits"
+    head = f"PathFileType\t4\t(X/Y/Z)\ta.trc\n{keys}\n100\t100\t{N}\t3\tmm\nFrame#\tTime\t{names}\n\t\tX1\n"
+    return (head + tabled("\t", ".", np.arange(N), TIME, 100 * ACCEL, 90 * ACCEL, 50 * ACCEL)).encode()
+
+
+def c3d(rotations: bool = False) -> bytes:
+    """One marker, or one rotation."""
+
+    def record(group: int, name: str, kind: int, shape: list[int], data: bytes) -> bytes:
+        rest = struct.pack("bB", kind, len(shape)) + bytes(shape) + data + b"\0"
+        return struct.pack("bb", len(name), group) + name.encode() + struct.pack("<h", len(rest) + 2) + rest
+
+    def group(number: int, name: str) -> bytes:
+        return struct.pack("bb", len(name), -number) + name.encode() + struct.pack("<h", 3) + b"\0"
+
+    used = struct.pack("<h", 0 if rotations else 1)
+    parameters = group(1, "POINT") + record(1, "USED", 2, [], used) + record(1, "RATE", 4, [], struct.pack("<f", 50.0))
+    parameters += record(1, "SCALE", 4, [], struct.pack("<f", -1.0)) + record(1, "UNITS", -1, [2, 1], b"mm")
+    parameters += record(1, "LABELS", -1, [4, 1], b"LSHO")
+    data = np.column_stack([100 * ACCEL, np.zeros(N)]).astype("<f4").tobytes()
+    if rotations:
+        parameters += group(2, "ROTATION") + record(2, "USED", 2, [], struct.pack("<h", 1))
+        parameters += record(2, "DATA_START", 2, [], struct.pack("<h", 3)) + record(
+            2, "LABELS", -1, [9, 1], b"torso_4X4"
+        )
+        data = np.tile([*np.eye(4).ravel(), 1.0], (N, 1)).astype("<f4").tobytes()
+    head = bytes([2, 0x50]) + struct.pack("<HHHHHfHHf", 1, 0, 1, N, 0, -1.0, 3, 0, 50.0)
+    return head.ljust(512, b"\0") + (bytes([0, 0, 1, 84]) + parameters).ljust(512, b"\0") + data
+
+
+MARKERS = b"""[points]
+"{side}_elbow" = [["{S}E1", "{S}E2"], ["LELB"]]
+[segments]
+torso = [{ up = [["A"], ["LSHO"]], left = [["RSHO"], ["LSHO"]] }]
+[rotations]
+torso = "trunk"
+"""
+
+
 def opensim() -> bytes:
     lines = [f"{t:.3f}\t0.8,0,0.6,0\t1,0,0,0\n" for t in TIME]
     return (

@@ -30,7 +30,10 @@ def _described(folder: Path, data: bytes) -> object:
 def _described_seeds() -> list[bytes]:
     """One of each kind."""
     of = {
-        ".csv": [seeds.csv(), *seeds.dot(), *seeds.ximu3(), *seeds.apdm()],
+        ".csv": [
+            *(seeds.csv(), seeds.wild_csv(), seeds.shimmer(), seeds.noraxon(), *seeds.delsys()),
+            *(*seeds.dot(), *seeds.ximu3(), *seeds.apdm()),
+        ],
         ".txt": seeds.mt_manager(),
         **{".sto": [seeds.opensim()], ".mvnx": [seeds.mvnx(True)], ".xml": [seeds.mvnx(False)]},
         **{".mat": [seeds.mat(True)], ".h5": [seeds.hdf5()], ".parquet": [seeds.parquet(), seeds.pose()]},
@@ -84,6 +87,19 @@ def _parquet(path: Path) -> object:
     session.write_text(TABLE.replace("arm.csv", path.name), encoding="utf-8")
     whole = load_session(session, gaps=True)
     return whole, list(iter_session(session, 0.05))
+
+
+def _reference(path: Path) -> object:
+    from wepose_pin.readers.reference import read_reference
+
+    return read_reference(path)
+
+
+def _markers(path: Path) -> object:
+    from wepose_pin.readers.reference import read_reference
+
+    (path.parent / "a.trc").write_bytes(seeds.trc())
+    return read_reference(path.parent / "a.trc", path)
 
 
 def _subject(path: Path) -> object:
@@ -261,7 +277,7 @@ def _device(name: str, format: str) -> Callable[[Path, bytes], object]:
 
 
 TARGETS = (
-    Target("csv", lambda: [seeds.csv()], _session("arm.csv", TABLE), LINES, "readers.tables"),
+    Target("csv", lambda: [seeds.csv(), seeds.wild_csv()], _session("arm.csv", TABLE), LINES, "readers.tables"),
     Target("pieces", lambda: [seeds.csv()], file("arm.csv", _pieces), LINES, "readers.tables"),
     Target(
         "parquet",
@@ -283,6 +299,14 @@ TARGETS = (
     Target("dot", seeds.dot, _device("a.csv", "dot"), LINES, "readers.dot"),
     Target("ximu3", seeds.ximu3, _device("Inertial.csv", "ximu3"), LINES, "readers.ximu3"),
     Target("apdm", seeds.apdm, _device("a.csv", "apdm"), LINES, "readers.apdm"),
+    Target("shimmer", lambda: [seeds.shimmer()], _device("a.csv", "shimmer"), LINES, "readers.shimmer"),
+    Target("noraxon", lambda: [seeds.noraxon()], _device("a.csv", "noraxon"), LINES, "readers.noraxon"),
+    Target("delsys", seeds.delsys, _device("a.csv", "delsys"), LINES, "readers.delsys"),
+    Target("phone", lambda: [seeds.sensor_logger()], _device("a.json", "sensor_logger"), JSON, "readers.sensor_logger"),
+    Target("xdf", lambda: [seeds.xdf()], _device("a.xdf", "xdf"), (), "readers.xdf"),
+    Target("trc", lambda: [seeds.trc()], file("a.trc", _reference), LINES, "readers.trc"),
+    Target("c3d", lambda: [seeds.c3d(), seeds.c3d(True)], file("a.c3d", _reference), (), "readers.c3d"),
+    Target("markers", lambda: [seeds.MARKERS], file("m.toml", _markers), TOML, "readers.markers"),
     Target("opensim", lambda: [seeds.opensim()], _device("a.sto", "opensim"), LINES, "readers.opensim"),
     Target("info", _described_seeds, _described, LINES, "readers.describe"),
     Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML, "readers.session"),

@@ -266,7 +266,7 @@ def _find_world(
             off = np.degrees(np.arccos(np.clip(full[2] @ AXES[up], -1.0, 1.0)))
             raise BadData(
                 f"no axis of the reference's world is up: {up} is nearest, {off:.0f} deg off; where its segments' "
-                f"frames are not ours, --align segments fits them too"
+                f"frames are not ours, --fit segments fits them too"
             )
     R_UV = _raise_axis(np.asarray(AXES[up]))
     level = cross @ R_UV.as_matrix().T

@@ -36,29 +36,29 @@ class EvaluateJob:
         rotations (.c3d), markers (.trc), an Xsens MVNX.
     interval : FROM TO
         Compare only from this to this time, in seconds.
-    align : world|segments
-        Align a table too. world: its clock, heading and place; segments: besides a constant rotation of each segment's
-        frame, where frames are not those of docs/glossary.md.
-    no_align
-        Compare times and worlds as they are.
+    align
+        Bring a file of another system to the clock and the world of the result.
+    fit : world|segments
+        Fit this to the result, of a table too. world: clock, heading and place; segments: besides a constant rotation
+        of each segment's frame, where frames are not those of docs/glossary.md.
     time_offset : SECONDS
         Add this to the times of the reference, in place of an offset that is fitted.
     markers : TOML
-        Table of markers, which goes before the shipped one (docs/formats/reference.md).
+        Table of markers, which goes before the shipped one (docs/formats/evaluate.md).
     """
 
     result: Path
     truth: Path
     interval: tuple[float, float] | None = None
-    align: Literal["world", "segments"] | None = None
-    no_align: bool = False
+    align: bool = True
+    fit: Literal["world", "segments"] | None = None
     time_offset: float | None = None
     markers: Path | None = None
 
     def check(self) -> None:
         """Raise `BadOption` where the interval is none, or options contradict each other."""
-        if self.no_align and self.align is not None:
-            raise WrongOption("no-align", "true", f"left out beside --align {self.align}")
+        if not self.align and self.fit is not None:
+            raise WrongOption("fit", self.fit, "nothing is fitted with --no-align; leave out one of the two")
         if self.interval is not None and not self.interval[0] < self.interval[1]:
             begin, end = self.interval
             needed = "two times in seconds are needed, the earlier one first"
@@ -104,15 +104,15 @@ def run_evaluate(
     if foreign:
         measured = read_reference(truth, job.markers)
         reference, up = Pose(measured.time, measured.quat_VT, measured.points), measured.up
-        align: str | None = job.align or ("segments" if measured.own_frames else "world")
+        fit: str | None = job.fit or ("segments" if measured.own_frames else "world")
     else:
-        reference, up, align = parse_pose_table(read_table(truth), str(truth)), None, job.align
+        reference, up, fit = parse_pose_table(read_table(truth), str(truth)), None, job.fit
     progress("comparing", 0.5)
-    if job.no_align or align is None:
+    if not job.align or fit is None:
         if job.time_offset:
             reference = replace(reference, time=reference.time + job.time_offset)
         return evaluate(pose, reference, job.interval, table)
-    reference, registration = register(pose, reference, up=up, frames=align == "segments", offset_s=job.time_offset)
+    reference, registration = register(pose, reference, up=up, frames=fit == "segments", offset_s=job.time_offset)
     first, last = registration.scored
     interval = job.interval or registration.scored
     scored = max(first, interval[0]), min(last, interval[1])

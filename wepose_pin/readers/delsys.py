@@ -101,7 +101,10 @@ def _find_channels(lines: Sequence[str]) -> tuple[int, str] | None:
 
 
 def _split(line: str, separator: str) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+    except csv.Error:  # no text
+        return []
 
 
 def _name_owners(cells: Sequence[str], width: int) -> list[str]:

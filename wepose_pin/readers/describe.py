@@ -447,7 +447,9 @@ def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[l
             refused = error
     else:
         name = guess.times[0]
-        dates = table[name].cast(pl.String).str.to_datetime(time_unit="us", strict=False).drop_nulls().to_physical()
+        dates = pl.Series([], dtype=pl.Int64)
+        with contextlib.suppress(pl.exceptions.PolarsError):  # in no form that is known
+            dates = table[name].cast(pl.String).str.to_datetime(time_unit="us", strict=False).drop_nulls().to_physical()
         span = 1e-6 * float(np.ptp(dates.to_numpy())) if len(dates) else 0.0
         if not span:
             return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {refused}"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -192,7 +193,15 @@ def open_folder(path: Path, what: str) -> Iterator[dict[str, Path]]:
                     name = PurePosixPath(member.filename).name
                     (Path(unpacked) / str(k)).mkdir()
                     (Path(unpacked) / str(k) / name).write_bytes(archive.read(member))
-        except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError) as error:
+        except (
+            zipfile.BadZipFile,
+            zlib.error,
+            NotImplementedError,
+            RuntimeError,
+            OSError,
+            EOFError,
+            ValueError,
+        ) as error:
             raise BadData(f"{path}: is a damaged zip: {error}") from error
         yield {file.name: file for file in sorted(Path(unpacked).glob("*/*"))}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from ..errors import MissingFile, WeposeError
+from ..errors import BadData, MissingFile, WeposeError
 from .apdm import is_apdm, read_apdm
 from .apdm_hdf5 import is_apdm_hdf5, read_apdm_hdf5
 from .delsys import is_delsys, read_delsys
@@ -143,4 +143,8 @@ def read_device(path: Path, format: str, use: str | None = None, rate_hz: float 
         raise MissingFile(f"{path}: is no regular file; a {TITLES[format]} is wanted here")
     if path.is_dir() and format not in FOLDERS:
         raise MissingFile(f"{path}: is a folder; a {TITLES[format]} is wanted here")
-    return FORMATS[format](path, use, rate_hz)
+    device = FORMATS[format](path, use, rate_hz)
+    for table in (device.table, *device.own_tables.values()):
+        if not table["time"].is_finite().any():
+            raise BadData(f"{path}: no row with a time in it; the export is empty or cut off")
+    return device

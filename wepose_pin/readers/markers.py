@@ -68,7 +68,7 @@ def _parse(top: TomlTable) -> MarkerTable:
             for side in SIDES if "{" in name else SIDES[:1]:
                 written = _write_side(value, side)
                 _check(top, key, name, written)
-                target[name.format(**side)] = written
+                target[str(_write_side(name, side))] = written
     return MarkerTable(points, segments, names)
 
 

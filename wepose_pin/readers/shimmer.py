@@ -90,7 +90,7 @@ def _choose_columns(
     if len(found.get("Gyro", ())) < 3 or not accels:
         return None
     accel = found[accels[0]]
-    if len(accels) == 2 and np.nanmax(np.abs(read_columns(table, accel, str(path), str(path)))) > LOW_NOISE_RANGE:
+    if len(accels) == 2 and (np.abs(read_columns(table, accel, str(path), str(path))) > LOW_NOISE_RANGE).any():
         accel = found["Accel_WR"]
     return {"gyro": found["Gyro"], "accel": accel}
 

@@ -413,6 +413,8 @@ def _parse_csv(path: Path, layout: CsvLayout, part: bytes = b"", first_row: int 
             raise BadData(f"{path}: is not UTF-8 text; save it as CSV in UTF-8") from error
         with _polars_errors(path):
             raise
+    if len(numbers) == table.width:
+        table.columns = list(names)  # polars reads quotes within names in its own way
     # polars fills short rows silently.
     if table.width > 1 and table[table.columns[-1]].null_count():
         _find_ragged(path, layout, part, first_row)

@@ -10,7 +10,7 @@ import numpy as np
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData
 from .intervals import check_time, format_span
-from .limits import LONGEST_STEP_S
+from .limits import LONGEST_STEP_S, SHORTEST_STEP_S
 
 LONGEST_GAP_S = 0.05  # [s] of lost samples that are bridged silently
 # Relative deviation of a step from the usual one that means an uneven clock or a lost row; devices jitter less.
@@ -71,6 +71,10 @@ def build_clock(time: np.ndarray, place: str) -> Clock:
         unit = guess_time_unit(step)
         guess = f'; time_unit = "{unit}" would fit' if unit else ""
         raise BadData(f"{place}: time grows by {step:g} s from row to row, slower than any body sensor{guess}")
+    if step < SHORTEST_STEP_S:
+        raise BadData(
+            f"{place}: time grows by {step:g} s from row to row, faster than any body sensor; is it in seconds?"
+        )
     wide = np.concatenate([first + np.flatnonzero(s > (1.0 + UNEVEN) * step) for first, s in _iterate_steps(time)])
     lost = np.round((time[wide + 1] - time[wide]) / step) - 1.0
     if np.quantile(np.abs(usual / step - 1.0), 0.75) > REGULAR:

@@ -26,3 +26,5 @@ MEDIAN_FORCE = (3.0, 300.0)
 
 # [s] longest step between samples of a body-worn sensor; a longer step means that the times are in another unit.
 LONGEST_STEP_S = 0.5
+# [s] shortest one; MEMS sensors give at most 32 kHz (TDK ICM-42688).
+SHORTEST_STEP_S = 1e-6
