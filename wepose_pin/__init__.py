@@ -48,7 +48,10 @@ _WHERE = {
     "load_subject": "subject",
     "retarget": "retargeting",
     "simulate": "simulation",
-    "track": "tracking",
+    "track": "api",
+    "TrackResult": "api",
+    "load_result": "api",
+    "Calibration": "calibration",
 }
 __all__ = ["__version__", *sorted(_WHERE)]
 __version__ = "0.1.0"

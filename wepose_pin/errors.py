@@ -21,7 +21,7 @@ class WeposeError(Exception):
     """Wrong input; the base of all errors this package raises on purpose."""
 
     def __str__(self) -> str:
-        text = printable(super().__str__())
+        text = printable(Exception.__str__(self))  # not that of KeyError, which is a repr
         return text if len(text) <= LONGEST else f"{text[: LONGEST - _END]} … {text[-_END:]}"
 
 
@@ -35,6 +35,10 @@ class ExistingOutput(WeposeError):
 
 class BadSession(WeposeError):
     """`session.toml` lacks a key, has one too many, or a value of the wrong kind."""
+
+
+class UnknownKey(WeposeError, KeyError):
+    """A result has nothing of this name."""
 
 
 class UnknownColumn(WeposeError):
