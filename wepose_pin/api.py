@@ -232,7 +232,7 @@ def track(
     >>> recording = wp.load_session("session.toml")
     >>> result = wp.track(recording, wp.load_subject("subject.toml"))
     >>> result
-    TrackResult('simulated': 28.5 s at 100 Hz, 5 segments, 8 points, amekf, 0 warnings)
+    TrackResult('simulated': 22.5 s at 100 Hz, 5 segments, 8 points, amekf, 0 warnings)
     >>> result.quat_WL["right_forearm"].shape == (len(result.time), 4)
     True
     """
@@ -281,7 +281,7 @@ def load_result(folder: str | Path) -> TrackResult:
     Examples
     --------
     >>> wp.load_result("result")
-    TrackResult('simulated': 28.5 s at 100 Hz, 5 segments, 8 points, amekf, 0 warnings)
+    TrackResult('simulated': 22.5 s at 100 Hz, 5 segments, 8 points, amekf, 0 warnings)
     """
     check_arguments(load_result, locals())
     folder = Path(folder)

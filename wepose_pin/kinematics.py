@@ -13,7 +13,15 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from . import rotations
-from .arguments import check_array, check_covariance, check_fields, check_finite, check_names, check_unit
+from .arguments import (
+    check_array,
+    check_covariance,
+    check_fields,
+    check_finite,
+    check_names,
+    check_unit,
+    format_object,
+)
 from .compilation import kernel
 from .errors import BadData, BadModel, one_of
 from .model import BodyModel
@@ -59,6 +67,11 @@ class Pose:
     point_cov: Mapping[str, np.ndarray] = field(default_factory=dict)
     gap: Mapping[str, np.ndarray] = field(default_factory=dict)
     joints: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return format_object(
+            self, lambda: f"{len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points"
+        )
 
     def check(self) -> Pose:
         """Check all fields and return the pose. NaN stands for missing values.

@@ -19,6 +19,7 @@ from .arguments import (
     check_finite,
     check_names,
     check_unit,
+    format_object,
 )
 from .documents import TomlTable, is_number, parse_toml, read_toml, toml_key, toml_string, toml_strings
 from .errors import BadData, BadModel, BadOption, BadSubject, one_of
@@ -88,6 +89,9 @@ class Subject:
     heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
     doubled: Mapping[str, str] = field(default_factory=dict)
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return format_object(self, lambda: f"{self.name!r}: {len(self.lengths)} lengths, {len(self.mounts)} mounts")
 
     @property
     def is_population(self) -> bool:
@@ -257,9 +261,17 @@ def population_subject(
 
     Parameters
     ----------
-    stature : body height [m]; None: 1.75 with the spread of adults
-    sex : "f", "m", or None for the mean of both
-    body : None: the upper body
+    stature : float, optional
+        Body height [m]; None: 1.75 with the spread of adults.
+    sex : str, optional
+        "f", "m", or None for the mean of both.
+    body : BodyModel or BodyTable, optional
+        The body whose lengths these are; None: the upper body.
+
+    Returns
+    -------
+    Subject
+        Lengths [m] with their covariance, without mounts.
 
     Raises
     ------
@@ -267,6 +279,14 @@ def population_subject(
         A stature outside 1.0 to 2.5 m, or another sex.
     BadModel
         The table names a share that is not known, or a length that is none without a model.
+
+    Examples
+    --------
+    >>> prior = wp.population_subject(1.68, "f")
+    >>> prior
+    Subject('population': 8 lengths, 0 mounts)
+    >>> round(prior.lengths["left_forearm"], 2), round(prior.std("left_forearm"), 2)  # [m]
+    (0.26, 0.01)
     """
     check_arguments(population_subject, locals())
     table = load_table() if body is None else body if isinstance(body, BodyTable) else body.table
@@ -331,12 +351,28 @@ def subject_toml(subject: Subject) -> str:
 
 
 def load_subject(path: str | Path) -> Subject:
-    """Read ``subject.toml`` (or the folder that holds it).
+    """Read ``subject.toml``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, or the folder that holds it, such as `wepose calibrate -o` wrote.
+
+    Returns
+    -------
+    Subject
+        Lengths [m] and mounts with their joint covariance.
 
     Raises
     ------
     MissingFile, BadSubject
         Not there; a length missing, not positive, unknown; a covariance that does not fit.
+
+    Examples
+    --------
+    >>> subject = wp.load_subject("subject.toml")
+    >>> round(subject.lengths["shoulder_width"], 2)  # [m]
+    0.37
     """
     check_arguments(load_subject, locals())
     path = Path(path)

@@ -125,6 +125,9 @@ class Trajectory:
     limiting_joint: LimitingJoint | None
     contact_times: tuple[float, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"Trajectory({self.robot.map.name!r}: {self.time[-1]:.1f} s, {len(self.robot.names)} joints)"
+
     @property
     def joint_position(self) -> np.ndarray:
         """(n, joints) [rad or m]."""
@@ -186,8 +189,10 @@ def retarget(
 
     Examples
     --------
-    >>> trajectory = wp.retarget(short_result, "arm.urdf")
-    >>> trajectory.joint_position.shape == (len(trajectory.time), len(trajectory.robot.joints))
+    >>> trajectory = wp.retarget("result", "arm.urdf", rate_hz=10.0)
+    >>> trajectory
+    Trajectory('arm': 29.0 s, 7 joints)
+    >>> trajectory.joint_position.shape == (len(trajectory.time), 7)  # [rad]
     True
     """
     check_arguments(retarget, locals())
