@@ -9,6 +9,7 @@ import re
 import sys
 import types
 import webbrowser
+from dataclasses import replace
 from html import escape, unescape
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import pytest
 from arms import write_arm
 
 import wepose_pin as wp
+from wepose_pin.cli import main
 from wepose_pin.kinematics import PosedBody
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import subject_toml
@@ -181,3 +183,25 @@ def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult
     for each in objects:
         assert re.fullmatch(r"\w+\(.{10,200}\)", repr(each)), repr(each)[:300]
     assert escape(repr(result)) in result._repr_html_()
+
+
+def test_a_subject_whose_calibration_failed_is_refused(
+    workplace: Path, simulated: Simulation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failed = replace(wp.population_subject(1.75), name="anna", quality="fail")
+    (workplace / "subject.toml").write_text(subject_toml(failed), encoding="utf-8")
+    line = r"subject 'anna': its calibration failed \(quality = \"fail\"\).*calibrate again"
+    with pytest.raises(wp.WeposeError, match=line):
+        wp.track(simulated.recording(), failed)
+    assert wp.track(simulated.recording(), failed, force=True).subject.quality == "fail"
+    track = ["track", "session.toml", "--subject", "subject.toml", "-o", "out", "--no-view", "--no-report"]
+    live = ["live", "--source", "replay:session.toml", "--subject", "subject.toml", "--no-page"]
+    for argv in (track, [*track, "--chunk-seconds", "20"], live):
+        with pytest.raises(SystemExit, match="2"):
+            main(argv)
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1)
+        assert re.search(line, err)
+    with pytest.raises(SystemExit, match="0"):
+        main([*track, "--accept-failed"])
+    assert wp.load_result("out").subject.quality == "fail"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import polars as pl
 
 from . import tracking
-from .arguments import check_arguments
+from .arguments import check_arguments, check_value
 from .diagnostics import WARNING, Diagnostic, from_json, lines
 from .errors import BadData
 from .filters import BEST
@@ -193,6 +193,7 @@ def track(
     open_loop: bool = False,
     causal: bool = False,
     limits: bool = True,
+    force: bool = False,
 ) -> TrackResult:
     """Estimate the pose of a body from a recording.
 
@@ -216,6 +217,8 @@ def track(
         Begin at the end of the start pose and look at nothing ahead, as a live session does.
     limits : bool
         Keep the limits of the model's joints of one axis.
+    force : bool
+        Use a subject whose calibration failed.
 
     Returns
     -------
@@ -225,7 +228,8 @@ def track(
     Raises
     ------
     WeposeError
-        What the recording, the subject or the model lacks; sensors on links that are no segments.
+        What the recording, the subject or the model lacks; a subject whose calibration failed; sensors on links that
+        are no segments.
 
     Examples
     --------
@@ -237,6 +241,9 @@ def track(
     True
     """
     person: Any = getattr(subject, "subject", subject)  # a calibration has one
+    check_value("force", force, bool)
+    if isinstance(person, Subject) and not force:
+        person.check_quality()
     tracked = tracking.track(
         recording,
         person,

@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -33,6 +33,7 @@ LONGEST = 3.0  # [m] of a plausible length
 _LEARNED = ("mounts", "hinges", "girdles", "start_pose_offset", "heading_drift", "doubled")
 _TABLES = ("lengths", "lengths_std", *_LEARNED, "covariance")
 FORMAT = 2
+Quality = Literal["pass", "poor", "fail"]  # of a calibration
 POPULATION = "population"  # name of the prior of a body's lengths
 MOST_OFFSET_DEG = 180.0  # of a file; the calibration checks whether it is plausible
 MOST_DRIFT_DEG_MIN = 6000.0  # of a heading: 100 deg/s, beyond any gyroscope's bias
@@ -76,6 +77,7 @@ class Subject:
     heading_drift : segment → that of its sensor in the calibration; on another day it has a similar size
     doubled : second sensor → its segment; its mount is under its own name
     girdles : point that a girdle moves → (7,) what the person differs by from its law, `model.girdle.PARAMETERS`
+    quality : of the calibration that estimated it; empty where none did
     """
 
     name: str
@@ -89,9 +91,14 @@ class Subject:
     heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
     doubled: Mapping[str, str] = field(default_factory=dict)
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
+    quality: Literal["", "pass", "poor", "fail"] = ""
 
     def __repr__(self) -> str:
-        return format_object(self, lambda: f"{self.name!r}: {len(self.lengths)} lengths, {len(self.mounts)} mounts")
+        def describe() -> str:
+            quality = f", calibration {self.quality}" if self.quality else ""
+            return f"{self.name!r}: {len(self.lengths)} lengths, {len(self.mounts)} mounts{quality}"
+
+        return format_object(self, describe)
 
     @property
     def is_population(self) -> bool:
@@ -132,6 +139,15 @@ class Subject:
         except (BadData, BadOption) as error:
             raise BadSubject(str(error)) from None
         return self
+
+    def check_quality(self) -> None:
+        """Raise `BadSubject` where the calibration failed that estimated it."""
+        if self.quality == "fail":
+            raise BadSubject(
+                f"subject '{self.name}': its calibration failed (quality = \"fail\"), so that lengths and mounts are "
+                f"not to be relied on; calibrate again, or use it all the same by --accept-failed (in Python "
+                f"force=True)"
+            )
 
     def check_body(self, table: BodyTable) -> None:
         """Raise `BadSubject` where a name is none of the body's, or a length of the body is missing."""
@@ -214,6 +230,7 @@ class Subject:
         return replace(
             self,
             name="sampled",
+            quality="",
             lengths=dict(zip(self.lengths, drawn.tolist(), strict=True)),
             covariance=np.zeros_like(self.covariance),
             note="a random person of the population",
@@ -311,6 +328,8 @@ def subject_toml(subject: Subject) -> str:
     lines = [f"format = {FORMAT}", f"name = {toml_string(subject.name)}"]
     if subject.note:
         lines.append(f"note = {toml_string(subject.note)}")
+    if subject.quality:
+        lines.append(f"quality = {toml_string(subject.quality)}   # of the calibration: pass, poor or fail")
     lines += ["", "[lengths]       # m", *(f"{k} = {v:.6f}" for k, v in subject.lengths.items())]
     lines += ["", "[lengths_std]   # m, one standard deviation"]
     lines += [f"{k} = {subject.std(k):.6f}" for k in subject.lengths if k in subject.order]
@@ -401,7 +420,10 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         raise BadSubject(f"{path}: is a session; a subject is needed here, as `wepose calibrate` writes one")
     if values.get("format") != FORMAT:
         raise BadSubject(f"{path}: format = {values.get('format')!r}; this version reads format = {FORMAT}")
-    top.allow("format", "name", "note", *_TABLES)
+    top.allow("format", "name", "note", "quality", *_TABLES)
+    quality = values.get("quality", "")
+    if quality not in ("", *get_args(Quality)):
+        raise BadSubject(f"{path}: quality = {quality!r} is not known; {one_of(get_args(Quality), str(quality))}")
     tables = {name: top.table(name, {}) for name in _TABLES}
     of_segments = {
         name: {segment: tables[name].table(segment) for segment in tables[name].values}
@@ -435,6 +457,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         heading_drift={segment: HeadingDrift(float(rate), float(std)) for segment, (rate, std) in drift.items()},
         girdles={point: np.array(entry.numbers(*PARAMETERS, most=LONGEST)) for point, entry in girdles.items()},
         doubled={name: tables["doubled"].text(name, None) or "" for name in tables["doubled"].values},
+        quality=quality,
     )
 
 

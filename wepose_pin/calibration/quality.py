@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from scipy.linalg import eigh
@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
 from ..errors import BadSession
 from ..model.table import ROOT
+from ..subject import Quality
 from .conditions import find_parts, fix_scale, group_lengths
 from .observability import MOST_OPEN, find_intervals, format_longest
 from .result import Calibration
 from .weights import CONTRADICTED, MIN_CONTACT
 
-Quality = Literal["pass", "poor", "fail"]
-QUALITIES: tuple[Quality, ...] = ("pass", "poor", "fail")
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
 SEVERITY: dict[Quality, Severity] = {"pass": INFO, "poor": WARNING, "fail": ERROR}
 
 
