@@ -27,8 +27,9 @@ from wepose_pin.simulation import Simulation
 from wepose_pin.subject import subject_toml
 from wepose_pin.writers import write_session
 
+ROOT = Path(__file__).resolve().parents[1]
 PUBLIC = {name: getattr(wp, name) for name in wp.__all__ if name != "__version__"}
-FUNCTIONS = [name for name, value in PUBLIC.items() if inspect.isfunction(value) and name != "calibrate"]
+FUNCTIONS = [name for name, value in PUBLIC.items() if inspect.isfunction(value)]
 METHODS = [f"TrackResult.{name}" for name in ("to_dataframe", "plot", "show", "save")]
 
 
@@ -74,6 +75,18 @@ def test_examples_of_the_documentation_run(name: str, simulated: Simulation, res
     lines: list[str] = []
     doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=lines.append)
     assert not lines, "".join(lines)
+
+
+@pytest.mark.usefixtures("workplace")
+@pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
+def test_python_of_the_pages_runs(page: str) -> None:
+    Path("result").unlink()
+    known: dict[str, Any] = {}
+    for block in re.findall(
+        r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    ):
+        exec(compile(block, page, "exec"), known)
+    assert known["angles"]["right_elbow"]["flexion"].shape == known["result"].time.shape
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)

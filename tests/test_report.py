@@ -13,7 +13,7 @@ from bodies import TABLE
 from reading import captions, headings, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate_lengths
+from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import Recording
 from wepose_pin.report import render_calibration_report
@@ -31,7 +31,7 @@ def made() -> Made:
     person = simulate_person(3)
     world = replace(MILD_PRESET, mount="any")
     recording = simulate(person.lengths, seed=3, imperfections=world, clasp_s=30.0, circles=0).recording("anna <3")
-    found = calibrate_lengths(recording, measured=person.measured, prior=person.prior)
+    found = calibrate(recording, measured=person.measured, prior=person.prior)
     return found, recording, track(recording, found.subject)
 
 

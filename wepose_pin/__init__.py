@@ -27,7 +27,6 @@ from typing import Any
 
 # Loaded on first use, so that the command line answers at once.
 _WHERE = {
-    "CalibrationFailed": "errors",
     "ImuSensor": "recording",
     "OrientationSensor": "recording",
     "Pose": "kinematics",

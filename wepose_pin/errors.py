@@ -11,7 +11,6 @@ import os
 import threading
 from collections.abc import Iterable, Iterator
 from difflib import SequenceMatcher, get_close_matches
-from typing import Any
 
 LONGEST = 2000  # letters of an error's text
 _END = 500  # of these, what is kept of the end, where it says what would be right
@@ -106,19 +105,6 @@ class BadPlan(WeposeError):
 
 class LostWorker(WeposeError):
     """Workers died at an item, again and again: too little memory, say."""
-
-
-class CalibrationFailed(WeposeError):
-    """A calibration whose quality is "fail": what it found must not be used unread.
-
-    Parameters
-    ----------
-    calibration, quality : what was found, and what is wrong with it
-    """
-
-    def __init__(self, text: str, calibration: Any = None, quality: Any = None) -> None:
-        super().__init__(text)
-        self.calibration, self.quality = calibration, quality
 
 
 class WeposeWarning(UserWarning):

@@ -170,7 +170,7 @@ def assess(calibration: Calibration) -> CalibrationQuality:
         quality=max((check.quality for check in checks), key=QUALITIES.index),
         checks=tuple(checks),
         reasons=reasons,
-        further=tuple(each for each in calibration.diagnostics if each.code not in {reason.code for reason in reasons}),
+        further=tuple(each for each in calibration.remarks if each.code not in {reason.code for reason in reasons}),
         motion=motion,
         directions=directions,
         rank=sum(d.information > MIN_INFORMATION for d in directions),
