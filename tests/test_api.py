@@ -181,6 +181,7 @@ def test_a_result_goes_into_each_step_as_object_and_as_folder(
     wp.export(result, tmp_path / "person.urdf")
     assert (tmp_path / "person.urdf").read_text("utf-8") == (saved / "subject.urdf").read_text("utf-8")
     angles = wp.joint_angles(result)
+    assert "right_elbow" in angles._repr_html_()
     np.testing.assert_array_equal(
         angles["left_elbow"]["flexion"], wp.joint_angles(result.pose)["left_elbow"].values[:, 0]
     )
@@ -190,9 +191,18 @@ def test_a_result_goes_into_each_step_as_object_and_as_folder(
         angles["left_elbow"]["bend"]
 
 
+def test_a_result_is_retargeted_as_object_and_as_folder(result: wp.TrackResult, saved: Path, tmp_path: Path) -> None:
+    pytest.importorskip("daqp")
+    urdf = write_arm(tmp_path)
+    moved, read = (wp.retarget(given, robot, rate_hz=10.0) for given, robot in ((result, urdf), (saved, str(urdf))))
+    np.testing.assert_allclose(moved.joint_position, read.joint_position, atol=1e-6)
+    assert repr(moved) == repr(read)
+
+
 def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult) -> None:
     objects = [simulated, simulated.recording(), result, result.pose, result.subject, result.model, result.plot()]
-    objects += [wp.joint_angles(result), wp.evaluate(result, simulated.truth()), result.show(open=False)]
+    objects += [*simulated.recording().sensors.values(), wp.joint_angles(result), wp.joint_angles(result)["thorax"]]
+    objects += [wp.evaluate(result, simulated.truth()), result.show(open=False)]
     for each in objects:
         assert re.fullmatch(r"\w+\(.{10,200}\)", repr(each)), repr(each)[:300]
     assert escape(repr(result)) in result._repr_html_()

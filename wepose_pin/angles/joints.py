@@ -157,6 +157,11 @@ class Angles:
     def __iter__(self) -> Iterator[str]:
         return iter(self.joints)
 
+    def _repr_html_(self) -> str:
+        from .tables import summary_table
+
+        return summary_table(self)._repr_html_()
+
     def __repr__(self) -> str:
         return f"Angles({', '.join(self.joints)}: {len(self.time)} samples)"
 

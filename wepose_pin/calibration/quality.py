@@ -151,6 +151,10 @@ class CalibrationQuality:
     unknowns: int
     condition: float
 
+    def __repr__(self) -> str:
+        failing = sum(check.quality != "pass" for check in self.checks)
+        return f"CalibrationQuality({self.quality!r}: {failing} of {len(self.checks)} checks do not pass)"
+
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """All that a user should know of the calibration."""
