@@ -83,7 +83,7 @@ def test_mounts_at_any_rotation_come_from_the_closure_alone() -> None:
     )
     recording = simulation.recording()
     assert all(sensor.stated_quat_LS is None for sensor in recording.sensors.values())
-    found = calibrate(recording, measured=person.measured, prior=person.prior)
+    found = calibrate(recording, measured=person.measured, prior=person.prior).subject
     for segment, quat_LS in simulation.quat_LS.items():
         off = Rotation.from_quat(found.mounts[segment]) * Rotation.from_quat(quat_LS).inv()
         assert np.degrees(off.magnitude()) < 0.3, segment
@@ -186,7 +186,7 @@ def test_the_standard_deviations_are_honest() -> None:
         simulation = simulate(person.lengths, seed=seed, circles=0)
         subject = calibrate(
             simulation.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std
-        )
+        ).subject
         names = [name for name in LENGTHS if name != "trunk"]
         error = np.array([subject.lengths[name] - person.lengths[name] for name in names])
         z.append(error / [subject.std(name) for name in names])
@@ -226,7 +226,7 @@ def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     assert "scale-from-prior" in codes(alone)
     assert alone.subject.note.endswith("of the population prior")
     measured = calibrate(recording, prior=person.prior, measured={"trunk": 0.5, "shoulder_width": 0.33})
-    assert measured.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
+    assert measured.subject.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
 
 
 def test_wrong_requests_are_named(exact: tuple[Person, Recording]) -> None:

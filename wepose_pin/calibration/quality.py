@@ -407,13 +407,14 @@ def _range(values: np.ndarray) -> Range:
 
 def _find_directions(calibration: Calibration) -> tuple[InformationDirection, ...]:
     """The information of the motion in units of the prior's: eigenvectors of one covariance in the other."""
-    k = len(calibration.prior_covariance)  # without second sensors, whose mounts follow from the first ones
-    names = calibration.subject.order[:k]
-    if not k:
+    # Without what the prior knows exactly, and second sensors, whose mounts follow from the first ones.
+    unknown = np.flatnonzero(np.diag(calibration.prior_covariance) > 0.0)
+    names = [calibration.subject.order[k] for k in unknown]
+    if not names:
         return ()
-    scale = np.sqrt(np.diag(calibration.prior_covariance))
-    before = calibration.prior_covariance / np.outer(scale, scale)
-    after = calibration.subject.covariance[:k, :k] / np.outer(scale, scale)
+    scale = np.sqrt(np.diag(calibration.prior_covariance)[unknown])
+    before = calibration.prior_covariance[np.ix_(unknown, unknown)] / np.outer(scale, scale)
+    after = calibration.subject.covariance[np.ix_(unknown, unknown)] / np.outer(scale, scale)
     shares, vectors = eigh(after, before)
     directions = []
     for share, vector in zip(shares, vectors.T, strict=True):
