@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import assess, calibrate_lengths
+from wepose_pin.calibration import assess, calibrate
 from wepose_pin.errors import WeposeError
 from wepose_pin.kinematics import compute_axis_std
 from wepose_pin.rotations import heading
@@ -42,7 +42,7 @@ def measure_sessions(seed: int, preset: str, sessions: int) -> list[dict[str, An
             person.lengths, seed=seed, imperfections=replace(PRESETS[preset], mount="any"), session=session, circles=0
         )
         recording = replace(simulation.recording(), remounted=session > 0)
-        subject = calibrate_lengths(recording, measured=measured, prior=prior, measured_std=person.measured_std).subject
+        subject = calibrate(recording, measured=measured, prior=prior, measured_std=person.measured_std).subject
         results.append({"seed": seed, **compare_subject(subject, person, simulation)})
         prior, measured = subject, {}  # a length is measured once
     return results
@@ -61,7 +61,7 @@ def measure_simulation(person: Person, simulation: Simulation, protocol: str = "
     """As `measure_person`, of what was simulated."""
     recording = simulation.recording()
     try:
-        calibration = calibrate_lengths(
+        calibration = calibrate(
             recording, measured=person.measured, prior=person.prior, measured_std=person.measured_std, protocol=protocol
         )
     except WeposeError as error:

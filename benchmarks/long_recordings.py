@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import calibrate_lengths
+from wepose_pin.calibration import calibrate
 from wepose_pin.errors import NoSolution
 from wepose_pin.model import load_model
 from wepose_pin.recording import Recording, Sensor
@@ -82,7 +82,7 @@ def _write(folder: Path, hours: float) -> None:
     person = simulate_person(1)
     made = simulate(person.lengths, seed=1)
     recording = made.recording("day")
-    found = calibrate_lengths(recording, measured=person.measured, prior=person.prior, measured_std=person.measured_std)
+    found = calibrate(recording, measured=person.measured, prior=person.prior, measured_std=person.measured_std)
     folder.mkdir()
     write_session(folder, there_and_back(recording, recording.span(recording.phases["start"][0])))
     repeated = pl.read_parquet(folder / "recording.parquet").drop("time")

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wepose_pin.calibration import calibrate_lengths, calibrate_sessions
+from wepose_pin.calibration import calibrate, calibrate_sessions
 from wepose_pin.simulation import (
     PEOPLE_MEASURED_STD,
     PRESETS,
@@ -107,10 +107,10 @@ def measure_series(seed: int) -> dict[Cell, dict[str, Any]]:
     ]
     subjects, prior = [], person.prior
     options: dict[str, Any] = {"measured": person.measured, "measured_std": person.measured_std}
-    subjects += [calibrate_lengths(recording, prior=person.prior, **options).subject for recording in recordings]
+    subjects += [calibrate(recording, prior=person.prior, **options).subject for recording in recordings]
     for k, recording in enumerate(recordings):
         # A length is measured once.
-        prior = calibrate_lengths(recording, prior=prior, **(options if k == 0 else {})).subject
+        prior = calibrate(recording, prior=prior, **(options if k == 0 else {})).subject
         subjects += [prior] if k else []
     subjects.append(calibrate_sessions(recordings, prior=person.prior, **options)[-1].subject)
     of_session = (*range(SESSIONS), *range(1, SESSIONS), SESSIONS - 1)

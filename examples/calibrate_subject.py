@@ -18,8 +18,10 @@ else:
     recording = wp.simulate(true, seed=2, circles=0).recording()
     measured = {"shoulder_width": true["shoulder_width"]}
 
-subject = wp.calibrate(recording, measured=measured)
+calibration = wp.calibrate(recording, measured=measured)
+subject = calibration.subject
 
+print(calibration)
 for name, length in subject.lengths.items():
     known = f"   true {1e3 * true[name]:6.1f}" if true else ""
     print(f"{name:16s} {1e3 * length:6.1f} ± {1e3 * subject.std(name):4.1f} mm{known}")

@@ -18,9 +18,12 @@ else:
     simulation = wp.simulate(wp.population_subject(1.75, "f").lengths, seed=1, clasp_s=10.0, circles=2)
     recording, subject = simulation.recording(), wp.population_subject(1.75, "f")
 
-pose = wp.track(recording, subject)
+result = wp.track(recording, subject)
+print(result)
 
-reach = np.linalg.norm(pose.points["right_palm"] - pose.points["right_shoulder"], axis=1)
-print(f"{recording.name}: {pose.time[-1] - pose.time[0]:.1f} s, segments: {', '.join(pose.quat_WL)}")
+reach = np.linalg.norm(result.points["right_palm"] - result.points["right_shoulder"], axis=1)
+print(f"segments: {', '.join(result.quat_WL)}")
 print(f"right hand from its shoulder: {reach.min():.3f} to {reach.max():.3f} m")
-print(f"configuration of the Pinocchio model: {pose.q.shape}, quaternions xyzw at the spherical joints")
+flexion = np.degrees(wp.joint_angles(result)["right_elbow"]["flexion"])
+print(f"right elbow's flexion: {flexion.min():.0f} to {flexion.max():.0f} deg")
+print(f"configuration of the Pinocchio model: {result.q.shape}, quaternions xyzw at the spherical joints")

@@ -11,7 +11,7 @@ from bodies import LENGTHS, RIGID_SHOULDERS, TABLE
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import Calibration, calibrate, calibrate_lengths
+from wepose_pin.calibration import Calibration, calibrate
 from wepose_pin.calibration.chain import rotate
 from wepose_pin.calibration.quality import assess
 from wepose_pin.errors import BadOption, BadPhase, BadSession
@@ -67,10 +67,10 @@ def test_a_known_mount_is_known_better_after_and_a_new_strapping_not(exact: tupl
         order=(*prior.order, *rows),
         covariance=block_diag(prior.covariance, before),
     )
-    after = calibrate_lengths(recording, prior=prior).subject.mount_covariance("torso")
+    after = calibrate(recording, prior=prior).subject.mount_covariance("torso")
     assert after is not None
     assert np.linalg.eigvalsh(before - after)[0] > -1e-12
-    again = calibrate_lengths(replace(recording, remounted=True), prior=prior).subject.mount_covariance("torso")
+    again = calibrate(replace(recording, remounted=True), prior=prior).subject.mount_covariance("torso")
     assert again is not None
     assert again[1, 1] > before[1, 1]
 
@@ -83,7 +83,7 @@ def test_mounts_at_any_rotation_come_from_the_closure_alone() -> None:
     )
     recording = simulation.recording()
     assert all(sensor.stated_quat_LS is None for sensor in recording.sensors.values())
-    found = calibrate(recording, measured=person.measured, prior=person.prior)
+    found = calibrate(recording, measured=person.measured, prior=person.prior).subject
     for segment, quat_LS in simulation.quat_LS.items():
         off = Rotation.from_quat(found.mounts[segment]) * Rotation.from_quat(quat_LS).inv()
         assert np.degrees(off.magnitude()) < 0.3, segment
@@ -93,7 +93,7 @@ def test_exact_orientations_and_a_gauge_give_the_lengths_back(exact: tuple[Perso
     person, recording = exact
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
     prior = with_rigid_shoulders(population_subject())
-    found = calibrate_lengths(recording, measured=measured, prior=prior, measured_std=1e-5)
+    found = calibrate(recording, measured=measured, prior=prior, measured_std=1e-5)
     for name in ("shoulder_width", "left_upper_arm", "right_upper_arm"):
         assert found.subject.lengths[name] == pytest.approx(person.lengths[name], abs=2e-4)
     for side in ("left", "right"):
@@ -108,7 +108,7 @@ def test_exact_orientations_and_a_gauge_give_the_lengths_back(exact: tuple[Perso
 
 def test_without_a_gauge_the_proportions_are_right_and_the_scale_is_the_priors(exact: tuple[Person, Recording]) -> None:
     person, recording = exact
-    found = calibrate_lengths(recording)
+    found = calibrate(recording)
     seen = ("shoulder_width", "left_upper_arm", "right_upper_arm")
     ratio = [found.subject.lengths[name] / person.lengths[name] for name in seen]
     assert np.ptp(ratio) < 2e-3
@@ -121,7 +121,7 @@ def test_without_a_gauge_the_proportions_are_right_and_the_scale_is_the_priors(e
     larger = replace(
         average, lengths={k: 1.1 * v for k, v in average.lengths.items()}, covariance=1.21 * average.covariance
     )
-    again = calibrate_lengths(recording, prior=larger)
+    again = calibrate(recording, prior=larger)
     for name in LENGTHS:
         assert again.subject.lengths[name] == pytest.approx(1.1 * found.subject.lengths[name], rel=1e-3)
 
@@ -142,7 +142,7 @@ def test_noise_in_the_orientations_does_not_shrink_the_person(exact: tuple[Perso
     }
     tight = {"shoulder_width": person.lengths["shoulder_width"]}
     prior = with_rigid_shoulders(population_subject())
-    found = calibrate_lengths(replace(recording, sensors=noisy), measured=tight, prior=prior, measured_std=1e-4)
+    found = calibrate(replace(recording, sensors=noisy), measured=tight, prior=prior, measured_std=1e-4)
     arm = np.mean([found.subject.lengths[n] / person.lengths[n] for n in ("left_upper_arm", "right_upper_arm")])
     assert arm == pytest.approx(1.0, abs=0.02)
 
@@ -172,8 +172,8 @@ def test_a_hand_with_a_sensor_is_seen_by_itself(exact: tuple[Person, Recording])
     bent_recording = replace(
         recording, sensors=sensors, phases={"start": recording.phases["start"], "clasp": tuple(clasp)}
     )
-    without = calibrate_lengths(recording, measured={"shoulder_width": length["shoulder_width"]})
-    found = calibrate_lengths(bent_recording, measured={"shoulder_width": length["shoulder_width"]})
+    without = calibrate(recording, measured={"shoulder_width": length["shoulder_width"]})
+    found = calibrate(bent_recording, measured={"shoulder_width": length["shoulder_width"]})
     assert found.subject.std("left_hand") < 0.5 * without.subject.std("left_hand")
 
 
@@ -186,7 +186,7 @@ def test_the_standard_deviations_are_honest() -> None:
         simulation = simulate(person.lengths, seed=seed, circles=0)
         subject = calibrate(
             simulation.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std
-        )
+        ).subject
         names = [name for name in LENGTHS if name != "trunk"]
         error = np.array([subject.lengths[name] - person.lengths[name] for name in names])
         z.append(error / [subject.std(name) for name in names])
@@ -211,22 +211,22 @@ def test_hands_that_do_not_move_say_so(exact: tuple[Person, Recording]) -> None:
     clasp = ((float(recording.time[held]), recording.phases["clasp"][0][1]),)
     still = replace(recording, sensors=frozen, phases={**recording.phases, "clasp": clasp})
     measured = {"shoulder_width": 0.38}
-    assert "lengths-mostly-prior" in codes(calibrate_lengths(still, measured=measured))
-    assert "lengths-mostly-prior" not in codes(calibrate_lengths(recording, measured=measured))
+    assert "lengths-mostly-prior" in codes(calibrate(still, measured=measured))
+    assert "lengths-mostly-prior" not in codes(calibrate(recording, measured=measured))
 
 
 def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     person, recording = exact
-    found = calibrate_lengths(recording, prior=person.prior).subject
+    found = calibrate(recording, prior=person.prior).subject
     assert found.lengths["trunk"] == pytest.approx(person.prior.lengths["trunk"], rel=1e-6)
     assert found.std("trunk") == pytest.approx(person.prior.std("trunk"), rel=1e-3)
     # A measured trunk is kept, and does not scale the arms.
-    alone = calibrate_lengths(recording, prior=person.prior, measured={"trunk": 0.5})
+    alone = calibrate(recording, prior=person.prior, measured={"trunk": 0.5})
     assert alone.subject.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
     assert "scale-from-prior" in codes(alone)
     assert alone.subject.note.endswith("of the population prior")
     measured = calibrate(recording, prior=person.prior, measured={"trunk": 0.5, "shoulder_width": 0.33})
-    assert measured.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
+    assert measured.subject.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
 
 
 def test_wrong_requests_are_named(exact: tuple[Person, Recording]) -> None:
@@ -258,7 +258,7 @@ def test_hands_that_hardly_move_leave_the_headings_open(
     made = simulate(
         person.lengths, seed=seed, clasp_s=30.0, circles=0, imperfections=replace(IDEAL_PRESET, mount="any")
     )
-    found = calibrate_lengths(made.recording(), measured=person.measured, prior=person.prior)
+    found = calibrate(made.recording(), measured=person.measured, prior=person.prior)
     for name, quat in found.subject.mounts.items():
         off = (Rotation.from_quat(quat) * Rotation.from_quat(made.quat_LS[name]).inv()).as_rotvec()
         assert abs(off[2]) < 4.0 * found.subject.std(f"mounts.{name}.z"), name
@@ -268,5 +268,5 @@ def test_hands_that_hardly_move_leave_the_headings_open(
 
 
 def test_a_motion_that_tells_the_headings_has_no_other(simulation: Simulation, person: Person) -> None:
-    found = calibrate_lengths(simulation.recording(), measured=person.measured, prior=person.prior)
+    found = calibrate(simulation.recording(), measured=person.measured, prior=person.prior)
     assert "headings-ambiguous" not in codes(found)

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_chain import urdf  # noqa: F401  the arm's URDF
 
-from wepose_pin.calibration import Calibration, Protocol, assess, calibrate_lengths
+from wepose_pin.calibration import Calibration, Protocol, assess, calibrate
 from wepose_pin.calibration.protocols import Closure
 from wepose_pin.calibration.recorded import interpolate_places
 from wepose_pin.cli import main
@@ -128,9 +128,9 @@ def on_point(phase: str = "tip", at: np.ndarray | None = None) -> Closure:
     return Closure(phase, "fixed_point", ("tip",), slip=0.001, at=place, at_std=0.002)
 
 
-def calibrate(body: BodyModel, moved: Moved, *closures: Closure) -> Calibration:
+def calibrate_arm(body: BodyModel, moved: Moved, *closures: Closure) -> Calibration:
     protocol = Protocol("points", "tip on points", (), (), closures or (on_point(),))
-    return calibrate_lengths(moved.recording, model=body, protocol=protocol)
+    return calibrate(moved.recording, model=body, protocol=protocol)
 
 
 def deviations(calibration: Calibration, moved: Moved) -> np.ndarray:
@@ -148,7 +148,7 @@ def describe(what: str, calibration: Calibration, moved: Moved) -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> None:
     moved = move_arm(arm, seed)
-    calibration = calibrate(arm, moved)
+    calibration = calibrate_arm(arm, moved)
     describe(f"one point, seed {seed}", calibration, moved)
     assert np.abs(deviations(calibration, moved)).max() < 3.0
     assert calibration.rms_gap < 0.2 * calibration.prior_rms_gap
@@ -158,19 +158,19 @@ def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> 
 
 def test_a_known_point_two_points_and_stated_mounts(arm: BodyModel) -> None:
     moved = move_arm(arm, 3)
-    known = calibrate(arm, moved, on_point(at=moved.tip[0]))
-    unknown = calibrate(arm, moved)
+    known = calibrate_arm(arm, moved, on_point(at=moved.tip[0]))
+    unknown = calibrate_arm(arm, moved)
     describe("known point", known, moved)
     describe("unknown point", unknown, moved)
     assert np.abs(deviations(known, moved)).max() < 3.0
     for name in TRUE:
         assert known.subject.std(name) < unknown.subject.std(name)
     moved = move_arm(arm, 4, points=2, seconds=55.0)
-    both = calibrate(arm, moved, on_point(), on_point("second"))
+    both = calibrate_arm(arm, moved, on_point(), on_point("second"))
     describe("two points", both, moved)
     assert np.abs(deviations(both, moved)).max() < 3.0
     moved = move_arm(arm, 5, stated=True)
-    stated = calibrate(arm, moved)
+    stated = calibrate_arm(arm, moved)
     describe("stated mounts", stated, moved)
     assert np.abs(deviations(stated, moved)).max() < 3.0
     assert not stated.unused_mounts
@@ -185,7 +185,7 @@ def test_recorded_places_of_the_tip_close_the_chain(arm: BodyModel, tmp_path: Pa
     columns = {"time": time, **{f"tip_{axis}": places[:, k] for k, axis in enumerate("xyz")}}
     pl.DataFrame(columns).write_parquet(tmp_path / "optical.parquet")
     moved = replace(moved, recording=replace(moved.recording, truth=tmp_path / "optical.parquet"))
-    calibration = calibrate(arm, moved, Closure("tip", "recorded", ("tip",), slip=0.001))
+    calibration = calibrate_arm(arm, moved, Closure("tip", "recorded", ("tip",), slip=0.001))
     describe("recorded tip", calibration, moved)
     assert np.abs(deviations(calibration, moved)).max() < 3.0
     seen = np.interp(calibration.time, time, (~lost).astype(float))
@@ -216,7 +216,7 @@ def test_what_a_truth_lacks_is_said_in_one_line(arm: BodyModel, tmp_path: Path) 
     ):
         pl.DataFrame(table).write_parquet(tmp_path / "optical.parquet")
         with pytest.raises(WeposeError) as raised:
-            calibrate(arm, Moved(recording, {}, lost), closure)
+            calibrate_arm(arm, Moved(recording, {}, lost), closure)
         assert named in str(raised.value)
         assert "\n" not in str(raised.value)
 
@@ -239,7 +239,7 @@ def test_stated_deviations_are_right_over_seeds(arm: BodyModel) -> None:
     z = []
     for seed in range(10, 20):
         moved = move_arm(arm, seed)
-        z.append(deviations(calibrate(arm, moved), moved))
+        z.append(deviations(calibrate_arm(arm, moved), moved))
     rms = np.sqrt(np.mean(np.square(z)))
     print(f"rms of z over {len(z)} seeds: {rms:.2f}")
     assert 0.4 < rms < 1.6

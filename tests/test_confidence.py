@@ -12,7 +12,7 @@ import pytest
 from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import calibrate_lengths
+from wepose_pin.calibration import calibrate
 from wepose_pin.cli import main
 from wepose_pin.kinematics import build_pose_table, compute_axis_std, compute_point_covariances, compute_pose
 from wepose_pin.model import load_model
@@ -99,9 +99,7 @@ def test_the_whole_chain_is_honest() -> None:
         person = simulate_person(200 + seed, PEOPLE_MEASURED_STD)
         simulation = simulate(person.lengths, seed=seed, imperfections=PEOPLE_PRESET)
         recording = simulation.recording()
-        found = calibrate_lengths(
-            recording, measured=person.measured, measured_std=PEOPLE_MEASURED_STD, prior=person.prior
-        )
+        found = calibrate(recording, measured=person.measured, measured_std=PEOPLE_MEASURED_STD, prior=person.prior)
         pose = track(recording, found.subject).pose
         during = recording.span(simulation.phases["circles"][0])
         for name in simulation.quat_WL:

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import load_session
-from wepose_pin.calibration import calibrate_lengths
+from wepose_pin.calibration import calibrate
 from wepose_pin.cli import main
 from wepose_pin.errors import BadSession
 from wepose_pin.recording import DoubledSensor, ImuSensor, Recording
@@ -67,7 +67,7 @@ def test_the_mounts_of_both_are_calibrated(made: tuple[Person, Simulation, Recor
     bare = {name: replace(sensor, stated_quat_LS=None) for name, sensor in recording.sensors.items()}
     unknown = replace(recording.doubled["torso"].sensor, stated_quat_LS=None)
     recording = replace(recording, sensors=bare, doubled={"torso": DoubledSensor("torso_back", unknown)})
-    subject = calibrate_lengths(recording, prior=person.prior).subject
+    subject = calibrate(recording, prior=person.prior).subject
     true = Rotation.from_quat(simulation.quat_LS["torso"]) * TURN.inv()
     off = (Rotation.from_quat(subject.mounts["torso_back"]) * true.inv()).magnitude()
     covariance = subject.mount_covariance("torso_back")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from wepose_pin import rotations
 from wepose_pin.alignment import compute_heading_offset
-from wepose_pin.calibration import calibrate_lengths, lengths
+from wepose_pin.calibration import calibrate, lengths
 from wepose_pin.calibration.joints import (
     MAX_STD,
     SYSTEMATIC_STD,
@@ -140,7 +140,7 @@ def test_soft_tissue_of_the_torso_is_no_heading(seed: int, monkeypatch: pytest.M
         with monkeypatch.context() as patch:
             if not coupled:
                 patch.setattr(lengths, "estimate_couplings", lambda *_: [])
-            found = calibrate_lengths(simulation.recording(), measured=measured, prior=person.prior).subject
+            found = calibrate(simulation.recording(), measured=measured, prior=person.prior).subject
         error = Rotation.from_quat(found.mounts["torso"]) * Rotation.from_quat(simulation.quat_LS["torso"]).inv()
         off[coupled] = abs(float(np.degrees(error.as_rotvec()[2])))
         assert off[coupled] < 2.0 * np.degrees(found.std("mounts.torso.z"))

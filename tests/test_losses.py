@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import calibrate_lengths
+from wepose_pin.calibration import calibrate
 from wepose_pin.calibration.lengths import Calibration
 from wepose_pin.calibration.losses import Loss, find_losses, group_steps, mask_connected
 from wepose_pin.errors import BadPhase
@@ -49,15 +49,15 @@ def worst_mount(found: Calibration, simulation: Simulation) -> float:
 
 @pytest.mark.parametrize("names", [("left_upper_arm",), ("torso",), ALL], ids=["upper arm", "torso", "all"])
 def test_headings_step_where_samples_were_lost(simulation: Simulation, names: tuple[str, ...]) -> None:
-    found = calibrate_lengths(lossy(simulation, (11.0, 13.0), names))
+    found = calibrate(lossy(simulation, (11.0, 13.0), names))
     assert found.rms_gap < 0.003
     assert worst_mount(found, simulation) < 4.0
 
 
 def test_a_loss_before_the_hands_are_joined_needs_the_mount(simulation: Simulation) -> None:
     with pytest.raises(BadPhase, match=r"left_upper_arm is lost from .* and its heading with it: .* state its mount"):
-        calibrate_lengths(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",)))
-    found = calibrate_lengths(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",), stated=True))
+        calibrate(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",)))
+    found = calibrate(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",), stated=True))
     assert found.rms_gap < 0.004  # arms that hang exactly contradict how people stand
     assert worst_mount(found, simulation) < 4.0
 
@@ -65,7 +65,7 @@ def test_a_loss_before_the_hands_are_joined_needs_the_mount(simulation: Simulati
 def test_samples_without_a_known_tilt_are_left_out(simulation: Simulation) -> None:
     """The smekf corrects while static, and joined hands are never static."""
     with pytest.raises(BadPhase, match=r"phases\.clasp holds 0 samples .*: sensors\.left_upper_arm, or their tilt"):
-        calibrate_lengths(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",), stated=True), method="smekf")
+        calibrate(lossy(simulation, (-0.5, 2.0), ("left_upper_arm",), stated=True), method="smekf")
 
 
 def test_what_lies_beyond_a_loss() -> None:

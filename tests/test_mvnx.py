@@ -16,6 +16,7 @@ from wepose_pin.errors import BadData, BadSession, MissingFile
 from wepose_pin.kinematics import compute_pose
 from wepose_pin.readers.mvnx import read_frames, read_mvnx
 from wepose_pin.subject import Hinge
+from wepose_pin.tracking import track
 
 SEGMENTS = ("Pelvis", "T8", "LeftUpperArm", "LeftForeArm", "LeftHand", "RightUpperArm")
 OURS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
@@ -109,7 +110,7 @@ def tracked(
     lengths["shoulder_width"] = np.linalg.norm(still["LeftUpperArm"] - still["RightUpperArm"])
     subject = wp.population_subject()
     subject = replace(subject, lengths={**subject.lengths, **{name: float(v) for name, v in lengths.items()}})
-    pose = wp.track(wp.load_session(session(tmp_path_factory.mktemp("mvnx"), path, OURS)), subject)
+    pose = track(wp.load_session(session(tmp_path_factory.mktemp("mvnx"), path, OURS)), subject)
     turn = Rotation.from_rotvec([0.0, 0.0, pose.segments.heading_offset["torso"]])
     return pose, {label: turn.apply(position) for label, position in moving.items()}
 
@@ -181,7 +182,7 @@ def test_a_subjects_mounts_and_hinges_do_not_touch_aligned_orientations(tracked)
         "left_elbow": Hinge(np.array([0.6, 0.8, 0.0]), 0.02),
         "right_elbow": Hinge(np.array([0.6, 0.8, 0.0]), 0.02),
     }
-    again = wp.track(pose.recording, replace(pose.subject, mounts=mounts, hinges=hinges))
+    again = track(pose.recording, replace(pose.subject, mounts=mounts, hinges=hinges))
     assert again.correction is None
     for name in OURS:
         np.testing.assert_array_equal(again.quat_WL[name], pose.quat_WL[name])

@@ -16,7 +16,7 @@ from bodies import LENGTHS, SEGMENTS
 from scipy.spatial.transform import Rotation
 from test_calibration import with_rigid_shoulders
 
-from wepose_pin.calibration import Calibration, assess, calibrate_lengths, load_protocol
+from wepose_pin.calibration import Calibration, assess, calibrate, load_protocol
 from wepose_pin.calibration.paper import check_paper_formulation
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import render
@@ -54,7 +54,7 @@ def made() -> tuple[Person, Simulation, Recording]:
 def estimated(made: tuple[Person, Simulation, Recording]) -> Calibration:
     person, _, recording = made
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
-    return calibrate_lengths(recording, measured=measured, prior=person.prior, method="smekf", formulation="paper")
+    return calibrate(recording, measured=measured, prior=person.prior, method="smekf", formulation="paper")
 
 
 def run(*words: object) -> int:
@@ -150,7 +150,7 @@ def test_exact_orientations_give_the_lengths_back() -> None:
     sensors = {name: OrientationSensor(quat_WS=quat) for name, quat in simulation.quat_WL.items()}
     recording = replace(simulation.recording("exact"), sensors=sensors)
     measured = {name: person.lengths[name] for name in ("left_upper_arm", "left_hand", "right_forearm")}
-    found = calibrate_lengths(recording, measured=measured, formulation="paper")
+    found = calibrate(recording, measured=measured, formulation="paper")
     for name in ("shoulder_width", *(n for n in LENGTHS if "arm" in n or "hand" in n)):
         assert found.subject.lengths[name] == pytest.approx(person.lengths[name], abs=1e-6), name
     assert found.rms_gap < 1e-6
@@ -158,7 +158,7 @@ def test_exact_orientations_give_the_lengths_back() -> None:
 
 def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulation, Recording]) -> None:
     person, _, recording = made
-    found = calibrate_lengths(recording, measured={"shoulder_width": 0.6}, prior=person.prior, formulation="paper")
+    found = calibrate(recording, measured={"shoulder_width": 0.6}, prior=person.prior, formulation="paper")
     quality = assess(found)
     (contradicted,) = [each for each in quality.reasons if each.code == "measured-length-contradicted"]
     assert quality.quality == "fail"
@@ -168,7 +168,7 @@ def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulati
 
 def test_lengths_that_are_all_measured_stay(made: tuple[Person, Simulation, Recording]) -> None:
     person, _, recording = made
-    found = calibrate_lengths(recording, measured=person.lengths, prior=person.prior, formulation="paper").subject
+    found = calibrate(recording, measured=person.lengths, prior=person.prior, formulation="paper").subject
     assert found.lengths == pytest.approx(person.lengths, abs=1e-9)
     np.testing.assert_allclose(found.covariance, 0.003**2 * np.eye(8), atol=1e-12)
 
@@ -186,7 +186,7 @@ def test_noise_in_the_orientations_makes_arms_short() -> None:
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
     ratio = {}
     for formulation in ("full", "paper"):
-        lengths = calibrate_lengths(
+        lengths = calibrate(
             recording,
             measured=measured,
             prior=with_rigid_shoulders(population_subject()),
@@ -204,7 +204,7 @@ def test_mounts_of_the_prior_are_used_and_stay(made: tuple[Person, Simulation, R
     person, simulation, recording = made
     prior = replace(person.prior, mounts=simulation.quat_LS)
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
-    found = calibrate_lengths(recording, measured=measured, prior=prior, method="smekf", formulation="paper")
+    found = calibrate(recording, measured=measured, prior=prior, method="smekf", formulation="paper")
     assert found.subject.mounts == simulation.quat_LS
     assert found.subject.lengths["left_upper_arm"] != found.prior.lengths["left_upper_arm"]
 
@@ -221,7 +221,7 @@ def test_mounts_of_the_prior_are_used_and_stay(made: tuple[Person, Simulation, R
 )
 def test_what_it_needs_is_said(options: dict[str, Any], said: str, made: tuple[Person, Simulation, Recording]) -> None:
     with pytest.raises(BadOption, match=said):
-        calibrate_lengths(made[2], **({"formulation": "paper"} | options))
+        calibrate(made[2], **({"formulation": "paper"} | options))
 
 
 @pytest.mark.parametrize("start_pose", ["t_pose", CONFIGURATION])
@@ -230,7 +230,7 @@ def test_another_start_pose_is_refused(start_pose: str, made: tuple[Person, Simu
     recording = replace(made[2], start_pose=start_pose)
     said = f"start_pose = '{start_pose}'; record a start in n_pose, or use --formulation full"
     with pytest.raises(BadOption, match=re.escape(said)):
-        calibrate_lengths(recording, measured={"shoulder_width": 0.4}, formulation="paper")
+        calibrate(recording, measured={"shoulder_width": 0.4}, formulation="paper")
 
 
 def test_a_hand_with_a_sensor_fixes_the_scale_and_one_without_does_not() -> None:
@@ -247,7 +247,7 @@ def test_every_mount_must_be_stated(made: tuple[Person, Simulation, Recording]) 
     torso = replace(recording.sensors["torso"], stated_quat_LS=None)
     unknown = replace(recording, sensors={**recording.sensors, "torso": torso})
     with pytest.raises(BadSession, match=r"sensors\.torso\.mount is not known"):
-        calibrate_lengths(unknown, measured={"shoulder_width": 0.38}, formulation="paper")
+        calibrate(unknown, measured={"shoulder_width": 0.38}, formulation="paper")
 
 
 @pytest.mark.parametrize(
@@ -267,7 +267,7 @@ def test_hands_that_are_not_joined_give_no_lengths(swing: float, said: str) -> N
         angles = k * swing * np.sin((1.0 + 0.3 * k) * since)[:, None] * [0.3, 1.0, 0.0]
         sensors[name] = OrientationSensor(quat_WS=Rotation.from_rotvec(angles).as_quat())
     with pytest.raises(NoSolution, match=said):
-        calibrate_lengths(
+        calibrate(
             replace(simulation.recording("apart"), sensors=sensors),
             measured={"shoulder_width": 0.38},
             formulation="paper",

@@ -15,7 +15,7 @@ from reading import text_of
 from scipy.spatial.transform import Rotation
 
 from benchmarks.long_recordings import there_and_back
-from wepose_pin.calibration import calibrate_lengths
+from wepose_pin.calibration import calibrate
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import from_json
 from wepose_pin.errors import BadData, BadOption
@@ -45,9 +45,7 @@ def made(person: Person) -> Simulation:
 @pytest.fixture(scope="module")
 def subject(made: Simulation, person: Person) -> Subject:
     """Calibrated, with hinges: headings are held together by them and by the hands."""
-    found = calibrate_lengths(
-        made.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std
-    )
+    found = calibrate(made.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std)
     assert set(found.subject.hinges) == {"left_elbow", "right_elbow"}
     return found.subject
 

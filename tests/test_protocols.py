@@ -11,7 +11,7 @@ import pytest
 from bodies import LENGTHS, RIGID_SHOULDERS, TABLE
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate_lengths, load_protocol
+from wepose_pin.calibration import PROTOCOLS, Calibration, assess, calibrate, load_protocol
 from wepose_pin.calibration.conditions import (
     Loop,
     StartPose,
@@ -192,7 +192,7 @@ GAUGE = {"handle": None, "touch_left": "left_upper_arm", "touch_right": "right_u
 def test_exact_motion_gives_headings_and_lengths_back(protocol: str, seed: int) -> None:
     person, simulation = made(protocol, seed, real=False)
     measured = {name: person.lengths[name] for name in (GAUGE[protocol],) if name}
-    found = calibrate_lengths(
+    found = calibrate(
         simulation.recording(),
         measured=measured,
         prior=person.prior,
@@ -228,7 +228,7 @@ def test_usual_imperfections_stay_within_the_stated_deviations(protocol: str) ->
         person, simulation = made(protocol, seed, real=True)
         rng = np.random.default_rng(seed)
         measured = {name: person.lengths[name] + rng.normal(0.0, 0.003) for name in TAPED[protocol]}
-        found = calibrate_lengths(simulation.recording(), measured=measured, prior=person.prior, protocol=protocol)
+        found = calibrate(simulation.recording(), measured=measured, prior=person.prior, protocol=protocol)
         error, std = mount_errors(found, simulation)
         off, off_std = length_errors(found, person, LENGTHS)
         z_lengths.append(off / off_std)
@@ -246,8 +246,8 @@ def test_usual_imperfections_stay_within_the_stated_deviations(protocol: str) ->
 def test_a_handle_fixes_the_scale_by_itself() -> None:
     person, simulation = made("handle", 4, real=True, seconds=20.0)
     recording = simulation.recording()
-    found = calibrate_lengths(recording, prior=person.prior, protocol="handle")
-    given = calibrate_lengths(recording, prior=person.prior, protocol="handle", measured={"handle": 0.40})
+    found = calibrate(recording, prior=person.prior, protocol="handle")
+    given = calibrate(recording, prior=person.prior, protocol="handle", measured={"handle": 0.40})
     (assumed,) = [d for d in found.diagnostics if d.code == "protocol-distance-assumed"]
     assert (assumed.place, assumed.value) == ("handle", 0.4)
     assert not {"protocol-distance-assumed", "scale-from-prior"} & codes(given)
@@ -260,7 +260,7 @@ def test_a_handle_fixes_the_scale_by_itself() -> None:
     person, simulation = made("handle", 1, real=False)
     scale = []
     for bar in (0.40, 0.42):
-        exact = calibrate_lengths(
+        exact = calibrate(
             simulation.recording(),
             prior=person.prior,
             protocol="handle",
@@ -278,11 +278,11 @@ def test_one_arm_needs_three_sensors_and_leaves_the_other_arm_to_the_prior() -> 
     recording = simulation.recording()
     measured = {"right_upper_arm": person.lengths["right_upper_arm"]}
     three = {name: recording.sensors[name] for name in ("torso", "right_upper_arm", "right_forearm")}
-    alone = calibrate_lengths(
+    alone = calibrate(
         replace(recording, sensors=three), measured=measured,
         prior=person.prior, protocol="touch_right",
     )  # fmt: skip
-    whole = calibrate_lengths(recording, measured=measured, prior=person.prior, protocol="touch_right")
+    whole = calibrate(recording, measured=measured, prior=person.prior, protocol="touch_right")
     assert alone.subject.lengths == pytest.approx(whole.subject.lengths, abs=1e-6)
     assert set(alone.subject.mounts) == set(three)
     assert set(alone.hinge_axes) == {"right_elbow"}
@@ -294,13 +294,13 @@ def test_one_arm_needs_three_sensors_and_leaves_the_other_arm_to_the_prior() -> 
 def test_a_fixed_point_says_that_it_has_no_scale_and_which_gauge_would_serve() -> None:
     person, simulation = made("touch_right", 4, real=True)
     recording = simulation.recording()
-    free = calibrate_lengths(recording, prior=person.prior, protocol="touch_right")
+    free = calibrate(recording, prior=person.prior, protocol="touch_right")
     assert ("scale-from-prior", "right_upper_arm") in measured_instead(free)
     width = {"shoulder_width": person.lengths["shoulder_width"]}
-    loose = calibrate_lengths(recording, measured=width, prior=person.prior, protocol="touch_right")
+    loose = calibrate(recording, measured=width, prior=person.prior, protocol="touch_right")
     assert ("scale-uncertain", "right_upper_arm") in measured_instead(loose)
     upper = {"right_upper_arm": person.lengths["right_upper_arm"]}
-    good = calibrate_lengths(recording, measured=upper, prior=person.prior, protocol="touch_right")
+    good = calibrate(recording, measured=upper, prior=person.prior, protocol="touch_right")
     assert not measured_instead(good)
     # The trunk is seen beside the arm, the better the better one knows how the shoulder moves on it.
     k = len(girdle_rows(TABLE))
@@ -310,7 +310,7 @@ def test_a_fixed_point_says_that_it_has_no_scale_and_which_gauge_would_serve() -
         order=(*person.prior.order, *girdle_rows(TABLE)),
         covariance=np.pad(person.prior.covariance, (0, k)),
     )
-    best = calibrate_lengths(recording, measured=upper, prior=sure, protocol="touch_right")
+    best = calibrate(recording, measured=upper, prior=sure, protocol="touch_right")
     assert best.subject.std("trunk") < good.subject.std("trunk") < 0.75 * person.prior.std("trunk")
 
 
@@ -325,7 +325,7 @@ def test_a_trunk_that_keeps_still_leaves_headings_unknown_and_says_so(monkeypatc
     monkeypatch.setitem(TASKS, "touch_right", StillTrunk)
     monkeypatch.delitem(MADE, ("touch_right", 9, False), raising=False)
     person, simulation = made("touch_right", 9, real=False)
-    found = calibrate_lengths(simulation.recording(), prior=person.prior, protocol="touch_right")
+    found = calibrate(simulation.recording(), prior=person.prior, protocol="touch_right")
     error, std = mount_errors(found, simulation)
     quality = assess(found)
     print(quality.reasons, error[:, 2], std[:, 2])
@@ -340,12 +340,12 @@ def test_a_palm_off_its_point_is_found_and_left_out() -> None:
     recording = simulation.recording()
     first, last = recording.phases["touch"][0]
     early = replace(recording, phases={**recording.phases, "touch": ((first - 2.3, last),)})  # the way to the table
-    found = calibrate_lengths(early, prior=person.prior, protocol="touch_right")
+    found = calibrate(early, prior=person.prior, protocol="touch_right")
     (off,) = [d for d in found.diagnostics if d.code == "closure-open"]
     assert (off.place, off.facts["variant"]) == ("touch", "fixed_point")
     assert render(off).what.startswith("The palm was off its point for ")
     assert found.contact[:8].max() < 0.1
-    whole = calibrate_lengths(recording, prior=person.prior, protocol="touch_right")
+    whole = calibrate(recording, prior=person.prior, protocol="touch_right")
     error, std = length_errors(found, person, find_measured_lengths(load_protocol("touch_right"), load_model()))
     assert np.abs(error / std).max() < 3.5
     assert found.rms_gap < 1.3 * whole.rms_gap
@@ -358,7 +358,7 @@ def test_advice_is_of_what_was_done(name: str, closed: str) -> None:
     recording = simulation.recording()
     phase, (begin, _) = next((n, spans[0]) for n, spans in recording.phases.items() if n in ("touch", "handle"))
     short = replace(recording, phases={**recording.phases, phase: ((begin, begin + 9.0),)})
-    found = calibrate_lengths(short, prior=person.prior, protocol=name)
+    found = calibrate(short, prior=person.prior, protocol=name)
     quality = assess(found)
     assert "motion-too-short" in {d.code for d in quality.reasons}
     words = " ".join(text.line() for _, text in render_all(quality.reasons))
@@ -374,7 +374,7 @@ def test_advice_is_of_what_was_done(name: str, closed: str) -> None:
 def test_poses_tell_headings_and_no_length() -> None:
     person, simulation = made("poses", 4, real=True)
     recording = simulation.recording()
-    found = calibrate_lengths(recording, prior=person.prior, protocol="poses")
+    found = calibrate(recording, prior=person.prior, protocol="poses")
     assert found.subject.lengths == pytest.approx(person.prior.lengths)
     for name in LENGTHS:
         assert found.subject.std(name) == pytest.approx(person.prior.std(name))
@@ -387,7 +387,7 @@ def test_poses_tell_headings_and_no_length() -> None:
     for name, std in heading.items():
         n_pose = np.degrees(np.linalg.norm(TABLE.segments[name].start_std[:2]))
         assert np.hypot(t_pose, 5.0) < std < np.linalg.norm([t_pose, n_pose, torso])
-    measured = calibrate_lengths(recording, prior=person.prior, protocol="poses", measured={"trunk": 0.47})
+    measured = calibrate(recording, prior=person.prior, protocol="poses", measured={"trunk": 0.47})
     assert measured.subject.lengths["trunk"] == pytest.approx(0.47, abs=2e-3)
 
 
@@ -396,7 +396,7 @@ def test_a_longer_phase_makes_no_better_pose() -> None:
     recording = simulation.recording()
     ((first, last),) = recording.phases["t_pose"]
     short = replace(recording, phases={**recording.phases, "t_pose": ((first, 0.5 * (first + last)),)})
-    both = [mount_errors(calibrate_lengths(r, protocol="poses"), simulation)[1] for r in (short, recording)]
+    both = [mount_errors(calibrate(r, protocol="poses"), simulation)[1] for r in (short, recording)]
     np.testing.assert_allclose(both[0], both[1], rtol=0.05)
 
 
@@ -406,11 +406,11 @@ def test_clasp_measured_is_clasp_with_a_measured_length() -> None:
     with pytest.raises(
         BadOption, match=r"needs 1 measured length of its chain, as in --measured shoulder_width=0\.385"
     ):
-        calibrate_lengths(recording, protocol="clasp_measured")
+        calibrate(recording, protocol="clasp_measured")
     with pytest.raises(BadOption, match="needs 1 measured length"):
-        calibrate_lengths(recording, protocol="clasp_measured", measured={"trunk": 0.5})
+        calibrate(recording, protocol="clasp_measured", measured={"trunk": 0.5})
     both = [
-        calibrate_lengths(recording, prior=person.prior, measured=person.measured, protocol=name)
+        calibrate(recording, prior=person.prior, measured=person.measured, protocol=name)
         for name in ("clasp", "clasp_measured")
     ]
     assert both[0].subject.lengths == both[1].subject.lengths
@@ -445,7 +445,7 @@ def test_wrong_requests_are_one_line_that_names_them() -> None:
 
 
 def run(recording: Recording, protocol: str, **measured: float) -> Calibration:
-    return calibrate_lengths(recording, protocol=protocol, measured=measured)
+    return calibrate(recording, protocol=protocol, measured=measured)
 
 
 OWN = """
@@ -467,7 +467,7 @@ def test_a_protocol_of_ones_own(tmp_path: Path) -> None:
     assert protocol.name == "rope"
     assert "left_hand" not in find_measured_lengths(protocol, load_model())
     person, simulation = made("handle", 1, real=False, seconds=20.0)
-    found = calibrate_lengths(simulation.recording(), prior=person.prior, protocol=protocol)
+    found = calibrate(simulation.recording(), prior=person.prior, protocol=protocol)
     assert "rope" in found.subject.note
     for old, new, match in (
         ('"left_wrist"', '"left_wirst"', "'left_wirst' is no point of upper_body; did you mean 'left_wrist'"),

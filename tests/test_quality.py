@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import warnings
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +14,13 @@ import pytest
 from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, calibrate_lengths
+import wepose_pin as wp
+from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate
 from wepose_pin.calibration.anatomy import LimbMotion, check_labels
 from wepose_pin.calibration.quality import OPEN_SHARE, QUALITIES
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, INFO, WARNING, from_json, render
-from wepose_pin.errors import CalibrationFailed, WeposeWarning
+from wepose_pin.errors import BadSubject
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import MILD_PRESET, Imperfections, Person, Simulation, simulate, simulate_person
 from wepose_pin.simulation import motion as motions
@@ -68,7 +69,7 @@ def moved_otherwise(person: Person, share: Mapping[str, float], imperfections: I
 
 def solved(recording: Recording, person: Person, measured: bool = True) -> Calibration:
     lengths = {"shoulder_width": person.measured["shoulder_width"]} if measured else {}
-    return calibrate_lengths(recording, measured=lengths, prior=person.prior, measured_std=person.measured_std)
+    return calibrate(recording, measured=lengths, prior=person.prior, measured_std=person.measured_std)
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +182,7 @@ def test_a_measured_length_that_contradicts_all_else_is_named_once(
 ) -> None:
     assert good.measured_lengths["shoulder_width"].deviation < 2.0
     assert good.measured_lengths["shoulder_width"].expected == pytest.approx(person.lengths["shoulder_width"], rel=0.1)
-    wrong = calibrate_lengths(anywhere.recording(), measured={"shoulder_width": 0.20}, prior=person.prior)
+    wrong = calibrate(anywhere.recording(), measured={"shoulder_width": 0.20}, prior=person.prior)
     quality = assess(wrong)
     assert quality.quality == "fail"
     (contradicted,) = quality.reasons
@@ -207,18 +208,21 @@ def test_of_sensors_that_sit_elsewhere_nothing_is_learned(anywhere: Simulation, 
     assert not found.subject.start_pose_offset
 
 
-def test_python_hands_out_no_subject_of_a_failed_calibration_in_silence(anywhere: Simulation, person: Person) -> None:
+def test_a_failed_calibration_says_so_and_is_not_tracked(anywhere: Simulation, person: Person) -> None:
     known = {"measured": {"shoulder_width": person.measured["shoulder_width"]}, "prior": person.prior}
     recording = anywhere.recording()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", WeposeWarning)
-        assert calibrate(recording, **known, measured_std=person.measured_std).mounts
-    with pytest.raises(CalibrationFailed, match="left upper arm and left forearm seem to be exchanged") as failed:
-        calibrate(exchanged(recording, ("left_upper_arm", "left_forearm")), **known)
-    assert failed.value.quality.quality == "fail"
-    assert failed.value.calibration.subject.lengths
-    with pytest.warns(WeposeWarning, match="No length was measured"):
-        assert calibrate(recording).lengths
+    moved = exchanged(recording, ("left_upper_arm", "left_forearm"))
+    failed = calibrate(moved, **known)
+    assert failed.quality.quality == failed.subject.quality == "fail"
+    assert re.fullmatch(r"Calibration\('simulated': fail; 8 lengths ± \d+ to \d+ mm; first: .+\)", repr(failed))
+    assert failed.diagnostics[0] == failed.quality.reasons[0]
+    assert "left upper arm and left forearm seem to be exchanged" in failed._repr_html_()
+    with pytest.raises(BadSubject, match="its calibration failed"):
+        wp.track(moved, failed)
+    assert wp.track(moved, failed, force=True).subject.quality == "fail"
+    unmeasured = calibrate(recording)
+    assert unmeasured.subject.quality == "poor"
+    assert "Measure" in repr(unmeasured)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from bodies import TABLE
 from reading import captions, headings, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate_lengths
+from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import Recording
 from wepose_pin.report import render_calibration_report
@@ -31,7 +31,7 @@ def made() -> Made:
     person = simulate_person(3)
     world = replace(MILD_PRESET, mount="any")
     recording = simulate(person.lengths, seed=3, imperfections=world, clasp_s=30.0, circles=0).recording("anna <3")
-    found = calibrate_lengths(recording, measured=person.measured, prior=person.prior)
+    found = calibrate(recording, measured=person.measured, prior=person.prior)
     return found, recording, track(recording, found.subject)
 
 
@@ -89,14 +89,14 @@ def test_the_quality_with_its_checks(made: Made) -> None:
 
 def test_diagnostics_stand_above_the_figures_in_words(made: Made) -> None:
     facts = {"intervals": "12 to 14 s", "variant": "coincide"}
-    warned = replace(made[0], diagnostics=(Diagnostic("closure-open", INFO, "clasp", 0.12, 0.1, facts),))
+    warned = replace(made[0], remarks=(Diagnostic("closure-open", INFO, "clasp", 0.12, 0.1, facts),))
     page = without_frame(render_calibration_report(warned, made[1], tracked=made[2]))
     assert page.index("The palms were apart for 12 % of the phase") < page.index("<figure")
     assert 'class="banner p' not in page  # nobody assessed it
 
 
 def test_what_keeps_it_from_passing_is_not_said_twice(made: Made) -> None:
-    twice = replace(made[0], diagnostics=(Diagnostic("scale-from-prior", INFO, value=0.05), *made[0].diagnostics))
+    twice = replace(made[0], remarks=(Diagnostic("scale-from-prior", INFO, value=0.05), *made[0].remarks))
     quality = assess(replace(twice, scale_lengths=(), scale_std=0.05))
     assert [d.code for d in quality.diagnostics].count("scale-from-prior") == 1
 

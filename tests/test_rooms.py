@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -35,6 +36,13 @@ def test_the_facade_knows_where_everything_is() -> None:
         assert getattr(wepose_pin, name) is not None
     with pytest.raises(AttributeError, match="nothing_of_the_kind"):
         _ = wepose_pin.nothing_of_the_kind
+
+
+def test_editors_see_every_public_name() -> None:
+    tree = ast.parse(Path(wepose_pin.__file__).read_text(encoding="utf-8"))
+    [block] = [node for node in tree.body if isinstance(node, ast.If)]
+    seen = {each.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for each in node.names}
+    assert seen == wepose_pin._WHERE
 
 
 def test_help_loads_no_heavy_room() -> None:

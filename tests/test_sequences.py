@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import Calibration, assess, calibrate_lengths, calibrate_sessions, load_protocol
+from wepose_pin.calibration import Calibration, assess, calibrate, calibrate_sessions, load_protocol
 from wepose_pin.calibration.initial_headings import _see_from
 from wepose_pin.calibration.series import check_same_person
 from wepose_pin.cli import main
@@ -95,7 +95,7 @@ def test_parts_are_done_as_they_say(joined: tuple[Person, Simulation]) -> None:
 def test_exact_parts_give_headings_and_lengths_back(joined: tuple[Person, Simulation]) -> None:
     """The T-pose is left out: it is held as people hold it, not exactly."""
     person, simulation = joined
-    calibration = calibrate_lengths(
+    calibration = calibrate(
         simulation.recording(),
         measured={"shoulder_width": person.lengths["shoulder_width"]},
         prior=person.prior,
@@ -123,7 +123,7 @@ def test_free_motion_shows_headings_and_keeps_lengths() -> None:
     person = simulate_person(4)
     simulation = simulate_activity("tasks", seed=4, imperfections=ANY, seconds=40.0, lengths=person.lengths)
     recording = simulation.recording()
-    calibration = calibrate_lengths(recording, prior=person.prior, protocol="free")
+    calibration = calibrate(recording, prior=person.prior, protocol="free")
     errors = heading_errors(calibration, simulation)
     std = max(calibration.subject.std(f"mounts.{name}.z") for name in calibration.subject.mounts)
     assert np.abs(errors).max() < 2.0 * np.degrees(std) < 40.0
@@ -133,7 +133,7 @@ def test_free_motion_shows_headings_and_keeps_lengths() -> None:
     assert assess(calibration).quality != "pass"
     still = replace(recording, phases={"start": ((0.5, 1.5),)}).cut(recording.span((0.0, 4.9)))
     with pytest.raises(BadPhase, match=r"the motion does not show how sensors\.left_upper_arm") as caught:
-        calibrate_lengths(still, prior=person.prior, protocol="free")
+        calibrate(still, prior=person.prior, protocol="free")
     assert "\n" not in str(caught.value)
 
 
@@ -175,7 +175,7 @@ def test_the_order_of_sessions_does_not_matter(sessions: list[Recording]) -> Non
 
 
 def test_sessions_of_two_people_are_one_line(sessions: list[Recording]) -> None:
-    first = calibrate_lengths(sessions[0], prior=simulate_person(11).prior).subject
+    first = calibrate(sessions[0], prior=simulate_person(11).prior).subject
     longer = {name: 1.3 * value if name.startswith("right") else value for name, value in first.lengths.items()}
     with pytest.raises(
         BadSession, match=r"b: the right arm is \d+ mm long and \d+ mm in a.*not sessions of one person"

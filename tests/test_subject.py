@@ -69,6 +69,7 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
         "by hand",
         start_pose_offset={"torso": StartPoseOffset(np.array([0.01, -0.07]), 0.02)},
         heading_drift={"torso": HeadingDrift(np.deg2rad(-0.7) / 60.0, np.deg2rad(0.3) / 60.0)},
+        quality="poor",
     )
     (tmp_path / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
     for path in (tmp_path, tmp_path / "subject.toml"):
@@ -76,6 +77,7 @@ def test_the_file_gives_back_what_was_written(tmp_path: Path) -> None:
         assert again.name == subject.name
         assert again.lengths == pytest.approx(dict(subject.lengths), abs=1e-6)
         assert again.order == order
+        assert again.quality == "poor"
         np.testing.assert_allclose(again.covariance, subject.covariance, rtol=1e-8)
         np.testing.assert_allclose(again.mounts["torso"], subject.mounts["torso"], atol=1e-9)
         np.testing.assert_allclose(again.start_pose_offset["torso"].tilt, [0.01, -0.07], atol=1e-6)
@@ -160,6 +162,7 @@ GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 
         ("format = 2\n[lengths]\ntrunk = -0.5", "lengths.trunk = -0.5"),
         ("format = 2\n[lengths]\ntrunk = 0.5", "lengths: shoulder_width, left_upper_arm"),
         ("format 1", "not valid TOML"),
+        ("format = 2\nquality = 'pas'\n[lengths]", "quality = 'pas' is not known; did you mean 'pass'"),
         (
             "ALL\n[mounts.torso]\nqx = 1.0\nqy = 1.0\nqz = 0.0\nqw = 0.0",
             "mounts.torso: qx, qy, qz, qw must be of length 1; it is 1.4",

@@ -110,6 +110,7 @@ def right() -> dict[str, dict[str, Any]]:
     return {
         "load_session": {"path": folder, "gaps": False},
         "load_subject": {"path": folder},
+        "load_result": {"folder": folder},
         "load_model": {"path": None, "lengths": None},
         "population_subject": {"stature": 1.7, "sex": "f"},
         "estimate_orientation": {
@@ -135,6 +136,7 @@ def right() -> dict[str, dict[str, Any]]:
 TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
     "load_session": {"path": (*PATH, None), "gaps": (*FLAG, None)},
     "load_subject": {"path": (*PATH, None)},
+    "load_result": {"folder": (*PATH, None, "nowhere")},
     "load_model": {
         "path": PATH,
         "lengths": LENGTHS,
@@ -163,6 +165,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "open_loop": (*FLAG, None),
         "causal": (*FLAG, None),
         "limits": (*FLAG, None),
+        "force": (*FLAG, None),
     },
     "calibrate": {
         "recording": (*THING, None),
@@ -480,8 +483,8 @@ def test_right_calls_go_through() -> None:
     """Else the table would prove nothing: a call that is wrong anyway is refused whatever else is in it."""
     pytest.importorskip("daqp")
     for function, arguments in right().items():
-        if function in ("load_session", "load_subject", "export"):  # nothing is there: see what they say of it
-            with pytest.raises(wp.WeposeError, match=str(arguments.get("path", arguments.get("result")))):
+        if function in ("load_session", "load_subject", "load_result", "export"):  # nothing is there
+            with pytest.raises(wp.WeposeError, match=str(next(iter(arguments.values())))):
                 getattr(wp, function)(**arguments)
         elif function != "calibrate":  # see test_python_calls
             assert getattr(wp, function)(**arguments) is not None

@@ -23,11 +23,37 @@ Conventions, everywhere:
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what editors and type checkers see
+    from .angles import joint_angles as joint_angles
+    from .api import TrackResult as TrackResult
+    from .api import load_result as load_result
+    from .api import track as track
+    from .calibration import Calibration as Calibration
+    from .calibration import calibrate as calibrate
+    from .errors import WeposeError as WeposeError
+    from .errors import WeposeWarning as WeposeWarning
+    from .evaluation import evaluate as evaluate
+    from .filters import estimate_orientation as estimate_orientation
+    from .filters.static import StaticTest as StaticTest
+    from .kinematics import Pose as Pose
+    from .model import load_model as load_model
+    from .readers import load_session as load_session
+    from .recording import ImuSensor as ImuSensor
+    from .recording import OrientationSensor as OrientationSensor
+    from .recording import Recording as Recording
+    from .recording import Sensor as Sensor
+    from .retargeting import retarget as retarget
+    from .simulation import simulate as simulate
+    from .subject import Subject as Subject
+    from .subject import load_subject as load_subject
+    from .subject import population_subject as population_subject
+    from .writers.export import export as export
 
 # Loaded on first use, so that the command line answers at once.
 _WHERE = {
-    "CalibrationFailed": "errors",
+    "Calibration": "calibration",
     "ImuSensor": "recording",
     "OrientationSensor": "recording",
     "Pose": "kinematics",
@@ -35,20 +61,22 @@ _WHERE = {
     "Sensor": "recording",
     "StaticTest": "filters.static",
     "Subject": "subject",
+    "TrackResult": "api",
     "WeposeError": "errors",
     "WeposeWarning": "errors",
-    "population_subject": "subject",
     "calibrate": "calibration",
     "estimate_orientation": "filters",
     "evaluate": "evaluation",
     "export": "writers.export",
     "joint_angles": "angles",
     "load_model": "model",
+    "load_result": "api",
     "load_session": "readers",
     "load_subject": "subject",
+    "population_subject": "subject",
     "retarget": "retargeting",
     "simulate": "simulation",
-    "track": "tracking",
+    "track": "api",
 }
 __all__ = ["__version__", *sorted(_WHERE)]
 __version__ = "0.1.0"

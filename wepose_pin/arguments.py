@@ -155,6 +155,15 @@ def check_names(place: str, names: Collection[str], known: Collection[str], othe
             raise BadOption(f"{place}: '{name}' is not known; {one_of(known, name)}{otherwise}")
 
 
+def format_object(value: object, describe: Callable[[], str]) -> str:
+    """``Class(description)`` in one line, for `__repr__`; an object with invalid fields says that it is invalid."""
+    name = type(value).__name__
+    try:
+        return f"{name}({describe()})"
+    except Exception:
+        return f"{name}(invalid: its check() says why)"
+
+
 @cache
 def _read_hints(function: Any) -> dict[str, Any]:
     hints = get_type_hints(function, include_extras=True)

@@ -11,7 +11,6 @@ import os
 import threading
 from collections.abc import Iterable, Iterator
 from difflib import SequenceMatcher, get_close_matches
-from typing import Any
 
 LONGEST = 2000  # letters of an error's text
 _END = 500  # of these, what is kept of the end, where it says what would be right
@@ -21,7 +20,7 @@ class WeposeError(Exception):
     """Wrong input; the base of all errors this package raises on purpose."""
 
     def __str__(self) -> str:
-        text = printable(super().__str__())
+        text = printable(Exception.__str__(self))  # not that of KeyError, which is a repr
         return text if len(text) <= LONGEST else f"{text[: LONGEST - _END]} … {text[-_END:]}"
 
 
@@ -35,6 +34,10 @@ class ExistingOutput(WeposeError):
 
 class BadSession(WeposeError):
     """`session.toml` lacks a key, has one too many, or a value of the wrong kind."""
+
+
+class UnknownKey(WeposeError, KeyError):
+    """A result has nothing of this name."""
 
 
 class UnknownColumn(WeposeError):
@@ -102,19 +105,6 @@ class BadPlan(WeposeError):
 
 class LostWorker(WeposeError):
     """Workers died at an item, again and again: too little memory, say."""
-
-
-class CalibrationFailed(WeposeError):
-    """A calibration whose quality is "fail": what it found must not be used unread.
-
-    Parameters
-    ----------
-    calibration, quality : what was found, and what is wrong with it
-    """
-
-    def __init__(self, text: str, calibration: Any = None, quality: Any = None) -> None:
-        super().__init__(text)
-        self.calibration, self.quality = calibration, quality
 
 
 class WeposeWarning(UserWarning):

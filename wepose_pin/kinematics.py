@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,15 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from . import rotations
-from .arguments import check_array, check_covariance, check_fields, check_finite, check_names, check_unit
+from .arguments import (
+    check_array,
+    check_covariance,
+    check_fields,
+    check_finite,
+    check_names,
+    check_unit,
+    format_object,
+)
 from .compilation import kernel
 from .errors import BadData, BadModel, one_of
 from .model import BodyModel
@@ -23,6 +32,7 @@ from .model.orientation_ik import OrientationIk, find_groups
 from .model.reaches import UNIVERSE
 from .recording import EACH_TIME, check_time
 from .rotations import product
+from .subject import Subject
 
 _ON_JOINT = 1e-12  # [m] from a joint's origin, below which the joint does not move a point
 _MAX_TABLE_VALUE = 1e12  # beyond this a number in a table is no time [s] and no position [m]
@@ -57,6 +67,11 @@ class Pose:
     point_cov: Mapping[str, np.ndarray] = field(default_factory=dict)
     gap: Mapping[str, np.ndarray] = field(default_factory=dict)
     joints: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return format_object(
+            self, lambda: f"{len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points"
+        )
 
     def check(self) -> Pose:
         """Check all fields and return the pose. NaN stands for missing values.
@@ -95,6 +110,58 @@ class Pose:
         for joint, values in self.joints.items():
             check_array(f"{where}joints.{joint}", values, (n,), rows=EACH_TIME)
             check_finite(f"{where}joints.{joint}", values, missing=True)
+        return self
+
+
+@dataclass(frozen=True)
+class PosedBody:
+    """A body and its pose over time.
+
+    Parameters
+    ----------
+    name : of the recording, as titles and files state it
+    model : the body with the subject's lengths
+    subject : lengths and mounts as used
+    """
+
+    name: str
+    pose: Pose
+    model: BodyModel
+    subject: Subject
+
+    @property
+    def time(self) -> np.ndarray:
+        """(n,) [s]."""
+        return self.pose.time
+
+    @property
+    def rate_hz(self) -> float:
+        """One over the usual time step, to six digits; NaN of one sample."""
+        return float(f"{1.0 / np.median(np.diff(self.time)):.6g}") if len(self.time) > 1 else float("nan")
+
+    @property
+    def quat_WL(self) -> Mapping[str, np.ndarray]:
+        """Segment → (n, 4) xyzw."""
+        return self.pose.quat_WL
+
+    @property
+    def points(self) -> Mapping[str, np.ndarray]:
+        """Point → (n, 3) [m] in W."""
+        return self.pose.points
+
+    @property
+    def joints(self) -> Mapping[str, np.ndarray]:
+        """Joint of one axis → its values (n,) [rad or m]; of a mechanism."""
+        return self.pose.joints
+
+    @cached_property
+    def q(self) -> np.ndarray:
+        """(n, nq) configuration of `model`."""
+        return solve_configuration(self.model, self.quat_WL) if self.pose.q is None else self.pose.q
+
+    def check(self) -> PosedBody:
+        """Check the pose (`Pose.check`) and return the posed body."""
+        self.pose.check()
         return self
 
 

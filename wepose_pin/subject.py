@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from .arguments import (
     check_finite,
     check_names,
     check_unit,
+    format_object,
 )
 from .documents import TomlTable, is_number, parse_toml, read_toml, toml_key, toml_string, toml_strings
 from .errors import BadData, BadModel, BadOption, BadSubject, one_of
@@ -32,6 +33,7 @@ LONGEST = 3.0  # [m] of a plausible length
 _LEARNED = ("mounts", "hinges", "girdles", "start_pose_offset", "heading_drift", "doubled")
 _TABLES = ("lengths", "lengths_std", *_LEARNED, "covariance")
 FORMAT = 2
+Quality = Literal["pass", "poor", "fail"]  # of a calibration
 POPULATION = "population"  # name of the prior of a body's lengths
 MOST_OFFSET_DEG = 180.0  # of a file; the calibration checks whether it is plausible
 MOST_DRIFT_DEG_MIN = 6000.0  # of a heading: 100 deg/s, beyond any gyroscope's bias
@@ -75,6 +77,7 @@ class Subject:
     heading_drift : segment → that of its sensor in the calibration; on another day it has a similar size
     doubled : second sensor → its segment; its mount is under its own name
     girdles : point that a girdle moves → (7,) what the person differs by from its law, `model.girdle.PARAMETERS`
+    quality : of the calibration that estimated it; empty where none did
     """
 
     name: str
@@ -88,6 +91,14 @@ class Subject:
     heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
     doubled: Mapping[str, str] = field(default_factory=dict)
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
+    quality: Literal["", "pass", "poor", "fail"] = ""
+
+    def __repr__(self) -> str:
+        def describe() -> str:
+            quality = f", calibration {self.quality}" if self.quality else ""
+            return f"{self.name!r}: {len(self.lengths)} lengths, {len(self.mounts)} mounts{quality}"
+
+        return format_object(self, describe)
 
     @property
     def is_population(self) -> bool:
@@ -128,6 +139,15 @@ class Subject:
         except (BadData, BadOption) as error:
             raise BadSubject(str(error)) from None
         return self
+
+    def check_quality(self) -> None:
+        """Raise `BadSubject` where the calibration failed that estimated it."""
+        if self.quality == "fail":
+            raise BadSubject(
+                f"subject '{self.name}': its calibration failed (quality = \"fail\"), so that lengths and mounts are "
+                f"not to be relied on; calibrate again, or use it all the same by --accept-failed (in Python "
+                f"force=True)"
+            )
 
     def check_body(self, table: BodyTable) -> None:
         """Raise `BadSubject` where a name is none of the body's, or a length of the body is missing."""
@@ -210,6 +230,7 @@ class Subject:
         return replace(
             self,
             name="sampled",
+            quality="",
             lengths=dict(zip(self.lengths, drawn.tolist(), strict=True)),
             covariance=np.zeros_like(self.covariance),
             note="a random person of the population",
@@ -257,9 +278,17 @@ def population_subject(
 
     Parameters
     ----------
-    stature : body height [m]; None: 1.75 with the spread of adults
-    sex : "f", "m", or None for the mean of both
-    body : None: the upper body
+    stature : float, optional
+        Body height [m]; None: 1.75 with the spread of adults.
+    sex : str, optional
+        "f", "m", or None for the mean of both.
+    body : BodyModel or BodyTable, optional
+        The body whose lengths these are; None: the upper body.
+
+    Returns
+    -------
+    Subject
+        Lengths [m] with their covariance, without mounts.
 
     Raises
     ------
@@ -267,6 +296,14 @@ def population_subject(
         A stature outside 1.0 to 2.5 m, or another sex.
     BadModel
         The table names a share that is not known, or a length that is none without a model.
+
+    Examples
+    --------
+    >>> prior = wp.population_subject(1.68, "f")
+    >>> prior
+    Subject('population': 8 lengths, 0 mounts)
+    >>> round(prior.lengths["left_forearm"], 2), round(prior.std("left_forearm"), 2)  # [m]
+    (0.26, 0.01)
     """
     check_arguments(population_subject, locals())
     table = load_table() if body is None else body if isinstance(body, BodyTable) else body.table
@@ -291,6 +328,8 @@ def subject_toml(subject: Subject) -> str:
     lines = [f"format = {FORMAT}", f"name = {toml_string(subject.name)}"]
     if subject.note:
         lines.append(f"note = {toml_string(subject.note)}")
+    if subject.quality:
+        lines.append(f"quality = {toml_string(subject.quality)}   # of the calibration: pass, poor or fail")
     lines += ["", "[lengths]       # m", *(f"{k} = {v:.6f}" for k, v in subject.lengths.items())]
     lines += ["", "[lengths_std]   # m, one standard deviation"]
     lines += [f"{k} = {subject.std(k):.6f}" for k in subject.lengths if k in subject.order]
@@ -331,12 +370,28 @@ def subject_toml(subject: Subject) -> str:
 
 
 def load_subject(path: str | Path) -> Subject:
-    """Read ``subject.toml`` (or the folder that holds it).
+    """Read ``subject.toml``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, or the folder that holds it, such as `wepose calibrate -o` wrote.
+
+    Returns
+    -------
+    Subject
+        Lengths [m] and mounts with their joint covariance.
 
     Raises
     ------
     MissingFile, BadSubject
         Not there; a length missing, not positive, unknown; a covariance that does not fit.
+
+    Examples
+    --------
+    >>> subject = wp.load_subject("subject.toml")
+    >>> round(subject.lengths["shoulder_width"], 2)  # [m]
+    0.37
     """
     check_arguments(load_subject, locals())
     path = Path(path)
@@ -365,7 +420,10 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         raise BadSubject(f"{path}: is a session; a subject is needed here, as `wepose calibrate` writes one")
     if values.get("format") != FORMAT:
         raise BadSubject(f"{path}: format = {values.get('format')!r}; this version reads format = {FORMAT}")
-    top.allow("format", "name", "note", *_TABLES)
+    top.allow("format", "name", "note", "quality", *_TABLES)
+    quality = values.get("quality", "")
+    if quality not in ("", *get_args(Quality)):
+        raise BadSubject(f"{path}: quality = {quality!r} is not known; {one_of(get_args(Quality), str(quality))}")
     tables = {name: top.table(name, {}) for name in _TABLES}
     of_segments = {
         name: {segment: tables[name].table(segment) for segment in tables[name].values}
@@ -399,6 +457,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         heading_drift={segment: HeadingDrift(float(rate), float(std)) for segment, (rate, std) in drift.items()},
         girdles={point: np.array(entry.numbers(*PARAMETERS, most=LONGEST)) for point, entry in girdles.items()},
         doubled={name: tables["doubled"].text(name, None) or "" for name in tables["doubled"].values},
+        quality=quality,
     )
 
 

@@ -348,7 +348,7 @@ def calibration_values(session: Path, measured: Mapping[str, float]) -> dict[str
     """What the function `calibrate` gives, in full precision."""
     import wepose_pin as wp
 
-    subject = wp.calibrate(wp.load_session(session), measured=dict(measured))
+    subject = wp.calibrate(wp.load_session(session), measured=dict(measured)).subject
     return {"lengths": subject.lengths, "mounts": subject.mounts, "covariance": subject.covariance}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..arguments import check_arguments
-from ..errors import BadData, BadOption, one_of
-from ..kinematics import Pose
+from ..errors import BadData, BadOption, UnknownKey, one_of
+from ..kinematics import Pose, PosedBody
 from ..recording import AXES
 from ..rotations import conjugate, multiply
 from . import euler
@@ -128,6 +128,18 @@ class JointAngles:
     std: np.ndarray | None
     quat: np.ndarray
 
+    def __getitem__(self, angle: str) -> np.ndarray:
+        """(n,) [rad], the values of the angle of this name."""
+        if angle not in self.names:
+            raise UnknownKey(f"no angle '{angle}'; {one_of(self.names, angle)}")
+        return self.values[:, self.names.index(angle)]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __repr__(self) -> str:
+        return f"JointAngles({', '.join(self.names)}: {len(self.values)} samples [rad], {self.sequence})"
+
 
 @dataclass(frozen=True)
 class Angles:
@@ -137,7 +149,21 @@ class Angles:
     joints: Mapping[str, JointAngles]
 
     def __getitem__(self, joint: str) -> JointAngles:
+        """The angles of the joint of this name."""
+        if joint not in self.joints:
+            raise UnknownKey(f"no joint '{joint}'; {one_of(self.joints, joint)}")
         return self.joints[joint]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.joints)
+
+    def _repr_html_(self) -> str:
+        from .tables import summary_table
+
+        return summary_table(self)._repr_html_()
+
+    def __repr__(self) -> str:
+        return f"Angles({', '.join(self.joints)}: {len(self.time)} samples)"
 
 
 def group_sides(joints: Iterable[str]) -> dict[str, dict[str, str]]:
@@ -149,8 +175,8 @@ def group_sides(joints: Iterable[str]) -> dict[str, dict[str, str]]:
     return groups
 
 
-def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK) -> Angles:
-    """Thorax and pelvis in W, shoulders (upper arm in thorax), elbows, wrists, hips, knees, ankles, where measured.
+def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float = NEAR_LOCK) -> Angles:
+    """Joint angles after the ISB: thorax and pelvis in W, shoulders, elbows, wrists, hips, knees, ankles, as measured.
 
     Left joints are mirrored on the sagittal plane first, so that an angle has the same sign and meaning on both sides.
     Angles are followed over time (`euler.follow`); standard deviations are to first order, with the errors of two
@@ -158,8 +184,18 @@ def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK
 
     Parameters
     ----------
-    sequence : of the shoulder, one of `SHOULDER_SEQUENCES`; other joints have ZXY
-    near_lock : [rad], what is nearer to gimbal lock is flagged, and does not decide how angles go on after it
+    pose : Pose or PosedBody
+        What `track` or `load_result` gives, or its `pose`; n samples.
+    sequence : str
+        Of the shoulder, one of `SHOULDER_SEQUENCES`: "YXY", "XZY" or "ZXY"; other joints have ZXY.
+    near_lock : float
+        [rad]. What is nearer to gimbal lock is flagged, and does not decide how angles go on after it.
+
+    Returns
+    -------
+    Angles
+        ``angles[joint][angle]`` is (n,) [rad]; ``list(angles)`` are its joints, ``list(angles[joint])`` their angles;
+        ``angles[joint].std`` (n, 3) [rad] is their standard deviation.
 
     Raises
     ------
@@ -167,8 +203,20 @@ def joint_angles(pose: Pose, sequence: str = "YXY", near_lock: float = NEAR_LOCK
         Another sequence; `near_lock` below 2° or above 45°.
     BadData
         No joint has both of its segments in the pose.
+
+    Examples
+    --------
+    >>> angles = wp.joint_angles(result)
+    >>> list(angles)
+    ['thorax', 'left_shoulder', 'left_elbow', 'right_shoulder', 'right_elbow']
+    >>> list(angles["right_elbow"])
+    ['flexion', 'carrying_angle', 'pronation']
+    >>> angles["right_elbow"]["flexion"].shape == result.time.shape
+    True
     """
     check_arguments(joint_angles, locals())
+    if isinstance(pose, PosedBody):
+        pose = pose.pose
     if sequence not in SHOULDER_SEQUENCES:
         raise BadOption(f"shoulder sequence '{sequence}' is not known; {one_of(SHOULDER_SEQUENCES, sequence)}")
     if not LEAST_NEAR_LOCK <= near_lock <= np.pi / 4.0:

@@ -5,8 +5,8 @@ inputs and samples, `chain` is the model's chains in CasADi, `least_squares` unk
 problem and its solution by `nlpsol`, `priors` what is known before. `initial_headings` and `contact` give the start,
 `joints` adds what accelerations show of headings, `losses` what lost samples change, `weights` weighs the samples,
 `alternatives` searches other minima, `anatomy` checks sensors and mounts. `paper` is the published calibration of the
-lengths alone. `series` calibrates several sessions of one person. `result` is the outcome, `observability` and
-`quality` assess it, `outcome` gives a subject that passed.
+lengths alone. `series` calibrates several sessions of one person. `result` is what comes of it, `observability` and
+`quality` assess it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .lengths import MEASURED_STD, calibrate_lengths
-    from .outcome import calibrate
+    from .lengths import MEASURED_STD, calibrate
     from .paper import Formulation
     from .protocols import PROTOCOLS, Protocol, load_protocol
     from .quality import CalibrationQuality, Check, assess, document
@@ -33,8 +32,7 @@ _WHERE = {
     "Formulation": "paper",
     "Protocol": "protocols",
     "assess": "quality",
-    "calibrate": "outcome",
-    "calibrate_lengths": "lengths",
+    "calibrate": "lengths",
     "calibrate_sessions": "series",
     "document": "quality",
     "load_protocol": "protocols",
@@ -49,7 +47,6 @@ __all__ = [
     "Protocol",
     "assess",
     "calibrate",
-    "calibrate_lengths",
     "calibrate_sessions",
     "document",
     "load_protocol",

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -73,32 +74,49 @@ MEASURED_RANGE = 0.02, 1.0  # [m] of lengths and distances that a user may measu
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
 
 
-def calibrate_lengths(
+def calibrate(
     recording: Recording,
     *,
     measured: Mapping[str, float] | None = None,
     prior: Subject | None = None,
-    model: BodyModel | None = None,
-    protocol: str | Protocol | None = None,
+    model: BodyModel | str | Path | None = None,
+    protocol: str | Path | Protocol | None = None,
     method: str = BEST,
     measured_std: Positive = MEASURED_STD,
     formulation: Formulation = "full",
 ) -> Calibration:
-    """Link lengths with their covariance, and all else that a calibration estimates.
+    """Calibrate a subject: lengths and mounts with their covariance from hands held together, or another protocol.
+
+    Joined hands determine the proportions of the arms and not their scale: that comes from a measured length. A poor
+    or failed calibration is returned as well, and says so.
 
     Parameters
     ----------
-    measured : measured lengths, breadths that give one (`model.list_breadths`, as biacromial), and distances that the
-        protocol names, name → [m]; without one the scale is the prior's
-    prior : lengths before, with covariance, and mounts; None: `population_subject`. The subject of an earlier
-        calibration is fused with the result (`sessions`)
-    model : the body; None: that which the recording states, else the upper body
-    protocol : what was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave; None: by the
-        recording's phases (`protocols.choose_protocol`)
-    method : the orientation filter
-    measured_std : standard deviation [m] of what was measured
-    formulation : "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone,
-        by plain least squares with one measured length at least (`paper`)
+    recording : Recording
+        Has the phases of the protocol.
+    measured : mapping, optional
+        Measured lengths, breadths that give one (`model.list_breadths`, as biacromial), and distances that the protocol
+        names, name → [m]; without one the scale is the prior's.
+    prior : Subject, optional
+        Lengths before, with covariance, and mounts; None: `population_subject`. The subject of an earlier calibration
+        is fused with the result (`sessions`).
+    model : BodyModel, str or Path, optional
+        The body, or its file or name as for `load_model`; None: that which the recording states, else the upper body.
+    protocol : str, Path or Protocol, optional
+        What was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave; None: by the
+        recording's phases (`protocols.choose_protocol`).
+    method : str
+        The orientation filter, a key of `wepose_pin.filters.METHODS`.
+    measured_std : float
+        Standard deviation [m] of what was measured.
+    formulation : str
+        "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone, by plain
+        least squares with one measured length at least (`paper`).
+
+    Returns
+    -------
+    Calibration
+        `subject`, which `track` takes; `quality`, whose `quality` is "pass", "poor" or "fail"; `diagnostics`.
 
     Raises
     ------
@@ -108,12 +126,23 @@ def calibrate_lengths(
         A sensor that the protocol needs is missing; there is no such phase.
     BadModel
         The body has no lengths.
+
+    Examples
+    --------
+    >>> calibration = wp.calibrate(recording, measured={"shoulder_width": 0.372})
+    >>> calibration.quality.quality
+    'poor'
+    >>> [diagnostic.code for diagnostic in calibration.diagnostics]
+    ['motion-too-short']
+    >>> wp.track(recording, calibration).subject.quality
+    'poor'
     """
-    check_arguments(calibrate_lengths, locals())
+    check_arguments(calibrate, locals())
     check_method(method)
     if not isinstance(protocol, Protocol):
         protocol = load_protocol(protocol or choose_protocol(recording.phases))
-    model = model or load_sensed_model(recording.model or None, recording.sensors, recording.where())
+    if not isinstance(model, BodyModel):
+        model = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
     table = model.table
     table.check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
     if not table.lengths:
@@ -144,12 +173,12 @@ def calibrate_lengths(
         prior = separate_mounts(earlier, population_subject(body=model))
     problem = CalibrationProblem(recording, filtered, protocol, prior, with_std, model)
     if formulation == "paper":
-        return solve_paper_calibration(problem)
+        return solve_paper_calibration(problem).state_quality()
     calibration = _calibrate_checked(problem)
     if earlier is not None and not calibration.labels.moved:
         fused = fuse_sessions([earlier, calibration.subject], prior, problem.measured, table)
         calibration = replace(calibration, subject=fused, prior=earlier)
-    return add_second_mounts(calibration, recording, method)
+    return add_second_mounts(calibration, recording, method).state_quality()
 
 
 def _check_measured(measured: Mapping[str, float], protocol: Protocol, model: BodyModel) -> None:
@@ -196,7 +225,7 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
             problem.model.table,
         )
         if labels.moved:
-            return _keep_prior(replace(stated, diagnostics=(*unused, *stated.diagnostics)), labels, problem.measured)
+            return _keep_prior(replace(stated, remarks=(*unused, *stated.remarks)), labels, problem.measured)
     try:
         best = solve_calibration(problem)
     except NoSolution as error:
@@ -377,7 +406,7 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
         effective_sample_size=solution.result.effective_sample_size,
         measured={name: metres for name, (metres, _) in problem.measured.items()},
         scale_std=scale_std,
-        diagnostics=tuple(diagnostics),
+        remarks=tuple(diagnostics),
         time=recording.time[samples],
         gap=gap,
         prior_gap=prior_gap,

@@ -129,7 +129,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         effective_sample_size=len(gap) / correlated,
         measured={name: metres for name, (metres, _) in problem.measured.items()},
         scale_std=float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1),
-        diagnostics=(
+        remarks=(
             *alignment.diagnostics,
             *diagnose_lengths(problem, lengths, covariance, measured_covariance, None),
             Diagnostic("lengths-alone-estimated", WARNING),

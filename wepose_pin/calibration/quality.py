@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from scipy.linalg import eigh
@@ -18,13 +18,13 @@ from scipy.spatial.transform import Rotation
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
 from ..errors import BadSession
 from ..model.table import ROOT
+from ..subject import Quality
 from .conditions import find_parts, fix_scale, group_lengths
 from .observability import MOST_OPEN, find_intervals, format_longest
 from .result import Calibration
 from .weights import CONTRADICTED, MIN_CONTACT
 
-Quality = Literal["pass", "poor", "fail"]
-QUALITIES: tuple[Quality, ...] = ("pass", "poor", "fail")
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
 SEVERITY: dict[Quality, Severity] = {"pass": INFO, "poor": WARNING, "fail": ERROR}
 
 
@@ -151,6 +151,10 @@ class CalibrationQuality:
     unknowns: int
     condition: float
 
+    def __repr__(self) -> str:
+        failing = sum(check.quality != "pass" for check in self.checks)
+        return f"CalibrationQuality({self.quality!r}: {failing} of {len(self.checks)} checks do not pass)"
+
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """All that a user should know of the calibration."""
@@ -170,7 +174,7 @@ def assess(calibration: Calibration) -> CalibrationQuality:
         quality=max((check.quality for check in checks), key=QUALITIES.index),
         checks=tuple(checks),
         reasons=reasons,
-        further=tuple(each for each in calibration.diagnostics if each.code not in {reason.code for reason in reasons}),
+        further=tuple(each for each in calibration.remarks if each.code not in {reason.code for reason in reasons}),
         motion=motion,
         directions=directions,
         rank=sum(d.information > MIN_INFORMATION for d in directions),
@@ -403,13 +407,14 @@ def _range(values: np.ndarray) -> Range:
 
 def _find_directions(calibration: Calibration) -> tuple[InformationDirection, ...]:
     """The information of the motion in units of the prior's: eigenvectors of one covariance in the other."""
-    k = len(calibration.prior_covariance)  # without second sensors, whose mounts follow from the first ones
-    names = calibration.subject.order[:k]
-    if not k:
+    # Without what the prior knows exactly, and second sensors, whose mounts follow from the first ones.
+    unknown = np.flatnonzero(np.diag(calibration.prior_covariance) > 0.0)
+    names = [calibration.subject.order[k] for k in unknown]
+    if not names:
         return ()
-    scale = np.sqrt(np.diag(calibration.prior_covariance))
-    before = calibration.prior_covariance / np.outer(scale, scale)
-    after = calibration.subject.covariance[:k, :k] / np.outer(scale, scale)
+    scale = np.sqrt(np.diag(calibration.prior_covariance)[unknown])
+    before = calibration.prior_covariance[np.ix_(unknown, unknown)] / np.outer(scale, scale)
+    after = calibration.subject.covariance[np.ix_(unknown, unknown)] / np.outer(scale, scale)
     shares, vectors = eigh(after, before)
     directions = []
     for share, vector in zip(shares, vectors.T, strict=True):

@@ -3,32 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..diagnostics import Diagnostic
+from ..diagnostics import Diagnostic, lines, render
 from ..model import BodyModel
 from ..subject import Subject
 from .anatomy import LabelCheck, LimbMotion, measure_limbs
 from .conditions import Constraint, StartPose
 from .weights import MIN_CONTACT, MeasuredLength
 
+if TYPE_CHECKING:
+    from .quality import CalibrationQuality
+
 
 @dataclass(frozen=True)
 class Calibration:
-    """The estimates of a calibration; n samples are those of the least squares.
+    """The estimates of a calibration, its quality and diagnostics; n samples are those of the least squares.
+
+    It prints itself in one line, with what to do first where it does not pass.
 
     Parameters
     ----------
-    subject : lengths and mounts with their joint covariance
+    subject : lengths and mounts with their joint covariance; it states the quality
     prior : what was known before
     rms_gap : palm-to-palm residual [m], root mean square of its length, where the palms touch
     prior_rms_gap : the same with the prior's lengths
     effective_sample_size : effective sample size of the gap
     measured : the measured lengths [m]; empty: the scale is the prior's
     scale_std : relative standard deviation of the overall scale, with the proportions as estimated
-    diagnostics : what the user should know besides its quality, see `assess`
+    remarks : diagnostics of the estimation, besides those of its quality
     time, gap, prior_gap : (n,) [s], (n,) [m] the residual's length at each sample, and with the prior's lengths
     contact : (n,) the weight of each sample's gap, near 0 where the palms are apart
     start_pose_offset : segment → (2,) [rad] about x and y of W, how far it was off the start pose
@@ -60,7 +68,7 @@ class Calibration:
     effective_sample_size: float
     measured: Mapping[str, float]
     scale_std: float
-    diagnostics: tuple[Diagnostic, ...]
+    remarks: tuple[Diagnostic, ...]
     time: np.ndarray
     gap: np.ndarray
     prior_gap: np.ndarray
@@ -80,6 +88,37 @@ class Calibration:
     unused_mounts: tuple[Diagnostic, ...] = ()
     scale_lengths: tuple[str, ...] = ()
     formulation: str = "full"
+
+    @cached_property
+    def quality(self) -> CalibrationQuality:
+        """Pass, poor or fail, with all checks and reasons (`assess`)."""
+        from .quality import assess
+
+        return assess(self)
+
+    @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """What the user should know, the reasons of its quality first."""
+        return self.quality.diagnostics
+
+    def state_quality(self) -> Calibration:
+        """Return the same calibration with a subject that states its quality."""
+        return replace(self, subject=replace(self.subject, quality=self.quality.quality))
+
+    def __repr__(self) -> str:
+        stds = [1e3 * std for name in self.subject.lengths if np.isfinite(std := self.subject.std(name))]
+        lengths = f"{len(self.subject.lengths)} lengths"
+        lengths += f" ± {min(stds):.0f} to {max(stds):.0f} mm" if stds else ""
+        remedy = f"; first: {render(self.quality.reasons[0]).do}" if self.quality.reasons else ""
+        return f"Calibration({self.subject.name!r}: {self.quality.quality}; {lengths}{remedy})"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{escape(name)}</td><td>{1e3 * length:.0f} ± {1e3 * self.subject.std(name):.0f} mm</td></tr>"
+            for name, length in self.subject.lengths.items()
+        )
+        entries = "".join(f"<li>{severity.value}: {escape(line)}</li>" for severity, line in lines(self.diagnostics))
+        return f"<p>{escape(repr(self))}</p><table>{rows}</table>" + (f"<ul>{entries}</ul>" if entries else "")
 
     @property
     def variant(self) -> str:

@@ -16,7 +16,7 @@ from ..filters import BEST
 from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject, population_subject
-from .lengths import MEASURED_STD, calibrate_lengths
+from .lengths import MEASURED_STD, calibrate
 from .protocols import Protocol
 from .result import Calibration
 from .sessions import fuse_sessions, separate_mounts
@@ -38,20 +38,20 @@ def calibrate_sessions(
 ) -> list[Calibration]:
     """The calibration of each session; the last one's subject has the lengths and shoulders of all of them.
 
-    Parameters as `calibrate_lengths`. A session whose sensors sit elsewhere than labelled adds nothing.
+    Parameters as `calibrate`. A session whose sensors sit elsewhere than labelled adds nothing.
 
     Raises
     ------
     BadSession
         Two sessions differ by more than one person's do.
     WeposeError
-        As `calibrate_lengths`.
+        As `calibrate`.
     """
     earlier = prior if prior is not None and prior.start_pose_offset else None
     if earlier is not None:
         prior = separate_mounts(earlier, population_subject(body=model))
     calibrations = [
-        calibrate_lengths(
+        calibrate(
             recording,
             measured=measured,
             prior=prior,
@@ -72,7 +72,7 @@ def calibrate_sessions(
         population = replace(prior or population_subject(body=last.model))
         stated = {name: (metres, measured_std) for name, metres in (measured or {}).items()}
         fused = fuse_sessions(subjects, population, stated, last.model.table)
-        calibrations[-1] = replace(last, subject=fused)
+        calibrations[-1] = replace(last, subject=fused).state_quality()
     return calibrations
 
 

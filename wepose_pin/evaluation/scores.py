@@ -12,7 +12,7 @@ from .. import rotations
 from ..angles import euler, joint_angles
 from ..arguments import check_arguments
 from ..errors import BadData, BadOption
-from ..kinematics import Pose
+from ..kinematics import Pose, PosedBody
 from ..model import BodyTable, load_table
 from ..recording import format_span
 from .agreement import Agreement, compute_agreement
@@ -80,23 +80,60 @@ class Evaluation:
     agreement: dict[str, dict[str, Agreement]] = field(default_factory=dict)  # joint → angle → of both measurements
     registration: Registration | None = None  # how the reference was brought to the pose; None: it is taken as it is
 
+    def __repr__(self) -> str:
+        total = max((error.total_rmse for error in self.attitude.values()), default=float("nan"))
+        position = max((error.rmse for error in self.position.values()), default=float("nan"))
+        return (
+            f"Evaluation({self.samples} samples; largest rms error of a segment {total:.1f}°, of a point "
+            f"{position:.0f} mm)"
+        )
+
 
 def evaluate(
-    pose: Pose, truth: Pose, interval: tuple[float, float] | None = None, table: BodyTable | None = None
+    pose: Pose | PosedBody,
+    truth: Pose | PosedBody,
+    interval: tuple[float, float] | None = None,
+    table: BodyTable | None = None,
 ) -> Evaluation:
-    """Errors of `pose` against `truth`, which is brought to the pose's times (rotations on the rotation).
+    """Errors of a pose against a reference, which is interpolated to the pose's times.
 
     Parameters
     ----------
-    interval : from, to [s]; None for all of the time both have. Samples whose truth is missing are left out.
-    table : of the body, which says where limbs hang; None: the upper body
+    pose : Pose or PosedBody
+        What `track` or `load_result` gives, or its `pose`.
+    truth : Pose or PosedBody
+        The reference. Samples without a truth are left out.
+    interval : (float, float), optional
+        From, to [s]; None: all of the time that both have.
+    table : BodyTable, optional
+        Of the body, which says where limbs hang; None: that of `pose`, where it has a body, else the upper body's.
+
+    Returns
+    -------
+    Evaluation
+        By segment `attitude` [deg], by joint and angle `joints` [deg], by point `position` [mm], and whether the
+        stated standard deviations are consistent with the errors.
 
     Raises
     ------
+    BadOption
+        An interval that is none.
     BadData
         No time in common, or nothing to compare.
+
+    Examples
+    --------
+    >>> errors = wp.evaluate(result, simulation.truth())
+    >>> errors.attitude["right_forearm"].inclination_rmse < 5.0  # [deg]
+    True
+    >>> errors.position["right_palm"].rmse < 150.0  # [mm]
+    True
     """
     check_arguments(evaluate, locals())
+    if isinstance(pose, PosedBody):
+        table, pose = table or pose.model.table, pose.pose
+    if isinstance(truth, PosedBody):
+        truth = truth.pose
     if interval is not None and not interval[0] < interval[1]:
         raise BadOption(f"interval = {interval}: from and to in seconds are needed, the earlier one first")
     first = max(pose.time[0], truth.time[0], interval[0] if interval else -np.inf)

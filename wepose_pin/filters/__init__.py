@@ -82,6 +82,11 @@ class Orientation(NamedTuple):
     detector: StaticDetector | None = None  # after the last sample as well
     diagnostics: tuple[Diagnostic, ...] = ()
 
+    def __repr__(self) -> str:
+        bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
+        share = 100.0 * float(np.mean(self.static)) if len(self.static) else float("nan")
+        return f"Orientation({len(self.quat_WS)} samples, {share:.0f} % static, gyro bias {bias:.2f} deg/s)"
+
 
 def check_method(method: str) -> str:
     """Check that a method of that name exists, and return it.
@@ -108,22 +113,35 @@ def estimate_orientation(
 ) -> Orientation:
     """Estimate the orientation of a sensor from its gyroscope and accelerometer.
 
-    Parameters
-    ----------
-    gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample
-    accel_S : (n, 3) [m/s²], specific force, +g up of a static sensor
-    rate_hz : samples a second, uniform
-    method : a key of `METHODS`
-    static : from, to [s] after the first sample: the sensor is static there, and noise and bias are measured. None:
-        no static phase; noise is `TYPICAL`, and the bias starts at zero
-    params : the filter's own frozen parameters; None for its defaults
-    static_test : when the sensor counts as static; None for the default values
-
-    The W of the returned `quat_WS` is the sensor's own world: z up, and a heading that has no relation to the worlds
+    W of the returned `quat_WS` is the sensor's own world: z up, and a heading that has no relation to the worlds
     of other sensors (`wepose_pin.alignment` finds it from a start pose). The static phase begins with zero heading
     and the tilt of the accelerometer, averaged over it (without one: over the first window of `static_test`); the
     filter goes forward and backward from there. Where gyro_S is cut off by the sensor's range, `attitude_cov` grows
     by what it may have turned beyond.
+
+    Parameters
+    ----------
+    gyro_S : (n, 3) array
+        [rad/s], the rate over the interval that ends at the sample.
+    accel_S : (n, 3) array
+        [m/s²], specific force, +g up while static.
+    rate_hz : float
+        Samples a second, uniform.
+    method : str
+        A key of `METHODS`: "amekf", "smoother", "smekf", "ncf" or "gdc".
+    static : (float, float) or None
+        From, to [s] after the first sample: the sensor is static there, and noise and bias are measured. None: no
+        static phase; noise is `TYPICAL`, and the bias starts at zero.
+    params : optional
+        The filter's own frozen parameters; None: its defaults.
+    static_test : StaticTest, optional
+        When the sensor counts as static; None: the default values.
+
+    Returns
+    -------
+    Orientation
+        `quat_WS` (n, 4) xyzw, `gyro_bias` (n, 3) [rad/s], `static` (n,) bool, `attitude_cov` (n, 3, 3) [rad²] in S or
+        None, `noise`, `diagnostics`.
 
     Raises
     ------
@@ -135,6 +153,15 @@ def estimate_orientation(
     -----
     WeposeWarning
         There is no static phase, as `Orientation.diagnostics` says.
+
+    Examples
+    --------
+    >>> sensor = recording.sensors["right_forearm"]
+    >>> o = wp.estimate_orientation(sensor.gyro_S, sensor.accel_S, recording.rate_hz, static=(0.5, 4.5))
+    >>> o
+    Orientation(2251 samples, 28 % static, gyro bias 0.42 deg/s)
+    >>> o.quat_WS.shape  # xyzw
+    (2251, 4)
     """
     check_arguments(estimate_orientation, locals())
     check_method(method)

@@ -154,7 +154,7 @@ def run_calibrate(
     WeposeError
         What the session, the protocol or an option lacks.
     """
-    from ..calibration import assess, calibrate_lengths, calibrate_sessions, load_protocol
+    from ..calibration import assess, calibrate, calibrate_sessions, load_protocol
     from ..calibration.protocols import choose_protocol
     from ..model.body import load_sensed_model
     from ..readers import load_session
@@ -187,7 +187,7 @@ def run_calibrate(
         if job.further:
             *before, calibration = calibrate_sessions(recordings, **options)
         else:
-            before, calibration = [], calibrate_lengths(recording, formulation=job.formulation, **options)
+            before, calibration = [], calibrate(recording, formulation=job.formulation, **options)
         quality = assess(calibration)
         others = tuple((path, assess(each)) for path, each in zip((job.session, *job.further), before, strict=False))
         write_subject(folder, calibration.subject, calibration.body)

@@ -66,7 +66,7 @@ def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
     import json
     from dataclasses import asdict
 
-    from ..calibration import calibrate_lengths
+    from ..calibration import calibrate
     from ..documents import whole_folder
     from ..evaluation import evaluate
     from ..filters import BEST, METHODS
@@ -92,7 +92,7 @@ def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
         calibrations, errors = {}, {}
         for k, method in enumerate(METHODS):
             progress(f"calibrating by {method}", (1 + 2 * k) / steps)
-            calibrations[method] = calibrate_lengths(
+            calibrations[method] = calibrate(
                 recording, measured=person.measured, prior=person.prior, method=method, measured_std=person.measured_std
             )
             progress(f"tracking by {method}", (2 + 2 * k) / steps)

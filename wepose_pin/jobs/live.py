@@ -32,6 +32,8 @@ class LiveJob:
     subject : SUBJECT
         Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
         Without it lengths are those of the population prior, and mounts those that --session states.
+    accept_failed
+        Use a subject whose calibration failed (quality = "fail" in subject.toml), which is refused otherwise.
     session : SESSION
         Take the mounts of the sensors from this session file; its data are not read.
     record : FILE
@@ -76,6 +78,7 @@ class LiveJob:
 
     source: str
     subject: Path | None = None
+    accept_failed: bool = False
     session: Path | None = None
     record: Path | None = None
     method: LiveMethod = "amekf"
@@ -137,8 +140,11 @@ def run_live(
     """
     from ..live import find_setup, open_source, run_session
     from ..live.loop import build_subject_model, warm_up
+    from ..subject import load_subject
 
     job.check()
+    if job.subject is not None and not job.accept_failed:
+        load_subject(job.subject).check_quality()
     stated = None if job.session is None else find_setup(None, job.subject, job.session)
     if job.replays:
         source = open_source(job.source, speed=job.speed)

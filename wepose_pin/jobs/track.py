@@ -13,6 +13,7 @@ from . import Method, Progress, no_progress
 from .fields import field_values
 
 if TYPE_CHECKING:
+    from ..subject import Subject
     from ..tracking import TrackedRecording
 
 
@@ -37,6 +38,8 @@ class TrackJob:
         Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it;
         or the lengths in an Xsens .mvnx. Without it lengths are those of the population prior, and mounts those that
         the session states.
+    accept_failed
+        Use a subject whose calibration failed (quality = "fail" in subject.toml), which is refused otherwise.
     model : URDF|TOML|NAME
         Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package, such as
         whole_body (docs/models.md). A URDF without a table, a robot's say, is a mechanism whose links bear the
@@ -79,6 +82,7 @@ class TrackJob:
     session: Path
     out: Path
     subject: Path | None = None
+    accept_failed: bool = False
     model: Path | None = None
     method: Method | None = None
     causal: bool = False
@@ -145,7 +149,6 @@ def run_track(
 def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
-    from ..readers.subject import read_subject
     from ..report import write_track_pages
     from ..subject import parse_subject
     from ..tracking import track
@@ -155,7 +158,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
     method, causal = job.method or BEST, job.causal
     with result_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
-        subject = read_subject(job.subject) if job.subject else None
+        subject = _load_subject(job)
         if is_live_log(job.session):
             log = read_live_log(job.session)
             recording, causal = log.recording, causal or (job.method is None and subject is None)
@@ -191,7 +194,6 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
     """In a memory that does not grow with the recording."""
     from ..filters import BEST
     from ..readers.session import SessionReader
-    from ..readers.subject import read_subject
     from ..report import write_decimated_pages
     from ..report.decimation import Decimator
     from ..report.track import MOST_FRAMES
@@ -201,7 +203,7 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
 
     with result_folder(job.out, job.force) as folder:
         progress("reading the times", 0.0)
-        subject = read_subject(job.subject) if job.subject else None
+        subject = _load_subject(job)
         reader = SessionReader(job.session, gaps=job.gaps, in_memory=False)
         writer, decimator = ChunkWriter(folder, job.covariance), Decimator(len(reader.time))
         options = TrackOptions(job.method or BEST, causal=job.causal, open_loop=job.open_loop, limits=job.limits)
@@ -222,6 +224,17 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
             job.out, decimator, reader.phases, diagnostics, view=job.view, report=job.report, fps=view_rate_hz
         )
     return TrackOutcome(summary, failures, view_rate_hz)
+
+
+def _load_subject(job: TrackJob) -> Subject | None:
+    from ..readers.subject import read_subject
+
+    if job.subject is None:
+        return None
+    subject = read_subject(job.subject)
+    if not job.accept_failed:
+        subject.check_quality()
+    return subject
 
 
 def _provenance_of(job: TrackJob, stated: Mapping[str, Any] | None) -> Mapping[str, Any]:

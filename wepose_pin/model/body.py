@@ -56,6 +56,9 @@ class BodyModel:
     limits: Mapping[str, AxisLimits]
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        return f"BodyModel({self.robot.name!r}: {len(self.table.segments)} segments, {self.pin.nv} degrees of freedom)"
+
     def girdle_parameters(self, name: str) -> np.ndarray:
         """(7,) what a girdle differs by from its law."""
         return self.girdles.get(name, np.zeros(len(PARAMETERS)))
@@ -168,31 +171,48 @@ def load_model(
     forward: str = "+x",
     root: str | Sequence[str] | None = None,
 ) -> BodyModel:
-    """Read a body, with other lengths [m] where given.
+    """Read a body model.
 
     Parameters
     ----------
-    path
+    path : str or Path, optional
         A URDF, or a table (TOML) that names one, or the name of a body that comes with the package ("whole_body"); None
         for the upper body, a person of 1.75 m.
-    like
+    lengths : mapping, optional
+        Length → [m] to stretch the body to; None: as the file has them.
+    like : str
         The body whose names and lengths `segments` and `points` are.
-    segments
+    segments : mapping, optional
         Segment → its link; or → ``{"link": …, "up": "+z", "forward": "+x"}`` with the link's axes in the N-pose, where
         they do not follow from the segment's direction at zero. None: a table beside the URDF, the segments' own
         names, or a table of ours that fits (human-gazebo, the human of example-robot-data).
-    points
+    points : mapping, optional
         Point → its link, or ``{"link": …, "at": [x, y, z]}`` [m], where it is not the origin of the segment's link.
-    up, forward
+    up, forward : str
         Axes of the URDF's root link while all joints are at zero.
-    root
+    root : str or sequence of str, optional
         Link at whose origin W begins, or the two hips, midway between which it does; None: the URDF's root.
+
+    Returns
+    -------
+    BodyModel
+        Its `pin` is the Pinocchio model, its `table` names segments, points, lengths and joints.
 
     Raises
     ------
     MissingFile, BadModel
         Not there; not a URDF; no tree with one root; a table that names what is not there; no links for the segments;
         a segment without a joint that could move it.
+
+    Examples
+    --------
+    >>> model = wp.load_model("whole_body")
+    >>> model
+    BodyModel('whole_body': 15 segments, 51 degrees of freedom)
+    >>> model.pin.nq  # numbers in a configuration
+    66
+    >>> round(wp.load_model(lengths={"left_forearm": 0.26}).lengths["left_forearm"], 3)  # [m]
+    0.26
     """
     check_arguments(load_model, locals())
     path = _find_body(path)

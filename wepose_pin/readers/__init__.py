@@ -18,14 +18,29 @@ def load_session(path: str | Path, gaps: bool = False) -> Recording:
 
     Parameters
     ----------
-    path : the session file, or its folder; a file of `wepose live --record`
-    gaps : accept lost samples for longer than 50 ms: they are bridged, and marked in the sensor's `gap`. Of a live
-        recording they always are
+    path : str or Path
+        The session file, or its folder; a file of `wepose live --record`.
+    gaps : bool
+        Accept lost samples for longer than 50 ms: they are bridged, and marked in the sensor's `gap`. Of a live
+        recording they always are.
+
+    Returns
+    -------
+    Recording
+        `time` (n,) [s], evenly spaced, and `sensors`, segment → samples in SI units.
 
     Raises
     ------
     WeposeError
         With one line that names the file, the key or column, the value found and what would be right.
+
+    Examples
+    --------
+    >>> recording = wp.load_session("session.toml")
+    >>> recording
+    Recording('simulated': 22.5 s at 100 Hz, 5 sensors, phases start, clasp, rest)
+    >>> recording.sensors["torso"].gyro_S.shape == (len(recording.time), 3)  # [rad/s]
+    True
     """
     check_arguments(load_session, locals())
     if is_live_log(Path(path)):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arguments import Positive, check_array, check_fields, check_finite, check_unit
+from ..arguments import Positive, check_array, check_fields, check_finite, check_unit, format_object
 from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, BadPhase, one_of
 from .intervals import Intervals, check_phases, check_time
@@ -72,6 +72,14 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        def describe() -> str:
+            phases = f", phases {', '.join(self.phases)}" if self.phases else ""
+            seconds = float(self.time[-1] - self.time[0])
+            return f"{self.name!r}: {seconds:.1f} s at {self.rate_hz:g} Hz, {len(self.sensors)} sensors{phases}"
+
+        return format_object(self, describe)
 
     def check(self) -> Recording:
         """Check a recording that was built in code, and return it; see `check_recording`.

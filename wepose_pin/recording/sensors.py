@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..arguments import format_object
 from ..documents import TomlTable
 
 # Names of sensor axes in a stated mount.
@@ -57,6 +58,9 @@ class ImuSensor:
     gap: np.ndarray | None = None
     gyro_range: float = np.inf
 
+    def __repr__(self) -> str:
+        return format_object(self, lambda: f"{len(self.gyro_S)} samples")
+
     @property
     def aligned(self) -> bool:
         """False: only measured orientations can be those of the segment."""
@@ -84,6 +88,9 @@ class OrientationSensor:
     stated_quat_LS: np.ndarray | None = None
     gap: np.ndarray | None = None
     aligned: bool = False
+
+    def __repr__(self) -> str:
+        return format_object(self, lambda: f"{len(self.quat_WS)} samples")
 
     def part(self, samples: slice | np.ndarray) -> OrientationSensor:
         """Return the sensor at these samples."""

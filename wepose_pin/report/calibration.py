@@ -153,7 +153,7 @@ def _describe_contact(protocol: Protocol, calibration: Calibration) -> _Contact:
 def _build_diagnostics_section(
     calibration: Calibration, quality: CalibrationQuality | None, untracked: Sequence[Diagnostic]
 ) -> dict[str, Any]:
-    further = calibration.diagnostics if quality is None else quality.further
+    further = calibration.remarks if quality is None else quality.further
     return {
         "quality": "" if quality is None else quality.quality,
         "reasons": [] if quality is None else lines(quality.reasons, titled=True),

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from ..angles import JointAngles, group_sides, joint_angles, summary
+from ..angles import Angles, JointAngles, group_sides, joint_angles, summary
 from ..errors import BadData
 from ..tracking import TrackedRecording
+from .chart import Picture
 from .measures import finite_median, has_stated_mounts
 from .page import Table
 from .track_figures import draw_over_time
@@ -23,18 +24,6 @@ def build_joint_angles_section(tracked: TrackedRecording) -> dict[str, Any] | No
         angles = joint_angles(tracked.pose)
     except BadData:  # no joint has both of its segments
         return None
-    pictures = []
-    for group, members in group_sides(angles.joints).items():
-        panels = {
-            f"{plain(name)} [°]": {side: np.degrees(_break_line(angles[joint], k)) for side, joint in members.items()}
-            for k, name in enumerate(angles[next(iter(members.values()))].names)
-        }
-        caption = f"The {plain(group) if len(members) == 1 else plural(plain(group))} over time."
-        if any((angles[joint].near_lock | angles[joint].gap).any() for joint in members.values()):
-            caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
-        pictures.append(
-            draw_over_time(angles.time, panels, f"angles-{group}", caption, dict(zip(members, members, strict=True)))
-        )
     rows = []
     for joint, ranges in summary(angles).items():
         stds = angles[joint].std
@@ -55,7 +44,24 @@ def build_joint_angles_section(tracked: TrackedRecording) -> dict[str, Any] | No
                 ]
             )
     header = ["angle", "least", "most", "range", "fastest", "usual ±", "near gimbal lock"]
-    return {"stated": has_stated_mounts(tracked), "pictures": pictures, "ranges": Table(header, rows)}
+    return {"stated": has_stated_mounts(tracked), "pictures": draw_joint_angles(angles), "ranges": Table(header, rows)}
+
+
+def draw_joint_angles(angles: Angles) -> list[Picture]:
+    """Draw a chart for each kind of joint, as the elbows."""
+    pictures = []
+    for group, members in group_sides(angles.joints).items():
+        panels = {
+            f"{plain(name)} [°]": {side: np.degrees(_break_line(angles[joint], k)) for side, joint in members.items()}
+            for k, name in enumerate(angles[next(iter(members.values()))].names)
+        }
+        caption = f"The {plain(group) if len(members) == 1 else plural(plain(group))} over time."
+        if any((angles[joint].near_lock | angles[joint].gap).any() for joint in members.values()):
+            caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
+        pictures.append(
+            draw_over_time(angles.time, panels, f"angles-{group}", caption, dict(zip(members, members, strict=True)))
+        )
+    return pictures
 
 
 def _break_line(joint: JointAngles, k: int) -> np.ndarray:

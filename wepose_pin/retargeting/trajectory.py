@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..arguments import check_arguments
 from ..errors import NoSolution, WrongOption
-from ..kinematics import Pose
+from ..kinematics import Pose, PosedBody
 from ..model import BodyTable
 from .collision import CollisionModel
 from .controller import (
@@ -125,6 +125,9 @@ class Trajectory:
     limiting_joint: LimitingJoint | None
     contact_times: tuple[float, ...] = ()
 
+    def __repr__(self) -> str:
+        return f"Trajectory({self.robot.map.name!r}: {self.time[-1]:.1f} s, {len(self.robot.names)} joints)"
+
     @property
     def joint_position(self) -> np.ndarray:
         """(n, joints) [rad or m]."""
@@ -137,7 +140,7 @@ class Trajectory:
 
 
 def retarget(
-    pose: Pose,
+    pose: Pose | PosedBody | str | Path,
     robot: Robot | str | Path,
     *,
     rate_hz: float = RATE_HZ,
@@ -148,25 +151,58 @@ def retarget(
     strict: bool = False,
     progress: Callable[[str, float], None] = lambda _text, _fraction: None,
 ) -> Trajectory:
-    """Compute the robot's trajectory for a person's motion. It begins and ends at rest.
+    """Compute the robot's joint trajectory for a person's motion. It begins and ends at rest.
 
     Parameters
     ----------
-    robot : of `load_robot`; or a name such as "panda", or a file, as for `find_map`, then with all its arms
-    rate_hz : of the trajectory
-    params : of the controller; None: default weights and gains
-    table, scale, smoothing_hz : as for `compute_arm_targets`
-    strict : raise `NoSolution` for a motion that is too fast for the robot, instead of slowing it
-    progress : called with the current stage (`STAGES`) and the fraction of it that is done
+    pose : Pose, PosedBody, str or Path
+        What `track` or `load_result` gives, or its `pose`; or a result folder.
+    robot : Robot, str or Path
+        A name such as "panda", a URDF with a map beside it, or the map, as for `find_map`, with all its arms; or what
+        `load_robot` gives.
+    rate_hz : float
+        Samples a second of the trajectory, 10 to 2000 Hz.
+    params : ControllerParams, optional
+        Weights and gains of the controller; None: the default ones.
+    table : BodyTable, optional
+        Of the person's body; None: that of `pose`, where it has a body, else the upper body's.
+    scale : float, optional
+        Factor on the way from shoulder to hand; None: the reach of the robot's arm over the length of the person's.
+    smoothing_hz : float
+        Cut-off frequency of the person's motion; 0: not filtered.
+    strict : bool
+        Raise `NoSolution` for a motion that is too fast for the robot, instead of slowing it.
+    progress : callable
+        Called with the current stage (`STAGES`) and the fraction of it that is done.
+
+    Returns
+    -------
+    Trajectory
+        `time` (n,) [s] from 0, `joint_position` (n, joints) [rad or m].
 
     Raises
     ------
-    BadData, BadOption
-        The pose lacks an arm; a rate out of range.
+    MissingFile, BadData, BadOption
+        No result, no such robot; the pose lacks an arm; a rate out of range.
     NoSolution
         `strict`, and the motion is too fast.
+
+    Examples
+    --------
+    >>> trajectory = wp.retarget("result", "arm.urdf", rate_hz=10.0)
+    >>> trajectory
+    Trajectory('arm': 29.0 s, 7 joints)
+    >>> trajectory.joint_position.shape == (len(trajectory.time), 7)  # [rad]
+    True
     """
     check_arguments(retarget, locals())
+    if isinstance(pose, str | Path):
+        from ..writers import read_result
+
+        pose, body, _ = read_result(Path(pose))
+        table = table or body.table
+    elif isinstance(pose, PosedBody):
+        table, pose = table or pose.model.table, pose.pose
     if not isinstance(robot, Robot):
         robot = load_robot(find_map(str(robot)))
     check_rate(rate_hz)

@@ -113,6 +113,9 @@ class Simulation:
     device: dict[str, Device]  # sensor -> its own errors
     sample_time: dict[str, np.ndarray]  # sensor -> (n,) [s], true sampling times; the file states `time`
 
+    def __repr__(self) -> str:
+        return f"Simulation({self.time[-1] - self.time[0]:.1f} s at {self.rate_hz:g} Hz, {len(self.gyro_S)} sensors)"
+
     def recording(self, name: str = "simulated") -> Recording:
         """Return the recording that a user would have: sensors, stated mounts and phases, without truth.
 
@@ -264,32 +267,51 @@ def simulate(
 
     Parameters
     ----------
-    lengths : segment lengths [m]: trunk, shoulder_width, and upper_arm, forearm, hand of left_ and right_.
-    seed : the same seed gives the same bits. Motion, mounts, noise and each imperfection draw from streams of their
-        own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
-    rate_hz : samples a second.
-    noise : of gyroscope and accelerometer; `NOISE_FREE` for none.
-    imperfections : of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for a careful subject,
-        `PEOPLE_PRESET` for what the literature has.
-    clasp_s : [s] duration of the clasp, palms together, at least 5.
-    circles : number of circles, 0 or more.
-    protocol : what is done in place of the clasp, one of `TASKS`, or several joined by "+"; "handle": 0.4 m between the
-        palms; "touch_left" and "touch_right": the palm on a fixed point while the trunk leans and turns; "poses":
-        T-pose and bow, no circles.
-    pose_deg : how far T-pose and bow are off, standard deviation of each axis [deg].
-    session : another session of the same person: sensors are mounted again, motion, start pose and noise are others.
+    lengths : mapping
+        Length → [m]: trunk, shoulder_width, and upper_arm, forearm, hand of left_ and right_.
+    seed : int
+        The same seed gives the same bits. Motion, mounts, noise and each imperfection draw from streams of their own:
+        noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
+    rate_hz : float
+        Samples a second.
+    noise : ImuNoise
+        Of gyroscope and accelerometer; `NOISE_FREE` for none.
+    imperfections : Imperfections
+        Of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for a careful subject, `PEOPLE_PRESET`
+        for what the literature has.
+    clasp_s : float
+        [s] of the clasp, palms together, at least 5.
+    circles : int
+        Number of circles, 0 or more.
+    protocol : str
+        What is done in place of the clasp, one of `TASKS`, or several joined by "+"; "handle": 0.4 m between the palms;
+        "touch_left" and "touch_right": the palm on a fixed point while the trunk leans and turns; "poses": T-pose and
+        bow, no circles.
+    pose_deg : float
+        How far T-pose and bow are off, standard deviation of each axis [deg].
+    session : int
+        Another session of the same person: sensors are mounted again, motion, start pose and noise are others.
 
     Returns
     -------
     Simulation
-        Before the sensor's own errors, gyro_S[k] is log(R_WS[k-1]^T R_WS[k]) over the time between the two samples, so
-        that multiplying up exp(gyro_S / rate) gives `quat_WS` back exactly; accel_S[k] is R_WS[k]^T (p_ddot + g e_z),
-        p_ddot by central differences.
+        `recording()` is what a user would have, `truth()` the true pose. Before the sensor's own errors, gyro_S[k] is
+        log(R_WS[k-1]^T R_WS[k]) over the time between the two samples, so that multiplying up exp(gyro_S / rate) gives
+        `quat_WS` back exactly; accel_S[k] is R_WS[k]^T (p_ddot + g e_z), p_ddot by central differences.
 
     Raises
     ------
     BadOption
         A length is missing or not positive, the arms cannot do the motion, or a parameter is out of range.
+
+    Examples
+    --------
+    >>> person = wp.population_subject(1.75)
+    >>> simulation = wp.simulate(person.lengths, seed=1, clasp_s=10.0, circles=0)
+    >>> simulation.recording()
+    Recording('simulated': 22.5 s at 100 Hz, 5 sensors, phases start, clasp, rest)
+    >>> simulation.truth().points["right_palm"].shape  # [m] in W
+    (2251, 3)
     """
     check_arguments(simulate, locals())
     names = tuple(load_table().lengths)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from ..alignment import SegmentOrientations, StartFrames, find_start_frames
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json
 from ..errors import BadData, BadSession
-from ..kinematics import Pose, compute_orientation_residuals
+from ..kinematics import PosedBody, compute_orientation_residuals
 from ..model import BodyModel
 from ..model.body import load_sensed_model
 from ..model.configurations import find_undetermined_joints
@@ -29,45 +28,19 @@ _MOST_LATER = 10  # diagnostics of the later chunks of a long recording
 
 
 @dataclass(frozen=True)
-class TrackedRecording:
+class TrackedRecording(PosedBody):
     """The pose of a recording or a chunk, with its inputs and intermediate results.
 
     Parameters
     ----------
     recording : the input; of a causal tracker the part after the start pose
-    subject : lengths and mounts as used
-    model : the body with those lengths
     correction : of the headings so far; None where nothing can correct them
     """
 
-    pose: Pose
     recording: Recording
-    subject: Subject
-    model: BodyModel
     segments: SegmentOrientations
     options: TrackOptions
     correction: HeadingCorrection | None
-
-    @property
-    def time(self) -> np.ndarray:
-        """(n,) [s]."""
-        return self.pose.time
-
-    @property
-    def quat_WL(self) -> Mapping[str, np.ndarray]:
-        """Segment → (n, 4) xyzw."""
-        return self.pose.quat_WL
-
-    @property
-    def points(self) -> Mapping[str, np.ndarray]:
-        """Point → (n, 3) [m] in W."""
-        return self.pose.points
-
-    @property
-    def q(self) -> np.ndarray:
-        """(n, nq) configuration of `model`."""
-        assert self.pose.q is not None  # kinematics have been run
-        return self.pose.q
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
@@ -83,11 +56,6 @@ class TrackedRecording:
         accumulator = SummaryAccumulator()
         accumulator.add(self)
         return accumulator
-
-    @property
-    def joints(self) -> Mapping[str, np.ndarray]:
-        """Joint of one axis → its values (n,) [rad or m]; of a mechanism."""
-        return self.pose.joints
 
     def orientation_residual(self) -> dict[str, np.ndarray]:
         """Segment → angle (n,) [rad] between its measured orientation and the model's, where joints are too few."""

@@ -132,7 +132,7 @@ class Tracker:
         )
         headings = self._headings if not isinstance(self._estimator, CausalEstimator) else self._estimator.headings
         correction = None if headings is None else headings.summarize()
-        return TrackedRecording(pose, recording, person, body, segments, self.options, correction)
+        return TrackedRecording(recording.name, pose, body, person, recording, segments, self.options, correction)
 
 
 def observe_headings(

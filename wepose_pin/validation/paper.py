@@ -15,7 +15,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..calibration import Formulation, calibrate_lengths
+from ..calibration import Formulation, calibrate
 from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
 from ..filters.noise import estimate_noise
 from ..model import ROOT, BodyTable, load_table
@@ -244,7 +244,7 @@ def calibrate_person(
     formulation: Formulation = "full",
 ) -> Subject:
     """Calibrate with the person's measured lengths of these names."""
-    return calibrate_lengths(
+    return calibrate(
         recording,
         measured={name: person.measured[name] for name in measured},
         prior=prior,

@@ -13,12 +13,13 @@ from ..arguments import check_arguments
 from ..diagnostics import Diagnostic
 from ..documents import whole_file
 from ..errors import BadData, BadOption, MissingFile, one_of
+from ..kinematics import PosedBody
 from .bvh import write_bvh
 from .c3d import write_c3d
 from .motion import Motion, check_rate, resampled
 from .opensim import write_mot, write_placement, write_sto, write_trc
 from .provenance import provenance_file, provenance_text
-from .result import read_result
+from .result import SUBJECT_URDF, format_urdf, read_result
 from .tables import write_csv, write_parquet
 
 Writer = Callable[[Path, Motion], list[Diagnostic]]  # gives what the file cannot hold
@@ -44,9 +45,12 @@ class Exported(NamedTuple):
     format: str
     diagnostics: list[Diagnostic]
 
+    def __repr__(self) -> str:
+        return f"Exported({self.format!r}; {len(self.diagnostics)} diagnostics)"
+
 
 def export(
-    result: str | Path,
+    result: PosedBody | str | Path,
     file: str | Path,
     format: str | None = None,
     *,
@@ -55,14 +59,30 @@ def export(
     force: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
-    """Write the motion of a result folder, or its subject, to a file, which appears whole or not at all.
+    """Write a motion, or the body that moves, to a file for other programs, which appears whole or not at all.
 
     Parameters
     ----------
-    format : one of `FORMATS`; None: that of the file's suffix, which otherwise has to be the format's own
-    names : of a .mot's columns, one of `NAMES`; None: "opensim"
-    rate_hz : resample the motion first
-    provenance : written beside the file, before it
+    result : PosedBody, str or Path
+        What `track` or `load_result` gives, or a result folder.
+    file : str or Path
+        The file to write.
+    format : str, optional
+        One of `FORMATS`: "csv", "parquet", "mot", "sto", "placement", "trc", "bvh", "c3d", "urdf"; None: that of the
+        file's suffix, which otherwise has to be the format's own.
+    names : str, optional
+        Of a .mot's columns: "opensim", or "isb"; None: "opensim".
+    rate_hz : float, optional
+        Resample the motion to so many samples a second first.
+    force : bool
+        Replace an existing file.
+    provenance : mapping, optional
+        Written beside the file, before it.
+
+    Returns
+    -------
+    Exported
+        The format, and as `diagnostics` what it cannot hold.
 
     Raises
     ------
@@ -72,9 +92,16 @@ def export(
         No result, or nothing in it that the format could hold.
     ExistingOutput
         The file is there and `force` is not given, or it cannot be written.
+
+    Examples
+    --------
+    >>> wp.export(result, "circles.mot").format
+    'mot'
+    >>> wp.export("result", "circles.csv", rate_hz=50.0).diagnostics
+    []
     """
     check_arguments(export, locals())
-    result, file = Path(result), Path(file)
+    file = Path(file)
     format = _format(file, format)
     if names is not None and format != "mot":
         raise BadOption(f"--names {names}: only a .mot has names to choose, and the format is {format}")
@@ -90,18 +117,36 @@ def export(
             partial_provenance = files.enter_context(whole_file(provenance_file(file), True))
             partial_provenance.write_text(provenance_text(provenance), encoding="utf-8")
         if format == "urdf":
-            if not (result / "subject.urdf").is_file():
-                raise MissingFile(f"{result}: no subject.urdf in it; a folder that `wepose track` wrote is wanted here")
-            shutil.copyfile(result / "subject.urdf", partial)
+            _write_urdf(partial, result)
             return Exported(format, [])
-        pose, model, summary = read_result(result)
-        if len(pose.time) < 2:
-            raise BadData(f"{result / 'pose.parquet'}: {len(pose.time)} samples; a motion has at least 2")
-        motion = Motion(pose, model, str(summary.get("recording") or result.name), str(result))
+        motion = _read_motion(result)
         if rate_hz is not None:
             motion = resampled(motion, rate_hz)
         write = WRITERS[format] if names is None else functools.partial(write_mot, names=names)
         return Exported(format, write(partial, motion))
+
+
+def _write_urdf(file: Path, result: PosedBody | str | Path) -> None:
+    if isinstance(result, PosedBody):
+        file.write_text(format_urdf(result.subject, result.model), encoding="utf-8")
+        return
+    urdf = Path(result) / SUBJECT_URDF
+    if not urdf.is_file():
+        raise MissingFile(f"{result}: no subject.urdf in it; a folder that `wepose track` wrote is wanted here")
+    shutil.copyfile(urdf, file)
+
+
+def _read_motion(result: PosedBody | str | Path) -> Motion:
+    """The motion of a result, of at least two samples."""
+    if isinstance(result, PosedBody):
+        motion = Motion(result.pose, result.model, result.name, result.name)
+    else:
+        folder = Path(result)
+        pose, model, summary = read_result(folder)
+        motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder))
+    if len(motion.pose.time) < 2:
+        raise BadData(f"{motion.where}: a pose of {len(motion.pose.time)} samples; a motion has at least 2")
+    return motion
 
 
 def _format(file: Path, format: str | None) -> str:

@@ -95,6 +95,13 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
 def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
     """``subject.toml``, and ``subject.urdf``: the body with the subject's lengths; of another body ``model.toml``."""
     (folder / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
+    (folder / SUBJECT_URDF).write_text(format_urdf(subject, model), encoding="utf-8")
+    if _strip_origin(model.table) != _strip_origin(load_table()):
+        (folder / MODEL_TABLE).write_text(format_table(model.table, SUBJECT_URDF), encoding="utf-8")
+
+
+def format_urdf(subject: Subject, model: BodyModel) -> str:
+    """The text of ``subject.urdf``."""
     head, _, body = model.urdf().partition("\n")
     text = "; ".join(
         f"{name} {value:.4f}" + (f" ± {subject.std(name):.4f}" if np.isfinite(subject.std(name)) else "")
@@ -103,9 +110,7 @@ def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
     comment = re.sub(
         "-(?=-)", "- ", f"{subject.name}: lengths in metres ± one standard deviation. {text}"
     )  # no -- in XML
-    (folder / SUBJECT_URDF).write_text(f"{head}\n<!-- {comment} -->\n{body}", encoding="utf-8")
-    if _strip_origin(model.table) != _strip_origin(load_table()):
-        (folder / MODEL_TABLE).write_text(format_table(model.table, SUBJECT_URDF), encoding="utf-8")
+    return f"{head}\n<!-- {comment} -->\n{body}"
 
 
 def _strip_origin(table: BodyTable) -> BodyTable:

@@ -1,0 +1,230 @@
+"""The Python interface: what is documented runs, results print, draw, show and save themselves."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+import json
+import re
+import sys
+import types
+import webbrowser
+from dataclasses import replace
+from html import escape, unescape
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from arms import write_arm
+
+import wepose_pin as wp
+from wepose_pin.cli import main
+from wepose_pin.kinematics import PosedBody
+from wepose_pin.simulation import Simulation
+from wepose_pin.subject import subject_toml
+from wepose_pin.writers import write_session
+
+ROOT = Path(__file__).resolve().parents[1]
+PUBLIC = {name: getattr(wp, name) for name in wp.__all__ if name != "__version__"}
+FUNCTIONS = [name for name, value in PUBLIC.items() if inspect.isfunction(value)]
+METHODS = [f"TrackResult.{name}" for name in ("to_dataframe", "plot", "show", "save")]
+
+
+@pytest.fixture(scope="module")
+def simulated() -> Simulation:
+    return wp.simulate(wp.population_subject(1.75).lengths, seed=1, clasp_s=10.0, circles=0)
+
+
+@pytest.fixture(scope="module")
+def result(simulated: Simulation) -> wp.TrackResult:
+    return wp.track(simulated.recording(), wp.population_subject(1.75))
+
+
+@pytest.fixture(scope="module")
+def saved(result: wp.TrackResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return result.save(tmp_path_factory.mktemp("api") / "result")
+
+
+@pytest.fixture
+def workplace(simulated: Simulation, saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder in which the examples run."""
+    write_session(tmp_path, simulated.recording())
+    (tmp_path / "subject.toml").write_text(subject_toml(wp.population_subject(1.75)), encoding="utf-8")
+    write_arm(tmp_path)
+    (tmp_path / "result").symlink_to(saved)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.usefixtures("workplace")
+@pytest.mark.parametrize("name", [*FUNCTIONS, *METHODS])
+def test_examples_of_the_documentation_run(name: str, simulated: Simulation, result: wp.TrackResult) -> None:
+    if name == "retarget":
+        pytest.importorskip("daqp")
+    if name.endswith("save"):
+        Path("result").unlink()
+    function: Any = wp
+    for part in name.split("."):
+        function = getattr(function, part)
+    known = {"wp": wp, "simulation": simulated, "recording": simulated.recording(), "result": result}
+    [test] = doctest.DocTestFinder(recurse=False).find(function, name, globs=known)
+    assert test.examples
+    lines: list[str] = []
+    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=lines.append)
+    assert not lines, "".join(lines)
+
+
+@pytest.mark.usefixtures("workplace")
+@pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
+def test_python_of_the_pages_runs(page: str) -> None:
+    Path("result").unlink()
+    known: dict[str, Any] = {}
+    for block in re.findall(
+        r"^```python\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    ):
+        exec(compile(block, page, "exec"), known)
+    assert known["angles"]["right_elbow"]["flexion"].shape == known["result"].time.shape
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_documentation_of_a_function_is_whole(name: str) -> None:
+    text = inspect.getdoc(PUBLIC[name]) or ""
+    sections = dict(re.findall(r"^(\w+)\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", text, re.MULTILINE | re.DOTALL))
+    assert {"Parameters", "Returns", "Raises", "Examples"} <= set(sections)
+    parameters = inspect.signature(PUBLIC[name]).parameters.values()
+    assert all(each.kind not in (each.VAR_KEYWORD, each.VAR_POSITIONAL) for each in parameters)
+    described = re.findall(r"^(\w[\w, ]*)(?: :|$)", sections["Parameters"], re.MULTILINE)
+    assert [each for line in described for each in line.split(", ")] == [each.name for each in parameters]
+
+
+@pytest.mark.parametrize("name", [name for name, value in PUBLIC.items() if inspect.isclass(value)])
+def test_a_class_is_documented(name: str) -> None:
+    first = (PUBLIC[name].__doc__ or "").strip().splitlines()[0]
+    assert first.endswith((".", ":")), first
+
+
+def test_a_result_reads_back_and_is_saved_again(result: wp.TrackResult, saved: Path, tmp_path: Path) -> None:
+    loaded = wp.load_result(str(saved))
+    assert repr(loaded) == repr(result)
+    assert (loaded.diagnostics, loaded.phases) == (result.diagnostics, result.phases)
+    for segment, quat in result.quat_WL.items():
+        np.testing.assert_allclose(loaded.quat_WL[segment], quat, atol=1e-12)
+    np.testing.assert_allclose(loaded.q, result.q, atol=1e-9)
+    again = loaded.save(str(tmp_path / "again"))
+    assert {file.name: file.read_bytes() for file in again.iterdir()} == {
+        file.name: file.read_bytes() for file in saved.iterdir()
+    }
+    with pytest.raises(wp.WeposeError, match="again"):
+        result.save(again)
+
+
+def test_a_saved_result_is_that_of_the_command(result: wp.TrackResult, tmp_path: Path) -> None:
+    source = Path(result.save(tmp_path / "mine"))
+    assert {file.name for file in source.iterdir()} == {
+        *("pose.parquet", "subject.toml", "subject.urdf", "summary.json", "view.html", "report.html")
+    }
+    summary = json.loads((source / "summary.json").read_text(encoding="utf-8"))
+    assert {*result.summary, "versions", "recorded_phases"} == set(summary)
+
+
+@pytest.mark.parametrize("part", ['"recorded_phases": {"start": 3}', '"diagnostics": [3]', '"diagnostics": [{}]'])
+def test_a_damaged_summary_is_one_line(part: str, saved: Path, tmp_path: Path) -> None:
+    for name in ("pose.parquet", "subject.toml", "subject.urdf"):
+        (tmp_path / name).write_bytes((saved / name).read_bytes())
+    (tmp_path / "summary.json").write_text(f"{{{part}}}", encoding="utf-8")
+    with pytest.raises(wp.WeposeError, match=r"summary\.json: is damaged"):
+        wp.load_result(tmp_path)
+
+
+def test_figures_are_whole_files_and_a_notebook_shows_them(result: wp.TrackResult, tmp_path: Path) -> None:
+    figures = result.plot()
+    page = figures._repr_html_()
+    for file in figures.save(tmp_path / "figures").iterdir():
+        text = file.read_text(encoding="utf-8")
+        assert ElementTree.fromstring(text).tag.endswith("svg")
+        assert text == figures[file.stem]._repr_svg_()
+        assert text in page
+    with pytest.raises(KeyError, match=r"no figure 'elbow'; .* angles-elbow"):
+        figures["elbow"]
+
+
+def test_a_motion_is_shown_in_the_browser_or_in_the_notebook(
+    result: wp.TrackResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
+    page = result.show()
+    [address] = opened
+    file = Path(unquote(urlsplit(address).path))
+    assert file.read_text(encoding="utf-8") == page.html
+    file.unlink()
+    frame = re.fullmatch(r'<iframe title="simulated" .*srcdoc="(.*)"></iframe>', page._repr_html_(), re.DOTALL)
+    assert frame is not None
+    assert unescape(frame.group(1)) == page.html
+    shell = types.SimpleNamespace(kernel=object())
+    monkeypatch.setitem(sys.modules, "IPython", types.SimpleNamespace(get_ipython=lambda: shell))
+    result.show()
+    assert len(opened) == 1
+
+
+def test_a_result_goes_into_each_step_as_object_and_as_folder(
+    result: wp.TrackResult, saved: Path, tmp_path: Path
+) -> None:
+    assert isinstance(result, PosedBody)
+    wp.export(result, str(tmp_path / "object.mot"))
+    wp.export(str(saved), tmp_path / "folder.mot")
+    table = [np.loadtxt(tmp_path / f"{name}.mot", skiprows=12) for name in ("object", "folder")]
+    np.testing.assert_allclose(*table, atol=1e-5)
+    wp.export(result, tmp_path / "person.urdf")
+    assert (tmp_path / "person.urdf").read_text("utf-8") == (saved / "subject.urdf").read_text("utf-8")
+    angles = wp.joint_angles(result)
+    assert "right_elbow" in angles._repr_html_()
+    np.testing.assert_array_equal(
+        angles["left_elbow"]["flexion"], wp.joint_angles(result.pose)["left_elbow"].values[:, 0]
+    )
+    with pytest.raises(KeyError, match="no joint 'elbow'; did you mean 'left_elbow'"):
+        angles["elbow"]
+    with pytest.raises(KeyError, match="no angle 'bend'; there is: flexion, carrying_angle, pronation"):
+        angles["left_elbow"]["bend"]
+
+
+def test_a_result_is_retargeted_as_object_and_as_folder(result: wp.TrackResult, saved: Path, tmp_path: Path) -> None:
+    pytest.importorskip("daqp")
+    urdf = write_arm(tmp_path)
+    moved, read = (wp.retarget(given, robot, rate_hz=10.0) for given, robot in ((result, urdf), (saved, str(urdf))))
+    np.testing.assert_allclose(moved.joint_position, read.joint_position, atol=1e-6)
+    assert repr(moved) == repr(read)
+
+
+def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult) -> None:
+    objects = [simulated, simulated.recording(), result, result.pose, result.subject, result.model, result.plot()]
+    objects += [*simulated.recording().sensors.values(), wp.joint_angles(result), wp.joint_angles(result)["thorax"]]
+    objects += [wp.evaluate(result, simulated.truth()), result.show(open=False)]
+    for each in objects:
+        assert re.fullmatch(r"\w+\(.{10,200}\)", repr(each)), repr(each)[:300]
+    assert escape(repr(result)) in result._repr_html_()
+
+
+def test_a_subject_whose_calibration_failed_is_refused(
+    workplace: Path, simulated: Simulation, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failed = replace(wp.population_subject(1.75), name="anna", quality="fail")
+    (workplace / "subject.toml").write_text(subject_toml(failed), encoding="utf-8")
+    line = r"subject 'anna': its calibration failed \(quality = \"fail\"\).*calibrate again"
+    with pytest.raises(wp.WeposeError, match=line):
+        wp.track(simulated.recording(), failed)
+    assert wp.track(simulated.recording(), failed, force=True).subject.quality == "fail"
+    track = ["track", "session.toml", "--subject", "subject.toml", "-o", "out", "--no-view", "--no-report"]
+    live = ["live", "--source", "replay:session.toml", "--subject", "subject.toml", "--no-page"]
+    for argv in (track, [*track, "--chunk-seconds", "20"], live):
+        with pytest.raises(SystemExit, match="2"):
+            main(argv)
+        out, err = capsys.readouterr()
+        assert (out, err.count("\n")) == ("", 1)
+        assert re.search(line, err)
+    with pytest.raises(SystemExit, match="0"):
+        main([*track, "--accept-failed"])
+    assert wp.load_result("out").subject.quality == "fail"

@@ -1,0 +1,314 @@
+"""From a recording to a result that prints, draws, shows and saves itself.
+
+`wepose_pin.track` and `wepose_pin.load_result` are here; both give a `TrackResult`. This room is above all others: a
+result can be written and drawn.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import polars as pl
+
+from . import tracking
+from .arguments import check_arguments, check_value
+from .diagnostics import WARNING, Diagnostic, from_json, lines
+from .errors import BadData
+from .filters import BEST
+from .filters.static import StaticTest
+from .kinematics import PosedBody, build_pose_table
+from .model import BodyModel
+from .recording import Intervals, Recording
+from .subject import Subject, load_subject
+from .tracking import TrackedRecording
+from .writers import read_result, write_result
+from .writers.folder import result_folder
+
+if TYPE_CHECKING:
+    from .calibration import Calibration
+    from .report.notebook import Figures, ViewPage
+
+
+@dataclass(frozen=True, repr=False)
+class TrackResult(PosedBody):
+    """The motion of a body, as `track` computes it and `load_result` reads it from a folder.
+
+    It prints itself in one line, and a notebook shows its diagnostics too. `export`, `retarget`, `joint_angles` and
+    `evaluate` take it as it is. `time` (n,) [s], `quat_WL` segment → (n, 4) xyzw, `points` point → (n, 3) [m] in W and
+    `q` (n, nq) are the pose's; `pose` also has their covariances.
+
+    Parameters
+    ----------
+    name : str
+        Of the recording.
+    pose : Pose
+        In W, n samples.
+    model : BodyModel
+        The body with the subject's lengths.
+    subject : Subject
+        Lengths and mounts as used.
+    phases : mapping
+        Name → intervals [s] of the recording.
+    summary : mapping
+        The content of ``summary.json``: inputs, options and results.
+    diagnostics : tuple of Diagnostic
+        What the user should know.
+    source : TrackedRecording or Path
+        What it was made of: the recording with intermediate results, such as `source.segments`, or the folder.
+    """
+
+    phases: Mapping[str, Intervals]
+    summary: Mapping[str, Any]
+    diagnostics: tuple[Diagnostic, ...]
+    source: TrackedRecording | Path
+
+    def to_dataframe(self) -> pl.DataFrame:
+        """Return the table of ``pose.parquet``, a row a sample; ``.to_pandas()`` of it needs pandas and pyarrow.
+
+        Columns: ``time`` [s]; ``<segment>_qx,_qy,_qz,_qw``, segment to W, and ``<segment>_std`` [rad];
+        ``<point>_x,_y,_z`` [m] in W and ``<point>_std`` [m]; ``<segment>_gap``. Standard deviations are of one axis.
+
+        Examples
+        --------
+        >>> result.to_dataframe().columns[:6]
+        ['time', 'torso_qx', 'torso_qy', 'torso_qz', 'torso_qw', 'torso_std']
+        """
+        return build_pose_table(self.pose)
+
+    def plot(self) -> Figures:
+        """Draw the report's figures: paths and reach of the hands, joint angles.
+
+        Returns
+        -------
+        Figures
+            Name → figure. A notebook shows them; ``figures.save(folder)`` writes an SVG each.
+
+        Examples
+        --------
+        >>> figures = result.plot()
+        >>> list(figures)
+        ['paths', 'reach', 'angles-thorax', 'angles-shoulder', 'angles-elbow']
+        >>> figures["paths"].save("paths.svg")
+        PosixPath('paths.svg')
+        """
+        from .report.notebook import draw_figures
+
+        return draw_figures(self)
+
+    def show(self, open: bool = True) -> ViewPage:
+        """Show the motion in 3D: in a notebook in its cell, else in the browser.
+
+        Parameters
+        ----------
+        open : bool
+            Open the browser; a notebook never does.
+
+        Returns
+        -------
+        ViewPage
+            The page; ``page.save(path)`` writes it to a file, which opens offline.
+
+        Examples
+        --------
+        >>> page = result.show(open=False)
+        >>> page.save("view.html")
+        PosixPath('view.html')
+        """
+        from .report.notebook import ViewPage, runs_in_notebook
+        from .report.viewer import pose_html
+
+        page = ViewPage(self.name, pose_html(self.model, self.pose, phases=self.phases, title=self.name))
+        if open and not runs_in_notebook():
+            page.open()
+        return page
+
+    def save(self, folder: str | Path, force: bool = False) -> Path:
+        """Write what `wepose track -o` writes: pose, subject, summary, view and report; of a loaded result its files.
+
+        Parameters
+        ----------
+        folder : str or Path
+            It is written whole or not at all.
+        force : bool
+            Replace the files of an earlier result in it.
+
+        Returns
+        -------
+        Path
+            The folder.
+
+        Raises
+        ------
+        ExistingOutput
+            The folder is not empty and `force` is not given, or it cannot be written.
+
+        Examples
+        --------
+        >>> result.save("result")
+        PosixPath('result')
+        """
+        out = Path(folder)
+        if isinstance(self.source, Path):
+            with result_folder(out, force) as partial:
+                for file in self.source.iterdir():
+                    if file.is_file():
+                        shutil.copyfile(file, partial / file.name)
+            return out
+        from .report import write_track_pages
+
+        with result_folder(out, force) as partial:
+            write_result(partial, self.source, phases=self.phases)
+        write_track_pages(out, self.source)
+        return out
+
+    def __repr__(self) -> str:
+        seconds = float(self.time[-1] - self.time[0])
+        warnings = sum(diagnostic.severity == WARNING for diagnostic in self.diagnostics)
+        parts = [
+            f"{seconds:.1f} s at {self.rate_hz:g} Hz",
+            f"{len(self.quat_WL)} segments",
+            f"{len(self.points)} points",
+            *([str(self.summary["method"])] if "method" in self.summary else []),
+            f"{warnings} warning{'' if warnings == 1 else 's'}",
+        ]
+        return f"TrackResult({self.name!r}: {', '.join(parts)})"
+
+    def _repr_html_(self) -> str:
+        entries = "".join(f"<li>{severity.value}: {escape(line)}</li>" for severity, line in lines(self.diagnostics))
+        return f"<p>{escape(repr(self))}</p>" + (f"<ul>{entries}</ul>" if entries else "")
+
+
+def track(
+    recording: Recording,
+    subject: Subject | Calibration | None = None,
+    *,
+    method: str = BEST,
+    model: BodyModel | str | Path | None = None,
+    static_test: StaticTest | None = None,
+    open_loop: bool = False,
+    causal: bool = False,
+    limits: bool = True,
+    force: bool = False,
+) -> TrackResult:
+    """Estimate the pose of a body from a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        As `load_session` reads it, or built in code.
+    subject : Subject or Calibration, optional
+        Lengths and mounts; None: the population's mean lengths and the session's stated mounts.
+    method : str
+        The orientation filter, a key of `wepose_pin.filters.METHODS`: "amekf", "smoother", "smekf", "ncf" or "gdc".
+    model : BodyModel, str or Path, optional
+        A body; its file, as for `load_model`, or the URDF of a mechanism whose links bear the sensors; or the name of
+        one of the package's. None: that which the recording names, else the upper body. It gets the subject's lengths;
+        without a subject its own stand.
+    static_test : StaticTest, optional
+        When a sensor counts as static; None: the default values.
+    open_loop : bool
+        Do not correct heading drift: orientations are the filter's from the start pose on.
+    causal : bool
+        Begin at the end of the start pose and look at nothing ahead, as a live session does.
+    limits : bool
+        Keep the limits of the model's joints of one axis.
+    force : bool
+        Use a subject whose calibration failed.
+
+    Returns
+    -------
+    TrackResult
+        Pose, body and subject; `time` (n,) [s], `quat_WL` segment → (n, 4) xyzw, `points` point → (n, 3) [m] in W.
+
+    Raises
+    ------
+    WeposeError
+        What the recording, the subject or the model lacks; a subject whose calibration failed; sensors on links that
+        are no segments.
+
+    Examples
+    --------
+    >>> recording = wp.load_session("session.toml")
+    >>> result = wp.track(recording, wp.load_subject("subject.toml"))
+    >>> result
+    TrackResult('simulated': 22.5 s at 100 Hz, 5 segments, 8 points, amekf, 0 warnings)
+    >>> result.quat_WL["right_forearm"].shape == (len(result.time), 4)
+    True
+    """
+    person: Any = getattr(subject, "subject", subject)  # a calibration has one
+    check_value("force", force, bool)
+    if isinstance(person, Subject) and not force:
+        person.check_quality()
+    tracked = tracking.track(
+        recording,
+        person,
+        method=method,
+        model=model,
+        static_test=static_test,
+        open_loop=open_loop,
+        causal=causal,
+        limits=limits,
+    )
+    return TrackResult(
+        name=tracked.name,
+        pose=tracked.pose,
+        model=tracked.model,
+        subject=tracked.subject,
+        phases=recording.phases,
+        summary=tracked.summary(),
+        diagnostics=tracked.diagnostics,
+        source=tracked,
+    )
+
+
+def load_result(folder: str | Path) -> TrackResult:
+    """Read a result folder, as `wepose track` and `TrackResult.save` write it.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Holds ``pose.parquet``, ``subject.toml``, ``subject.urdf`` and ``summary.json``.
+
+    Returns
+    -------
+    TrackResult
+        What its files hold. Of covariances a file has the standard deviations alone, unless `wepose track --covariance`
+        wrote it: all axes then have the same.
+
+    Raises
+    ------
+    MissingFile, BadData, BadSubject, BadModel
+        It is no result folder, or its files are damaged.
+
+    Examples
+    --------
+    >>> wp.load_result("result")
+    TrackResult('simulated': 22.5 s at 100 Hz, 5 segments, 8 points, amekf, 0 warnings)
+    """
+    check_arguments(load_result, locals())
+    folder = Path(folder)
+    pose, model, summary = read_result(folder)
+    try:
+        phases = _parse_phases(summary.get("recorded_phases", {}))
+        diagnostics = tuple(from_json(each) for each in summary.get("diagnostics", ()))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise BadData(f"{folder / 'summary.json'}: is damaged: {error}") from error
+    return TrackResult(
+        name=str(summary.get("recording") or folder.name),
+        pose=pose,
+        model=model,
+        subject=load_subject(folder),
+        phases=phases,
+        summary=summary,
+        diagnostics=diagnostics,
+        source=folder,
+    )
+
+
+def _parse_phases(recorded: Mapping[str, Iterable[tuple[float, float]]]) -> dict[str, Intervals]:
+    return {name: tuple((float(begin), float(end)) for begin, end in spans) for name, spans in recorded.items()}
