@@ -160,13 +160,15 @@ def test_nothing_is_overwritten_without_force(short: Path, tmp_path: Path, capsy
     assert run("track", short, "-o", tmp_path / "result", "--force") == 0
 
 
-def test_gauges_add_up_and_none_is_given_twice(short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gauges_add_up_and_none_is_given_twice(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     two = ["--measured", "shoulder_width=0.39", "--measured", "trunk=0.51"]
-    assert run("calibrate", short, *two, "-o", tmp_path / "subject") == 0
+    assert run("calibrate", session, *two, "-o", tmp_path / "subject") == 0
     subject = (tmp_path / "subject" / "subject.toml").read_text()
     assert "measured: shoulder_width" in subject
     assert "trunk = 0.510" in subject  # the prior gives way to the tape
-    assert run("calibrate", short, *two, "--measured", "trunk=0.6", "-o", tmp_path / "again") == 2
+    assert run("calibrate", session, *two, "--measured", "trunk=0.6", "-o", tmp_path / "again") == 2
     assert "'trunk' is given twice" in capsys.readouterr().err
 
 
