@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.assets import asset
 from wepose_pin.calibration import Calibration, assess, calibrate, calibrate_sessions, load_protocol
 from wepose_pin.calibration.initial_headings import _see_from
+from wepose_pin.calibration.protocols import choose_protocol
 from wepose_pin.calibration.series import check_same_person
 from wepose_pin.cli import main
 from wepose_pin.errors import BadOption, BadPhase, BadSession
@@ -61,11 +63,16 @@ def heading_errors(calibration: Calibration, simulation: Simulation) -> np.ndarr
     )
 
 
-def test_protocols_join() -> None:
+def test_protocols_join(tmp_path: Path) -> None:
     protocol = load_protocol("clasp+t_pose")
     assert [step.phase for step in protocol.steps] == ["start", "clasp", "t_pose"]
     assert protocol.conditions == load_protocol("clasp").conditions + load_protocol("t_pose").conditions
     assert protocol.needs == load_protocol("clasp").needs
+    own = tmp_path / "a+b.toml"  # a path is one protocol
+    own.write_text((asset("calibration", "clasp.toml")).read_text(encoding="utf-8"), encoding="utf-8")
+    assert load_protocol(own).steps == load_protocol("clasp").steps
+    assert choose_protocol({"start", "clasp"}) == "clasp"
+    assert choose_protocol({"start", "clasp", "t_pose"}) == "clasp+t_pose"
     with pytest.raises(BadOption, match="protocol 't_poes' is not known; did you mean 't_pose'"):
         load_protocol("clasp+t_poes")
     with pytest.raises(BadOption, match=r"protocol 'clasp\+handle' is not simulated"):

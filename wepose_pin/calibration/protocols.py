@@ -220,7 +220,7 @@ def load_protocol(name: str | Path) -> Protocol:
     BadOption
         There is no such protocol, or its file has a key or value that is none.
     """
-    names = str(name).split("+")
+    names = [str(name)] if Path(name).is_file() else str(name).split("+")  # a path may have a +
     if len(names) > 1:
         return _join_protocols(str(name), [load_protocol(each) for each in names])
     own = str(name).endswith(".toml")

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import BadSession
 from ..filters import BEST
-from ..model import BodyModel
+from ..model import BodyModel, convert_breadths
 from ..recording import Recording
 from ..subject import Subject, population_subject
 from .lengths import MEASURED_STD, calibrate
@@ -69,9 +69,9 @@ def calibrate_sessions(
     if earlier is not None and used:
         subjects = [earlier, *subjects]
     if len(subjects) > 1:
-        population = replace(prior or population_subject(body=last.model))
-        stated = {name: (metres, measured_std) for name, metres in (measured or {}).items()}
-        fused = fuse_sessions(subjects, population, stated, last.model.table)
+        table = last.model.table
+        stated = convert_breadths(measured or {}, table, measured_std)
+        fused = fuse_sessions(subjects, prior or population_subject(body=last.model), stated, table)
         calibrations[-1] = replace(last, subject=fused).state_quality()
     return calibrations
 

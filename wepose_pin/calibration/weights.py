@@ -101,12 +101,18 @@ def solve_reweighted(
             if isinstance(closure, Loop):
                 r = fit.closure[span, : closure.rows]
                 contact[span] = _estimate_contact(r, MIN_LATE_CONTACT if k > 1 else MIN_CONTACT)
-                weights[span, :3] = _weigh(r, contact[span], correlation)
-                effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], correlation)
+                least = max(correlation, _correlate_all(closure, span))
+                weights[span, :3] = _weigh(r, contact[span], least)
+                effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], least)
         if observations.layout.hinges and not quick:
             weights[closed, GAP_ROWS:] = _weigh(fit.hinge[closed], np.ones(int(closed.sum())), correlation)
     fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, not quick)
     return WeightedFit(fit, weights, contact, effective)
+
+
+def _correlate_all(loop: Loop, span: slice) -> int:
+    """The samples of a closure whose errors are one: of a palm on the body, whose wrist bends as the elbow moves."""
+    return span.stop - span.start if loop.closure.on else 0
 
 
 def _estimate_contact(r: np.ndarray, least: float) -> np.ndarray:
@@ -172,7 +178,8 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
             # The fit has reduced the residuals: their variance gets back what it took.
             size = np.sum(r[span][:, rows] ** 2, axis=1) + np.einsum("nki,ij,nkj->n", slope, C, slope, optimize=True)
             variance = max(float(share @ size) / (len(rows) * float(share.sum())), LEAST_VARIANCE)
-            duration = round(count_correlated_samples(r[span][:, rows] * share[:, None], least))
+            all_alike = _correlate_all(condition, span) if isinstance(condition, Loop) and rows != hinges else 0
+            duration = round(count_correlated_samples(r[span][:, rows] * share[:, None], max(least, all_alike)))
             summed = np.concatenate((np.zeros((1, *pull.shape[1:])), np.cumsum(pull, axis=0)))
             ends = np.arange(1, len(pull) + duration)
             windows = summed[np.minimum(ends, len(pull))] - summed[np.maximum(ends - duration, 0)]
