@@ -25,9 +25,10 @@ from ..recording.limits import LONGEST_STEP_S
 from ..recording.sensors import compute_rate
 from .arrays import ArrayFile, is_array_file
 from .device import Device
-from .formats import TITLES, WHOLE, detect_format, read_device
+from .formats import FOLDERS, TITLES, WHOLE, detect_format, read_device
 from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
+from .reference import read_reference
 from .session import SessionReader
 from .tables import FORMATS as TABLES
 from .tables import Rows, read_columns, read_table
@@ -103,8 +104,8 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         raise MissingFile(f"{path}: no such file or folder")
     if path.is_dir() and (path / "pose.parquet").is_file():
         return _describe_result(path)
-    if path.is_dir() and detect_format(path) is None:
-        named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
+    named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
+    if named is not None or (path.is_dir() and detect_format(path) is None):
         if named is None:
             raise MissingFile(
                 f"{path}: a folder without session.toml, subject.toml or pose.parquet, none of an x-IMU3, a phone or a "
@@ -113,6 +114,8 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         path = named
     if path.suffix.lower() == ".toml":
         return _describe_toml(path)
+    if path.suffix.lower() in (".c3d", ".trc"):
+        return _describe_reference(path)
     folder, wearer = folder or path.absolute().parent, wearer or Wearer(load_table())
     table = wearer.table
     format = detect_format(path)
@@ -132,7 +135,7 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         return _propose_session(path, folder, proposal, wearer)
     known = (
         ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose, .xdf, .db3, .mcap, .bag, "
-        ".zip and .json of phones; folders of a result, an x-IMU3, a phone, a ROS bag"
+        ".c3d, .trc, .zip and .json of phones; folders of a result, an x-IMU3, a phone, a ROS bag"
     )
     raise BadData(f"{path}: is nothing that is known here; there is: {known}")
 
@@ -172,6 +175,17 @@ def _read_diagnostics(value: object) -> list[str]:
 
 def _texts(value: object) -> list[str]:
     return [str(item) for item in value] if isinstance(value, list | dict) else []
+
+
+def _describe_reference(path: Path) -> Description:
+    reference = read_reference(path)
+    rate_hz = (len(reference.time) - 1) / float(reference.time[-1] - reference.time[0])
+    facts = [f"{len(reference.time)} samples at {rate_hz:.6g} Hz, {format_span(reference.time[[0, -1]])}"]
+    for name, known in (("joints", reference.points), ("segments", reference.quat_VT)):
+        facts.append(f"{name}: {', '.join(known) or 'none'}")
+    facts.append(f"compare a result with it: wepose evaluate RESULT {path}")
+    what = "rotations" if reference.own_frames else "markers"
+    return Description(f"{path}: {what}, a reference for `wepose evaluate`", tuple(facts), (), None)
 
 
 def _describe_toml(path: Path) -> Description:
@@ -370,7 +384,7 @@ def _describe_live(path: Path) -> tuple[list[str], list[str]]:
 
 def _siblings(path: Path, format: str) -> list[Path]:
     """List the file and those of the same format beside it: the files of one recording are in one folder."""
-    if path.is_dir() or path.name in ("Inertial.csv", "Quaternion.csv"):
+    if path.is_dir() or (format in FOLDERS and path.suffix.lower() == ".csv"):
         own = path if path.is_dir() else path.parent
         beside = [folder for folder in sorted(own.absolute().parent.iterdir()) if folder.is_dir()]
         same = [own if folder == own.absolute() else folder for folder in beside]
