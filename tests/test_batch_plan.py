@@ -45,7 +45,7 @@ def test_steps_run_in_their_order_however_they_are_written(folder: Path) -> None
     )
     assert list(plan.items[0].steps) == ["track", "export", "evaluate"]
     assert plan.items[0].steps["export"] == {"formats": ("trc", "mot"), "names": None, "rate_hz": 50.0}
-    assert plan.items[0].steps["evaluate"] == {"interval": (1.0, 2.0)}
+    assert plan.items[0].steps["evaluate"]["interval"] == (1.0, 2.0)
     assert plan.items[0].steps["track"]["covariance"] is True
 
 

@@ -222,9 +222,10 @@ def sensor_logger(folder: Path, platform: str = "android", late: float = 0.0, gr
     sign = -1.0 if platform == "ios" else 1.0
     names = ["time", "seconds_elapsed"]
     (folder / "Gyroscope.csv").write_text(text([stamps, TIME, *GYRO[:, ::-1].T], [*names, *"zyx"]))
-    accel = {"TotalAcceleration": ACCEL, "Accelerometer": 0.3 * ACCEL}
+    total = own(ACCEL, folder)
+    accel = {"TotalAcceleration": total, "Accelerometer": 0.3 * total}
     if gravity:
-        accel = {"Accelerometer": 0.3 * ACCEL, "Gravity": 0.7 * ACCEL}
+        accel = {"Accelerometer": 0.3 * total, "Gravity": 0.7 * total}
     for name, values in accel.items():
         (folder / f"{name}.csv").write_text(text([after, TIME, *sign * values[:, ::-1].T], [*names, *"zyx"]))
     quat = text(
@@ -250,6 +251,18 @@ def test_sensor_logger(platform: str, gravity: bool, tmp_path: Path) -> None:
     (folder / "Metadata.csv").unlink()
     device = read_device(folder, "sensor_logger")
     assert [each.code for each in device.diagnostics] == ["accel-sign-assumed"]
+
+
+def test_phones_side_by_side_make_one_session(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for name in ("chest", "left_wrist"):
+        sensor_logger(tmp_path / name)
+    info(capsys, tmp_path / "chest", "--write")
+    recording = wp.load_session(tmp_path / "session.toml")
+    assert set(recording.sensors) == {"torso", "left_forearm"}
+    out = info(capsys, tmp_path / "chest" / "TotalAcceleration.csv", "--write")
+    assert out.count("[sensors.") <= 1
+    assert set(wp.load_session(tmp_path / "chest").sensors) == {"torso"}
+    assert "a session" in info(capsys, tmp_path / "chest")
 
 
 def test_sensor_logger_as_zip_and_json(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
+from test_info import info
 from test_mvnx import mvnx, turning
 
 import wepose_pin as wp
@@ -157,6 +158,15 @@ def trc(path: Path, pose: Pose) -> Path:
 
 def to_pose(reference: Reference) -> Pose:
     return Pose(reference.time, reference.quat_VT, reference.points)
+
+
+def test_wepose_info_says_what_joints_there_are(
+    brief: Pose, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = info(capsys, c3d(tmp_path / "a.c3d", brief))
+    assert "markers, a reference for `wepose evaluate`" in out
+    assert "at 60 Hz" in out
+    assert "left_elbow" in out
 
 
 @pytest.mark.parametrize("processor", [84, 85, 86])

@@ -156,6 +156,25 @@ def test_layouts(
     assert read_table(tmp_path / "a.csv").rows() == rows
 
 
+def test_a_file_for_each_sensor_by_its_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """Not the other recording of the same name, nor a table of something else."""
+    names = ",".join(["t_ms", *(f"{k}_{a}" for k in ("acc", "gyr") for a in "xyz")])
+    time = [str(10 * k) for k in range(N)]
+    for k, name in enumerate(("chest", "left_wrist", "right_wrist_2")):
+        (tmp_path / f"{name}.csv").write_text(names + "\n" + lines(time, values(k), ","))
+    (tmp_path / "right_upper_arm.csv").write_text("t_ms,emg\n0,1\n")
+    assert "CSV table, 7 columns, 3 files" in info(capsys, tmp_path / "left_wrist.csv", "--write")
+    recording = wp.load_session(tmp_path / "session.toml")
+    assert set(recording.sensors) == {"torso", "left_forearm", "right_forearm"}
+    np.testing.assert_allclose(recording.sensors["left_forearm"].gyro_S, values(1)[:, 3:], atol=1e-5)
+
+
+def test_a_rate_that_the_file_states(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = info(capsys, data / "ring" / "trial1" / "imu_rigid.csv")
+    assert "rate_hz = 40.0\n" in out
+    assert "the file says 'sampling frequency: 40'" in out
+
+
 def test_axes_anywhere_in_a_name() -> None:
     """Numbers are those of sensors while letters are axes."""
     imus = [f"imu{s}_{k}_{a}" for s in range(3) for k in ("acc", "gyro") for a in "xyz"]

@@ -96,7 +96,7 @@ def _say_registration(registration: Registration) -> None:
     say(f"The reference was aligned by {format_span(registration.fitted)}, which are not scored:")
     say(f"  its clock {registration.offset_s:+.3f} s ({clock})")
     say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+.1f} deg about the vertical")
-    if registration.shift_m.any():
+    if any(registration.shift_m):
         x, y, z = registration.shift_m
         say(f"  its points moved by {x:+.3f} {y:+.3f} {z:+.3f} m")
     if registration.frames_deg:

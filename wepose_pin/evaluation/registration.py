@@ -41,7 +41,7 @@ class Registration:
     correlation : of the speeds at that offset; NaN: the offset was stated
     up : the axis of the reference's world that is up
     heading_deg : by which its world was then rotated about the vertical
-    shift_m : (3,) by which its points were moved
+    shift_m : x, y, z by which its points were moved
     frames_deg : segment → angle of the constant rotation of its frame; empty: frames are as the reference has them
     fitted, scored : from, to [s], of the pose
     """
@@ -50,7 +50,7 @@ class Registration:
     correlation: float
     up: str
     heading_deg: float
-    shift_m: np.ndarray
+    shift_m: tuple[float, float, float]
     fitted: tuple[float, float]
     scored: tuple[float, float]
     frames_deg: Mapping[str, float] = field(default_factory=dict)
@@ -122,8 +122,9 @@ def register(
         ]
         seen = np.isfinite(off).all(axis=(0, 2))
         shift = np.median(np.mean(off, axis=0)[seen], axis=0) if seen.any() else shift
+    x, y, z = shift.tolist()
     registration = Registration(
-        offset_s, correlation, axis, heading, shift, (first, float(fit_end)), (float(fit_end), last), turned
+        offset_s, correlation, axis, heading, (x, y, z), (first, float(fit_end)), (float(fit_end), last), turned
     )
     return replace(truth, quat_WL=quat, points={name: p + shift for name, p in points.items()}), registration
 

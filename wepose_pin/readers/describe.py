@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -24,14 +25,17 @@ from ..recording.gaps import find_runs
 from ..recording.limits import LONGEST_STEP_S
 from ..recording.sensors import compute_rate
 from .arrays import ArrayFile, is_array_file
-from .device import Device
-from .formats import TITLES, WHOLE, detect_format, read_device
+from .device import Device, read_first_lines
+from .formats import FOLDERS, TITLES, WHOLE, detect_format, read_device
 from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
+from .reference import read_reference
 from .session import SessionReader
 from .tables import FORMATS as TABLES
 from .tables import Rows, read_columns, read_table
 
+# A line of a file that says its rate.
+_STATED_RATE = re.compile(r"(sampl\w*|frame|data)[ _]*(frequency|rate)[^0-9]{0,12}(?P<rate>\d+(\.\d+)?)", re.IGNORECASE)
 # A sensor is static where its rate [rad/s] and specific force [m/s²] vary by less over `BLOCK_S`; the sway of a
 # standing person is below.
 BLOCK_S, STATIC_GYRO, STATIC_ACCEL = 0.25, np.deg2rad(3.0), 0.4
@@ -103,8 +107,8 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         raise MissingFile(f"{path}: no such file or folder")
     if path.is_dir() and (path / "pose.parquet").is_file():
         return _describe_result(path)
-    if path.is_dir() and detect_format(path) is None:
-        named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
+    named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
+    if named is not None or (path.is_dir() and detect_format(path) is None):
         if named is None:
             raise MissingFile(
                 f"{path}: a folder without session.toml, subject.toml or pose.parquet, none of an x-IMU3, a phone or a "
@@ -113,6 +117,8 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         path = named
     if path.suffix.lower() == ".toml":
         return _describe_toml(path)
+    if path.suffix.lower() in (".c3d", ".trc"):
+        return _describe_reference(path)
     folder, wearer = folder or path.absolute().parent, wearer or Wearer(load_table())
     table = wearer.table
     format = detect_format(path)
@@ -121,18 +127,18 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
     if is_array_file(path):
         arrays = ArrayFile(path)
         guess = guess_arrays(arrays.shapes, table)
-        proposal = _propose_from_names(path, folder, guess, list(arrays.shapes), arrays)
+        proposal = _propose_from_names(path, folder, guess, list(arrays.shapes), arrays, table)
         return _propose_session(path, folder, proposal, wearer)
     if path.suffix.lower() in TABLES:
         rows = Rows(path)
         names = rows.names
         if any(f"{point}_x" in names for point in table.points):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
-        proposal = _propose_from_names(path, folder, guess_columns(names, table, rows.units), names, None)
+        proposal = _propose_from_names(path, folder, guess_columns(names, table, rows.units), names, None, table)
         return _propose_session(path, folder, proposal, wearer)
     known = (
         ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose, .xdf, .db3, .mcap, .bag, "
-        ".zip and .json of phones; folders of a result, an x-IMU3, a phone, a ROS bag"
+        ".c3d, .trc, .zip and .json of phones; folders of a result, an x-IMU3, a phone, a ROS bag"
     )
     raise BadData(f"{path}: is nothing that is known here; there is: {known}")
 
@@ -172,6 +178,17 @@ def _read_diagnostics(value: object) -> list[str]:
 
 def _texts(value: object) -> list[str]:
     return [str(item) for item in value] if isinstance(value, list | dict) else []
+
+
+def _describe_reference(path: Path) -> Description:
+    reference = read_reference(path)
+    rate_hz = (len(reference.time) - 1) / float(reference.time[-1] - reference.time[0])
+    facts = [f"{len(reference.time)} samples at {rate_hz:.6g} Hz, {format_span(reference.time[[0, -1]])}"]
+    for name, known in (("joints", reference.points), ("segments", reference.quat_VT)):
+        facts.append(f"{name}: {', '.join(known) or 'none'}")
+    facts.append(f"compare a result with it: wepose evaluate RESULT {path}")
+    what = "rotations" if reference.own_frames else "markers"
+    return Description(f"{path}: {what}, a reference for `wepose evaluate`", tuple(facts), (), None)
 
 
 def _describe_toml(path: Path) -> Description:
@@ -370,7 +387,7 @@ def _describe_live(path: Path) -> tuple[list[str], list[str]]:
 
 def _siblings(path: Path, format: str) -> list[Path]:
     """List the file and those of the same format beside it: the files of one recording are in one folder."""
-    if path.is_dir() or path.name in ("Inertial.csv", "Quaternion.csv"):
+    if path.is_dir() or (format in FOLDERS and path.suffix.lower() == ".csv"):
         own = path if path.is_dir() else path.parent
         beside = [folder for folder in sorted(own.absolute().parent.iterdir()) if folder.is_dir()]
         same = [own if folder == own.absolute() else folder for folder in beside]
@@ -401,7 +418,7 @@ def _find_segments(labels: Mapping[str, str | None], path: Path, table: BodyTabl
 
 
 def _propose_from_names(
-    path: Path, folder: Path, guess: Guess, names: list[str], arrays: ArrayFile | None
+    path: Path, folder: Path, guess: Guess, names: list[str], arrays: ArrayFile | None, body: BodyTable
 ) -> _Proposal:
     """Propose a session for a table or arrays by their names."""
     kind = {".parquet": "Parquet table", ".csv": "CSV table", ".mat": "MATLAB file"}.get(
@@ -414,7 +431,8 @@ def _propose_from_names(
         return _Proposal(title, facts=[fact])
     time, facts = _propose_time(path, guess, arrays)
     raw = any("gyro" in signals for signals in guess.sensors.values())
-    head = [f"file = {_relative(path, folder)}", *time]
+    beside = _find_tables_beside(path, folder, guess, names, body) if arrays is None else {}
+    head = [*([] if beside else [f"file = {_relative(path, folder)}"]), *time]
     if raw:
         head += [
             f"gyro_unit = {toml_string(guess.units.get('gyro', 'rad/s'))}",
@@ -429,14 +447,44 @@ def _propose_from_names(
                 f'{CHECK}x, y, z, w? if w comes first: ["{path_}[1]", "{path_}[2]", "{path_}[3]", "{path_}[0]"]'
             )
         tables[segment] = lines
+    if beside:
+        ((_, lines),) = tables.items()
+        tables = {segment: [f"file = {file}", *lines] for segment, file in beside.items()}
+        title += f", {len(beside)} files" if len(beside) > 1 else ""
+        return _Proposal(title, head, tables, facts=facts)
     columns_of = {name: next(iter(signals.values()))[0] for name, signals in guess.sensors.items()}
     unknown = [name.removeprefix("?") or f"{columns_of[name]}, …" for name in tables if name.startswith("?")]
     return _Proposal(title, head, tables, facts=facts, diagnostics=_unknown_segments(path, unknown))
 
 
+def _find_tables_beside(
+    path: Path, folder: Path, guess: Guess, names: Sequence[str], body: BodyTable
+) -> dict[str, str]:
+    """Find segment → file, of a table with one sensor whose name is the file's, and those beside it with its columns.
+
+    Empty where the table's own names say the segment, or its file's name does not.
+    """
+    (owner, *others) = guess.sensors
+    own = body.guess_segment(path.stem)
+    if others or own is None or not owner.startswith("?"):
+        return {}
+    same = [file for file in sorted(path.parent.iterdir()) if file.suffix == path.suffix and file.is_file()]
+    found = {own: _relative(path, folder)}
+    for file in same[:MOST_SIBLINGS]:
+        segment = body.guess_segment(file.stem)
+        if segment is not None and segment not in found:
+            with contextlib.suppress(WeposeError):
+                if list(Rows(file).names) == list(names):
+                    found[segment] = _relative(file, folder)
+    return found
+
+
 def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str], list[str]]:
     """Propose the lines of the time, `time` and its unit or `rate_hz`; with facts about it."""
     if not guess.times:
+        stated = next(filter(None, map(_STATED_RATE.search, read_first_lines(path) if not arrays else ())), None)
+        if stated:
+            return [f"rate_hz = {float(stated['rate'])}"], [f"no column looks like time; the file says '{stated[0]}'"]
         return [f"rate_hz = 100.0{CHECK}no column looks like time"], ["no column looks like time: state the rate"]
     table = arrays.table({name: str(path) for name in guess.times}) if arrays else read_table(path)
     for name in guess.times:

@@ -179,7 +179,7 @@ def open_folder(path: Path, what: str) -> Iterator[dict[str, Path]]:
     BadData
         The zip is damaged, or holds far more than its size.
     """
-    if not zipfile.is_zipfile(path) if path.is_file() else True:
+    if not (path.is_file() and zipfile.is_zipfile(path)):
         folder = path if path.is_dir() else path.parent
         yield {file.name: file for file in sorted(folder.iterdir()) if file.is_file()}
         return

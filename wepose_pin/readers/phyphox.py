@@ -19,6 +19,7 @@ from .device import Device, join_signals, make_device, open_folder, read_convert
 from .guess import group_columns, split_unit
 from .tables import read_columns, read_layout, read_table
 
+MOST_FILES = 50  # of a folder that are looked into
 _TIME = re.compile(r"(time|zeit) \(s\)", re.IGNORECASE)
 
 
@@ -66,9 +67,7 @@ def read_phyphox(path: Path, use: str | None = None, rate_hz: float | None = Non
 def _find_signals(files: dict[str, Path]) -> dict[str, tuple[Path, list[str]]]:
     """Find the file and the columns of gyro and accel, the axes of which follow on a time."""
     found: dict[str, tuple[Path, list[str]]] = {}
-    for name, file in files.items():
-        if not name.lower().endswith(".csv"):
-            continue
+    for file in [file for name, file in files.items() if name.lower().endswith(".csv")][:MOST_FILES]:
         names = read_layout(file).names
         if not names or not _TIME.fullmatch(names[0].strip()):
             continue
