@@ -171,7 +171,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "recording": (*THING, None),
         "measured": LENGTHS,
         "prior": THING,
-        "protocol": (*NAME, None),
+        "protocol": NAME,
         "method": (*NAME, None),
         "measured_std": (*POSITIVE, None),
         "formulation": (*NAME, None),

@@ -391,7 +391,7 @@ def load_subject(path: str | Path) -> Subject:
     --------
     >>> subject = wp.load_subject("subject.toml")
     >>> round(subject.lengths["shoulder_width"], 2)  # [m]
-    0.37
+    0.33
     """
     check_arguments(load_subject, locals())
     path = Path(path)

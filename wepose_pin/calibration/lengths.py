@@ -129,7 +129,7 @@ def calibrate(
 
     Examples
     --------
-    >>> calibration = wp.calibrate(recording, measured={"shoulder_width": 0.372})
+    >>> calibration = wp.calibrate(recording, measured={"shoulder_width": 0.33})
     >>> calibration.quality.quality
     'poor'
     >>> [diagnostic.code for diagnostic in calibration.diagnostics]
@@ -140,7 +140,7 @@ def calibrate(
     check_arguments(calibrate, locals())
     check_method(method)
     if not isinstance(protocol, Protocol):
-        protocol = load_protocol(protocol or choose_protocol(recording.phases))
+        protocol = load_protocol(choose_protocol(recording.phases) if protocol is None else protocol)
     if not isinstance(model, BodyModel):
         model = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
     table = model.table
