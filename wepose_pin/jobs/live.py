@@ -191,7 +191,8 @@ def run_live(
     tell(model.diagnostics)
     outputs: list[Output] = list(views)
     robot: RobotOutput | None = None
-    record, page = job.record, _open_page(job, model, setup.name, say, tell)
+    title = job.out.absolute().name if job.out is not None else setup.name
+    record, page = job.record, _open_page(job, model, title, say, tell)
     if page is not None:
         outputs.insert(0, page)
     try:

@@ -230,6 +230,8 @@ class CalibrationStep(Step):
             "poor": "The calibration can be used, and more motion makes it better.",
             "fail": "This calibration must not be used.",
         }[quality.quality]
+        if quality.quality == "poor" and all(reason.code.startswith("scale-") for reason in quality.reasons):
+            sentence = "The proportions are good. One measured length gives the scale too."
         if self._moved:
             sentence = "Some sensors sit on other segments than assigned."
         return GuideView(
