@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from guided_person import RATE_HZ, GuidedPerson, PersonSource, perform
 
-from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate_lengths, load_protocol
+from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, load_protocol
 from wepose_pin.errors import BadSession
 from wepose_pin.live.assignment import AssignedSource, ShakeDetector, read_segments, write_segments
 from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
@@ -41,7 +41,7 @@ class Moment(NamedTuple):
 
 
 def calibrate_recording(recording: Recording, measured: Mapping[str, float]) -> tuple[Calibration, CalibrationQuality]:
-    calibration = calibrate_lengths(recording, measured=measured)
+    calibration = calibrate(recording, measured=measured)
     return calibration, assess(calibration)
 
 
@@ -50,7 +50,7 @@ def make_options(folder: Path, known: Mapping[str, str] | None = None) -> GuideO
     protocol, model = load_protocol("clasp"), load_model()
     steps = tuple(replace(step, seconds=CLASP_S) if step.phase == "clasp" else step for step in protocol.steps)
 
-    def calibrate(path: Path, measured: Mapping[str, float]) -> Calibrated:
+    def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
         return Calibrated(*calibrate_recording(load_session(path), {**MEASURED, **measured}), folder)
 
     def estimate(_: Recording) -> tuple[Calibration, CalibrationQuality]:
@@ -63,7 +63,7 @@ def make_options(folder: Path, known: Mapping[str, str] | None = None) -> GuideO
         SensorSetup(remounted=True),
         tuple(model.table.segments),
         depth,
-        calibrate,
+        calibrate_file,
         estimate,
         "amekf",
         known or {},

@@ -17,7 +17,7 @@ import pytest
 from browser import BROWSER, Browser
 from guided_person import GuidedPerson, UdpPerson, perform
 
-from wepose_pin.calibration import calibrate_lengths
+from wepose_pin.calibration import calibrate
 from wepose_pin.readers import load_session
 from wepose_pin.subject import load_subject
 
@@ -129,7 +129,7 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
     assert "anna/session-1.wepose" in out
     # The subject that tracking used is that of the offline calibration of the same samples.
     recording = load_session(tmp_path / "anna" / "calibration-1.wepose")
-    offline = calibrate_lengths(recording, measured={"shoulder_width": LENGTHS["shoulder_width"]}).subject
+    offline = calibrate(recording, measured={"shoulder_width": LENGTHS["shoulder_width"]}).subject
     saved = load_subject(tmp_path / "anna")
     for name, metres in offline.lengths.items():
         assert saved.lengths[name] == pytest.approx(metres, abs=1e-6)

@@ -98,7 +98,7 @@ def _with_subject(setup: SensorSetup, folder: Path) -> SensorSetup:
 
 def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyModel) -> GuideOptions:
     """What the guide does, by the functions that `wepose calibrate` calls too."""
-    from ..calibration import assess, calibrate_lengths, load_protocol
+    from ..calibration import assess, calibrate, load_protocol
     from ..live.assignment import read_segments
     from ..live.guide import Calibrated, GuideOptions
     from ..readers.subject import read_subject
@@ -108,7 +108,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
     prior = read_subject(job.subject) if job.subject else population_subject(job.stature, None, model)
     order = tuple(model.table.segments)
 
-    def calibrate(path: Path, measured: Mapping[str, float]) -> Calibrated:
+    def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
         out = path.with_suffix("")
         calibration = CalibrateJob(
             path,
@@ -124,7 +124,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
         return Calibrated(outcome.calibration, outcome.quality, out)
 
     def estimate(recording: Recording) -> tuple[Calibration, CalibrationQuality]:
-        calibration = calibrate_lengths(
+        calibration = calibrate(
             recording,
             measured=dict(job.measured),
             prior=prior,
@@ -140,7 +140,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
         replace(setup, remounted=True),
         order,
         {name: _depth(model, name) for name in order},
-        calibrate,
+        calibrate_file,
         estimate,
         job.method,
         {} if job.setup is None else read_segments(job.setup, order),
