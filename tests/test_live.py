@@ -123,6 +123,46 @@ def live(
     return loop.run()
 
 
+def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Recording, tmp_path: Path) -> None:
+    file = tmp_path / "a.wepose"
+    keys = [(9.0, "take"), (12.0, "mark trial 3"), (15.0, "take"), (16.0, "begin clasp"), (17.0, "begin clasp")]
+    keys += [(18.0, "end clasp"), (19.0, "end clasp"), (20.0, "take"), (21.0, "mark "), (22.0, "nonsense")]
+    names = tuple(recording.sensors)
+    arrivals = [(float(t), single(recording, name, k)) for k, t in enumerate(recording.time) for name in names]
+    source = Chaos(recording, arrivals)
+    watcher = Watcher(keys)
+    live(recording, file, source, watcher)
+    log = read_live_log(file)
+    phases = log.recording.phases
+    end = log.recording.time[-1]
+    # What is marked is marked at the newest tick; the last take was not ended.
+    for name, spans in {"take_1": [(9.0, 15.0)], "clasp": [(16.0, 18.0)], "take_2": [(20.0, end)]}.items():
+        np.testing.assert_allclose(phases[name], spans, atol=0.15)
+    assert [(round(marker.time), marker.text) for marker in log.texts] == [(12, "trial 3")]
+    assert {status.open_phases for status in watcher.statuses} == {(), ("take_1",), ("clasp",), ("take_2",)}
+    # Without a recording the first take begins one, which is as one from the beginning.
+    late = tmp_path / "late.wepose"
+    setup = SensorSetup.from_recording(recording)
+    header = setup.header(tuple(recording.sensors)) | {"method": "amekf"}
+    source = Chaos(recording, arrivals)
+    watcher = Watcher([(8.0, "r"), (9.0, "mark too early"), (10.0, "take"), (11.0, "take")])
+    LiveLoop(
+        source, setup, begin=float(recording.time[0]), outputs=[watcher], open_log=lambda: LiveLog(late, header)
+    ).run()
+    again = read_live_log(late)
+    assert again.recording.resets
+    assert again.texts == ()
+    assert len(again.recording) == len(log.recording)
+    tracked = track(again.recording, causal=True)
+    poses = np.stack([tracked.quat_WL[name] for name in again.header["sensors"]], axis=1)
+    first_row = again.first - (len(again.recording) - len(tracked.time))
+    assert np.array_equal(poses[first_row : first_row + len(again.quat_WL)], again.quat_WL)
+    assert 9.5 < again.recording.time[again.first] < 10.5
+    # They change no pose.
+    live(recording, tmp_path / "b.wepose")
+    assert np.array_equal(log.quat_WL, read_live_log(tmp_path / "b.wepose").quat_WL)
+
+
 @pytest.mark.parametrize("method", ["amekf", "smekf", "ncf"])
 def test_live_its_file_and_causal_tracking_give_the_same_bits(
     recording: Recording, tmp_path: Path, method: str

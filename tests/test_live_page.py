@@ -8,6 +8,7 @@ import http.client
 import json
 import math
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from browser import BROWSER, Browser, pixels
 from scipy.spatial.transform import Rotation
@@ -27,11 +29,22 @@ from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from wepose_pin.errors import BadOption
 from wepose_pin.kinematics import LiveKinematics, compute_link_placements, solve_configuration
-from wepose_pin.live.encoder import PoseEncoder
+from wepose_pin.live import server
+from wepose_pin.live.encoder import AngleCurves, PoseEncoder, RobotFigure
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.server import status_json
-from wepose_pin.live.state import LivePose, SensorStatus, Status, StreamInfo
+from wepose_pin.live.state import (
+    GuideAction,
+    GuideStep,
+    GuideView,
+    LengthEstimate,
+    LivePose,
+    SensorStatus,
+    Status,
+    StreamInfo,
+)
 from wepose_pin.model import BodyModel, load_model
+from wepose_pin.retargeting import find_map, load_robot
 
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 NARROW = "document.documentElement.scrollWidth <= innerWidth"
@@ -136,8 +149,47 @@ def test_status_is_json_whatever_is_not_known(person: Person) -> None:
     assert sent["sensors"][0] | {"bias_deg_s": 0} == {
         "segment": "torso", "rate_hz": 99.8, "lost": True, "static": True, "bias_deg_s": 0, "heading_std_deg": None,
         "heading_age_s": 3.0, "missing": 1, "late": 2, "duplicate": 3, "frozen": False,
+        "battery": None,
     }  # fmt: skip
     assert sent["sensors"][0]["bias_deg_s"] == [0.11459, -0.28648, 0.0]
+
+
+def test_what_the_guide_says_is_json(person: Person) -> None:
+    view = GuideView(
+        "Shake it.",
+        countdown=2.34,
+        steps=(GuideStep("sensors", "Sensors", "done"), GuideStep("assignment", "Segments", "now")),
+        actions=(GuideAction("again", "Once more", "a"),),
+        lengths=(LengthEstimate("left_forearm", 0.2512, math.nan),),
+        sample_size=(4.26, 12.0),
+    )
+    sent = json.loads(status_json(person.status("guide")._replace(guide=view, open_phases=("take_1",))))
+    assert sent["open_phases"] == ["take_1"]
+    guide = sent["guide"]
+    assert (guide["sentence"], guide["countdown"], guide["remaining"]) == ("Shake it.", 2.3, None)
+    assert guide["lengths"] == [{"name": "left_forearm", "mm": 251.0, "std_mm": None}]
+    assert guide["sample_size"] == [4.3, 12.0]
+    assert guide["actions"] == [{"name": "again", "label": "Once more", "key": "a"}]
+    assert json.loads(status_json(person.status()))["guide"] is None
+
+
+def test_joint_angles_are_those_of_the_poses(person: Person) -> None:
+    curves = AngleCurves(person.info.segments)
+    assert curves.take() is None
+    poses = [person.pose(0.01 * k) for k in range(60)]
+    for pose in poses:
+        curves.push(pose)
+    taken = curves.take()
+    assert taken is not None
+    assert curves.take() is None
+    kept = [pose for pose in poses if round(pose.time, 3) in taken["time"]]
+    assert len(kept) == len(taken["time"]) == 12  # of 100 Hz
+    flexion = [
+        math.degrees((Rotation.from_quat(p.quat_WL[3]).inv() * Rotation.from_quat(p.quat_WL[4])).magnitude())
+        for p in kept
+    ]
+    np.testing.assert_allclose(taken["joints"]["right_elbow"]["flexion"], flexion, atol=0.06)
+    assert AngleCurves(("head",)).take() is None
 
 
 # The server ---------------------------------------------------------------------------------------------------------
@@ -237,6 +289,52 @@ def talk(page: LivePage, do: Callable[[WebSocketClientConnection], Awaitable[Any
     return asyncio.run(connected())
 
 
+def test_another_address_than_loopback_needs_the_token(model: BodyModel) -> None:
+    with LivePage(model, host="127.0.0.2") as page:
+        address, _, token = page.url.partition("?token=")
+        assert len(token) > 20
+        for wrong in ("", "?token=", f"?token={token[:-1]}", f"?other={token}"):
+            for path in ("", "stream"):
+                code, _, text = get(f"{address}{path}{wrong}")
+                assert (code, text) == (403, "The address of this page has a token, as the terminal shows it.")
+        assert get(page.url)[0] == 200
+        assert get(f"{address}?token={token}", Origin="http://evil.example")[0] == 403
+
+
+def test_another_body_is_another_page(page: LivePage, person: Person, model: BodyModel) -> None:
+    robot = load_robot(find_map("ur5"))
+    first = get(page.url)[2]
+
+    async def watch(connection: WebSocketClientConnection) -> None:
+        before = json.loads(await taken(connection))["id"]
+        page.set_body(model, RobotFigure(robot, model, lambda: None))
+        while True:
+            message = await taken(connection)
+            if isinstance(message, str) and "id" in json.loads(message):
+                assert json.loads(message)["id"] != before
+                return
+
+    talk(page, watch)
+    second = get(page.url)[2]
+    pattern = r'<script id="wepose-data" type="application/json">(.*?)</script>'
+    links = [json.loads(re.findall(pattern, text, re.DOTALL)[0])["links"] for text in (first, second)]
+    assert [link for link in links[1] if link.startswith("robot ")] == links[1][len(links[0]) :] != []
+    # A frame has the links of both, and the robot stands in its rest posture beside the person.
+    encoder = PoseEncoder(model, RobotFigure(robot, model, lambda: None))
+    encoder.start(person.info)
+    n = len(links[1])
+    frame = encoder.encode(person.pose(0.2))
+    assert len(frame) == 8 + 4 * (12 * n + 6) + n
+    rows = np.frombuffer(frame, "<f4", 12 * n, 8).reshape(n, 12)[len(links[0]) :]
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, robot.configuration(robot.rest))
+    joints = [int(link.removeprefix("robot ")) for link in links[1][len(links[0]) :]]
+    for a, b in ((0, -1), (0, 1)):
+        seen = np.linalg.norm(rows[a, 9:] - rows[b, 9:])
+        true = np.linalg.norm(data.oMi[joints[a]].translation - data.oMi[joints[b]].translation)
+        assert seen == pytest.approx(true, abs=1e-6)
+
+
 async def taken(connection: WebSocketClientConnection) -> Any:
     message = await asyncio.wait_for(connection.read_message(), 10.0)
     await connection.write_message("taken")
@@ -260,7 +358,10 @@ def test_a_foreign_origin_gets_no_poses(page: LivePage) -> None:
         connection.close()
 
 
-def test_who_does_not_take_gets_no_more_and_then_the_newest(page: LivePage, person: Person, model: BodyModel) -> None:
+def test_who_does_not_take_gets_no_more_and_then_the_newest(
+    page: LivePage, person: Person, model: BodyModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "CURVES_S", 1e9)  # no joint angles between the frames
     page.start(person.info)
 
     async def slow(connection: WebSocketClientConnection) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -72,6 +72,12 @@ class Pose:
         return format_object(
             self, lambda: f"{len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points"
         )
+
+    def cut(self, span: slice) -> Pose:
+        """Return the pose of a span of samples."""
+        series = ("quat_WL", "points", "segment_cov", "point_cov", "gap", "joints")
+        parts = {name: {key: rows[span] for key, rows in getattr(self, name).items()} for name in series}
+        return replace(self, time=self.time[span], q=None if self.q is None else self.q[span], **parts)
 
     def check(self) -> Pose:
         """Check all fields and return the pose. NaN stands for missing values.

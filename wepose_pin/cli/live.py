@@ -21,16 +21,19 @@ def run(job: LiveJob) -> int:
 
     outcome = run_live(job, views=[TerminalView()], stop=stop_requests(), say=say, tell=print_diagnostics)
     session = outcome.session
+    if session is None:
+        say("The guided session was ended before a calibration was accepted.")
+        return 0
     print_diagnostics(session.diagnostics)
     _print_session(session)
     if outcome.robot is not None:
         _print_robot(outcome.robot)
     if session.problem:
         reason = {"reason": session.problem}
-        print_diagnostics([Diagnostic("live-recording-incomplete", WARNING, str(job.record), facts=reason)])
-    elif job.record is not None:
-        again = f"  (wepose track {job.record} -o DIR gives these poses again)" if session.poses else ""
-        say(f"Recorded: {job.record}{again}")
+        print_diagnostics([Diagnostic("live-recording-incomplete", WARNING, str(session.record), facts=reason)])
+    elif session.record is not None:
+        again = f"  (wepose track {session.record} -o DIR gives these poses again)" if session.poses else ""
+        say(f"Recorded: {session.record}{again}")
     return 0
 
 

@@ -35,6 +35,9 @@ class ExportJob:
         angles of the International Society of Biomechanics (isb). Without it opensim.
     rate_hz : HZ
         Resample the motion at this rate.
+    phase : NAME
+        Write only this phase of the recording, such as take_1. Where it has several intervals, from the first to the
+        last.
     force
         Replace an existing file.
     """
@@ -44,6 +47,7 @@ class ExportJob:
     format: str | None = None
     names: Literal["opensim", "isb"] | None = None
     rate_hz: float | None = None
+    phase: str | None = None
     force: bool = False
 
     def check(self) -> None:
@@ -81,6 +85,7 @@ def run_export(
         job.format,
         names=job.names,
         rate_hz=job.rate_hz,
+        phase=job.phase,
         force=job.force,
         provenance=provenance or None,
     )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,8 +14,11 @@ from ..errors import BadOption
 from . import Arms, LiveMethod, arm_sides
 
 if TYPE_CHECKING:
-    from ..live import Output, SessionSummary
+    from ..live import Output, SensorSetup, SessionSummary
+    from ..live.page import LivePage
     from ..live.robot import RobotOutput, RobotSummary
+    from ..live.sources.base import Source
+    from ..model import BodyModel
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,20 @@ class LiveJob:
     ----------
     source : SOURCE
         Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME or mti:DEVICE=SEGMENT,... (docs/live-sources.md).
+    guide
+        Lead through the calibration first: which sensor sits where, the start pose, the motion, its quality (docs/
+        live-guide.md). Needs no subject and no session.
+    out : DIR
+        With --guide: write subject, recordings and the sensors' setup to this folder. Without it to a new folder
+        named by the date.
+    protocol : NAME|FILE.toml
+        With --guide: calibrate by this protocol, as `wepose calibrate`.
+    measured : NAME=METRES
+        With --guide: use this measured length, such as shoulder_width=0.385; may be given several times.
+    stature : METRES
+        With --guide: narrow the population prior to people of this body height.
+    setup : DIR
+        Take from this folder, of an earlier --guide, which sensor sits on which segment.
     subject : SUBJECT
         Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
         Without it lengths are those of the population prior, and mounts those that --session states.
@@ -37,7 +55,8 @@ class LiveJob:
     session : SESSION
         Take the mounts of the sensors from this session file; its data are not read.
     record : FILE
-        Write all that is received and the poses to this file; `wepose track FILE` gives the same poses again.
+        Write all that is received and the poses to this file; `wepose track FILE` gives the same poses again. Without
+        it the first take (T) begins such a file, which holds what came before too.
     method
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smekf (Kalman filter of
         Lisini Baldi et al. 2019, corrected in static phases), ncf (complementary filter, Mahony et al. 2008), gdc
@@ -51,6 +70,9 @@ class LiveJob:
         Serve the page that shows the pose (which only this machine can open).
     open
         Open the page in the browser.
+    host : ADDRESS
+        Serve the page on this address of this machine, as 0.0.0.0 for all, to open it on a phone. Its URL then holds a
+        token, without which nobody gets it. Without it this machine alone can open the page.
     port : PORT
         Serve the page at this port; 0 takes any that is free.
     udp : [HOST:]PORT
@@ -77,6 +99,12 @@ class LiveJob:
     """
 
     source: str
+    guide: bool = False
+    out: Path | None = None
+    protocol: str = "clasp"
+    measured: Mapping[str, float] = field(default_factory=dict)
+    stature: float | None = None
+    setup: Path | None = None
     subject: Path | None = None
     accept_failed: bool = False
     session: Path | None = None
@@ -86,6 +114,7 @@ class LiveJob:
     speed: str = "1"
     page: bool = True
     open: bool = True
+    host: str | None = None
     port: int = 0
     udp: str | None = None
     lsl: str | None = None
@@ -99,7 +128,11 @@ class LiveJob:
     force: bool = False
 
     def check(self) -> None:
-        """Raise `BadOption` where an option of the robot is given without one."""
+        """Raise `BadOption` where an option of the robot or the guide is given without one."""
+        guided = {"out": self.out, "measured": self.measured or None, "stature": self.stature}
+        for option, given in guided.items():
+            if given is not None and not self.guide:
+                raise BadOption(f"--{option}: goes with --guide, which is not given")
         for option, value in (("arm", self.arm), ("map", self.map), ("to", self.to)):
             if value is not None and self.robot is None:
                 raise BadOption(f"--{option} {value}: goes with --robot, which is not given")
@@ -113,7 +146,7 @@ class LiveJob:
 class LiveOutcome(NamedTuple):
     """Outcome of a `LiveJob`."""
 
-    session: SessionSummary
+    session: SessionSummary | None  # None: the guided session was ended before tracking
     robot: RobotSummary | None
 
 
@@ -145,6 +178,7 @@ def run_live(
     job.check()
     if job.subject is not None and not job.accept_failed:
         load_subject(job.subject).check_quality()
+    setup: SensorSetup
     stated = None if job.session is None else find_setup(None, job.subject, job.session)
     if job.replays:
         source = open_source(job.source, speed=job.speed)
@@ -153,52 +187,40 @@ def run_live(
     else:
         setup = stated or find_setup(None, job.subject, None)
         model = build_subject_model(setup, job.model)
-        sensors, segments = list(setup.mounts), list(model.table.segments)
-        source = open_source(job.source, sensors=sensors or None, segments=segments)
+        source = _open_stream(job, setup, model)
     tell(model.diagnostics)
-    outputs: list[Output] = []
+    outputs: list[Output] = list(views)
     robot: RobotOutput | None = None
+    title = job.out.absolute().name if job.out is not None else setup.name
+    record, page = job.record, _open_page(job, model, title, say, tell)
+    if page is not None:
+        outputs.insert(0, page)
     try:
-        if job.robot is not None:
-            from ..live.robot import PORT, RobotOptions, connect_robot
-            from ..retargeting.stream import StreamOptions
-
-            timing = StreamOptions(job.robot_hz, job.hold_after, job.stop_after)
-            options = RobotOptions(job.robot, arm_sides(job.arm), job.map, job.to or str(PORT), timing)
-            speed = float(job.speed.replace("max", "inf")) if job.replays else 1.0
-            robot, source = connect_robot(options, source, setup, speed, model.table)
-            outputs.append(robot)
-        if job.udp is not None:
-            from ..live.outputs import UdpOutput
-
-            outputs.append(UdpOutput(job.udp))
-        if job.lsl is not None:
-            from ..live.outputs import LslOutput
-
-            outputs.append(LslOutput(job.lsl))
-        if job.page:
-            from ..live.page import LivePage
-
-            page = LivePage(model, port=job.port, title=setup.name)
-            page.open()
-            outputs.append(_add_robot_status(page, robot))
-            say(f"Page: {page.url}  (this machine only)")
-            if job.open:
-                import webbrowser
-
-                if not webbrowser.open(page.url):
-                    tell([Diagnostic("browser-not-started", INFO)])
-        outputs += [_add_robot_status(view, robot) for view in views]
-        if robot is not None:
-            warm_up(job.method)  # compiles before commands are due
-            robot.open()
         with stop or contextlib.nullcontext(lambda: False) as until:
+            if job.guide:
+                from .guide import run_guide
+
+                guided = run_guide(job, source, setup, model, outputs, until)
+                if guided is None:
+                    return LiveOutcome(None, None)
+                source, setup, record = guided.source, guided.setup, record or _name_recording(guided.folder)
+                model = build_subject_model(setup, job.model, source.sensors)
+            if job.robot is not None:
+                robot, source = _connect_robot(job, source, setup, model)
+            if page is not None and (job.guide or robot is not None):
+                page.set_body(model, None if robot is None else robot.figure(model))
+            if robot is not None:
+                outputs = [robot, *(_add_robot_status(view, robot) for view in outputs)]
+            outputs += _open_senders(job)
+            if robot is not None:
+                warm_up(job.method)  # compiles before commands are due
+                robot.open()
             summary = run_session(
                 source,
                 setup,
                 method=job.method,
                 model=model,
-                record=job.record,
+                record=record,
                 force=job.force,
                 outputs=outputs,
                 until=until,
@@ -207,6 +229,77 @@ def run_live(
         for output in outputs:
             output.close()
     return LiveOutcome(summary, None if robot is None else robot.summary())
+
+
+def _open_stream(job: LiveJob, setup: SensorSetup, model: BodyModel) -> Source:
+    """The source of a stream, not yet opened; with the segments of --setup."""
+    from ..live import open_source
+    from ..live.assignment import AssignedSource, read_segments
+
+    sensors, segments = list(setup.mounts), list(model.table.segments)
+    if job.guide:
+        return open_source(job.source, segments=segments, any_name=True)
+    if job.setup is None:
+        return open_source(job.source, sensors=sensors or None, segments=segments)
+    assigned = read_segments(job.setup, segments)
+    source = open_source(job.source, sensors=list(assigned), segments=list(assigned))
+    return AssignedSource(source, assigned, segments)
+
+
+def _open_page(
+    job: LiveJob, model: BodyModel, title: str, say: Callable[[str], None], tell: Callable[[Sequence[Diagnostic]], None]
+) -> LivePage | None:
+    """Serve the page, and say where; None where it is not wanted."""
+    if not job.page:
+        return None
+    from ..live.addresses import LOOPBACK
+    from ..live.page import LivePage
+
+    page = LivePage(model, host=job.host or LOOPBACK, port=job.port, title=title)
+    page.open()
+    if "token=" in page.url:
+        say(f"Page: {page.url}")
+        say(f"Whoever reaches this machine at {job.host} and has this address can watch and press the page's buttons.")
+    else:
+        say(f"Page: {page.url}  (this machine only)")
+    if job.open:
+        import webbrowser
+
+        if not webbrowser.open(page.url):
+            tell([Diagnostic("browser-not-started", INFO)])
+    return page
+
+
+def _connect_robot(job: LiveJob, source: Source, setup: SensorSetup, model: BodyModel) -> tuple[RobotOutput, Source]:
+    """The robot's output, and the source as it needs it."""
+    from ..live.robot import PORT, RobotOptions, connect_robot
+    from ..retargeting.stream import StreamOptions
+
+    assert job.robot is not None
+    timing = StreamOptions(job.robot_hz, job.hold_after, job.stop_after)
+    options = RobotOptions(job.robot, arm_sides(job.arm), job.map, job.to or str(PORT), timing)
+    speed = float(job.speed.replace("max", "inf")) if job.replays else 1.0
+    return connect_robot(options, source, setup, speed, model.table)
+
+
+def _open_senders(job: LiveJob) -> list[Output]:
+    """Outputs for other programs."""
+    senders: list[Output] = []
+    if job.udp is not None:
+        from ..live.outputs import UdpOutput
+
+        senders.append(UdpOutput(job.udp))
+    if job.lsl is not None:
+        from ..live.outputs import LslOutput
+
+        senders.append(LslOutput(job.lsl))
+    return senders
+
+
+def _name_recording(folder: Path) -> Path:
+    """A file in the folder that is not there yet."""
+    number = next(n for n in itertools.count(1) if not (folder / f"session-{n}.wepose").exists())
+    return folder / f"session-{number}.wepose"
 
 
 def _add_robot_status(view: Output, robot: RobotOutput | None) -> Output:

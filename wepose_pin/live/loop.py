@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,18 +19,16 @@ from ..model import BodyModel, load_table
 from ..model.body import load_sensed_model
 from ..model.start_pose import compute_start_configuration
 from ..model.table import NEUTRAL_POSE
-from ..readers.live_log import build_recording
+from ..readers.live_log import LONGEST_TEXT, build_recording
 from ..recording import ImuSensor, Recording
 from ..recording.arrivals import (
     COUNTS,
     CUT_OFF,
     DUPLICATE,
-    JUMP_S,
     LATE,
     MISSING,
     TAKEN,
     WAIT_S,
-    Arrivals,
     Samples,
     StreamSynchronizer,
     Ticks,
@@ -42,17 +40,15 @@ from ..tracking.causal import CausalSegmentEstimator
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
 from .setup import SensorSetup
-from .sources.base import Source
+from .sources.base import Source, find_batteries
 from .state import LivePose, Output, SensorStatus, Status, StreamInfo, join_names
+from .ticks import TickStream
 
 STATUS_PERIOD_S = 0.2  # [s]
 READ_TIMEOUT_S = 0.05  # [s]; keys and the status wait for a read
-RATE_MEASUREMENT_S = 1.0  # [s] over which the rate is measured if the source does not know it
-MAX_ABSENCE_S = 3.0  # [s] after which ticks begin without a sensor that has sent nothing
 MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
 MAX_LATENCIES = 1000  # newest latencies in the status
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
-DEFAULT_RATE_HZ = 100.0  # where none can be measured
 START_POSES = {NEUTRAL_POSE: "Stand upright and still, arms hanging, palms to the thighs"}  # what to tell a person
 
 
@@ -88,6 +84,7 @@ class SessionSummary(NamedTuple):
     latency: Latencies  # of every tick: [s] from its time to its pose
     diagnostics: tuple[Diagnostic, ...]
     problem: str  # of the recording; empty where it is complete
+    record: Path | None  # the recording
 
 
 class StartPoseSearch:
@@ -129,6 +126,7 @@ class LiveLoop:
     source : an open source; `run` closes it
     model : a body; None: that of the setup, with the subject's lengths
     log : the recording; `run` closes it
+    open_log : opens a recording when the person begins a take and there is none; None: there is none then
     begin : time [s] of the first tick; None: when every sensor has sent a sample
 
     Raises
@@ -145,11 +143,13 @@ class LiveLoop:
         method: str = BEST,
         model: BodyModel | str | Path | None = None,
         log: LiveLog | None = None,
+        open_log: Callable[[], LiveLog] | None = None,
         outputs: Sequence[Output] = (),
         begin: float | None = None,
         wait_s: float = WAIT_S,
     ) -> None:
         self.source, self.method, self.log, self.outputs = source, method, log, tuple(outputs)
+        self._open_log = open_log
         self.setup = setup.as_recorded()
         self.model = build_subject_model(setup, model, source.sensors)
         self.model.table.check_segments(source.sensors, f"{setup.name}: sensors.", BadSession)
@@ -158,17 +158,18 @@ class LiveLoop:
         self._instruction = START_POSES.get(setup.start_pose, f"Hold still in the start pose, {setup.start_pose}")
         if self.model.table.is_mechanism:
             self._instruction = f"{self.model.table.name} must stand still in its start configuration"
-        self._begin, self._wait_s = begin, wait_s
+        self._stream = TickStream(source.sensors, source.rate_hz, begin, wait_s, log)
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
         self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
-        self._waiting: list[Arrivals] = []
-        self._newest_times = dict.fromkeys(source.sensors, -np.inf)
         self._heading_reset_time = 0.0
         self._std, self._std_interval_ticks = np.full(len(source.sensors), np.nan), 1
         self._latency = Latencies()
         self._recent_latencies: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s] of displayed poses
         self._first_pose = self._last_pose = 0.0
         self._count_history: deque[tuple[float, np.ndarray]] = deque(maxlen=round(1.0 / STATUS_PERIOD_S) + 1)
+        self._events: list[tuple[str, dict[str, Any]]] = []  # that decide poses
+        self._open_phases: list[str] = []
+        self._takes = 0
         self._ended = False
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> SessionSummary:
@@ -180,7 +181,8 @@ class LiveLoop:
                 if samples is None:
                     break
                 self._process_samples(samples)
-                self._flush_log()
+                if self.log is not None:
+                    self.log.due()
                 if not self._handle_keys():
                     break
                 if time.monotonic() >= next_status:
@@ -200,54 +202,24 @@ class LiveLoop:
 
     def _process_samples(self, samples: list[Samples]) -> None:
         """Record the samples of one read, track the ticks that they complete, and show the last pose."""
-        samples = [chunk for chunk in samples if len(chunk.time)]
-        if not samples:
-            return
-        for chunk in samples:
-            self._newest_times[chunk.sensor] = max(self._newest_times[chunk.sensor], float(chunk.time[-1]))
-        arrivals = order_arrivals(samples, self.source.sensors)
-        if self.log is not None:
-            self.log.samples(arrivals)
-        if self._start_search is None:
-            self._waiting.append(arrivals)
-            self._begin_ticks()
-            return
         pose = None
-        for ticks in self._start_search.synchronizer.iterate_ticks(arrivals):
-            pose = self._track_ticks(ticks, self._start_search) or pose
-            self._flush_log()
+        for ticks in self._stream.push(samples):
+            pose = self._track_ticks(ticks, self._begin_search()) or pose
+        if self._stream.synchronizer is not None:
+            self._begin_search()
         if pose is not None:
             for output in self.outputs:
                 output.show(pose)
 
-    def _flush_log(self) -> None:
-        if self.log is not None:
-            self.log.due()
-
-    def _begin_ticks(self) -> None:
-        """Begin the ticks once every sensor has sent a sample and the rate is known."""
-        sensor, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])
-        times = {int(i): time_s[sensor == i] for i in np.unique(sensor)}
-        first = np.array([float(sensor_times[0]) for sensor_times in times.values()])
-        newest = max(self._newest_times.values())
-        if len(first) < len(self.source.sensors) and newest - first.min() < MAX_ABSENCE_S:
-            return
-        rate = self.source.rate_hz
-        if rate is None:
-            if newest - first.max() < RATE_MEASUREMENT_S:
-                return
-            rate = _measure_rate(list(times.values()))
-        # A time-stamp outlier must not put all other sensors before the beginning.
-        begin = self._begin if self._begin is not None else float(first[first < np.median(first) + JUMP_S].max())
-        synchronizer = StreamSynchronizer(self.source.sensors, rate, begin, self._wait_s)
-        stated = next(iter(self.setup.phases.get("start", ())), None)
-        self._start_search = StartPoseSearch(synchronizer, len(self.source.sensors), stated)
-        self._std_interval_ticks = max(1, round(STATUS_PERIOD_S * rate))
-        if self.log is not None:
-            self.log.event("clock", rate_hz=rate, begin=begin, wait_s=self._wait_s)
-        waiting, self._waiting = self._waiting, []
-        for arrivals in waiting:
-            self._track_ticks(synchronizer.push(arrivals), self._start_search)
+    def _begin_search(self) -> StartPoseSearch:
+        """The search of the start pose, which begins with the ticks."""
+        synchronizer = self._stream.synchronizer
+        if self._start_search is None:
+            assert synchronizer is not None
+            stated = next(iter(self.setup.phases.get("start", ())), None)
+            self._start_search = StartPoseSearch(synchronizer, len(self.source.sensors), stated)
+            self._std_interval_ticks = max(1, round(STATUS_PERIOD_S * synchronizer.rate_hz))
+        return self._start_search
 
     # Ticks to poses --------------------------------------------------------------------------------------------------
 
@@ -290,8 +262,7 @@ class LiveLoop:
         tracker.push(recording)
         search.ticks = []
         self._first_pose = self._heading_reset_time = float(recording.time[-1])
-        if self.log is not None:
-            self.log.event("start", begin=begin, end=end)
+        self._record_event("start", begin=begin, end=end)
         info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, rate_hz)
         for output in self.outputs:
             output.start(info)
@@ -307,9 +278,47 @@ class LiveLoop:
             if key == "r" and self._segment_estimator is not None and self._start_search is not None:
                 self._segment_estimator.reset_headings()
                 self._heading_reset_time = self._start_search.synchronizer.newest
-                if self.log is not None:
-                    self.log.event("reset", tick=self._start_search.synchronizer.next_tick)
+                self._record_event("reset", tick=self._start_search.synchronizer.next_tick)
+            self._mark(key)
         return True
+
+    def _record_event(self, kind: str, **values: Any) -> None:
+        """Record an event that decides poses, now or once a recording begins."""
+        self._events.append((kind, values))
+        if self.log is not None:
+            self.log.event(kind, **values)
+
+    def _begin_recording(self) -> None:
+        """Begin to record where nothing was recorded so far; the file holds what came before as well."""
+        if self._open_log is None or self._stream.history is None or self._segment_estimator is None:
+            return
+        self.log = self._open_log()
+        self._stream.record(self.log)
+        for kind, values in self._events:
+            self.log.event(kind, **values)
+
+    def _mark(self, key: str) -> None:
+        """Mark in the recording what a key asks for: "mark TEXT", "begin PHASE", "end PHASE", or "take"."""
+        synchronizer = self._stream.synchronizer
+        if key == "take" and self.log is None:
+            self._begin_recording()
+        if self.log is None or synchronizer is None or not synchronizer.next_tick:
+            return
+        time_s = synchronizer.begin + (synchronizer.next_tick - 1) / synchronizer.rate_hz
+        kind, _, name = key.partition(" ")
+        if key == "take":
+            takes = [phase for phase in self._open_phases if phase.startswith("take_")]
+            self._takes += not takes
+            kind, name = ("end", takes[0]) if takes else ("begin", f"take_{self._takes}")
+        name = name[:LONGEST_TEXT]
+        if kind == "mark" and name:
+            self.log.event("mark", text=name, time=time_s)
+        elif kind == "begin" and name and name not in self._open_phases:
+            self._open_phases.append(name)
+            self.log.event("begin", phase=name, time=time_s)
+        elif kind == "end" and name in self._open_phases:
+            self._open_phases.remove(name)
+            self.log.event("end", phase=name, time=time_s)
 
     def _send_status(self) -> None:
         status = self._build_status()
@@ -322,7 +331,7 @@ class LiveLoop:
         synchronizer = None if self._start_search is None else self._start_search.synchronizer
         now, k = self.source.clock(), len(sensors)
         counts, frozen = np.zeros((k, len(COUNTS)), dtype=np.int64), np.zeros(k, dtype=bool)
-        lost = np.array([now - self._newest_times[name] > MAX_SILENCE_S for name in sensors])
+        lost = np.array([now - self._stream.newest_times[name] > MAX_SILENCE_S for name in sensors])
         recorded_s = 0.0
         if synchronizer is not None:
             counts, frozen = synchronizer.counts.copy(), synchronizer.frozen.copy()
@@ -335,6 +344,7 @@ class LiveLoop:
         self._count_history.append((now, counts[:, TAKEN]))
         (first_time, first_count), (_, last_count) = self._count_history[0], self._count_history[-1]
         rates = (last_count - first_count) / (now - first_time) if now > first_time else np.zeros(k)
+        battery = find_batteries(self.source)
         latencies_ms = 1e3 * np.array(self._recent_latencies or [0.0])
         return Status(
             *self._describe_state(lost, frozen),
@@ -352,12 +362,14 @@ class LiveLoop:
                     int(counts[i, LATE]),
                     int(counts[i, DUPLICATE]),
                     bool(frozen[i]),
+                    battery.get(name, math.nan),
                 )
                 for i, name in enumerate(sensors)
             ),
             (float(np.quantile(latencies_ms, 0.5)), float(np.quantile(latencies_ms, 0.99))),
             recorded_s,
             self._count_problems(counts),
+            tuple(self._open_phases),
         )
 
     def _count_problems(self, counts: np.ndarray) -> dict[str, int]:
@@ -377,7 +389,7 @@ class LiveLoop:
         if self._segment_estimator is not None:
             return "ready", self._describe_lost(lost, frozen) or "Tracking.", 1.0
         if self._start_search is None:
-            missing_sensors = [name for name in self.source.sensors if self._newest_times[name] == -np.inf]
+            missing_sensors = [name for name in self.source.sensors if self._stream.newest_times[name] == -np.inf]
             if missing_sensors:
                 return "waiting", f"Waiting for {join_names(missing_sensors)}.", 0.0
             return "waiting", "Measuring the sampling rate.", 0.0
@@ -424,6 +436,7 @@ class LiveLoop:
             self._latency,
             () if self._segment_estimator is None else self._segment_estimator.start.diagnostics,
             "" if self.log is None else self.log.problem,
+            None if self.log is None else self.log.path,
         )
 
 
@@ -442,18 +455,6 @@ def build_subject_model(
     if setup.subject is None and chosen is not None:
         return body
     return (setup.subject or population_subject(body=body)).shape(body)
-
-
-def _measure_rate(times: Sequence[np.ndarray]) -> float:
-    """Measure the rate [Hz] of the slowest sensor from times [s] of each, rounded to 0.1 Hz."""
-    rates = []
-    for time_s in map(np.unique, times):
-        if len(time_s) > 2:
-            median = 1.0 / float(np.median(np.diff(time_s)))
-            mean = (len(time_s) - 1) / float(time_s[-1] - time_s[0])
-            # The mean is more precise unless samples are lost. For time stamps in bursts only the mean is right.
-            rates.append(mean if abs(mean / median - 1.0) < 0.05 or median > 3.0 * mean else median)
-    return max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ
 
 
 def warm_up(method: str) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -17,7 +18,7 @@ from ..kinematics import find_known_points
 from ..model import BodyModel
 from ..report.viewer import DARK, LIGHT, backdrop, choose_trail_colour, filled, find_floor, scene, view
 from .addresses import LOOPBACK
-from .encoder import PoseEncoder
+from .encoder import PoseEncoder, RobotFigure
 from .server import Server, ServerOptions
 from .state import LivePose, Output, Status, StreamInfo
 
@@ -32,7 +33,8 @@ class LivePage(Output):
     ----------
     model : the body, with its lengths
     info : where it is known before the start: what no sensor determines is then hidden from the beginning
-    host : address to listen on; another than loopback lets others in the network watch and press keys
+    host : address to listen on; another than loopback lets others in the network watch and press keys, who know the
+        token in `url`
     port : 0 for any free one
     title : shown above the body
     """
@@ -44,7 +46,10 @@ class LivePage(Output):
         if info is not None:
             self._encoder.start(info)
         identity = secrets.token_hex(8)
-        self._options = ServerOptions(_fill_page(model, self._encoder, title, identity), identity, host, port)
+        token = "" if host in (LOOPBACK, "localhost", "::1") else secrets.token_urlsafe(16)
+        self._options = ServerOptions(_fill_page(model, self._encoder, title, identity), identity, host, port, token)
+        self._title = title
+        self._demonstrated: tuple[str, ...] = ()  # segments of the demonstrated poses
         self._server: Server | None = None
         self._keys: deque[str] = deque(maxlen=MAX_KEYS)
         self.url = ""  # of an open page
@@ -62,6 +67,23 @@ class LivePage(Output):
             self._server.start()
             self.url = self._server.url
 
+    def set_body(self, model: BodyModel, robot: RobotFigure | None = None) -> None:
+        """Draw this body from now on, and a robot beside it; open browsers load the page again."""
+        identity = secrets.token_hex(8)
+        self._encoder, self._demonstrated = PoseEncoder(model, robot), ()
+        self._options = replace(
+            self._options, page=_fill_page(model, self._encoder, self._title, identity), identity=identity
+        )
+        if self._server is not None:
+            self._server.set_page(self._options, self._encoder)
+
+    def demonstrate(self, pose: LivePose, segments: tuple[str, ...]) -> None:
+        """Draw a pose of the guide."""
+        if self._demonstrated != segments:
+            self._encoder.start(StreamInfo(segments, tuple(self._encoder.points(segments)), 0.0))
+            self._demonstrated = segments
+        self._encoder.newest = pose
+
     def start(self, info: StreamInfo) -> None:
         """From now on draw only what is measured."""
         self._encoder.start(info)
@@ -69,6 +91,7 @@ class LivePage(Output):
     def show(self, pose: LivePose) -> None:
         """Take the newest pose; it is drawn when a browser is ready for it. Costs less than a microsecond."""
         self._encoder.newest = pose
+        self._encoder.angles.push(pose)
 
     def status(self, status: Status) -> None:
         if self._server is not None:
@@ -76,7 +99,8 @@ class LivePage(Output):
 
     def take_keys(self) -> list[str]:
         """Keys pressed in the page since the last call: "r" to reset the headings."""
-        return [self._keys.popleft() for _ in range(len(self._keys))]
+        keys = [self._keys.popleft() for _ in range(len(self._keys))]
+        return [key for key in keys if key != "q"]  # who watches does not end the session
 
     def close(self) -> None:
         """Tell the browsers, and stop listening. May be called twice."""
@@ -94,17 +118,20 @@ class LivePage(Output):
 
 def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str) -> str:
     """The page; its scene is the body in the N-pose, its camera sees all that the limbs can reach."""
-    links = encoder.links
-    neutral = np.frombuffer(encoder.encode(None), "<f4", 12 * len(links), offset=8).reshape(-1, 12)
-    motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(links), 1, 1)).astype("<f4")
+    links, robot = encoder.links, encoder.robot
+    body = encoder.body_links
+    neutral = np.frombuffer(encoder.encode(None), "<f4", 12 * len(body), offset=8).reshape(-1, 12)
+    motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(body), 1, 1)).astype("<f4")
     motion[:, 0, 4:] = neutral[:, 9:]
-    floor = find_floor(model)
+    floor, reach = find_floor(model), [_find_reach(model)]
+    if robot is not None:
+        reach.append(robot.points())
     data = {
         "id": identity,
         "links": list(links),
-        "scene": scene(encoder.visuals, links),
+        "scene": scene(encoder.visuals, links, () if robot is None else robot.meshes),
         "backdrops": {name: backdrop(colours, floor) for name, colours in (("light", LIGHT), ("dark", DARK))},
-        "view": view(encoder.visuals, links, motion, [_find_reach(model)]),
+        "view": view(encoder.visuals, body, motion, reach),
         "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.paths],
     }
     return filled("live/templates/live.html.j2", data, title or "wepose live")

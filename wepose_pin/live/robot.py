@@ -10,13 +10,13 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption
-from ..model import BodyTable, load_table
+from ..model import BodyModel, BodyTable, load_table
 from ..retargeting import Robot, find_map, load_robot, read_map
 from ..retargeting.stream import ArmObserver, Command, CommandStream, StreamOptions, check_segments
 from ..subject import population_subject
@@ -26,6 +26,9 @@ from .setup import SensorSetup
 from .sources.base import Source
 from .sources.replay import ReplaySource
 from .state import LivePose, Output, Status, StreamInfo, round_finite
+
+if TYPE_CHECKING:
+    from .encoder import RobotFigure
 
 FORMAT = 1
 PORT = 9002
@@ -143,6 +146,12 @@ class RobotOutput(Output):
         elif self._by_ticks and self._failure is None:
             self._finish()
         self._sender.close()
+
+    def figure(self, model: BodyModel) -> RobotFigure:
+        """The robot as the page draws it beside a person."""
+        from .encoder import RobotFigure
+
+        return RobotFigure(self.robot, model, lambda: None if self.newest is None else self.newest.u)
 
     def summary(self) -> RobotSummary:
         posed = sum(self._states.values())

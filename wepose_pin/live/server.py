@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import hashlib
+import hmac
 import json
 import math
 import re
@@ -17,13 +19,14 @@ from typing import Any
 
 from ..errors import BadOption
 from .encoder import PoseEncoder
-from .state import Status, round_finite
+from .state import GuideView, Status, round_finite
 
 FRAME_S = 1.0 / 60.0
-KEYS = ("r",)
+MAX_ACTION = 120  # letters of an action
 MAX_CLIENTS = 16
 MAX_BYTES = 256  # of a message from the page
 PING_S, PONG_S = 5.0, 4.0
+CURVES_S = 0.4  # between joint angles
 GOODBYE_S = 0.5  # that a browser has to answer when the page ends
 
 
@@ -35,12 +38,14 @@ class ServerOptions:
     ----------
     page : HTML
     identity : of this page; a browser that reconnects with another one reloads
+    token : that the address must have; empty: none is needed
     """
 
     page: str
     identity: str
     host: str
     port: int
+    token: str = ""
 
 
 class Server:
@@ -59,13 +64,10 @@ class Server:
     def __init__(self, options: ServerOptions, encoder: PoseEncoder, keys: deque[str]) -> None:
         host, port = options.host, options.port
         self.status: Status | None = None
-        self._encoder, self._keys, self._host = encoder, keys, host
+        self._encoder, self._keys, self._host, self.token = encoder, keys, host, options.token
         self._clients: set[Any] = set()
-        self.page = options.page.encode("utf-8")
-        self.hello = json.dumps({"id": options.identity})
-        scripts = re.findall(r"<script>(.*?)</script>", options.page, flags=re.DOTALL)
-        digests = [hashlib.sha256(script.encode("utf-8")).digest() for script in scripts]
-        self._scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
+        self._curves, self._curves_due = "", 0.0
+        self.set_page(options, encoder)
         if not host:  # to the system that would be every interface
             raise BadOption("the live page needs an address to listen on; 127.0.0.1 is this machine only")
         if not 0 <= port < 65536:
@@ -80,10 +82,18 @@ class Server:
             ) from None
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
+        self.url = f"http://{_name_host(host)}:{self.port}/" + (f"?token={self.token}" if self.token else "")
         self._loop = asyncio.new_event_loop()
         self._end = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="live page", daemon=True)
+
+    def set_page(self, options: ServerOptions, encoder: PoseEncoder) -> None:
+        """Serve this page from now on; browsers that show another one learn of it and load it."""
+        scripts = re.findall(r"<script>(.*?)</script>", options.page, flags=re.DOTALL)
+        digests = [hashlib.sha256(script.encode("utf-8")).digest() for script in scripts]
+        self._scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
+        self.page, self._encoder = options.page.encode("utf-8"), encoder
+        self.hello = json.dumps({"id": options.identity})
 
     def start(self) -> None:
         self._thread.start()
@@ -129,12 +139,23 @@ class Server:
         if not ready:
             return
         status, pose, measured = self.status, self._encoder.newest, self._encoder.measured
+        if self._loop.time() >= self._curves_due:
+            self._curves_due = self._loop.time() + CURVES_S
+            curves = self._encoder.angles.take()
+            self._curves = self._curves if curves is None else json.dumps({"angles": curves}, allow_nan=False)
         text = frame = None
         for client in ready:
+            if client.hello is not self.hello:  # it loads the new page
+                client.send(self.hello)
+                client.hello = self.hello
+                continue
             if status is not None and client.status is not status:
                 text = text or status_json(status)
                 client.send(text)
                 client.status = status
+            if client.curves is not self._curves:
+                client.send(self._curves)
+                client.curves = self._curves
             if client.pose is not pose or client.measured is not measured:
                 frame = frame or self._encoder.encode(pose)
                 client.send(frame)
@@ -151,7 +172,7 @@ class Server:
         self._clients.discard(client)
 
     def press_key(self, key: str) -> None:
-        if key in KEYS:
+        if key.isprintable() and 0 < len(key) <= MAX_ACTION:
             self._keys.append(key)
 
     def accepts_host(self, host: str) -> bool:
@@ -171,6 +192,10 @@ class Server:
             return False
         return True
 
+    def accepts_token(self, token: str) -> bool:
+        """Whether the address of a request has the token, where one is needed."""
+        return not self.token or hmac.compare_digest(token.encode(), self.token.encode())
+
     def content_policy(self, host: str) -> str:
         """Content-Security-Policy: the page's own scripts, connections to its own server."""
         # meshcat's viewer creates style elements when it starts and fails without them.
@@ -178,6 +203,16 @@ class Server:
             f"default-src 'none'; script-src {self._scripts}; style-src 'unsafe-inline'; img-src data:; "
             f"connect-src ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
+
+
+def _name_host(host: str) -> str:
+    """The address under which others reach `host`, as a URL has it; of "any address" that of this machine's network."""
+    if host in ("0.0.0.0", "::"):
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.socket(family, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+            probe.connect(("2001:db8::1" if ":" in host else "192.0.2.1", 9))  # sends nothing
+            host = str(probe.getsockname()[0])
+    return f"[{host}]" if ":" in host else host
 
 
 def _build_application(server: Server) -> Any:
@@ -192,6 +227,11 @@ def _build_application(server: Server) -> Any:
         elif origin is not None and origin != f"http://{host}":
             handler.set_status(403)
             handler.finish("This page speaks to itself only.")
+        elif server.token and not hmac.compare_digest(
+            handler.get_query_argument("token", "").encode(), server.token.encode()
+        ):
+            handler.set_status(403)
+            handler.finish("The address of this page has a token, as the terminal shows it.")
 
     class Page(RequestHandler):  # type: ignore[misc]
         def prepare(self) -> None:
@@ -215,6 +255,8 @@ def _build_application(server: Server) -> Any:
 
     class Stream(WebSocketHandler):  # type: ignore[misc]
         pending = 0  # messages that the browser has not drawn yet
+        curves: Any = ""  # that were sent
+        hello = ""  # that was sent: which page it shows
         status: Status | None = None
         pose: Any = ()  # that was sent; () before the first
         measured: Any = ()
@@ -227,6 +269,7 @@ def _build_application(server: Server) -> Any:
                 self.close(1013, "too many pages are open")
                 return
             self.send(server.hello)
+            self.hello = server.hello
 
         def on_message(self, message: str | bytes) -> None:
             if message == "taken":
@@ -281,12 +324,40 @@ def status_json(status: Status) -> str:
                     "late": sensor.late,
                     "duplicate": sensor.duplicate,
                     "frozen": bool(sensor.frozen),
+                    "battery": round_finite(sensor.battery, 2),
                 }
                 for sensor in status.sensors
             ],
             "latency_ms": [round_finite(latency, 2) for latency in status.latency_ms],
             "recorded_s": round_finite(status.recorded_s, 1),
             "problems": dict(status.problems),
+            "open_phases": list(status.open_phases),
+            "guide": None if status.guide is None else _guide_json(status.guide),
         },
         allow_nan=False,
     )
+
+
+def _guide_json(view: GuideView) -> dict[str, Any]:
+    """The guide's view for the page: lengths in millimetres."""
+    return {
+        "steps": [step._asdict() for step in view.steps],
+        "sentence": view.sentence,
+        "note": view.note,
+        "countdown": None if view.countdown is None else round_finite(view.countdown, 1),
+        "remaining": None if view.remaining is None else round_finite(view.remaining, 0),
+        "progress": round_finite(view.progress, 3),
+        "measurable": view.measurable,
+        "actions": [action._asdict() for action in view.actions],
+        "lengths": [
+            {
+                "name": length.name,
+                "mm": round_finite(1e3 * length.metres, 0),
+                "std_mm": round_finite(1e3 * length.std, 1),
+            }
+            for length in view.lengths
+        ],
+        "sample_size": None if view.sample_size is None else [round_finite(size, 1) for size in view.sample_size],
+        "quality": view.quality,
+        "reasons": list(view.reasons),
+    }

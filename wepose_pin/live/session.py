@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -51,6 +52,8 @@ def run_session(
 ) -> SessionSummary:
     """Open the source, track it to its end, close everything.
 
+    Without `record` the first take begins a recording in the current folder, named by date and time.
+
     Raises
     ------
     WeposeError
@@ -65,11 +68,20 @@ def run_session(
     log = None
     try:
         _check_mounts(source.sensors, setup)
+        header = setup.header(source.sensors) | {"method": method, "versions": versions()}
         if record is not None:
-            header = setup.header(source.sensors) | {"method": method, "versions": versions()}
             log = LiveLog(record, header, force)
         begin = float(source.recording.time[0]) if isinstance(source, ReplaySource) else None
-        loop = LiveLoop(source, setup, method=method, model=model, log=log, outputs=outputs, begin=begin)
+        loop = LiveLoop(
+            source,
+            setup,
+            method=method,
+            model=model,
+            log=log,
+            open_log=lambda: LiveLog(Path(time.strftime("wepose-%Y%m%d-%H%M%S.wepose")), header),
+            outputs=outputs,
+            begin=begin,
+        )
     except BaseException:
         source.close()
         if log is not None:

@@ -41,12 +41,57 @@ class SensorStatus(NamedTuple):
     late: int  # samples that came after their tick
     duplicate: int
     frozen: bool  # its values repeat bit for bit, though it has noise
+    battery: float = math.nan  # share of its charge, 0 to 1; NaN where it is not known
+
+
+class GuideAction(NamedTuple):
+    """Something that the person may ask the guide for."""
+
+    name: str
+    label: str  # of a button
+    key: str  # of a terminal
+
+
+class GuideStep(NamedTuple):
+    """A step of the guided session."""
+
+    name: str
+    title: str
+    state: str  # "done", "now", "ahead"
+
+
+class LengthEstimate(NamedTuple):
+    """A length as far as the motion so far determines it."""
+
+    name: str
+    metres: float
+    std: float  # [m]
+
+
+class GuideView(NamedTuple):
+    """What the guide tells the person."""
+
+    sentence: str  # what to do now
+    note: str = ""  # what went wrong; empty: nothing
+    countdown: float | None = None  # [s] until it begins, or until the start pose was held
+    remaining: float | None = None  # [s] of motion that are left
+    progress: float = 0.0  # 0 to 1 of this step
+    steps: tuple[GuideStep, ...] = ()
+    actions: tuple[GuideAction, ...] = ()  # the first is the usual one
+    segments: tuple[tuple[str, str], ...] = ()  # sensor, and the segment that it is assigned to or ""
+    highlight: str = ""  # segment to draw apart from the others
+    demonstration: str = ""  # phase of the protocol to draw; empty: the start pose
+    lengths: tuple[LengthEstimate, ...] = ()
+    sample_size: tuple[float, float] | None = None  # effective sample size so far, and what is enough
+    quality: str = ""  # of the calibration: pass, poor, fail; empty before
+    reasons: tuple[str, ...] = ()  # what to do more so far, or why it does not pass
+    measurable: str = ""  # length that the person may measure to fix the scale; empty: none
 
 
 class Status(NamedTuple):
     """State of the session, a few times a second."""
 
-    state: str  # "waiting" for sensors, "start_pose" the start pose, "moved" in it, "ready", "ended"
+    state: str  # "guide", "waiting" for sensors, "start_pose" the start pose, "moved" in it, "ready", "ended"
     message: str  # the state as a sentence to the person
     progress: float  # 0 to 1 of the start pose; 1 when ready
     time: float  # [s] on the source's clock
@@ -54,6 +99,8 @@ class Status(NamedTuple):
     latency_ms: tuple[float, float]  # p50, p99 of the last poses
     recorded_s: float  # [s] in the file of --record; 0 without one
     problems: dict[str, int]  # problem → count: of the source, the sensors, the recording
+    open_phases: tuple[str, ...] = ()  # of the recording, that were begun and not ended
+    guide: GuideView | None = None  # None: no guided session, or it is over
 
 
 class Output:
@@ -68,8 +115,11 @@ class Output:
     def status(self, status: Status) -> None:
         """Take the status, a few times a second from the first sample on."""
 
+    def demonstrate(self, pose: LivePose, segments: tuple[str, ...]) -> None:
+        """Draw a pose of these segments that nobody took: an instruction of the guide."""
+
     def take_keys(self) -> list[str]:
-        """Keys since the last call: "r" to reset the headings, "q" to end."""
+        """Keys since the last call: "r" to reset the headings, "q" to end; in a guided session names of its actions."""
         return []
 
     def close(self) -> None:

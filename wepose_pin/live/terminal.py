@@ -10,10 +10,10 @@ import select
 import sys
 from typing import Any, TextIO
 
-from .state import Output, SensorStatus, Status
+from .state import GuideView, Output, SensorStatus, Status
 
 REFRESH_HZ = 4
-KEYS = ("r", "q")
+KEYS = {"r": "r", "q": "q", "t": "take", "m": "mark mark"}  # key → what it asks for
 STATES = {"waiting": "…", "start_pose": "■", "moved": "✕", "ready": "▶", "ended": "■"}
 # Columns, and the width of the terminal from which each is shown.
 COLUMNS = (
@@ -67,8 +67,12 @@ class TerminalView(Output):
                 self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def take_keys(self) -> list[str]:
-        """Keys since the last call, of "r" and "q"."""
-        return [] if self._keyboard is None else [key for key in self._keyboard.take() if key in KEYS]
+        """What the keys since the last call ask for; those of the guide's actions go before the others."""
+        if self._keyboard is None:
+            return []
+        guide = None if self._newest is None else self._newest.guide
+        keys = KEYS if guide is None else {"q": "q"} | {action.key: action.name for action in guide.actions}
+        return [keys[key] for key in self._keyboard.take() if key in keys]
 
     def close(self) -> None:
         """Restore the terminal; the last table stays. May be called twice."""
@@ -87,17 +91,16 @@ class TerminalView(Output):
 
     def _list_changes(self, status: Status) -> list[str]:
         """A line for each state that differs from the last one reported; a countdown is no change."""
-        now = {"": status.state} | {
+        state = status.state if status.guide is None else f"{status.message} {status.guide.note}".strip()
+        now = {"": state} | {
             f"{s.segment}: ": "frozen" if s.frozen else "lost" if s.lost else "there" for s in status.sensors
         }
         now |= {f"{problem}: ": "since now" for problem, count in status.problems.items() if count}
         changed = [key for key, state in now.items() if self._reported.get(key, "there") != state]
         self._reported |= now
         clock = f"{status.time:.1f} s  "
-        return [
-            clock + (key + now[key] if key else f"{status.state.replace('_', ' ')}: {status.message}")
-            for key in changed
-        ]
+        said = state if status.guide is not None else f"{status.state.replace('_', ' ')}: {status.message}"
+        return [clock + (key + now[key] if key else said) for key in changed]
 
     def _render(self) -> Any:
         from rich.text import Text
@@ -113,6 +116,8 @@ def build_table(status: Status, *, keys: bool = False, width: int = 80) -> Any:
     from rich.table import Table
     from rich.text import Text
 
+    if status.guide is not None:
+        return build_guide(status, status.guide, keys=keys)
     tracking = status.state in ("ready", "ended")  # before, nothing is estimated
     rows = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     shown = [k for k, (_, least) in enumerate(COLUMNS) if width >= least]
@@ -139,7 +144,42 @@ def build_table(status: Status, *, keys: bool = False, width: int = 80) -> Any:
     if problems:
         parts.append(Text(problems, style="red"))
     if keys:
-        parts.append(Text("r reset headings (stand in the start pose)   q end", style="dim"))
+        marks = "   t begin or end a take" * tracking + "   m mark" * bool(status.recorded_s)
+        parts.append(Text(f"r reset headings (stand in the start pose){marks}   q end", style="dim"))
+    return Group(*parts)
+
+
+def build_guide(status: Status, guide: GuideView, *, keys: bool = False) -> Any:
+    """A view of the guide for a terminal: steps, what to do, progress, sensors, what the motion determined."""
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    marks = {"done": ("✓ ", "green"), "now": ("▶ ", "bold reverse"), "ahead": ("", "dim")}
+    steps = Text("  ").join(Text(f" {marks[s.state][0]}{s.title} ", style=marks[s.state][1]) for s in guide.steps)
+    parts: list[Any] = [steps, Text("")]
+    if guide.countdown is not None:
+        parts.append(Text(f"{math.ceil(guide.countdown)}", style="bold yellow"))
+    parts.append(Text(guide.sentence, style="bold"))
+    if guide.note:
+        parts.append(Text(guide.note, style="bold red"))
+    done = round(30 * min(max(guide.progress, 0.0), 1.0))
+    remaining = "" if guide.remaining is None else f"  {guide.remaining:.0f} s"
+    parts.append(Text("█" * done + "░" * (30 - done) + remaining))
+    if guide.lengths:
+        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
+        for length in guide.lengths:
+            name, mm = length.name.replace("_", " "), f"{1e3 * length.metres:.0f} mm"
+            table.add_row(name, mm, f"± {1e3 * length.std:.0f}", "▪" * min(30, round(1e3 * length.std)))
+        parts.append(table)
+    if guide.sample_size is not None:
+        parts.append(Text(f"effective sample size {guide.sample_size[0]:.1f}; {guide.sample_size[1]:.0f} are enough"))
+    parts += [Text(reason) for reason in ([guide.quality] if guide.quality else []) + list(guide.reasons)]
+    states = [f"{s.segment} {'✕ silent' if s.lost else f'{s.rate_hz:.0f} Hz'}" for s in status.sensors]
+    parts.append(Text("   ".join(states).replace("_", " "), style="dim"))
+    if keys:
+        offered = "   ".join(f"{action.key} {action.label}" for action in guide.actions)
+        parts.append(Text(f"{offered}   q end".strip(), style="dim"))
     return Group(*parts)
 
 
@@ -147,6 +187,8 @@ def _sensor_cells(sensor: SensorStatus, tracking: bool) -> tuple[str, ...]:
     state = "● there" if not tracking else "■ static" if sensor.static else "▶ moving"
     if sensor.lost:
         state = "✕ frozen" if sensor.frozen else "✕ lost"
+    if math.isfinite(sensor.battery):
+        state += f" {100.0 * sensor.battery:.0f} %"
     bias = " ".join(f"{_format(math.degrees(axis) if tracking else math.nan, 2):>6}" for axis in sensor.gyro_bias)
     heading = _format(math.degrees(sensor.heading_std), 1)
     age = _format(sensor.heading_age if tracking else math.nan, 0)

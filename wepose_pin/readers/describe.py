@@ -16,10 +16,19 @@ import numpy as np
 import polars as pl
 
 from ..diagnostics import ERROR, WARNING, Diagnostic
-from ..documents import is_number, parse_toml, read_toml, toml_string, toml_strings
+from ..documents import is_number, parse_toml, read_toml, toml_key, toml_string, toml_strings
 from ..errors import BadData, MissingFile, MissingRate, WeposeError, WrongUnit, one_of
 from ..model import BodyTable, load_table
-from ..recording import AXES, CONFIGURATION, ImuSensor, OrientationSensor, Recording, format_span, format_time
+from ..recording import (
+    AXES,
+    CONFIGURATION,
+    ImuSensor,
+    Intervals,
+    OrientationSensor,
+    Recording,
+    format_span,
+    format_time,
+)
 from ..recording.clocks import TIME_UNITS, guess_time_unit
 from ..recording.gaps import find_runs
 from ..recording.limits import LONGEST_STEP_S
@@ -63,7 +72,8 @@ class _Proposal:
     Parameters
     ----------
     title : kind of file
-    head : lines of [data], and of [phases] where the file states them
+    head : lines of [data]
+    phases : lines of [phases] where the file states them
     tables : segment, or "?" and a name of the file → lines of its [sensors.…]
     labels : segment → its name in the file
     facts : other facts from the file, one line each
@@ -75,6 +85,7 @@ class _Proposal:
     labels: Mapping[str, str] = field(default_factory=dict)
     facts: Sequence[str] = ()
     diagnostics: Sequence[Diagnostic] = ()
+    phases: list[str] = field(default_factory=list)
 
 
 class Wearer(NamedTuple):
@@ -217,8 +228,7 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal, wearer: Wear
         return Description(what, tuple(proposal.facts), (), None, diagnostics=diagnostics)
     model = wearer.name_model(folder)
     title = [f"name = {toml_string(path.stem)}", *([model] if model else [])]
-    phases = [line for line in proposal.head if line.startswith("start = ")]
-    head = [line for line in proposal.head if line not in phases]
+    phases, head = proposal.phases, proposal.head
     recording: Recording | None = None
     for _ in range(3):
         try:
@@ -292,7 +302,8 @@ def _session_text(
     lines += phases
     lacking = [segment for segment in body.needed if segment not in tables]
     known = any(name in body.segments for name in tables)
-    if (not lacking or not known) and body.paths and all(body.counterpart(tip) in body.paths for tip in body.paths):
+    clasped = any(line.startswith("clasp = ") for line in phases) or (lacking and known)
+    if not clasped and body.paths and all(body.counterpart(tip) in body.paths for tip in body.paths):
         tips = " and ".join(dict.fromkeys(f"{body.shared_name(tip).replace('_', ' ')}s" for tip in body.paths))
         lines.append(
             f"# clasp = [[10.0, 70.0]]   # for wepose calibrate: the seconds in which the {tips} are held together"
@@ -318,7 +329,7 @@ def _propose_from_device(path: Path, folder: Path, format: str, table: BodyTable
     if format == "wepose_live":
         facts, phases = _describe_live(path)
         worn = {str(segment): list[str]() for segment in device.labels.values()}
-        return _Proposal(title, [f"file = {_relative(path, folder)}", *phases], worn, facts=facts)
+        return _Proposal(title, [f"file = {_relative(path, folder)}"], worn, facts=facts, phases=phases)
     if len(device.labels) > 1 or format in WHOLE:
         tables: dict[str, list[str]] = {}
         for label, segment in device.labels.items():
@@ -380,9 +391,22 @@ def _describe_live(path: Path) -> tuple[list[str], list[str]]:
     if recording.resets:
         times = ", ".join(f"{recording.time[tick]:.1f}" for tick in recording.resets)
         facts.append(f"headings reset at [s]: {times}")
-    facts.append(f"track it as it was: wepose track {path} -o result; to add phases, for wepose calibrate: --write")
-    first, last = np.ceil(1e3 * first) / 1e3, np.floor(1e3 * last) / 1e3
-    return facts, [f"start = [[{first:.3f}, {last:.3f}]]   # as it was held live"]
+    marked = {name: spans for name, spans in recording.phases.items() if name != "start"}
+    for name, spans in marked.items():
+        facts.append(f"phase {name} [s]: {', '.join(f'{begin:.2f} to {end:.2f}' for begin, end in spans)}")
+    facts += [f"marked at {marker.time:.2f} s: {marker.text}" for marker in log.texts]
+    if len(log.quat_WL):
+        facts.append(f"track it as it was: wepose track {path} -o result")
+    facts.append("to change its phases: --write")
+    lines = [f"start = {_write_spans(recording.phases['start'])}   # as it was held live"]
+    return facts, lines + [
+        f"{toml_key(name)} = {_write_spans(spans)}   # as it was marked" for name, spans in marked.items()
+    ]
+
+
+def _write_spans(spans: Intervals) -> str:
+    """Intervals [s] in TOML, to the millisecond within them."""
+    return f"[{', '.join(f'[{np.ceil(1e3 * a) / 1e3:.3f}, {np.floor(1e3 * b) / 1e3:.3f}]' for a, b in spans)}]"
 
 
 def _siblings(path: Path, format: str) -> list[Path]:

@@ -6,7 +6,10 @@ All little-endian. An incomplete last block is left out, so that the recording o
 - ``HEAD``: JSON, the settings before the first sample: sensors, stated mounts, subject, method
 - ``SMPL``: samples in the order of arrival: u32 m, then sensor u8 (m), time f64 (m), gyro f64 (m, 3), accel f64 (m, 3)
 - ``EVNT``: JSON, ``{"kind": "clock", …}`` when ticks began, ``{"kind": "start", "begin": tick, "end": tick}`` the start
-  pose, ``{"kind": "reset", "tick": tick}`` headings anew before that tick
+  pose of tracking, ``{"kind": "reset", "tick": tick}`` headings anew before that tick; and what was marked, with times
+  in seconds: ``{"kind": "begin", "phase": name, "time": t}`` and ``"end"`` of a phase, ``{"kind": "discard", "phase":
+  name}`` what was marked of it so far, ``{"kind": "mark", "text": …, "time": t}`` a text, ``{"kind": "assign",
+  "segments": {sensor: segment}}`` segments that differ from the names in the header
 - ``POSE``: the live poses: u64 first tick, u32 m, quat_WL f64 (m, k, 4) xyzw
 """
 
@@ -25,7 +28,7 @@ import numpy as np
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable, is_number
 from ..errors import BadData, MissingFile
-from ..recording import ImuSensor, Recording, check_recording
+from ..recording import ImuSensor, Intervals, Recording, check_recording
 from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
@@ -42,15 +45,73 @@ LONGEST_BLOCK = 1 << 28  # [bytes] longer than any block that we write
 # Ticks without a sample: with more than in eight hours at 100 Hz, times of samples are wrong.
 MOST_SILENT = 3_000_000
 MOST_RATE, MOST_WAIT_S = 10_000.0, 10.0
+LONGEST_TEXT = 200  # letters of a phase's name, or of a marked text
+_EVENTS = {
+    "clock": ("rate_hz", "begin", "wait_s"),
+    "start": ("begin", "end"),
+    "reset": ("tick",),
+    "begin": ("phase", "time"),
+    "end": ("phase", "time"),
+    "discard": ("phase",),
+    "mark": ("text", "time"),
+    "assign": ("segments",),
+}
+
+
+class Marker(NamedTuple):
+    """A text that was marked at a time."""
+
+    time: float  # [s]
+    text: str
+
+
+class Markers:
+    """Phases and texts that were marked in a live session, and the segments of its sensors.
+
+    Attributes
+    ----------
+    texts : marked texts
+    segments : sensor → segment, of sensors that were assigned to another segment than their name
+    """
+
+    def __init__(self) -> None:
+        self.texts: list[Marker] = []
+        self.segments: dict[str, str] = {}
+        self._spans: dict[str, list[tuple[float, float]]] = {}
+        self._open: dict[str, float] = {}
+
+    def add(self, kind: str, event: Mapping[str, Any]) -> None:
+        """Add an event; one of another kind changes nothing."""
+        if kind == "begin":
+            self._open.setdefault(event["phase"], event["time"])
+        elif kind == "end" and event["phase"] in self._open:
+            self._spans.setdefault(event["phase"], []).append((self._open.pop(event["phase"]), event["time"]))
+        elif kind == "discard":
+            self._spans.pop(event["phase"], None)
+            self._open.pop(event["phase"], None)
+        elif kind == "mark":
+            self.texts.append(Marker(event["time"], event["text"]))
+        elif kind == "assign":
+            self.segments = dict(event["segments"])
+
+    def phases(self, first: float, last: float) -> dict[str, Intervals]:
+        """Name → intervals [s] of each phase, cut to `first` and `last` [s]; one that was not ended ends there."""
+        spans = {name: list(own) for name, own in self._spans.items()}
+        for name, begin in self._open.items():
+            spans.setdefault(name, []).append((begin, last))
+        cut = {name: tuple((max(a, first), min(b, last)) for a, b in own) for name, own in spans.items()}
+        cut = {name: tuple(span for span in own if span[0] < span[1]) for name, own in cut.items()}
+        return {name: own for name, own in cut.items() if own}
 
 
 class LiveRecording(NamedTuple):
     """The contents of a live session's recording."""
 
-    recording: Recording  # on its ticks, with its start pose and resets
+    recording: Recording  # on its ticks, with its start pose, marked phases and resets
     header: dict[str, Any]  # as `HEAD`
     first: int  # tick of the first pose
     quat_WL: np.ndarray  # (n, k, 4) xyzw, the live poses, in the order of the header's sensors
+    texts: tuple[Marker, ...]  # marked in the session
 
 
 def is_live_log(path: Path) -> bool:
@@ -81,6 +142,7 @@ def read_live_log(path: Path) -> LiveRecording:
     waiting: list[Arrivals] = []
     ticks: list[Ticks] = []
     start: tuple[int, int] | None = None
+    markers = Markers()
     resets, poses = [], []
     end_s, late = 0.0, 0
     broken_off = True
@@ -102,6 +164,8 @@ def read_live_log(path: Path) -> LiveRecording:
                 start = int(event["begin"]), int(event["end"])
             elif kind == "reset":
                 resets.append(int(event["tick"]))
+            else:
+                markers.add(kind, event)
         elif tag == POSES:
             poses.append(_poses(path, payload, len(header["sensors"])))
         while synchronizer is not None and waiting:
@@ -112,17 +176,31 @@ def read_live_log(path: Path) -> LiveRecording:
                     f"{path}: samples at {arrivals.time[far][0]:g} s, where the file holds no as long recording"
                 )
             ticks.append(synchronizer.push(Arrivals(*(column[~far] for column in arrivals)) if far.any() else arrivals))
-    if header is None or synchronizer is None or start is None:
+    if header is None or synchronizer is None or synchronizer.next_tick < 2:
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     resets = [tick for tick in resets if tick < synchronizer.next_tick]
-    if synchronizer.next_tick <= start[1] + 1:
+    if start is not None and synchronizer.next_tick <= start[1] + 1:
         raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
+    header["sensors"] = _assign_segments(path, header["sensors"], markers.segments)
+    ends = synchronizer.begin, synchronizer.begin + (synchronizer.next_tick - 1) / synchronizer.rate_hz
+    header["phases"] = {**header["phases"], **markers.phases(*ends)}
+    if start is None and "start" not in header["phases"]:
+        raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     recording = check_recording(build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets)))
     if broken_off:
         killed = Diagnostic("live-recording-incomplete", WARNING, path.name, facts={"variant": "killed"})
         recording = replace(recording, diagnostics=(killed,))
     quat_WL = np.concatenate([quat for _, quat in poses]) if poses else np.empty((0, len(header["sensors"]), 4))
-    return LiveRecording(recording, header, poses[0][0] if poses else start[1] + 1, quat_WL)
+    first = poses[0][0] if poses else start[1] + 1 if start is not None else 0
+    return LiveRecording(recording, header, first, quat_WL, tuple(markers.texts))
+
+
+def _assign_segments(path: Path, sensors: Sequence[str], segments: Mapping[str, str]) -> list[str]:
+    """The segments of the sensors (k) after those that were assigned to another one."""
+    assigned = [segments.get(name, name) for name in sensors]
+    if not set(segments) <= set(sensors) or len(set(assigned)) < len(assigned):
+        raise BadData(f"{path}: segments = {dict(segments)!r} of sensors {list(sensors)!r}; the file is damaged")
+    return assigned
 
 
 def read_live_device(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
@@ -218,21 +296,33 @@ def _json(path: Path, payload: bytes) -> dict[str, Any]:
     return found
 
 
-def _event(path: Path, payload: bytes) -> tuple[str, dict[str, float]]:
-    """Read kind and numbers of an event; an unknown kind has no numbers."""
+def _event(path: Path, payload: bytes) -> tuple[str, dict[str, Any]]:
+    """Read kind and values of an event; an unknown kind has none."""
     event = _json(path, payload)
     kind = str(event.get("kind"))
-    wanted = {"clock": ("rate_hz", "begin", "wait_s"), "start": ("begin", "end"), "reset": ("tick",)}.get(kind, ())
-    values = {name: event.get(name) for name in wanted}
-    well = all(is_number(value, 1e12) for value in values.values())
-    if well and kind == "clock":
-        well = 0.1 <= values["rate_hz"] <= MOST_RATE and 0.0 <= values["wait_s"] <= MOST_WAIT_S  # type: ignore[operator]
-    elif well:
-        whole = [int(value) for value in values.values() if value == int(value)]  # type: ignore[arg-type]
-        well = len(whole) == len(values) and whole == sorted(set(whole)) and min(whole, default=0) >= 0
-    if not well:
+    values = {name: event.get(name) for name in _EVENTS.get(kind, ())}
+    if not _is_event(kind, values):
         raise BadData(f"{path}: an event '{kind}' with {values!r}; the file is damaged")
-    return kind, {name: float(value) for name, value in values.items()}  # type: ignore[arg-type]
+    return kind, values
+
+
+def _is_event(kind: str, values: Mapping[str, Any]) -> bool:
+    """Whether the values are such as an event of this kind has."""
+    texts = [values[name] for name in ("phase", "text") if name in values]
+    if not all(isinstance(text, str) and 0 < len(text) <= LONGEST_TEXT for text in texts):
+        return False
+    if "segments" in values:
+        segments = values["segments"]
+        return isinstance(segments, dict) and all(isinstance(segment, str) for segment in segments.values())
+    numbers = [value for name, value in values.items() if name not in ("phase", "text")]
+    if not all(is_number(value, 1e12) for value in numbers):
+        return False
+    if kind == "clock":
+        return bool(0.1 <= values["rate_hz"] <= MOST_RATE and 0.0 <= values["wait_s"] <= MOST_WAIT_S)
+    if kind in ("start", "reset"):
+        ticks = [int(value) for value in numbers if value == int(value)]
+        return len(ticks) == len(numbers) and ticks == sorted(set(ticks)) and min(ticks, default=0) >= 0
+    return True
 
 
 def _poses(path: Path, payload: bytes, sensors: int) -> tuple[int, np.ndarray]:
@@ -258,7 +348,7 @@ def build_recording(
     header: Mapping[str, Any],
     rate_hz: float,
     ticks: Sequence[Ticks],
-    start: tuple[int, int],
+    start: tuple[int, int] | None,
     source: Path | None = None,
     resets: tuple[int, ...] = (),
     last: int | None = None,
@@ -268,7 +358,7 @@ def build_recording(
     Parameters
     ----------
     header : name, sensors, mounts, phases, start_pose, remounted, joints, model, as in `HEAD`
-    start : first and last tick of the start pose
+    start : first and last tick of the start pose; None: that of the header's phases
     resets : ticks before which the headings were reset
 
     Raises
@@ -299,7 +389,8 @@ def build_recording(
         name: tuple((float(a), float(b)) for a, b in spans if time[0] <= a and b <= time[-1])
         for name, spans in header["phases"].items()
     }
-    phases["start"] = ((float(time[start[0] - first]), float(time[start[1] - first])),)
+    if start is not None:
+        phases["start"] = ((float(time[start[0] - first]), float(time[start[1] - first])),)
     return Recording(
         header["name"],
         time,

@@ -148,7 +148,7 @@ class Recording:
         intervals = self.phases.get(name, ())
         if not intervals and self.source is not None and self.source.suffix == ".wepose":
             raise BadPhase(
-                f"{self.where()}: phases.{name} is needed here, and a live recording has phases.start alone; `wepose "
+                f"{self.where()}: phases.{name} is needed here, and was not marked in this live recording; `wepose "
                 f"info {self.source.name} --write` writes a session that names it: add {name} = [[from, to]] to its "
                 f"[phases]"
             )

@@ -31,7 +31,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
         "[phases]   # seconds on the time column",
     ]
     for name, spans in recording.phases.items():
-        lines.append(f"{name} = [{', '.join(f'[{first:.3f}, {last:.3f}]' for first, last in spans)}]")
+        lines.append(f"{toml_key(name)} = [{', '.join(f'[{first:.3f}, {last:.3f}]' for first, last in spans)}]")
     if recording.joints:
         lines += ["", "[joints]   # rad, m for a prismatic joint"]
         lines += [f"{toml_key(name)} = {float(value)!r}" for name, value in recording.joints.items()]

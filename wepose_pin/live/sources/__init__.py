@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from ...errors import BadOption, one_of
 from ...model import load_table
 from ..addresses import parse_address
 from .base import Source
+from .packets import AnyName
 
 FORMS = {
     "replay": "replay:PATH",
@@ -27,6 +28,7 @@ def open_source(
     baud: int = 115200,
     wait_s: float = 10.0,
     segments: Sequence[str] | None = None,
+    any_name: bool = False,
 ) -> Source:
     """The source that `spec` describes, not yet opened.
 
@@ -39,6 +41,7 @@ def open_source(
     baud : of serial ports
     wait_s : how long `open` waits for streams or senders [s]
     segments : names that sensors of a stream may have, those of the body; None: the upper body's. A replay has its own
+    any_name : take sensors of any name from UDP; they are assigned to segments later
 
     Raises
     ------
@@ -57,7 +60,7 @@ def open_source(
     if kind == "lsl":
         return _open_lsl(spec, rest, sensors, wait_s, segments)
     if kind == "udp":
-        return _open_udp(spec, rest, sensors, wait_s, segments)
+        return _open_udp(spec, rest, sensors, wait_s, AnyName() if any_name else segments)
     return _open_mti(spec, rest, sensors, baud, segments)
 
 
@@ -93,7 +96,7 @@ def _open_lsl(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float
     return LslSource(name, sensors, scope, wait_s, segments)
 
 
-def _open_udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]) -> Source:
+def _open_udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Collection[str]) -> Source:
     from .udp import UdpSource
 
     host, port = parse_address(rest, f"source '{spec}':", 9000)

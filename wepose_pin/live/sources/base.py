@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
 
 from ...recording.arrivals import Samples
 
@@ -36,3 +37,18 @@ class Source(Protocol):
     def close(self) -> None:
         """Disconnect and free what `open` took. May be called twice."""
         ...
+
+
+@runtime_checkable
+class ReportsBattery(Protocol):
+    """A source whose sensors say how much charge they have."""
+
+    @property
+    def batteries(self) -> Mapping[str, float]:
+        """Sensor → share of its charge, 0 to 1, of those that have said it."""
+        ...
+
+
+def find_batteries(source: Source) -> Mapping[str, float]:
+    """Sensor → share of its charge, 0 to 1; empty where the source does not know."""
+    return source.batteries if isinstance(source, ReportsBattery) else {}

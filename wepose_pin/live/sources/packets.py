@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
@@ -21,7 +21,20 @@ CRC = struct.Struct("<I")
 NUMBERS = tuple(
     "torso left_upper_arm left_forearm right_upper_arm right_forearm pelvis head left_hand right_hand".split()
 )
-MAX_NAME = 24  # letters of an unknown sensor's name in the problems
+MAX_NAME = 24  # letters of a sensor's name
+
+
+class AnyName(Collection[str]):
+    """All names: the sensors are assigned to segments later."""
+
+    def __contains__(self, name: object) -> bool:
+        return isinstance(name, str)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(())
+
+    def __len__(self) -> int:
+        return 0
 
 
 class Batch(NamedTuple):
@@ -91,7 +104,7 @@ def _decode_line(line: bytes, segments: Collection[str]) -> tuple[str, list[floa
     if not isinstance(message, dict) or not message.keys() >= {"sensor", "t", "gyro", "accel"}:
         raise _Malformed("JSON lines without sensor, t, gyro and accel")
     sensor = message["sensor"]
-    if sensor not in tuple(segments):
+    if not isinstance(sensor, str) or not 0 < len(sensor) <= MAX_NAME or sensor not in segments:
         raise _Malformed(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
     time, gyro, accel = message["t"], message["gyro"], message["accel"]
     if not isinstance(time, list):

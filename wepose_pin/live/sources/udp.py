@@ -6,7 +6,7 @@ import select
 import socket
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -15,13 +15,14 @@ from ...model import load_table
 from ...recording.arrivals import Samples
 from .checks import IMPLAUSIBLE, MAX_TIME, keep_plausible
 from .clocks import HostClock
-from .packets import Batch, decode
+from .packets import AnyName, Batch, decode
 
 MAX_SIZE = 65536  # [bytes] of a datagram
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
 BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
 MAX_CLOCKS = 64  # of senders
 MAX_KINDS = 24  # of problems
+MAX_SENSORS = 64  # of any name
 COLLECT_S = 1.0  # [s] after the first datagram in which the other sensors may appear
 
 
@@ -34,7 +35,7 @@ class UdpSource:
     ----------
     port : 0 for any free one; then see `address`
     sensors : to take; None: those that send while `open` waits
-    segments : names that sensors may have; None: those of the upper body
+    segments : names that sensors may have; None: those of the upper body; `AnyName`: `sensors` grows as new ones send
     wait_s : [s] for which `open` waits for the first datagram where `sensors` are not given
     """
 
@@ -44,10 +45,11 @@ class UdpSource:
         port: int,
         sensors: Sequence[str] | None = None,
         wait_s: float = 10.0,
-        segments: Sequence[str] | None = None,
+        segments: Collection[str] | None = None,
     ) -> None:
         self.sensors = tuple(sensors or ())
-        self._segments = tuple(load_table().segments if segments is None else segments)
+        self._finds = isinstance(segments, AnyName)
+        self._segments = load_table().segments if segments is None else segments
         self.rate_hz: float | None = None
         self.problems: dict[str, int] = Counter()
         self.address = (host, port)
@@ -78,12 +80,12 @@ class UdpSource:
             ) from None
         self._socket.setblocking(False)
         self.address = self._socket.getsockname()[:2]
-        if not self.sensors:
+        if not self.sensors and not self._finds:
             self._find_sensors()
 
     def _find_sensors(self) -> None:
         host, port = self.address
-        self.sensors = self._segments
+        self.sensors = tuple(self._segments)
         deadline = time.monotonic() + self._wait_s
         while not self._waiting and time.monotonic() < deadline:
             self._waiting = self._receive(0.1)
@@ -158,6 +160,8 @@ class UdpSource:
 
     def _accepts(self, batch: Batch) -> bool:
         """Whether the batch is of a tracked sensor, with times that fit a clock."""
+        if self._finds and batch.sensor not in self.sensors and len(self.sensors) < MAX_SENSORS:
+            self.sensors += (batch.sensor,)
         if batch.sensor not in self.sensors:
             self._count(f"samples of {batch.sensor}, which is not tracked", len(batch.time))
             return False

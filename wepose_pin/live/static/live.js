@@ -8,6 +8,7 @@ const n = data.links.length;
 const stage = $("stage");
 const viewer = openViewer(stage);
 const body = buildScene(viewer, data.scene, data.links);
+body.forEach((link) => { link.visible = false; });                        // until the first frame places them
 const skins = body.map((link) => {
   const found = [];
   link.traverse(({ material }) => { if (material) found.push([material, material.color.getHex(), material.opacity]); });
@@ -64,7 +65,11 @@ function pose(buffer) {
 const fit = () => fitCamera(viewer, stage, data.view, 80);
 let moved = false;                                                       // by the user: then a resize leaves it alone
 viewer.controls.addEventListener("start", () => { moved = true; });
-new ResizeObserver(() => { viewer.set_3d_pane_size(); if (!moved) fit(); }).observe(stage);
+new ResizeObserver(() => {                                               // a resized canvas is empty until it is drawn
+  viewer.set_3d_pane_size();
+  if (!moved) fit();
+  draw();
+}).observe(stage);
 
 // ---- words
 const SHAPES = { there: "M5 1a4 4 0 1 0 .01 0z", moving: "M1 0l9 5-9 5z", static: "M1 1h8v8H1z", lost: "M0 2l2-2 3 3 3-3 2 2-3 3 3 3-2 2-3-3-3 3-2-2 3-3z" };
@@ -96,13 +101,91 @@ function small(id, value, unit) {
   text($(id), "small", unit);
 }
 
-let state = "";
+// ---- the guided session
+const MAIN = ["next", "accept", "exchange"];
+let guideSays = "", spokenCount = null, voice = false;
+function speak(what) {
+  if (!voice || !what) return;
+  speechSynthesis.cancel();
+  speechSynthesis.speak(new SpeechSynthesisUtterance(what));
+}
+function button({ name, label, key }, main) {
+  const element = text($("actions"), "button", label, `key ${key.toUpperCase()}`);
+  element.className = main ? "main" : "";
+  element.dataset.action = name;
+  element.addEventListener("click", () => ask(name));
+}
+function showGuide(guide) {
+  document.body.classList.toggle("guided", guide !== null);
+  $("steps").hidden = $("result").hidden = guide === null;
+  $("note").hidden = !guide?.note;
+  if (guide === null) { $("actions").replaceChildren(); return; }
+  $("note").textContent = guide.note;
+  $("steps").replaceChildren(...guide.steps.map(({ name, title, state }) => {
+    const item = Object.assign(document.createElement("li"), { className: state });
+    const inner = text(item, state === "done" ? "button" : "span", title);
+    if (state === "done") inner.addEventListener("click", () => ask(`go ${name}`));
+    if (state === "now") item.setAttribute("aria-current", "step");
+    return item;
+  }));
+  const now = guide.steps.find((step) => step.state === "now"), count = guide.countdown;
+  const left = guide.remaining === null ? "" : ` · ${known(guide.remaining, 0)} s`;
+  $("say").querySelector("strong").textContent = count === null ? now.title + left : Math.ceil(count);
+  $("say").classList.toggle("counting", count !== null);
+  const offered = guide.actions.map((action) => action.name + action.label).join();
+  if ($("actions").dataset.offered !== offered) {                        // a button stays while it is pressed
+    $("actions").dataset.offered = offered;
+    $("actions").replaceChildren();
+    guide.actions.forEach((action) => button(action, MAIN.includes(action.name)));
+  }
+  showResult(guide);
+  if (guideSays !== guide.note + guide.sentence) speak(guide.note || guide.sentence);
+  else if (count !== null && count <= 3.2 && Math.ceil(count) !== spokenCount) speak(String(Math.ceil(count)));
+  guideSays = guide.note + guide.sentence;
+  spokenCount = count === null ? null : Math.ceil(count);
+}
+const NAMED = { biacromial: "breadth of the shoulders, from acromion to acromion" };
+const QUALITY = { "": "So far", pass: "✓ Good", poor: "! Usable", fail: "✕ Not usable" };
+function showResult(guide) {
+  $("result").hidden = !guide.lengths.length && !guide.reasons.length;
+  $("quality").textContent = QUALITY[guide.quality];
+  $("quality").className = guide.quality;
+  $("reasons").replaceChildren();
+  guide.reasons.forEach((reason) => text($("reasons"), "p", reason));
+  $("lengths").querySelector("tbody").replaceChildren(...guide.lengths.map(({ name, mm, std_mm }) => {
+    const row = document.createElement("tr");
+    text(row, "td", words(name));
+    text(row, "td", `${known(mm, 0)} mm`);
+    text(row, "td", `± ${known(std_mm, 0)}`);
+    const bar = text(text(row, "td", ""), "i", "");
+    bar.style.width = `${Math.min(100, 2.5 * std_mm)}%`;
+    return row;
+  }));
+  $("measure").hidden = !guide.measurable;
+  $("measure").querySelector("span").textContent = `Measured ${NAMED[guide.measurable] ?? words(guide.measurable)}:`;
+  $("measure").dataset.name = guide.measurable;
+  $("sample-size").textContent = guide.sample_size === null ? ""
+    : `Effective sample size ${known(guide.sample_size[0], 1)}; ${known(guide.sample_size[1], 0)} are enough.`;
+}
+function ask(action) {
+  if (socket.readyState === WebSocket.OPEN) socket.send(`key ${action}`);
+}
+
+let state = "", offers = [];
 function show(status) {
   state = status.state;
+  offers = status.guide?.actions ?? [];
   const begun = state === "ready" || state === "ended";                  // before, nothing is estimated
   $("say").className = `${begun ? "small" : ""} ${state}`;
   $("say").querySelector("strong").textContent = SAYS[state] ?? state;
   $("say").querySelector("span").textContent = status.message;
+  showGuide(status.guide);
+  $("curves").hidden = !begun;
+  $("markers").hidden = state !== "ready";
+  $("mark").disabled = !status.recorded_s;
+  const taking = status.open_phases.some((name) => name.startsWith("take_"));
+  $("take").setAttribute("aria-pressed", taking);
+  $("take").firstChild.textContent = taking ? `End ${words(status.open_phases.find((name) => name.startsWith("take_")))} ` : "Begin take ";
   $("progress").querySelector("i").style.width = `${100 * status.progress}%`;
   $("progress").hidden = state === "waiting";
   $("rows").replaceChildren(...status.sensors.map((sensor) => {
@@ -110,7 +193,9 @@ function show(status) {
     const is = sensor.lost ? "lost" : !begun ? "there" : sensor.static ? "static" : "moving";
     if (sensor.lost) row.className = "lost";
     text(row, "td", words(sensor.segment));
-    text(row, "td", sensor.frozen ? "frozen" : is).prepend(shape(is));
+    const place = text(row, "td", sensor.frozen ? "frozen" : is);
+    place.prepend(shape(is));
+    if (sensor.battery !== null) text(place, "small", ` ${Math.round(100 * sensor.battery)} %`, "charge of its battery").className = sensor.battery < .15 ? "low" : "";
     text(row, "td", known(sensor.rate_hz, 0));
     text(row, "td", sensor.bias_deg_s.map((axis) => known(begun ? axis : null, 2).padStart(5, "\u2007")).join(" "));
     text(row, "td", known(sensor.heading_std_deg, 1));
@@ -134,10 +219,72 @@ data.trails.forEach(({ name, colour }) => {
 });
 text($("legend"), "span", "sensor lost").prepend(Object.assign(document.createElement("i"), { className: "lost" }));
 
+// ---- joint angles of the last seconds
+const CURVES_S = 10, SIDE_COLOURS = Object.fromEntries(data.trails.map(({ name, colour }) => [name.split("_")[0], colour]));
+const curves = {};                                                       // joint → angle → [time, value] of each sample
+let curvesEnd = 0;
+const sideOf = (joint) => (/^(left|right)_/.exec(joint) ?? [])[1] ?? "";
+const groupOf = (joint) => joint.replace(/^(left|right)_/, "");
+function addAngles({ time, joints }) {
+  const end = time[time.length - 1];
+  if (end < curvesEnd || time[0] > curvesEnd + CURVES_S) Object.values(curves).forEach((angles) => { for (const angle in angles) angles[angle] = []; });
+  curvesEnd = end;
+  for (const [joint, angles] of Object.entries(joints)) {
+    for (const [angle, values] of Object.entries(angles)) {
+      const points = (curves[joint] ??= {})[angle] ??= [];
+      values.forEach((value, k) => points.push([time[k], value]));
+      while (points.length && points[0][0] < end - CURVES_S) points.shift();
+    }
+  }
+  const groups = [...new Set(Object.keys(curves).map(groupOf))];
+  if ($("joint").children.length !== groups.length) {
+    $("joint").replaceChildren(...groups.map((group) => Object.assign(document.createElement("option"), { value: group, textContent: words(group) })));
+    if (groups.includes("elbow")) $("joint").value = "elbow";
+  }
+  drawCurves();
+}
+function drawCurves() {
+  const canvas = $("plot"), shown = Object.keys(curves).filter((joint) => groupOf(joint) === $("joint").value);
+  if (document.body.classList.contains("guided") || !shown.length || !canvas.clientWidth) return;
+  const scale = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
+  canvas.width = width * scale;
+  canvas.height = height * scale;
+  const pen = canvas.getContext("2d"), ink = getComputedStyle(canvas), angles = Object.keys(curves[shown[0]]), panel = height / angles.length;
+  pen.scale(scale, scale);
+  pen.font = "11px system-ui, sans-serif";
+  angles.forEach((angle, row) => {
+    const lines = shown.map((joint) => [sideOf(joint), curves[joint][angle].filter(([, value]) => value !== null)]);
+    const values = lines.flatMap(([, points]) => points.map(([, value]) => value));
+    let low = Math.min(...values), high = Math.max(...values);
+    if (!(high - low > 20)) [low, high] = [(low + high) / 2 - 10, (low + high) / 2 + 10];
+    const y = (value) => panel * row + 18 + (panel - 24) * (high - value) / (high - low);
+    const x = (time) => 38 + (width - 40) * (1 - (curvesEnd - time) / CURVES_S);
+    pen.fillStyle = ink.color;
+    pen.fillText(words(angle), 38, panel * row + 11);
+    pen.textAlign = "right";
+    [high, low].forEach((value) => pen.fillText(`${value.toFixed(0)}°`, 34, y(value) + 4));
+    pen.textAlign = "left";
+    pen.strokeStyle = ink.borderColor;
+    pen.strokeRect(38, panel * row + 18, width - 40, panel - 24);
+    lines.forEach(([side, points]) => {
+      pen.strokeStyle = SIDE_COLOURS[side] ?? ink.color;
+      pen.lineWidth = 1.6;
+      pen.beginPath();
+      points.forEach(([time, value], k) => {
+        const jumps = k === 0 || Math.abs(value - points[k - 1][1]) > 180 || time - points[k - 1][0] > 0.5;
+        pen[jumps ? "moveTo" : "lineTo"](x(time), y(value));
+      });
+      pen.stroke();
+      pen.lineWidth = 1;
+    });
+  });
+}
+$("joint").addEventListener("change", drawCurves);
+
 // ---- the line: nothing more comes until what came is drawn
 let socket, tries = 0, owed = 0, newestStatus = null, newestFrame = null, drawnAt = performance.now();
 function connect() {
-  socket = new WebSocket(`ws://${location.host}/stream`);
+  socket = new WebSocket(`ws://${location.host}/stream${location.search}`);
   socket.binaryType = "arraybuffer";
   socket.onopen = () => { tries = 0; owed = 0; $("offline").hidden = true; };
   socket.onmessage = ({ data: message }) => {
@@ -145,6 +292,7 @@ function connect() {
     if (typeof message !== "string") { newestFrame = message; return; }
     const said = JSON.parse(message);
     if ("state" in said) newestStatus = said;
+    else if ("angles" in said) addAngles(said.angles);
     else if (said.id !== data.id) location.reload();                     // another session at the same address
   };
   socket.onclose = () => {
@@ -168,17 +316,38 @@ function toggleTrails() {
   $("trails").setAttribute("aria-pressed", trailsShown);
   viewer.set_dirty();
 }
+function mark() {
+  ask(`mark ${$("mark-text").value.trim() || "mark"}`);
+  $("answer").textContent = "Marked.";
+  setTimeout(() => { $("answer").textContent = ""; }, 2000);
+}
+$("measure").addEventListener("submit", (event) => {
+  event.preventDefault();
+  ask(`measure ${$("measure").dataset.name}=${(Number($("measured").value) / 100).toFixed(4)}`);
+});
+$("take").addEventListener("click", () => ask("take"));
+$("markers").addEventListener("submit", (event) => { event.preventDefault(); mark(); });
+$("voice").addEventListener("click", () => {
+  voice = !voice;
+  $("voice").setAttribute("aria-pressed", voice);
+  if (voice) speak("Voice on"); else speechSynthesis.cancel();
+});
 $("reset").addEventListener("click", () => press("r"));
 $("trails").addEventListener("click", toggleTrails);
 $("camera").addEventListener("click", () => { moved = false; fit(); });
 addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
-  if (event.key !== " " && event.key.toLowerCase() !== "r") return;
+  if (event.target instanceof HTMLInputElement) return;
+  const key = event.key.toLowerCase(), offered = offers.find((action) => action.key === key);
+  if (offered || (key === " " && offers.length)) ask((offered ?? offers[0]).name);
+  else if (state === "ready" && key === "t") ask("take");
+  else if (state === "ready" && key === "m") mark();
+  else if (!offers.length && (key === " " || key === "r")) press("r");
+  else return;
   event.preventDefault();
-  press("r");
 });
 addEventListener("keyup", (event) => {                                   // space would press a focused button, too
-  if (event.key === " ") event.preventDefault();
+  if (event.key === " " && !(event.target instanceof HTMLInputElement)) event.preventDefault();
 });
 
 // ---- the loop
@@ -200,9 +369,9 @@ function tick() {
 let counted = 0;
 setInterval(() => {
   const silent = (performance.now() - drawnAt) / 1000;
-  if (!isFinite(now)) small("picture", "the start pose", "");
+  if (!isFinite(now)) small("picture", "–", " before tracking");
   else if (silent > 1.5) small("picture", `${duration(silent)} old`, ": no new pose comes");
-  else small("picture", `${frames - counted}`, " a second");
+  else small("picture", `${frames - counted}`, " drawn in the last second");
   counted = frames;
 }, 1000);
 addEventListener("beforeprint", () => {                                  // on paper a canvas would be as it last was on screen

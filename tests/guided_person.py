@@ -1,0 +1,144 @@
+"""A simulated person with five raw sensors in any rotation, who does what the guide says, or does it wrong."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from wepose_pin.recording.arrivals import Samples
+from wepose_pin.simulation import PRESETS, Simulation, simulate, simulate_person
+
+RATE_HZ = 100.0
+STAND = 60, 440  # samples of the simulation in which the person stands
+RETURN_FASTER = 12  # times, back to the start pose: samples in between are left out
+SHAKE_HZ, SHAKE_RATE = 3.0, 8.0  # amplitude in rad/s
+NAMES = ("a7", "b2", "c9", "d4", "e5")
+
+
+@lru_cache(maxsize=4)
+def perform(seed: int = 3, clasp_s: float = 100.0, preset: str = "mild") -> Simulation:
+    """A person whose clasp lasts longer than the guide asks for."""
+    lengths = simulate_person(seed).lengths
+    imperfections = replace(PRESETS[preset], mount="any", dropped=0.0)
+    return simulate(lengths, seed=seed, imperfections=imperfections, clasp_s=clasp_s, circles=0)
+
+
+class GuidedPerson:
+    """Plays the samples of a simulation to and fro: what is asked for decides where to.
+
+    Attributes
+    ----------
+    doing : "stand", "clasp", or "shake SEGMENT"
+    silent : segments whose sensors send nothing
+    hurries : returns to the start pose faster than the motion went
+    worn : sensor → segment that it sits on
+    """
+
+    def __init__(self, simulation: Simulation, worn: Mapping[str, str] | None = None) -> None:
+        self.simulation = simulation
+        self.worn = dict(zip(NAMES, simulation.gyro_S, strict=True)) if worn is None else dict(worn)
+        self.doing, self.silent, self.hurries = "stand", set[str](), True
+        self.disturb: Callable[[str, np.ndarray], np.ndarray] = lambda _segment, gyro: gyro
+        self._k, self._direction, self._sent = STAND[0], 1, 0
+
+    def follow(self, step: str, highlight: str, countdown: float | None) -> None:
+        """Do what the guide's view says."""
+        shakes = step == "assignment" and highlight
+        self.doing = f"shake {highlight}" if shakes else "clasp" if step in ("clasp", "quality") else "stand"
+        del countdown
+
+    def step(self) -> tuple[float, dict[str, tuple[np.ndarray, np.ndarray]]]:
+        """Time [s] of the next sample, and sensor → gyro (3,) and accel (3,)."""
+        before, simulation = self._k, self.simulation
+        if self.doing == "clasp" and self._k < len(simulation.time) - 300:
+            self._direction = 1
+        elif self._k >= STAND[1] or self._k >= len(simulation.time) - 300:
+            self._direction = -1
+        elif self._k <= STAND[0]:
+            self._direction = 1
+        returns = self.hurries and self._direction < 0 and self._k > STAND[1] + RETURN_FASTER
+        self._k += self._direction * (RETURN_FASTER if returns else 1)
+        row = max(before, self._k)  # the rate over the interval between the two
+        self._sent += 1
+        time_s = self._sent / RATE_HZ
+        samples = {}
+        for sensor, segment in self.worn.items():
+            bias = simulation.gyro_bias[segment][row]
+            gyro = bias + self._direction * (simulation.gyro_S[segment][row] - bias)
+            if self.doing == f"shake {segment}":
+                gyro = gyro + SHAKE_RATE * np.sin(2.0 * np.pi * SHAKE_HZ * time_s) * (time_s % 3.0 < 1.5)
+            gyro = self.disturb(segment, gyro)
+            if segment not in self.silent:
+                samples[sensor] = gyro, simulation.accel_S[segment][self._k]
+        return time_s, samples
+
+
+class PersonSource:
+    """A source with a clock of its own: the person acts as fast as the guide takes samples."""
+
+    rate_hz: float | None = RATE_HZ
+
+    def __init__(self, person: GuidedPerson, step_s: float = 0.05) -> None:
+        self.person, self.sensors, self.problems = person, tuple(person.worn), dict[str, int]()
+        self._rows, self._now = round(step_s * RATE_HZ), 0.0
+        self.asleep_s = 0.0  # [s] for which nothing comes
+
+    def open(self) -> None: ...
+
+    def clock(self) -> float:
+        return self._now
+
+    def read(self, timeout_s: float) -> list[Samples] | None:
+        assert timeout_s > 0.0
+        rows = [self.person.step() for _ in range(self._rows)]
+        self._now = rows[-1][0]
+        if self.asleep_s > 0.0:
+            self.asleep_s -= self._rows / RATE_HZ
+            return []
+        samples = []
+        for sensor in self.person.worn:
+            own = [(t, *values[sensor]) for t, values in rows if sensor in values]
+            if own:
+                samples.append(Samples(sensor, *(np.array(column) for column in zip(*own, strict=True))))
+        return samples
+
+    def close(self) -> None: ...
+
+
+class UdpPerson:
+    """Sends the person's samples as JSON in real time, from a thread of its own."""
+
+    def __init__(self, person: GuidedPerson, port: int) -> None:
+        self.person, self._port, self.asleep = person, port, False
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> UdpPerson:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            begin, sent = time.monotonic(), 0
+            while not self._end.is_set():
+                time.sleep(max(0.0, begin + sent / RATE_HZ - time.monotonic()))
+                t, samples = self.person.step()
+                sent += 1
+                if self.asleep:
+                    continue
+                lines = [
+                    json.dumps({"sensor": sensor, "t": t, "gyro": gyro.tolist(), "accel": accel.tolist()})
+                    for sensor, (gyro, accel) in samples.items()
+                ]
+                out.sendto("\n".join(lines).encode(), ("127.0.0.1", self._port))

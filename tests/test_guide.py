@@ -1,0 +1,257 @@
+"""The guided session: who follows it ends with the calibration that the recording gives; who does not is told so."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+import pytest
+from guided_person import RATE_HZ, GuidedPerson, PersonSource, perform
+
+from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, load_protocol
+from wepose_pin.errors import BadSession
+from wepose_pin.live.assignment import AssignedSource, ShakeDetector, read_segments, write_segments
+from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
+from wepose_pin.live.guided import make_steps
+from wepose_pin.live.setup import SensorSetup
+from wepose_pin.live.state import GuideView
+from wepose_pin.model import load_model
+from wepose_pin.readers import load_session
+from wepose_pin.readers.live_log import read_live_log
+from wepose_pin.recording import Recording
+from wepose_pin.recording.arrivals import Samples
+from wepose_pin.simulation import simulate_person
+
+PERSON = 3, 45.0  # seed, and seconds that the clasp may last
+MEASURED = {"shoulder_width": simulate_person(PERSON[0]).lengths["shoulder_width"]}
+PRESSED = {("sensors", "next"), ("start", "next"), ("quality", "accept"), ("quality", "exchange")}
+CLASP_S = 20.0  # of the test's protocol, for short recordings
+
+
+class Moment(NamedTuple):
+    """What the guide said at a time [s]."""
+
+    time: float
+    step: str
+    view: GuideView
+
+
+def calibrate_recording(recording: Recording, measured: Mapping[str, float]) -> tuple[Calibration, CalibrationQuality]:
+    calibration = calibrate(recording, measured=measured)
+    return calibration, assess(calibration)
+
+
+def make_options(folder: Path, known: Mapping[str, str] | None = None) -> GuideOptions:
+    """A guide whose clasp is short, and which estimates nothing on the way."""
+    protocol, model = load_protocol("clasp"), load_model()
+    steps = tuple(replace(step, seconds=CLASP_S) if step.phase == "clasp" else step for step in protocol.steps)
+
+    def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
+        return Calibrated(*calibrate_recording(load_session(path), {**MEASURED, **measured}), folder)
+
+    def estimate(_: Recording) -> tuple[Calibration, CalibrationQuality]:
+        raise BadSession("nothing is estimated here")
+
+    depth = {name: int("arm" in name) + int("forearm" in name) for name in model.table.segments}
+    return GuideOptions(
+        folder,
+        replace(protocol, steps=steps),
+        SensorSetup(remounted=True),
+        tuple(model.table.segments),
+        depth,
+        calibrate_file,
+        estimate,
+        "amekf",
+        known or {},
+    )
+
+
+class Session:
+    """A person in front of a guide; presses what is offered first."""
+
+    def __init__(self, folder: Path, known: Mapping[str, str] | None = None) -> None:
+        self.person = GuidedPerson(perform(*PERSON))
+        self.source = PersonSource(self.person)
+        self.guide = Guide(self.source, make_options(folder, known), make_steps)
+        self.clicks: list[str] = []
+        self.obeys: Callable[[str, GuideView], str] = lambda _step, view: view.highlight
+
+    def run(self, until: Callable[[Moment], bool] = lambda _: False, seconds: float = 300.0) -> list[Moment]:
+        """What was said until `until`; on the person's clock."""
+        moments = []
+        for moment in self._moments():
+            moments.append(moment)
+            if until(moment):
+                return moments
+            assert moment.time < seconds, moment
+        return moments
+
+    def _moments(self) -> Iterator[Moment]:
+        guide = self.guide
+        while guide.accepted is None:
+            guide.push(self.source.read(0.1), self.source.clock())
+            view, step = guide.view(), guide.step.name
+            self.person.follow(step, self.obeys(step, view), view.countdown)
+            yield Moment(self.source.clock(), step, view)
+            first = view.actions[0].name if view.actions else ""
+            if (step, first) in {
+                ("sensors", "next"),
+                ("start", "next"),
+                ("quality", "accept"),
+                ("quality", "exchange"),
+            }:
+                self.clicks.append(first)
+                guide.act(first)
+            elif step == "quality":
+                time.sleep(0.02)  # the calibration runs in a thread
+        guide.close()
+
+
+def test_from_sensors_of_any_name_to_the_calibration_of_their_recording(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    moments = session.run()
+    assert session.clicks == ["next", "next", "accept"]
+    assert session.guide.segments == session.person.worn
+    assert [*dict.fromkeys(moment.step for moment in moments)] == [
+        "sensors", "assignment", "static", "start", "clasp", "quality",
+    ]  # fmt: skip
+    assert session.guide.accepted is not None
+    live = session.guide.accepted.calibration
+    file = tmp_path / "calibration-1.wepose"
+    again, quality = calibrate_recording(load_session(file), MEASURED)
+    assert again.subject.lengths == live.subject.lengths
+    assert np.array_equal(again.subject.covariance, live.subject.covariance)
+    for name, mount in live.subject.mounts.items():
+        assert np.array_equal(again.subject.mounts[name], mount)
+    assert quality.quality != "fail"
+    for name, length in perform(*PERSON).lengths.items():
+        assert abs(live.subject.lengths[name] - length) < 3.0 * live.subject.std(name), name
+    # What was said on the way is in the file.
+    recording = read_live_log(file).recording
+    ((first, last),) = recording.phases["start"]
+    assert last - first == pytest.approx(4.0, abs=0.02)
+    ((first, last),) = recording.phases["clasp"]
+    assert last - first == pytest.approx(CLASP_S, abs=0.1)
+    # The start pose is held after the countdown, not before.
+    counted = [m.view.countdown for m in moments if m.step == "start" and m.view.countdown is not None]
+    assert counted[0] == pytest.approx(8.0, abs=0.1)
+
+
+def begin(session: Session, phase: str, seconds: float) -> None:
+    """Follow the guide until so many seconds of a phase are recorded."""
+    session.run(lambda m: m.step == phase and session.guide.attempt.measured_s(phase) >= seconds)
+
+
+def test_who_moves_in_the_start_pose_is_told_which_sensor_moved(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    session.run(lambda m: m.step == "start" and 0.2 < m.view.progress < 1.0)
+    session.person.disturb = lambda segment, gyro: gyro + 1.0 * (segment == "right_forearm")
+    moved = session.run(lambda m: bool(m.view.note))[-1]
+    assert moved.step == "start"
+    assert moved.view.note == "You moved (right forearm). Once more: 4 s still."
+    session.person.disturb = lambda _segment, gyro: gyro
+    begin_s = session.run(lambda m: m.step == "clasp")[-1].time
+    assert begin_s - moved.time == pytest.approx(4.0, abs=0.4)
+    session.guide.close()
+
+
+def test_a_short_loss_pauses_and_a_long_one_needs_the_start_pose_again(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    begin(session, "clasp", 5.0)
+    session.person.silent = {"left_forearm"}
+    note = session.run(lambda m: bool(m.view.note))[-1].view.note
+    assert note == "No samples from left forearm: it goes on when they come again."
+    back = session.source.clock() + 0.8
+    session.run(lambda m: m.time > back)
+    session.person.silent = set()
+    begin(session, "clasp", 8.0)
+    (_, paused), (resumed, _) = session.guide.attempt.recording().phases["clasp"]
+    assert 3.0 < resumed - paused < 5.0
+    # All are silent for ten seconds, as when the laptop sleeps.
+    session.source.asleep_s = 10.0
+    again = session.run(lambda m: m.step == "start")[-1].view
+    assert again.note.startswith("No samples from any sensor for 10 s, and headings were lost")
+    assert session.guide.segments == session.person.worn
+    session.run(lambda m: m.step == "clasp")
+    assert session.guide.attempts == 1
+    assert set(session.guide.attempt.recording().phases) == {"start"}
+    session.guide.close()
+
+
+@pytest.mark.slow
+def test_sensors_that_were_mistaken_are_exchanged_without_another_motion(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    mistaken = {"left_forearm": "right_forearm", "right_forearm": "left_forearm"}
+    session.obeys = lambda _step, view: mistaken.get(view.highlight, view.highlight)
+    moments = session.run()
+    assert session.clicks == ["next", "next", "exchange", "accept"]
+    assert session.guide.segments == session.person.worn
+    said = next(m.view for m in moments if m.view.quality == "fail")
+    assert said.sentence == "Some sensors sit on other segments than assigned."
+    assert "left forearm and right forearm seem to be exchanged" in said.reasons[0]
+    recording = load_session(tmp_path / "calibration-1.wepose")
+    assert calibrate_recording(recording, MEASURED)[1].quality == "pass"
+
+
+def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -> None:
+    worn = GuidedPerson(perform(*PERSON)).worn
+    write_segments(tmp_path, worn)
+    session = Session(tmp_path, read_segments(tmp_path, load_model().table.segments))
+    moments = session.run(lambda m: m.step == "clasp")
+    assert "assignment" not in {moment.step for moment in moments}
+    session.guide.act("again")  # is not offered
+    assert session.guide.step.name == "clasp"
+    session.guide.act("restart")
+    assert session.guide.step.name == "start"
+    session.guide.act("go assignment")
+    assert (session.guide.step.name, session.guide.segments) == ("assignment", {})
+    session.run(lambda m: m.step == "start")
+    assert session.guide.segments == worn
+    assert session.guide.attempts == 2  # of other sensors: another file
+    session.guide.close()
+
+
+def test_a_setup_with_a_wrong_segment_is_refused(tmp_path: Path) -> None:
+    for text, said in (
+        ('format = 1\n[sensors]\na = "tail"', "sensors.a = 'tail' is not a segment"),
+        ('format = 1\n[sensors]\na = "torso"\nb = "torso"', "names a segment twice"),
+        ("format = 2", "no sensor setup of format 1"),
+    ):
+        (tmp_path / "setup.toml").write_text(text)
+        with pytest.raises(BadSession, match=said):
+            read_segments(tmp_path, ("torso",))
+
+
+def test_the_battery_of_a_sensor_goes_with_its_segment() -> None:
+    class Charged(PersonSource):
+        batteries: ClassVar = {"a7": 0.4, "zz": 0.1}
+
+    person = GuidedPerson(perform(*PERSON))
+    assert AssignedSource(Charged(person), person.worn, ("torso",)).batteries == {"torso": 0.4}
+    assert AssignedSource(PersonSource(person), person.worn, ("torso",)).batteries == {}
+
+
+def test_a_shake_is_found_among_sensors_that_move_with_it() -> None:
+    detector, t = ShakeDetector(), np.arange(0.0, 1.0, 1.0 / RATE_HZ)
+    wave = 8.0 * np.sin(2.0 * np.pi * 3.0 * t)[:, None] * [1.0, 0.0, 0.0]
+    still = 1e-3 * np.ones((len(t), 3))
+
+    def push(begin: float, **rates: np.ndarray) -> None:
+        for k in range(0, len(t), 5):
+            part = slice(k, k + 5)
+            detector.push([Samples(name, begin + t[part], rate[part], rate[part]) for name, rate in rates.items()])
+
+    push(0.0, a=still, b=still)
+    assert detector.find(["a", "b"]) is None
+    push(1.0, a=wave, b=0.5 * wave)
+    assert detector.find(["a", "b"]) == "a"
+    assert detector.find(["b"]) is None  # not before all have come to rest
+    push(2.0, a=still, b=still)
+    assert detector.find(["b"]) is None
+    push(3.0, a=wave, b=0.9 * wave)
+    assert detector.find(["a", "b"]) is None  # either of them
+    assert detector.find(["b"]) == "b"

@@ -1,0 +1,140 @@
+"""Which sensor sits on which segment: found by shaking, kept in a file, applied to a source."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..documents import read_toml, toml_key, toml_string, whole_file
+from ..errors import BadSession
+from ..recording.arrivals import Samples
+from .sources.base import Source, find_batteries
+
+SETUP_FILE = "setup.toml"
+SETUP_FORMAT = 1
+SHAKE_WINDOW_S = 0.8  # [s] newest samples by which a shake is detected
+SHAKE_RATE = 2.5  # [rad/s] rms of a sensor that is shaken; a person who stands is below 0.1
+CALM_RATE = 0.6  # [rad/s] below which all must be before the next shake counts
+SHAKE_RATIO = 1.6  # of the shaken sensor's rms to that of every other candidate
+
+
+class ShakeDetector:
+    """Detects which sensor is shaken; after one was found, all must come to rest before the next."""
+
+    def __init__(self) -> None:
+        self._recent: dict[str, deque[tuple[float, float]]] = {}  # sensor → time [s], squared rate [rad²/s²]
+        self._calm = False
+
+    def push(self, samples: Iterable[Samples]) -> None:
+        """Add samples of any sensors."""
+        for chunk in samples:
+            recent = self._recent.setdefault(chunk.sensor, deque())
+            recent.extend(zip(chunk.time.tolist(), np.sum(chunk.gyro_S**2, axis=1).tolist(), strict=True))
+            while recent and recent[0][0] < recent[-1][0] - SHAKE_WINDOW_S:
+                recent.popleft()
+
+    def find(self, candidates: Sequence[str]) -> str | None:
+        """The candidate that is shaken; None: none, several, or those of the last shake still move."""
+        rates = {sensor: self._rate(sensor) for sensor in self._recent}
+        if not self._calm:
+            self._calm = all(rate < CALM_RATE for rate in rates.values())
+            return None
+        ranked = sorted(candidates, key=lambda sensor: rates.get(sensor, 0.0), reverse=True)
+        if not ranked or rates.get(ranked[0], 0.0) < SHAKE_RATE or not self._lasts(ranked[0]):
+            return None
+        if len(ranked) > 1 and rates[ranked[0]] < SHAKE_RATIO * rates.get(ranked[1], 0.0):
+            return None
+        self._calm = False
+        return ranked[0]
+
+    def is_shaken(self, sensor: str) -> bool:
+        """Whether a sensor moves as one that is shaken, and not still from the last shake."""
+        return self._calm and self._rate(sensor) > SHAKE_RATE and self._lasts(sensor)
+
+    def _lasts(self, sensor: str) -> bool:
+        """Whether it was seen for as long as a shake takes."""
+        recent = self._recent.get(sensor, deque())
+        return len(recent) > 1 and recent[-1][0] - recent[0][0] > 0.75 * SHAKE_WINDOW_S
+
+    def _rate(self, sensor: str) -> float:
+        recent = self._recent.get(sensor, ())
+        return float(np.sqrt(np.mean([square for _, square in recent]))) if recent else 0.0
+
+
+class AssignedSource:
+    """A source whose sensors are named by the segments that they are assigned to.
+
+    Parameters
+    ----------
+    segments : sensor of the source → segment; other sensors are left out
+    order : of the segments
+    is_open : the source is open already
+    """
+
+    def __init__(
+        self, source: Source, segments: Mapping[str, str], order: Iterable[str], is_open: bool = False
+    ) -> None:
+        self.source, self.segments, self._is_open = source, dict(segments), is_open
+        self.sensors = tuple(segment for segment in order if segment in self.segments.values())
+        self.rate_hz, self.problems = source.rate_hz, source.problems
+
+    def open(self) -> None:
+        """Open the source, unless it is open already."""
+        if not self._is_open:
+            self.source.open()
+            self._is_open = True
+
+    def read(self, timeout_s: float) -> list[Samples] | None:
+        """Samples of the assigned sensors since the last call; None at the end."""
+        samples = self.source.read(timeout_s)
+        return None if samples is None else self.rename(samples)
+
+    def rename(self, samples: Iterable[Samples]) -> list[Samples]:
+        """The samples of the assigned sensors, named by their segments."""
+        return [
+            chunk._replace(sensor=self.segments[chunk.sensor]) for chunk in samples if chunk.sensor in self.segments
+        ]
+
+    @property
+    def batteries(self) -> dict[str, float]:
+        """Segment → share of its sensor's charge, 0 to 1, where it is known."""
+        known = find_batteries(self.source).items()
+        return {self.segments[name]: charge for name, charge in known if name in self.segments}
+
+    def clock(self) -> float:
+        return self.source.clock()
+
+    def close(self) -> None:
+        self.source.close()
+
+
+def read_segments(path: Path, known: Iterable[str]) -> dict[str, str]:
+    """Sensor → segment, of a setup file or the folder that holds it.
+
+    Raises
+    ------
+    BadSession
+        A segment is not among `known`, or is named twice.
+    """
+    path = path / SETUP_FILE if path.is_dir() else path
+    content = read_toml(path, "a sensor setup", BadSession)
+    segments, names = content.get("sensors"), tuple(known)
+    if content.get("format") != SETUP_FORMAT or not isinstance(segments, dict) or not segments:
+        raise BadSession(f"{path}: no sensor setup of format {SETUP_FORMAT}; `wepose live --guide` writes one")
+    for sensor, segment in segments.items():
+        if segment not in names:
+            raise BadSession(f"{path}: sensors.{sensor} = {segment!r} is not a segment; {', '.join(names)} are")
+    if len(set(segments.values())) < len(segments):
+        raise BadSession(f"{path}: [sensors] names a segment twice")
+    return dict(segments)
+
+
+def write_segments(folder: Path, segments: Mapping[str, str]) -> None:
+    """Write the setup file that `read_segments` reads."""
+    lines = [f"format = {SETUP_FORMAT}", "", "[sensors]   # name that the source gives it = segment"]
+    lines += [f"{toml_key(sensor)} = {toml_string(segment)}" for sensor, segment in segments.items()]
+    with whole_file(folder / SETUP_FILE, force=True) as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="utf-8")

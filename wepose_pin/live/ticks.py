@@ -1,0 +1,117 @@
+"""`TickStream`: arrivals of a source → ticks of one clock, from when the sensors and the rate are known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ..recording.arrivals import JUMP_S, WAIT_S, Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
+from ..writers.live_log import LiveLog
+
+RATE_MEASUREMENT_S = 1.0  # [s] over which the rate is measured if the source does not know it
+MAX_ABSENCE_S = 3.0  # [s] after which ticks begin without a sensor that has sent nothing
+MAX_HISTORY = 2_000_000  # samples that wait for a recording that may begin: an hour of five sensors at 100 Hz, 110 MB
+DEFAULT_RATE_HZ = 100.0  # where none can be measured
+
+
+class TickStream:
+    """Makes ticks once every sensor has sent a sample and the rate is known, and records the arrivals.
+
+    Parameters
+    ----------
+    rate_hz : of the ticks; None: that of the slowest sensor is measured
+    begin : time [s] of the first tick; None: when every sensor has sent a sample
+    log : the recording; None: nothing is recorded
+
+    Attributes
+    ----------
+    newest_times : sensor → time [s] of its newest sample; −inf before the first
+    history : the arrivals so far, while nothing is recorded; None once there are more than `MAX_HISTORY`
+    synchronizer : what makes the ticks; None before they begin
+    """
+
+    def __init__(
+        self,
+        sensors: Sequence[str],
+        rate_hz: float | None = None,
+        begin: float | None = None,
+        wait_s: float = WAIT_S,
+        log: LiveLog | None = None,
+    ) -> None:
+        self.sensors, self.log = tuple(sensors), log
+        self.newest_times = dict.fromkeys(self.sensors, -np.inf)
+        self.synchronizer: StreamSynchronizer | None = None
+        self._rate_hz, self._begin, self._wait_s = rate_hz, begin, wait_s
+        self.history: list[Arrivals] | None = [] if log is None else None
+        self._kept = 0  # samples in the history
+        self._waiting: list[Arrivals] = []
+
+    def push(self, samples: Sequence[Samples]) -> Iterator[Ticks]:
+        """Record the samples of one read, and iterate over the ticks that they complete."""
+        samples = [chunk for chunk in samples if len(chunk.time)]
+        if not samples:
+            return
+        for chunk in samples:
+            self.newest_times[chunk.sensor] = max(self.newest_times[chunk.sensor], float(chunk.time[-1]))
+        arrivals = order_arrivals(samples, self.sensors)
+        if self.log is not None:
+            self.log.samples(arrivals)
+        elif self.history is not None:
+            self.history.append(arrivals)
+            self._kept += len(arrivals.time)
+            self.history = self.history if self._kept <= MAX_HISTORY else None
+        self._waiting.append(arrivals)
+        if self.synchronizer is None:
+            self._begin_ticks()
+        if self.synchronizer is not None:
+            waiting, self._waiting = self._waiting, []
+            for each in waiting:
+                for ticks in self.synchronizer.iterate_ticks(each):
+                    yield ticks
+                    if self.log is not None:
+                        self.log.due()
+
+    def _begin_ticks(self) -> None:
+        sensor, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])
+        times = {int(i): time_s[sensor == i] for i in np.unique(sensor)}
+        first = np.array([float(sensor_times[0]) for sensor_times in times.values()])
+        newest = max(self.newest_times.values())
+        if len(first) < len(self.sensors) and newest - first.min() < MAX_ABSENCE_S:
+            return
+        rate = self._rate_hz
+        if rate is None:
+            if newest - first.max() < RATE_MEASUREMENT_S:
+                return
+            rate = _measure_rate(list(times.values()))
+        # A time-stamp outlier must not put all other sensors before the beginning.
+        begin = self._begin if self._begin is not None else float(first[first < np.median(first) + JUMP_S].max())
+        self.synchronizer = StreamSynchronizer(self.sensors, rate, begin, self._wait_s)
+        self._record_clock()
+
+    def record(self, log: LiveLog) -> None:
+        """Record from now on, and what came before: the recording is as one from the beginning.
+
+        Only where there is a `history`.
+        """
+        history, self.history, self.log = self.history, None, log
+        for arrivals in history or ():
+            log.samples(arrivals)
+        self._record_clock()
+
+    def _record_clock(self) -> None:
+        synchronizer = self.synchronizer
+        if self.log is not None and synchronizer is not None:
+            self.log.event("clock", rate_hz=synchronizer.rate_hz, begin=synchronizer.begin, wait_s=self._wait_s)
+
+
+def _measure_rate(times: Sequence[np.ndarray]) -> float:
+    """Measure the rate [Hz] of the slowest sensor from times [s] of each, rounded to 0.1 Hz."""
+    rates = []
+    for time_s in map(np.unique, times):
+        if len(time_s) > 2:
+            median = 1.0 / float(np.median(np.diff(time_s)))
+            mean = (len(time_s) - 1) / float(time_s[-1] - time_s[0])
+            # The mean is more precise unless samples are lost. For time stamps in bursts only the mean is right.
+            rates.append(mean if abs(mean / median - 1.0) < 0.05 or median > 3.0 * mean else median)
+    return max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ
