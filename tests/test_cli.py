@@ -163,7 +163,7 @@ def test_nothing_is_overwritten_without_force(short: Path, tmp_path: Path, capsy
 def test_gauges_add_up_and_none_is_given_twice(
     session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    two = ["--measured", "shoulder_width=0.39", "--measured", "trunk=0.51"]
+    two = ["--measured", "shoulder_width=0.35", "--measured", "trunk=0.51"]
     assert run("calibrate", session, *two, "-o", tmp_path / "subject") == 0
     subject = (tmp_path / "subject" / "subject.toml").read_text()
     assert "measured: shoulder_width" in subject
