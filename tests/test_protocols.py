@@ -403,9 +403,7 @@ def test_a_longer_phase_makes_no_better_pose() -> None:
 def test_clasp_measured_is_clasp_with_a_measured_length() -> None:
     person, simulation = made("clasp", 4, real=False)
     recording = simulation.recording()
-    with pytest.raises(
-        BadOption, match=r"needs 1 measured length of its chain, as in --measured biacromial=0\.41"
-    ):
+    with pytest.raises(BadOption, match=r"needs 1 measured length of its chain, as in --measured biacromial=0\.41"):
         calibrate(recording, protocol="clasp_measured")
     with pytest.raises(BadOption, match="needs 1 measured length"):
         calibrate(recording, protocol="clasp_measured", measured={"trunk": 0.5})
