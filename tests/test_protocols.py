@@ -311,7 +311,7 @@ def test_a_fixed_point_says_that_it_has_no_scale_and_which_gauge_would_serve() -
         covariance=np.pad(person.prior.covariance, (0, k)),
     )
     best = calibrate(recording, measured=upper, prior=sure, protocol="touch_right")
-    assert best.subject.std("trunk") < good.subject.std("trunk") < 0.75 * person.prior.std("trunk")
+    assert best.subject.std("trunk") < good.subject.std("trunk") < 0.8 * person.prior.std("trunk")
 
 
 class StillTrunk(Touch):
