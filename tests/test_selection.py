@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from test_export import a_pose, write_folder
 
-from tests.test_export import a_pose, write_folder
 from wepose_pin.cli import main
 from wepose_pin.errors import BadData, WrongOption
 from wepose_pin.kinematics import cut_pose

@@ -6,6 +6,7 @@ of the reports are lines, bars and markers, and as SVG they follow the page's li
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -51,7 +52,7 @@ class Picture(NamedTuple):
 class Mark:
     """Something drawn in a panel, in data coordinates; an infinite coordinate is the panel's edge."""
 
-    kind: Literal["line", "area", "box", "disc"] | Marker
+    kind: Literal["line", "area", "band", "box", "disc"] | Marker
     css: str
     x: np.ndarray  # (n,); of boxes (n, 2)
     y: np.ndarray
@@ -115,6 +116,14 @@ class Panel:
     def area(self, x: np.ndarray, y: np.ndarray, css: str) -> None:
         """The area between a line and zero."""
         self.marks.append(Mark("area", css, np.asarray(x, float), np.asarray(y, float)))
+
+    def band(self, x: np.ndarray, low: np.ndarray, high: np.ndarray, css: str) -> None:
+        """The area between two lines through points (n,); NaN breaks it."""
+        known = np.isfinite(low) & np.isfinite(high)
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], known, [False]))))
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            xs, ys = (np.concatenate([there[a:b], back[a:b][::-1]]) for there, back in ((x, x), (low, high)))
+            self.marks.append(Mark("band", css, xs, ys))
 
     def boxes(self, x: object, y: object, css: str, *, colour: str = "", counts: bool = True) -> None:
         """Boxes from x[:, 0] to x[:, 1] and y[:, 0] to y[:, 1]."""
@@ -260,6 +269,16 @@ class Chart:
         return drawn, (_LINE + 2.0) * len(lines) + 3.0 if self.legend else 0.0
 
 
+def resolve_style(svg: str) -> str:
+    """A standalone chart for programs that know no CSS variables, as Inkscape and librsvg: each as its light colour."""
+    start, end = svg.index("<style>"), svg.index("</style>")
+    style = svg[start:end].partition("@media")[0]
+    colours = dict(re.findall(r"(--\w+): (#\w+);", style))
+    style = re.sub(r"--\w+: #\w+;\s*", "", style)
+    style = re.sub(r"var\((--\w+)\)", lambda found: colours[found[1]], style)
+    return svg[:start] + style + svg[end:]
+
+
 def envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A line of at most 2 `COLUMNS` points with the same picture: the least and the largest value of each column.
 
@@ -370,7 +389,7 @@ def _drawn_panel(panel: Panel, left: float, top: float, width: float, height: fl
     return DrawnPanel(round(left, 1), top, round(width, 1), height, panel.bare, grid, marks, texts)
 
 
-_CLASSES = {"line": "line", "area": "area", "box": "area", "disc": "area"}
+_CLASSES = {"line": "line", "area": "area", "band": "area", "box": "area", "disc": "area"}
 
 
 def _share(values: np.ndarray, low: float, high: float, log: bool) -> np.ndarray:
@@ -382,6 +401,8 @@ def _share(values: np.ndarray, low: float, high: float, log: bool) -> np.ndarray
 
 
 def _path(mark: Mark, x: np.ndarray, y: np.ndarray, zero: float, scale: float) -> str:
+    if mark.kind == "band":
+        return "".join(_runs(x, y, None)) + "z"
     if mark.kind in ("line", "area"):
         return "".join(_runs(x, y, zero if mark.kind == "area" else None))
     xs, ys = (np.rint(_UNITS_A_PIXEL * values) for values in (x, y))
