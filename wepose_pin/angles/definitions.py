@@ -7,8 +7,9 @@ from typing import NamedTuple
 from .joints import Angles, group_sides
 
 SOURCE = (
-    "Wu et al. 2005 (J Biomech 38:981-992) for thorax, shoulder, elbow and wrist, Wu et al. 2002 (J Biomech 35:543-548) "
-    "for pelvis, hip and ankle, Grood and Suntay 1983 (J Biomech Eng 105:136-144) for the knee"
+    "Wu et al. 2005 (J Biomech 38:981-992) for thorax, shoulder, elbow and wrist, "
+    "Wu et al. 2002 (J Biomech 35:543-548) for pelvis, hip and ankle, "
+    "Grood and Suntay 1983 (J Biomech Eng 105:136-144) for the knee"
 )
 
 # Joint without its side → the distal segment in the proximal one.

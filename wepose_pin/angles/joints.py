@@ -141,7 +141,7 @@ class JointAngles:
         return f"JointAngles({', '.join(self.names)}: {len(self.values)} samples [rad], {self.sequence})"
 
     def hidden(self, k: int) -> np.ndarray:
-        """(n,) bool, where the k-th angle is not to be read: lost, or near gimbal lock, where the second alone is good."""
+        """(n,) bool, where the k-th angle is not to be read: in gaps, and but for the second near gimbal lock."""
         return self.gap if k == 1 else self.gap | self.near_lock
 
 
@@ -301,7 +301,7 @@ def _joint_frame(pose: Pose, joint: Joint, segment: str, left: bool, known: np.n
 
 
 def _spread(values: np.ndarray, sequence: str, quat_WP: np.ndarray, cov_W: np.ndarray) -> np.ndarray:
-    """Standard deviations (n, 3) [rad] of angles from the covariance (n, 3, 3) of the turn between the segments, in W."""
+    """Standard deviations (n, 3) [rad] of angles from the covariance (n, 3, 3) of the turn between segments, in W."""
     if not len(values):
         return values
     rows = _gradients(values, sequence, quat_WP)

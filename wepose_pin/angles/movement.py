@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -167,9 +167,15 @@ def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float
 
 
 def _cut(joint: JointAngles, part: slice) -> JointAngles:
-    arrays = (joint.values, joint.gimbal, joint.near_lock, joint.gap)
-    std = None if joint.std is None else joint.std[part]
-    return JointAngles(joint.sequence, joint.names, *(array[part] for array in arrays), std, joint.quat[part])
+    return replace(
+        joint,
+        values=joint.values[part],
+        gimbal=joint.gimbal[part],
+        near_lock=joint.near_lock[part],
+        gap=joint.gap[part],
+        std=None if joint.std is None else joint.std[part],
+        quat=joint.quat[part],
+    )
 
 
 def _count_turns(values: np.ndarray) -> np.ndarray:

@@ -46,6 +46,7 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
                 "duration_mean_s": duration.mean,
                 "duration_sd_s": duration.sd,
                 "cmc": found.cmc,
+                "left_out": found.left_out,
                 "why_none": found.reason,
             }
         )
@@ -124,10 +125,10 @@ def build_curve_table(movements: Sequence[Movement]) -> pl.DataFrame:
 
 def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
     """Each further session against the first, a row a measure of each angle that both have."""
-    rows = []
-    first, *others = [movement for movement in movements if movement.curves] or [None]
-    for movement in others:
-        assert first is not None  # there are others
+    rows: list[dict[str, Any]] = []
+    repeated = [movement for movement in movements if movement.curves]
+    for movement in repeated[1:]:
+        first = repeated[0]
         for name in (name for name in first.curves if name in movement.curves):
             for k, angle in enumerate(first.angles[name].names):
                 about = {"session": movement.name, "against": first.name, "joint": name, "angle": angle}

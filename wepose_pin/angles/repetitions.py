@@ -174,7 +174,7 @@ def _find_spans(time: np.ndarray, signal: np.ndarray, full_range: float) -> np.n
 
 
 def _close_cycles(spans: np.ndarray) -> np.ndarray:
-    """Spans (r, 2) [s] from one begin to the next; those with a rest, by which they last twice as long, are left out."""
+    """Spans (r, 2) [s] from one begin to the next, without those that a rest makes last twice as long."""
     if len(spans) < 2:
         return spans[:0]
     cycles = np.column_stack([spans[:-1, 0], spans[1:, 0]])
@@ -201,7 +201,7 @@ def _size(signal: np.ndarray, before: int, peak: int, after: int) -> float:
 
 def _find_excursions(signal: np.ndarray, least: float) -> Iterator[tuple[int, int, int]]:
     """Valley, peak and valley of each excursion that rises and falls by at least `least`."""
-    peaks, valleys = _find_turns(signal, least)
+    peaks = _find_peaks(signal, least)
     for k, peak in enumerate(peaks):
         first = 0 if k == 0 else peaks[k - 1]
         last = len(signal) - 1 if k == len(peaks) - 1 else peaks[k + 1]
@@ -211,21 +211,19 @@ def _find_excursions(signal: np.ndarray, least: float) -> Iterator[tuple[int, in
             yield before, peak, after
 
 
-def _find_turns(signal: np.ndarray, least: float) -> tuple[list[int], list[int]]:
-    """Peaks after which the signal falls, and valleys after which it rises, by at least `least`, in turns."""
+def _find_peaks(signal: np.ndarray, least: float) -> list[int]:
+    """Peaks after which the signal falls by at least `least`, between each two of them a valley as deep."""
     peaks: list[int] = []
-    valleys: list[int] = []
     top = bottom = 0
-    seeks_peak = seeks_valley = True
+    seeks_peak = True
     for i, value in enumerate(signal.tolist()):
-        if value > signal[top]:
-            top = i
-        if value < signal[bottom]:
-            bottom = i
-        if seeks_peak and value <= signal[top] - least:
-            peaks.append(top)
-            seeks_peak, seeks_valley, bottom = False, True, i
-        elif seeks_valley and value >= signal[bottom] + least:
-            valleys.append(bottom)
-            seeks_peak, seeks_valley, top = True, False, i
-    return peaks, valleys
+        if seeks_peak:
+            top = i if value > signal[top] else top
+            if value <= signal[top] - least:
+                peaks.append(top)
+                seeks_peak, bottom = False, i
+        else:
+            bottom = i if value < signal[bottom] else bottom
+            if value >= signal[bottom] + least:
+                seeks_peak, top = True, i
+    return peaks

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -37,7 +38,7 @@ def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
         smooth = quat.copy()
         for first, last in find_runs(np.isfinite(quat).all(axis=1)):
             starts = [first, *(first + 1 + np.flatnonzero(~even[first + 1 : last])), last]
-            for a, b in zip(starts[:-1], starts[1:], strict=True):
+            for a, b in pairwise(starts):
                 if b - a >= _SHORTEST_RUN:
                     filtered = low_pass(unwrap_signs(quat[a:b]), cutoff_hz, 1.0 / step)
                     smooth[a:b] = filtered / np.linalg.norm(filtered, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""What the covariance of a pose makes of ranges and rates: two samples of one angle, whose errors are not independent."""
+"""What the covariance of a pose makes of ranges and rates, which are of two samples with a common error."""
 
 from __future__ import annotations
 

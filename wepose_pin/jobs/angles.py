@@ -21,9 +21,9 @@ PAGE = "angles.html"
 class AnglesJob:
     """Write the joint angles of results as tables and figures for a paper.
 
-    Angles are those of the International Society of Biomechanics (docs/angles.md). Repetitions of the movement are found
-    by the angle of the largest range, or taken from a phase of the recording, and normalised in time, 0 to 100 %.
-    Several results are compared with the first one: the same person before and after, say.
+    Angles are those of the International Society of Biomechanics (docs/angles.md). Repetitions of the movement are
+    found by the angle of the largest range, or taken from a phase of the recording, and normalised in time, 0 to 100 %.
+    Several results are compared with the first one: the same person before and after a treatment, say.
 
     Parameters
     ----------
@@ -32,10 +32,10 @@ class AnglesJob:
     further : RESULT
         Further results, each compared with the first one.
     out : DIR
-        Write to this folder: sessions.csv, repetitions.csv (a row a repetition: least, most, range, peak rate), phases.csv
-        (the same of all of the time and of each phase), summary.csv (mean and standard deviation over repetitions),
-        curves.csv (0 to 100 %), comparison.csv, definitions.csv (sequences and signs), figures (.svg) and angles.html,
-        which shows all of it.
+        Write to this folder: repetitions.csv (least, most, range, peak rate of each angle in each repetition),
+        phases.csv (the same of all of the time and of each phase), summary.csv (mean and standard deviation over
+        repetitions), curves.csv (0 to 100 %), comparison.csv (of several results), sessions.csv, definitions.csv
+        (sequences and signs), the figures as .svg, and angles.html, which shows all of it.
     interval : FROM TO
         Use only this time of each recording, in seconds.
     phase : NAME

@@ -64,14 +64,19 @@ def _draw_joint(shown: Sequence[tuple[int, Movement]], group: str, members: dict
     for side, joint in members.items():
         names = next(movement.angles[joint].names for _, movement in shown if joint in movement.curves)
         label = "" if len(members) == 1 and side == joint else f"{side} "
-        row = [Panel(f"{label}{plain(name)} [°]", "repetition [%]", x=(0.0, 100.0)) for name in names]
+        row = [Panel(f"{label}{plain(name)} [°]", x=(0.0, 100.0), shown_x=False) for name in names]
         for place, panel in enumerate(row):
             panel.y = columns[place]
             for k, movement in shown:
                 if joint in movement.curves:
                     _draw_curve(panel, movement.curves[joint][place], session_style(k), alone=len(shown) == 1)
         rows.append(row)
-    keys = [Key(f"{movement.name}, n = {len(movement.repetitions.spans)}", session_style(k)) for k, movement in shown]
+    for panel in rows[-1]:
+        panel.shown_x, panel.x_label = True, "repetition [%]"
+    keys = [
+        Key(f"{movement.name}, n = {len(movement.repetitions.spans)}", f"{session_style(k)} strong")
+        for k, movement in shown
+    ]
     spread = "Line: mean over n repetitions. Band: ± one standard deviation between repetitions."
     single = " Thin: the repetitions." if len(shown) == 1 else ""
     caption = f"The {plain(group)} over the repetition. {spread}{single}"
@@ -98,7 +103,7 @@ def _find_limits(
 def _draw_curve(panel: Panel, curve: MeanCurve, css: str, *, alone: bool) -> None:
     mean, sd = np.degrees(curve.mean), np.degrees(curve.sd)
     if not np.isfinite(mean).any():
-        panel.text(50.0, np.mean(panel.limits("y")), "not determined (near gimbal lock)", "soft", "middle")
+        panel.text(50.0, float(np.mean(panel.limits("y"))), "not determined (near gimbal lock)", "soft", "middle")
         return
     panel.band(PERCENT, mean - sd, mean + sd, f"{css} sd")
     if alone:

@@ -138,7 +138,7 @@ def _with_stated(each: Statistics, measure: str) -> str:
 
 
 def _pair(mean: float, sd: float, digits: int = 1) -> str:
-    text = f"{mean:.{digits}f}".replace("-", "−")
+    text = f"{round(mean, digits) + 0.0:.{digits}f}".replace("-", "−")
     return f"{text} ± {sd:.{digits}f}" if np.isfinite(sd) else text
 
 

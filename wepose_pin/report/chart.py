@@ -16,6 +16,7 @@ import numpy as np
 WIDTH = 920.0  # [px] of every chart
 COLUMNS = 700  # of an envelope: about a column a pixel
 _UNITS_A_PIXEL = 10  # of the integers that paths are made of
+_EDGE = 0.05  # [px] by which a rounded tick may lie beyond its axis
 _LETTER = 6.5  # [px] mean width of a letter
 _LINE = 17.0  # [px] height of a line of text
 _MARKERS = {  # about their centre, of size 1
@@ -375,12 +376,12 @@ def _drawn_panel(panel: Panel, left: float, top: float, width: float, height: fl
         x_ticks, y_ticks = _ticks(panel, "x", x0, x1, width), _ticks(panel, "y", y0, y1, height)
         for value, label in x_ticks:
             x = round(float(at_x(value)), 1)
-            if 0.0 <= x <= width:
+            if 0.0 <= x <= width + _EDGE:
                 texts += [DrawnText(x, height + 15.0, label, "tick", "middle")] if panel.shown_x else []
                 grid += f"M{x:g} 0v{height:g}" if "x" in panel.grid else ""
         for value, label in y_ticks:
             y = round(float(at_y(value)), 1)
-            if 0.0 <= y <= height:
+            if 0.0 <= y <= height + _EDGE:
                 texts += [DrawnText(-7.0, y + 4.0, label, "tick", "end")] if panel.shown_y else []
                 grid += f"M0 {y:g}h{width:.1f}" if "y" in panel.grid else ""
         if panel.x_label:
