@@ -271,13 +271,27 @@ class Chart:
 
 
 def resolve_style(svg: str) -> str:
-    """A standalone chart for programs that know no CSS variables, as Inkscape and librsvg: each as its light colour."""
+    """A standalone chart for programs that know less of CSS, as Inkscape, librsvg and LaTeX's converters.
+
+    Variables become their light colours. Paths, whose units are tenths of a pixel, have strokes in these units in place
+    of ones that do not scale.
+    """
     start, end = svg.index("<style>"), svg.index("</style>")
-    style = svg[start:end].partition("@media")[0]
+    style = svg[start:end].partition("@media")[0].replace(" vector-effect: non-scaling-stroke;", "")
     colours = dict(re.findall(r"(--\w+): (#\w+);", style))
     style = re.sub(r"--\w+: #\w+;\s*", "", style)
     style = re.sub(r"var\((--\w+)\)", lambda found: colours[found[1]], style)
-    return svg[:start] + style + svg[end:]
+    lines = [line if _UNSCALED.match(line) else _STROKE.sub(_scale_stroke, line) for line in style.split("\n")]
+    return svg[:start] + "\n".join(lines) + svg[end:]
+
+
+_UNSCALED = re.compile(r"\.chart (text|\.grid|\.axes|\.hatch )")
+_STROKE = re.compile(r"(stroke-(?:width|dasharray): )([\d. px]+)")
+
+
+def _scale_stroke(found: re.Match[str]) -> str:
+    numbers = " ".join(f"{_UNITS_A_PIXEL * float(number):g}" for number in re.findall(r"[\d.]+", found[2]))
+    return found[1] + numbers
 
 
 def envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
