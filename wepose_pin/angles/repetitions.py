@@ -189,10 +189,10 @@ def _find_onset(signal: np.ndarray, rate: np.ndarray, *, cut: bool) -> int | Non
     ----------
     cut : the valley is the end of the recording, and may be none
     """
-    if cut and rate[0] > CUT_SHARE * rate.max():
-        return None
     rests = (signal <= signal[0] + LOW_SHARE * (signal[-1] - signal[0])) & (rate <= ONSET_SHARE * rate.max())
-    return int(np.flatnonzero(rests)[-1]) if rests.any() else 0
+    if rests.any():
+        return int(np.flatnonzero(rests)[-1])
+    return None if cut and rate[0] > CUT_SHARE * rate.max() else 0
 
 
 def _size(signal: np.ndarray, before: int, peak: int, after: int) -> float:
