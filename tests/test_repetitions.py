@@ -1,4 +1,4 @@
-"""Repetitions of a movement: found where they are, however fast, with rests, cut at the ends; and none where none are."""
+"""Repetitions of a movement: found where they are, however fast, with rests, cut at the ends; none where none are."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def test_the_main_angle_is_that_of_the_largest_range_between_segments() -> None:
 
 
 def test_an_angle_that_is_not_there_is_named() -> None:
-    with pytest.raises(WrongOption, match="--main-angle right_elbow_flex: no such angle.*'right_elbow_flexion'"):
+    with pytest.raises(WrongOption, match=r"--main-angle right_elbow_flex: no such angle.*'right_elbow_flexion'"):
         find(reach(2.0), main_angle="right_elbow_flex")
 
 

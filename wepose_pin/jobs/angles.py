@@ -69,16 +69,16 @@ class AnglesJob:
     force: bool = False
 
     def check(self) -> None:
-        """Raise `WrongOption` where the interval is none, or options contradict each other."""
-        from ..errors import WrongOption
+        """Raise `BadOption` where the interval is none, or options contradict each other."""
+        from ..errors import BadOption
         from ..recording import check_selection
 
         check_selection(self.interval, self.phase)
-        if self.repetitions is not None:
-            for name, given in (("main-angle", self.main_angle), ("cycles", self.cycles or None)):
-                if given is not None:
-                    needed = f"finds no repetitions: --repetitions {self.repetitions} marks them; leave one out"
-                    raise WrongOption(name, given if name == "main-angle" else "", needed)
+        finds = f"--main-angle {self.main_angle}" if self.main_angle is not None else "--cycles" if self.cycles else ""
+        if finds and self.repetitions is not None:
+            raise BadOption(
+                f"{finds}: finds repetitions, and --repetitions {self.repetitions} marks them; leave one out"
+            )
 
 
 class AnglesOutcome(NamedTuple):
