@@ -29,7 +29,7 @@ class AnglesJob:
     ----------
     result : RESULT
         Folder that `wepose track` wrote.
-    further : RESULT
+    further : RESULT…
         Further results, each compared with the first one.
     out : DIR
         Write to this folder: repetitions.csv (least, most, range, peak rate of each angle in each repetition),
