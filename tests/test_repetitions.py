@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
-from wepose_pin.angles import JOINTS, Angles, JointAngles
+import wepose_pin as wp
+from wepose_pin.angles import JOINTS, Angles, JointAngles, joint_angles
 from wepose_pin.angles.curves import compute_cmc, compute_mean_curves, normalize_time
 from wepose_pin.angles.repetitions import MIN_RANGE, Repetitions, find_main_angle, find_repetitions
 from wepose_pin.errors import BadData, WrongOption
+from wepose_pin.model import load_model
+from wepose_pin.recording import ImuSensor
+from wepose_pin.simulation.activities import Walk
 
 RATE = 100.0
 FLEXION = "right_elbow_flexion"
@@ -257,3 +263,31 @@ def test_the_cmc_is_kadabas() -> None:
     assert compute_cmc(rng.normal(size=(5, 50)) + np.arange(5.0)[:, None]) == 0.0
     assert np.isnan(compute_cmc(curves[:1]))
     assert np.degrees(MIN_RANGE) == pytest.approx(10.0)
+
+
+# People -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_arm_swings_of_a_real_walk_are_found(data: Path) -> None:
+    """A person works at a table, stands up and walks; the period of the swing is the raw gyroscope's."""
+    recording = wp.load_session(data / "upper_body" / "session.toml")
+    pose = wp.track(recording, method="amekf", open_loop=True).pose
+    found = find_repetitions(joint_angles(pose, "XZY"), "left_shoulder_flexion")
+    walk = (recording.time > 97.0) & (recording.time < 137.0)
+    sensor = recording.sensors["left_upper_arm"]
+    assert isinstance(sensor, ImuSensor)
+    swing = sensor.gyro_S[walk, np.argmax(sensor.gyro_S[walk].std(axis=0))]
+    spectrum = np.abs(np.fft.rfft((swing - swing.mean()) * np.hanning(len(swing)), 16 * len(swing)))
+    period = 1.0 / np.fft.rfftfreq(16 * len(swing), 1.0 / recording.rate_hz)[spectrum.argmax()]
+    assert np.median(np.diff(found.spans, axis=1)) == pytest.approx(period, rel=0.06)
+    assert 38 <= len(found.spans) <= 46
+    assert found.spans.min() > 95.0  # none at the table
+
+
+def test_the_strides_of_a_simulated_walk_are_those_of_the_walk() -> None:
+    motion = Walk(load_model("whole_body"), np.random.default_rng(2), 15.0)
+    time = np.arange(0.0, 20.0, 0.01)
+    knee = np.degrees(motion.leg("right", time).knee[:, 0])
+    found = find(knee, cycles=True)
+    np.testing.assert_allclose(np.diff(found.spans, axis=1), motion.stride_s, atol=0.021)
+    assert len(found.spans) >= int(15.0 / motion.stride_s) - 4

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ..angles.movement import Movement
 
 PAGE = "angles.html"
+DECIMALS = 4  # of tables; degrees and seconds
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,8 @@ def run_angles(
     WeposeError
         No result; no such phase or angle; a cut-off that is not possible.
     """
+    from polars import selectors
+
     from ..angles import movement_tables as tables
     from ..documents import whole_folder
     from ..report.angles import draw_figures, render_angles_page
@@ -125,7 +128,7 @@ def run_angles(
         for name, build in builders.items():
             table = build(movements)
             if len(table):
-                write_table_csv(folder / f"{name}.csv", table)
+                write_table_csv(folder / f"{name}.csv", table.with_columns(selectors.float().round(DECIMALS)))
         pictures = draw_figures(movements)
         for picture in pictures:
             (folder / f"{picture.stem}.svg").write_text(render_standalone(picture), encoding="utf-8")
