@@ -12,7 +12,7 @@ import wepose_pin as wp
 from wepose_pin.angles import JOINTS, Angles, JointAngles, joint_angles
 from wepose_pin.angles.curves import compute_cmc, compute_mean_curves, normalize_time
 from wepose_pin.angles.repetitions import MIN_RANGE, Repetitions, find_main_angle, find_repetitions
-from wepose_pin.errors import BadData, WrongOption
+from wepose_pin.errors import WrongOption
 from wepose_pin.model import load_model
 from wepose_pin.recording import ImuSensor
 from wepose_pin.simulation.activities import Walk
@@ -197,15 +197,27 @@ def test_the_main_angle_is_that_of_the_largest_range_between_segments() -> None:
     large, small = np.column_stack([10.0 * wave, 50.0 * wave, 0.0 * wave]), np.outer(wave, np.ones(3))
     angles = angles_of(20.0 * wave, thorax=9.0 * large, right_wrist=large, left_wrist=small)
     assert find_main_angle(angles) == "right_wrist_ulnar_deviation"
-    angles.joints["right_wrist"].gap[:20] = True
+    angles.joints["right_wrist"].gap[:100] = True
+    assert find_main_angle(angles) == "right_wrist_ulnar_deviation"
+    angles.joints["right_wrist"].gap[:300] = True
     assert find_main_angle(angles) == FLEXION
     angles = angles_of(20.0 * wave)
     angles.joints["right_elbow"].near_lock[:] = True  # leaves the second angle
     assert find_main_angle(angles) == "right_elbow_carrying_angle"
     angles.joints["right_elbow"].gap[:] = True
-    with pytest.raises(BadData, match="no angle is determined throughout"):
-        find_main_angle(angles)
+    assert find_main_angle(angles) is None
+    assert find_repetitions(angles).reason.startswith("each angle is near gimbal lock for over 1 % of the time")
     assert "not determined for even 10 samples" in find_repetitions(angles, FLEXION).reason
+
+
+def test_a_repetition_in_a_gap_is_left_out() -> None:
+    signal, spans = chain(rest(1.0), *[part for _ in range(6) for part in (reach(2.0), rest(1.0))])
+    angles = angles_of(signal)
+    angles.joints["right_elbow"].gap[450:490] = True  # 0.4 s of the second: bridged by a line, and still much alike
+    angles.joints["right_elbow"].gap[700:705] = True
+    found = find_repetitions(angles)
+    check_spans(found, np.delete(spans, 1, axis=0))
+    assert found.left_out == 1
 
 
 def test_an_angle_that_is_not_there_is_named() -> None:

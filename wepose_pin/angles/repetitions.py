@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import BadData, WrongOption, one_of
+from ..errors import WrongOption, one_of
 from ..filters.butterworth import low_pass
 from .curves import compute_cmc, normalize_time
 from .joints import JOINTS, Angles
@@ -31,7 +31,8 @@ MAX_LEFT_OUT = 0.25
 MIN_CMC = 0.85
 _REST_SHARE = 0.15  # of the range; nearer than this to an end of it the angle dwells there
 _CLEARLY_LONGER = 1.5  # times as long at one end: the angle rests there
-_NEVER = 0.01  # share of samples that are flagged
+MAX_NEAR_LOCK, MAX_GAP = 0.01, 0.2  # of the samples of a main angle
+MAX_HIDDEN = 0.1  # of the samples of a repetition, which the main angle is not determined for
 
 
 class Repetitions(NamedTuple):
@@ -40,10 +41,10 @@ class Repetitions(NamedTuple):
     Parameters
     ----------
     spans : (r, 2) [s], begin and end
-    source : the angle they were found by, as ``right_elbow_flexion``, or the phase that marks them
+    source : the angle they were found by, as ``right_elbow_flexion``, or the phase that marks them; empty: no angle
     rising : the angle grows first; None where a phase marks them
     cmc : of the curves of that angle; NaN where a phase marks them
-    left_out : excursions of the angle that are unlike the others
+    left_out : excursions of the angle that are unlike the others, or in gaps
     reason : why there are none; empty where there are some
     """
 
@@ -60,27 +61,22 @@ def list_angles(angles: Angles) -> dict[str, tuple[str, int]]:
     return {f"{joint}_{name}": (joint, k) for joint, each in angles.joints.items() for k, name in enumerate(each.names)}
 
 
-def find_main_angle(angles: Angles) -> str:
-    """Return the angle of the largest range (2 to 98 %) among those that are determined throughout.
+def find_main_angle(angles: Angles) -> str | None:
+    """Return the angle of the largest range (2 to 98 %) among those that are determined nearly throughout.
 
     Of joints between two segments; of thorax and pelvis in W only where there are no others, for a person who turns
-    round has the largest range there. An angle that is near gimbal lock, or in a gap, for 1 % of the time is left out.
-
-    Raises
-    ------
-    BadData
-        No angle is determined throughout.
+    round has the largest range there. An angle that is near gimbal lock, or in gaps, for longer is left out
+    (`MAX_NEAR_LOCK`, `MAX_GAP`). None where all are.
     """
     ranges: dict[str, tuple[bool, float]] = {}
     for angle, (joint, k) in list_angles(angles).items():
         each = angles[joint]
         hidden = each.hidden(k)
-        if np.mean(hidden) <= _NEVER:
+        near_lock = each.near_lock & ~each.gap if k != 1 else np.zeros(len(hidden))
+        if np.mean(near_lock) <= MAX_NEAR_LOCK and np.mean(each.gap) <= MAX_GAP:
             low, high = np.percentile(each.values[~hidden, k], [2.0, 98.0])
             ranges[angle] = (JOINTS[joint].proximal != "world", float(high - low))
-    if not ranges:
-        raise BadData("no angle is determined throughout: each is near gimbal lock or lost for 1 % of the time")
-    return max(ranges, key=lambda angle: ranges[angle])
+    return max(ranges, key=lambda angle: ranges[angle], default=None)
 
 
 def find_repetitions(
@@ -103,6 +99,9 @@ def find_repetitions(
     if main_angle is not None and main_angle not in known:
         raise WrongOption("main-angle", main_angle, f"no such angle in the result; {one_of(known, main_angle, 30)}")
     source = main_angle or find_main_angle(angles)
+    if source is None:
+        limits = f"{100 * MAX_NEAR_LOCK:g} % of the time, or in gaps for over {100 * MAX_GAP:g} %"
+        return Repetitions(np.empty((0, 2)), "", reason=f"each angle is near gimbal lock for over {limits}")
     joint, k = known[source]
     values, hidden = angles[joint].values[:, k], angles[joint].hidden(k)
     if np.count_nonzero(~hidden) < 10:
@@ -122,7 +121,7 @@ def find_repetitions(
         reason = f"the angle goes out and back {times}, and {MIN_REPETITIONS} times are needed"
         return Repetitions(np.empty((0, 2)), source, rising, reason=reason)
     curves = normalize_time(angles.time, signal[:, None], spans)[:, :, 0]
-    alike = _are_alike(curves)
+    alike = _are_alike(curves) & (_share_within(angles.time, hidden, spans) <= MAX_HIDDEN)
     left_out, cmc = int(np.count_nonzero(~alike)), compute_cmc(curves[alike])
     if left_out > MAX_LEFT_OUT * len(spans) or np.count_nonzero(alike) < MIN_REPETITIONS:
         reason = f"{left_out} of its {len(spans)} excursions are unlike the others"
@@ -140,6 +139,13 @@ def _are_alike(curves: np.ndarray) -> np.ndarray:
     usual -= usual.mean()
     size = np.linalg.norm(centred, axis=1) * np.linalg.norm(usual)
     return np.asarray(centred @ usual >= MIN_CORRELATION * np.maximum(size, 1e-12))
+
+
+def _share_within(time: np.ndarray, which: np.ndarray, spans: np.ndarray) -> np.ndarray:
+    """(r,) share of the samples within each span (r, 2) [s] that are `which` (n,) bool."""
+    first, last = np.searchsorted(time, [spans[:, 0] - 1e-9, spans[:, 1] + 1e-9])
+    count = np.concatenate([[0], np.cumsum(which)])
+    return np.asarray((count[last] - count[first]) / (last - first))
 
 
 def _smooth(time: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -30,14 +30,14 @@ def run(job: AnglesJob) -> int:
 
 def _print_repetitions(movement: Movement) -> None:
     found = movement.repetitions
-    by = f"{movement.name}: {len(found.spans)} repetitions by {found.source}"
+    by = f" by {found.source}" if found.source else ""
     if not len(found.spans):
-        say(f"{movement.name}: no repetitions by {found.source}: {found.reason}")
-    elif found.rising is None:
-        say(by)
-    else:
-        left_out = f", {found.left_out} left out that are unlike them" if found.left_out else ""
-        say(f"{by}, {'rising' if found.rising else 'falling'} first; CMC {found.cmc:.2f}{left_out}")
+        say(f"{movement.name}: no repetitions{by}: {found.reason}")
+        return
+    text = f"{movement.name}: {len(found.spans)} repetitions{by}"
+    if found.rising is not None:
+        text += f", {'rising' if found.rising else 'falling'} first; CMC {found.cmc:.2f}"
+    say(text + (f"; {found.left_out} left out as unlike them, or in gaps" if found.left_out else ""))
 
 
 def _print_ranges(movements: Sequence[Movement]) -> None:

@@ -147,6 +147,7 @@ def _analyze(job: AnglesJob, progress: Progress) -> list[Movement]:
     from dataclasses import replace
 
     from ..angles.movement import MovementOptions, analyze_movement
+    from ..errors import BadOption, WrongOption
     from ..writers import read_result
     from ..writers.result import read_phases
 
@@ -159,7 +160,10 @@ def _analyze(job: AnglesJob, progress: Progress) -> list[Movement]:
         name = str(summary.get("recording") or folder.name)
         if name in [each.name for each in movements]:
             name = f"{name} ({k + 1})"
-        movement = analyze_movement(name, pose, read_phases(summary), options)
+        try:
+            movement = analyze_movement(name, pose, read_phases(summary), options)
+        except WrongOption as error:
+            raise BadOption(f"{folder}: {error}" if job.further else str(error)) from None
         if job.repetitions is None and len(movement.repetitions.spans):
             found = movement.repetitions
             options = replace(options, main_angle=found.source, rising=found.rising)

@@ -24,8 +24,8 @@ from .page import Page, Table
 from .words import capital, intervals, plain, signed, versions
 
 TEMPLATE = "report/templates/angles.html.j2"
-HEADINGS = {"lowest": "least", "highest": "most", "range": "range", "peak_rate": "fastest"}
-UNITS = {"peak_rate": " °/s"}  # others are in degrees
+HEADINGS = ("least [°]", "most [°]", "range [°]", "fastest [°/s]")  # of MEASURES
+CLEAR = 2.0  # standard deviations that the poses state; a smaller difference may be an error that a session shares
 
 
 def draw_figures(movements: Sequence[Movement]) -> list[Picture]:
@@ -95,10 +95,14 @@ def _tabulate_sessions(movements: Sequence[Movement]) -> Table:
 
 def _list_reasons(movements: Sequence[Movement]) -> list[str]:
     return [
-        f"{movement.name}: no repetitions by {plain(movement.repetitions.source)}: {movement.repetitions.reason}."
+        f"{movement.name}: no repetitions{_by(movement)}: {movement.repetitions.reason}."
         for movement in movements
         if movement.repetitions.reason
     ]
+
+
+def _by(movement: Movement) -> str:
+    return f" by {plain(movement.repetitions.source)}" if movement.repetitions.source else ""
 
 
 def _tabulate_measures(movements: Sequence[Movement]) -> Table:
@@ -106,12 +110,11 @@ def _tabulate_measures(movements: Sequence[Movement]) -> Table:
     for movement, joint, k, angle in _list_angles(movements):
         each = movement.measures[joint]
         cells = [
-            _with_stated(compute_statistics(each.values[:, k, m], each.std[:, k, m]), measure)
-            for m, measure in enumerate(MEASURES)
+            _with_stated(compute_statistics(each.values[:, k, m], each.std[:, k, m])) for m in range(len(MEASURES))
         ]
         curve = movement.curves[joint][k]
         rows.append([angle, *_name(movements, movement), *cells, f"{curve.cmc:.2f}" if np.isfinite(curve.cmc) else ""])
-    header = ["angle", *(["session"] if len(movements) > 1 else []), *HEADINGS.values(), "CMC"]
+    header = ["angle", *(["session"] if len(movements) > 1 else []), *HEADINGS, "CMC"]
     return Table(header, rows)
 
 
@@ -128,13 +131,12 @@ def _name(movements: Sequence[Movement], movement: Movement) -> list[str]:
     return [movement.name] if len(movements) > 1 else []
 
 
-def _with_stated(each: Statistics, measure: str) -> str:
+def _with_stated(each: Statistics) -> str:
     """Mean ± standard deviation, and what is stated in brackets."""
     if not each.n:
         return ""
     mean, sd, std = (float(np.degrees(value)) for value in (each.mean, each.sd, each.std))
-    text = f"{_pair(mean, sd)}{UNITS.get(measure, '°')}"
-    return f"{text} [{std:.1f}]" if np.isfinite(std) else text
+    return f"{_pair(mean, sd)} [{std:.1f}]" if np.isfinite(std) else _pair(mean, sd)
 
 
 def _pair(mean: float, sd: float, digits: int = 1) -> str:
@@ -145,7 +147,7 @@ def _pair(mean: float, sd: float, digits: int = 1) -> str:
 def _tabulate_comparisons(movements: Sequence[Movement]) -> list[tuple[str, Table]]:
     """Title and table of each further session against the first."""
     first, *others = [movement for movement in movements if movement.curves]
-    header = ["angle", *HEADINGS.values(), "curve, root mean square", "curve, largest"]
+    header = ["angle", *HEADINGS, "curve, rms [°]", "curve, largest [°]"]
     tables = []
     for other in others:
         rows = []
@@ -167,18 +169,18 @@ def _difference(first: Movement, other: Movement, joint: str, k: int, m: int) ->
     if not np.isfinite(difference.value):
         return ""
     value, low, high = (signed(float(np.degrees(each))) for each in difference[:3])
-    text = f"{value}{UNITS.get(MEASURES[m], '°')}"
     if not np.isfinite(difference.low):
-        return text
-    text = f"{text} ({low} to {high})"
-    return f"**{text}**" if difference.low > 0.0 or difference.high < 0.0 else text
+        return value
+    text = f"{value} ({low} to {high})"
+    excludes_zero = difference.low > 0.0 or difference.high < 0.0
+    return f"**{text}**" if excludes_zero and abs(difference.value) > CLEAR * np.nan_to_num(difference.std) else text
 
 
 def _curve_difference(first: MeanCurve, other: MeanCurve) -> list[str]:
     curve = compare_curves(first, other)
     if not np.isfinite(curve.rms):
         return ["", ""]
-    return [f"{np.degrees(curve.rms):.1f}°", f"{signed(float(np.degrees(curve.largest)))}° at {curve.percent:.0f} %"]
+    return [f"{np.degrees(curve.rms):.1f}", f"{signed(float(np.degrees(curve.largest)))} at {curve.percent:.0f} %"]
 
 
 def _tabulate_phases(movements: Sequence[Movement]) -> list[tuple[str, Table]]:
@@ -199,17 +201,15 @@ def _tabulate_phases(movements: Sequence[Movement]) -> list[tuple[str, Table]]:
                 for k, angle in enumerate(movement.angles[joint].names)
             ]
             title = f"{capital(name)}, {intervals([span])}"
-            tables.append((f"{movement.name}: {title}", Table(["angle", *HEADINGS.values()], rows)))
+            tables.append((f"{movement.name}: {title}", Table(["angle", *HEADINGS], rows)))
     return tables
 
 
 def _span_cells(values: np.ndarray, stds: np.ndarray) -> list[str]:
     """The measures of one angle in one span, ± as stated."""
     return [
-        f"{_pair(float(np.degrees(value)), float(np.degrees(std)))}{UNITS.get(measure, '°')}"
-        if np.isfinite(value)
-        else ""
-        for measure, value, std in zip(MEASURES, values, stds, strict=True)
+        _pair(float(np.degrees(value)), float(np.degrees(std))) if np.isfinite(value) else ""
+        for value, std in zip(values, stds, strict=True)
     ]
 
 
