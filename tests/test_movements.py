@@ -145,7 +145,7 @@ def test_ranges_and_rates_are_as_uncertain_as_drawn_errors_make_them(side: str) 
     pose = Pose(time, {name: R.as_quat() for name, R in rotations.items()}, {}, segment_cov=cov)
     joint = joint_angles(pose)[f"{side}_elbow"]
     summary = summarize_joint(time, joint)
-    stated = compute_summary_std(pose, f"{side}_elbow", joint, summary)
+    stated = compute_summary_std(pose, f"{side}_elbow", joint, summary.samples[None])[0]
     low, high, begin, end = summary.samples[0]
     spreads = []
     for constant in ("W", "L"):
@@ -164,26 +164,24 @@ def test_ranges_and_rates_are_as_uncertain_as_drawn_errors_make_them(side: str) 
         rate = (draw(end) - draw(begin)) / (time[end] - time[begin])
         spreads.append([np.std(draw(high) - draw(low)), np.std(rate)])
     range_std, rate_std = np.max(spreads, axis=0)
-    assert stated.range[0] == pytest.approx(range_std, rel=0.1)
-    assert stated.peak_rate[0] == pytest.approx(rate_std, rel=0.1)
-    assert np.array_equal(stated.lowest, [joint.std[s, k] for k, s in enumerate(summary.samples[:, 0])])
+    assert stated[0, 2] == pytest.approx(range_std, rel=0.1)
+    assert stated[0, 3] == pytest.approx(rate_std, rel=0.1)
+    assert np.array_equal(stated[:, 0], [joint.std[s, k] for k, s in enumerate(summary.samples[:, 0])])
 
 
 def test_a_heading_that_is_off_for_all_of_the_time_changes_no_range_of_the_trunk() -> None:
     pose = pose_about(np.radians(30.0) * np.sin(np.arange(200) / 30.0))
     pose = replace(pose, segment_cov={"torso": np.tile(np.diag([0.0, 0.0, 0.01]), (200, 1, 1))})
     joint = joint_angles(pose)["thorax"]
-    stated = compute_summary_std(pose, "thorax", joint, summarize_joint(pose.time, joint))
-    assert stated.highest[2] == pytest.approx(0.1)
-    assert stated.range[2] == pytest.approx(0.0, abs=1e-9)
-    assert stated.peak_rate[2] == pytest.approx(0.0, abs=1e-9)
+    stated = compute_summary_std(pose, "thorax", joint, summarize_joint(pose.time, joint).samples[None])
+    np.testing.assert_allclose(stated[0, 2], [0.1, 0.1, 0.0, 0.0], atol=1e-9)
 
 
 def test_without_covariances_nothing_is_stated() -> None:
     pose = pose_about(np.sin(np.arange(200) / 30.0))
     joint = joint_angles(pose)["thorax"]
-    stated = compute_summary_std(pose, "thorax", joint, summarize_joint(pose.time, joint))
-    assert all(np.isnan(each).all() for each in stated)
+    stated = compute_summary_std(pose, "thorax", joint, summarize_joint(pose.time, joint).samples[None])
+    assert np.isnan(stated).all()
 
 
 # Comparison -------------------------------------------------------------------------------------------------------

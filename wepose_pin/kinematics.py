@@ -171,6 +171,20 @@ class PosedBody:
         return self
 
 
+def find_samples(time: np.ndarray, interval: tuple[float, float]) -> slice:
+    """Return the samples of times (n,) [s] within an interval [s], both ends included.
+
+    Raises
+    ------
+    BadData
+        There is none.
+    """
+    first, last = (int(k) for k in np.searchsorted(time, [interval[0] - 1e-9, interval[1] + 1e-9]))
+    if first == last:
+        raise BadData(f"the interval {format_span(interval)} has no sample")
+    return slice(first, last)
+
+
 def cut_pose(pose: Pose, interval: tuple[float, float]) -> Pose:
     """Return the samples of a pose within an interval [s], both ends included; times stay.
 
@@ -179,18 +193,16 @@ def cut_pose(pose: Pose, interval: tuple[float, float]) -> Pose:
     BadData
         There is none.
     """
-    first, last = (int(k) for k in np.searchsorted(pose.time, [interval[0] - 1e-9, interval[1] + 1e-9]))
-    if first == last:
-        raise BadData(f"the interval {format_span(interval)} has no sample")
+    part = find_samples(pose.time, interval)
 
     def cut(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return {name: array[first:last] for name, array in values.items()}
+        return {name: array[part] for name, array in values.items()}
 
     return Pose(
-        pose.time[first:last],
+        pose.time[part],
         cut(pose.quat_WL),
         cut(pose.points),
-        None if pose.q is None else pose.q[first:last],
+        None if pose.q is None else pose.q[part],
         cut(pose.segment_cov),
         cut(pose.point_cov),
         cut(pose.gap),

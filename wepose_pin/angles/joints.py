@@ -272,9 +272,10 @@ def compute_gradients(pose: Pose, name: str, joint: JointAngles, samples: np.nda
 
     Those by the proximal segment are of opposite sign. The samples are known ones.
     """
-    parts = Pose(pose.time[samples], {segment: quat[samples] for segment, quat in pose.quat_WL.items()}, {})
-    left = name.startswith("left_")
-    quat_WP = _joint_frame(parts, JOINTS[name], JOINTS[name].proximal, left, np.ones(len(samples), dtype=bool))
+    left, proximal = name.startswith("left_"), JOINTS[name].proximal
+    quat_WL = {segment: quat[samples] for segment, quat in pose.quat_WL.items() if segment == proximal}
+    part = Pose(pose.time[samples], quat_WL, {})
+    quat_WP = _joint_frame(part, JOINTS[name], proximal, left, np.ones(len(samples), dtype=bool))
     rows = _gradients(joint.values[samples], joint.sequence, quat_WP)
     return rows * _MIRRORED_TURN if left else rows
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from ..errors import WrongOption, one_of
-from ..kinematics import Pose, cut_pose
+from ..kinematics import Pose, find_samples
 from ..recording import Intervals
 from .curves import MeanCurve, compute_mean_curves
 from .joints import Angles, JointAngles, joint_angles
@@ -148,21 +148,21 @@ def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float
     BadData
         A span has no sample.
     """
-    parts = [cut_pose(pose, (float(begin), float(end))) for begin, end in spans]
-    firsts = [int(np.searchsorted(pose.time, part.time[0])) for part in parts]
+    parts = [find_samples(pose.time, (float(begin), float(end))) for begin, end in spans]
     measures = {}
     for name, joint in angles.joints.items():
-        values, std = (np.full((len(parts), 3, len(MEASURES)), np.nan) for _ in range(2))
-        near_lock, gap = np.zeros(len(parts)), np.zeros(len(parts))
-        for row, (part, first) in enumerate(zip(parts, firsts, strict=True)):
-            cut = _cut(joint, slice(first, first + len(part.time)))
-            summary = summarize_joint(part.time, cut)
-            stds = compute_summary_std(part, name, cut, summary)
-            values[row] = np.column_stack([summary.lowest, summary.highest, summary.range, summary.peak_rate])
-            std[row] = np.column_stack(stds)
-            near_lock[row], gap[row] = summary.near_lock, summary.gap
+        summaries = [summarize_joint(pose.time[part], _cut(joint, part)) for part in parts]
+        values, samples = np.empty((len(parts), 3, len(MEASURES))), np.empty((len(parts), 3, len(MEASURES)), dtype=int)
+        for row, (part, each) in enumerate(zip(parts, summaries, strict=True)):
+            values[row] = np.column_stack([each.lowest, each.highest, each.range, each.peak_rate])
+            samples[row] = np.where(each.samples < 0, -1, each.samples + part.start)
         values[:, :, :2] -= _count_turns(values)[:, :, None]
-        measures[name] = Measures(values, std, near_lock, gap)
+        measures[name] = Measures(
+            values,
+            compute_summary_std(pose, name, joint, samples),
+            np.array([each.near_lock for each in summaries]),
+            np.array([each.gap for each in summaries]),
+        )
     return measures
 
 

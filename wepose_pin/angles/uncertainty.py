@@ -2,59 +2,57 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..kinematics import Pose
 from .joints import JOINTS, JointAngles, compute_gradients
-from .tables import JointSummary
 
 
-class SummaryStd(NamedTuple):
-    """Standard deviations of a `JointSummary`, each (3,), to first order; NaN where nothing is stated."""
-
-    lowest: np.ndarray  # [rad]
-    highest: np.ndarray  # [rad]
-    range: np.ndarray  # [rad]
-    peak_rate: np.ndarray  # [rad/s]
-
-
-def compute_summary_std(pose: Pose, name: str, joint: JointAngles, summary: JointSummary) -> SummaryStd:
-    """Compute the standard deviations of a joint's extremes, ranges and peak rates.
+def compute_summary_std(pose: Pose, name: str, joint: JointAngles, samples: np.ndarray) -> np.ndarray:
+    """Compute the standard deviations of a joint's summaries, to first order; NaN where nothing is stated.
 
     Those of a range and of a rate are of two samples. Their error is taken once as constant in W, as that of a heading
     is, and once as constant in each segment, as that of a mount is; the larger standard deviation of the two counts.
 
     Parameters
     ----------
-    pose, joint, summary : of the same samples
+    samples : (s, 3, 4) of the pose, as `JointSummary` has them for each of s spans
+
+    Returns
+    -------
+    np.ndarray
+        (s, 3, 4), of the lowest, the highest and the range [rad], and of the peak rate [rad/s]
     """
-    stds = SummaryStd(*(np.full(3, np.nan) for _ in range(4)))
+    stds = np.full(samples.shape, np.nan)
     if joint.std is None:
         return stds
-    for k, (low, high, begin, end) in enumerate(summary.samples):
-        if low >= 0:
-            stds.lowest[k], stds.highest[k] = joint.std[[low, high], k]
-            stds.range[k] = _difference_std(pose, name, joint, k, np.array([low, high]))
-        if begin >= 0:
-            span = pose.time[end] - pose.time[begin]
-            stds.peak_rate[k] = _difference_std(pose, name, joint, k, np.array([begin, end])) / span
+    for k in range(3):
+        low, high, begin, end = samples[:, k].T
+        known = np.flatnonzero(low >= 0)
+        stds[known, k, 0], stds[known, k, 1] = joint.std[low[known], k], joint.std[high[known], k]
+        stds[known, k, 2] = _difference_std(pose, name, joint, k, np.column_stack([low, high])[known])
+        known = np.flatnonzero(begin >= 0)
+        spans = pose.time[end[known]] - pose.time[begin[known]]
+        stds[known, k, 3] = _difference_std(pose, name, joint, k, np.column_stack([begin, end])[known]) / spans
     return stds
 
 
-def _difference_std(pose: Pose, name: str, joint: JointAngles, k: int, samples: np.ndarray) -> float:
-    """Standard deviation [rad] of the k-th angle at the second sample less that at the first."""
-    rows = compute_gradients(pose, name, joint, samples)[:, k]  # (2, 3)
-    constant_W = constant_L = 0.0
+def _difference_std(pose: Pose, name: str, joint: JointAngles, k: int, pairs: np.ndarray) -> np.ndarray:
+    """Standard deviations (m,) [rad] of the k-th angle at the second sample of each pair (m, 2) less the first."""
+    rows = compute_gradients(pose, name, joint, pairs.ravel())[:, k].reshape(-1, 2, 1, 3)
+    constant_W, constant_L = np.zeros(len(pairs)), np.zeros(len(pairs))
     for segment in (JOINTS[name].proximal, JOINTS[name].distal):
-        if segment == "world":
+        if segment == "world" or not len(pairs):
             continue
-        cov_W = pose.segment_cov[segment][samples]
-        R_WL = Rotation.from_quat(pose.quat_WL[segment][samples]).as_matrix()
-        cov_L = np.swapaxes(R_WL, 1, 2) @ cov_W @ R_WL
-        by_W, by_L = rows[1] - rows[0], rows[1] @ R_WL[1] - rows[0] @ R_WL[0]
-        constant_W += float(by_W @ cov_W.mean(axis=0) @ by_W)
-        constant_L += float(by_L @ cov_L.mean(axis=0) @ by_L)
-    return float(np.sqrt(max(constant_W, constant_L, 0.0)))
+        cov_W = pose.segment_cov[segment][pairs]
+        R_WL = Rotation.from_quat(pose.quat_WL[segment][pairs.ravel()]).as_matrix().reshape(-1, 2, 3, 3)
+        constant_W += _compute_variance(rows, cov_W)
+        constant_L += _compute_variance(rows @ R_WL, np.swapaxes(R_WL, 2, 3) @ cov_W @ R_WL)
+    return np.asarray(np.sqrt(np.maximum(np.maximum(constant_W, constant_L), 0.0)))
+
+
+def _compute_variance(rows: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """Variance (m,) of the second value less the first: derivatives (m, 2, 1, 3), covariances (m, 2, 3, 3)."""
+    difference = rows[:, 1] - rows[:, 0]
+    return np.asarray((difference @ cov.mean(axis=1) @ np.swapaxes(difference, 1, 2))[:, 0, 0])
