@@ -31,6 +31,7 @@ MAX_LEFT_OUT = 0.25
 MIN_CMC = 0.85
 _REST_SHARE = 0.15  # of the range; nearer than this to an end of it the angle dwells there
 _CLEARLY_LONGER = 1.5  # times as long at one end: the angle rests there
+_NO_SPANS = np.empty((0, 2))
 MAX_NEAR_LOCK, MAX_GAP = 0.01, 0.2  # of the samples of a main angle
 MAX_HIDDEN = 0.1  # of the samples of a repetition, which the main angle is not determined for
 
@@ -101,16 +102,16 @@ def find_repetitions(
     source = main_angle or find_main_angle(angles)
     if source is None:
         limits = f"{100 * MAX_NEAR_LOCK:g} % of the time, or in gaps for over {100 * MAX_GAP:g} %"
-        return Repetitions(np.empty((0, 2)), "", reason=f"each angle is near gimbal lock for over {limits}")
+        return Repetitions(_NO_SPANS, "", reason=f"each angle is near gimbal lock for over {limits}")
     joint, k = known[source]
     values, hidden = angles[joint].values[:, k], angles[joint].hidden(k)
     if np.count_nonzero(~hidden) < 10:
-        return Repetitions(np.empty((0, 2)), source, reason="the angle is not determined for even 10 samples")
+        return Repetitions(_NO_SPANS, source, reason="the angle is not determined for even 10 samples")
     signal = _smooth(angles.time, np.interp(angles.time, angles.time[~hidden], values[~hidden]))
     low, high = np.percentile(signal, [2.0, 98.0])
     if high - low < MIN_RANGE:
         reason = f"the angle has a range of {np.degrees(high - low):.1f}°, and {np.degrees(MIN_RANGE):.0f}° are needed"
-        return Repetitions(np.empty((0, 2)), source, reason=reason)
+        return Repetitions(_NO_SPANS, source, reason=reason)
     if rising is None:
         rising = _rests_low(signal, low, high)
     spans = _find_spans(angles.time, signal if rising else -signal, float(high - low))
@@ -119,16 +120,16 @@ def find_repetitions(
     if len(spans) < MIN_REPETITIONS:
         times = {0: "no time", 1: "once", 2: "twice"}[len(spans)]
         reason = f"the angle goes out and back {times}, and {MIN_REPETITIONS} times are needed"
-        return Repetitions(np.empty((0, 2)), source, rising, reason=reason)
+        return Repetitions(_NO_SPANS, source, rising, reason=reason)
     curves = normalize_time(angles.time, signal[:, None], spans)[:, :, 0]
     alike = _are_alike(curves) & (_share_within(angles.time, hidden, spans) <= MAX_HIDDEN)
     left_out, cmc = int(np.count_nonzero(~alike)), compute_cmc(curves[alike])
     if left_out > MAX_LEFT_OUT * len(spans) or np.count_nonzero(alike) < MIN_REPETITIONS:
         reason = f"{left_out} of its {len(spans)} excursions are unlike the others"
-        return Repetitions(np.empty((0, 2)), source, rising, cmc, left_out, reason)
+        return Repetitions(_NO_SPANS, source, rising, cmc, left_out, reason)
     if cmc < MIN_CMC:
         reason = f"its {len(spans)} excursions are not alike: their CMC is {cmc:.2f}, and {MIN_CMC} is needed"
-        return Repetitions(np.empty((0, 2)), source, rising, cmc, left_out, reason)
+        return Repetitions(_NO_SPANS, source, rising, cmc, left_out, reason)
     return Repetitions(spans[alike], source, rising, cmc, left_out)
 
 
