@@ -59,17 +59,19 @@ def draw_curves(movements: Sequence[Movement]) -> list[Picture]:
 
 
 def _draw_joint(shown: Sequence[tuple[int, Movement]], group: str, members: dict[str, str]) -> Picture:
+    shown = [(k, movement) for k, movement in shown if set(members.values()) & set(movement.curves)]
     columns = [_find_limits(shown, list(members.values()), place) for place in range(3)]
     rows = []
     for side, joint in members.items():
-        names = next(movement.angles[joint].names for _, movement in shown if joint in movement.curves)
+        sessions = [(k, movement) for k, movement in shown if joint in movement.curves]
         label = "" if len(members) == 1 and side == joint else f"{side} "
-        row = [Panel(f"{label}{plain(name)} [°]", x=(0.0, 100.0), shown_x=False) for name in names]
-        for place, panel in enumerate(row):
-            panel.y = columns[place]
-            for k, movement in shown:
-                if joint in movement.curves:
-                    _draw_curve(panel, movement.curves[joint][place], session_style(k), alone=len(shown) == 1)
+        row = []
+        first = sessions[0][1].angles[joint]
+        sequence = "-".join(first.sequence)
+        for place, name in enumerate(first.names):
+            row.append(Panel(f"{label}{plain(name)} [°]", x=(0.0, 100.0), y=columns[place], shown_x=False))
+            for k, movement in sessions:
+                _draw_curve(row[-1], movement.curves[joint][place], session_style(k), alone=len(shown) == 1)
         rows.append(row)
     for panel in rows[-1]:
         panel.shown_x, panel.x_label = True, "repetition [%]"
@@ -77,10 +79,18 @@ def _draw_joint(shown: Sequence[tuple[int, Movement]], group: str, members: dict
         Key(f"{movement.name}, n = {len(movement.repetitions.spans)}", f"{session_style(k)} strong")
         for k, movement in shown
     ]
-    spread = "Line: mean over n repetitions. Band: ± one standard deviation between repetitions."
-    single = " Thin: the repetitions." if len(shown) == 1 else ""
-    caption = f"The {plain(group)} over the repetition. {spread}{single}"
+    caption = (
+        f"The {plain(group)} over the repetition, sequence {sequence}, {_describe_filter(shown[0][1])}. "
+        "Line: mean over n repetitions. Band: ± one standard deviation between repetitions."
+    )
+    if len(shown) == 1:
+        caption += " Thin: the repetitions."
     return Picture(f"curves-{group}", caption, Chart(rows, [CURVE_HEIGHT] * len(rows), keys))
+
+
+def _describe_filter(movement: Movement) -> str:
+    cutoff = movement.cutoff_hz
+    return "not low-passed" if cutoff is None else f"low-passed at {cutoff:g} Hz (half amplitude)"
 
 
 def _find_limits(
