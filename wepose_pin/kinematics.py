@@ -193,21 +193,7 @@ def cut_pose(pose: Pose, interval: tuple[float, float]) -> Pose:
     BadData
         There is none.
     """
-    part = find_samples(pose.time, interval)
-
-    def cut(values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return {name: array[part] for name, array in values.items()}
-
-    return Pose(
-        pose.time[part],
-        cut(pose.quat_WL),
-        cut(pose.points),
-        None if pose.q is None else pose.q[part],
-        cut(pose.segment_cov),
-        cut(pose.point_cov),
-        cut(pose.gap),
-        cut(pose.joints),
-    )
+    return pose.cut(find_samples(pose.time, interval))
 
 
 def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:
