@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 
 from wepose_pin.batch import Plan, read_plan
-from wepose_pin.batch.plan import Anthropometrics
+from wepose_pin.batch.plan import Anthropometrics, step_options
 from wepose_pin.errors import BadPlan, MissingFile, WeposeError
 
 STEPS = "[steps.calibrate]\n[steps.track]\n"
@@ -44,8 +44,9 @@ def test_steps_run_in_their_order_however_they_are_written(folder: Path) -> None
         "rate_hz = 50\n[steps.track]\ncovariance = true\n",
     )
     assert list(plan.items[0].steps) == ["track", "export", "evaluate"]
-    assert plan.items[0].steps["export"] == {"formats": ("trc", "mot"), "names": None, "rate_hz": 50.0}
-    assert plan.items[0].steps["evaluate"]["interval"] == (1.0, 2.0)
+    exports = {**step_options("export"), "formats": ("trc", "mot"), "rate_hz": 50.0}
+    assert plan.items[0].steps["export"] == exports
+    assert plan.items[0].steps["evaluate"] == {**step_options("evaluate"), "interval": (1.0, 2.0)}
     assert plan.items[0].steps["track"]["covariance"] is True
 
 

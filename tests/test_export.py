@@ -104,7 +104,7 @@ def test_a_phase_is_exported_by_itself(tmp_path: Path, pose: Pose) -> None:
     folder = write_folder(tmp_path / "r", pose)
     phases = '{"take_1": [[2.5, 3.0]], "late": [[90.0, 91.0]], "trial 3": [[2.1, 2.2], [2.4, 2.5]]}'
     (folder / "summary.json").write_text(f'{{"recorded_phases": {phases}}}', encoding="utf-8")
-    for phase, first, last in (("take_1", 2.5, 3.0), ("trial 3", 2.1, 2.5)):
+    for phase, first, last in (("take_1", 2.5, 3.0), ("trial 3:2", 2.4, 2.5)):
         export(folder, tmp_path / f"{phase}.parquet", phase=phase)
         table = pl.read_parquet(tmp_path / f"{phase}.parquet")
         assert (table["time"][0], table["time"][-1]) == pytest.approx((first, last))
@@ -112,9 +112,10 @@ def test_a_phase_is_exported_by_itself(tmp_path: Path, pose: Pose) -> None:
         np.testing.assert_allclose(table["left_forearm_qw"][0], pose.quat_WL["left_forearm"][k, 3], atol=1e-12)
     for phase, said in (
         ("take_2", "no such phase; did you mean .take_1."),
-        ("late", "from 90 to 91 s, where"),
+        ("trial 3", "has 2 intervals; choose trial 3:1"),
+        ("late", "the interval 90 to 91 s has no sample"),
     ):
-        with pytest.raises(BadOption, match=said):
+        with pytest.raises((BadOption, BadData), match=said):
             export(folder, tmp_path / "a.csv", phase=phase)
     with pytest.raises(BadOption, match="no motion in a file of format urdf"):
         export(folder, tmp_path / "a.urdf", phase="take_1")

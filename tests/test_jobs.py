@@ -20,6 +20,7 @@ from wepose_pin.cli.parser import parse
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import METHODS, OFFLINE
 from wepose_pin.jobs import Formulation, LiveMethod, Method
+from wepose_pin.jobs.angles import AnglesJob
 from wepose_pin.jobs.calibrate import CalibrateJob
 from wepose_pin.jobs.demo import DemoJob
 from wepose_pin.jobs.evaluate import EvaluateJob
@@ -47,7 +48,8 @@ JOBS = {
     "simulate": SimulateJob(Path("out"), 3, 50.0, preset="mild", imperfection={"bits": 12.0, "mount": "any"}),
     "retarget": RetargetJob(Path("result"), "panda", Path("out"), "both", scale=0.8, episode=True),
     "demo": DemoJob(Path("out"), 4),
-    "export": ExportJob(Path("result"), Path("a.mot"), names="isb", rate_hz=50.0),
+    "export": ExportJob(Path("result"), Path("a.mot"), names="isb", rate_hz=50.0, interval=(1.0, 2.5)),
+    "angles": AnglesJob(Path("result"), Path("out"), phase="reach:2", low_pass_hz=6.0, shoulder="XZY", cycles=True),
 }
 
 

@@ -21,6 +21,7 @@ BUILT = re.compile(rf"(left|right)_({'|'.join(PARTS)})|^_({'|'.join(PARTS)})$|(^
 
 # Files that may name them, and why.
 ALLOWED = {
+    "angles/definitions.py": "definitions of joint angles",
     "angles/joints.py": "definitions of joint angles",
     "live/sources/packets.py": "the numbers of a format",
     "report/words.py": "a plural of English",

@@ -30,7 +30,7 @@ from .model.fit import Fit
 from .model.girdle import PARAMETERS, SCALARS, Girdle, displace, find_girdle_scale, move_girdles
 from .model.orientation_ik import OrientationIk, find_groups
 from .model.reaches import UNIVERSE
-from .recording import EACH_TIME, check_time
+from .recording import EACH_TIME, check_time, format_span
 from .rotations import product
 from .subject import Subject
 
@@ -169,6 +169,31 @@ class PosedBody:
         """Check the pose (`Pose.check`) and return the posed body."""
         self.pose.check()
         return self
+
+
+def find_samples(time: np.ndarray, interval: tuple[float, float]) -> slice:
+    """Return the samples of times (n,) [s] within an interval [s], both ends included.
+
+    Raises
+    ------
+    BadData
+        There is none.
+    """
+    first, last = (int(k) for k in np.searchsorted(time, [interval[0] - 1e-9, interval[1] + 1e-9]))
+    if first == last:
+        raise BadData(f"the interval {format_span(interval)} has no sample")
+    return slice(first, last)
+
+
+def cut_pose(pose: Pose, interval: tuple[float, float]) -> Pose:
+    """Return the samples of a pose within an interval [s], both ends included; times stay.
+
+    Raises
+    ------
+    BadData
+        There is none.
+    """
+    return pose.cut(find_samples(pose.time, interval))
 
 
 def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:

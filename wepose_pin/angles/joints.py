@@ -140,6 +140,10 @@ class JointAngles:
     def __repr__(self) -> str:
         return f"JointAngles({', '.join(self.names)}: {len(self.values)} samples [rad], {self.sequence})"
 
+    def hidden(self, k: int) -> np.ndarray:
+        """(n,) bool, where the k-th angle is not to be read: in gaps, and but for the second near gimbal lock."""
+        return self.gap if k == 1 else self.gap | self.near_lock
+
 
 @dataclass(frozen=True)
 class Angles:
@@ -263,6 +267,27 @@ def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngl
     )
 
 
+def compute_gradients(pose: Pose, name: str, joint: JointAngles, samples: np.ndarray) -> np.ndarray:
+    """Derivatives (m, 3, 3) of a joint's angles at samples (m,) by a small rotation in W of its distal segment.
+
+    Those by the proximal segment are of opposite sign. The samples are known ones.
+    """
+    left, proximal = name.startswith("left_"), JOINTS[name].proximal
+    quat_WL = {segment: quat[samples] for segment, quat in pose.quat_WL.items() if segment == proximal}
+    part = Pose(pose.time[samples], quat_WL, {})
+    quat_WP = _joint_frame(part, JOINTS[name], proximal, left, np.ones(len(samples), dtype=bool))
+    rows = _gradients(joint.values[samples], joint.sequence, quat_WP)
+    return rows * _MIRRORED_TURN if left else rows
+
+
+def _gradients(values: np.ndarray, sequence: str, quat_WP: np.ndarray) -> np.ndarray:
+    """Derivatives (n, 3, 3) of angles by the turn between the segments, in W.
+
+    With ``exp(e_W) R_WL`` for each segment the rotation between two is turned on its left by ``R_WPᵀ (e_D − e_P)``.
+    """
+    return euler.gradients(values, sequence) @ np.swapaxes(Rotation.from_quat(quat_WP).as_matrix(), -1, -2)
+
+
 def _joint_frame(pose: Pose, joint: Joint, segment: str, left: bool, known: np.ndarray) -> np.ndarray:
     """The axes in which a joint's angles are taken, of one of its segments, in W; (n, 4) where it is `known`.
 
@@ -277,13 +302,10 @@ def _joint_frame(pose: Pose, joint: Joint, segment: str, left: bool, known: np.n
 
 
 def _spread(values: np.ndarray, sequence: str, quat_WP: np.ndarray, cov_W: np.ndarray) -> np.ndarray:
-    """Standard deviations (n, 3) [rad] of angles from the covariance (n, 3, 3) of the turn between the segments, in W.
-
-    With ``exp(e_W) R_WL`` for each segment the rotation between two is turned on its left by ``R_WPᵀ (e_D − e_P)``.
-    """
+    """Standard deviations (n, 3) [rad] of angles from the covariance (n, 3, 3) of the turn between segments, in W."""
     if not len(values):
         return values
-    rows = euler.gradients(values, sequence) @ np.swapaxes(Rotation.from_quat(quat_WP).as_matrix(), -1, -2)
+    rows = _gradients(values, sequence, quat_WP)
     variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
     return np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN)
 

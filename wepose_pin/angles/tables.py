@@ -27,6 +27,7 @@ class JointSummary(NamedTuple):
     peak_speed: float  # [rad/s], greatest length of the joint's angular velocity over `RATE_WINDOW_S`
     near_lock: float  # share of the samples
     gap: float  # share of the samples
+    samples: np.ndarray  # (3, 4) int: of the lowest, the highest, begin and end of the fastest; −1 where there is none
 
     @property
     def range(self) -> np.ndarray:
@@ -36,25 +37,33 @@ class JointSummary(NamedTuple):
 
 def summary(angles: Angles) -> dict[str, JointSummary]:
     """Range of motion and peak rates of every joint."""
-    return {name: _summary(angles.time, joint) for name, joint in angles.joints.items()}
+    return {name: summarize_joint(angles.time, joint) for name, joint in angles.joints.items()}
 
 
-def _summary(time: np.ndarray, joint: JointAngles) -> JointSummary:
+def summarize_joint(time: np.ndarray, joint: JointAngles) -> JointSummary:
+    """Range of motion and peak rates of one joint; `time` (n,) [s]."""
     m = _window(time)
     span = time[m:] - time[:-m]
     lowest, highest, peak_rate = (np.full(3, np.nan) for _ in range(3))
-    bad = joint.gap | joint.near_lock
-    sound = _without_bad(bad, m)
+    samples = np.full((3, 4), -1)
+    sound = np.flatnonzero(_without_bad(joint.gap | joint.near_lock, m))
     for k in range(3):
-        value = joint.values[~(joint.gap if k == 1 else bad), k]
-        if len(value):
-            lowest[k], highest[k] = value.min(), value.max()
-        peak_rate[k] = _peak_rate(np.abs(joint.values[m:, k] - joint.values[:-m, k])[sound] / span[sound])
+        values, usable = joint.values[:, k], np.flatnonzero(~joint.hidden(k))
+        if len(usable):
+            samples[k, :2] = usable[[values[usable].argmin(), values[usable].argmax()]]
+            lowest[k], highest[k] = values[samples[k, :2]]
+        if len(sound):
+            rates = np.abs(values[m:] - values[:-m])[sound] / span[sound]
+            first = sound[rates.argmax()]
+            samples[k, 2:] = first, first + m
+            peak_rate[k] = rates.max()
     whole = _without_bad(joint.gap, m)
     turn = multiply(conjugate(joint.quat[:-m][whole]), joint.quat[m:][whole])
     speed = 2.0 * np.arctan2(np.linalg.norm(turn[:, :3], axis=1), np.abs(turn[:, 3])) / span[whole]
     return JointSummary(
-        lowest, highest, peak_rate, _peak_rate(speed), float(np.mean(joint.near_lock)), float(np.mean(joint.gap))
+        *(lowest, highest, peak_rate, float(speed.max()) if len(speed) else float("nan")),
+        *(float(np.mean(joint.near_lock)), float(np.mean(joint.gap))),
+        samples,
     )
 
 
@@ -69,10 +78,6 @@ def _without_bad(bad: np.ndarray, m: int) -> np.ndarray:
     """(n − m,) bool: none of the samples k … k + m is `bad`."""
     count = np.concatenate([[0], np.cumsum(bad)])
     return count[m + 1 :] == count[: -m - 1]
-
-
-def _peak_rate(rates: np.ndarray) -> float:
-    return float(rates.max()) if len(rates) else float("nan")
 
 
 def summary_table(angles: Angles) -> pl.DataFrame:

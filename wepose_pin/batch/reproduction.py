@@ -13,6 +13,7 @@ import polars as pl
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, BadOption, MissingFile, WeposeError
 from ..jobs import Progress, no_progress
+from ..jobs.angles import AnglesJob, run_angles
 from ..jobs.calibrate import CalibrateJob, run_calibrate
 from ..jobs.demo import DemoJob, run_demo
 from ..jobs.export import ExportJob, run_export
@@ -37,6 +38,7 @@ REPRODUCIBLE: dict[str, tuple[type, Callable[[Any], Any]]] = {
     "retarget": (RetargetJob, run_retarget),
     "demo": (DemoJob, run_demo),
     "export": (ExportJob, run_export),
+    "angles": (AnglesJob, run_angles),
 }
 _PAGES = ("report", "view")  # options that write pages, which are not compared
 

@@ -15,8 +15,8 @@ from .stopping import catch_signals, ignore_signals, is_stopped, whats_written
 
 # In the order of `wepose --help`; each is a module here.
 COMMANDS = (
-    *("demo", "info", "simulate", "calibrate", "track", "view", "evaluate", "export", "retarget", "live", "batch"),
-    *("reproduce", "validate"),
+    *("demo", "info", "simulate", "calibrate", "track", "view", "evaluate", "angles", "export", "retarget"),
+    *("live", "batch", "reproduce", "validate"),
 )
 
 

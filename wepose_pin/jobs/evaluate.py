@@ -35,7 +35,9 @@ class EvaluateJob:
         Table (.parquet or .csv) with the columns of pose.parquet, or a session that names one (data.truth); markers or
         rotations (.c3d), markers (.trc), an Xsens MVNX.
     interval : FROM TO
-        Compare only from this to this time, in seconds.
+        Compare only this time of the recording, in seconds.
+    phase : NAME
+        Compare only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
     align
         Bring a file of another system to the clock and the world of the result.
     fit : world|segments
@@ -50,6 +52,7 @@ class EvaluateJob:
     result: Path
     truth: Path
     interval: tuple[float, float] | None = None
+    phase: str | None = None
     align: bool = True
     fit: Literal["world", "segments"] | None = None
     time_offset: float | None = None
@@ -57,12 +60,11 @@ class EvaluateJob:
 
     def check(self) -> None:
         """Raise `BadOption` where the interval is none, or options contradict each other."""
+        from ..recording import check_selection
+
         if not self.align and self.fit is not None:
             raise WrongOption("fit", self.fit, "nothing is fitted with --no-align; leave out one of the two")
-        if self.interval is not None and not self.interval[0] < self.interval[1]:
-            begin, end = self.interval
-            needed = "two times in seconds are needed, the earlier one first"
-            raise WrongOption("interval", f"{begin:g} {end:g}", needed)
+        check_selection(self.interval, self.phase)
 
 
 def run_evaluate(
@@ -84,15 +86,18 @@ def run_evaluate(
     from ..readers import load_session
     from ..readers.reference import is_reference, read_reference
     from ..readers.tables import read_table
+    from ..recording import select_interval
     from ..writers import read_result
+    from ..writers.result import read_phases
 
     job.check()
     progress("reading", 0.0)
     if tracked is not None:
-        pose, table = tracked.pose, tracked.model.table
+        pose, table, phases = tracked.pose, tracked.model.table, tracked.recording.phases
     else:
-        pose, model, _ = read_result(job.result)
-        table = model.table
+        pose, model, summary = read_result(job.result)
+        table, phases = model.table, read_phases(summary)
+    selected = select_interval(pose.time, phases, job.interval, job.phase)
     truth: Path | None = job.truth
     if job.truth.suffix == ".toml" or job.truth.is_dir():
         truth = load_session(job.truth, gaps=True).truth
@@ -111,10 +116,10 @@ def run_evaluate(
     if not job.align or fit is None:
         if job.time_offset:
             reference = replace(reference, time=reference.time + job.time_offset)
-        return evaluate(pose, reference, job.interval, table)
+        return evaluate(pose, reference, selected, table)
     reference, registration = register(pose, reference, up=up, frames=fit == "segments", offset_s=job.time_offset)
     first, last = registration.scored
-    interval = job.interval or registration.scored
+    interval = selected or registration.scored
     scored = max(first, interval[0]), min(last, interval[1])
     if not scored[0] < scored[1]:
         raise WrongOption(

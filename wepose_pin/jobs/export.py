@@ -35,9 +35,10 @@ class ExportJob:
         angles of the International Society of Biomechanics (isb). Without it opensim.
     rate_hz : HZ
         Resample the motion at this rate.
+    interval : FROM TO
+        Write only this time of the recording, in seconds.
     phase : NAME
-        Write only this phase of the recording, such as take_1. Where it has several intervals, from the first to the
-        last.
+        Write only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
     force
         Replace an existing file.
     """
@@ -47,13 +48,16 @@ class ExportJob:
     format: str | None = None
     names: Literal["opensim", "isb"] | None = None
     rate_hz: float | None = None
+    interval: tuple[float, float] | None = None
     phase: str | None = None
     force: bool = False
 
     def check(self) -> None:
-        """Raise `BadOption` where the rate is none."""
+        """Raise `BadOption` where the rate or the interval is none."""
+        from ..recording import check_selection
         from ..writers.motion import check_rate
 
+        check_selection(self.interval, self.phase)
         if self.rate_hz is not None:
             check_rate(self.rate_hz)
 
@@ -85,6 +89,7 @@ def run_export(
         job.format,
         names=job.names,
         rate_hz=job.rate_hz,
+        interval=job.interval,
         phase=job.phase,
         force=job.force,
         provenance=provenance or None,

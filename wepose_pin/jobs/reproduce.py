@@ -15,8 +15,8 @@ class ReproduceJob:
     Parameters
     ----------
     result : RESULT
-        Folder of `wepose track`, calibrate, simulate, retarget or demo, a study of `wepose batch` or an item of it, or
-        a file of `wepose export`.
+        Folder of `wepose track`, calibrate, simulate, retarget, angles or demo, a study of `wepose batch` or an item of
+        it, or a file of `wepose export`.
     """
 
     result: Path

@@ -38,6 +38,10 @@ class RetargetJob:
         the length of the person's (docs/retargeting.md).
     smoothing_hz : HZ
         Low-pass filter the person's motion at this frequency; 0 does not filter it.
+    interval : FROM TO
+        Follow only this time of the recording, in seconds.
+    phase : NAME
+        Follow only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
     strict
         Refuse a motion that is too fast for the robot, instead of slowing it down.
     episode
@@ -56,6 +60,8 @@ class RetargetJob:
     task: Literal["both", "position", "orientation"] = "both"
     scale: float | None = None
     smoothing_hz: float = 6.0
+    interval: tuple[float, float] | None = None
+    phase: str | None = None
     strict: bool = False
     episode: bool = False
     view: bool = True
@@ -63,10 +69,12 @@ class RetargetJob:
 
     def check(self) -> None:
         """Raise `WeposeError` where there is no such robot, or a number is out of its range."""
+        from ..recording import check_selection
         from ..retargeting import find_map
         from ..retargeting.targets import check_mapping
         from ..retargeting.trajectory import check_rate
 
+        check_selection(self.interval, self.phase)
         find_map(self.robot)
         check_rate(self.rate_hz)
         check_mapping(self.scale, self.smoothing_hz)
@@ -116,7 +124,7 @@ def run_retarget(
     params = replace(retargeting.ControllerParams(), **dict.fromkeys(without, 0.0))
     with whole_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
-        pose, body, about = read_result(job.result)
+        pose, body, about = read_result(job.result, job.interval, job.phase)
         robot = retargeting.load_robot(retargeting.find_map(job.robot), arm_sides(job.arm))
         trajectory = retargeting.retarget(
             pose,

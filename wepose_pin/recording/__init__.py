@@ -5,7 +5,15 @@ sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a f
 `faults` and `plausibility` say whether the sensors measured, by the `limits` of what sensors can.
 """
 
-from .intervals import Intervals, check_phases, check_time, format_span, format_time
+from .intervals import (
+    Intervals,
+    check_phases,
+    check_selection,
+    check_time,
+    format_span,
+    format_time,
+    select_interval,
+)
 from .recording import CONFIGURATION, EACH_TIME, DoubledSensor, Recording, check_recording, join_recordings
 from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, compute_mount, find_mount_axes
 
@@ -21,10 +29,12 @@ __all__ = [
     "Sensor",
     "check_phases",
     "check_recording",
+    "check_selection",
     "check_time",
     "compute_mount",
     "find_mount_axes",
     "format_span",
     "format_time",
     "join_recordings",
+    "select_interval",
 ]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..errors import BadData, BadPhase
+from ..errors import BadData, BadPhase, WrongOption, one_of
 
 Intervals = tuple[tuple[float, float], ...]
 
@@ -45,3 +46,64 @@ def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tup
                 raise BadPhase(f"{place} is empty; the first number is the earlier one, in seconds")
             if first < time[0] - 1e-6 or last > time[-1] + 1e-6:
                 raise BadPhase(f"{place} is outside the recording, which runs from {time[0]:.3f} to {time[-1]:.3f} s")
+
+
+# What the options --interval and --phase select ----------------------------------------------------------------------
+
+
+def check_selection(interval: tuple[float, float] | None, phase: str | None) -> None:
+    """Raise `WrongOption` where the interval [s] does not run forwards, or a phase is given besides."""
+    if interval is None:
+        return
+    shown = f"{interval[0]:g} {interval[1]:g}"
+    if not interval[0] < interval[1]:
+        raise WrongOption("interval", shown, "two times in seconds are needed, the earlier one first")
+    if phase is not None:
+        raise WrongOption("interval", shown, f"--phase {phase} is given too; only one of them can select the time")
+
+
+def select_interval(
+    time: np.ndarray,
+    phases: Mapping[str, Sequence[tuple[float, float]]],
+    interval: tuple[float, float] | None,
+    phase: str | None,
+) -> tuple[float, float] | None:
+    """Return the interval [s] that --interval or --phase selects; None: neither is given.
+
+    Parameters
+    ----------
+    time : (n,) [s]; the interval may exceed it by one sample at each end
+    phases : name → intervals [s]
+    phase : a name; of a phase with several intervals ``NAME:2`` is the second
+
+    Raises
+    ------
+    WrongOption
+        Both are given; the interval is outside the recording; there is no such phase, or it has several intervals.
+    """
+    check_selection(interval, phase)
+    if phase is not None:
+        return _find_phase(phases, phase)
+    if interval is not None:
+        step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        if interval[0] < time[0] - 1.01 * step or interval[1] > time[-1] + 1.01 * step:
+            shown = f"{format_time(interval[0])} {format_time(interval[1])}"
+            raise WrongOption("interval", shown, f"the recording runs from {format_span((time[0], time[-1]))}")
+    return interval
+
+
+def _find_phase(phases: Mapping[str, Sequence[tuple[float, float]]], phase: str) -> tuple[float, float]:
+    name, number = phase, 0
+    if phase not in phases and (numbered := re.fullmatch(r"(.+):(\d{1,6})", phase)):
+        name, number = numbered[1], int(numbered[2])
+    if not phases.get(name):
+        known = [each for each, intervals in phases.items() if intervals]
+        choices = one_of(known, name) if known else "the recording has no phases; use --interval FROM TO"
+        raise WrongOption("phase", phase, f"the recording has no such phase; {choices}")
+    intervals = phases[name]
+    if number > len(intervals) or (number == 0 and (len(intervals) > 1 or name != phase)):
+        spans = ", ".join(f"{name}:{k} ({format_span(span)})" for k, span in enumerate(intervals[:5], 1))
+        more = f" … {name}:{len(intervals)}" if len(intervals) > 5 else ""
+        count = "one interval" if len(intervals) == 1 else f"{len(intervals)} intervals"
+        raise WrongOption("phase", phase, f"{name} has {count}; choose {spans}{more}")
+    return intervals[max(number, 1) - 1]

@@ -6,6 +6,7 @@ of the reports are lines, bars and markers, and as SVG they follow the page's li
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -15,6 +16,7 @@ import numpy as np
 WIDTH = 920.0  # [px] of every chart
 COLUMNS = 700  # of an envelope: about a column a pixel
 _UNITS_A_PIXEL = 10  # of the integers that paths are made of
+_EDGE = 0.05  # [px] by which a rounded tick may lie beyond its axis
 _LETTER = 6.5  # [px] mean width of a letter
 _LINE = 17.0  # [px] height of a line of text
 _MARKERS = {  # about their centre, of size 1
@@ -51,7 +53,7 @@ class Picture(NamedTuple):
 class Mark:
     """Something drawn in a panel, in data coordinates; an infinite coordinate is the panel's edge."""
 
-    kind: Literal["line", "area", "box", "disc"] | Marker
+    kind: Literal["line", "area", "band", "box", "disc"] | Marker
     css: str
     x: np.ndarray  # (n,); of boxes (n, 2)
     y: np.ndarray
@@ -115,6 +117,14 @@ class Panel:
     def area(self, x: np.ndarray, y: np.ndarray, css: str) -> None:
         """The area between a line and zero."""
         self.marks.append(Mark("area", css, np.asarray(x, float), np.asarray(y, float)))
+
+    def band(self, x: np.ndarray, low: np.ndarray, high: np.ndarray, css: str) -> None:
+        """The area between two lines through points (n,); NaN breaks it."""
+        known = np.isfinite(low) & np.isfinite(high)
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], known, [False]))))
+        for a, b in zip(edges[::2], edges[1::2], strict=True):
+            xs, ys = (np.concatenate([there[a:b], back[a:b][::-1]]) for there, back in ((x, x), (low, high)))
+            self.marks.append(Mark("band", css, xs, ys))
 
     def boxes(self, x: object, y: object, css: str, *, colour: str = "", counts: bool = True) -> None:
         """Boxes from x[:, 0] to x[:, 1] and y[:, 0] to y[:, 1]."""
@@ -260,6 +270,30 @@ class Chart:
         return drawn, (_LINE + 2.0) * len(lines) + 3.0 if self.legend else 0.0
 
 
+def resolve_style(svg: str) -> str:
+    """A standalone chart for programs that know less of CSS, as Inkscape, librsvg and LaTeX's converters.
+
+    Variables become their light colours. Paths, whose units are tenths of a pixel, have strokes in these units in place
+    of ones that do not scale.
+    """
+    start, end = svg.index("<style>"), svg.index("</style>")
+    style = svg[start:end].partition("@media")[0].replace(" vector-effect: non-scaling-stroke;", "")
+    colours = dict(re.findall(r"(--\w+): (#\w+);", style))
+    style = re.sub(r"--\w+: #\w+;\s*", "", style)
+    style = re.sub(r"var\((--\w+)\)", lambda found: colours[found[1]], style)
+    lines = [line if _UNSCALED.match(line) else _STROKE.sub(_scale_stroke, line) for line in style.split("\n")]
+    return svg[:start] + "\n".join(lines) + svg[end:]
+
+
+_UNSCALED = re.compile(r"\.chart (text|\.grid|\.axes|\.hatch )")
+_STROKE = re.compile(r"(stroke-(?:width|dasharray): )([\d. px]+)")
+
+
+def _scale_stroke(found: re.Match[str]) -> str:
+    numbers = " ".join(f"{_UNITS_A_PIXEL * float(number):g}" for number in re.findall(r"[\d.]+", found[2]))
+    return found[1] + numbers
+
+
 def envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A line of at most 2 `COLUMNS` points with the same picture: the least and the largest value of each column.
 
@@ -356,12 +390,12 @@ def _drawn_panel(panel: Panel, left: float, top: float, width: float, height: fl
         x_ticks, y_ticks = _ticks(panel, "x", x0, x1, width), _ticks(panel, "y", y0, y1, height)
         for value, label in x_ticks:
             x = round(float(at_x(value)), 1)
-            if 0.0 <= x <= width:
+            if 0.0 <= x <= width + _EDGE:
                 texts += [DrawnText(x, height + 15.0, label, "tick", "middle")] if panel.shown_x else []
                 grid += f"M{x:g} 0v{height:g}" if "x" in panel.grid else ""
         for value, label in y_ticks:
             y = round(float(at_y(value)), 1)
-            if 0.0 <= y <= height:
+            if 0.0 <= y <= height + _EDGE:
                 texts += [DrawnText(-7.0, y + 4.0, label, "tick", "end")] if panel.shown_y else []
                 grid += f"M0 {y:g}h{width:.1f}" if "y" in panel.grid else ""
         if panel.x_label:
@@ -370,7 +404,7 @@ def _drawn_panel(panel: Panel, left: float, top: float, width: float, height: fl
     return DrawnPanel(round(left, 1), top, round(width, 1), height, panel.bare, grid, marks, texts)
 
 
-_CLASSES = {"line": "line", "area": "area", "box": "area", "disc": "area"}
+_CLASSES = {"line": "line", "area": "area", "band": "area", "box": "area", "disc": "area"}
 
 
 def _share(values: np.ndarray, low: float, high: float, log: bool) -> np.ndarray:
@@ -382,6 +416,8 @@ def _share(values: np.ndarray, low: float, high: float, log: bool) -> np.ndarray
 
 
 def _path(mark: Mark, x: np.ndarray, y: np.ndarray, zero: float, scale: float) -> str:
+    if mark.kind == "band":
+        return "".join(_runs(x, y, None)) + "z"
     if mark.kind in ("line", "area"):
         return "".join(_runs(x, y, zero if mark.kind == "area" else None))
     xs, ys = (np.rint(_UNITS_A_PIXEL * values) for values in (x, y))

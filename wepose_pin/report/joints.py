@@ -66,7 +66,7 @@ def draw_joint_angles(angles: Angles) -> list[Picture]:
 
 def _break_line(joint: JointAngles, k: int) -> np.ndarray:
     """An angle with its line broken where it is not determined; within ± half a turn where it passed the lock."""
-    hidden = joint.gap if k == 1 else joint.gap | joint.near_lock
+    hidden = joint.hidden(k)
     values = np.where(hidden, np.nan, joint.values[:, k])
     if hidden.all() or not joint.near_lock.any() or np.nanmax(values) - np.nanmin(values) < FULL_TURN:
         return values  # a real whole turn

@@ -17,6 +17,7 @@ from ..diagnostics import WARNING, Diagnostic, as_json
 from ..documents import whole_file
 from ..errors import WeposeError, reason
 from . import words
+from .chart import Picture, resolve_style
 
 PACKAGE = Path(__file__).parent.parent  # templates are named by their path below it
 
@@ -84,6 +85,12 @@ class Page:
         scripts = any("<iframe" in section.html for section in self._sections)
         page = load_template("report/templates/page.html.j2")
         return page.render(title=self._title, window_title=window_title, sections=self._sections, scripts=scripts)
+
+
+def render_standalone(picture: Picture) -> str:
+    """The text of an SVG file of a chart, for any program that draws SVG."""
+    chart: Any = load_template("report/templates/chart.svg.j2").module
+    return resolve_style(str(chart.svg(picture, standalone=True)).strip()) + "\n"
 
 
 def load_template(name: str) -> Template:

@@ -6,17 +6,15 @@ import contextlib
 import functools
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from ..arguments import check_arguments
 from ..diagnostics import Diagnostic
 from ..documents import whole_file
 from ..errors import BadData, BadOption, MissingFile, one_of
-from ..kinematics import Pose, PosedBody
+from ..kinematics import PosedBody, cut_pose
+from ..recording import select_interval
 from ..tracking.tracked import TrackedRecording
 from .bvh import write_bvh
 from .c3d import write_c3d
@@ -60,6 +58,7 @@ def export(
     *,
     names: str | None = None,
     rate_hz: float | None = None,
+    interval: tuple[float, float] | None = None,
     phase: str | None = None,
     force: bool = False,
     provenance: Mapping[str, Any] | None = None,
@@ -79,8 +78,9 @@ def export(
         Of a .mot's columns: "opensim", or "isb"; None: "opensim".
     rate_hz : float, optional
         Resample the motion to so many samples a second first.
-    phase : str, optional
-        Write the motion of this phase of the recording alone, from its first interval to its last.
+    interval, phase : optional
+        Write only this interval, from and to [s], or this phase of the recording; of a phase with several intervals
+        "NAME:2" is the second.
     force : bool
         Replace an existing file.
     provenance : mapping, optional
@@ -118,8 +118,9 @@ def export(
         check_rate(rate_hz)
     if rate_hz is not None and format in ("urdf", "placement"):
         raise BadOption(f"--rate-hz {rate_hz:g}: there is no motion in a file of format {format}")
-    if phase is not None and format == "urdf":
-        raise BadOption(f"--phase {phase}: there is no motion in a file of format {format}")
+    if (interval is not None or phase is not None) and format in ("urdf", "placement"):
+        option = "interval" if phase is None else "phase"
+        raise BadOption(f"--{option}: there is no motion in a file of format {format}")
     with contextlib.ExitStack() as files:
         partial = files.enter_context(whole_file(file, force))
         if provenance is not None:
@@ -128,7 +129,7 @@ def export(
         if format == "urdf":
             _write_urdf(partial, result)
             return Exported(format, [])
-        motion = _read_motion(result, phase)
+        motion = _read_motion(result, interval, phase)
         if rate_hz is not None:
             motion = resampled(motion, rate_hz)
         write = WRITERS[format] if names is None else functools.partial(write_mot, names=names)
@@ -145,39 +146,20 @@ def _write_urdf(file: Path, result: PosedBody | str | Path) -> None:
     shutil.copyfile(urdf, file)
 
 
-def _read_motion(result: PosedBody | str | Path, phase: str | None) -> Motion:
-    """The motion of a result, or of one of its phases, of at least two samples."""
-    phases: Mapping[str, Any] = {}
+def _read_motion(result: PosedBody | str | Path, interval: tuple[float, float] | None, phase: str | None) -> Motion:
+    """The motion of a result, or the selected part of it, of at least two samples."""
     if isinstance(result, PosedBody):
-        motion = Motion(result.pose, result.model, result.name, result.name)
-        phases = result.recording.phases if isinstance(result, TrackedRecording) else {}
+        phases = result.recording.phases if isinstance(result, TrackedRecording) else getattr(result, "phases", {})
+        selected = select_interval(result.time, phases, interval, phase)
+        pose = result.pose if selected is None else cut_pose(result.pose, selected)
+        motion = Motion(pose, result.model, result.name, result.name)
     else:
         folder = Path(result)
-        pose, model, summary = read_result(folder)
+        pose, model, summary = read_result(folder, interval, phase)
         motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder))
-        phases = summary.get("recorded_phases", {})
-    if phase is not None:
-        motion = replace(motion, pose=_cut_phase(motion.pose, phase, phases, motion.where))
     if len(motion.pose.time) < 2:
         raise BadData(f"{motion.where}: a pose of {len(motion.pose.time)} samples; a motion has at least 2")
     return motion
-
-
-def _cut_phase(pose: Pose, phase: str, phases: Mapping[str, Any], where: str) -> Pose:
-    """The part of the pose from the beginning of a recorded phase to its end.
-
-    Raises
-    ------
-    BadOption
-        The recording has no such phase, or no pose in it.
-    """
-    if not phases.get(phase):
-        raise BadOption(f"--phase {phase}: {where} has no such phase; {one_of(phases, phase)}")
-    first, last = phases[phase][0][0], phases[phase][-1][1]
-    rows = np.flatnonzero((pose.time >= first - 1e-9) & (pose.time <= last + 1e-9))
-    if len(rows) < 2:
-        raise BadOption(f"--phase {phase}: from {first:g} to {last:g} s, where {where} has no poses")
-    return pose.cut(slice(int(rows[0]), int(rows[-1]) + 1))
 
 
 def _format(file: Path, format: str | None) -> str:

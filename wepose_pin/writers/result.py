@@ -5,6 +5,7 @@ With a body other than the upper body also ``model.toml``, its table; of a mecha
 
 from __future__ import annotations
 
+import contextlib
 import json
 import platform
 import re
@@ -21,10 +22,11 @@ import polars as pl
 from .. import __version__
 from ..angles.torques import Torques, torque_table
 from ..errors import BadData, ExistingOutput, MissingFile
-from ..kinematics import Pose, build_pose_table, parse_pose_table
+from ..kinematics import Pose, build_pose_table, cut_pose, parse_pose_table
 from ..model import BodyModel, BodyTable, load_model, load_table
 from ..model.table import MODEL_TABLE, format_table
 from ..readers.tables import read_table
+from ..recording import Intervals, select_interval
 from ..subject import Subject, load_subject, subject_toml
 from ..tracking import TrackedRecording
 
@@ -118,13 +120,19 @@ def _strip_origin(table: BodyTable) -> BodyTable:
     return replace(table, name="", where="")
 
 
-def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
+def read_result(
+    folder: Path, interval: tuple[float, float] | None = None, phase: str | None = None
+) -> tuple[Pose, BodyModel, dict[str, Any]]:
     """Pose, body and summary of a result folder; the body with the subject's lengths and girdles.
+
+    Parameters
+    ----------
+    interval, phase : of the pose, only this interval [s] or this phase of the recording (`select_interval`)
 
     Raises
     ------
     WeposeError
-        It is no result folder, or its files are damaged.
+        It is no result folder, or its files are damaged; the interval or the phase is not in the recording.
     """
     if not (folder / "pose.parquet").is_file():
         raise MissingFile(f"{folder}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
@@ -141,7 +149,17 @@ def read_result(folder: Path) -> tuple[Pose, BodyModel, dict[str, Any]]:
     model, subject_file = load_model(folder / SUBJECT_URDF), folder / "subject.toml"
     if model.table.girdles and subject_file.is_file():
         model = replace(model, girdles=load_subject(subject_file).girdles)
-    return pose, model, summary
+    selected = select_interval(pose.time, read_phases(summary), interval, phase)
+    return pose if selected is None else cut_pose(pose, selected), model, summary
+
+
+def read_phases(summary: Mapping[str, Any]) -> dict[str, Intervals]:
+    """Read the phases of the recording from a result's summary; what is no list of intervals is left out."""
+    phases, recorded = {}, summary.get("recorded_phases")
+    for name, spans in (recorded if isinstance(recorded, dict) else {}).items():
+        with contextlib.suppress(TypeError, ValueError):
+            phases[name] = tuple((float(begin), float(end)) for begin, end in spans)
+    return phases
 
 
 def _read_joints(file: Path, samples: int) -> dict[str, np.ndarray]:

@@ -32,5 +32,10 @@ def write_parquet(path: Path, motion: Motion) -> list[Diagnostic]:
 
 def write_csv(path: Path, motion: Motion) -> list[Diagnostic]:
     """Every number to its last bit (the shortest text that reads back as it); what is not known is empty."""
-    table(motion).fill_nan(None).write_csv(path)
+    write_table_csv(path, table(motion))
     return []
+
+
+def write_table_csv(path: Path, table: pl.DataFrame) -> None:
+    """A CSV file; what is not known is empty."""
+    table.fill_nan(None).write_csv(path)

@@ -1,0 +1,355 @@
+"""`wepose angles`: low-pass, stated uncertainty of ranges and rates, comparison, tables, figures, page."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy.signal import butter, sosfiltfilt
+from scipy.spatial.transform import Rotation
+from scipy.stats import ttest_ind
+from test_export import LENGTHS, write_folder
+
+from wepose_pin.angles import SHOULDER_SEQUENCES, group_sides, joint_angles
+from wepose_pin.angles.definitions import POSITIVE, ROTATIONS
+from wepose_pin.angles.joints import JOINTS
+from wepose_pin.angles.movement import (
+    MovementOptions,
+    Statistics,
+    analyze_movement,
+    compare_curves,
+    compare_statistics,
+    compute_statistics,
+)
+from wepose_pin.angles.smoothing import smooth_pose
+from wepose_pin.angles.tables import summarize_joint
+from wepose_pin.angles.uncertainty import compute_summary_std
+from wepose_pin.cli import main
+from wepose_pin.errors import WrongOption
+from wepose_pin.kinematics import Pose, compute_pose
+from wepose_pin.model import load_model
+from wepose_pin.report.angle_figures import draw_curves
+from wepose_pin.report.page import render_standalone
+
+RATE = 100.0
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def bend(n: int, seed: int, most_deg: float = 90.0, seconds: float = 2.0) -> np.ndarray:
+    """Flexion of an elbow (n,) [rad], out and back every so many seconds, each a little different."""
+    rng = np.random.default_rng(seed)
+    phase = np.arange(n) / (RATE * seconds)
+    height = np.radians(most_deg + rng.normal(0.0, 3.0, int(phase[-1]) + 1))[phase.astype(int)]
+    return 0.5 * height * (1.0 - np.cos(2.0 * np.pi * phase))
+
+
+def about(axis: str, angle: np.ndarray) -> Rotation:
+    return Rotation.from_euler(axis, angle[:, None])
+
+
+def pose_of(seed: int, most_deg: float = 90.0, n: int = 1401) -> Pose:
+    """A person who bends the right elbow, in covariances of its own in each segment."""
+    sway = 0.05 * np.sin(np.arange(n) / 300.0)
+    upright = about("z", sway)
+    upper_arm = upright * about("y", sway - 0.4)
+    forearm = upper_arm * about("y", -bend(n, seed, most_deg))
+    rotations = {"torso": upright, "right_upper_arm": upper_arm, "right_forearm": forearm}
+    quat_WL = {name: rotation.as_quat() for name, rotation in rotations.items()}
+    pose = compute_pose(load_model(lengths=LENGTHS), np.arange(n) / RATE, quat_WL)
+    rng = np.random.default_rng(9)
+    factors = {name: rng.normal(0.0, 0.02, (3, 3)) for name in quat_WL}
+    cov = {name: np.broadcast_to(factor @ factor.T, (n, 3, 3)).copy() for name, factor in factors.items()}
+    return replace(pose, segment_cov=cov)
+
+
+PHASES = {"start": [[0.0, 1.0]], "bend": [[2.0, 4.0], [4.0, 6.0], [6.0, 8.0]]}
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two results of the same recording's name: bends of 90° and of 70°."""
+    folders = []
+    for name, most in (("before", 90.0), ("after", 70.0)):
+        folder = write_folder(tmp_path_factory.mktemp("angles") / name, pose_of(1 if most > 80.0 else 2, most))
+        about = {"recording": name, "recorded_phases": PHASES}
+        (folder / "summary.json").write_text(json.dumps(about), encoding="utf-8")
+        folders.append(folder)
+    return folders[0], folders[1]
+
+
+# The low-pass -----------------------------------------------------------------------------------------------------
+
+
+def pose_about(angle: np.ndarray, segment: str = "torso") -> Pose:
+    return Pose(np.arange(len(angle)) / RATE, {segment: Rotation.from_rotvec(np.outer(angle, [0, 0, 1])).as_quat()}, {})
+
+
+def angle_about(pose: Pose) -> np.ndarray:
+    return np.unwrap(2.0 * np.arctan2(pose.quat_WL["torso"][:, 2], pose.quat_WL["torso"][:, 3]))
+
+
+def test_the_low_pass_is_that_of_the_angle_also_through_full_turns() -> None:
+    t = np.arange(1000) / RATE
+    angle = 1.2 * t + 0.2 * np.sin(2 * np.pi * 1.0 * t) + 0.02 * np.sin(2 * np.pi * 15.0 * t)
+    smooth = angle_about(smooth_pose(pose_about(angle), 5.0))
+    expected = sosfiltfilt(butter(2, 5.0, fs=RATE, output="sos"), angle)
+    turns = 2.0 * np.pi * np.round((smooth[0] - expected[0]) / (2.0 * np.pi))
+    np.testing.assert_allclose((smooth - turns)[50:-50], expected[50:-50], atol=2e-4)
+
+
+def test_at_the_cut_off_half_of_the_amplitude_is_left_and_nothing_is_late() -> None:
+    t = np.arange(2000) / RATE
+    smooth = angle_about(smooth_pose(pose_about(0.1 * np.sin(2.0 * np.pi * 6.0 * t)), 6.0))[300:-300]
+    np.testing.assert_allclose(smooth, 0.05 * np.sin(2.0 * np.pi * 6.0 * t)[300:-300], atol=2e-4)
+
+
+def test_the_low_pass_keeps_what_is_not_known_and_stops_at_a_gap_in_time() -> None:
+    angle = np.where(np.arange(400) < 200, 0.0, 1.0)
+    pose = pose_about(angle)
+    pose.quat_WL["torso"][100:110] = np.nan
+    jump = replace(pose, time=np.where(np.arange(400) < 200, pose.time, pose.time + 1.0))
+    smooth = smooth_pose(jump, 5.0).quat_WL["torso"]
+    assert np.flatnonzero(np.isnan(smooth).any(axis=1)).tolist() == list(range(100, 110))
+    known = np.isfinite(smooth).all(axis=1)
+    np.testing.assert_allclose(smooth[known], pose.quat_WL["torso"][known], atol=1e-9)
+    assert np.abs(smooth_pose(pose, 5.0).quat_WL["torso"][199, 2]) > 0.1  # without the gap the step is smoothed
+
+
+@pytest.mark.parametrize("cutoff_hz", [0.0, -1.0, 45.0, np.inf])
+def test_a_cut_off_that_is_none_is_named(cutoff_hz: float) -> None:
+    with pytest.raises(WrongOption, match=r"--low-pass-hz .*above 0 and below 45 Hz"):
+        smooth_pose(pose_about(np.zeros(100)), cutoff_hz)
+
+
+# What the pose states ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_ranges_and_rates_are_as_uncertain_as_drawn_errors_make_them(side: str) -> None:
+    """Errors of each segment, constant in W or in the segment: the larger spread of the two is stated."""
+    rng = np.random.default_rng(5)
+    n, draws = 60, 3000
+    time = np.arange(n) / RATE
+    arm = Rotation.from_euler("yxz", np.column_stack([-0.3 - 0.5 * time, 0.4 + 0.3 * time, 0.2 + 0.0 * time]))
+    fore = arm * Rotation.from_euler("yz", np.column_stack([-0.5 - 2.0 * time, 0.3 + 0.5 * time]))
+    names = (f"{side}_upper_arm", f"{side}_forearm")
+    rotations = dict(zip(names, (arm, fore), strict=True))
+    factors = {name: rng.normal(0.0, 0.01, (3, 3)) for name in names}
+    cov = {name: np.broadcast_to(factor @ factor.T, (n, 3, 3)).copy() for name, factor in factors.items()}
+    pose = Pose(time, {name: R.as_quat() for name, R in rotations.items()}, {}, segment_cov=cov)
+    joint = joint_angles(pose)[f"{side}_elbow"]
+    summary = summarize_joint(time, joint)
+    stated = compute_summary_std(pose, f"{side}_elbow", joint, summary.samples[None])[0]
+    low, high, begin, end = summary.samples[0]
+    spreads = []
+    for constant in ("W", "L"):
+        errors = {
+            name: Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), cov[name][0], draws)) for name in names
+        }
+
+        def draw(sample: int, constant: str = constant, errors: dict[str, Rotation] = errors) -> np.ndarray:
+            quat_WL = {}
+            for name, R in rotations.items():
+                # The error of the middle of the movement, as it is in W, or as it is in the segment.
+                error = errors[name] if constant == "W" else R[n // 2].inv() * errors[name] * R[n // 2]
+                quat_WL[name] = (error * R[sample] if constant == "W" else R[sample] * error).as_quat()
+            return joint_angles(Pose(np.arange(draws) / RATE, quat_WL, {}))[f"{side}_elbow"].values[:, 0]
+
+        rate = (draw(end) - draw(begin)) / (time[end] - time[begin])
+        spreads.append([np.std(draw(high) - draw(low)), np.std(rate)])
+    range_std, rate_std = np.max(spreads, axis=0)
+    assert stated[0, 2] == pytest.approx(range_std, rel=0.1)
+    assert stated[0, 3] == pytest.approx(rate_std, rel=0.1)
+    assert np.array_equal(stated[:, 0], [joint.std[s, k] for k, s in enumerate(summary.samples[:, 0])])
+
+
+def test_a_heading_that_is_off_for_all_of_the_time_changes_no_range_of_the_trunk() -> None:
+    pose = pose_about(np.radians(30.0) * np.sin(np.arange(200) / 30.0))
+    pose = replace(pose, segment_cov={"torso": np.tile(np.diag([0.0, 0.0, 0.01]), (200, 1, 1))})
+    joint = joint_angles(pose)["thorax"]
+    stated = compute_summary_std(pose, "thorax", joint, summarize_joint(pose.time, joint).samples[None])
+    np.testing.assert_allclose(stated[0, 2], [0.1, 0.1, 0.0, 0.0], atol=1e-9)
+
+
+def test_without_covariances_nothing_is_stated() -> None:
+    pose = pose_about(np.sin(np.arange(200) / 30.0))
+    joint = joint_angles(pose)["thorax"]
+    stated = compute_summary_std(pose, "thorax", joint, summarize_joint(pose.time, joint).samples[None])
+    assert np.isnan(stated).all()
+
+
+# Comparison -------------------------------------------------------------------------------------------------------
+
+
+def test_the_interval_of_a_difference_is_welchs() -> None:
+    rng = np.random.default_rng(7)
+    first, second = rng.normal(60.0, 3.0, 8), rng.normal(63.0, 6.0, 13)
+    one, two = (compute_statistics(values, np.full(len(values), 2.0)) for values in (first, second))
+    found = compare_statistics(one, two)
+    low, high = ttest_ind(second, first, equal_var=False).confidence_interval(0.95)
+    assert (found.low, found.high) == pytest.approx((low, high), rel=1e-9)
+    assert found.value == pytest.approx(second.mean() - first.mean())
+    assert found.std == pytest.approx(np.hypot(2.0, 2.0))
+    few = compare_statistics(one, Statistics(1, 5.0, float("nan"), float("nan")))
+    assert few.value == pytest.approx(5.0 - first.mean())
+    assert np.isnan([few.low, few.high, few.std]).all()
+
+
+def test_curves_are_compared_after_the_full_turns_between_them() -> None:
+    pose = pose_of(1)
+    curve = analyze_movement("a", pose, {}, MovementOptions()).curves["right_elbow"][0]
+    higher = curve._replace(mean=curve.mean + 2.0 * np.pi + 0.1 * np.sin(np.linspace(0.0, np.pi, 101)))
+    found = compare_curves(curve, higher)
+    assert found.largest == pytest.approx(0.1)
+    assert found.percent == 50.0
+    assert found.rms == pytest.approx(0.1 / np.sqrt(2.0), rel=0.01)
+    lost = curve._replace(mean=np.full(101, np.nan))
+    assert np.isnan(compare_curves(curve, lost)).all()
+
+
+# The command ------------------------------------------------------------------------------------------------------
+
+
+def run(*words: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main(["angles", *map(str, words)])
+    return int(stop.value.code or 0)
+
+
+def test_two_sessions_become_tables_figures_and_a_page(
+    results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "angles"
+    assert run(*results, "-o", out, "--low-pass-hz", 6) == 0
+    said = capsys.readouterr().out
+    assert "before: 7 repetitions by right_elbow_flexion, rising first; CMC 1.00" in said
+    assert "low-passed at 6 Hz" in said
+    tables = {path.stem: pl.read_csv(path) for path in out.glob("*.csv")}
+    assert set(tables) == {
+        *("sessions", "repetitions", "phases", "summary", "curves", "comparison", "definitions"),
+    }
+    assert tables["sessions"].select("session", "n", "low_pass_hz").rows() == [("before", 7, 6.0), ("after", 7, 6.0)]
+    elbow = (pl.col("joint") == "right_elbow") & (pl.col("angle") == "flexion")
+    repetitions = tables["repetitions"].filter(elbow & (pl.col("session") == "before"))
+    true = np.degrees(bend(1401, 1)).reshape(-1)[:1400].reshape(7, 200).max(axis=1)
+    np.testing.assert_allclose(repetitions["highest_deg"].to_numpy(), true, atol=0.3)
+    np.testing.assert_allclose(repetitions["peak_rate_deg_s"].to_numpy(), np.pi / 2.0 * true, rtol=0.02)
+    assert (repetitions["highest_std_deg"] > 0.0).all()
+    summary = tables["summary"].filter(elbow)
+    assert summary["range_mean_deg"][0] == pytest.approx(repetitions["range_deg"].mean(), abs=1e-3)
+    assert summary["range_sd_deg"][0] == pytest.approx(repetitions["range_deg"].std(), abs=1e-3)
+    compared = tables["comparison"].filter(elbow & (pl.col("measure") == "range")).row(0, named=True)
+    assert compared["difference"] == pytest.approx(
+        summary["range_mean_deg"][1] - summary["range_mean_deg"][0], abs=1e-3
+    )
+    assert compared["ci95_low"] < compared["difference"] < compared["ci95_high"] < 0.0
+    curve = tables["curves"].filter(elbow & (pl.col("session") == "after"))
+    assert curve["percent"].to_list() == list(range(101))
+    assert curve["mean_deg"].max() == pytest.approx(70.0, abs=4.0)
+    phases = tables["phases"].filter(elbow & (pl.col("session") == "before"))
+    assert phases["phase"].to_list() == ["all", "start", "bend", "bend", "bend"]
+    assert phases["highest_deg"][2] == pytest.approx(true[1], abs=0.3)
+    for picture in ("repetitions", "curves-elbow", "curves-shoulder", "curves-thorax"):
+        ET.fromstring((out / f"{picture}.svg").read_text(encoding="utf-8"))
+    page = (out / "angles.html").read_text(encoding="utf-8")
+    for words in (
+        "before, n = 7",
+        "after, n = 7",
+        "repetition [%]",
+        "flexion [°]",
+        "−6 dB",
+        "Z-X-Y",
+        "after less before",
+    ):
+        assert words in page
+    assert "cannot be made" not in page
+    assert run(*results, "-o", out) == 2  # nothing is overwritten
+    assert "--force" in capsys.readouterr().err
+
+
+def test_a_folder_of_two_results_is_made_again_from_its_provenance(
+    results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(*results, "-o", tmp_path / "a", "--low-pass-hz", 5, "--shoulder", "XZY", "--interval", 1, 9) == 0
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        main(["reproduce", str(tmp_path / "a")])
+    assert "the same, made again by wepose angles" in capsys.readouterr().out
+    assert not stop.value.code
+
+
+def test_a_phase_marks_the_repetitions(results: tuple[Path, Path], tmp_path: Path) -> None:
+    assert run(results[0], "-o", tmp_path / "a", "--repetitions", "bend", "--interval", 3, 9) == 0
+    found = pl.read_csv(tmp_path / "a" / "repetitions.csv").unique("repetition", maintain_order=True)
+    assert found.select("from_s", "to_s").rows() == [(4.0, 6.0), (6.0, 8.0)]
+    assert not (tmp_path / "a" / "repetitions.svg").exists()
+    assert not (tmp_path / "a" / "comparison.csv").exists()
+
+
+def test_where_nothing_repeats_there_are_phases_all_the_same(
+    results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(results[0], "-o", tmp_path / "a", "--phase", "start") == 0
+    assert "no repetitions by right_elbow_flexion: the angle goes out and back" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "a").iterdir()} == {
+        *("sessions.csv", "phases.csv", "definitions.csv", "repetitions.svg", "angles.html", "provenance.json"),
+    }
+    assert "goes out and back" in (tmp_path / "a" / "angles.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--low-pass-hz 60", "--low-pass-hz 60: above 0 and below 45 Hz"),
+        ("--main-angle elbow", "--main-angle elbow: no such angle in the result"),
+        ("--repetitions bent", "--repetitions bent: the recording has no such phase; did you mean 'bend'"),
+        ("--repetitions bend --main-angle right_elbow_flexion", "and --repetitions bend marks them"),
+        ("--repetitions bend --cycles", "--cycles: finds repetitions, and --repetitions bend marks them"),
+        ("--interval 5 99", "--interval 5 99: the recording runs from 0 to 14 s"),
+        ("--phase bend", "--phase bend: bend has 3 intervals"),
+        ("--shoulder XYZ", "'XYZ' is not known"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_2(
+    results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, said: str
+) -> None:
+    assert run(results[0], "-o", tmp_path / "a", *words.split()) == 2
+    line = capsys.readouterr().err
+    assert said in line
+    assert line.count("\n") == 1
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_figure_needs_no_css_that_few_programs_know() -> None:
+    movement = analyze_movement("a", pose_of(1), {}, MovementOptions())
+    for picture in draw_curves([movement]):
+        svg = render_standalone(picture)
+        assert "var(" not in svg
+        assert "vector-effect" not in svg
+        assert "@media" not in svg
+        style = re.search(r"\.chart \.strong \{ stroke-width: ([\d.]+)", svg)
+        assert style is not None  # 2 px, in the paths' tenths
+        assert float(style[1]) == 20.0
+
+
+# Definitions ------------------------------------------------------------------------------------------------------
+
+
+def test_each_angle_is_defined_as_the_page_has_it() -> None:
+    """The words of the tables are those of docs/angles.md."""
+    page = (ROOT / "docs" / "angles.md").read_text(encoding="utf-8").replace("**", "")
+    groups = {group: next(iter(sides.values())) for group, sides in group_sides(JOINTS).items()}
+    for group, joint in groups.items():
+        names = JOINTS[joint].names or SHOULDER_SEQUENCES["YXY"]
+        for name in names:
+            assert f"| `{name}` | {POSITIVE[group, name]} |" in page, (group, name)
+        assert f" | {ROTATIONS[group]} | " in page
+    needed = {("shoulder", name) for names in SHOULDER_SEQUENCES.values() for name in names}
+    needed |= {(group, name) for group, joint in groups.items() for name in JOINTS[joint].names}
+    assert needed == set(POSITIVE)

@@ -1,0 +1,305 @@
+"""Repetitions of a movement: found where they are, however fast, with rests, cut at the ends; none where none are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfiltfilt
+
+import wepose_pin as wp
+from wepose_pin.angles import JOINTS, Angles, JointAngles, joint_angles
+from wepose_pin.angles.curves import compute_cmc, compute_mean_curves, normalize_time
+from wepose_pin.angles.repetitions import MIN_RANGE, Repetitions, find_main_angle, find_repetitions
+from wepose_pin.errors import WrongOption
+from wepose_pin.model import load_model
+from wepose_pin.recording import ImuSensor
+from wepose_pin.simulation.activities import Walk
+
+RATE = 100.0
+FLEXION = "right_elbow_flexion"
+
+
+def angles_of(flexion_deg: np.ndarray, rate_hz: float = RATE, **joints: np.ndarray) -> Angles:
+    """Angles over time: the first of the right elbow, and of other joints (n, 3) [deg]."""
+    n = len(flexion_deg)
+    values = {"right_elbow": np.column_stack([flexion_deg, np.zeros(n), np.full(n, 90.0)]), **joints}
+    never = np.zeros(n, dtype=bool)
+    return Angles(
+        np.arange(n) / rate_hz,
+        {
+            name: JointAngles(
+                "ZXY",
+                JOINTS[name].names,
+                np.radians(each),
+                np.ones(n),
+                never.copy(),
+                never.copy(),
+                None,
+                np.zeros((n, 4)),
+            )
+            for name, each in values.items()
+        },
+    )
+
+
+def reach(seconds: float, low: float = 10.0, high: float = 90.0, rate_hz: float = RATE) -> np.ndarray:
+    """One movement out and back [deg]."""
+    phase = np.arange(round(seconds * rate_hz)) / (seconds * rate_hz)
+    return low + 0.5 * (high - low) * (1.0 - np.cos(2.0 * np.pi * phase))
+
+
+def rest(seconds: float, at: float = 10.0, rate_hz: float = RATE) -> np.ndarray:
+    return np.full(round(seconds * rate_hz), at)
+
+
+def chain(*parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The parts one after the other, and begin and end [s] of those that move."""
+    ends = np.cumsum([len(part) for part in parts]) / RATE
+    spans = [(end - len(part) / RATE, end) for part, end in zip(parts, ends, strict=True) if np.ptp(part) > 0.0]
+    return np.concatenate(parts), np.array(spans)
+
+
+def find(flexion_deg: np.ndarray, **options: object) -> Repetitions:
+    return find_repetitions(angles_of(flexion_deg), **options)
+
+
+def check_spans(found: Repetitions, expected: np.ndarray, share: float = 0.04) -> None:
+    """Begin and end within a share of the duration."""
+    assert found.reason == ""
+    assert len(found.spans) == len(expected)
+    duration = np.diff(expected, axis=1)
+    assert np.all(np.abs(found.spans - expected) < share * duration + 0.011)
+
+
+def test_repetitions_without_a_rest_follow_each_other() -> None:
+    signal, spans = chain(rest(1.0), *[reach(2.0)] * 6, rest(1.0))
+    found = find(signal)
+    check_spans(found, spans)
+    assert (found.source, found.rising, found.left_out) == (FLEXION, True, 0)
+    assert found.cmc > 0.999
+
+
+@pytest.mark.parametrize("noise_deg", [0.3, 2.0])
+def test_rests_of_any_length_between_repetitions_do_not_count(noise_deg: float) -> None:
+    rng = np.random.default_rng(1)
+    parts = [part for pause in rng.uniform(0.3, 4.0, 8) for part in (rest(pause), reach(1.5))]
+    signal, spans = chain(*parts, rest(1.0))
+    found = find(signal + rng.normal(0.0, noise_deg, len(signal)))
+    check_spans(found, spans, 0.04 if noise_deg < 1.0 else 0.12)
+
+
+def test_two_speeds_are_one_movement() -> None:
+    signal, spans = chain(rest(1.0), *[reach(4.0)] * 4, *[reach(0.8)] * 5, rest(1.0))
+    check_spans(find(signal), spans)
+
+
+def test_half_repetitions_at_the_ends_are_left_out() -> None:
+    whole, spans = chain(*[reach(2.0)] * 6)
+    found = find(whole[100:-60])  # from the peak of the first to shortly after that of the last
+    check_spans(found, spans[1:-1] - 1.0)
+    found = find(whole[40:-40])  # both begin, or end, half way up
+    check_spans(found, spans[1:-1] - 0.4)
+
+
+def test_a_stop_on_the_way_is_part_of_a_repetition() -> None:
+    half = reach(2.0)[:100]
+    there = np.concatenate([half[:50], rest(0.8, half[50]), half[50:], half[::-1]])
+    signal, spans = chain(rest(1.0), *[part for _ in range(4) for part in (there, rest(1.0))])
+    check_spans(find(signal), spans)
+
+
+def test_an_angle_that_rests_high_falls_first() -> None:
+    signal, spans = chain(*[part for _ in range(5) for part in (rest(1.0), reach(1.5))], rest(1.0))
+    for turned in (-signal, 100.0 - signal):
+        found = find(turned)
+        assert found.rising is False
+        check_spans(found, spans)
+
+
+def test_without_a_rest_the_end_nearer_to_zero_begins() -> None:
+    signal = np.concatenate([reach(2.0)] * 6)
+    assert find(signal).rising is True
+    assert find(-signal).rising is False
+    assert len(find(signal, rising=False).spans) == 5  # from peak to peak
+
+
+def test_other_movements_between_are_left_out() -> None:
+    """Standing up, say: an excursion far larger than those that repeat, a small one, and one with a long stop in it."""
+    stop = np.concatenate([reach(1.5)[:75], rest(6.0, 88.0), reach(1.5)[75:]])
+    signal, spans = chain(
+        *(rest(1.0), *[reach(1.5)] * 5, rest(1.0), reach(3.0, 10.0, 240.0), rest(1.0), reach(1.0, 10.0, 30.0)),
+        *(rest(1.0), *[reach(1.5)] * 4, rest(1.0), stop, rest(1.0)),
+    )
+    kept = [k for k in range(len(spans)) if k not in (5, 6, 11)]
+    found = find(signal)
+    check_spans(found, spans[kept])
+    assert found.left_out == 1
+
+
+def test_a_cycle_lasts_until_the_next_one_begins() -> None:
+    """A knee: the swing, and the stance with a small flexion of its own."""
+    cycle = np.concatenate([reach(0.4, 2.0, 65.0), reach(0.6, 2.0, 18.0)])
+    signal = np.concatenate([rest(1.0, 2.0), *[cycle] * 8, rest(3.0, 2.0), *[cycle] * 3, rest(1.0, 2.0)])
+    found = find(signal, cycles=True)
+    np.testing.assert_allclose(np.diff(found.spans, axis=1), 1.0, atol=0.011)
+    assert len(found.spans) == 7 + 2
+    np.testing.assert_allclose(np.diff(find(signal).spans, axis=1), 0.4, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("signal", "said"),
+    [
+        (rest(10.0), "has a range of 0.0°, and 10° are needed"),
+        (10.0 + np.random.default_rng(0).normal(0.0, 3.0, 3000), "°, and 10° are needed"),
+        (chain(rest(2.0), reach(2.0), rest(2.0))[0], "goes out and back once, and 3 times are needed"),
+        (chain(rest(2.0), reach(2.0), rest(1.0), reach(2.0), rest(2.0))[0], "goes out and back twice"),
+        (np.linspace(0.0, 90.0, 1000), "goes out and back no time"),
+        (reach(2.0)[:100], "goes out and back no time"),
+    ],
+    ids=["still", "noise", "once", "twice", "one way", "half"],
+)
+def test_where_nothing_repeats_it_says_so(signal: np.ndarray, said: str) -> None:
+    found = find(signal)
+    assert said in found.reason
+    assert found.spans.shape == (0, 2)
+
+
+def test_a_motion_at_random_is_hardly_ever_taken_for_repetitions() -> None:
+    taken = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        sos = butter(2, rng.uniform(0.1, 1.0), fs=RATE, output="sos")
+        signal = sosfiltfilt(sos, rng.normal(size=6000))
+        found = find(40.0 * signal / signal.std())
+        taken += not found.reason
+        assert found.reason or found.cmc >= 0.85
+    assert taken <= 2
+
+
+def test_the_rate_of_sampling_does_not_matter() -> None:
+    for rate_hz in (25.0, 400.0):
+        signal = np.concatenate(
+            [rest(1.0, rate_hz=rate_hz), *[reach(2.0, rate_hz=rate_hz)] * 5, rest(1.0, rate_hz=rate_hz)]
+        )
+        found = find_repetitions(angles_of(signal, rate_hz))
+        np.testing.assert_allclose(found.spans[:, 0], 1.0 + 2.0 * np.arange(5), atol=0.081)
+        np.testing.assert_allclose(found.spans[:, 1], 3.0 + 2.0 * np.arange(5), atol=0.081)
+
+
+# The main angle ---------------------------------------------------------------------------------------------------
+
+
+def test_the_main_angle_is_that_of_the_largest_range_between_segments() -> None:
+    n = 1000
+    wave = np.sin(np.linspace(0.0, 20.0, n))
+    large, small = np.column_stack([10.0 * wave, 50.0 * wave, 0.0 * wave]), np.outer(wave, np.ones(3))
+    angles = angles_of(20.0 * wave, thorax=9.0 * large, right_wrist=large, left_wrist=small)
+    assert find_main_angle(angles) == "right_wrist_ulnar_deviation"
+    angles.joints["right_wrist"].gap[:100] = True
+    assert find_main_angle(angles) == "right_wrist_ulnar_deviation"
+    angles.joints["right_wrist"].gap[:300] = True
+    assert find_main_angle(angles) == FLEXION
+    angles = angles_of(20.0 * wave)
+    angles.joints["right_elbow"].near_lock[:] = True  # leaves the second angle
+    assert find_main_angle(angles) == "right_elbow_carrying_angle"
+    angles.joints["right_elbow"].gap[:] = True
+    assert find_main_angle(angles) is None
+    assert find_repetitions(angles).reason.startswith("each angle is near gimbal lock for over 1 % of the time")
+    assert "not determined for even 10 samples" in find_repetitions(angles, FLEXION).reason
+
+
+def test_a_repetition_in_a_gap_is_left_out() -> None:
+    signal, spans = chain(rest(1.0), *[part for _ in range(6) for part in (reach(2.0), rest(1.0))])
+    angles = angles_of(signal)
+    angles.joints["right_elbow"].gap[450:490] = True  # 0.4 s of the second: bridged by a line, and still much alike
+    angles.joints["right_elbow"].gap[700:705] = True
+    found = find_repetitions(angles)
+    check_spans(found, np.delete(spans, 1, axis=0))
+    assert found.left_out == 1
+
+
+def test_an_angle_that_is_not_there_is_named() -> None:
+    with pytest.raises(WrongOption, match=r"--main-angle right_elbow_flex: no such angle.*'right_elbow_flexion'"):
+        find(reach(2.0), main_angle="right_elbow_flex")
+
+
+# Curves -----------------------------------------------------------------------------------------------------------
+
+
+def test_curves_are_those_of_the_repetitions() -> None:
+    signal, spans = chain(rest(1.0), reach(2.0), reach(3.0), reach(1.0, 12.0, 92.0), rest(1.0))
+    angles = angles_of(signal)
+    curves = normalize_time(angles.time, np.degrees(angles["right_elbow"].values), spans)
+    for row, low in zip(curves[:, :, 0], (10.0, 10.0, 12.0), strict=True):
+        np.testing.assert_allclose(
+            row[:-1], low + 40.0 * (1.0 - np.cos(2.0 * np.pi * np.arange(100) / 100.0)), atol=0.3
+        )
+    mean = compute_mean_curves(angles, spans)["right_elbow"][0]
+    np.testing.assert_allclose(np.degrees(mean.mean), curves[:, :, 0].mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(np.degrees(mean.sd), curves[:, :, 0].std(axis=0, ddof=1), atol=1e-9)
+    assert mean.n.tolist() == [3] * 101
+
+
+def test_what_is_not_determined_breaks_a_curve() -> None:
+    signal, spans = chain(rest(1.0), *[reach(2.0)] * 4, rest(1.0))
+    angles = angles_of(signal)
+    angles.joints["right_elbow"].near_lock[100:150] = True  # the first quarter of one of four
+    angles.joints["right_elbow"].gap[300:310] = True
+    first, second, _ = compute_mean_curves(angles, spans)["right_elbow"]
+    assert first.n[12] == second.n[12] - 1 == 3
+    assert np.isfinite(first.mean).all()
+    for begin in (300, 500):
+        angles.joints["right_elbow"].near_lock[begin : begin + 50] = True
+    first, second, _ = compute_mean_curves(angles, spans)["right_elbow"]
+    assert np.isnan(first.mean[5:20]).all()
+    assert np.isfinite(first.mean[30:]).all()
+    assert np.isfinite(second.mean[12:]).all()
+
+
+def test_a_full_turn_between_repetitions_is_none() -> None:
+    signal, spans = chain(*[reach(2.0)] * 4)
+    turns = np.repeat([0.0, 360.0, 360.0, -720.0], 200)
+    mean = compute_mean_curves(angles_of(signal + turns), spans - [0.0, 0.02])["right_elbow"][0]
+    assert np.degrees(mean.sd).max() < 1e-6
+
+
+def test_the_cmc_is_kadabas() -> None:
+    rng = np.random.default_rng(3)
+    curves = np.sin(np.linspace(0.0, 6.0, 50)) + rng.normal(0.0, 0.3, (7, 50))
+    within = sum((curves[i, t] - curves[:, t].mean()) ** 2 for i in range(7) for t in range(50)) / (50 * 6)
+    total = sum((curves[i, t] - curves.mean()) ** 2 for i in range(7) for t in range(50)) / (7 * 50 - 1)
+    assert compute_cmc(curves) == pytest.approx(np.sqrt(1.0 - within / total), abs=1e-12)
+    assert compute_cmc(np.tile(curves[0], (3, 1))) == 1.0
+    assert compute_cmc(rng.normal(size=(5, 50)) + np.arange(5.0)[:, None]) == 0.0
+    assert np.isnan(compute_cmc(curves[:1]))
+    assert np.degrees(MIN_RANGE) == pytest.approx(10.0)
+
+
+# People -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_arm_swings_of_a_real_walk_are_found(data: Path) -> None:
+    """A person works at a table, stands up and walks; the period of the swing is the raw gyroscope's."""
+    recording = wp.load_session(data / "upper_body" / "session.toml")
+    pose = wp.track(recording, method="amekf", open_loop=True).pose
+    found = find_repetitions(joint_angles(pose, "XZY"), "left_shoulder_flexion")
+    walk = (recording.time > 97.0) & (recording.time < 137.0)
+    sensor = recording.sensors["left_upper_arm"]
+    assert isinstance(sensor, ImuSensor)
+    swing = sensor.gyro_S[walk, np.argmax(sensor.gyro_S[walk].std(axis=0))]
+    spectrum = np.abs(np.fft.rfft((swing - swing.mean()) * np.hanning(len(swing)), 16 * len(swing)))
+    period = 1.0 / np.fft.rfftfreq(16 * len(swing), 1.0 / recording.rate_hz)[spectrum.argmax()]
+    assert np.median(np.diff(found.spans, axis=1)) == pytest.approx(period, rel=0.06)
+    assert 38 <= len(found.spans) <= 46
+    assert found.spans.min() > 95.0  # none at the table
+
+
+def test_the_strides_of_a_simulated_walk_are_those_of_the_walk() -> None:
+    motion = Walk(load_model("whole_body"), np.random.default_rng(2), 15.0)
+    time = np.arange(0.0, 20.0, 0.01)
+    knee = np.degrees(motion.leg("right", time).knee[:, 0])
+    found = find(knee, cycles=True)
+    np.testing.assert_allclose(np.diff(found.spans, axis=1), motion.stride_s, atol=0.021)
+    assert len(found.spans) >= int(15.0 / motion.stride_s) - 4

@@ -1,0 +1,252 @@
+"""A session's angles for a paper: its repetitions, what each comes to, and two sessions compared."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import stdtrit
+
+from ..errors import WrongOption, one_of
+from ..kinematics import Pose, find_samples
+from ..recording import Intervals
+from .curves import MeanCurve, compute_mean_curves
+from .joints import Angles, JointAngles, joint_angles
+from .repetitions import Repetitions, find_repetitions
+from .smoothing import smooth_pose
+from .tables import summarize_joint
+from .uncertainty import compute_summary_std
+
+MEASURES = ("lowest", "highest", "range", "peak_rate")
+UNITS = ("deg", "deg", "deg", "deg_s")
+CONFIDENCE = 0.95  # of the interval of a difference
+
+
+@dataclass(frozen=True)
+class MovementOptions:
+    """How the angles of a session are made and its repetitions found.
+
+    Parameters
+    ----------
+    sequence : of the shoulder, one of `SHOULDER_SEQUENCES`
+    cutoff_hz : of the low-pass (`smooth_pose`); None: none
+    phase : takes each of its intervals as a repetition; None: repetitions are found
+    main_angle, rising, cycles : of `find_repetitions`
+    """
+
+    sequence: str = "YXY"
+    cutoff_hz: float | None = None
+    phase: str | None = None
+    main_angle: str | None = None
+    rising: bool | None = None
+    cycles: bool = False
+
+
+class Measures(NamedTuple):
+    """`MEASURES` of one joint in several spans; [rad], of `peak_rate` [rad/s]; NaN where not determined."""
+
+    values: np.ndarray  # (s, 3 angles, 4)
+    std: np.ndarray  # (s, 3, 4) as the pose states them
+    near_lock: np.ndarray  # (s,) share of the samples
+    gap: np.ndarray  # (s,) share of the samples
+
+
+@dataclass(frozen=True)
+class Movement:
+    """The angles of a session, or of the selected time of it.
+
+    Parameters
+    ----------
+    name : of the session
+    pose : low-passed as the angles are
+    angles : of the pose
+    phases : of the recording, as far as they lie in the time of the pose
+    repetitions : found, or marked by a phase
+    measures : joint → those of the repetitions
+    curves : joint → its three mean curves; empty without repetitions
+    cutoff_hz : of the low-pass; None: there is none
+    isotropic : the pose states one standard deviation a segment, and no covariance
+    """
+
+    name: str
+    pose: Pose
+    angles: Angles
+    phases: Mapping[str, Intervals]
+    repetitions: Repetitions
+    measures: Mapping[str, Measures]
+    curves: Mapping[str, tuple[MeanCurve, MeanCurve, MeanCurve]]
+    cutoff_hz: float | None
+    isotropic: bool
+
+    @property
+    def durations(self) -> np.ndarray:
+        """(r,) [s] of the repetitions."""
+        return np.diff(self.repetitions.spans, axis=1)[:, 0]
+
+
+def analyze_movement(name: str, pose: Pose, phases: Mapping[str, Intervals], options: MovementOptions) -> Movement:
+    """Compute the angles of a session, find its repetitions and measure them.
+
+    Parameters
+    ----------
+    phases : of the recording, [s]
+
+    Raises
+    ------
+    WeposeError
+        No joint has both of its segments; there is no such angle or phase; a cut-off that is not possible.
+    """
+    if options.cutoff_hz is not None:
+        pose = smooth_pose(pose, options.cutoff_hz)
+    angles = joint_angles(pose, options.sequence)
+    inside = _select_inside(pose.time, phases)
+    if options.phase is not None:
+        repetitions = _take_marked(options.phase, phases, inside)
+    else:
+        repetitions = find_repetitions(angles, options.main_angle, options.rising, options.cycles)
+    return Movement(
+        name,
+        pose,
+        angles,
+        inside,
+        repetitions,
+        measure_spans(pose, angles, repetitions.spans),
+        compute_mean_curves(angles, repetitions.spans) if len(repetitions.spans) else {},
+        options.cutoff_hz,
+        all(np.array_equal(cov, cov[:, :1, :1] * np.eye(3)) for cov in pose.segment_cov.values()),
+    )
+
+
+def _select_inside(time: np.ndarray, phases: Mapping[str, Intervals]) -> dict[str, Intervals]:
+    """The intervals that lie in a time (n,) [s], or exceed it by less than a sample."""
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    inside = {
+        name: tuple((a, b) for a, b in spans if a > time[0] - step and b < time[-1] + step)
+        for name, spans in phases.items()
+    }
+    return {name: spans for name, spans in inside.items() if spans}
+
+
+def _take_marked(phase: str, phases: Mapping[str, Intervals], inside: Mapping[str, Intervals]) -> Repetitions:
+    if not phases.get(phase):
+        choices = one_of(phases, phase) if phases else "it has no phases; without --repetitions they are found"
+        raise WrongOption("repetitions", phase, f"the recording has no such phase; {choices}")
+    if phase not in inside:
+        return Repetitions(
+            np.empty((0, 2)), phase, reason=f"no interval of the phase {phase} lies in the selected time"
+        )
+    return Repetitions(np.array(inside[phase], dtype=float), phase)
+
+
+def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float]] | np.ndarray) -> dict[str, Measures]:
+    """Joint → its measures in each span [s], both ends included.
+
+    Raises
+    ------
+    BadData
+        A span has no sample.
+    """
+    parts = [find_samples(pose.time, (float(begin), float(end))) for begin, end in spans]
+    measures = {}
+    for name, joint in angles.joints.items():
+        summaries = [summarize_joint(pose.time[part], _cut(joint, part)) for part in parts]
+        values, samples = np.empty((len(parts), 3, len(MEASURES))), np.empty((len(parts), 3, len(MEASURES)), dtype=int)
+        for row, (part, each) in enumerate(zip(parts, summaries, strict=True)):
+            values[row] = np.column_stack([each.lowest, each.highest, each.range, each.peak_rate])
+            samples[row] = np.where(each.samples < 0, -1, each.samples + part.start)
+        values[:, :, :2] -= _count_turns(values)[:, :, None]
+        measures[name] = Measures(
+            values,
+            compute_summary_std(pose, name, joint, samples),
+            np.array([each.near_lock for each in summaries]),
+            np.array([each.gap for each in summaries]),
+        )
+    return measures
+
+
+def _cut(joint: JointAngles, part: slice) -> JointAngles:
+    return replace(
+        joint,
+        values=joint.values[part],
+        gimbal=joint.gimbal[part],
+        near_lock=joint.near_lock[part],
+        gap=joint.gap[part],
+        std=None if joint.std is None else joint.std[part],
+        quat=joint.quat[part],
+    )
+
+
+def _count_turns(values: np.ndarray) -> np.ndarray:
+    """Full turns [rad] (s, 3) by which spans are off the first one that is determined: angles are unwrapped in time."""
+    middle = values[:, :, :2].mean(axis=2)
+    turns = np.zeros_like(middle)
+    for k in range(3):
+        known = np.flatnonzero(np.isfinite(middle[:, k]))
+        if len(known):
+            turns[known, k] = np.round((middle[known, k] - middle[known[0], k]) / (2.0 * np.pi))
+    return 2.0 * np.pi * turns
+
+
+class Statistics(NamedTuple):
+    """Values over repetitions; NaN where there are too few."""
+
+    n: int
+    mean: float
+    sd: float  # with n − 1
+    std: float  # stated for one repetition, root mean square
+
+
+def compute_statistics(values: np.ndarray, std: np.ndarray) -> Statistics:
+    """Mean and standard deviation of values (r,), NaN left out, and what is stated for them."""
+    known = values[np.isfinite(values)]
+    stated = std[np.isfinite(std) & np.isfinite(values)]
+    return Statistics(
+        len(known),
+        float(known.mean()) if len(known) else float("nan"),
+        float(known.std(ddof=1)) if len(known) > 1 else float("nan"),
+        float(np.sqrt(np.mean(np.square(stated)))) if len(stated) else float("nan"),
+    )
+
+
+class Difference(NamedTuple):
+    """Of two sessions, the second less the first."""
+
+    value: float
+    low: float  # of the interval of `CONFIDENCE` (Welch 1947), from the spread of the repetitions alone
+    high: float
+    std: float  # stated: of both sessions, as independent
+
+
+def compare_statistics(first: Statistics, second: Statistics) -> Difference:
+    """The difference of two means; the interval is NaN where a session has fewer than two repetitions."""
+    value = second.mean - first.mean
+    low = high = float("nan")
+    if min(first.n, second.n) > 1:
+        a, b = first.sd**2 / first.n, second.sd**2 / second.n
+        half = 0.0
+        if a + b > 0.0:
+            freedom = (a + b) ** 2 / (a**2 / (first.n - 1) + b**2 / (second.n - 1))
+            half = float(stdtrit(freedom, 0.5 + 0.5 * CONFIDENCE)) * np.sqrt(a + b)
+        low, high = value - half, value + half
+    return Difference(value, low, high, float(np.hypot(first.std, second.std)))
+
+
+class CurveDifference(NamedTuple):
+    """Of two mean curves, the second less the first; NaN where they have no point in common."""
+
+    rms: float  # [rad]
+    largest: float  # [rad], with its sign
+    percent: float  # where it is
+
+
+def compare_curves(first: MeanCurve, second: MeanCurve) -> CurveDifference:
+    """The difference of two mean curves, after the full turns between them."""
+    difference = second.mean - first.mean
+    known = np.isfinite(difference)
+    if not known.any():
+        return CurveDifference(*[float("nan")] * 3)
+    difference = difference - 2.0 * np.pi * np.round(difference[known].mean() / (2.0 * np.pi))
+    worst = int(np.nanargmax(np.abs(difference)))
+    return CurveDifference(float(np.sqrt(np.mean(difference[known] ** 2))), float(difference[worst]), float(worst))

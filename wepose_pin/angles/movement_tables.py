@@ -1,0 +1,149 @@
+"""The tables of `Movement`: a row an angle, in degrees; what is not determined is NaN."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from .curves import PERCENT
+from .definitions import SOURCE, define_angles
+from .movement import (
+    MEASURES,
+    UNITS,
+    Measures,
+    Movement,
+    compare_curves,
+    compare_statistics,
+    compute_statistics,
+    measure_spans,
+)
+
+
+def build_definition_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """What each angle is: sequence, axis, where it is positive, and the source."""
+    definitions = dict.fromkeys(each for movement in movements for each in define_angles(movement.angles))
+    return pl.DataFrame([{**each._asdict(), "source": SOURCE} for each in definitions]).rename({"group": "joint"})
+
+
+def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """A row a session: its time, how repetitions were found, their number and duration."""
+    rows = []
+    for movement in movements:
+        time, found = movement.angles.time, movement.repetitions
+        duration = compute_statistics(movement.durations, np.full(len(movement.durations), np.nan))
+        rows.append(
+            {
+                "session": movement.name,
+                "from_s": float(time[0]),
+                "to_s": float(time[-1]),
+                "low_pass_hz": movement.cutoff_hz,
+                "repetitions_by": found.source,
+                "first": {None: "", True: "rising", False: "falling"}[found.rising],
+                "n": len(found.spans),
+                "duration_mean_s": duration.mean,
+                "duration_sd_s": duration.sd,
+                "cmc": found.cmc,
+                "left_out": found.left_out,
+                "why_none": found.reason,
+            }
+        )
+    return pl.DataFrame(rows, schema_overrides={"low_pass_hz": pl.Float64})
+
+
+def build_phase_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """A row an angle in all of the selected time, and in each interval of a phase that lies in it."""
+    rows: list[dict[str, Any]] = []
+    for movement in movements:
+        time = movement.angles.time
+        parts = [("all", 1, (float(time[0]), float(time[-1])))]
+        parts += [(name, k, span) for name, spans in movement.phases.items() for k, span in enumerate(spans, 1)]
+        measures = measure_spans(movement.pose, movement.angles, [span for _, _, span in parts])
+        for row, (name, k, (begin, end)) in enumerate(parts):
+            about = {"session": movement.name, "phase": name, "number": k, "from_s": begin, "to_s": end}
+            rows += [{**about, **angle} for angle in _list_measures(movement, measures, row)]
+    return pl.DataFrame(rows)
+
+
+def build_repetition_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """A row an angle in each repetition."""
+    rows: list[dict[str, Any]] = []
+    for movement in movements:
+        for row, (begin, end) in enumerate(movement.repetitions.spans.tolist()):
+            about = {"session": movement.name, "repetition": row + 1, "from_s": begin, "to_s": end}
+            about["duration_s"] = end - begin
+            rows += [{**about, **angle} for angle in _list_measures(movement, movement.measures, row)]
+    return pl.DataFrame(rows)
+
+
+def _list_measures(movement: Movement, measures: Mapping[str, Measures], row: int) -> Iterator[dict[str, Any]]:
+    for name, joint in movement.angles.joints.items():
+        found = measures[name]
+        for k, angle in enumerate(joint.names):
+            cells: dict[str, Any] = {"joint": name, "angle": angle, "sequence": joint.sequence}
+            for m, (measure, unit) in enumerate(zip(MEASURES, UNITS, strict=True)):
+                cells[f"{measure}_{unit}"] = float(np.degrees(found.values[row, k, m]))
+                cells[f"{measure}_std_{unit}"] = float(np.degrees(found.std[row, k, m]))
+            yield {**cells, "near_lock": float(found.near_lock[row]), "gap": float(found.gap[row])}
+
+
+def build_summary_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """A row an angle of each session: mean and standard deviation over repetitions, what is stated, and the CMC."""
+    rows = []
+    for movement in (movement for movement in movements if movement.curves):
+        for name, joint in movement.angles.joints.items():
+            found = movement.measures[name]
+            for k, angle in enumerate(joint.names):
+                cells: dict[str, Any] = {"session": movement.name, "joint": name, "angle": angle}
+                cells |= {"sequence": joint.sequence, "repetitions": len(movement.repetitions.spans)}
+                for m, (measure, unit) in enumerate(zip(MEASURES, UNITS, strict=True)):
+                    each = compute_statistics(found.values[:, k, m], found.std[:, k, m])
+                    cells |= {f"{measure}_n": each.n} if measure in ("range", "peak_rate") else {}
+                    for part in ("mean", "sd", "std"):
+                        cells[f"{measure}_{part}_{unit}"] = float(np.degrees(getattr(each, part)))
+                rows.append({**cells, "cmc": movement.curves[name][k].cmc})
+    return pl.DataFrame(rows)
+
+
+def build_curve_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """A row a percent of the repetition of each angle and session."""
+    tables = []
+    for movement in movements:
+        for name, curves in movement.curves.items():
+            for angle, curve in zip(movement.angles[name].names, curves, strict=True):
+                about = {"session": movement.name, "joint": name, "angle": angle}
+                columns = {key: pl.Series([text]).new_from_index(0, len(PERCENT)) for key, text in about.items()}
+                columns |= {"percent": pl.Series(PERCENT), "n": pl.Series(curve.n)}
+                columns |= {
+                    f"{part}_deg": pl.Series(np.degrees(getattr(curve, part))) for part in ("mean", "sd", "std")
+                }
+                tables.append(pl.DataFrame(columns))
+    return pl.concat(tables) if tables else pl.DataFrame()
+
+
+def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """Each further session against the first, a row a measure of each angle that both have."""
+    rows: list[dict[str, Any]] = []
+    repeated = [movement for movement in movements if movement.curves]
+    for movement in repeated[1:]:
+        first = repeated[0]
+        for name in (name for name in first.curves if name in movement.curves):
+            for k, angle in enumerate(first.angles[name].names):
+                about = {"session": movement.name, "against": first.name, "joint": name, "angle": angle}
+                for m, (measure, unit) in enumerate(zip(MEASURES, UNITS, strict=True)):
+                    one, two = (
+                        compute_statistics(each.measures[name].values[:, k, m], each.measures[name].std[:, k, m])
+                        for each in (first, movement)
+                    )
+                    difference = compare_statistics(one, two)
+                    numbers = {"first_mean": one.mean, "first_sd": one.sd, "mean": two.mean, "sd": two.sd}
+                    numbers |= {"difference": difference.value, "ci95_low": difference.low}
+                    numbers |= {"ci95_high": difference.high, "difference_std": difference.std}
+                    about_n = {"measure": measure, "unit": unit.replace("_", "/"), "first_n": one.n, "n": two.n}
+                    rows.append({**about, **about_n, **{key: float(np.degrees(v)) for key, v in numbers.items()}})
+                curve = compare_curves(first.curves[name][k], movement.curves[name][k])
+                for measure, value in (("curve_rms", curve.rms), ("curve_largest", curve.largest)):
+                    rows.append({**about, "measure": measure, "unit": "deg", "difference": float(np.degrees(value))})
+    return pl.DataFrame(rows, infer_schema_length=None)

@@ -1,0 +1,236 @@
+"""The repetitions of a movement: excursions of one angle, from a low posture over a peak and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import WrongOption, one_of
+from ..filters.butterworth import low_pass
+from .curves import compute_cmc, normalize_time
+from .joints import JOINTS, Angles
+
+# Found on the angle below this frequency [Hz]; voluntary motion of limbs is slower (Winter 2009, 2.2.3).
+CUTOFF_HZ = 5.0
+MIN_RANGE = np.radians(10.0)  # of the angle; what is smaller is sway, or noise
+MIN_REPETITIONS = 3
+# Rise and fall of an excursion: this share of the angle's range at first, then of the median excursion.
+FIRST_SHARE, SHARE = 0.25, 0.5
+MAX_SHARE = 2.0  # of the median excursion; what is larger is another movement, as standing up
+# A movement begins and ends where the rate is this share of its peak, as in studies of reaching, and the angle has
+# covered at most `LOW_SHARE` of the excursion: a stop on the way is part of the repetition, a rest between two is not.
+ONSET_SHARE = 0.05
+LOW_SHARE = 0.2
+CUT_SHARE = 0.2  # of the peak rate; an excursion that is faster where the recording begins or ends is cut by it
+# An excursion whose curve correlates less with the median curve is left out, as one with a long stop in it; where that
+# is more than `MAX_LEFT_OUT` of them, or the rest has a lower `compute_cmc`, it is not one movement repeated.
+MIN_CORRELATION = 0.8
+MAX_LEFT_OUT = 0.25
+MIN_CMC = 0.85
+_REST_SHARE = 0.15  # of the range; nearer than this to an end of it the angle dwells there
+_CLEARLY_LONGER = 1.5  # times as long at one end: the angle rests there
+_NO_SPANS = np.empty((0, 2))
+MAX_NEAR_LOCK, MAX_GAP = 0.01, 0.2  # of the samples of a main angle
+MAX_HIDDEN = 0.1  # of the samples of a repetition, which the main angle is not determined for
+
+
+class Repetitions(NamedTuple):
+    """Repetitions of a movement.
+
+    Parameters
+    ----------
+    spans : (r, 2) [s], begin and end
+    source : the angle they were found by, as ``right_elbow_flexion``, or the phase that marks them; empty: no angle
+    rising : the angle grows first; None where a phase marks them
+    cmc : of the curves of that angle; NaN where a phase marks them
+    left_out : excursions of the angle that are unlike the others, or in gaps
+    reason : why there are none; empty where there are some
+    """
+
+    spans: np.ndarray
+    source: str
+    rising: bool | None = None
+    cmc: float = float("nan")
+    left_out: int = 0
+    reason: str = ""
+
+
+def list_angles(angles: Angles) -> dict[str, tuple[str, int]]:
+    """Angle, as ``right_elbow_flexion`` → its joint and place among the joint's three."""
+    return {f"{joint}_{name}": (joint, k) for joint, each in angles.joints.items() for k, name in enumerate(each.names)}
+
+
+def find_main_angle(angles: Angles) -> str | None:
+    """Return the angle of the largest range (2 to 98 %) among those that are determined nearly throughout.
+
+    Of joints between two segments; of thorax and pelvis in W only where there are no others, for a person who turns
+    round has the largest range there. An angle that is near gimbal lock, or in gaps, for longer is left out
+    (`MAX_NEAR_LOCK`, `MAX_GAP`). None where all are.
+    """
+    ranges: dict[str, tuple[bool, float]] = {}
+    for angle, (joint, k) in list_angles(angles).items():
+        each = angles[joint]
+        hidden = each.hidden(k)
+        near_lock = each.near_lock & ~each.gap if k != 1 else np.zeros(len(hidden))
+        if np.mean(near_lock) <= MAX_NEAR_LOCK and np.mean(each.gap) <= MAX_GAP:
+            low, high = np.percentile(each.values[~hidden, k], [2.0, 98.0])
+            ranges[angle] = (JOINTS[joint].proximal != "world", float(high - low))
+    return max(ranges, key=lambda angle: ranges[angle], default=None)
+
+
+def find_repetitions(
+    angles: Angles, main_angle: str | None = None, rising: bool | None = None, cycles: bool = False
+) -> Repetitions:
+    """Find the repetitions by one angle; `docs/angles.md` states the rule.
+
+    Parameters
+    ----------
+    main_angle : as ``right_elbow_flexion``; None: that of `find_main_angle`
+    rising : the angle grows first in a repetition; None: by where it rests
+    cycles : a repetition lasts until the next one begins, and not only until the angle is back
+
+    Raises
+    ------
+    WrongOption
+        There is no such angle.
+    """
+    known = list_angles(angles)
+    if main_angle is not None and main_angle not in known:
+        raise WrongOption("main-angle", main_angle, f"no such angle in the result; {one_of(known, main_angle, 30)}")
+    source = main_angle or find_main_angle(angles)
+    if source is None:
+        limits = f"{100 * MAX_NEAR_LOCK:g} % of the time, or in gaps for over {100 * MAX_GAP:g} %"
+        return Repetitions(_NO_SPANS, "", reason=f"each angle is near gimbal lock for over {limits}")
+    joint, k = known[source]
+    values, hidden = angles[joint].values[:, k], angles[joint].hidden(k)
+    if np.count_nonzero(~hidden) < 10:
+        return Repetitions(_NO_SPANS, source, reason="the angle is not determined for even 10 samples")
+    signal = _smooth(angles.time, np.interp(angles.time, angles.time[~hidden], values[~hidden]))
+    low, high = np.percentile(signal, [2.0, 98.0])
+    if high - low < MIN_RANGE:
+        reason = f"the angle has a range of {np.degrees(high - low):.1f}°, and {np.degrees(MIN_RANGE):.0f}° are needed"
+        return Repetitions(_NO_SPANS, source, reason=reason)
+    if rising is None:
+        rising = _rests_low(signal, low, high)
+    spans = _find_spans(angles.time, signal if rising else -signal, float(high - low))
+    if cycles:
+        spans = _close_cycles(spans)
+    if len(spans) < MIN_REPETITIONS:
+        times = {0: "no time", 1: "once", 2: "twice"}[len(spans)]
+        reason = f"the angle goes out and back {times}, and {MIN_REPETITIONS} times are needed"
+        return Repetitions(_NO_SPANS, source, rising, reason=reason)
+    curves = normalize_time(angles.time, signal[:, None], spans)[:, :, 0]
+    alike = _are_alike(curves) & (_share_within(angles.time, hidden, spans) <= MAX_HIDDEN)
+    left_out, cmc = int(np.count_nonzero(~alike)), compute_cmc(curves[alike])
+    if left_out > MAX_LEFT_OUT * len(spans) or np.count_nonzero(alike) < MIN_REPETITIONS:
+        reason = f"{left_out} of its {len(spans)} excursions are unlike the others"
+        return Repetitions(_NO_SPANS, source, rising, cmc, left_out, reason)
+    if cmc < MIN_CMC:
+        reason = f"its {len(spans)} excursions are not alike: their CMC is {cmc:.2f}, and {MIN_CMC} is needed"
+        return Repetitions(_NO_SPANS, source, rising, cmc, left_out, reason)
+    return Repetitions(spans[alike], source, rising, cmc, left_out)
+
+
+def _are_alike(curves: np.ndarray) -> np.ndarray:
+    """(r,) bool, which of the curves (r, p) correlate with the median curve."""
+    centred = curves - curves.mean(axis=1, keepdims=True)
+    usual = np.median(centred, axis=0)
+    usual -= usual.mean()
+    size = np.linalg.norm(centred, axis=1) * np.linalg.norm(usual)
+    return np.asarray(centred @ usual >= MIN_CORRELATION * np.maximum(size, 1e-12))
+
+
+def _share_within(time: np.ndarray, which: np.ndarray, spans: np.ndarray) -> np.ndarray:
+    """(r,) share of the samples within each span (r, 2) [s] that are `which` (n,) bool."""
+    first, last = np.searchsorted(time, [spans[:, 0] - 1e-9, spans[:, 1] + 1e-9])
+    count = np.concatenate([[0], np.cumsum(which)])
+    return np.asarray((count[last] - count[first]) / (last - first))
+
+
+def _smooth(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    rate_hz = 1.0 / float(np.median(np.diff(time)))
+    return low_pass(values, min(CUTOFF_HZ, 0.4 * rate_hz), rate_hz)
+
+
+def _rests_low(signal: np.ndarray, low: float, high: float) -> bool:
+    """Whether the angle rests at the low end of its range; where it rests at neither, at the one nearer to zero."""
+    margin = _REST_SHARE * (high - low)
+    at_low, at_high = np.count_nonzero(signal < low + margin), np.count_nonzero(signal > high - margin)
+    if max(at_low, at_high) > _CLEARLY_LONGER * min(at_low, at_high):
+        return bool(at_low > at_high)
+    return bool(abs(low) <= abs(high))
+
+
+def _find_spans(time: np.ndarray, signal: np.ndarray, full_range: float) -> np.ndarray:
+    """Spans (r, 2) [s] of the excursions upwards of a signal."""
+    excursions = list(_find_excursions(signal, FIRST_SHARE * full_range))
+    if not excursions:
+        return np.empty((0, 2))
+    usual = float(np.median([_size(signal, *each) for each in excursions]))
+    rate = np.gradient(signal, time)
+    spans = []
+    for before, peak, after in _find_excursions(signal, SHARE * usual):
+        up, down = slice(before, peak + 1), slice(peak, after + 1)
+        start = _find_onset(signal[up], rate[up], cut=before == 0)
+        end = _find_onset(signal[down][::-1], -rate[down][::-1], cut=after == len(signal) - 1)
+        if start is not None and end is not None and _size(signal, before, peak, after) <= MAX_SHARE * usual:
+            spans.append((time[before + start], time[after - end]))
+    return np.array(spans).reshape(-1, 2)
+
+
+def _close_cycles(spans: np.ndarray) -> np.ndarray:
+    """Spans (r, 2) [s] from one begin to the next, without those that a rest makes last twice as long."""
+    if len(spans) < 2:
+        return spans[:0]
+    cycles = np.column_stack([spans[:-1, 0], spans[1:, 0]])
+    durations = np.diff(cycles, axis=1)[:, 0]
+    return cycles[durations < MAX_SHARE * np.median(durations)]
+
+
+def _find_onset(signal: np.ndarray, rate: np.ndarray, *, cut: bool) -> int | None:
+    """The last sample of rest on the way from a valley to a peak (n,); None where the recording begins on the way.
+
+    Parameters
+    ----------
+    cut : the valley is the end of the recording, and may be none
+    """
+    rests = (signal <= signal[0] + LOW_SHARE * (signal[-1] - signal[0])) & (rate <= ONSET_SHARE * rate.max())
+    if rests.any():
+        return int(np.flatnonzero(rests)[-1])
+    return None if cut and rate[0] > CUT_SHARE * rate.max() else 0
+
+
+def _size(signal: np.ndarray, before: int, peak: int, after: int) -> float:
+    return float(signal[peak] - 0.5 * (signal[before] + signal[after]))
+
+
+def _find_excursions(signal: np.ndarray, least: float) -> Iterator[tuple[int, int, int]]:
+    """Valley, peak and valley of each excursion that rises and falls by at least `least`."""
+    peaks = _find_peaks(signal, least)
+    for k, peak in enumerate(peaks):
+        first = 0 if k == 0 else peaks[k - 1]
+        last = len(signal) - 1 if k == len(peaks) - 1 else peaks[k + 1]
+        before = first + int(np.argmin(signal[first : peak + 1]))
+        after = peak + int(np.argmin(signal[peak : last + 1]))
+        if signal[peak] - signal[before] >= least:
+            yield before, peak, after
+
+
+def _find_peaks(signal: np.ndarray, least: float) -> list[int]:
+    """Peaks after which the signal falls by at least `least`, between each two of them a valley as deep."""
+    peaks: list[int] = []
+    top = bottom = 0
+    seeks_peak = True
+    for i, value in enumerate(signal.tolist()):
+        if seeks_peak:
+            top = i if value > signal[top] else top
+            if value <= signal[top] - least:
+                peaks.append(top)
+                seeks_peak, bottom = False, i
+        else:
+            bottom = i if value < signal[bottom] else bottom
+            if value >= signal[bottom] + least:
+                seeks_peak, top = True, i
+    return peaks
