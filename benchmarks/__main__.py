@@ -33,10 +33,13 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "others; live: five sensors at 1 kHz for five minutes, and again with the page; batch: a study of 500 "
         "sessions on one worker, two, and two of which one is killed (stopped, the same command goes on from there); "
         "long: recordings of up to 24 hours in chunks; headings: relative headings of simulated people with and "
-        "without their correction, half an hour; protocols: what each calibration protocol is worth on simulated "
-        f"people, an hour for eight. Without any: {' and '.join(DEFAULT)}",
+        "without their correction, half an hour; with --live an hour of one person who clasps the hands every ten "
+        "minutes; protocols: what each calibration protocol is worth on simulated people, an hour for eight. "
+        f"Without any: {' and '.join(DEFAULT)}",
     )
     add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 12 sessions, up to one hour")
+    add("--live", action="store_true", help="with headings: live, over a long time, with and without correction")
+    add("--minutes", type=float, metavar="MIN", help="with headings --live: minutes of motion; without it 60")
     add("--sessions", type=int, metavar="N", help="number of sessions of batch")
     add("--persons", type=int, default=8, metavar="N", help="number of simulated people of protocols")
     add("--results", type=Path, metavar="FILE", help="where protocols keeps what it has measured, to go on from there")
@@ -56,6 +59,10 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
     """Name → a function that measures it."""
     if options.sessions is not None and ("batch" not in options.kinds or options.sessions < 2):
         raise BadOption(f"--sessions {options.sessions}: a number of sessions of batch, at least 2")
+    if (options.live or options.minutes is not None) and "headings" not in options.kinds:
+        raise BadOption("--live, --minutes: go with headings, which is not asked for")
+    if options.minutes is not None and not (options.live and 5.0 <= options.minutes <= 600.0):
+        raise BadOption(f"--minutes {options.minutes:g}: goes with --live, from 5 to 600")
     named = options.data or os.environ.get("WEPOSE_DATA")
     chosen: dict[str, Section] = {}
     for kind in options.kinds:
@@ -75,6 +82,11 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
             from . import batch
 
             chosen |= batch.sections(options.quick, options.sessions)
+        elif kind == "headings" and options.live:
+            from . import live_headings
+
+            quick = 10.0 if options.quick else live_headings.MINUTES
+            chosen |= live_headings.sections(options.minutes or quick)
         elif kind == "headings":
             from . import headings
 

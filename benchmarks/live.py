@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import importlib
+import math
 import os
 import subprocess
 import sys
@@ -17,8 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from wepose_pin.live import Output, SensorSetup, Status, run_session
+from wepose_pin.live.mvn_output import MvnOutput
+from wepose_pin.live.outputs import UdpOutput
+from wepose_pin.live.robot import RobotOptions, RobotOutput, connect_robot
 from wepose_pin.live.sources.replay import ReplaySource
+from wepose_pin.live.vmc_output import VmcOutput
 from wepose_pin.recording import Recording
+from wepose_pin.recording.arrivals import Samples
 from wepose_pin.simulation import simulate, simulate_person
 
 from .tables import Column, Section, Table
@@ -67,11 +74,12 @@ class _Meter(Output):
 
 def sections(quick: bool) -> dict[str, Section]:
     """Name → a function that measures it."""
-    return {"live session": partial(live_session, 30.0 if quick else 300.0)}
+    seconds = 30.0 if quick else 300.0
+    return {"live session": partial(live_session, seconds), "live samples": partial(live_samples, seconds)}
 
 
 def live_session(seconds: float) -> Table:
-    """Loop, file and page for `seconds` each."""
+    """Loop and file, page and robot for `seconds` each."""
     recording = _recording(seconds)
     table = Table(
         f"A live session: five sensors at {RATE_HZ:g} Hz for {seconds:g} s, replayed at their own pace",
@@ -80,6 +88,7 @@ def live_session(seconds: float) -> Table:
             Column("lost", "lost samples", 0),
             Column("p50", "latency p50 [ms]", 2),
             Column("p99", "p99 [ms]", 2),
+            Column("busy_us", "processor time per pose [us]", 0),
             Column("share", "of one core [%]", 1),
             Column("grown", "memory grown [MB]", 1),
         ),
@@ -93,12 +102,74 @@ def live_session(seconds: float) -> Table:
         page.open()
         with _reader(page.url):
             table.rows["and page, with a browser"] = _measure(recording, Path(folder) / "b.wepose", [page])
+            robot = _connect_robot(recording, Path(folder))
+            page = LivePage(load_model())
+            page.open()
+            with _reader(page.url):
+                outputs = [page, UdpOutput("9"), MvnOutput("9"), VmcOutput("9"), robot]
+                row = "and a robot's arm, UDP, MVN, VMC"
+                table.rows[row] = _measure(recording, Path(folder) / "c.wepose", outputs)
     table.notes.append(
         "Latency is from the moment at which the newest sample was due to its pose. Limits: p50 under "
         f"{LATENCY_MS:g} ms, p99 {LATENCY_99_MS:g} ms, under {SHARE:g} % of one core, no sample lost, memory flat."
     )
-    table.notes.append("Other work on the machine shows in the 99th percentile first.")
+    load = os.getloadavg()[0] / (os.cpu_count() or 1)
+    table.notes.append(
+        "Other work on the machine shows in the 99th percentile first: after the measurement "
+        f"{load:.1f} programs waited for each core. Processor time is that of all threads, robot and page included."
+    )
     return table
+
+
+class _OneByOne(ReplaySource):
+    """A replay, a sample of each sensor a read, that notes the processor time from one read to the next."""
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(recording, math.inf)
+        self.busy_s: list[float] = []
+        self._since: float | None = None
+
+    def _count_due(self) -> int:
+        return min(self._next + 1, len(self.recording))
+
+    def read(self, timeout_s: float) -> list[Samples] | None:
+        if self._since is not None:
+            self.busy_s.append(time.thread_time() - self._since)
+        samples = super().read(timeout_s)
+        self._since = time.thread_time()
+        return samples
+
+
+def live_samples(seconds: float) -> Table:
+    """Processor time that the loop takes for a sample of all sensors; other programs matter little."""
+    recording = _recording(seconds)
+    columns = (
+        *(Column(f"p{share:g}", f"{share:g} % of samples under [ms]", 3) for share in (50.0, 99.0, 99.9)),
+        Column("longest", "longest [ms]", 2),
+    )
+    table = Table(f"Processor time of the loop for a sample: five sensors at {RATE_HZ:g} Hz, {seconds:g} s", columns)
+    for row, outputs in (
+        ("poses and file", []),
+        ("and UDP, MVN, VMC", [UdpOutput("9"), MvnOutput("9"), VmcOutput("9")]),
+    ):
+        source = _OneByOne(recording)
+        with tempfile.TemporaryDirectory() as folder:
+            setup = SensorSetup.from_recording(recording)
+            run_session(source, setup, record=Path(folder) / "a.wepose", outputs=outputs)
+        busy_ms = 1e3 * np.array(source.busy_s[round(10.0 * RATE_HZ) :])  # after the start pose
+        table.rows[row] = {column.key: float(np.percentile(busy_ms, float(column.key[1:]))) for column in columns[:3]}
+        table.rows[row]["longest"] = float(busy_ms.max())
+    table.notes.append("A pose is late by what the samples before it take longer than the time between two samples.")
+    return table
+
+
+def _connect_robot(recording: Recording, folder: Path) -> RobotOutput:
+    """The output for an arm of seven joints, that of the tests."""
+    write_arm = importlib.import_module("tests.arms").write_arm
+    options = RobotOptions(str(write_arm(folder)), to="9")
+    robot, _ = connect_robot(options, ReplaySource(recording), SensorSetup.from_recording(recording))
+    robot.open()
+    return robot
 
 
 def _recording(seconds: float) -> Recording:
@@ -131,6 +202,7 @@ def _measure(recording: Recording, file: Path, outputs: Sequence[Output]) -> dic
         "lost": float(lost),
         "p50": 1e3 * summary.latency.quantile(0.5),
         "p99": 1e3 * summary.latency.quantile(0.99),
+        "busy_us": 1e6 * busy / max(summary.poses, 1),
         "share": 100.0 * busy / wall,
         "grown": grown / 1e6,
     }

@@ -87,10 +87,11 @@ class PersonSource:
 
     def __init__(self, person: GuidedPerson, step_s: float = 0.05) -> None:
         self.person, self.sensors, self.problems = person, tuple(person.worn), dict[str, int]()
+        self.orientations: dict[str, bool] = {}
         self._rows, self._now = round(step_s * RATE_HZ), 0.0
         self.asleep_s = 0.0  # [s] for which nothing comes
 
-    def open(self) -> None: ...
+    def open(self, _waiting: object = None) -> None: ...
 
     def clock(self) -> float:
         return self._now

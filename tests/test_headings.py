@@ -13,9 +13,11 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate
 from wepose_pin.recording import OrientationSensor, Recording
+from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.tracking import track
+from wepose_pin.tracking.heading_filter import ClaspDetector
 
 # The simulated person's shoulders stay in place, against the law of the table.
 RIGID = {name: np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) for name in TABLE.girdles}
@@ -126,6 +128,30 @@ def test_joined_hands_are_found_and_hands_apart_are_not(causal: bool) -> None:
         assert begin - 1.0 < a < b < end + 1.0
     gap = np.linalg.norm(simulation.points["left_palm"] - simulation.points["right_palm"], axis=1)
     assert all(gap[(simulation.time > a) & (simulation.time < b)].max() < 0.05 for a, b in found.found_clasps)
+
+
+def test_a_marked_clasp_of_two_seconds_brings_a_turned_arm_back_within_one(
+    made: tuple[Simulation, Subject], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sensors without accelerations: nothing else tells that a whole arm has turned against the torso."""
+    simulation, subject = made
+    monkeypatch.setattr(ClaspDetector, "find", lambda *_: [])
+    recording = drifting(simulation, dict.fromkeys(("right_upper_arm", "right_forearm"), 24.0)).cut(slice(0, 3000))
+    subject = replace(subject, covariance=0.04 * subject.covariance)
+    off = {}
+    for marked in (False, True):
+        phases = {"start": recording.phases["start"]} | ({"clasp": ((25.0, 27.0),)} if marked else {})
+        pose = track(replace(recording, phases=phases), subject, causal=True)
+        at = np.searchsorted(simulation.time, pose.time - 1e-9)
+        turn = {
+            name: heading((Rotation.from_quat(simulation.quat_WL[name][at]) * Rotation.from_quat(quat).inv()).as_quat())
+            for name, quat in pose.quat_WL.items()
+        }
+        relative = np.degrees(turn["right_upper_arm"] - turn["torso"])
+        off[marked] = [float(np.interp(time, pose.time, relative)) for time in (24.9, 26.0)]
+    assert off[True][0] == off[False][0]
+    assert abs(off[False][1]) > abs(off[False][0]) > 7.0
+    assert abs(off[True][1]) < 0.5 * abs(off[False][1])
 
 
 def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +23,7 @@ from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, Status, StreamInfo
 from wepose_pin.model import load_model
 from wepose_pin.readers.live_log import SAMPLES, read_blocks, read_live_log
-from wepose_pin.recording import Recording
+from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import mount_rows, parse_subject, population_subject
@@ -75,9 +75,10 @@ class Chaos:
         self.sensors = tuple(recording.sensors)
         self.rate_hz = recording.rate_hz
         self.problems: dict[str, int] = {}
+        self.orientations: Mapping[str, bool] = {}
         self._arrivals, self._now, self._at = sorted(arrivals, key=lambda a: a[0]), float(recording.time[0]), 0
 
-    def open(self) -> None: ...
+    def open(self, _waiting: object = None) -> None: ...
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         assert timeout_s > 0.0
@@ -109,8 +110,8 @@ def live(
     method: str = "amekf",
 ) -> SessionSummary:
     setup = SensorSetup.from_recording(recording)
-    log = LiveLog(file, setup.header(tuple(recording.sensors)) | {"method": method})
     source = source or ReplaySource(recording, math.inf)
+    log = LiveLog(file, setup.header(source.sensors, source.orientations) | {"method": method})
     source.open()
     loop = LiveLoop(
         source,
@@ -138,6 +139,9 @@ def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Record
     # What is marked is marked at the newest tick; the last take was not ended.
     for name, spans in {"take_1": [(9.0, 15.0)], "clasp": [(16.0, 18.0)], "take_2": [(20.0, end)]}.items():
         np.testing.assert_allclose(phases[name], spans, atol=0.15)
+    tracked = track(log.recording, causal=True)  # with the clasp that was marked
+    for i, name in enumerate(names):
+        assert np.array_equal(log.quat_WL[:, i], tracked.quat_WL[name])
     assert [(round(marker.time), marker.text) for marker in log.texts] == [(12, "trial 3")]
     assert {status.open_phases for status in watcher.statuses} == {(), ("take_1",), ("clasp",), ("take_2",)}
     # Without a recording the first take begins one, which is as one from the beginning.
@@ -178,6 +182,38 @@ def test_live_its_file_and_causal_tracking_give_the_same_bits(
         assert np.array_equal(found.quat_WL[:, i], again.quat_WL[name])
         assert ended.counts[name]["taken"] == len(recording)
         assert ended.counts[name]["missing"] == ended.counts[name]["late"] == 0
+
+
+def test_measured_orientations_and_a_marked_clasp_give_the_same_bits(
+    recording: Recording, simulation: Simulation, tmp_path: Path
+) -> None:
+    """Two sensors with orientations, one of them lost for a second, beside raw ones."""
+    gap = np.zeros(len(recording), dtype=bool)
+    gap[1500:1600] = True
+    sensors = dict(recording.sensors)
+    for name, lost in (("torso", None), ("left_forearm", gap)):
+        quat_WS, mount = simulation.quat_WS[name][: len(recording)], sensors[name].stated_quat_LS
+        sensors[name] = OrientationSensor(quat_WS, mount, lost)
+    phases = {**recording.phases, "clasp": ((12.0, 14.0), (20.5, 22.5))}
+    mixed = replace(recording, sensors=sensors, phases=phases)
+    live(mixed, tmp_path / "a.wepose")
+    found = read_live_log(tmp_path / "a.wepose")
+    causal, again = track(mixed, causal=True), track(found.recording, causal=True)
+    without = track(replace(mixed, phases=recording.phases), causal=True)
+    for i, name in enumerate(sensors):
+        assert np.array_equal(found.quat_WL[:, i], causal.quat_WL[name])
+        assert np.array_equal(found.quat_WL[:, i], again.quat_WL[name])
+    assert not np.array_equal(causal.quat_WL["right_forearm"], without.quat_WL["right_forearm"])
+    live(mixed.cut(slice(0, 2100)), tmp_path / "b.wepose")  # ended within the second clasp
+    ended = read_live_log(tmp_path / "b.wepose")
+    assert ended.recording.phases["clasp"] == ((12.0, 14.0), (20.5, float(ended.recording.time[-1])))
+    cut = track(ended.recording, causal=True)
+    assert np.array_equal(ended.quat_WL[:, 0], cut.quat_WL[next(iter(sensors))])
+    read = found.recording.sensors["left_forearm"]
+    assert isinstance(read, OrientationSensor)
+    assert read.gap is not None
+    assert np.array_equal(read.gap, gap)
+    assert np.array_equal(read.quat_WS[~gap], simulation.quat_WS["left_forearm"][: len(recording)][~gap])
 
 
 def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: Simulation, tmp_path: Path) -> None:

@@ -167,9 +167,9 @@ import sys
 from wepose_pin import cli
 from wepose_pin.live.sources.udp import UdpSource
 find = UdpSource._find_sensors
-def say(self):
+def say(self, waiting):
     print("open", flush=True)
-    find(self)
+    find(self, waiting)
 UdpSource._find_sensors = say
 sys.argv[1:] = ["live", "--source", sys.argv[1], "--no-page"]
 cli.main()

@@ -8,12 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption, WeposeError
 from wepose_pin.live.sources import open_source
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
+from wepose_pin.recording.arrivals import unpack_orientations
 
 
 def recording(n: int = 300, rate_hz: float = 100.0) -> Recording:
@@ -73,11 +75,14 @@ def test_nothing_due_is_nothing() -> None:
     assert source.read(0.0) == []
 
 
-def test_ready_orientations_are_refused() -> None:
+def test_measured_orientations_come_as_six_numbers() -> None:
     r = recording()
-    ready = OrientationSensor(quat_WS=np.tile([0.0, 0.0, 0.0, 1.0], (len(r), 1)))
-    with pytest.raises(BadOption, match=r"sensors\.torso gives measured orientations"):
-        ReplaySource(replace(r, sensors={"torso": ready}))
+    quat_WS = Rotation.random(len(r), rng=np.random.default_rng(0)).as_quat()
+    source = ReplaySource(replace(r, sensors={"torso": OrientationSensor(quat_WS, aligned=True)}), math.inf)
+    source.open()
+    [first] = source.read(0.0) or []
+    assert source.orientations == {"torso": True}
+    np.testing.assert_array_equal(unpack_orientations(first.gyro_S, first.accel_S), quat_WS[: len(first.time)])
 
 
 @pytest.mark.parametrize(

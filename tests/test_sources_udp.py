@@ -226,7 +226,7 @@ def test_sensors_are_found_where_they_are_not_given(sender: socket.socket) -> No
 
 def test_nobody_sends() -> None:
     source = UdpSource("127.0.0.1", 0, None, 0.2)
-    with pytest.raises(BadSource, match=r"no samples within 0\.2 s"):
+    with pytest.raises(BadSource, match=r"nothing came within 0\.2 s from samples at UDP"):
         source.open()
 
 

@@ -32,7 +32,8 @@ class LiveJob:
     Parameters
     ----------
     source : SOURCE
-        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME or mti:DEVICE=SEGMENT,... (docs/live-sources.md).
+        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME, mti:DEVICE=SEGMENT,..., ximu3:DEVICE=SEGMENT,...,
+        slimevr:[HOST] or mvn:[HOST] (docs/live-sources.md). Without HOST only this machine can send.
     guide
         Lead through the calibration first: which sensor sits where, the start pose, the motion, its quality (docs/
         live-guide.md). Needs no subject and no session.
@@ -77,6 +78,11 @@ class LiveJob:
         Serve the page at this port; 0 takes any that is free.
     udp : [HOST:]PORT
         Send each pose as JSON to this UDP port (docs/live-page.md). Without HOST to this machine.
+    mvn : [HOST:]PORT
+        Send each pose to this UDP port as the Xsens MVN network streamer does (port 9763 by habit): the whole figure,
+        its legs standing.
+    vmc : [HOST:]PORT
+        Send each pose to this UDP port by the VMC protocol (OSC; 39539 by habit), for Unity, VSeeFace or Blender.
     lsl : NAME
         Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
     robot : NAME|FILE.urdf
@@ -117,6 +123,8 @@ class LiveJob:
     host: str | None = None
     port: int = 0
     udp: str | None = None
+    mvn: str | None = None
+    vmc: str | None = None
     lsl: str | None = None
     robot: str | None = None
     arm: Arms | None = None
@@ -289,6 +297,14 @@ def _open_senders(job: LiveJob) -> list[Output]:
         from ..live.outputs import UdpOutput
 
         senders.append(UdpOutput(job.udp))
+    if job.mvn is not None:
+        from ..live.mvn_output import MvnOutput
+
+        senders.append(MvnOutput(job.mvn))
+    if job.vmc is not None:
+        from ..live.vmc_output import VmcOutput
+
+        senders.append(VmcOutput(job.vmc))
     if job.lsl is not None:
         from ..live.outputs import LslOutput
 

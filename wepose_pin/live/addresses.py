@@ -15,3 +15,18 @@ def parse_address(text: str, option: str, example_port: int) -> tuple[str, int]:
             f"{option} {text}: a port or HOST:PORT is needed, as {example_port} or 192.168.1.20:{example_port}"
         )
     return host.removeprefix("[").removesuffix("]") or LOOPBACK, int(port)
+
+
+def parse_listening_address(text: str, option: str, default_port: int) -> tuple[str, int]:
+    """Host and port of ``[HOST][:PORT]``: without a host this machine, without a port the usual one.
+
+    Raises
+    ------
+    BadOption
+        Anything else.
+    """
+    if not text:
+        return LOOPBACK, default_port
+    if text.isdigit() or ":" in text:
+        return parse_address(text, option, default_port)
+    return text, default_port

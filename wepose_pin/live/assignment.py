@@ -12,6 +12,7 @@ from ..documents import read_toml, toml_key, toml_string, whole_file
 from ..errors import BadSession
 from ..recording.arrivals import Samples
 from .sources.base import Source, find_batteries
+from .sources.waiting import Waiting
 
 SETUP_FILE = "setup.toml"
 SETUP_FORMAT = 1
@@ -80,12 +81,17 @@ class AssignedSource:
         self.source, self.segments, self._is_open = source, dict(segments), is_open
         self.sensors = tuple(segment for segment in order if segment in self.segments.values())
         self.rate_hz, self.problems = source.rate_hz, source.problems
+        self.orientations = self._rename_orientations()
 
-    def open(self) -> None:
+    def _rename_orientations(self) -> Mapping[str, bool]:
+        return {self.segments[name]: own for name, own in self.source.orientations.items() if name in self.segments}
+
+    def open(self, waiting: Waiting | None = None) -> None:
         """Open the source, unless it is open already."""
         if not self._is_open:
-            self.source.open()
+            self.source.open(waiting)
             self._is_open = True
+            self.orientations = self._rename_orientations()
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         """Samples of the assigned sensors since the last call; None at the end."""

@@ -27,7 +27,7 @@ class Attempt:
 
     def __init__(self, path: Path, source: AssignedSource, header: Mapping[str, Any]) -> None:
         self.log, self._source = LiveLog(path, header), source
-        self.stream = TickStream(source.sensors, source.rate_hz, log=self.log)
+        self.stream = TickStream(source.sensors, source.rate_hz, log=self.log, orientations=source.orientations)
         self._header, self._markers = dict(header), Markers()
         self._ticks: list[Ticks] = []
 

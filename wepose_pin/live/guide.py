@@ -173,7 +173,7 @@ class Guide:
             while (path := self.options.folder / f"calibration-{self.attempts}.wepose").exists():
                 self.attempts += 1
             source = self.assigned()
-            header = self.options.setup.header(source.sensors) | {"method": self.options.method}
+            header = self.options.setup.header(source.sensors, source.orientations) | {"method": self.options.method}
             self.attempt = Attempt(path, source, header)
         return self.attempt
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from ..model.body import load_sensed_model
 from ..model.start_pose import compute_start_configuration
 from ..model.table import NEUTRAL_POSE
 from ..readers.live_log import LONGEST_TEXT, build_recording
-from ..recording import ImuSensor, Recording
+from ..recording import ImuSensor, Intervals, Recording
 from ..recording.arrivals import (
     COUNTS,
     CUT_OFF,
@@ -37,7 +37,8 @@ from ..recording.arrivals import (
 from ..subject import population_subject
 from ..tracking import Tracker, TrackOptions
 from ..tracking.causal import CausalSegmentEstimator
-from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
+from ..tracking.headings import CAUSAL_KNOT_S
+from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates
 from ..writers.live_log import LiveLog
 from .setup import SensorSetup
 from .sources.base import Source, find_batteries
@@ -87,12 +88,22 @@ class SessionSummary(NamedTuple):
     record: Path | None  # the recording
 
 
+EMPTY_SESSION = SessionSummary(0, 0.0, {}, Latencies(), (), "", None)  # ended before a sample came
+
+
 class StartPoseSearch:
     """Finds the start pose in the ticks before tracking: stated by the session, or held for `START_POSE_HOLD_S`."""
 
-    def __init__(self, synchronizer: StreamSynchronizer, sensors: int, stated: tuple[float, float] | None) -> None:
+    def __init__(
+        self,
+        synchronizer: StreamSynchronizer,
+        orientations: Collection[str] = (),
+        stated: tuple[float, float] | None = None,
+    ) -> None:
         self.synchronizer, self.stated = synchronizer, stated
-        self.detector = StartPoseDetector(synchronizer.rate_hz, sensors)
+        self.detector = StartPoseDetector(synchronizer.rate_hz, len(synchronizer.sensors))
+        measured = np.array([name in orientations for name in synchronizer.sensors], dtype=np.bool_)
+        self._rates = TickRates(measured, synchronizer.rate_hz)
         self.ticks: list[Ticks] = []
 
     def push(self, ticks: Ticks) -> tuple[int, int, int] | None:
@@ -104,7 +115,7 @@ class StartPoseSearch:
                 if ticks.time[n] >= self.stated[1] - 0.5 / rate_hz:
                     begin = max(0, round((self.stated[0] - self.synchronizer.begin) * rate_hz))
                     return begin, ticks.first + n, n + 1
-            elif self.detector.push(ticks.gyro_S[n]) == "ready":
+            elif self.detector.push(self._rates.push(ticks.gyro_S[n], ticks.accel_S[n])) == "ready":
                 return self.detector.begin, self.detector.end, n + 1
         if self.stated is None and len(self.ticks) > MAX_TICK_BLOCKS:
             self.ticks = [t for t in self.ticks if t.first + len(t.time) > self.detector.begin]
@@ -116,6 +127,21 @@ class StartPoseSearch:
         if self.stated is None:
             return min(1.0, self.detector.held_s / START_POSE_HOLD_S)
         return float(np.clip((self.synchronizer.newest - self.stated[0]) / (self.stated[1] - self.stated[0]), 0.0, 1.0))
+
+
+class PhaseEdges:
+    """Where stated phases begin and end, in order of time; a phase holds from its first second to its last, both in."""
+
+    def __init__(self, phases: Mapping[str, Intervals]) -> None:
+        edges = [(a - 1e-9, name, True) for name, spans in phases.items() for a, _ in spans]
+        edges += [(b + 1e-9, name, False) for name, spans in phases.items() for _, b in spans]
+        self._edges = deque(sorted(edges))
+
+    def take_due(self, time_s: float) -> Iterator[tuple[str, bool]]:
+        """Iterate over the phases that begin (True) or have ended by this time [s], each once."""
+        while self._edges and self._edges[0][0] <= time_s:
+            _, name, begins = self._edges.popleft()
+            yield name, begins
 
 
 class LiveLoop:
@@ -158,7 +184,8 @@ class LiveLoop:
         self._instruction = START_POSES.get(setup.start_pose, f"Hold still in the start pose, {setup.start_pose}")
         if self.model.table.is_mechanism:
             self._instruction = f"{self.model.table.name} must stand still in its start configuration"
-        self._stream = TickStream(source.sensors, source.rate_hz, begin, wait_s, log)
+        self._stream = TickStream(source.sensors, source.rate_hz, begin, wait_s, log, source.orientations)
+        self._phase_edges = PhaseEdges(self.setup.phases)
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
         self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
         self._heading_reset_time = 0.0
@@ -217,7 +244,7 @@ class LiveLoop:
         if self._start_search is None:
             assert synchronizer is not None
             stated = next(iter(self.setup.phases.get("start", ())), None)
-            self._start_search = StartPoseSearch(synchronizer, len(self.source.sensors), stated)
+            self._start_search = StartPoseSearch(synchronizer, self.source.orientations, stated)
             self._std_interval_ticks = max(1, round(STATUS_PERIOD_S * synchronizer.rate_hz))
         return self._start_search
 
@@ -235,6 +262,8 @@ class LiveLoop:
             begin, end, row = start
             estimator = self._segment_estimator = self._start_tracking(search, begin, end)
         for n in range(row, len(ticks.time)):
+            for phase, begins in self._phase_edges.take_due(ticks.time[n]):
+                estimator.mark_phase(phase, begins=begins)
             quat_WL = estimator.step(ticks.gyro_S[n], ticks.accel_S[n])
             if (ticks.first + n) % self._std_interval_ticks == 0:  # by ticks: a recording reproduces the values
                 self._std = estimator.std()
@@ -256,10 +285,16 @@ class LiveLoop:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
         rate_hz = search.synchronizer.rate_hz
         recording = build_recording(
-            self.setup.header(self.source.sensors), rate_hz, search.ticks, (begin, end), last=end
+            self.setup.header(self.source.sensors, self.source.orientations),
+            rate_hz,
+            search.ticks,
+            (begin, end),
+            last=end,
         )
         tracker = Tracker(self.setup.subject, model=self.model, options=TrackOptions(self.method, causal=True))
         tracker.push(recording)
+        for phase in self._open_phases:
+            tracker.segment_estimator.mark_phase(phase, begins=True)
         search.ticks = []
         self._first_pose = self._heading_reset_time = float(recording.time[-1])
         self._record_event("start", begin=begin, end=end)
@@ -314,11 +349,18 @@ class LiveLoop:
         if kind == "mark" and name:
             self.log.event("mark", text=name, time=time_s)
         elif kind == "begin" and name and name not in self._open_phases:
+            # It holds from the next tick on: the ticks before have been tracked without it.
             self._open_phases.append(name)
-            self.log.event("begin", phase=name, time=time_s)
+            self._mark_phase(name, begins=True)
+            self.log.event("begin", phase=name, time=time_s + 1.0 / synchronizer.rate_hz)
         elif kind == "end" and name in self._open_phases:
             self._open_phases.remove(name)
+            self._mark_phase(name, begins=False)
             self.log.event("end", phase=name, time=time_s)
+
+    def _mark_phase(self, phase: str, *, begins: bool) -> None:
+        if self._segment_estimator is not None:
+            self._segment_estimator.mark_phase(phase, begins=begins)
 
     def _send_status(self) -> None:
         status = self._build_status()
@@ -458,8 +500,8 @@ def build_subject_model(
 
 
 def warm_up(method: str) -> None:
-    """Run a tracker once: compilation and reading of files must not delay the start pose."""
-    n, rng, sensors = 200, np.random.default_rng(0), tuple(load_table().segments)[:2]
+    """Run a tracker once: compilation and reading of files must not delay the start pose, nor a heading correction."""
+    n, rng, sensors = 200, np.random.default_rng(0), tuple(load_table().segments)[:5]
     recording = Recording(
         "warm",
         np.arange(n) / 100.0,
@@ -476,7 +518,9 @@ def warm_up(method: str) -> None:
     )
     tracker = Tracker(options=TrackOptions(method, causal=True))
     tracker.push(recording)
-    tracker.segment_estimator.step(np.zeros((2, 3)), np.tile([0.0, 0.0, 9.81], (2, 1)))
-    tracker.segment_estimator.std()
+    estimator = tracker.segment_estimator
+    for _ in range(round(2.0 * CAUSAL_KNOT_S * recording.rate_hz)):
+        estimator.step(np.zeros((len(sensors), 3)), np.tile([0.0, 0.0, 9.81], (len(sensors), 1)))
+    estimator.std()
     synchronizer = StreamSynchronizer(sensors, 100.0, 0.0)
     synchronizer.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))

@@ -12,11 +12,11 @@ from ..model import BodyModel
 from ..subject import Subject, load_subject
 from ..writers.live_log import LiveLog
 from ..writers.result import versions
-from .loop import LiveLoop, SessionSummary, warm_up
+from .loop import EMPTY_SESSION, LiveLoop, SessionSummary, warm_up
 from .setup import SensorSetup, read_setup
 from .sources.base import Source
 from .sources.replay import ReplaySource
-from .state import Output
+from .state import Output, Status
 
 
 def find_setup(source: Source | None, subject: str | Path | None, session: str | Path | None) -> SensorSetup:
@@ -62,13 +62,14 @@ def run_session(
     setup, record = setup.as_recorded(), None if record is None else Path(record)
     if record is not None and record.exists() and not force:
         raise ExistingOutput(f"{record}: exists; --force replaces it, --record names another file")
-    _check_mounts(source.sensors, setup)
+    _check_mounts(source, setup)
     warm_up(method)  # before samples come
-    source.open()
+    if not _open(source, outputs, until):
+        return EMPTY_SESSION
     log = None
     try:
-        _check_mounts(source.sensors, setup)
-        header = setup.header(source.sensors) | {"method": method, "versions": versions()}
+        _check_mounts(source, setup)
+        header = setup.header(source.sensors, source.orientations) | {"method": method, "versions": versions()}
         if record is not None:
             log = LiveLog(record, header, force)
         begin = float(source.recording.time[0]) if isinstance(source, ReplaySource) else None
@@ -90,9 +91,41 @@ def run_session(
     return loop.run(until)
 
 
-def _check_mounts(sensors: Sequence[str], setup: SensorSetup) -> None:
-    """Raise `BadSession` where the mount of a sensor is not known."""
+def _open(source: Source, outputs: Sequence[Output], until: Callable[[], bool]) -> bool:
+    """Open the source and show what it waits for; return False where the user ends that by a key.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        `until` returns True meanwhile.
+    """
+    stopped = False
+
+    def show(message: str) -> bool:
+        nonlocal stopped
+        for output in outputs:
+            output.status(Status("waiting", message, 0.0, 0.0, (), (0.0, 0.0), 0.0, dict(source.problems)))
+        if until():
+            raise KeyboardInterrupt
+        stopped = "q" in [key for output in outputs for key in output.take_keys()]
+        return not stopped
+
+    try:
+        source.open(show)
+    except KeyboardInterrupt:
+        source.close()
+        raise
+    if stopped:
+        source.close()
+        for output in outputs:
+            output.close()
+    return not stopped
+
+
+def _check_mounts(source: Source, setup: SensorSetup) -> None:
+    """Raise `BadSession` where the mount of a sensor is not known, and its orientation is not the segment's own."""
     calibrated = setup.subject.mounts if setup.subject is not None and not setup.remounted else {}
+    sensors = [name for name in source.sensors if not source.orientations.get(name)]
     unknown = [name for name in sensors if name not in calibrated and name not in setup.mounts]
     if unknown:
         raise BadSession(

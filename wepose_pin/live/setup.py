@@ -62,11 +62,12 @@ class SensorSetup:
         text = subject_toml(self.subject)
         return replace(self, subject=parse_subject(text, Path("subject.toml")), subject_text=text)
 
-    def header(self, sensors: Sequence[str]) -> dict[str, Any]:
-        """Header of the recording of a live session, without the method."""
+    def header(self, sensors: Sequence[str], orientations: Mapping[str, bool] | None = None) -> dict[str, Any]:
+        """Header of the recording of a live session, without the method; `orientations` as of a `Source`."""
         return {
             "name": self.name,
             "sensors": list(sensors),
+            "orientations": dict(orientations or {}),
             "mounts": {name: np.asarray(quat).tolist() for name, quat in self.mounts.items() if name in sensors},
             "phases": {name: [list(span) for span in spans] for name, spans in self.phases.items()},
             "start_pose": self.start_pose,

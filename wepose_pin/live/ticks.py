@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
@@ -23,6 +23,7 @@ class TickStream:
     rate_hz : of the ticks; None: that of the slowest sensor is measured
     begin : time [s] of the first tick; None: when every sensor has sent a sample
     log : the recording; None: nothing is recorded
+    orientations : sensors whose samples are measured orientations
 
     Attributes
     ----------
@@ -38,11 +39,13 @@ class TickStream:
         begin: float | None = None,
         wait_s: float = WAIT_S,
         log: LiveLog | None = None,
+        orientations: Collection[str] = (),
     ) -> None:
         self.sensors, self.log = tuple(sensors), log
         self.newest_times = dict.fromkeys(self.sensors, -np.inf)
         self.synchronizer: StreamSynchronizer | None = None
         self._rate_hz, self._begin, self._wait_s = rate_hz, begin, wait_s
+        self._orientations = orientations
         self.history: list[Arrivals] | None = [] if log is None else None
         self._kept = 0  # samples in the history
         self._waiting: list[Arrivals] = []
@@ -86,7 +89,7 @@ class TickStream:
             rate = _measure_rate(list(times.values()))
         # A time-stamp outlier must not put all other sensors before the beginning.
         begin = self._begin if self._begin is not None else float(first[first < np.median(first) + JUMP_S].max())
-        self.synchronizer = StreamSynchronizer(self.sensors, rate, begin, self._wait_s)
+        self.synchronizer = StreamSynchronizer(self.sensors, rate, begin, self._wait_s, self._orientations)
         self._record_clock()
 
     def record(self, log: LiveLog) -> None:

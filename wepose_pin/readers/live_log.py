@@ -3,7 +3,8 @@
 A file is the magic `MAGIC` and blocks: a tag of four bytes, the payload's length and its CRC-32 (both u32), payload.
 All little-endian. An incomplete last block is left out, so that the recording of a killed session is readable.
 
-- ``HEAD``: JSON, the settings before the first sample: sensors, stated mounts, subject, method
+- ``HEAD``: JSON, the settings before the first sample: sensors, stated mounts, subject, method, and the sensors with
+  measured `orientations`, each with whether it is the segment's own; their samples hold qx qy qz qw 0 0
 - ``SMPL``: samples in the order of arrival: u32 m, then sensor u8 (m), time f64 (m), gyro f64 (m, 3), accel f64 (m, 3)
 - ``EVNT``: JSON, ``{"kind": "clock", …}`` when ticks began, ``{"kind": "start", "begin": tick, "end": tick}`` the start
   pose of tracking, ``{"kind": "reset", "tick": tick}`` headings anew before that tick; and what was marked, with times
@@ -28,10 +29,10 @@ import numpy as np
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable, is_number
 from ..errors import BadData, MissingFile
-from ..recording import ImuSensor, Intervals, Recording, check_recording
-from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks
+from ..recording import ImuSensor, Intervals, OrientationSensor, Recording, Sensor, check_recording
+from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks, unpack_orientations
 from ..recording.clocks import Clock
-from ..recording.gaps import GOOD, LONG, bridge
+from ..recording.gaps import GOOD, LONG, bridge, bridge_quat
 from .device import Device, make_table
 from .session_file import read_phases
 
@@ -158,7 +159,8 @@ def read_live_log(path: Path) -> LiveRecording:
         elif tag == EVENT:
             kind, event = _event(path, payload)
             if kind == "clock":
-                synchronizer = StreamSynchronizer(header["sensors"], event["rate_hz"], event["begin"], event["wait_s"])
+                clock = event["rate_hz"], event["begin"], event["wait_s"]
+                synchronizer = StreamSynchronizer(header["sensors"], *clock, header["orientations"])
                 end_s = synchronizer.begin + (MOST_SILENT + path.stat().st_size / 57) / synchronizer.rate_hz
             elif kind == "start":
                 start = int(event["begin"]), int(event["end"])
@@ -209,19 +211,25 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     Raises
     ------
     MissingFile, BadData
-        As `read_live_log`; orientations or another rate are requested.
+        As `read_live_log`; another rate is requested, or what the recording does not hold of all sensors.
     """
-    if use == "orientation" or rate_hz is not None:
-        what = 'use = "orientation"' if rate_hz is None else f"rate_hz = {rate_hz:g}"
-        raise BadData(f"{path}: {what}: a live recording holds raw data with times of their own; leave it out")
+    if rate_hz is not None:
+        raise BadData(f"{path}: rate_hz = {rate_hz:g}: a live recording has times of its own; leave it out")
     log = read_live_log(path)
+    kinds = {"orientation" if isinstance(s, OrientationSensor) else "raw" for s in log.recording.sensors.values()}
+    kind = kinds.pop()
+    if kinds or use not in (None, kind):
+        held = "raw data of some sensors and orientations of others" if kinds else f"'{kind}' of its sensors"
+        remedy = "track it as it is" if kinds else "leave it out"
+        raise BadData(f"{path}: use = {use!r}: the live recording holds {held}; {remedy}")
     values = {}
-    for label, sensor in log.recording.imus.items():
+    for label, sensor in log.recording.sensors.items():
         lost = np.zeros((len(log.recording), 1), dtype=bool) if sensor.gap is None else sensor.gap[:, None]
-        values[label] = {
-            "gyro": np.where(lost, np.nan, sensor.gyro_S),
-            "accel": np.where(lost, np.nan, sensor.accel_S),
-        }
+        if isinstance(sensor, OrientationSensor):
+            signals = {"orientation": sensor.quat_WS}
+        else:
+            signals = {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
+        values[label] = {name: np.where(lost, np.nan, signal) for name, signal in signals.items()}
     mounts = {
         label: sensor.stated_quat_LS
         for label, sensor in log.recording.sensors.items()
@@ -235,7 +243,8 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
         "wepose_live",
         make_table(log.recording.time, values),
         {label: label for label in values},
-        "raw",
+        kind,
+        aligned=all(sensor.aligned for sensor in log.recording.sensors.values()),
         mounts=mounts,
         diagnostics=tuple(diagnostics),
     )
@@ -278,7 +287,10 @@ def _header(path: Path, payload: bytes) -> dict[str, Any]:
     joints, model = header.get("joints", {}), header.get("model", "")
     if not isinstance(model, str) or not isinstance(joints, dict) or not all(map(is_number, joints.values())):
         raise BadData(f"{path}: joints = {joints!r}, model = {model!r} in its header; the file is damaged")
-    return {"subject": None, "joints": {}, "model": "", **header}
+    orientations = header.get("orientations", {})
+    if not isinstance(orientations, dict) or not set(orientations) <= set(sensors or ()):
+        raise BadData(f"{path}: orientations = {orientations!r} in its header; the file is damaged")
+    return {"subject": None, "joints": {}, "model": "", "orientations": {}, **header}
 
 
 def _is_quat(value: Any) -> bool:
@@ -344,6 +356,14 @@ def _arrivals(path: Path, payload: bytes, sensors: int) -> Arrivals:
     return Arrivals(which, time, gyro.reshape(count, 3), accel.reshape(count, 3))
 
 
+def _cut_spans(phase: str, spans: Sequence[Sequence[float]], time: np.ndarray) -> Intervals:
+    """The intervals [s] of a phase within the times (n,) [s]; one that goes on ends there, a static one is left out."""
+    inside = [(float(a), float(b)) for a, b in spans if time[0] <= a < time[-1]]
+    if phase == "static":
+        return tuple((a, b) for a, b in inside if b <= time[-1])
+    return tuple((a, min(b, float(time[-1]))) for a, b in inside)
+
+
 def build_recording(
     header: Mapping[str, Any],
     rate_hz: float,
@@ -372,23 +392,28 @@ def build_recording(
     time = np.concatenate([t.time for t in ticks])[:count]
     gyro, accel = (np.concatenate([getattr(t, part) for t in ticks])[:count] for part in ("gyro_S", "accel_S"))
     clock = Clock(time, np.arange(count), 1.0 / rate_hz)
-    sensors = {}
+    sensors: dict[str, Sensor] = {}
     for i, name in enumerate(header["sensors"]):
         lost = ~np.isfinite(gyro[:, i]).all(axis=1)
         if lost.all():
             raise BadData(f"{source or header['name']}: sensors.{name} never sent a sample")
         marks = np.where(lost, LONG, GOOD).astype(np.int8)  # the live session bridged short gaps
         stated = header["mounts"].get(name)
+        if name in header["orientations"]:
+            sensors[name] = OrientationSensor(
+                bridge_quat(unpack_orientations(gyro[:, i], accel[:, i]), marks, clock),
+                None if stated is None else np.array(stated),
+                lost if lost.any() else None,
+                header["orientations"][name],
+            )
+            continue
         sensors[name] = ImuSensor(
             gyro_S=bridge(np.ascontiguousarray(gyro[:, i]), marks, clock, rate=True),
             accel_S=bridge(np.ascontiguousarray(accel[:, i]), marks, clock),
             stated_quat_LS=None if stated is None else np.array(stated),
             gap=lost if lost.any() else None,
         )
-    phases = {
-        name: tuple((float(a), float(b)) for a, b in spans if time[0] <= a and b <= time[-1])
-        for name, spans in header["phases"].items()
-    }
+    phases = {name: _cut_spans(name, spans, time) for name, spans in header["phases"].items()}
     if start is not None:
         phases["start"] = ((float(time[start[0] - first]), float(time[start[1] - first])),)
     return Recording(

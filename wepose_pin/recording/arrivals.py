@@ -6,7 +6,7 @@ file with the arrivals therefore gives bit-identical ticks.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from .clocks import LONGEST_GAP_S
 from .faults import AT_RANGE, FROZEN_SAMPLES, NOISY_S, SAME_RANGE, TURNS_BACK, TURNS_BACK_HZ
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED, NARROWEST_GYRO_RANGE
 from .plausibility import ROUNDING
+from .sensors import ImuSensor, Sensor
 
 # A sample within this share of a step from a tick counts as at the tick.
 SAME = 0.01
@@ -53,7 +54,10 @@ _TICK, _NEWEST = 0, 1  # the scalars: number of ticks so far, newest time of all
 
 
 class Samples(NamedTuple):
-    """One or more samples of one sensor in their order of arrival."""
+    """One or more samples of one sensor in their order of arrival.
+
+    Of a sensor with measured orientations `gyro_S` and `accel_S` hold them, as `pack_orientations` gives them.
+    """
 
     sensor: str  # its segment
     time: np.ndarray  # (m,) [s], all sensors on one clock
@@ -68,6 +72,23 @@ class Arrivals(NamedTuple):
     time: np.ndarray  # (m,) [s]
     gyro_S: np.ndarray  # (m, 3) [rad/s]
     accel_S: np.ndarray  # (m, 3) [m/s²]
+
+
+def pack_orientations(quat_WS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return orientations (…, 4) xyzw as the six numbers of a sample: (…, 3) qx, qy, qz, and (…, 3) qw, 0, 0."""
+    rest = np.zeros((*quat_WS.shape[:-1], 3))
+    rest[..., 0] = quat_WS[..., 3]
+    return quat_WS[..., :3].copy(), rest
+
+
+def unpack_orientations(gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+    """Return the orientations (…, 4) xyzw that `pack_orientations` has packed."""
+    return np.concatenate([gyro_S, accel_S[..., :1]], axis=-1)
+
+
+def list_numbers(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Return the six numbers of each sample, (n, 3), (n, 3): rate and specific force, or packed orientations."""
+    return (sensor.gyro_S, sensor.accel_S) if isinstance(sensor, ImuSensor) else pack_orientations(sensor.quat_WS)
 
 
 def order_arrivals(samples: Sequence[Samples], sensors: Sequence[str]) -> Arrivals:
@@ -100,7 +121,8 @@ class StreamSynchronizer:
     interpolated. Gaps of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN. A noisy sensor is frozen when
     it repeats its values for longer than the silent bridge and than ever before; its samples are lost until they
     change. An axis of gyro that stays at its extreme after a steep rise is saturated: from then on, ticks with a rate
-    at that level are NaN, because the rotation is not known.
+    at that level are NaN, because the rotation is not known. Measured orientations between ticks are interpolated; they
+    may repeat, as a device's own filter lets them.
 
     Parameters
     ----------
@@ -108,12 +130,21 @@ class StreamSynchronizer:
     rate_hz : ticks a second
     begin : time [s] of tick 0
     wait_s : [s] that a tick waits for a silent sensor
+    orientations : the sensors whose samples are measured orientations
     """
 
-    def __init__(self, sensors: Sequence[str], rate_hz: float, begin: float, wait_s: float = WAIT_S) -> None:
+    def __init__(
+        self,
+        sensors: Sequence[str],
+        rate_hz: float,
+        begin: float,
+        wait_s: float = WAIT_S,
+        orientations: Collection[str] = (),
+    ) -> None:
         self.sensors, self.rate_hz, self.begin, self.wait_s = tuple(sensors), rate_hz, begin, wait_s
         k = len(self.sensors)
         self.counts = np.zeros((k, len(COUNTS)), dtype=np.int64)
+        self._measured = np.array([name in orientations for name in self.sensors], dtype=np.bool_)
         self.lost = np.zeros(k, dtype=np.bool_)
         self.frozen = np.zeros(k, dtype=np.bool_)
         self._memory = np.zeros((k, _MEMORY))
@@ -163,6 +194,7 @@ class StreamSynchronizer:
                 self.lost,
                 self.frozen,
                 self._memory,
+                self._measured,
                 *arrivals,
                 next_sample,
                 values,
@@ -184,6 +216,7 @@ def _take_samples(  # type: ignore[no-untyped-def]
     lost,
     frozen,
     memory,
+    measured,
     which,
     time,
     gyro,
@@ -196,13 +229,15 @@ def _take_samples(  # type: ignore[no-untyped-def]
     count = 0
     while True:
         while count < len(out) and _is_complete(buffers, lengths, scalars, settings, lost):
-            _write_tick(buffers, lengths, scalars, settings, counts, lost, memory, out[count], out_lost[count])
+            _write_tick(
+                buffers, lengths, scalars, settings, counts, lost, memory, measured, out[count], out_lost[count]
+            )
             count += 1
         if count == len(out) or next_sample == len(time):
             return next_sample, count
         s, t = which[next_sample], time[next_sample]
         if _is_sound(jump, scalars, counts, s, t, gyro[next_sample], accel[next_sample]):
-            if t > memory[s, _TIME] or memory[s, _VALUES] == 0.0:
+            if not measured[s] and (t > memory[s, _TIME] or memory[s, _VALUES] == 0.0):
                 frozen[s] = _repeats_itself(memory, frozen[s], s, t, gyro[next_sample], accel[next_sample])
             if frozen[s] and t > memory[s, _SINCE]:
                 counts[s, FROZEN] += 1
@@ -396,7 +431,9 @@ def _find_sample(buffer, n, t, dt):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _write_tick(buffers, lengths, scalars, settings, counts, lost, memory, out, out_lost):  # type: ignore[no-untyped-def]
+def _write_tick(  # type: ignore[no-untyped-def]
+    buffers, lengths, scalars, settings, counts, lost, memory, measured, out, out_lost
+):
     """Write the next tick into `out` (k, 6), and drop the samples that no later tick needs."""
     dt = settings[1]
     t = settings[0] + scalars[_TICK] * dt
@@ -405,7 +442,7 @@ def _write_tick(buffers, lengths, scalars, settings, counts, lost, memory, out, 
         i = _find_sample(buffer, n, t, dt)
         if i == n:
             lost[s] = True
-        if not _write_value(buffer, n, i, t, dt, out[s]):
+        if not _write_value(buffer, n, i, t, dt, measured[s], out[s]):
             counts[s, MISSING] += 1
             out[s, :] = np.nan
         elif max(abs(out[s, 0]), abs(out[s, 1]), abs(out[s, 2])) >= (1.0 - AT_RANGE) * _saturation(memory[s]):
@@ -423,7 +460,7 @@ def _write_tick(buffers, lengths, scalars, settings, counts, lost, memory, out, 
 
 
 @kernel
-def _write_value(buffer, n, i, t, dt, out):  # type: ignore[no-untyped-def]
+def _write_value(buffer, n, i, t, dt, measured, out):  # type: ignore[no-untyped-def]
     """Write the sensor's values at `t` into `out` (6,); `i` is its first sample from `t` on. False: not known."""
     if i == n:
         return False
@@ -436,6 +473,9 @@ def _write_value(buffer, n, i, t, dt, out):  # type: ignore[no-untyped-def]
     bridged = max(LONGEST_GAP_S, dt) * (1.0 + 1e-6)  # [s] as in `clocks`: a single lost sample is always bridged
     if first or step - dt > bridged:
         return False
+    if measured:
+        _interpolate_orientation(buffer[i - 1], buffer[i], (t - buffer[i - 1, _T]) / step, out)
+        return True
     if step > HOLE * dt:
         share = (t - buffer[i - 1, _T]) / step
         for m in range(6):
@@ -470,3 +510,18 @@ def _write_value(buffer, n, i, t, dt, out):  # type: ignore[no-untyped-def]
         for m in range(3):
             out[3 + m] = buffer[i - 1, _AX + m] + share * (buffer[i, _AX + m] - buffer[i - 1, _AX + m])
     return True
+
+
+@kernel
+def _interpolate_orientation(before, after, share, out):  # type: ignore[no-untyped-def]
+    """Write the orientation between two samples, along the shorter way, into `out` (6,)."""
+    dot, size = 0.0, 0.0
+    for m in range(4):
+        dot += before[1 + m] * after[1 + m]
+    sign = 1.0 if dot >= 0.0 else -1.0
+    for m in range(4):
+        out[m] = (1.0 - share) * before[1 + m] + share * sign * after[1 + m]
+        size += out[m] * out[m]
+    for m in range(4):
+        out[m] /= np.sqrt(size)
+    out[4] = out[5] = 0.0

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..alignment import (
+    MEASURED_ORIENTATION_STD,
     N_POSE,
     SegmentOrientations,
     StartFrames,
@@ -28,13 +29,14 @@ from ..alignment import (
     orient_segments,
 )
 from ..compilation import kernel
-from ..errors import BadOption, BadPhase
+from ..errors import BadPhase
 from ..filters import BEST, Orientation
 from ..filters.bank import LiveBank, OneByOne, create_bank
 from ..filters.sensors import SensorFilters, combine_chunk
 from ..filters.static import StaticTest
 from ..kinematics import compute_axis_std
-from ..recording import OrientationSensor, Recording, join_recordings
+from ..recording import ImuSensor, OrientationSensor, Recording, join_recordings
+from ..recording.arrivals import list_numbers, unpack_orientations
 from ..rotations import product
 from ..subject import Subject
 from .heading_filter import HeadingProblem
@@ -46,11 +48,12 @@ from .headings import (
     replace_heading_variance,
 )
 from .segments import Oriented
-from .start_pose import START_POSE_HOLD_S, StartPoseDetector, cut_start_pose
+from .start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates, cut_start_pose
 
 # What there is to observe headings by, from the recording of the start pose and its orientations; None: nothing.
 PoseProblem = Callable[[Recording, SegmentOrientations], HeadingProblem | None]
 
+_MEASURED_COV = MEASURED_ORIENTATION_STD**2 * np.eye(3)  # [rad²] of a measured orientation
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
 
 
@@ -81,6 +84,7 @@ class CausalEstimator:
         self._pose_problem = pose_problem
         self._received: Recording | None = None  # samples up to the end of the start pose
         self._start_detector: StartPoseDetector | None = None
+        self._rates: TickRates | None = None
         self._segment_estimator: CausalSegmentEstimator | None = None
         self._tracked = False
 
@@ -108,7 +112,7 @@ class CausalEstimator:
         Raises
         ------
         WeposeError
-            A sensor with measured orientations, or without a known mount; as `SensorFilters`.
+            A sensor without a known mount; as `SensorFilters`.
         """
         if self._segment_estimator is None:
             chunk = self._find_start(chunk)
@@ -139,12 +143,6 @@ class CausalEstimator:
 
     def _find_start(self, chunk: Recording) -> Recording:
         """Return the part of a chunk after the start pose; the whole chunk while the start pose has not ended."""
-        for name, sensor in chunk.sensors.items():
-            if isinstance(sensor, OrientationSensor):
-                raise BadOption(
-                    f"{chunk.where()}: sensors.{name} comes with measured orientations: there is no filter to run "
-                    f"causally; leave the option out"
-                )
         received = chunk if self._received is None else join_recordings(self._received, chunk)
         self._received = received
         if received.phases.get("start"):
@@ -153,11 +151,11 @@ class CausalEstimator:
                 return chunk
             last = received.span(interval).stop
         else:
-            if self._start_detector is None:
+            if self._start_detector is None or self._rates is None:
                 self._start_detector = StartPoseDetector(received.rate_hz, len(received.sensors))
-            rates = [sensor.gyro_S for sensor in chunk.imus.values()]
-            for tick in np.stack(rates, axis=1):
-                if self._start_detector.push(tick) == "ready":
+                self._rates = TickRates(find_measured(received), received.rate_hz)
+            for gyro_S, accel_S in zip(*stack_ticks(chunk), strict=True):
+                if self._start_detector.push(self._rates.push(gyro_S, accel_S)) == "ready":
                     break
             else:
                 return chunk
@@ -175,8 +173,22 @@ class CausalEstimator:
         return received.cut(slice(last, len(received)))
 
 
+def find_measured(recording: Recording) -> np.ndarray:
+    """Find (k,) bool the sensors with measured orientations."""
+    return np.array([isinstance(sensor, OrientationSensor) for sensor in recording.sensors.values()], dtype=np.bool_)
+
+
+def stack_ticks(chunk: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Stack the six numbers of all sensors as ticks have them, (n, k, 3) each, orientations packed; bridged in gaps."""
+    numbers = [list_numbers(sensor) for sensor in chunk.sensors.values()]
+    gyro_S, accel_S = (np.stack(column, axis=1) for column in zip(*numbers, strict=True))
+    return gyro_S, accel_S
+
+
 class CausalSegmentEstimator:
     """Estimates segment orientations after a start pose; k sensors in the order of `names`.
+
+    A sensor with measured orientations has no filter; while it is lost, its last orientation stands.
 
     Parameters
     ----------
@@ -211,16 +223,21 @@ class CausalSegmentEstimator:
         self.start = orient_segments(start_recording, alignment, orientation, subject, start_frames)
         self.names = tuple(start_recording.sensors)
         self.rate_hz = start_recording.rate_hz
-        started = [orientation[name] for name in self.names]
-        self._bank: LiveBank | OneByOne = create_bank(
-            [filtered.filter for filtered in started if filtered.filter is not None],
-            [filtered.detector for filtered in started if filtered.detector is not None],
-        )
+        self._measured = find_measured(start_recording)
+        self._all_measured, self._any_measured = bool(self._measured.all()), bool(self._measured.any())
+        self._bank: LiveBank | OneByOne | None = None
+        if not self._all_measured:
+            started = [orientation[name] for name in self.names if name in orientation]
+            self._bank = create_bank(
+                [filtered.filter for filtered in started if filtered.filter is not None],
+                [filtered.detector for filtered in started if filtered.detector is not None],
+            )
         self._start_recording, self._subject, self._start_frames = start_recording, subject, start_frames
         self._quat_LS = np.array([self.start.quat_LS[name] for name in self.names])
         self.heading_offset = np.array([self.start.heading_offset[name] for name in self.names])
         self._quat_WV = _quat_about_z(self.heading_offset)
-        self._recent = np.stack([filtered.quat_WS for filtered in started], axis=1)[
+        self._recent = np.empty((0, len(self.names), 4))
+        self._recent = self._stack_orientations(start_recording, orientation)[
             -max(1, round(RESET_S * self.rate_hz)) :
         ].copy()
         self._oldest = 0  # row of `_recent` with the oldest sample
@@ -241,15 +258,43 @@ class CausalSegmentEstimator:
 
     @property
     def static(self) -> np.ndarray:
-        return self._bank.static
+        static = np.zeros(len(self.names), dtype=np.bool_)
+        if self._bank is not None:
+            static[~self._measured] = self._bank.static
+        return static
 
     @property
     def gyro_bias(self) -> np.ndarray:
-        return self._bank.gyro_bias
+        bias = np.full((len(self.names), 3), np.nan)
+        if self._bank is not None:
+            bias[~self._measured] = self._bank.gyro_bias
+        return bias
+
+    def _stack_orientations(self, chunk: Recording, orientation: Mapping[str, Orientation]) -> np.ndarray:
+        """Stack `quat_VS` (n, k, 4) of all sensors; in a gap that was measured last stands."""
+        columns = []
+        for i, (name, sensor) in enumerate(chunk.sensors.items()):
+            if isinstance(sensor, ImuSensor):
+                columns.append(orientation[name].quat_WS)
+                continue
+            quat_VS = sensor.quat_WS
+            if sensor.gap is not None and sensor.gap.any():
+                before = self._recent[self._oldest - 1, i] if len(self._recent) else quat_VS[0]
+                known = np.concatenate([[True], ~sensor.gap])
+                last = np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
+                quat_VS = np.concatenate([before[None], quat_VS])[last][1:]
+            columns.append(quat_VS)
+        return np.stack(columns, axis=1)
 
     def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """Add one sample, (k, 3) [rad/s], (k, 3) [m/s²], NaN where a sensor is lost; return `quat_WL` (k, 4)."""
-        self._recent[self._oldest] = self._bank.update(gyro_S, accel_S)
+        """Add one sample, (k, 3) [rad/s], (k, 3) [m/s²], NaN where a sensor is lost; return `quat_WL` (k, 4).
+
+        Of a sensor with measured orientations they hold what `pack_orientations` gives.
+        """
+        if self._any_measured:
+            accel_S = self._take_measured(gyro_S, accel_S)
+        elif self._bank is not None:
+            self._recent[self._oldest] = self._bank.update(gyro_S, accel_S)
         newest = self._recent[self._oldest : self._oldest + 1]
         _place_segments(self._quat_WV, self._correction(), newest, self._quat_LS, self.quat_WL, self.quat_WL[None])
         self._oldest = (self._oldest + 1) % len(self._recent)
@@ -258,26 +303,56 @@ class CausalSegmentEstimator:
             self.headings.close(np.full(len(self.names), np.nan) if var is None else var)
         return self.quat_WL
 
+    def _take_measured(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+        """Add one sample of which some are measured; return `accel_S`, zero where there is none."""
+        row, before, measured = self._recent[self._oldest], self._recent[self._oldest - 1], self._measured
+        quat_VS = unpack_orientations(gyro_S, accel_S)
+        lost = ~np.isfinite(quat_VS).all(axis=1)
+        orientations = np.where(lost[:, None], before, quat_VS)
+        if self._bank is not None:
+            orientations[~measured] = self._bank.update(gyro_S[~measured], accel_S[~measured])
+        row[:] = orientations
+        return np.where((measured & ~lost)[:, None], 0.0, accel_S)
+
     def _correction(self) -> tuple[np.ndarray, np.ndarray, int, int]:
         """Return what `_place_segments` fades in: from and to (k,) [rad], the next sample's number, their number."""
         if self.headings is None:
             return self._uncorrected, self._uncorrected, 0, 1
-        return self.headings.begin, self.headings.end, *self.headings.position
+        return self.headings.fade
 
     def run(self, chunk: Recording) -> SegmentOrientations:
         """Return the segment orientations of a chunk, bit-identical with as many steps."""
         resets = {tick for tick in chunk.resets if 0 <= tick < len(chunk)}
+        marks = self._find_marks(chunk)
         parts = []
-        for begin, end in pairwise(sorted({0, *resets, len(chunk)})):
+        for begin, end in pairwise(sorted({0, *resets, *marks, len(chunk)})):
             if begin in resets:
                 self.reset_headings(self._run_var)
+            for phase, begins in marks.get(begin, ()):
+                self.mark_phase(phase, begins=begins)
             parts.append(self._run(chunk.cut(slice(begin, end))))
         return parts[0] if len(parts) == 1 else _join_segments(chunk, parts)
+
+    def _find_marks(self, chunk: Recording) -> dict[int, list[tuple[str, bool]]]:
+        """Find sample → phases that begin (True) or have ended with it, of those that headings are corrected by."""
+        marks: dict[int, list[tuple[str, bool]]] = {}
+        for phase in () if self.headings is None else sorted(self.headings.phases):
+            inside = np.zeros(len(chunk), dtype=bool)
+            for interval in chunk.phases.get(phase, ()):
+                inside[chunk.span(interval)] = True
+            for sample in (0, *(np.flatnonzero(np.diff(inside)) + 1).tolist()):
+                marks.setdefault(sample, []).append((phase, bool(inside[sample])))
+        return marks
+
+    def mark_phase(self, phase: str, *, begins: bool) -> None:
+        """Mark that a phase, such as `clasp`, begins with the next sample, or has ended before it."""
+        if self.headings is not None:
+            self.headings.mark(phase, begins=begins)
 
     def _run(self, chunk: Recording) -> SegmentOrientations:
         """Return the segment orientations of a chunk without resets."""
         _, orientation = self._filters.push(chunk) or self._filters.finish()
-        quat_VS = np.stack([orientation[name].quat_WS for name in self.names], axis=1)
+        quat_VS = self._stack_orientations(chunk, orientation)
         quat_WL = np.empty(quat_VS.shape)
         variance = self._place(chunk, orientation, quat_VS, quat_WL)
         self._recent = np.concatenate([self._order_recent(), quat_VS])[-len(self._recent) :].copy()
@@ -285,14 +360,17 @@ class CausalSegmentEstimator:
         covariance_W = {}
         covs = {name: o.attitude_cov for name, o in orientation.items() if o.attitude_cov is not None}
         if covs:
-            last = np.stack([covs[name][-1] for name in self.names])
-            self._run_var = compute_heading_variance(quat_VS[-1], last)
+            self._run_var = find_heading_variance(orientation, self.names, len(chunk) - 1)
+        for i in np.flatnonzero(self._measured):
+            covs[self.names[i]] = np.tile(_MEASURED_COV, (len(chunk), 1, 1))
+        if covs:
             soft = compute_soft_tissue_covariances(
                 self._start_frames.table, {name: quat_WL[:, i] for i, name in enumerate(self.names)}
             )
             covariance_W = {
-                name: self._covariance_W(i, quat_VS[:, i], covs[name], variance[:, i]) + soft[name]
+                name: self._covariance_W(i, quat_VS[:, i], covs[name], variance[:, :, i]) + soft[name]
                 for i, name in enumerate(self.names)
+                if name in covs
             }
         return replace(
             self.start,
@@ -306,25 +384,24 @@ class CausalSegmentEstimator:
     def _place(
         self, chunk: Recording, orientation: Mapping[str, Orientation], quat_VS: np.ndarray, quat_WL: np.ndarray
     ) -> np.ndarray:
-        """Fill `quat_WL` (n, k, 4), knot by knot; return the variance (n, k) [rad²] of the headings at its beginning.
+        """Fill `quat_WL` (n, k, 4), knot by knot; return `CausalHeadings.variance` (n, 2, k) [rad²] of each sample.
 
         It is NaN where headings are not corrected.
         """
         n = len(chunk)
-        variance = np.full((n, len(self.names)), np.nan)
+        variance = np.full((n, 2, len(self.names)), np.nan)
         if self.headings is None:
             _place_segments(self._quat_WV, self._correction(), quat_VS, self._quat_LS, self.quat_WL, quat_WL)
             return variance
         accel_S = np.stack([find_specific_force(chunk, name) for name in self.names], axis=1)
         begin = 0
         while begin < n:
-            count, size = self.headings.position
-            end = min(n, begin + size - count)
+            end = min(n, begin + self.headings.remaining)
             rows = slice(begin, end)
             _place_segments(
                 self._quat_WV, self._correction(), quat_VS[rows], self._quat_LS, self.quat_WL, quat_WL[rows]
             )
-            variance[rows] = self.headings.excess_variance()
+            variance[rows] = self.headings.variance
             if self.headings.push(quat_VS[rows], accel_S[rows]):
                 self.headings.close(find_heading_variance(orientation, self.names, end - 1), record=True)
             begin = end
@@ -354,9 +431,19 @@ class CausalSegmentEstimator:
         self._var_at_reset = heading_var if heading_var is not None else self.heading_var()
 
     def heading_var(self) -> np.ndarray | None:
-        """Return the variance (k,) [rad²] of each heading by its filter alone after a step; None: it has none."""
-        cov = self._bank.attitude_cov
-        return None if cov is None else compute_heading_variance(self._recent[self._oldest - 1], cov)
+        """Return the variance (k,) [rad²] of each heading by its filter alone after a step, NaN without a filter.
+
+        None: no filter has a covariance.
+        """
+        cov = None if self._bank is None else self._bank.attitude_cov
+        if cov is None:
+            return None
+        newest = self._recent[self._oldest - 1]
+        if not self._any_measured:
+            return compute_heading_variance(newest, cov)
+        variance = np.full(len(self.names), np.nan)
+        variance[~self._measured] = compute_heading_variance(newest[~self._measured], cov)
+        return variance
 
     def heading_std(self) -> np.ndarray:
         """Return the standard deviation (k,) [rad] of each segment's heading, that of the mounts included.
@@ -371,31 +458,35 @@ class CausalSegmentEstimator:
 
     def _covariances_W(self) -> np.ndarray:
         """Return the covariance (k, 3, 3) [rad²] of each segment in W after the last step; NaN: the filter has none."""
-        cov = self._bank.attitude_cov
-        if cov is None:
-            return np.full((len(self.names), 3, 3), np.nan)
+        cov = np.full((len(self.names), 3, 3), np.nan)
+        cov[self._measured] = _MEASURED_COV
+        filtered = None if self._bank is None else self._bank.attitude_cov
+        if filtered is not None:
+            cov[~self._measured] = filtered
+        if not np.isfinite(cov).any():
+            return cov
         newest = self._recent[self._oldest - 1]
         soft = compute_soft_tissue_covariances(
             self._start_frames.table, {name: self.quat_WL[i : i + 1] for i, name in enumerate(self.names)}
         )
-        excess = np.full(len(cov), np.nan) if self.headings is None else self.headings.excess_variance()
+        variance = np.full((2, len(cov)), np.nan) if self.headings is None else np.array(self.headings.variance)
         return np.concatenate(
             [
-                self._covariance_W(i, newest[i : i + 1], cov[i : i + 1], excess[i : i + 1]) + soft[name]
+                self._covariance_W(i, newest[i : i + 1], cov[i : i + 1], variance[None, :, i]) + soft[name]
                 for i, name in enumerate(self.names)
             ]
         )
 
-    def _covariance_W(
-        self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray, excess_var: np.ndarray
-    ) -> np.ndarray:
+    def _covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment, error on the left of `quat_WL`, in W.
 
-        `excess_var` (n,) [rad²] is by how much the variance of the corrected heading exceeds the filter's.
+        `variance` (n, 2) [rad²] is that of the corrected heading after a knot, and that of its filter then.
 
         As `alignment.compute_segment_covariance`; after a reset the heading's error is that of the start pose and the
         drift since.
         """
+        if self._start_recording.sensors[self.names[i]].aligned:
+            return attitude_cov
         R_WS = Rotation.from_rotvec([0.0, 0.0, self.heading_offset[i]]) * Rotation.from_quat(quat_VS)
         R_LS = Rotation.from_quat(self._quat_LS[i])
         cov = compute_segment_covariance(
@@ -407,8 +498,9 @@ class CausalSegmentEstimator:
             with_heading = compute_heading_covariance(R_VS, attitude_cov)
             start = compute_start_heading_var(self._start_recording, self.names[i], self._subject, self._start_frames)
             var = with_heading[:, 2]
-            cov = replace_heading_variance(cov, R_WV.apply(with_heading), var + start, var + excess_var)
-        if self._var_at_reset is not None:
+            grown = np.maximum(var - variance[:, 1], 0.0)
+            cov = replace_heading_variance(cov, R_WV.apply(with_heading), var + start, variance[:, 0] + grown)
+        if self._var_at_reset is not None and np.isfinite(self._var_at_reset[i]):
             var = compute_heading_variance(quat_VS, attitude_cov)
             grown = np.maximum(0.0, var - self._var_at_reset[i])
             # The mount's part of the heading stays: the reset has set that of the start pose alone.

@@ -15,7 +15,7 @@ state, so that a long recording does not average it away.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -36,13 +36,35 @@ LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance with
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
-# A clasp that is found: the points are joined for this long [s], at most so far apart [m] rms, so much [m] rms around
-# their mean and so far [m] in height, while each moves by at least this speed [m/s] rms and their distance by at most a
-# share of it. With the lengths of the population the joined hands of simulated people seem up to 25 cm apart, and are
-# not found.
-CLASP_S = 2.0
-CLASP_GAP, CLASP_CHANGE, CLASP_HEIGHT = 0.06, 0.03, 0.12
-CLASP_SPEED, CLASP_SPEED_RATIO = 0.08, 0.3
+
+
+@dataclass(frozen=True)
+class ClaspTest:
+    """When points of a closure are found to coincide; lengths are rms over the time.
+
+    With the lengths of the population the joined hands of simulated people seem up to 25 cm apart, and are not found.
+
+    Parameters
+    ----------
+    seconds : [s] for which they do
+    gap : [m] most between them, once the headings have closed it as far as their uncertainty lets them
+    change : [m] most around the mean of that gap
+    height : [m] most of the gap's vertical part
+    speed : [m/s] least of each of them in the frame of the reference segment
+    speed_ratio : most of the gap's rate against that
+    """
+
+    seconds: float = 2.0
+    gap: float = 0.06
+    change: float = 0.03
+    height: float = 0.12
+    speed: float = 0.08
+    speed_ratio: float = 0.3
+
+
+OFFLINE_CLASP = ClaspTest()
+# Over the shorter time of a clasp of two seconds tissue moves the gap by more of the hands' speed.
+CAUSAL_CLASP = ClaspTest(change=0.04, gap=0.08, speed_ratio=0.8)
 
 
 @dataclass(frozen=True)
@@ -138,8 +160,9 @@ class Way(NamedTuple):
 
 
 class Closure(NamedTuple):
-    """Two points that coincide in some intervals [s]."""
+    """Two points that coincide in some intervals [s], those of a phase."""
 
+    phase: str
     points: tuple[str, ...]
     intervals: tuple[tuple[float, float], ...]
     gap: Way  # from the second point to the first one
@@ -183,6 +206,7 @@ class HeadingProblem:
     drift_psd : (k,) [rad²/s] most that a heading gains by what is not a rate that changes slowly
     start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
     levers_at : (pairs, 6) [m] where levers are known; None: they are unknowns
+    causal : headings are corrected as samples come; a short clasp then counts as one observation
     """
 
     names: tuple[str, ...]
@@ -198,6 +222,7 @@ class HeadingProblem:
     start_var: np.ndarray
     mount_var: np.ndarray
     levers_at: np.ndarray | None = None
+    causal: bool = False
 
     @property
     def size(self) -> int:
@@ -268,6 +293,7 @@ class HeadingFilter:
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
         self._usual_gain = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, largest of late
         self._clasps = ClaspDetector(problem)
+        self._closed_before = set[tuple[str, ...]]()  # points that coincided in the last knot
         self.clasps: list[tuple[float, float]] = []  # [s] when points were found to coincide
 
     def reset(self, headings: np.ndarray) -> None:
@@ -281,8 +307,15 @@ class HeadingFilter:
         """Predict to a knot and update by it; return the step variance (k,) [rad²] that was added."""
         step_var = self.find_step_variance(knot)
         self.predict(step_var)
-        self.update(knot)
+        for _ in self.update(knot):
+            pass
         return step_var
+
+    def step_gradually(self, knot: Knot) -> Iterator[None]:
+        """Do as `step`, in parts of a millisecond or two; the state is valid after the last one."""
+        self.predict(self.find_step_variance(knot))
+        yield
+        yield from self.update(knot)
 
     def find_step_variance(self, knot: Knot) -> np.ndarray:
         """Find the variance (k,) [rad²] that the headings have gained in a knot beside their rates.
@@ -316,35 +349,54 @@ class HeadingFilter:
         rates = np.arange(k, 2 * k)
         self.P[rates, rates] += self.problem.noise.rate_change_psd * self.problem.knot_s
 
-    def update(self, knot: Knot) -> None:
-        """Update by a knot's observations, then by the points that are found to coincide in it."""
+    def update(self, knot: Knot) -> Iterator[None]:
+        """Update by a knot's observations, then by the points that are found to coincide in it; yield between parts."""
         before, P = self.x, self.P
         x, information = before, np.zeros_like(P)
         for iteration in range(ITERATIONS):
             information, vector = np.zeros_like(P), np.zeros(len(x))
             self._add_joints(knot, x, information, vector, last=iteration == ITERATIONS - 1)
-            self._add_rows(knot, x, information, vector)
+            yield
+            yield from self._add_rows(knot, x, information, vector)
             x = self._fuse(x, information, vector)
+            yield
         self.x = x
         self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + P @ information, P))
+        yield
         found = self._clasps.find(knot, self)
+        yield
         unsure = self._find_unsure(knot)
         self._lost_before = knot.lost
-        for rows in () if unsure.any() else found:
+        closed = {closure.points for closure in self.problem.closures if closure.holds(knot.time).any()}
+        for points, rows in () if unsure.any() else found:
+            closed.add(points)
             k = len(self.problem.names)
             information, vector = np.zeros_like(P), np.zeros(len(x))
-            information[:k, :k] = rows.H.T @ (rows.weight[:, None] * rows.H)
-            vector[:k] = rows.H.T @ (rows.weight * rows.r)
+            weight = rows.weight / self._find_correlation(points, knot)
+            information[:k, :k] = rows.H.T @ (weight[:, None] * rows.H)
+            vector[:k] = rows.H.T @ (weight * rows.r)
             self.x = self._fuse(self.x, information, vector)
             self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + self.P @ information, self.P))
             begin = float(knot.time[0])
             if self.clasps and begin - self.clasps[-1][1] < 1.5 * self.problem.knot_s:
                 begin = self.clasps.pop()[0]
             self.clasps.append((begin, knot.end))
+            yield
+        self._closed_before = closed
+
+    def _find_correlation(self, points: tuple[str, ...], knot: Knot) -> float:
+        """Find the number of samples of a closure that count as one observation.
+
+        Causally all of a clasp's first knot: a clasp may be shorter than its residuals are correlated.
+        """
+        rate = self.problem.samples_per_knot / self.problem.knot_s
+        if self.problem.causal and points not in self._closed_before:
+            return float(len(knot.time))
+        return max(1.0, self.problem.noise.closure_correlation_s * rate)
 
     def _find_unsure(self, knot: Knot) -> np.ndarray:
-        """Find (k,) bool the sensors that are lost or were in the last knot; measured orientations are not filtered."""
-        return (knot.lost | self._lost_before) & np.isfinite(knot.heading_var)
+        """Find (k,) bool the sensors that are lost or were in the last knot."""
+        return knot.lost | self._lost_before
 
     def _fuse(self, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> np.ndarray:
         """Minimize (y − before)ᵀ P⁻¹ (y − before) + (y − x)ᵀ Λ (y − x) + 2 vectorᵀ (y − x) over y."""
@@ -380,7 +432,8 @@ class HeadingFilter:
                 share = 1.0 - np.exp(-problem.knot_s / 20.0)
                 self._misfit[i] += share * (cost / (3.0 * sums.samples) - self._misfit[i])
 
-    def _add_rows(self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> None:
+    def _add_rows(self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Iterator[None]:
+        """Add the hinges and the closures that hold; yield between them."""
         problem = self.problem
         k, noise = len(problem.names), problem.noise
         rate = problem.samples_per_knot / problem.knot_s
@@ -390,6 +443,7 @@ class HeadingFilter:
         for i, hinge in enumerate(problem.hinges):
             if unsure[hinge.on] or unsure[hinge.moves]:
                 continue
+            yield
             self._add_range(R, hinge, information, vector)
             columns = [hinge.moves, hinge.on] + [problem.column(part, i) for part in ("axis", "twist", "tilt")]
             r, H = linearize_hinge(R[hinge.on], R[hinge.moves], hinge)
@@ -403,8 +457,9 @@ class HeadingFilter:
             closed = closure.holds(knot.time)
             used = [problem.names.index(part.sensor) for part in closure.gap.parts if part.sensor in problem.names]
             if closed.any() and not unsure[used].any():
+                yield
                 rows = build_gap_rows(named, problem.model, problem.subject, closure, closed)
-                weight = rows.weight / max(1.0, noise.closure_correlation_s * rate)
+                weight = rows.weight / self._find_correlation(closure.points, knot)
                 information[:k, :k] += rows.H.T @ (weight[:, None] * rows.H)
                 vector[:k] += rows.H.T @ (weight * rows.r)
 
@@ -464,17 +519,19 @@ class ClaspDetector:
     """
 
     def __init__(self, problem: HeadingProblem) -> None:
-        self._problem = problem
+        # Of a clasp of that many seconds so many knots are whole, whenever it begins.
+        self._test = CAUSAL_CLASP if problem.causal else OFFLINE_CLASP
+        self._knots = max(2, int(self._test.seconds / problem.knot_s) - 1)
         self._recent: list[Knot] = []
 
-    def find(self, knot: Knot, state: HeadingFilter) -> list[Rows]:
-        """Return the rows of the gaps in the last knot that are closed, with the weights of their correlation."""
-        problem = self._problem
+    def find(self, knot: Knot, state: HeadingFilter) -> list[tuple[tuple[str, ...], Rows]]:
+        """Return the points that coincide and the rows of the gap between them in the last knot."""
+        problem, test = state.problem, self._test
         names, reference = problem.names, problem.model.table.reference
         if not problem.closures or reference not in names:
             return []
-        self._recent = [*self._recent, knot][-max(2, int(np.ceil(CLASP_S / problem.knot_s - 0.2))) :]
-        if len(self._recent) * problem.knot_s < 0.8 * CLASP_S:
+        self._recent = [*self._recent, knot][-self._knots :]
+        if len(self._recent) < self._knots and len(self._recent) * problem.knot_s < 0.8 * test.seconds:
             return []
         k, rate = len(names), problem.samples_per_knot / problem.knot_s
         quats = np.concatenate([each.quat_WL for each in self._recent])
@@ -496,28 +553,26 @@ class ClaspDetector:
             speed = min(float(np.sqrt(np.mean(np.sum(np.gradient(p, time, axis=0) ** 2, axis=1)))) for p in paths)
             v = closure.gap.vectors(R, problem.model)
             gap = v.sum(axis=0)
-            if speed < CLASP_SPEED or np.abs(gap[:, 2]).max() > CLASP_HEIGHT:
+            if speed < test.speed or np.abs(gap[:, 2]).max() > test.height:
                 continue
             H = np.zeros((len(time), 3, k))
             for part, link in zip(closure.gap.parts, v, strict=True):
                 H[:, :, names.index(part.sensor)] += np.cross(E_Z, link)
             # The headings that close the gap best, within their covariance.
             P, flat, r = state.P[:k, :k], H.reshape(-1, k), gap.ravel()
-            weight = 1.0 / (problem.noise.slip_std**2 * max(1.0, CLASP_S * rate))
+            weight = 1.0 / (problem.noise.slip_std**2 * max(1.0, test.seconds * rate))
             turn = -np.linalg.solve(np.eye(k) + P @ (weight * flat.T @ flat), P @ (weight * flat.T @ r))
             closed = gap + H @ turn
             change = np.sqrt(np.mean(np.sum((closed - closed.mean(axis=0)) ** 2, axis=1)))
             drift = np.sqrt(np.mean(np.sum(np.gradient(closed, time, axis=0) ** 2, axis=1)))
             length = np.sqrt(np.mean(np.sum(closed**2, axis=1)))
-            if length > CLASP_GAP or change > CLASP_CHANGE or drift > CLASP_SPEED_RATIO * speed:
+            if length > test.gap or change > test.change or drift > test.speed_ratio * speed:
                 continue
             named = {name: R[name][-len(knot.time) :] for name in names}
-            rows = build_gap_rows(
-                named, problem.model, problem.subject, closure, np.ones(len(knot.time), dtype=bool),
-                problem.noise.slip_std,
-            )  # fmt: skip
-            correlated = max(1.0, problem.noise.closure_correlation_s * rate)
-            found.append(rows._replace(weight=rows.weight / correlated))
+            joined = np.ones(len(knot.time), dtype=bool)
+            slip_std = problem.noise.slip_std
+            rows = build_gap_rows(named, problem.model, problem.subject, closure, joined, slip_std)
+            found.append((closure.points, rows))
         return found
 
 

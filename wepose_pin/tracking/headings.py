@@ -2,12 +2,12 @@
 
 The filters' tilt is good and their headings drift. `heading_filter` estimates their errors knot by knot; an error
 common to all segments is unobservable. Offline a forward pass learns where sensors sit, and a second one and a
-Rauch-Tung-Striebel pass give the errors. Causally the forward pass alone does, each knot's errors from the next one on.
+Rauch-Tung-Striebel pass give the errors. Causally the forward pass alone does, and a knot is corrected in the next one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -45,8 +45,10 @@ from .heading_filter import (
 from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, find_pairs
 
 REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
-# [s] between knots: causally a correction waits for the next one, offline each costs memory.
-CAUSAL_KNOT_S, OFFLINE_KNOT_S = 1.0, 2.0
+# [s] between knots: causally what a knot observes is corrected by the end of the next one, offline each costs memory.
+CAUSAL_KNOT_S, OFFLINE_KNOT_S = 0.5, 2.0
+# Share of the next knot in which a knot is solved, a part with each sample; over the rest its correction fades in.
+SOLVE_SHARE = 0.4
 SAMPLE_RATE_HZ = 8.0
 
 
@@ -119,18 +121,26 @@ class KnotReader:
 
     def close(self, heading_var: np.ndarray) -> Knot:
         """Return the open knot; `heading_var` (k,) [rad²] of the filters at its last sample."""
-        n, k = self.count, self._quat_VS.shape[1]
-        self.count = 0
-        quat_VS = self._quat_VS[:n]
+        return self.form(self.take(), heading_var)
+
+    def take(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the samples of the open knot, time, `quat_VS` and `accel_S`, and open the next one."""
+        n, self.count = self.count, 0
+        return self._time[:n].copy(), self._quat_VS[:n].copy(), self._accel_S[:n].copy()
+
+    def form(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], heading_var: np.ndarray) -> Knot:
+        """Form the knot of samples that were taken; knots are formed in their order."""
+        time, quat_VS, accel_S = samples
+        n, k = quat_VS.shape[:2]
         rows = np.arange(0, n, self._stride)
         R_VS = Rotation.from_quat(quat_VS.reshape(-1, 4)).as_matrix().reshape(n, k, 3, 3)
         R_WS = self._R_WV.as_matrix() @ R_VS
-        joints = self._accelerations.push(R_WS, self._accel_S[:n], rows)
+        joints = self._accelerations.push(R_WS, accel_S, rows)
         quat_WL = np.stack(
             [(self._R_WV[i] * Rotation.from_quat(quat_VS[rows, i]) * self._R_SL[i]).as_quat() for i in range(k)], axis=1
         )
-        lost = np.asarray(~np.isfinite(self._accel_S[:n]).all(axis=(0, 2)))
-        return Knot(float(self._time[n - 1]), self._time[rows].copy(), quat_WL, joints, heading_var, lost)
+        lost = np.asarray(~np.isfinite(accel_S).all(axis=(0, 2)))
+        return Knot(float(time[n - 1]), time[rows].copy(), quat_WL, joints, heading_var, lost)
 
 
 def pose_problem(
@@ -140,7 +150,7 @@ def pose_problem(
 
     Parameters
     ----------
-    causal : as samples come: points coincide where they are found to, and not in the phases of closures
+    causal : as samples come: the phases of closures are marked as they begin and end
     """
     names = tuple(orientations.quat_WL)
     raw = {name: orientations.quat_LS[name] for name in names if name in recording.imus}
@@ -161,7 +171,19 @@ def pose_problem(
             drift_psd[i] = max(noise.drift_psd, white)
     start_var, mount_var = np.array([find_start_variances(recording, name, subject, model) for name in names]).T
     return HeadingProblem(
-        names, model, subject, pairs, hinges, closures, noise, knot_s, samples, drift_psd, start_var, mount_var
+        names,
+        model,
+        subject,
+        pairs,
+        hinges,
+        closures,
+        noise,
+        knot_s,
+        samples,
+        drift_psd,
+        start_var,
+        mount_var,
+        causal=causal,
     )
 
 
@@ -236,7 +258,7 @@ def _find_closures(recording: Recording | None, segments: Collection[str], model
             except BadSession:
                 continue
             intervals = () if recording is None else tuple(recording.phases.get(closure.phase, ()))
-            closures.append(Closure(closure.points, intervals, gap, tuple(ways)))
+            closures.append(Closure(closure.phase, closure.points, intervals, gap, tuple(ways)))
     return tuple(closures)
 
 
@@ -369,12 +391,14 @@ class HeadingCorrector:
 
 
 class CausalHeadings:
-    """Corrects headings as samples come: what a knot observes holds from the next one on, over which it fades in.
+    """Corrects headings as samples come; what a knot observes is corrected by the end of the next one.
+
+    When a knot is complete it is solved in parts, one with each sample, so that no pose waits for long. From the sample
+    `lead` of the next knot on, by which all parts are done, the correction fades in.
 
     Attributes
     ----------
     offset : (k,) ψ [rad] to which corrections are added
-    begin, end : (k,) [rad] the correction before the open knot and after it
     """
 
     def __init__(self, recording: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
@@ -385,46 +409,112 @@ class CausalHeadings:
         self._filter = HeadingFilter(problem)
         self._rate_hz, self._samples = recording.rate_hz, 0
         self._start_end = float(recording.time[-1])
-        self.begin, self.end = np.zeros(len(problem.names)), np.zeros(len(problem.names))
-        self._var_at_knot: np.ndarray | None = None
+        self._lead = min(round(SOLVE_SHARE * self._reader.size), self._reader.size - 1)
+        self._solving: Iterator[None] | None = None  # the last knot, until its correction is applied
+        self._record = False
+        self._begin, self._end = np.zeros(len(problem.names)), np.zeros(len(problem.names))
+        self._var_at_knot = np.zeros(len(problem.names))  # [rad²] of the filters
+        self._var = self._find_variance()  # [rad²] of the segments' headings then
         self._max_correction = np.zeros(len(problem.names))
+        self._marked: dict[str, list[tuple[int, int | None]]] = {}  # phase → first sample, and the one after the last
         self._history: list[tuple[float, np.ndarray]] = []
 
     @property
-    def position(self) -> tuple[int, int]:
-        """The number of the next sample in its knot, and the samples of a knot."""
-        return self._reader.count, self._reader.size
+    def phases(self) -> set[str]:
+        """The phases in which points coincide."""
+        return {closure.phase for closure in self._problem.closures}
+
+    @property
+    def fade(self) -> tuple[np.ndarray, np.ndarray, int, int]:
+        """The correction (k,) [rad] from and to which it fades, the number of the next sample in that, of how many."""
+        count = self._reader.count
+        if count < self._lead:
+            return self._end, self._end, 0, 1
+        return self._begin, self._end, count - self._lead, self._reader.size - self._lead
+
+    @property
+    def remaining(self) -> int:
+        """Number of samples that can be pushed at once, after which `fade` is another."""
+        count = self._reader.count
+        return (self._lead if count < self._lead else self._reader.size) - count
 
     def push(self, quat_VS: np.ndarray, accel_S: np.ndarray) -> bool:
-        """Add samples of one knot, (n, k, 4) and (n, k, 3), NaN where lost; return whether the knot is complete."""
+        """Add up to `remaining` samples, (n, k, 4), (n, k, 3), NaN where lost; return whether the knot is complete."""
         time = (self._samples + np.arange(len(quat_VS))) / self._rate_hz
         self._reader.push(time, quat_VS, accel_S)
         self._samples += len(quat_VS)
+        if self._solving is not None:
+            if self._reader.count < self._lead:
+                next(self._solving, None)
+            else:
+                self._apply()
         return not self._reader.remaining
 
     def close(self, heading_var: np.ndarray, *, record: bool = False) -> None:
         """Close a complete knot; `heading_var` (k,) [rad²] of the filters now; `record` its covariance."""
-        knot = self._reader.close(heading_var)
-        self._filter.step(knot)
-        self.begin, self.end = self.end, self._filter.x[: len(heading_var)].copy()
-        self._max_correction = np.maximum(self._max_correction, np.abs(self.end))
-        self._var_at_knot = heading_var
-        if record:
-            k = len(heading_var)
+        self._record = record
+        self._solving = self._solve(self._reader.take(), heading_var)
+        if not self._lead:
+            self._apply()
+
+    def mark(self, phase: str, *, begins: bool) -> None:
+        """Mark that a phase begins, or has ended, with the next sample; one that no closure has changes nothing."""
+        marked = self._marked.setdefault(phase, [])
+        is_open = bool(marked) and marked[-1][1] is None
+        if begins and not is_open:
+            marked.append((self._samples, None))
+        elif is_open and not begins:
+            marked[-1] = marked[-1][0], self._samples
+        else:
+            return
+        # Half a sample around the first and the last one.
+        intervals = tuple(
+            ((first - 0.5) / self._rate_hz, np.inf if last is None else (last - 0.5) / self._rate_hz)
+            for first, last in marked
+        )
+        closures = tuple(
+            closure._replace(intervals=intervals) if closure.phase == phase else closure
+            for closure in self._problem.closures
+        )
+        self._problem = self._filter.problem = replace(self._problem, closures=closures)
+
+    def _solve(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], heading_var: np.ndarray) -> Iterator[None]:
+        knot = self._reader.form(samples, heading_var)
+        yield
+        yield from self._filter.step_gradually(knot)
+        k = len(heading_var)
+        self._var_at_knot = np.nan_to_num(heading_var)
+        if self._record:
             self._history.append((self._start_end + knot.end, self._filter.P[:k, :k].copy()))
+
+    def _apply(self) -> None:
+        """Finish the last knot; its correction fades in from the next sample on."""
+        if self._solving is None:
+            return
+        for _ in self._solving:
+            pass
+        self._solving = None
+        self._begin, self._end = self._end, self._filter.x[: len(self._end)].copy()
+        self._max_correction = np.maximum(self._max_correction, np.abs(self._end))
+        self._var = self._find_variance()
 
     def reset(self, heading_offset: np.ndarray) -> None:
         """Set ψ (k,) [rad] as the start pose shows it."""
+        self._apply()
         error = heading_offset - self.offset
-        error = error + 2.0 * np.pi * np.round((self.end - error) / (2.0 * np.pi))
+        error = error + 2.0 * np.pi * np.round((self._end - error) / (2.0 * np.pi))
         self._filter.reset(error)
-        self.begin = self.end = error
+        self._begin = self._end = error
+        self._var = self._find_variance()
 
-    def excess_variance(self) -> np.ndarray:
-        """Return by how much (k,) [rad²] the variance of each heading exceeds its filter's, since the last knot."""
-        var = np.diag(self._filter.P)[: len(self.end)]
-        own = np.array([self._problem.find_segment_variance(i, value) for i, value in enumerate(var)])
-        return np.asarray(own - (0.0 if self._var_at_knot is None else np.nan_to_num(self._var_at_knot)))
+    @property
+    def variance(self) -> tuple[np.ndarray, np.ndarray]:
+        """The variance (k,) [rad²] of each heading after the last knot, and that of its filter alone."""
+        return self._var, self._var_at_knot
+
+    def _find_variance(self) -> np.ndarray:
+        var = np.diag(self._filter.P)[: len(self._problem.names)]
+        return np.array([self._problem.find_segment_variance(i, value) for i, value in enumerate(var)])
 
     def summarize(self) -> HeadingCorrection:
         """Return what was observed and corrected so far; residuals are not known."""
@@ -449,7 +539,7 @@ def _rotations(knot: Knot) -> list[Rotation]:
 def _stack_samples(
     chunk: Recording, orientations: SegmentOrientations, names: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stack `quat_VS` (n, k, 4) and `accel_S` (n, k, 3) [m/s²], NaN where there is none."""
+    """Stack `quat_VS` (n, k, 4) and `accel_S` (n, k, 3) [m/s²], NaN where a sensor is lost."""
     quats, accels = [], []
     for name in names:
         sensor = chunk.sensors[name]
@@ -460,11 +550,10 @@ def _stack_samples(
 
 
 def find_specific_force(chunk: Recording, name: str) -> np.ndarray:
-    """Find `accel_S` (n, 3) [m/s²] of a sensor, NaN where it has none or has lost it."""
+    """Find `accel_S` (n, 3) [m/s²] of a sensor, NaN where it is lost; zero of a sensor that has none."""
     sensor = chunk.sensors[name]
-    if not isinstance(sensor, ImuSensor):
-        return np.full((len(chunk), 3), np.nan)
-    return sensor.accel_S if sensor.gap is None else np.where(sensor.gap[:, None], np.nan, sensor.accel_S)
+    accel_S = sensor.accel_S if isinstance(sensor, ImuSensor) else np.zeros((len(chunk), 3))
+    return accel_S if sensor.gap is None else np.where(sensor.gap[:, None], np.nan, accel_S)
 
 
 def find_heading_variance(orientation: Mapping[str, Orientation], names: Sequence[str], row: int) -> np.ndarray:

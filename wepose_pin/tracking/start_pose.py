@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..errors import BadPhase
 from ..filters.phases import SWAYS_DEG, SWAYS_DEG_S
 from ..recording import Intervals, OrientationSensor, Recording, Sensor
+from ..recording.arrivals import unpack_orientations
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
 
@@ -78,6 +80,33 @@ class StartPoseDetector:
         else:
             self.state = "moved" if self._tick - self._moved_at < self._rate else "start_pose"
         return self.state
+
+
+class TickRates:
+    """Rates of all sensors, tick by tick; of measured orientations that from one tick to the next, zero at the first.
+
+    Parameters
+    ----------
+    measured : (k,) bool: the sensors with measured orientations
+    """
+
+    def __init__(self, measured: np.ndarray, rate_hz: float) -> None:
+        self._measured, self._rate_hz = measured, rate_hz
+        self._last: np.ndarray | None = None
+
+    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+        """Return the rates (k, 3) [rad/s] in S at the next tick, NaN where a sensor is lost."""
+        if not self._measured.any():
+            return gyro_S
+        quat = unpack_orientations(gyro_S[self._measured], accel_S[self._measured])
+        last = quat if self._last is None else self._last
+        known = np.isfinite(quat).all(axis=1) & np.isfinite(last).all(axis=1)
+        rates = gyro_S.copy()
+        turns = np.full((len(quat), 3), np.nan)
+        turns[known] = (Rotation.from_quat(last[known]).inv() * Rotation.from_quat(quat[known])).as_rotvec()
+        rates[self._measured] = turns * self._rate_hz
+        self._last = quat
+        return rates
 
 
 def cut_start_pose(recording: Recording, interval: tuple[float, float]) -> Recording:

@@ -225,6 +225,8 @@ def _estimator(
     subject: Subject | None, body: TrackedBody, options: TrackOptions, chunk: Recording
 ) -> SegmentEstimator | CausalEstimator | DoubledEstimator:
     def observe(recording: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
+        if any(sensor.aligned for sensor in recording.sensors.values()):
+            return None
         return pose_problem(recording, segments, body.subject, body.model, causal=True)
 
     def make(person: Subject | None) -> SegmentEstimator | CausalEstimator:

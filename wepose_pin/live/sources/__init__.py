@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ...errors import BadOption, one_of
 from ...model import load_table
-from ..addresses import parse_address
+from ..addresses import parse_address, parse_listening_address
 from .base import Source
 from .packets import AnyName
 
@@ -17,7 +17,11 @@ FORMS = {
     "lsl": "lsl:NAME[@machine|link|site]",
     "udp": "udp:[HOST:]PORT",
     "mti": "mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]",
+    "ximu3": "ximu3:DEVICE=SEGMENT,DEVICE=SEGMENT",
+    "slimevr": "slimevr:[HOST][:PORT][,TRACKER=SEGMENT...]",
+    "mvn": "mvn:[HOST][:PORT]",
 }
+LISTENING = ("slimevr", "mvn")  # at an address that has a default
 
 
 def open_source(
@@ -34,8 +38,8 @@ def open_source(
 
     Parameters
     ----------
-    spec : ``replay:PATH`` (a session.toml or its folder), ``lsl:NAME``, ``udp:PORT``, ``udp:HOST:PORT`` or
-        ``mti:DEVICE=SEGMENT,…@RATE``; docs/live-sources.md says what each takes
+    spec : one of `FORMS`, as ``replay:PATH`` (a session.toml or its folder) or ``udp:PORT``; docs/live-sources.md says
+        what each takes
     sensors : to take; None: all that the source has. A UDP or LSL source waits for its sensors in `open`
     speed : of a replay: 1.0 its own, 4.0 four times that, "max" as fast as possible
     baud : of serial ports
@@ -49,7 +53,7 @@ def open_source(
         No such kind of source, or it names what does not exist; WeposeErrors of the recording that is replayed.
     """
     kind, colon, rest = spec.partition(":")
-    if kind not in FORMS or not colon or not rest:
+    if kind not in FORMS or not colon or not (rest or kind in LISTENING):
         raise BadOption(f"source '{spec}' is none; {one_of(FORMS.values(), kind)}")
     if kind == "replay":
         return _open_replay(spec, rest, sensors, speed)
@@ -61,6 +65,12 @@ def open_source(
         return _open_lsl(spec, rest, sensors, wait_s, segments)
     if kind == "udp":
         return _open_udp(spec, rest, sensors, wait_s, AnyName() if any_name else segments)
+    if kind == "slimevr":
+        return _open_slimevr(spec, rest, sensors, wait_s, segments)
+    if kind == "mvn":
+        return _open_mvn(spec, rest, sensors, wait_s, segments)
+    if kind == "ximu3":
+        return _open_ximu3(spec, rest, sensors, baud, wait_s, segments)
     return _open_mti(spec, rest, sensors, baud, segments)
 
 
@@ -112,19 +122,64 @@ def _open_mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int, se
         if not (rate.isascii() and rate.isdigit() and 0 < int(rate) <= 2000):
             raise BadOption(f"source '{spec}': rate '{rate}'; whole samples a second from 1 to 2000, as @100")
         rate_hz = int(rate)
+    devices = _choose_devices(spec, _read_pairs(spec, pairs if separator else rest, segments, "/dev/ttyUSB0"), sensors)
+    return MTiSource(devices, rate_hz, baud)
+
+
+def _open_ximu3(
+    spec: str, rest: str, sensors: Sequence[str] | None, baud: int, wait_s: float, segments: Sequence[str]
+) -> Source:
+    from .ximu3 import Ximu3Source, check_device
+
+    devices = _choose_devices(spec, _read_pairs(spec, rest, segments, "192.168.1.2"), sensors)
+    for device in devices.values():
+        check_device(device, spec)
+    return Ximu3Source(devices, baud, wait_s)
+
+
+def _open_slimevr(
+    spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]
+) -> Source:
+    from .slimevr import PORT, SlimeVrSource
+
+    address, _, pairs = rest.partition(",")
+    host, port = parse_listening_address(address, f"source '{spec}':", PORT)
+    assigned = {}
+    if pairs:
+        assigned = {
+            tracker.lower(): segment
+            for segment, tracker in _read_pairs(spec, pairs, segments, "4c:11:ae:00:00:01/0").items()
+        }
+    return SlimeVrSource(host, port, sensors or list(assigned.values()), segments, wait_s, assigned=assigned)
+
+
+def _open_mvn(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]) -> Source:
+    from .mvn import PORT, MvnSource
+
+    host, port = parse_listening_address(rest, f"source '{spec}':", PORT)
+    return MvnSource(host, port, sensors, segments, wait_s)
+
+
+def _read_pairs(spec: str, text: str, segments: Sequence[str], example: str) -> dict[str, str]:
+    """Segment → device of ``DEVICE=SEGMENT,…``."""
     devices: dict[str, str] = {}
-    for pair in (pairs if separator else rest).split(","):
+    for pair in text.split(","):
         device, equals, segment = pair.rpartition("=")
         if not equals or not device:
-            raise BadOption(f"source '{spec}': '{pair}' is no DEVICE=SEGMENT, as /dev/ttyUSB0={segments[0]}")
+            raise BadOption(f"source '{spec}': '{pair}' is no DEVICE=SEGMENT, as {example}={segments[0]}")
         if segment not in segments:
             raise BadOption(f"source '{spec}': '{segment}' is not a segment; {one_of(segments, segment)}")
         if segment in devices or device in devices.values():
             raise BadOption(f"source '{spec}': '{pair}': each device and each segment is named once")
         devices[segment] = device
-    if sensors is not None:
-        missing = [name for name in sensors if name not in devices]
-        if missing:
-            raise BadOption(f"source '{spec}': no device for {missing[0]}; {one_of(devices, missing[0])}")
-        devices = {name: devices[name] for name in sensors}
-    return MTiSource(devices, rate_hz, baud)
+    return devices
+
+
+def _choose_devices(spec: str, devices: dict[str, str], sensors: Sequence[str] | None) -> dict[str, str]:
+    """The devices of the chosen sensors, in their order; None: all."""
+    if sensors is None:
+        return devices
+    missing = [name for name in sensors if name not in devices]
+    if missing:
+        raise BadOption(f"source '{spec}': no device for {missing[0]}; {one_of(devices, missing[0])}")
+    return {name: devices[name] for name in sensors}

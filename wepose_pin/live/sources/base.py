@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 from ...recording.arrivals import Samples
+from .waiting import Waiting
 
 
 class Source(Protocol):
@@ -16,14 +17,20 @@ class Source(Protocol):
     sensors : segments, in the order in which results name them
     rate_hz : nominal samples a second of each; None where it has to be measured
     problems : problem → count of what was dropped so far ("bad checksums": 3)
+    orientations : segments whose samples are measured orientations (`pack_orientations`) → whether these are the
+        segment's own, in one world; else they are the sensor's, in a world of its own
     """
 
     sensors: tuple[str, ...]
     rate_hz: float | None
     problems: dict[str, int]
+    orientations: Mapping[str, bool]
 
-    def open(self) -> None:
-        """Connect, or bind; raises `WeposeError` with one line on what is missing."""
+    def open(self, waiting: Waiting | None = None) -> None:
+        """Connect, or bind, and wait for what is not there yet: with `waiting` until it returns False.
+
+        Raises `WeposeError` with one line on what is missing, without `waiting` after some seconds.
+        """
         ...
 
     def read(self, timeout_s: float) -> list[Samples] | None:

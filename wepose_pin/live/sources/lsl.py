@@ -12,7 +12,7 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from ...model import load_table
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
 from .checks import IMPLAUSIBLE, keep_plausible
+from .waiting import Waiting
 
 # Scope of the search → configuration of liblsl. On one machine there is one clock and one loopback.
 _QUIET = "[log]\nlevel = -3\n"
@@ -140,14 +141,15 @@ class LslSource:
         self._segments = tuple(load_table().segments if segments is None else segments)
         self.rate_hz: float | None = None
         self.problems: dict[str, int] = Counter()
+        self.orientations: Mapping[str, bool] = {}
         self._name, self._scope, self._wait_s = name, scope, wait_s
         self._streams: dict[str, _Stream] = {}
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._reconnector: threading.Thread | None = None
 
-    def open(self) -> None:
-        """Find the streams and subscribe.
+    def open(self, waiting: Waiting | None = None) -> None:
+        """Find the streams and subscribe, with `waiting` until it returns False.
 
         Raises
         ------
@@ -161,6 +163,11 @@ class LslSource:
         deadline = time.monotonic() + self._wait_s
         while not present or any(segment not in present for segment in self.sensors):
             left = deadline - time.monotonic()
+            if waiting is not None:
+                absent = ", ".join(name for name in self.sensors if name not in present)
+                if not waiting(f"Waiting for the LSL stream {self._name}{': ' + absent if absent else ''}."):
+                    return
+                left = COLLECT_S
             if left <= 0.0:
                 break
             for stream, info in self._resolve(min(COLLECT_S, left)).items():

@@ -17,6 +17,7 @@ from ...recording.arrivals import Samples
 from . import xbus
 from .checks import IMPLAUSIBLE, keep_plausible
 from .clocks import HostClock
+from .waiting import Waiting
 
 PLAIN_HZ = 100  # that the plain outputs of every MTi have; above, the HR outputs are tried first
 ANSWER_S = 0.5
@@ -45,11 +46,12 @@ class MTiSource:
         self.sensors = tuple(devices)
         self.rate_hz: float | None = rate_hz
         self.problems: dict[str, int] = Counter()
+        self.orientations: Mapping[str, bool] = {}
         self._queue: SimpleQueue[Samples | tuple[str, int]] = SimpleQueue()
         self._devices = [_Device(segment, port, rate_hz, baud, self._queue) for segment, port in devices.items()]
 
-    def open(self) -> None:
-        """Open and configure every port, then listen.
+    def open(self, _waiting: Waiting | None = None) -> None:
+        """Open and configure every port, then listen; a port that is not there is an error and not waited for.
 
         Raises
         ------

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 
 import numpy as np
 
 from ...errors import BadOption
-from ...recording import Recording
-from ...recording.arrivals import Samples
+from ...recording import OrientationSensor, Recording
+from ...recording.arrivals import Samples, list_numbers
+from .waiting import Waiting
 
 BLOCK = 64  # samples of every sensor at once, as fast as possible
 # Up to 1 kHz every sample comes when it is due, faster ones come together.
@@ -32,20 +34,21 @@ class ReplaySource:
     Raises
     ------
     BadOption
-        A sensor that gives measured orientations, or a speed that is not positive.
+        A speed that is not positive.
     """
 
     def __init__(self, recording: Recording, speed: float = 1.0) -> None:
         if not speed > 0.0:
             raise BadOption(f"speed: {speed:g}; it must be positive: 1.0 is the recording's own, 4.0 four times that")
-        fused = [segment for segment in recording.sensors if segment not in recording.imus]
-        if fused:
-            raise BadOption(
-                f"{recording.where()}: sensors.{fused[0]} gives measured orientations; live needs gyro and accel"
-            )
         self.sensors = tuple(recording.sensors)
         self.rate_hz: float | None = recording.rate_hz
         self.problems: dict[str, int] = {}
+        self.orientations: Mapping[str, bool] = {
+            segment: sensor.aligned
+            for segment, sensor in recording.sensors.items()
+            if isinstance(sensor, OrientationSensor)
+        }
+        self._numbers = dict(zip(recording.sensors, map(list_numbers, recording.sensors.values()), strict=True))
         self.recording = recording
         # Samples are taken as evenly spaced: the jitter of the clock is no motion, and every sample has its own tick.
         self._time = recording.time[0] + np.arange(len(recording)) / recording.rate_hz
@@ -53,7 +56,7 @@ class ReplaySource:
         self._next = 0
         self._begin = 0.0
 
-    def open(self) -> None:
+    def open(self, _waiting: Waiting | None = None) -> None:
         """Start: the first sample is due now."""
         self._next = 0
         self._begin = time.monotonic()
@@ -78,13 +81,14 @@ class ReplaySource:
             time.sleep(min(max(wait, MIN_SLEEP_S), left))
         self._next = last
         samples = []
-        for segment, sensor in recording.imus.items():
+        for segment, sensor in recording.sensors.items():
             rows: slice | np.ndarray = slice(first, last)
             if sensor.gap is not None and sensor.gap[rows].any():
                 rows = first + np.flatnonzero(~sensor.gap[first:last])
                 if not rows.size:
                     continue
-            samples.append(Samples(segment, time_s[rows], sensor.gyro_S[rows], sensor.accel_S[rows]))
+            gyro_S, accel_S = self._numbers[segment]
+            samples.append(Samples(segment, time_s[rows], gyro_S[rows], accel_S[rows]))
         return samples
 
     def close(self) -> None:

@@ -6,7 +6,7 @@ import select
 import socket
 import time
 from collections import Counter, OrderedDict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from ...recording.arrivals import Samples
 from .checks import IMPLAUSIBLE, MAX_TIME, keep_plausible
 from .clocks import HostClock
 from .packets import AnyName, Batch, decode
+from .waiting import Waiting, wait_for
 
 MAX_SIZE = 65536  # [bytes] of a datagram
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
@@ -52,14 +53,15 @@ class UdpSource:
         self._segments = load_table().segments if segments is None else segments
         self.rate_hz: float | None = None
         self.problems: dict[str, int] = Counter()
+        self.orientations: Mapping[str, bool] = {}
         self.address = (host, port)
         self._wait_s = wait_s
         self._socket: socket.socket | None = None
         self._clocks: OrderedDict[tuple[str, int], HostClock] = OrderedDict()
         self._waiting: list[Samples] = []
 
-    def open(self) -> None:
-        """Bind; where the sensors are not given, wait for them.
+    def open(self, waiting: Waiting | None = None) -> None:
+        """Bind; where the sensors are not given, wait for them, with `waiting` until it returns False.
 
         Raises
         ------
@@ -81,26 +83,33 @@ class UdpSource:
         self._socket.setblocking(False)
         self.address = self._socket.getsockname()[:2]
         if not self.sensors and not self._finds:
-            self._find_sensors()
+            self._find_sensors(waiting)
 
-    def _find_sensors(self) -> None:
-        host, port = self.address
+    def _find_sensors(self, waiting: Waiting | None) -> None:
         self.sensors = tuple(self._segments)
-        deadline = time.monotonic() + self._wait_s
-        while not self._waiting and time.monotonic() < deadline:
-            self._waiting = self._receive(0.1)
-        if not self._waiting:
+        try:
+            found = wait_for(self._find_any, self._describe_wait, self._wait_s, waiting)
+        except BadSource:
             self.close()
-            dropped = "; dropped: " + ", ".join(f"{n} {problem}" for problem, n in self.problems.items())
-            raise BadSource(
-                f"udp:{host}:{port}: no samples within {self._wait_s:g} s{dropped if self.problems else ''}; "
-                f"send to this address, in a format of docs/live-sources.md"
-            )
+            raise
+        if not found:
+            self.close()
+            self.sensors = ()
+            return
         deadline = time.monotonic() + COLLECT_S
         while time.monotonic() < deadline:
             self._waiting += self._receive(0.1)
         present = {samples.sensor for samples in self._waiting}
         self.sensors = tuple(segment for segment in self._segments if segment in present)
+
+    def _find_any(self, timeout_s: float) -> bool:
+        self._waiting += self._receive(timeout_s)
+        return bool(self._waiting)
+
+    def _describe_wait(self) -> str:
+        host, port = self.address
+        dropped = "; dropped so far: " + ", ".join(f"{n} {problem}" for problem, n in self.problems.items())
+        return f"samples at UDP {host}:{port}, in a format of docs/live-sources.md{dropped if self.problems else ''}"
 
     def read(self, timeout_s: float) -> list[Samples]:
         """Samples since the last call, one `Samples` a sensor."""

@@ -1,0 +1,212 @@
+"""`DatagramSource`: what sources of measured orientations over UDP share."""
+
+from __future__ import annotations
+
+import math
+import select
+import socket
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import BadSource
+from ...recording.arrivals import Samples, pack_orientations
+from .waiting import Waiting, wait_for
+
+MAX_SIZE = 65536  # [bytes] of a datagram
+MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
+BUFFER = 1 << 20  # [bytes] that the system keeps while nobody reads
+COLLECT_S = 1.0  # [s] after the first orientation in which the other sensors may appear
+MAX_KINDS = 24  # of problems
+UNIT_ERROR = 0.05  # of a quaternion's length
+LONGEST_STEP_S = 0.02  # [s] between orientations that came together, of senders that do not tell their time
+
+
+class OrientationSample(NamedTuple):
+    """One orientation of one segment's sensor."""
+
+    segment: str
+    time: float  # [s] on our clock
+    quat: np.ndarray  # (4,) xyzw, not yet of unit length
+
+
+class DatagramSource(ABC):
+    """A UDP socket from whose datagrams `_decode` reads orientations.
+
+    Parameters
+    ----------
+    sensors : to take; None: those that send while `open` waits
+    segments : names that sensors may have
+    wait_s : [s] for which `open` waits for the first orientation where `sensors` are not given
+
+    Attributes
+    ----------
+    kind, sender : of the source, and who sends to it, for messages
+    has_clock : whether datagrams hold the sender's time; else that of their arrival is taken
+    """
+
+    kind: str
+    sender: str
+    has_clock: bool
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        sensors: Sequence[str] | None,
+        segments: Sequence[str],
+        wait_s: float = 10.0,
+    ) -> None:
+        self.sensors = tuple(sensors or ())
+        self.rate_hz: float | None = None
+        self.problems: dict[str, int] = Counter()
+        self.orientations: Mapping[str, bool] = {}
+        self.address = (host, port)
+        self._segments, self._wait_s = tuple(segments), wait_s
+        self._socket: socket.socket | None = None
+        self._waiting: list[Samples] = []
+        self._last_times: dict[str, float] = {}
+
+    @abstractmethod
+    def _decode(self, datagram: bytes, sender: Any, now: float, /) -> Iterator[OrientationSample]:
+        """Iterate over the orientations of a datagram that came at `now` [s]; what cannot be read is counted."""
+
+    @abstractmethod
+    def _is_aligned(self) -> bool:
+        """Whether the orientations are the segments' own."""
+
+    def _serve(self, now: float) -> None:  # noqa: B027 - most senders want to hear nothing
+        """Do what senders want to hear from time to time; `now` [s]."""
+
+    def open(self, waiting: Waiting | None = None) -> None:
+        """Bind; where the sensors are not given, wait for them, with `waiting` until it returns False.
+
+        Raises
+        ------
+        BadSource
+            The address cannot be bound, or without `waiting` nothing comes.
+        """
+        host, port = self.address
+        try:
+            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            self._socket = socket.socket(family, kind)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+            self._socket.bind(address)
+        except (OSError, UnicodeError) as error:
+            self.close()
+            raise BadSource(
+                f"{self.kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); "
+                f"an address of this machine and a port that nobody uses are needed"
+            ) from None
+        self._socket.setblocking(False)
+        self.address = self._socket.getsockname()[:2]
+        given = self.sensors
+        self.sensors = given or self._segments
+        if not given and self._wait(waiting):
+            deadline = time.monotonic() + COLLECT_S
+            while time.monotonic() < deadline:
+                self._waiting += self.read_new(0.1)
+            present = {samples.sensor for samples in self._waiting}
+            self.sensors = tuple(segment for segment in self._segments if segment in present)
+        elif not given:
+            self.close()
+            self.sensors = ()
+        self.orientations = dict.fromkeys(self.sensors, self._is_aligned())
+
+    def _wait(self, waiting: Waiting | None) -> bool:
+        try:
+            return wait_for(self._find_any, self._describe_wait, self._wait_s, waiting)
+        except BadSource:
+            self.close()
+            raise
+
+    def _find_any(self, timeout_s: float) -> bool:
+        self._waiting += self.read_new(timeout_s)
+        return bool(self._waiting)
+
+    def _describe_wait(self) -> str:
+        host, port = self.address
+        dropped = ", ".join(f"{count} {problem}" for problem, count in self.problems.items())
+        here = " (this machine only)" if host.startswith("127.") or host == "::1" else ""
+        return f"{self.sender} at UDP {host}:{port}{here}" + (f"; dropped so far: {dropped}" if dropped else "")
+
+    def read(self, timeout_s: float) -> list[Samples]:
+        """Samples since the last call, one `Samples` a sensor."""
+        if self._waiting:
+            waiting, self._waiting = self._waiting, []
+            return waiting
+        return self.read_new(timeout_s)
+
+    def read_new(self, timeout_s: float) -> list[Samples]:
+        """Samples in the socket, or the first that come within `timeout_s`."""
+        if self._socket is None:
+            return []
+        found: dict[str, list[OrientationSample]] = {}
+        deadline = time.monotonic() + timeout_s
+        while not found:
+            left = deadline - time.monotonic()
+            self._serve(time.monotonic())
+            ready, _, _ = select.select([self._socket], [], [], max(left, 0.0))
+            if ready:
+                self._drain(self._socket, found)
+            if left <= 0.0:
+                break
+        return [
+            Samples(segment, self._find_times(segment, own), *pack_orientations(np.array([each.quat for each in own])))
+            for segment, own in found.items()
+        ]
+
+    def _find_times(self, segment: str, samples: Sequence[OrientationSample]) -> np.ndarray:
+        """Return the times (m,) [s] of a sensor's samples; those that came together were sent one after the other."""
+        times = np.array([each.time for each in samples])
+        if self.has_clock:
+            return times
+        count, newest = len(times), float(times[-1])
+        begin = max(self._last_times.get(segment, -math.inf), newest - LONGEST_STEP_S * count)
+        self._last_times[segment] = newest
+        return begin + (newest - begin) * np.arange(1, count + 1) / count
+
+    def _drain(self, udp: socket.socket, found: dict[str, list[OrientationSample]]) -> None:
+        for _ in range(MAX_DATAGRAMS):
+            try:
+                datagram, sender = udp.recvfrom(MAX_SIZE)
+            except BlockingIOError:
+                return
+            except OSError:  # an ICMP reply to another datagram
+                self._count("errors of the socket")
+                return
+            for sample in self._decode(datagram, sender[:2], time.monotonic()):
+                size = float(np.linalg.norm(sample.quat))
+                if sample.segment not in self.sensors:
+                    self._count(f"orientations of {sample.segment}, which is not tracked")
+                elif not (math.isfinite(size) and abs(size - 1.0) < UNIT_ERROR):
+                    self._count("orientations that are none")
+                else:
+                    found.setdefault(sample.segment, []).append(sample._replace(quat=sample.quat / size))
+
+    def clock(self) -> float:
+        """Now [s], monotonic."""
+        return time.monotonic()
+
+    def close(self) -> None:
+        """Free the port."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _send(self, data: bytes, to: Any) -> None:
+        """Send a datagram; one that cannot be sent is left out."""
+        if self._socket is not None:
+            try:
+                self._socket.sendto(data, to)
+            except OSError:
+                self._count("answers that could not be sent")
+
+    def _count(self, problem: str, number: int = 1) -> None:
+        if problem not in self.problems and len(self.problems) >= MAX_KINDS:
+            problem = "other problems"
+        self.problems[problem] += number

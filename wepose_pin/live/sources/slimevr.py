@@ -1,0 +1,189 @@
+"""SlimeVR trackers over Wi-Fi, for which this is the server they look for.
+
+A tracker broadcasts a handshake until a server answers, then sends its orientation, to a world with z up whose heading
+is its own, and the places of its sensors on the body. It wants a heartbeat at least every three seconds, and
+sends no rates. Big-endian; a packet is its type (u32), a rising number (u64; 0 is always taken) and data. Source:
+SlimeVR-Tracker-ESP, protocol version 22.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .datagrams import DatagramSource, OrientationSample
+
+PORT = 6969
+HEARTBEAT_S = 0.5  # [s] from one to the next
+SILENT_S = 60.0  # [s] without a packet after which a tracker is forgotten
+MAX_TRACKERS = 64
+HEADER = struct.Struct(">IQ")
+QUAT = struct.Struct(">4f")
+BUNDLED_QUAT = struct.Struct(">4h")
+HANDSHAKE_ANSWER = (b"\x03Hey OVR =D 5").ljust(64, b"\0")
+HEARTBEAT = HEADER.pack(1, 0)
+ROTATION_1, HANDSHAKE, PING, SENSOR_INFO, ROTATION_2, ROTATION, ROTATION_ACCEL = 1, 3, 10, 15, 16, 17, 23
+BATTERY = 12
+NORMAL = 1  # kind of a rotation; 2 is a correction
+# Packets that hold nothing for us: heartbeat, acceleration, tap, error, signal and others.
+UNUSED = frozenset({0, 2, 4, 10, 11, 13, 14, 18, 19, 20, 21, 22, 26})
+# Place on the body → segment.
+SEGMENT_OF = {
+    1: "head",
+    3: "torso",
+    4: "torso",
+    5: "pelvis",
+    6: "pelvis",
+    13: "left_forearm",
+    14: "right_forearm",
+    15: "left_upper_arm",
+    16: "right_upper_arm",
+    17: "left_hand",
+    18: "right_hand",
+}
+_MAC_AT = 12 + 7 * 4  # of a handshake, after seven numbers; then comes the firmware's name
+
+
+@dataclass
+class Tracker:
+    """A tracker and the sensors on it.
+
+    Parameters
+    ----------
+    mac : six bytes as text, or empty where the tracker has not told it
+    number : of its newest packet
+    places : sensor → segment by its place on the body
+    battery : share, 0 to 1; NaN: not known
+    """
+
+    mac: str
+    seen: float  # [s]
+    number: int = 0
+    places: dict[int, str] = field(default_factory=dict)
+    battery: float = float("nan")
+
+
+class SlimeVrSource(DatagramSource):
+    """Orientations of SlimeVR trackers; other parameters and errors as `DatagramSource`.
+
+    Parameters
+    ----------
+    assigned : tracker, as ``MAC`` or ``MAC/SENSOR``, → segment; goes before the place that the tracker states
+
+    Attributes
+    ----------
+    trackers : address → tracker
+    """
+
+    kind, sender, has_clock = "slimevr", "SlimeVR trackers", False
+
+    def __init__(self, *args: Any, assigned: Mapping[str, str] | None = None, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.trackers: dict[Any, Tracker] = {}
+        self._assigned = dict(assigned or {})
+        self._heartbeat = -np.inf
+
+    @property
+    def batteries(self) -> dict[str, float]:
+        """Segment → battery of its tracker, 0 to 1, where it is known."""
+        found = {}
+        for tracker in self.trackers.values():
+            for sensor in tracker.places or {0: ""}:
+                segment = self._find_segment(tracker, sensor)
+                if segment is not None and np.isfinite(tracker.battery):
+                    found[segment] = tracker.battery
+        return found
+
+    def _is_aligned(self) -> bool:
+        return False
+
+    def _serve(self, now: float) -> None:
+        if now - self._heartbeat < HEARTBEAT_S:
+            return
+        self._heartbeat = now
+        self.trackers = {at: tracker for at, tracker in self.trackers.items() if now - tracker.seen < SILENT_S}
+        for address in self.trackers:
+            self._send(HEARTBEAT, address)
+
+    def _decode(self, datagram: bytes, sender: Any, now: float, /) -> Iterator[OrientationSample]:
+        if len(datagram) < HEADER.size or datagram[:3] != b"\0\0\0":
+            self._count("datagrams that are none of SlimeVR")
+            return
+        kind, number = HEADER.unpack_from(datagram)
+        data = datagram[HEADER.size :]
+        if kind == HANDSHAKE:
+            self._welcome(datagram, sender, now)
+            return
+        tracker = self.trackers.get(sender)
+        if tracker is None:
+            # It found a server before; without answer for three seconds it looks for one again.
+            self._count("packets of trackers that have not introduced themselves")
+            return
+        if number and number <= tracker.number:
+            self._count("SlimeVR packets that came twice or too late")
+            return
+        tracker.number, tracker.seen = max(number, tracker.number), now
+        if kind == SENSOR_INFO and len(data) >= 2:
+            self._send(struct.pack(">IBB", SENSOR_INFO, data[0], data[1]), sender)
+            if len(data) >= 7 and data[6] in SEGMENT_OF:
+                tracker.places[data[0]] = SEGMENT_OF[data[6]]
+        elif kind == PING:
+            self._send(datagram, sender)
+        elif kind == BATTERY and len(data) >= 8:
+            tracker.battery = float(np.clip(struct.unpack_from(">2f", data)[1], 0.0, 1.0))
+        elif kind in (ROTATION_1, ROTATION_2, ROTATION, ROTATION_ACCEL):
+            yield from self._read_rotation(kind, data, tracker, now)
+        elif kind not in UNUSED:
+            self._count(f"SlimeVR packets of type {kind}, which is not read")
+
+    def _welcome(self, datagram: bytes, sender: Any, now: float) -> None:
+        """Answer a handshake."""
+        if len(self.trackers) >= MAX_TRACKERS and sender not in self.trackers:
+            self._count("trackers beyond the number that can be used")
+            return
+        at = _MAC_AT
+        if len(datagram) > at:
+            at += 1 + datagram[at]  # the firmware's name
+        mac = datagram[at : at + 6] if len(datagram) >= at + 6 else b""
+        places = self.trackers[sender].places if sender in self.trackers else {}
+        self.trackers[sender] = Tracker(":".join(f"{byte:02x}" for byte in mac), now, places=places)
+        self._send(HANDSHAKE_ANSWER, sender)
+
+    def _read_rotation(self, kind: int, data: bytes, tracker: Tracker, now: float) -> Iterator[OrientationSample]:
+        sensor, at, layout = 0, 0, QUAT
+        if kind == ROTATION_2:
+            sensor = 1
+        elif kind == ROTATION:
+            at = 2
+        elif kind == ROTATION_ACCEL:
+            at, layout = 1, BUNDLED_QUAT
+        if len(data) < at + layout.size:
+            self._count("SlimeVR packets of a wrong length")
+            return
+        if at:
+            sensor = data[0]
+        if kind == ROTATION and data[1] != NORMAL:
+            return
+        quat = np.array(layout.unpack_from(data, at), dtype=float)
+        if layout is BUNDLED_QUAT:
+            quat /= 2.0**15
+        segment = self._find_segment(tracker, sensor)
+        if segment is None:
+            self._count(f"orientations of {tracker.mac or 'a tracker'}/{sensor}, whose place on the body is not known")
+            return
+        yield OrientationSample(segment, now, quat)
+
+    def _find_segment(self, tracker: Tracker, sensor: int) -> str | None:
+        stated = self._assigned.get(f"{tracker.mac}/{sensor}") or (
+            self._assigned.get(tracker.mac) if not sensor else None
+        )
+        return stated or tracker.places.get(sensor)
+
+    def _describe_wait(self) -> str:
+        known = ", ".join(tracker.mac or address[0] for address, tracker in self.trackers.items())
+        text = super()._describe_wait()
+        return f"{text}; connected: {known}" if known else text
