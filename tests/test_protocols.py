@@ -404,7 +404,7 @@ def test_clasp_measured_is_clasp_with_a_measured_length() -> None:
     person, simulation = made("clasp", 4, real=False)
     recording = simulation.recording()
     with pytest.raises(
-        BadOption, match=r"needs 1 measured length of its chain, as in --measured shoulder_width=0\.385"
+        BadOption, match=r"needs 1 measured length of its chain, as in --measured biacromial=0\.41"
     ):
         calibrate(recording, protocol="clasp_measured")
     with pytest.raises(BadOption, match="needs 1 measured length"):
