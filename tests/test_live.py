@@ -143,7 +143,8 @@ def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Record
     for i, name in enumerate(names):
         assert np.array_equal(log.quat_WL[:, i], tracked.quat_WL[name])
     assert [(round(marker.time), marker.text) for marker in log.texts] == [(12, "trial 3")]
-    assert {status.open_phases for status in watcher.statuses} == {(), ("take_1",), ("clasp",), ("take_2",)}
+    assert watcher.statuses[0].open_phases == ()
+    assert watcher.statuses[-1].open_phases == ("take_2",)
     # Without a recording the first take begins one, which is as one from the beginning.
     late = tmp_path / "late.wepose"
     setup = SensorSetup.from_recording(recording)

@@ -29,7 +29,6 @@ from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from wepose_pin.errors import BadOption
 from wepose_pin.kinematics import LiveKinematics, compute_link_placements, solve_configuration
-from wepose_pin.live import server
 from wepose_pin.live.encoder import AngleCurves, PoseEncoder, RobotFigure
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.server import status_json
@@ -361,7 +360,7 @@ def test_a_foreign_origin_gets_no_poses(page: LivePage) -> None:
 def test_who_does_not_take_gets_no_more_and_then_the_newest(
     page: LivePage, person: Person, model: BodyModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "CURVES_S", 1e9)  # no joint angles between the frames
+    monkeypatch.setattr(AngleCurves, "take", lambda _: None)  # no joint angles between the frames
     page.start(person.info)
 
     async def slow(connection: WebSocketClientConnection) -> None:

@@ -185,8 +185,9 @@ def read_live_log(path: Path) -> LiveRecording:
         raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
     header["sensors"] = _assign_segments(path, header["sensors"], markers.segments)
     ends = synchronizer.begin, synchronizer.begin + (synchronizer.next_tick - 1) / synchronizer.rate_hz
-    header["phases"] = {**header["phases"], **markers.phases(*ends)}
-    if start is None and "start" not in header["phases"]:
+    marked = markers.phases(*ends)
+    header["phases"] = {**header["phases"], **marked}
+    if start is None and "start" not in marked:  # that of a header was still to come
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     recording = check_recording(build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets)))
     if broken_off:
