@@ -35,8 +35,8 @@ class LiveJob:
         Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME, mti:DEVICE=SEGMENT,..., ximu3:DEVICE=SEGMENT,...,
         slimevr:[HOST] or mvn:[HOST] (docs/live-sources.md). Without HOST only this machine can send.
     guide
-        Lead through the calibration first: which sensor sits where, the start pose, the motion, its quality (docs/
-        live-guide.md). Needs no subject and no session.
+        Lead through the calibration first: which sensor sits where, the start pose, the motion, its quality
+        (docs/live-guide.md). Needs no subject and no session.
     out : DIR
         With --guide: write subject, recordings and the sensors' setup to this folder. Without it to a new folder
         named by the date.
