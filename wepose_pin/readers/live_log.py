@@ -185,9 +185,8 @@ def read_live_log(path: Path) -> LiveRecording:
         raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
     header["sensors"] = _assign_segments(path, header["sensors"], markers.segments)
     ends = synchronizer.begin, synchronizer.begin + (synchronizer.next_tick - 1) / synchronizer.rate_hz
-    marked = markers.phases(*ends)
-    header["phases"] = {**header["phases"], **marked}
-    if start is None and "start" not in marked:  # that of a header was still to come
+    header["phases"] = {**header["phases"], **markers.phases(*ends)}
+    if start is None and not any(end <= ends[1] for _, end in header["phases"].get("start", ())):
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     recording = check_recording(build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets)))
     if broken_off:
@@ -358,9 +357,9 @@ def _arrivals(path: Path, payload: bytes, sensors: int) -> Arrivals:
 
 
 def _cut_spans(phase: str, spans: Sequence[Sequence[float]], time: np.ndarray) -> Intervals:
-    """The intervals [s] of a phase within the times (n,) [s]; one that goes on ends there, a static one is left out."""
+    """The intervals [s] of a phase within the times (n,) [s]; one that goes on ends there, if it need not be whole."""
     inside = [(float(a), float(b)) for a, b in spans if time[0] <= a < time[-1]]
-    if phase == "static":
+    if phase in ("start", "static"):
         return tuple((a, b) for a, b in inside if b <= time[-1])
     return tuple((a, min(b, float(time[-1]))) for a, b in inside)
 
