@@ -13,7 +13,7 @@ from unittest import mock
 from . import seeds
 from .target import file
 
-REPRODUCED = ("track", "calibrate", "simulate", "retarget", "demo", "export")
+REPRODUCED = ("track", "calibrate", "simulate", "retarget", "demo", "export", "angles")
 
 
 def plan(folder: Path, data: bytes) -> object:

@@ -12,7 +12,7 @@ from collections import deque
 from pathlib import Path
 from queue import SimpleQueue
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 from unittest import mock
 
 import numpy as np
@@ -165,13 +165,14 @@ class _Wild:
 
     sensors = TORSO_HEAD
     rate_hz: float | None = 100.0
+    orientations: ClassVar[dict[str, bool]] = {}
 
     def __init__(self, data: bytes) -> None:
         self.problems: dict[str, int] = {}
         self._rows = np.frombuffer(data[: len(data) // SAMPLE.itemsize * SAMPLE.itemsize], SAMPLE)
         self._at = 0
 
-    def open(self) -> None: ...
+    def open(self, waiting: object = None) -> None: ...
 
     def close(self) -> None: ...
 

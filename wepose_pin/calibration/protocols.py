@@ -315,6 +315,8 @@ def _closure(entry: dict[str, Any], place: str) -> Closure:
         more["origin"] = str(entry.get("origin", ""))
         if more["origin"] in points:
             raise BadOption(f"{place}: origin = {more['origin']!r} is the point itself; another one is needed")
+    if kind == "fixed_point" and more["origin"] and not more["on"]:
+        raise BadOption(f"{place}: 'origin' of a fixed_point needs on, the segment whose point it is; add it")
     if kind == "fixed_point" and "at" in entry:
         at = entry["at"]
         if not isinstance(at, list) or len(at) != 3 or not all(is_number(v, 100.0) for v in at):

@@ -339,7 +339,8 @@ class SessionReader:
                 time = read_columns(table, [name], str(path), place)[:, 0] if name is not None else np.empty(0)
                 height = table.height
             time = np.arange(height) / rate_hz if rate_hz is not None else unit * time
-            self._clocks[key] = clock = build_clock(time + offset, str(path))
+            source = str(path) if rate_hz is None else own.at("rate_hz")
+            self._clocks[key] = clock = build_clock(time + offset, source)
             lost = find_runs(mark_lost_samples(clock, clock.row >= 0) == LONG)
             if lost and not self.gaps:
                 before, after = lost[0][0] - 1, lost[0][1]
