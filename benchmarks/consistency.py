@@ -105,9 +105,8 @@ def _face_forward(simulation: Simulation) -> tuple[np.ndarray, Rotation]:
 
 
 def _compare_pose(tracked: TrackedRecording, simulation: Simulation) -> dict[str, Any]:
-    _, turn = _face_forward(simulation)
-    quat_WL = {name: (turn * Rotation.from_quat(quat)).as_quat() for name, quat in simulation.quat_WL.items()}
-    true_points = {name: turn.apply(p) for name, p in simulation.points.items()}
+    truth = simulation.truth_facing_torso()
+    quat_WL, true_points = truth.quat_WL, truth.points
     begin, end = simulation.phases["tasks" if "tasks" in simulation.phases else "circles"][0]
     rows = np.flatnonzero((tracked.time >= begin) & (tracked.time <= end))[::10]
     segments, points, out = [], {}, {}

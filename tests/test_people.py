@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
@@ -14,7 +15,9 @@ from simulated import SUBJECT, G, check_accel, check_gyro, check_lengths, in_tor
 from wepose_pin.cli import main
 from wepose_pin.errors import BadOption
 from wepose_pin.jobs.simulate import SimulateJob
+from wepose_pin.kinematics import parse_pose_table
 from wepose_pin.readers import load_session
+from wepose_pin.rotations import heading
 from wepose_pin.simulation import (
     IDEAL_PRESET,
     MEASURED_STD,
@@ -704,6 +707,11 @@ def test_the_command_has_people(tmp_path: Path, capsys: pytest.CaptureFixture[st
     person = simulate_person(4, PEOPLE_MEASURED_STD)
     assert f"(measured: biacromial={person.measured['shoulder_width'] / 0.83:.4f}, stature" in capsys.readouterr().out
     session = load_session(out)
+    assert session.truth is not None
+    truth = parse_pose_table(pl.read_parquet(session.truth), "truth")
+    held = (truth.time > session.phases["start"][0][0]) & (truth.time < session.phases["start"][0][1])
+    faced = Rotation.from_quat(truth.quat_WL["torso"][held]).mean()
+    assert abs(float(heading(faced.as_quat()))) < np.deg2rad(0.1)  # W's x is where the torso faces
     (clasp,) = session.phases["clasp"]
     assert clasp[1] - clasp[0] == pytest.approx(4.8)
     run("simulate", "-o", tmp_path / "tasks", "--activity", "tasks", "--rate-hz", 20, "--seconds", 6)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
 from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
-from ..model import BodyModel, Segment
+from ..model import BodyModel, Segment, list_breadths
 from ..model.start_pose import compute_start_configuration, orient_links
 from ..recording import Intervals, Recording
 from ..subject import Subject
@@ -112,10 +112,14 @@ class CalibrationProblem:
 
     @property
     def measured_example(self) -> str:
-        """The length that fixes the scale best, as ``name=metres``: the protocol's, else the longest in a closure."""
-        names = self.lengths_in_closures
-        if self.protocol.measured_example or not names:
-            return self.protocol.measured_example
+        """What would fix the scale best, as ``name=metres``: the protocol's, else the longest length in a closure that
+        was not measured.
+        """
+        example = self.protocol.measured_example
+        breadth = list_breadths(self.model.table).get(example.partition("=")[0])
+        names = [name for name in self.lengths_in_closures if name not in self.measured]
+        if (example and not (breadth and breadth.length in self.measured)) or not names:
+            return example
         longest = max(names, key=lambda name: self.model.lengths[name])
         return f"{longest}={self.model.lengths[longest]:.3f}"
 

@@ -177,7 +177,9 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
                 protocol=job.protocol or (PROTOCOL if seconds >= LEAST_S else SHORT_PROTOCOL),
                 circles=0 if job.protocol == "poses" else CIRCLES,
             )
-        write_session(folder, simulation.recording(f"simulated-{job.seed}"), simulation.truth())
+        turned = job.imperfections().start_heading_deg > 0.0  # tracking's W faces where the torso does
+        truth = simulation.truth_facing_torso() if turned else simulation.truth()
+        write_session(folder, simulation.recording(f"simulated-{job.seed}"), truth)
         order = (*simulation.lengths, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
         true = replace(
             person.prior,

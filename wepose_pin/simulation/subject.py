@@ -18,6 +18,7 @@ from ..model.girdle import PARAMETERS
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, mark_lost_samples
+from ..rotations import heading
 from ..subject import Subject, check_lengths, population_subject
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
@@ -148,6 +149,18 @@ class Simulation:
     def truth(self) -> Pose:
         """Return the exact pose."""
         return Pose(self.time, self.quat_WL, self.points)
+
+    def truth_facing_torso(self) -> Pose:
+        """Return the exact pose in the W of tracking, whose x is where the torso faces in the first start phase."""
+        begin, end = self.phases["start"][0]
+        start = (self.time >= begin) & (self.time <= end)
+        facing = float(heading(Rotation.from_quat(self.quat_WL["torso"][start]).mean().as_quat()))
+        turn = Rotation.from_rotvec([0.0, 0.0, -facing])
+        return Pose(
+            self.time,
+            {name: (turn * Rotation.from_quat(quat)).as_quat() for name, quat in self.quat_WL.items()},
+            {name: turn.apply(place) for name, place in self.points.items()},
+        )
 
 
 class _Moved(NamedTuple):
