@@ -13,8 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .figure import SEGMENTS, Figure, complete_figure
-from .outputs import RateLimiter, UdpSender
-from .state import LivePose, Output, StreamInfo
+from .outputs import DatagramOutput
+from .state import LivePose, StreamInfo
 
 PORT = 39539  # on which renderers listen
 RATE_HZ = 60.0  # of screens
@@ -47,34 +47,16 @@ _ABOVE = np.array([SEGMENTS.index(BONES[above or "Hips"][0]) for _, above in BON
 _IMMEDIATELY = b"#bundle\0" + struct.pack(">Q", 1)
 
 
-class VmcOutput(Output):
-    """Sends each pose as bundles of OSC messages.
+class VmcOutput(DatagramOutput):
+    """Sends each pose as bundles of OSC messages."""
 
-    Parameters
-    ----------
-    to : ``PORT`` of this machine, or ``HOST:PORT``
-    rate_hz : poses a second at most; None: every pose
-
-    Raises
-    ------
-    BadOption
-        No such host, port or rate.
-    """
+    option, port = "--vmc", PORT
 
     def __init__(self, to: str, rate_hz: float | None = RATE_HZ) -> None:
-        self._limiter, self._sender = RateLimiter(rate_hz), UdpSender(to, "--vmc", PORT)
-        self._info: StreamInfo | None = None
+        super().__init__(to, rate_hz)
 
-    def start(self, info: StreamInfo) -> None:
-        self._info = info
-
-    def show(self, pose: LivePose) -> None:
-        if self._info is not None and self._limiter.accepts(pose.time):
-            for bundle in encode_bundles(complete_figure(self._info, pose), pose.time):
-                self._sender.send(bundle)
-
-    def close(self) -> None:
-        self._sender.close()
+    def encode(self, info: StreamInfo, pose: LivePose) -> list[bytes]:
+        return encode_bundles(complete_figure(info, pose), pose.time)
 
 
 def encode_bundles(figure: Figure, time_s: float) -> list[bytes]:
