@@ -120,8 +120,8 @@ def register(
             _interpolate(pose.time, pose.points[name], time) - _interpolate(truth.time, points[name], time)
             for name in common.points
         ]
-        seen = np.isfinite(off).all(axis=(0, 2))
-        shift = np.median(np.mean(off, axis=0)[seen], axis=0) if seen.any() else shift
+        known = np.isfinite(off).all(axis=(0, 2))
+        shift = np.median(np.mean(off, axis=0)[known], axis=0) if known.any() else shift
     x, y, z = shift.tolist()
     registration = Registration(
         offset_s, correlation, axis, heading, (x, y, z), (first, float(fit_end)), (float(fit_end), last), turned
@@ -252,8 +252,8 @@ def _find_world(
             np.stack([_interpolate(each.time, each.points[name], time) for name in common.points])
             for each in (pose, truth)
         )
-        seen = np.isfinite(ours_p).all(axis=(0, 2)) & np.isfinite(theirs_p).all(axis=(0, 2))
-        about = [p[:, seen] - p[:, seen].mean(axis=0) for p in (ours_p, theirs_p)]
+        known = np.isfinite(ours_p).all(axis=(0, 2)) & np.isfinite(theirs_p).all(axis=(0, 2))
+        about = [p[:, known] - p[:, known].mean(axis=0) for p in (ours_p, theirs_p)]
         cross = np.einsum("pni,pnj->ij", *about)
     left, sizes, right = np.linalg.svd(cross)
     if sizes[1] < 1e-6 * max(sizes[0], 1e-300):

@@ -92,7 +92,7 @@ class Guide:
         self.accepted: Calibrated | None = None
         self.steps = make_steps(self)
         self._index = 0
-        self._held: list[Sequence[Samples]] = []  # that came while an attempt is evaluated
+        self._postponed: list[Sequence[Samples]] = []  # that came while an attempt is evaluated
         self.step.enter()
 
     @property
@@ -117,15 +117,15 @@ class Guide:
             if len(chunk.time):
                 self.newest_times[chunk.sensor] = float(chunk.time[-1])
         self.step.push_samples(samples)
-        self._held.append(samples)
+        self._postponed.append(samples)
         if self.attempt is not None and self.step.records:
-            held, self._held = self._held, []
-            for each in held:
+            postponed, self._postponed = self._postponed, []
+            for each in postponed:
                 for ticks in self.attempt.push(each):
                     self.step.push_ticks(ticks)
             self.attempt.log.due()
         elif self.attempt is None:
-            self._held.clear()
+            self._postponed.clear()
         self.step.update()
 
     def act(self, action: str) -> None:

@@ -61,7 +61,7 @@ class Tracker:
     """
 
     mac: str
-    seen: float  # [s]
+    newest_time: float  # [s] at which it last sent
     number: int = 0
     places: dict[int, str] = field(default_factory=dict)
     battery: float = float("nan")
@@ -105,7 +105,7 @@ class SlimeVrSource(DatagramSource):
         if now - self._heartbeat < HEARTBEAT_S:
             return
         self._heartbeat = now
-        self.trackers = {at: tracker for at, tracker in self.trackers.items() if now - tracker.seen < SILENT_S}
+        self.trackers = {at: tracker for at, tracker in self.trackers.items() if now - tracker.newest_time < SILENT_S}
         for address in self.trackers:
             self._send(HEARTBEAT, address)
 
@@ -126,7 +126,7 @@ class SlimeVrSource(DatagramSource):
         if number and number <= tracker.number:
             self._count("SlimeVR packets that came twice or too late")
             return
-        tracker.number, tracker.seen = max(number, tracker.number), now
+        tracker.number, tracker.newest_time = max(number, tracker.number), now
         if kind == SENSOR_INFO and len(data) >= 2:
             self._send(struct.pack(">IBB", SENSOR_INFO, data[0], data[1]), sender)
             if len(data) >= 7 and data[6] in SEGMENT_OF:
