@@ -14,7 +14,7 @@ from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.tracking import TrackedRecording, track
-from wepose_pin.tracking.heading_filter import HingeAxis, linearize_range
+from wepose_pin.tracking.heading_filter import HingeAxis, linearize_hinge
 from wepose_pin.tracking.joint_accelerations import JointAccelerationFilter, JointPair, _sum_products, find_pairs
 
 LIMB = ("torso", "right_upper_arm", "right_forearm")
@@ -167,8 +167,8 @@ def test_a_hinge_is_brought_back_into_its_range() -> None:
 
     def excess(flexion_deg: float, turned: float = 0.0) -> tuple[float, float]:
         below = Rotation.from_rotvec([0.0, 0.0, turned]) * above * Rotation.from_rotvec(-np.deg2rad(flexion_deg) * n)
-        beyond, slope = linearize_range(*(Rotation.concatenate([R]) for R in (above, below)), hinge)
-        return float(beyond[0]), float(slope[0])
+        rows = linearize_hinge(above.as_matrix()[None], below.as_matrix()[None], hinge)
+        return float(rows.excess[0]), float(rows.slope[0])
 
     for flexion in (0.0, 60.0, 140.0):
         assert excess(flexion)[0] == 0.0

@@ -333,7 +333,7 @@ def solve_configuration(
 
 def _write_girdles(model: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> None:
     """Write the joints of the girdles into `q` (n, nq): they follow the limbs."""
-    R_WL = {name: Rotation.from_quat(quat_WL[name]) for name in _girdle_segments(model) if name in quat_WL}
+    R_WL = {name: Rotation.from_quat(quat_WL[name]).as_matrix() for name in _girdle_segments(model) if name in quat_WL}
     for name, motion in move_girdles(model, R_WL).items():
         for joint, values in zip(model.table.girdles[name].joints, motion.displacement.T, strict=True):
             q[:, model.pin.idx_qs[model.pin.getJointId(joint)]] = values
@@ -612,7 +612,7 @@ def compute_point_covariances(
         return _propagate_through_joints(model, q, segment_cov, shape_cov, points)
     lengths = np.array(list(model.lengths.values()))
     girdles = list(model.table.girdles)
-    known = {name: Rotation.from_quat(quat_WL[name]) for name in _girdle_segments(model) if name in quat_WL}
+    known = {name: Rotation.from_quat(quat_WL[name]).as_matrix() for name in _girdle_segments(model) if name in quat_WL}
     motions = move_girdles(model, known)
     R_WK: dict[str, np.ndarray] = {}
     carriers = {link: find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
@@ -644,8 +644,8 @@ def compute_point_covariances(
                 motions[name],
                 len(lengths) + len(PARAMETERS) * girdles.index(name),
             )
-            R_on = known[girdle.on].as_matrix()
-            vectors[girdle.on] = vectors.get(girdle.on, 0.0) + known[girdle.on].apply(motion.displacement)
+            R_on = known[girdle.on]
+            vectors[girdle.on] = vectors.get(girdle.on, 0.0) + np.einsum("nij,nj->ni", R_on, motion.displacement)
             shape_jacobian[:, :, first : first + len(PARAMETERS)] += R_on @ motion.jacobian
             residual += (R_on * motion.residual_covariance(girdle)[:, None, :]) @ R_on.swapaxes(1, 2)
         cov = shape_jacobian @ shape_cov @ shape_jacobian.swapaxes(1, 2) + residual

@@ -18,7 +18,6 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 if TYPE_CHECKING:
     from .body import BodyModel
@@ -128,13 +127,13 @@ class GirdleMotion(NamedTuple):
 
 
 def move_girdles(
-    model: BodyModel, R_WL: Mapping[str, Rotation], names: Iterable[str] | None = None
+    model: BodyModel, R_WL: Mapping[str, np.ndarray], names: Iterable[str] | None = None
 ) -> dict[str, GirdleMotion]:
     """Girdle → its motion, of those that hang on a measured segment.
 
     Parameters
     ----------
-    R_WL : segment → n orientations
+    R_WL : segment → orientations (n, 3, 3)
     names : of girdles; None: all of the body
     """
     motions = {}
@@ -148,10 +147,11 @@ def move_girdles(
             raised = np.full(n, MEAN_RAISED)
             motions[name] = GirdleMotion(np.tile(parameters[1:4], (n, 1)), np.zeros((n, 3)), raised, False)
             continue
-        # Sums of columns: `Rotation.apply` has other last bits for one orientation than for many.
-        columns = (R_WL[girdle.on].inv() * R_WL[girdle.moves]).as_matrix().transpose(2, 1, 0)
+        # Sums of columns: a product of matrices may have other last bits for one orientation than for many.
         x, y, z = model.table.segments[girdle.moves].along
-        along = x * columns[0] + y * columns[1] + z * columns[2]
+        columns = R_WL[girdle.moves].transpose(2, 1, 0)
+        along_W = x * columns[0] + y * columns[1] + z * columns[2]
+        along = sum(rows * part for rows, part in zip(R_WL[girdle.on].transpose(1, 2, 0), along_W, strict=True))
         law, s = displace(girdle, along, find_girdle_scale(girdle, model.lengths), np)
         by_law = np.column_stack(law)
         displacement = (1.0 + parameters[0]) * by_law + parameters[1:4] + s[:, None] * parameters[4:]

@@ -17,24 +17,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..alignment import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
 from ..calibration.conditions import Part, StartPose
-from ..model import BodyModel, move_girdles
+from ..compilation import kernel
+from ..model import BodyModel, GirdleMotion, move_girdles
 from ..model.girdle import PARAMETERS
 from ..subject import Subject
 from .joint_accelerations import JointPair, JointSums
 
-E_Z = np.array([0.0, 0.0, 1.0])
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
 LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance within so long [s], above which it leaps
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
+_DIFFERENCE = np.array([[1.0, -1.0], [-1.0, 1.0]])
+# Of the angle and the levers of a joint by their columns.
+_BY_ANGLE_AND_LEVERS = np.zeros((7, 9))
+_BY_ANGLE_AND_LEVERS[0, :3], _BY_ANGLE_AND_LEVERS[1:, 3:] = (1.0, -1.0, 1.0), np.eye(6)
 ITERATIONS = 2  # linearizations of an update
 
 
@@ -132,31 +136,48 @@ class HingeAxis(NamedTuple):
 
 
 class Way(NamedTuple):
-    """The way from the root to a point, or from one point to another."""
+    """Vectors that turn with segments; their sum is the way from the root to a point, or from one point to another.
 
-    parts: tuple[Part, ...]  # in frames that equal W at zero
-    girdles: tuple[tuple[str, float], ...]  # that move its ends, each with its sign
-    neutral: StartPose
+    Parameters
+    ----------
+    segments : (p,) index of each vector's segment
+    vectors : (p, 3) [m] in the frames L of their segments
+    by_length : (p, 3, lengths) their derivatives by the lengths of the model
+    girdles : that move the ends: name, sign, index of the vector on whose segment the girdle is
+    """
 
-    def rotations(self, R: Mapping[str, Rotation]) -> list[Rotation]:
-        """The orientation of each part."""
-        neutral = [self.neutral.R_WK[part.sensor] for part in self.parts]
-        return [
-            R[part.sensor] if np.array_equal(R_0, np.eye(3)) else R[part.sensor] * Rotation.from_matrix(R_0).inv()
-            for part, R_0 in zip(self.parts, neutral, strict=True)
-        ]
+    segments: np.ndarray
+    vectors: np.ndarray
+    by_length: np.ndarray
+    girdles: tuple[tuple[str, float, int], ...]
 
-    def vectors(self, R: Mapping[str, Rotation], model: BodyModel) -> np.ndarray:
-        """The vectors (k, n, 3) [m] in W of the parts; their sum is the way."""
+    @classmethod
+    def of(
+        cls,
+        model: BodyModel,
+        names: Sequence[str],
+        parts: Sequence[Part],
+        neutral: StartPose,
+        girdles: Sequence[tuple[str, float]],
+    ) -> Way:
+        """Return the way of `parts`, which are in frames that equal W in `neutral`; `names` are the segments."""
+        parts = [part for part in parts if part.sensor in names]  # what does not turn is left out
         lengths = np.array(list(model.lengths.values()))
-        turned = zip(self.rotations(R), self.parts, strict=True)
-        vectors = np.array([rotation.apply(part.vector(lengths)) for rotation, part in turned])
-        sensors = [part.sensor for part in self.parts]
-        motions = move_girdles(model, R, [name for name, _ in self.girdles])
-        for name, sign in self.girdles:
-            on = model.table.girdles[name].on
-            vectors[sensors.index(on)] += sign * R[on].apply(motions[name].displacement)
-        return vectors
+        R_LK = [neutral.R_WK[part.sensor].T for part in parts]
+        carriers = [part.sensor for part in parts]
+        return cls(
+            np.array([names.index(carrier) for carrier in carriers], dtype=int),
+            np.array([R @ part.vector(lengths) for R, part in zip(R_LK, parts, strict=True)]).reshape(-1, 3),
+            np.array([R @ np.array(part.by_length) for R, part in zip(R_LK, parts, strict=True)]),
+            tuple((name, sign, carriers.index(model.table.girdles[name].on)) for name, sign in girdles),
+        )
+
+    def turn(self, R_WL: np.ndarray, motions: Mapping[str, GirdleMotion]) -> np.ndarray:
+        """Return the vectors (p, n, 3) [m] in W, for orientations (k, n, 3, 3) and the motions of the girdles."""
+        turned = np.asarray((R_WL[self.segments] @ self.vectors[:, None, :, None])[..., 0])
+        for name, sign, i in self.girdles:
+            turned[i] += sign * (R_WL[self.segments[i]] @ motions[name].displacement[:, :, None])[..., 0]
+        return turned
 
 
 class Closure(NamedTuple):
@@ -224,6 +245,11 @@ class HeadingProblem:
     levers_at: np.ndarray | None = None
     causal: bool = False
 
+    @cached_property
+    def shape_cov(self) -> np.ndarray:
+        """The covariance of the lengths and of the girdles' parameters, as `Subject.shape_covariance`."""
+        return self.subject.shape_covariance(self.model.table)
+
     @property
     def size(self) -> int:
         levers = 0 if self.levers_at is not None else 6 * len(self.pairs)
@@ -255,6 +281,29 @@ class HeadingProblem:
             "tilt": 2 * k + j + 2 * h,
         }
         return first[part] + index
+
+    @cached_property
+    def hinge_columns(self) -> list[np.ndarray]:
+        """The columns of each hinge, in the order of `HingeRows.H`."""
+        return [
+            np.array([hinge.moves, hinge.on, *(self.column(part, i) for part in ("axis", "twist", "tilt"))])
+            for i, hinge in enumerate(self.hinges)
+        ]
+
+    @cached_property
+    def pair_columns(self) -> list[np.ndarray]:
+        """The columns of each joint: headings of the near and the far segment, the joint, its levers."""
+        return [
+            np.array(
+                [
+                    self.names.index(pair.near),
+                    self.names.index(pair.far),
+                    self.column("joint", i),
+                    *range(self.size)[self.lever_columns(i)],
+                ]
+            )
+            for i, pair in enumerate(self.pairs)
+        ]
 
     def lever_columns(self, pair: int) -> slice:
         first = self.kept + 6 * pair
@@ -408,25 +457,18 @@ class HeadingFilter:
     ) -> None:
         problem = self.problem
         rate = problem.samples_per_knot / problem.knot_s
-        names = problem.names
-        for i, (pair, sums) in enumerate(zip(problem.pairs, knot.joints, strict=True)):
+        for i, sums in enumerate(knot.joints):
             if sums is None or not sums.samples:
                 continue
-            near, far, joint = names.index(pair.near), names.index(pair.far), problem.column("joint", i)
+            near, far, joint = problem.pair_columns[i][:3]
             levers = problem.levers_at[i] if problem.levers_at is not None else x[problem.lever_columns(i)]
             JJ, Je, cost = sums.linearize(x[near] - x[far] + x[joint], levers)
             misfit = max(cost / (3.0 * sums.samples), self._misfit[i], problem.noise.acceleration_std**2)
             weight = 1.0 / (misfit * max(1.0, problem.noise.acceleration_correlation_s * rate))
-            columns = np.array([near, far, joint])
-            signs = np.array([1.0, -1.0, 1.0])
-            if problem.levers_at is None:
-                at = np.arange(problem.size)[problem.lever_columns(i)]
-                columns = np.concatenate([columns, at])
-                G = np.zeros((7, 9))
-                G[0, :3], G[1:, 3:] = signs, np.eye(6)
-            else:
-                G, JJ, Je = signs[None], JJ[:1, :1], Je[:1]
-            information[np.ix_(columns, columns)] += weight * G.T @ JJ @ G
+            columns, G = problem.pair_columns[i], _BY_ANGLE_AND_LEVERS
+            if problem.levers_at is not None:
+                columns, G, JJ, Je = columns[:3], G[:1, :3], JJ[:1, :1], Je[:1]
+            information[columns[:, None], columns] += weight * G.T @ JJ @ G
             vector[columns] += weight * G.T @ Je
             if last:
                 share = 1.0 - np.exp(-problem.knot_s / 20.0)
@@ -437,78 +479,113 @@ class HeadingFilter:
         problem = self.problem
         k, noise = len(problem.names), problem.noise
         rate = problem.samples_per_knot / problem.knot_s
-        R = self.correct(knot, x)
+        R = correct_headings(knot.quat_WL, x)
         # While a sensor is lost, and while its tilt comes back, its segment is where nobody knows.
         unsure = self._find_unsure(knot)
         for i, hinge in enumerate(problem.hinges):
             if unsure[hinge.on] or unsure[hinge.moves]:
                 continue
             yield
-            self._add_range(R, hinge, information, vector)
-            columns = [hinge.moves, hinge.on] + [problem.column(part, i) for part in ("axis", "twist", "tilt")]
-            r, H = linearize_hinge(R[hinge.on], R[hinge.moves], hinge)
+            columns, samples = problem.hinge_columns[i], max(1.0, noise.hinge_correlation_s * rate)
+            r, H, excess, slope = linearize_hinge(R[hinge.on], R[hinge.moves], hinge)
             r = r + H[:, 2:] @ x[columns[2:]]
-            inlier = np.abs(r) < OUTLIER_STDS * hinge.std + HINGE_HEADING_MARGIN
-            weight = inlier / (hinge.std**2 * max(1.0, noise.hinge_correlation_s * rate))
-            information[np.ix_(columns, columns)] += H.T @ (weight[:, None] * H)
+            weight = (np.abs(r) < OUTLIER_STDS * hinge.std + HINGE_HEADING_MARGIN) / (hinge.std**2 * samples)
+            information[columns[:, None], columns] += H.T @ (weight[:, None] * H)
             vector[columns] += H.T @ (weight * r)
-        named = dict(zip(problem.names, R, strict=True))
+            beyond = slope / (noise.range_std**2 * samples) * (excess != 0.0)
+            information[columns[:2, None], columns[:2]] += beyond @ slope * _DIFFERENCE
+            vector[columns[:2]] += beyond @ excess * _DIFFERENCE[0]
         for closure in problem.closures:
             closed = closure.holds(knot.time)
-            used = [problem.names.index(part.sensor) for part in closure.gap.parts if part.sensor in problem.names]
-            if closed.any() and not unsure[used].any():
+            if closed.any() and not unsure[closure.gap.segments].any():
                 yield
-                rows = build_gap_rows(named, problem.model, problem.subject, closure, closed)
+                rows = build_gap_rows(R, problem, closure, closed)
                 weight = rows.weight / self._find_correlation(closure.points, knot)
                 information[:k, :k] += rows.H.T @ (weight[:, None] * rows.H)
                 vector[:k] += rows.H.T @ (weight * rows.r)
 
-    def _add_range(self, R: Sequence[Rotation], hinge: HingeAxis, information: np.ndarray, vector: np.ndarray) -> None:
-        """Add the samples at which a hinge is bent beyond its range."""
-        noise = self.problem.noise
-        excess, slope = linearize_range(R[hinge.on], R[hinge.moves], hinge)
-        rate = self.problem.samples_per_knot / self.problem.knot_s
-        weight = (excess != 0.0) / (noise.range_std**2 * max(1.0, noise.hinge_correlation_s * rate))
-        columns, H = [hinge.moves, hinge.on], np.stack([slope, -slope], axis=1)
-        information[np.ix_(columns, columns)] += H.T @ (weight[:, None] * H)
-        vector[columns] += H.T @ (weight * excess)
 
-    def correct(self, knot: Knot, x: np.ndarray) -> list[Rotation]:
-        """Return the corrected orientations of the samples, segment by segment."""
-        return [
-            Rotation.from_rotvec(x[i] * E_Z) * Rotation.from_quat(knot.quat_WL[:, i])
-            for i in range(len(self.problem.names))
-        ]
+def correct_headings(quat_WL: np.ndarray, headings: np.ndarray) -> np.ndarray:
+    """Return Rz(δ) R_WL (k, n, 3, 3) for orientations (n, k, 4) xyzw and headings δ (k,) or more [rad]."""
+    R = np.empty((quat_WL.shape[1], len(quat_WL), 3, 3))
+    _turn_about_vertical(quat_WL, headings, R)
+    return R
 
 
-def linearize_hinge(R_on: Rotation, R_moves: Rotation, hinge: HingeAxis) -> tuple[np.ndarray, np.ndarray]:
-    """Angle (n,) [rad] out of the hinge's plane, and its slope (n, 5).
+@kernel
+def _turn_about_vertical(quat_WL, headings, R):  # type: ignore[no-untyped-def]
+    for k in range(len(R)):
+        s, c = np.sin(headings[k]), np.cos(headings[k])
+        for n in range(len(quat_WL)):
+            x, y, z, w = quat_WL[n, k, 0], quat_WL[n, k, 1], quat_WL[n, k, 2], quat_WL[n, k, 3]
+            xx, xy, xz = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
+            yx, yy, yz = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
+            R[k, n, 0, 0], R[k, n, 0, 1], R[k, n, 0, 2] = c * xx - s * yx, c * xy - s * yy, c * xz - s * yz
+            R[k, n, 1, 0], R[k, n, 1, 1], R[k, n, 1, 2] = s * xx + c * yx, s * xy + c * yy, s * xz + c * yz
+            R[k, n, 2, 0], R[k, n, 2, 1] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w)
+            R[k, n, 2, 2] = 1.0 - 2.0 * (x * x + y * y)
 
-    By the headings of `moves` and `on`, the axis about the long axis of `on`, tissue there, and the axis across.
+
+def _cross_vertical(v: np.ndarray) -> np.ndarray:
+    """Return ``[0, 0, 1] × v`` of vectors (..., 3): how they change as they turn about the vertical."""
+    turned = np.zeros(v.shape)
+    turned[..., 0], turned[..., 1] = -v[..., 1], v[..., 0]
+    return turned
+
+
+class HingeRows(NamedTuple):
+    """What n samples of two orientations tell of a hinge.
+
+    Parameters
+    ----------
+    r : (n,) [rad] out of the hinge's plane
+    H : (n, 5) its slope by the headings of `moves` and `on`, the axis about the long axis of `on`, tissue there, and
+        the axis across
+    excess : (n,) [rad] beyond the hinge's range, signed
+    slope : (n,) of that by the heading of `moves`; by the heading of `on` it is the negative
     """
-    n, a = hinge.axis, hinge.on_along
-    along_W = R_moves.apply(hinge.along)
-    v = R_on.inv().apply(along_W)
-    by_heading = R_on.inv().apply(np.cross(E_Z, along_W)) @ n
-    by_twist = -np.cross(a, v) @ n
-    by_tilt = -np.cross(np.cross(a, n), v) @ n
-    return v @ n, np.stack([by_heading, -by_heading, by_twist, by_twist, by_tilt], axis=1)
+
+    r: np.ndarray
+    H: np.ndarray
+    excess: np.ndarray
+    slope: np.ndarray
 
 
-def linearize_range(R_on: Rotation, R_moves: Rotation, hinge: HingeAxis) -> tuple[np.ndarray, np.ndarray]:
-    """Angle (n,) [rad] beyond a hinge's range, signed, and its slope (n,) by the heading of `moves`."""
-    n, a = hinge.axis, hinge.on_along
-    along_W = R_moves.apply(hinge.along)
-    v, dv = R_on.inv().apply(along_W), R_on.inv().apply(np.cross(E_Z, along_W))
-    b = np.cross(n, a)
-    sine, cosine = v @ b, v @ a
-    angle = np.arctan2(sine, cosine)
-    low, high = hinge.range
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    off = np.angle(np.exp(1j * (angle - middle)))
-    excess = np.sign(off) * np.maximum(np.abs(off) - half, 0.0)
-    slope = ((dv @ b) * cosine - (dv @ a) * sine) / np.maximum(sine**2 + cosine**2, 0.1)
-    return excess, slope
+def linearize_hinge(R_on: np.ndarray, R_moves: np.ndarray, hinge: HingeAxis) -> HingeRows:
+    """Linearize a hinge of orientations (n, 3, 3)."""
+    n = len(R_on)
+    rows = HingeRows(np.empty(n), np.empty((n, 5)), np.empty(n), np.empty(n))
+    _linearize_hinge(R_on, R_moves, hinge.axis, hinge.on_along, hinge.along, hinge.range, *rows)
+    return rows
+
+
+@kernel
+def _linearize_hinge(R_on, R_moves, axis, on_along, along, limits, r, H, excess, slope):  # type: ignore[no-untyped-def]
+    nx, ny, nz = axis[0], axis[1], axis[2]
+    ax, ay, az = on_along[0], on_along[1], on_along[2]
+    bx, by, bz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax  # axis × long axis
+    tx, ty, tz = by * nz - bz * ny, bz * nx - bx * nz, bx * ny - by * nx  # that × axis
+    middle, half = 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
+    for i in range(len(R_on)):
+        A, B = R_on[i], R_moves[i]
+        # The long axis of `moves` in W, in the frame of `on`, and its slope there by the heading of `moves`.
+        ux = B[0, 0] * along[0] + B[0, 1] * along[1] + B[0, 2] * along[2]
+        uy = B[1, 0] * along[0] + B[1, 1] * along[1] + B[1, 2] * along[2]
+        uz = B[2, 0] * along[0] + B[2, 1] * along[1] + B[2, 2] * along[2]
+        vx = A[0, 0] * ux + A[1, 0] * uy + A[2, 0] * uz
+        vy = A[0, 1] * ux + A[1, 1] * uy + A[2, 1] * uz
+        vz = A[0, 2] * ux + A[1, 2] * uy + A[2, 2] * uz
+        dx, dy, dz = A[1, 0] * ux - A[0, 0] * uy, A[1, 1] * ux - A[0, 1] * uy, A[1, 2] * ux - A[0, 2] * uy
+        r[i] = vx * nx + vy * ny + vz * nz
+        by_heading = dx * nx + dy * ny + dz * nz
+        sine, cosine = vx * bx + vy * by + vz * bz, vx * ax + vy * ay + vz * az
+        H[i, 0], H[i, 1], H[i, 2], H[i, 3] = by_heading, -by_heading, -sine, -sine
+        H[i, 4] = -(vx * tx + vy * ty + vz * tz)
+        off = np.arctan2(sine, cosine) - middle
+        off -= 2.0 * np.pi * np.round(off / (2.0 * np.pi))
+        excess[i] = np.sign(off) * max(abs(off) - half, 0.0)
+        by_sine, by_cosine = dx * bx + dy * by + dz * bz, dx * ax + dy * ay + dz * az
+        slope[i] = (by_sine * cosine - by_cosine * sine) / max(sine * sine + cosine * cosine, 0.1)
 
 
 class ClaspDetector:
@@ -538,40 +615,35 @@ class ClaspDetector:
         time = np.concatenate([each.time for each in self._recent])
         if len(time) < 2:
             return []
-        R = {
-            name: Rotation.from_rotvec(state.x[i] * E_Z) * Rotation.from_quat(quats[:, i])
-            for i, name in enumerate(names)
-        }
+        R = correct_headings(quats, state.x)
+        motions = move_all_girdles(problem, R)
+        R_reference = R[names.index(reference)]
         found = []
         seen = set[tuple[str, ...]]()
         for closure in problem.closures:
             if closure.points in seen or closure.holds(knot.time).any():
                 continue
             seen.add(closure.points)
-            points = R[reference].inv().apply
-            paths = [points(path) for path in (way.vectors(R, problem.model).sum(axis=0) for way in closure.ways)]
-            speed = min(float(np.sqrt(np.mean(np.sum(np.gradient(p, time, axis=0) ** 2, axis=1)))) for p in paths)
-            v = closure.gap.vectors(R, problem.model)
+            paths = [(way.turn(R, motions).sum(axis=0)[:, None] @ R_reference)[:, 0] for way in closure.ways]
+            speed = min(_find_rms(np.gradient(path, time, axis=0)) for path in paths)
+            v = closure.gap.turn(R, motions)
             gap = v.sum(axis=0)
             if speed < test.speed or np.abs(gap[:, 2]).max() > test.height:
                 continue
             H = np.zeros((len(time), 3, k))
-            for part, link in zip(closure.gap.parts, v, strict=True):
-                H[:, :, names.index(part.sensor)] += np.cross(E_Z, link)
+            for i, link in zip(closure.gap.segments, v, strict=True):
+                H[:, :, i] += _cross_vertical(link)
             # The headings that close the gap best, within their covariance.
             P, flat, r = state.P[:k, :k], H.reshape(-1, k), gap.ravel()
             weight = 1.0 / (problem.noise.slip_std**2 * max(1.0, test.seconds * rate))
             turn = -np.linalg.solve(np.eye(k) + P @ (weight * flat.T @ flat), P @ (weight * flat.T @ r))
             closed = gap + H @ turn
-            change = np.sqrt(np.mean(np.sum((closed - closed.mean(axis=0)) ** 2, axis=1)))
-            drift = np.sqrt(np.mean(np.sum(np.gradient(closed, time, axis=0) ** 2, axis=1)))
-            length = np.sqrt(np.mean(np.sum(closed**2, axis=1)))
+            change, length = _find_rms(closed - closed.mean(axis=0)), _find_rms(closed)
+            drift = _find_rms(np.gradient(closed, time, axis=0))
             if length > test.gap or change > test.change or drift > test.speed_ratio * speed:
                 continue
-            named = {name: R[name][-len(knot.time) :] for name in names}
             joined = np.ones(len(knot.time), dtype=bool)
-            slip_std = problem.noise.slip_std
-            rows = build_gap_rows(named, problem.model, problem.subject, closure, joined, slip_std)
+            rows = build_gap_rows(R[:, -len(knot.time) :], problem, closure, joined, problem.noise.slip_std)
             found.append((closure.points, rows))
         return found
 
@@ -580,47 +652,56 @@ def _symmetric(P: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * (P + P.T))
 
 
+def _find_rms(v: np.ndarray) -> float:
+    """Return the rms length of vectors (n, 3)."""
+    return float(np.sqrt(np.mean(np.sum(v**2, axis=1))))
+
+
+def move_all_girdles(problem: HeadingProblem, R_WL: np.ndarray) -> dict[str, GirdleMotion]:
+    """Return the motions of the girdles for orientations (k, n, 3, 3) of the problem's segments."""
+    return move_girdles(problem.model, dict(zip(problem.names, R_WL, strict=True)))
+
+
 def build_gap_rows(
-    R: Mapping[str, Rotation],
-    model: BodyModel,
-    subject: Subject,
+    R_WL: np.ndarray,
+    problem: HeadingProblem,
     closure: Closure,
     closed: np.ndarray,
     slip_std: float = PALM_SLIP_STD,
 ) -> Rows:
-    """Build three whitened rows for each sample at which the points coincide, without outliers."""
-    v = closure.gap.vectors(R, model)[:, closed]
-    n = v.shape[1]
-    eye = np.eye(3)
-    covariance = np.tile(slip_std**2 * eye, (n, 1, 1))
-    for link in v:
-        covariance += SEGMENT_ATTITUDE_STD**2 * (
-            np.sum(link**2, axis=1)[:, None, None] * eye - np.einsum("na,nb->nab", link, link)
-        )
-    by_length = zip(closure.gap.rotations(R), closure.gap.parts, strict=True)
-    J = sum(rotation.as_matrix()[closed] @ np.array(part.by_length) for rotation, part in by_length)  # (n, 3, lengths)
-    shape_cov, k = subject.shape_covariance(model.table), len(model.lengths)
-    J = np.concatenate((J, np.zeros((n, 3, len(shape_cov) - k))), axis=2)
-    R_closed = {name: rotation[closed] for name, rotation in R.items()}
-    girdles = closure.gap.girdles if n else ()
-    motions = move_girdles(model, R_closed, [name for name, _ in girdles])
-    for name, sign in girdles:
-        girdle, motion = model.table.girdles[name], motions[name]
-        R_on = R_closed[girdle.on].as_matrix()
-        columns = np.arange(len(PARAMETERS)) + k + len(PARAMETERS) * list(model.table.girdles).index(name)
-        J[:, :, columns] += sign * R_on @ motion.jacobian
+    """Build three whitened rows for each sample at which the points coincide, without outliers.
+
+    Parameters
+    ----------
+    R_WL : (k, n, 3, 3) of the problem's segments
+    closed : (n,) bool
+    """
+    model, gap, R = problem.model, closure.gap, R_WL[:, closed]
+    motions = move_all_girdles(problem, R)
+    v = gap.turn(R, motions)
+    n, lengths = v.shape[1], len(model.lengths)
+    squares = np.sum(v**2, axis=(0, 2))
+    covariance = (slip_std**2 + SEGMENT_ATTITUDE_STD**2 * squares)[:, None, None] * np.eye(3)
+    links = v.transpose(1, 2, 0)
+    covariance -= SEGMENT_ATTITUDE_STD**2 * (links @ links.swapaxes(1, 2))
+    shape_cov = problem.shape_cov
+    J = np.zeros((n, 3, len(shape_cov)))
+    J[:, :, :lengths] = (R[gap.segments] @ gap.by_length[:, None]).sum(axis=0)
+    for name, sign, i in gap.girdles:
+        girdle, motion, R_on = model.table.girdles[name], motions[name], R[gap.segments[i]]
+        first = lengths + len(PARAMETERS) * list(model.table.girdles).index(name)
+        J[:, :, first : first + len(PARAMETERS)] += sign * R_on @ motion.jacobian
         covariance += (R_on * motion.residual_covariance(girdle)[:, None, :]) @ R_on.swapaxes(1, 2)
-    covariance += J @ shape_cov @ np.swapaxes(J, 1, 2)
-    names = list(R)
-    H = np.zeros((n, 3, len(names)))
-    for part, link in zip(closure.gap.parts, v, strict=True):
-        H[:, :, names.index(part.sensor)] += np.cross(E_Z, link)
+    covariance += J @ shape_cov @ J.swapaxes(1, 2)
+    H = np.zeros((n, 3, len(problem.names)))
+    for i, link in zip(gap.segments, v, strict=True):
+        H[:, :, i] += _cross_vertical(link)
     r = v.sum(axis=0)
     whiten = np.linalg.inv(np.linalg.cholesky(covariance)) if n else covariance
-    r, H = np.einsum("nab,nb->na", whiten, r), whiten @ H
+    r, H = (whiten @ r[:, :, None])[..., 0], whiten @ H
     is_inlier = np.sum(r**2, axis=1) < OUTLIER_STDS**2 * 3.0  # three axes
     sample = np.repeat(np.flatnonzero(closed)[is_inlier], 3)
-    return Rows(sample, r[is_inlier].ravel(), H[is_inlier].reshape(-1, len(names)), np.ones(len(sample)))
+    return Rows(sample, r[is_inlier].ravel(), H[is_inlier].reshape(-1, len(problem.names)), np.ones(len(sample)))
 
 
 def smooth(

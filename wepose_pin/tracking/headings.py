@@ -7,7 +7,7 @@ Rauch-Tung-Striebel pass give the errors. Causally the forward pass alone does, 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
+from .. import rotations
 from ..alignment import (
     SegmentOrientations,
     StartFrames,
@@ -39,7 +40,9 @@ from .heading_filter import (
     HingeAxis,
     Knot,
     Way,
+    correct_headings,
     linearize_hinge,
+    move_all_girdles,
     smooth,
 )
 from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, find_pairs
@@ -50,6 +53,7 @@ CAUSAL_KNOT_S, OFFLINE_KNOT_S = 0.5, 2.0
 # Share of the next knot in which a knot is solved, a part with each sample; over the rest its correction fades in.
 SOLVE_SHARE = 0.4
 SAMPLE_RATE_HZ = 8.0
+E_Z = np.array([0.0, 0.0, 1.0])
 
 
 class HeadingCorrection(NamedTuple):
@@ -98,8 +102,8 @@ class KnotReader:
         self._stride = find_stride(rate_hz)
         self.size = self._stride * problem.samples_per_knot
         k = len(names)
-        self._R_SL = Rotation.from_quat(quat_LS).inv()
-        self._R_WV = Rotation.from_rotvec(heading_offset[:, None] * [0.0, 0.0, 1.0])
+        self._quat_SL = rotations.conjugate(quat_LS)
+        self._heading_offset = heading_offset
         self._time, self._quat_VS, self._accel_S = (
             np.zeros(self.size),
             np.zeros((self.size, k, 4)),
@@ -131,14 +135,12 @@ class KnotReader:
     def form(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], heading_var: np.ndarray) -> Knot:
         """Form the knot of samples that were taken; knots are formed in their order."""
         time, quat_VS, accel_S = samples
-        n, k = quat_VS.shape[:2]
+        n = len(time)
         rows = np.arange(0, n, self._stride)
-        R_VS = Rotation.from_quat(quat_VS.reshape(-1, 4)).as_matrix().reshape(n, k, 3, 3)
-        R_WS = self._R_WV.as_matrix() @ R_VS
+        R_WS = correct_headings(quat_VS, self._heading_offset).swapaxes(0, 1)
         joints = self._accelerations.push(R_WS, accel_S, rows)
-        quat_WL = np.stack(
-            [(self._R_WV[i] * Rotation.from_quat(quat_VS[rows, i]) * self._R_SL[i]).as_quat() for i in range(k)], axis=1
-        )
+        quat_WS = rotations.multiply(rotations.rotation_about(E_Z, self._heading_offset), quat_VS[rows])
+        quat_WL = rotations.multiply(quat_WS, self._quat_SL)
         lost = np.asarray(~np.isfinite(accel_S).all(axis=(0, 2)))
         return Knot(float(time[n - 1]), time[rows].copy(), quat_WL, joints, heading_var, lost)
 
@@ -235,7 +237,7 @@ def _find_hinges(
     return tuple(hinges)
 
 
-def _find_closures(recording: Recording | None, segments: Collection[str], model: BodyModel) -> tuple[Closure, ...]:
+def _find_closures(recording: Recording | None, segments: Sequence[str], model: BodyModel) -> tuple[Closure, ...]:
     """The closures of points that coincide whose segments are all measured.
 
     They are those of the protocols; each holds in the phase of its name, which the recording may lack. None: in none.
@@ -252,7 +254,13 @@ def _find_closures(recording: Recording | None, segments: Collection[str], model
             first, last = closure.points
             try:
                 gap, *ways = (
-                    Way(find_parts(model, neutral, segments, ends), find_girdle_signs(model, ends), neutral)
+                    Way.of(
+                        model,
+                        segments,
+                        find_parts(model, neutral, segments, ends),
+                        neutral,
+                        find_girdle_signs(model, ends),
+                    )
                     for ends in ([(first, 1.0), (last, -1.0)], [(first, 1.0)], [(last, 1.0)])
                 )
             except BadSession:
@@ -323,7 +331,7 @@ class HeadingCorrector:
         begins = np.array([knot.time[0] for knot in self._knots])
         self._knot_times = 0.5 * (begins + ends)  # the errors are constant before the first and after the last
         for knot in self._knots:
-            self._add_residuals("before", knot.time, dict(zip(self._names, _rotations(knot), strict=True)))
+            self._add_residuals("before", knot.time, correct_headings(knot.quat_WL, np.zeros(len(self._names))))
         self._knots = []
         return True
 
@@ -332,8 +340,7 @@ class HeadingCorrector:
         corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
         for i, name in enumerate(self._names):
             delta = np.interp(chunk.time, self._knot_times, self._heading_errors[:, i])
-            R_delta = Rotation.from_rotvec(delta[:, None] * [0.0, 0.0, 1.0])
-            corrected[name] = (R_delta * Rotation.from_quat(corrected[name])).as_quat()
+            corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
             self._max_correction_deg[name] = max(self._max_correction_deg[name], float(np.degrees(np.abs(delta).max())))
             filter_cov = _compute_filter_covariance(orientations, name)
             if filter_cov is not None:
@@ -350,9 +357,8 @@ class HeadingCorrector:
         rows = np.arange(-self._corrected_samples % stride, len(chunk), stride)
         rows = rows[chunk.time[rows] >= self._start_end]
         self._corrected_samples += len(chunk)
-        self._add_residuals(
-            "after", chunk.time[rows], {name: Rotation.from_quat(corrected[name][rows]) for name in self._names}
-        )
+        quat_WL = np.stack([corrected[name][rows] for name in self._names], axis=1)
+        self._add_residuals("after", chunk.time[rows], correct_headings(quat_WL, np.zeros(len(self._names))))
         return result
 
     def summarize(self) -> HeadingCorrection:
@@ -376,17 +382,18 @@ class HeadingCorrector:
             covariance=self._cov,
         )
 
-    def _add_residuals(self, stage: str, time: np.ndarray, R: Mapping[str, Rotation]) -> None:
-        """Add the residuals of closures and hinges before or after the correction."""
+    def _add_residuals(self, stage: str, time: np.ndarray, R_WL: np.ndarray) -> None:
+        """Add the residuals of closures and hinges before or after the correction, of orientations (k, n, 3, 3)."""
         problem = self._problem
+        motions = move_all_girdles(problem, R_WL) if problem.closures else {}
         for closure in problem.closures:
             closed = closure.holds(time)
             if closed.any():
-                gap = closure.gap.vectors(R, problem.model).sum(axis=0)
+                gap = closure.gap.turn(R_WL, motions).sum(axis=0)
                 self._gaps[stage].add(np.sum(gap[closed] ** 2, axis=1))
         if len(time):
             for hinge in problem.hinges:
-                r, _ = linearize_hinge(R[self._names[hinge.on]], R[self._names[hinge.moves]], hinge)
+                r = linearize_hinge(R_WL[hinge.on], R_WL[hinge.moves], hinge).r
                 self._hinge_rms[stage][hinge.joint].add(r**2)
 
 
@@ -530,10 +537,6 @@ class CausalHeadings:
             time=np.array([time for time, _ in self._history]),
             covariance=np.array([cov for _, cov in self._history]),
         )
-
-
-def _rotations(knot: Knot) -> list[Rotation]:
-    return [Rotation.from_quat(knot.quat_WL[:, i]) for i in range(knot.quat_WL.shape[1])]
 
 
 def _stack_samples(

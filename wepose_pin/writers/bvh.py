@@ -175,11 +175,12 @@ def _root_position(motion: Motion, root: Bone) -> np.ndarray:
 def _girdle_motion(motion: Motion, point: str) -> np.ndarray:
     """By how much girdles have moved a point (n, 3) [m] in W, from where it is at rest."""
     model = motion.model
-    R_WL = {segment: Rotation.from_quat(quat) for segment, quat in motion.pose.quat_WL.items()}
+    R_WL = {segment: Rotation.from_quat(quat).as_matrix() for segment, quat in motion.pose.quat_WL.items()}
     moved = np.zeros((len(motion.pose.time), 3))
     for name, girdle_motion in move_girdles(model, R_WL, model.point_girdles[point]).items():
         at_rest = model.girdle_parameters(name)[1:4]
-        moved += R_WL[model.table.girdles[name].on].apply(girdle_motion.displacement - at_rest)
+        R_on = R_WL[model.table.girdles[name].on]
+        moved += np.einsum("nij,nj->ni", R_on, girdle_motion.displacement - at_rest)
     return moved
 
 
