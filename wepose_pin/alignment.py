@@ -275,19 +275,19 @@ def orient_segments(
     """Return the segment orientations of a recording or a chunk of it, from the results of its sensors' filters."""
     quat_WL, covariance_W = {}, {}
     for segment, R_VS in collect_rotations(chunk, orientation).items():
-        R_WS, R_LS = alignment.R_WV[segment] * R_VS, alignment.R_LS[segment]
+        R_LS, quat_WS = alignment.R_LS[segment], rotations.multiply(alignment.R_WV[segment].as_quat(), R_VS.as_quat())
         if chunk.sensors[segment].aligned:
-            quat_WL[segment] = R_WS.as_quat()
+            quat_WL[segment] = quat_WS
             covariance_W[segment] = np.tile(MEASURED_ORIENTATION_STD**2 * np.eye(3), (len(chunk), 1, 1))
             continue
-        quat_WL[segment] = (R_WS * R_LS.inv()).as_quat()
+        quat_WL[segment] = rotations.multiply(quat_WS, rotations.conjugate(R_LS.as_quat()))
         filtered = orientation.get(segment)
         attitude_cov = None if filtered is None else filtered.attitude_cov
         if filtered is None:
             attitude_cov = np.tile(MEASURED_ORIENTATION_STD**2 * np.eye(3), (len(chunk), 1, 1))
         if attitude_cov is not None:
             covariance_W[segment] = compute_segment_covariance(
-                chunk, segment, subject, R_WS, R_LS, attitude_cov, start_frames
+                chunk, segment, subject, quat_WS, R_LS, attitude_cov, start_frames
             )
     for segment, cov in compute_soft_tissue_covariances(start_frames.table, quat_WL).items():
         if segment in covariance_W:
@@ -337,22 +337,23 @@ def compute_segment_covariance(
     recording: Recording,
     segment: str,
     subject: Subject | None,
-    R_WS: Rotation,
+    quat_WS: np.ndarray,
     R_LS: Rotation,
     attitude_cov: np.ndarray,
     start_frames: StartFrames = N_POSE,
 ) -> np.ndarray:
     """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
 
-    `attitude_cov` (n, 3, 3) [rad²] is the filter's, in S, error on the right.
+    `quat_WS` (n, 4) xyzw is the sensor's orientation, `attitude_cov` (n, 3, 3) [rad²] the filter's, in S, error on the
+    right.
     """
-    R = R_WS.as_matrix()
+    R = Rotation.from_quat(quat_WS).as_matrix()
     cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
     # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
     # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes
     # off the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
-    R_WL = (R_WS * start_frames.to_world(segment, R_LS).inv()).as_matrix()
+    R_WL = R @ start_frames.to_world(segment, R_LS).inv().as_matrix()
     mount_cov, start_var = (
         _find_start_mount_covariance(recording, segment, subject, start_frames),
         start_frames.std(segment) ** 2,
@@ -379,26 +380,26 @@ def compute_segment_covariance(
 
 def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Compute segment → covariance (n, 3, 3) [rad²] in W by which soft tissue turns its sensor in motion."""
-    covariances = {}
-    R_WL = {segment: Rotation.from_quat(quat) for segment, quat in quat_WL.items()}
-    elevation = {}
-    for segment, R in R_WL.items():
+    covariances, elevation, relative = {}, {}, {}
+    for segment, quat in quat_WL.items():
         tissue = table.segments[segment].soft_tissue
         along = np.array(table.segments[segment].along)
-        relative = R_WL[tissue.relative_to].inv() * R if tissue.relative_to in R_WL else R
-        elevation[segment] = np.arccos(np.clip(relative.apply(along) @ along, -1.0, 1.0))
-    for segment, R in R_WL.items():
+        below = quat_WL.get(tissue.relative_to)
+        relative[segment] = quat if below is None else rotations.multiply(rotations.conjugate(below), quat)
+        turned = Rotation.from_quat(relative[segment]).as_matrix() @ along
+        elevation[segment] = np.arccos(np.clip(turned @ along, -1.0, 1.0))
+    for segment, quat in quat_WL.items():
         tissue = table.segments[segment].soft_tissue
         along = np.array(table.segments[segment].along)
         var = np.square(tissue.std) + np.square(np.outer(elevation[segment], tissue.per_tilt))
         raised = [elevation[other] for other in tissue.raised if other in elevation]
         if raised:
             var = var + np.square(np.outer(np.mean(raised, axis=0), tissue.per_raised))
-        if tissue.per_twist and tissue.relative_to in R_WL:
-            quat = (R_WL[tissue.relative_to].inv() * R).as_quat()
-            twist = 2.0 * np.arctan2(np.abs(quat[:, :3] @ along), np.abs(quat[:, 3]))
+        if tissue.per_twist and tissue.relative_to in quat_WL:
+            x_y_z, w = relative[segment][:, :3], relative[segment][:, 3]
+            twist = 2.0 * np.arctan2(np.abs(x_y_z @ along), np.abs(w))
             var = var + np.square(np.outer(tissue.per_twist * twist, along))
-        matrix = R.as_matrix()
+        matrix = Rotation.from_quat(quat).as_matrix()
         covariances[segment] = (matrix * var[:, None, :]) @ matrix.swapaxes(1, 2)
     return covariances
 

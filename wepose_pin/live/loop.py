@@ -6,13 +6,14 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..diagnostics import Diagnostic
-from ..errors import BadSession
+from ..errors import BadModel, BadSession
 from ..filters import BEST
 from ..kinematics import LiveKinematics
 from ..model import BodyModel, load_table
@@ -179,6 +180,8 @@ class LiveLoop:
         self.setup = setup.as_recorded()
         self.model = build_subject_model(setup, model, source.sensors)
         self.model.table.check_segments(source.sensors, f"{setup.name}: sensors.", BadSession)
+        with suppress(BadModel):  # measured before samples come; the parts of the way to a point
+            assert self.model.reaches is not None
         start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
         self.kinematics = LiveKinematics(self.model, source.sensors, start)
         self._instruction = START_POSES.get(setup.start_pose, f"Hold still in the start pose, {setup.start_pose}")

@@ -47,6 +47,7 @@ class BodyModel:
     joints : child link of a spherical joint → its Pinocchio joint
     limits : the same → what its three axes may do; without an entry for a `floating` joint
     girdles : girdle → (7,) what a person differs by from its law, `girdle.PARAMETERS`; zeros where it is not named
+    loaded : the same body before its lengths were set; None: they were not
     """
 
     pin: pin.Model
@@ -55,6 +56,7 @@ class BodyModel:
     joints: Mapping[str, int]
     limits: Mapping[str, AxisLimits]
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
+    loaded: BodyModel | None = field(default=None, repr=False, compare=False)
 
     def __repr__(self) -> str:
         return f"BodyModel({self.robot.name!r}: {len(self.table.segments)} segments, {self.pin.nv} degrees of freedom)"
@@ -92,8 +94,8 @@ class BodyModel:
 
     @cached_property
     def reaches(self) -> dict[str, dict[str, LinkVector]]:
-        """Point → link → its part of the way from the root."""
-        return measure_reaches(self)
+        """Point → link → its part of the way from the root, the same for all lengths."""
+        return measure_reaches(self) if self.loaded is None else self.loaded.reaches
 
     @cached_property
     def point_frames(self) -> dict[str, str]:
@@ -150,7 +152,7 @@ class BodyModel:
                     f"{self.robot.name}: length {name} = {value!r} is no length of a body: above 0 and below 10 m"
                 )
         body = _body(_lengths.with_lengths(self.robot, self.table, lengths), self.table, self.robot.name)
-        return replace(body, girdles=self.girdles)
+        return replace(body, girdles=self.girdles, loaded=self.loaded or self)
 
     def urdf(self) -> str:
         """This body as the text of a URDF that any tool reads."""

@@ -487,10 +487,10 @@ class CausalSegmentEstimator:
         """
         if self._start_recording.sensors[self.names[i]].aligned:
             return attitude_cov
-        R_WS = Rotation.from_rotvec([0.0, 0.0, self.heading_offset[i]]) * Rotation.from_quat(quat_VS)
+        quat_WS = rotations.multiply(_quat_about_z(self.heading_offset[i : i + 1]), quat_VS)
         R_LS = Rotation.from_quat(self._quat_LS[i])
         cov = compute_segment_covariance(
-            self._start_recording, self.names[i], self._subject, R_WS, R_LS, attitude_cov, self._start_frames
+            self._start_recording, self.names[i], self._subject, quat_WS, R_LS, attitude_cov, self._start_frames
         )
         if self.headings is not None:
             R_VS = Rotation.from_quat(quat_VS)
