@@ -7,6 +7,7 @@ keep their order of operations, so that results stay bit-identical.
 
 from __future__ import annotations
 
+from functools import reduce
 from math import factorial
 
 import numpy as np
@@ -61,8 +62,45 @@ def exp(rotvec: ArrayLike) -> np.ndarray:
 
 
 def log(quat: ArrayLike) -> np.ndarray:
-    """Rotation vector (..., 3) [rad], at most pi long, of the quaternion (..., 4) xyzw."""
-    return Rotation.from_quat(np.asarray(quat, dtype=float)).as_rotvec()
+    """Rotation vector (..., 3) [rad], at most pi long, of the unit quaternion (..., 4) xyzw."""
+    quat = np.asarray(quat, dtype=float)
+    v, w = quat[..., :3], quat[..., 3:]
+    sine = np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
+    angle = 2.0 * np.arctan2(np.where(w < 0.0, -sine, sine), np.abs(w))
+    return np.asarray(v * np.divide(angle, sine, out=np.full(sine.shape, 2.0), where=sine > 0.0))
+
+
+def compose(first: Rotation, *others: Rotation) -> Rotation:
+    """``first * others[0] * …``, which SciPy takes thirty times as long for where they are many."""
+    quat = first.as_quat()
+    for other in others:
+        quat = multiply(quat, other.as_quat())
+    return Rotation.from_quat(quat)
+
+
+def turn_about(axes: str, angles: np.ndarray) -> Rotation:
+    """Turns (n) about own axes one after the other, such as ``"XYX"``, by angles (n, k) [rad], made for many."""
+    turns = [rotation_about(np.eye(3)["XYZ".index(axis)], angle) for axis, angle in zip(axes, angles.T, strict=True)]
+    return Rotation.from_quat(reduce(multiply, turns))
+
+
+def quat_from_matrix(R: np.ndarray) -> np.ndarray:
+    """Quaternions (n, 4) xyzw of rotation matrices (n, 3, 3): the largest component comes from its own square root."""
+    xx, yy, zz = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
+    squares = np.stack((1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz, 1.0 + xx + yy + zz), axis=1)
+    x, y, z = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
+    xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
+    # Row k of the outer product 4 q qᵀ, for the largest component k.
+    rows = np.array(
+        (
+            (squares[:, 0], xy, xz, x),
+            (xy, squares[:, 1], yz, y),
+            (xz, yz, squares[:, 2], z),
+            (x, y, z, squares[:, 3]),
+        )
+    )
+    largest = rows[np.argmax(squares, axis=1), :, np.arange(len(R))]
+    return np.asarray(largest / np.linalg.norm(largest, axis=1, keepdims=True))
 
 
 def quat_from_gravity(accel_S: ArrayLike) -> np.ndarray:

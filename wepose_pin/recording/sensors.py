@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from .. import rotations
 from ..arguments import format_object
 from ..documents import TomlTable
 
@@ -120,5 +121,5 @@ def compute_rate(sensor: Sensor, rate_hz: float) -> np.ndarray:
     if isinstance(sensor, ImuSensor):
         return sensor.gyro_S
     R = Rotation.from_quat(sensor.quat_WS)
-    rate = (R[:-1].inv() * R[1:]).as_rotvec() * rate_hz
+    rate = rotations.log(rotations.compose(R[:-1].inv(), R[1:]).as_quat()) * rate_hz
     return np.concatenate([rate[:1], rate])

@@ -10,14 +10,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import reduce
-from operator import mul
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadOption
+from ..rotations import compose, log, quat_from_matrix
 from .girdle import Girdle
 from .imperfections import IDEAL_PRESET, Imperfections
 from .people import Elbow, StartPose, Wrists
@@ -348,7 +347,7 @@ class Motion(BodyMotion):
         m = np.cos(swivel)[:, None] * down + SIDES[side] * np.sin(swivel)[:, None] * np.cross(n, down)
         u = cos_alpha[:, None] * n + sin_alpha[:, None] * m  # shoulder to elbow
         x = sin_alpha[:, None] * n - cos_alpha[:, None] * m  # into which the forearm flexes
-        return Rotation.from_matrix(np.stack((x, np.cross(n, m), -u), axis=2)), flexion
+        return Rotation.from_quat(quat_from_matrix(np.stack((x, np.cross(n, m), -u), axis=2))), flexion
 
     def _aim(self, t: np.ndarray) -> _Aim:
         """Compute what torso and hands do at the times `t` (n,) [s]."""
@@ -367,7 +366,7 @@ class Motion(BodyMotion):
             lean[:, 1:] += np.deg2rad(flaws.sizes.sway_tilt_deg) / np.sqrt(2.0) * flaws.tilt(t)
         R_WT = self._torso(t, lean)
         if flaws.start_pose.torso.any():
-            R_WT = R_WT * Rotation.from_rotvec((1.0 - led)[:, None] * flaws.start_pose.torso)
+            R_WT = compose(R_WT, Rotation.from_rotvec((1.0 - led)[:, None] * flaws.start_pose.torso))
         centred_T = self._clasp_point(t, moving)
         clasp_T = centred_T + self.lengths["trunk"] * E_Z
         hand_W = self.table_W + sum((c.offset_W(t, self.table_W) for c in self.circles), np.zeros((len(t), 3)))
@@ -403,7 +402,7 @@ class Motion(BodyMotion):
             R_TU, _ = self._arm(side, aim.palm_T[side] - self._shoulder(side), aim.swivel[side])
             free, lead = self._free(t + step, side), aim.lead[side][:, None]
             down = -E_Z if free is None else Rotation.from_rotvec((1.0 - lead) * free.turn).apply(-E_Z)
-            along_T = Rotation.from_rotvec(lead * R_TU.as_rotvec()).apply(down)
+            along_T = Rotation.from_rotvec(lead * log(R_TU.as_quat())).apply(down)
             elevation.append(np.rad2deg(np.arctan2(np.hypot(along_T[:, 0], along_T[:, 1]), -along_T[:, 2])))
         return (elevation[1] - elevation[0]) / (2.0 * _RATE_STEP_S)
 
@@ -439,8 +438,8 @@ class Motion(BodyMotion):
             flexion = flexion if flexion.size else straight
             if self.leads:
                 flexion = flexion + opening(palm_T) - opening(bend(flexion))
-                R_TU = _turn_to(R_TU.apply(bend(flexion)), palm_T) * R_TU
-            along_T = Rotation.from_rotvec(blend * R_TU.as_rotvec()).apply(down_U)
+                R_TU = compose(_turn_to(R_TU.apply(bend(flexion)), palm_T), R_TU)
+            along_T = Rotation.from_rotvec(blend * log(R_TU.as_quat())).apply(down_U)
             # A shoulder that rises lowers the arm, which lowers the shoulder: a part of the way settles sooner.
             displaced_T = centre_T + flaws.girdle.displace(along_T, y, raising)
             shoulder_T = shoulder_T + _RELAXATION * (displaced_T - shoulder_T)
@@ -475,14 +474,14 @@ class Motion(BodyMotion):
             if flaws.sizes.start_pose:
                 turns.append(starting * flaws.start_pose.upper_arm[side])
             if flaws.iterates:
-                hang = reduce(mul, (Rotation.from_rotvec(turn) for turn in turns), Rotation.identity(len(t)))
+                hang = compose(Rotation.identity(len(t)), *(Rotation.from_rotvec(turn) for turn in turns))
                 shoulder_T, R_TU, flexion = self._reach(t, side, aim, hang)
             else:
                 shoulder_T = self._shoulder(side)
                 R_TU, flexion = self._arm(side, aim.palm_T[side] - shoulder_T, aim.swivel[side])
             if flaws.sizes.shoulder_wander:
                 # The elevation is that of the arm from the mean centre: the same to within a degree.
-                along_T = Rotation.from_rotvec(blend[:, None] * R_TU.as_rotvec()).apply(-E_Z)
+                along_T = Rotation.from_rotvec(blend[:, None] * log(R_TU.as_quat())).apply(-E_Z)
                 shoulder_T = shoulder_T + (1.0 + along_T[:, 2:]) * flaws.shoulder[side]
                 R_TU, flexion = self._arm(side, aim.palm_T[side] - shoulder_T, aim.swivel[side])
             bend = np.column_stack((-blend * flexion, blend * aim.pronation[side]))
@@ -492,14 +491,15 @@ class Motion(BodyMotion):
                 bend -= starting * np.array((flaws.start_pose.flexion[side], -flaws.start_pose.pronation[side]))
             if free is not None:
                 bend += hanging * free.bend
-            R_WU = R_WT * Rotation.from_rotvec(blend[:, None] * R_TU.as_rotvec())
-            for turn in turns:
-                R_WU = R_WU * Rotation.from_rotvec(turn)
-            R_WF = R_WU * flaws.elbow_joint.rotate(y, -bend[:, 0], bend[:, 1])  # a hinge about -y, then pronation
+            R_TU = Rotation.from_rotvec(blend[:, None] * log(R_TU.as_quat()))
+            R_WU = compose(R_WT, R_TU, *(Rotation.from_rotvec(turn) for turn in turns))
+            R_WF = compose(
+                R_WU, flaws.elbow_joint.rotate(y, -bend[:, 0], bend[:, 1])
+            )  # a hinge about -y, then pronation
             if flaws.sizes.start_segment_deg:
-                R_WF = R_WF * Rotation.from_rotvec(hanging * flaws.start[f"{side}_forearm"])
+                R_WF = compose(R_WF, Rotation.from_rotvec(hanging * flaws.start[f"{side}_forearm"]))
             R_WL[f"{side}_upper_arm"], R_WL[f"{side}_forearm"] = R_WU, R_WF
-            R_WH = R_WF * aim.hand_F[side] if aim.hand_F else R_WF
+            R_WH = compose(R_WF, aim.hand_F[side]) if aim.hand_F else R_WF
             points |= place_arm(R_WT.apply(shoulder_T), side, (R_WU, R_WF, R_WH), self.lengths)
             origins |= {f"{side}_upper_arm": points[f"{side}_shoulder"], f"{side}_forearm": points[f"{side}_elbow"]}
         return BodyPose(R_WL, points, origins)

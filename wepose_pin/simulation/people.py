@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..rotations import turn_about
 from .imperfections import Imperfections
 from .signals import Process, rotate_about
 
@@ -110,9 +111,8 @@ class Elbow:
     def rotate(self, y: float, flexion: np.ndarray, pronation: np.ndarray) -> Rotation:
         """R_UF from flexion (n,) and pronation about z (n,) [rad] of the side y."""
         if self.is_ideal:
-            return Rotation.from_euler("YZ", np.column_stack((-flexion, pronation)))
-        angles = self._angles(y, flexion, pronation)
-        return Rotation.from_euler("XYX", angles[:, :3]) * Rotation.from_euler("Z", angles[:, 3:])
+            return turn_about("YZ", np.column_stack((-flexion, pronation)))
+        return turn_about("XYXZ", self._angles(y, flexion, pronation))
 
     def rotate_vectors(self, y: float, flexion: np.ndarray, pronation: np.ndarray, vectors_F: np.ndarray) -> np.ndarray:
         """Vectors (n, 3) in the upper arm from those in the forearm: `rotate`, made for speed."""
@@ -162,4 +162,4 @@ class Wrists:
         follows, wanders = self._parts(t, np.column_stack((distance, distance)))
         angles = moving[:, None, None] * (follows + wanders) + circling[:, None, None] * wanders
         flexion, deviation = (self.rms * self.gain[side] * angles[:, side]).T
-        return Rotation.from_euler("YX", np.column_stack((-flexion, y * deviation)))
+        return turn_about("YX", np.column_stack((-flexion, y * deviation)))

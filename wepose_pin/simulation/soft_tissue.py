@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..rotations import compose, log
 from .imperfections import Imperfections
 from .imu import GRAVITY
 from .motion import E_Z, SIDES, STAND_S, BodyPose
@@ -77,7 +78,7 @@ def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
     z, w = R.as_quat()[:, 2:].T
     twist = 2.0 * np.arctan2(np.where(w < 0.0, -z, z), np.abs(w))
     about_z = Rotation.from_rotvec(twist[:, None] * E_Z)
-    return about_z.inv().apply((R * about_z.inv()).as_rotvec()), twist
+    return about_z.inv().apply(log(compose(R, about_z.inv()).as_quat())), twist
 
 
 def read_joints(pose: BodyPose) -> JointRotations:
@@ -88,8 +89,8 @@ def read_joints(pose: BodyPose) -> JointRotations:
         if f"{side}_upper_arm" not in pose.R_WL:
             continue
         R_WU = pose.R_WL[f"{side}_upper_arm"]
-        swing, twist = _split(pose.R_WL["torso"].inv() * R_WU)
-        bend, pronation = _split(R_WU.inv() * pose.R_WL[f"{side}_forearm"])
+        swing, twist = _split(compose(pose.R_WL["torso"].inv(), R_WU))
+        bend, pronation = _split(compose(R_WU.inv(), pose.R_WL[f"{side}_forearm"]))
         angles = [np.hypot(np.linalg.norm(vector, axis=1), _ROUND) - _ROUND for vector in (swing, bend)]
         for values, value in zip(by_side, (angles[0], swing, twist, angles[1], pronation), strict=True):
             values[side] = value

@@ -18,7 +18,7 @@ from ..model.girdle import PARAMETERS
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, mark_lost_samples
-from ..rotations import heading
+from ..rotations import compose, heading, log
 from ..subject import Subject, check_lengths, population_subject
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
@@ -194,8 +194,8 @@ class _Sampled:
         p_W = locate_sensor(self.pose, segment, p_LS)
         far, near, near_after, far_after = (locate_sensor(b, segment, p_LS) - p_W for b in self.neighbours)
         p_ddot = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
-        turn = self.neighbours[1].R_WL[segment].inv() * self.neighbours[2].R_WL[segment]
-        return _Moved(self.time, self.pose.R_WL[segment], p_ddot, turn.as_rotvec() / (2.0 * _STENCIL_S))
+        turn = compose(self.neighbours[1].R_WL[segment].inv(), self.neighbours[2].R_WL[segment])
+        return _Moved(self.time, self.pose.R_WL[segment], p_ddot, log(turn.as_quat()) / (2.0 * _STENCIL_S))
 
 
 class _MildTissue:
@@ -395,8 +395,8 @@ def measure_motion(
         sampled = _Sampled(motion, own_time, segment, joints=start is not None) if own_clocks else stated_time
         moved, soft_L = skin.turn(sampled)
         # A product with the identity would not keep the last bit.
-        R_WS = (moved.R_WL * Rotation.from_rotvec(soft_L) if skin.moves else moved.R_WL) * R_LS
-        rotvec = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec()
+        R_WS = compose(moved.R_WL, *([Rotation.from_rotvec(soft_L)] if skin.moves else []), R_LS)
+        rotvec = log(compose(R_WS[:-1].inv(), R_WS[1:]).as_quat())
         rate_S = np.vstack((np.zeros(3), rotvec * rate_hz))  # static before the first sample
         if own_clocks:
             rate_S[1:] = rotvec / np.diff(own_time)[:, None]
