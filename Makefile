@@ -8,6 +8,8 @@ READY := $(VENV)/.ready
 demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 	$(BIN)/wepose demo -o demo --force
 
+# Compiled once: without bytecode each worker, and each command that a test runs, compiles all files anew.
+test test-all: export PYTHONDONTWRITEBYTECODE :=
 test: $(READY)            ## what must pass before a commit: minutes
 	$(BIN)/python -m pytest -n auto --dist worksteal
 

@@ -22,6 +22,7 @@ from ..errors import BadOption, one_of
 from ..kinematics import compute_link_poses, solve_configuration
 from ..model import BodyModel, load_model
 from ..model.girdle import PARAMETERS
+from ..rotations import compose, turn_about
 from .arm_tasks import ArmTasks
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
@@ -118,7 +119,7 @@ class Activity(BodyMotion):
         girdle, R_WT = self.flaws.girdle, R_WL["torso"]
         points: dict[str, np.ndarray] = {}
         for side, y in SIDES.items():
-            along_T = (R_WT.inv() * R_WL[f"{side}_upper_arm"]).apply(-E_Z)
+            along_T = compose(R_WT.inv(), R_WL[f"{side}_upper_arm"]).apply(-E_Z)
             shoulder_T = np.array((0.0, 0.5 * y * self.lengths["shoulder_width"], self.lengths["trunk"]))
             shoulder_T = shoulder_T + girdle.place(y, self.moving_time(t))
             shoulder_T = shoulder_T + girdle.displace(along_T, y, np.zeros_like(t))
@@ -137,9 +138,9 @@ class Activity(BodyMotion):
             R_WL["head"] = R_WL["head"] * Rotation.from_rotvec(start.head)
         for side, y in SIDES.items():
             shoulder, elbow = self.arm(side, t).T
-            R_WU = R_WL["torso"] * Rotation.from_euler("y", -shoulder[:, None])
+            R_WU = compose(R_WL["torso"], turn_about("Y", -shoulder[:, None]))
             if self.flaws is None or start is None:
-                R_WF = R_WU * Rotation.from_euler("y", -elbow[:, None])
+                R_WF = compose(R_WU, turn_about("Y", -elbow[:, None]))
             else:
                 if start.upper_arm[side].any():
                     R_WU = R_WU * Rotation.from_rotvec(start.upper_arm[side])
@@ -147,9 +148,9 @@ class Activity(BodyMotion):
                 R_WF = R_WU * self.flaws.elbow_joint.rotate(y, flexion, pronation)
             leg = self.leg(side, t)
             # A right leg, y = −1: flexion about −y, adduction about x, internal rotation about z. Its knee: y, x, −z.
-            R_WT = R_WL["pelvis"] * Rotation.from_euler("YXZ", leg.hip * (-1.0, -y, -y))
-            R_WS = R_WT * Rotation.from_euler("YXZ", leg.knee * (1.0, -y, y))
-            R_WA = R_WS * Rotation.from_euler("YXZ", leg.ankle * (-1.0, -y, -y))
+            R_WT = compose(R_WL["pelvis"], turn_about("YXZ", leg.hip * (-1.0, -y, -y)))
+            R_WS = compose(R_WT, turn_about("YXZ", leg.knee * (1.0, -y, y)))
+            R_WA = compose(R_WS, turn_about("YXZ", leg.ankle * (-1.0, -y, -y)))
             parts = {"upper_arm": R_WU, "forearm": R_WF, "hand": R_WF, "thigh": R_WT, "shank": R_WS, "foot": R_WA}
             R_WL |= {f"{side}_{part}": R for part, R in parts.items()}
         return R_WL

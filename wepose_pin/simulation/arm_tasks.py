@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..model import DEFAULT_BODY, BodyModel
+from ..rotations import compose, turn_about
 from .motion import E_Z, MARGIN_S, SEGMENTS, SIDES, STAND_S, BodyMotion, BodyPose, Flaws, place_arm, place_sensors
 from .signals import Process, make_pulse, make_step
 
@@ -194,20 +195,21 @@ class ArmTasks(BodyMotion):
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
             y, angles = SIDES[side], self._angles(t, side)
             swing = np.pad(angles[:, :2], ((0, 0), (0, 1)))
-            R_TU = Rotation.from_rotvec(swing) * Rotation.from_euler("z", angles[:, 2:3])
+            R_TU = compose(Rotation.from_rotvec(swing), turn_about("Z", angles[:, 2:3]))
             hanging = make_pulse(t, -10.0, STAND_S + 0.5, 0.5) + make_step(t, self.span[1] - _END_S - 0.5, 0.5)
-            R_TU = R_TU * Rotation.from_rotvec(sway * hanging[:, None] * np.pad(flaws.sway[side](t), ((0, 0), (0, 1))))
+            swaying = sway * hanging[:, None] * np.pad(flaws.sway[side](t), ((0, 0), (0, 1)))
+            R_TU = compose(R_TU, Rotation.from_rotvec(swaying))
             along_T = R_TU.apply(-E_Z)
             shoulder_T = np.array((0.0, 0.5 * y * self.lengths["shoulder_width"], self.lengths["trunk"]))
             shoulder_T = shoulder_T + flaws.girdle.place(y, self.moving_time(t, f"{side}_upper_arm"))
             raising = self._raising(t, side) if sizes.girdle_hysteresis else np.zeros_like(t)
             shoulder_T = shoulder_T + flaws.girdle.displace(along_T, y, raising)
-            R_WU = R_WT * R_TU
-            R_WF = R_WU * flaws.elbow_joint.rotate(y, angles[:, 3], angles[:, 4])
+            R_WU = compose(R_WT, R_TU)
+            R_WF = compose(R_WU, flaws.elbow_joint.rotate(y, angles[:, 3], angles[:, 4]))
             R_WH = R_WF
             if flaws.wrists.bend:
                 none = np.zeros_like(t)
-                R_WH = R_WF * flaws.wrists.rotate(y, t, self.activity(t), none, self._distance(t, side))
+                R_WH = compose(R_WF, flaws.wrists.rotate(y, t, self.activity(t), none, self._distance(t, side)))
             R_WL[f"{side}_upper_arm"], R_WL[f"{side}_forearm"] = R_WU, R_WF
             points |= place_arm(R_WT.apply(shoulder_T), side, (R_WU, R_WF, R_WH), self.lengths)
             origins |= {f"{side}_upper_arm": points[f"{side}_shoulder"], f"{side}_forearm": points[f"{side}_elbow"]}

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadOption
-from ..rotations import compose, log, quat_from_matrix
+from ..rotations import compose, log, quat_from_matrix, turn_about
 from .girdle import Girdle
 from .imperfections import IDEAL_PRESET, Imperfections
 from .people import Elbow, StartPose, Wrists
@@ -304,7 +304,7 @@ class Motion(BodyMotion):
 
     def _torso(self, _t: np.ndarray, lean: np.ndarray) -> Rotation:
         """Return R_WT from `lean` (n, 3) [rad]: yaw, pitch, roll."""
-        return Rotation.from_euler("ZYX", lean)
+        return turn_about("ZYX", lean)
 
     def _palms(
         self, _t: np.ndarray, _motion_share: np.ndarray, clasp_T: np.ndarray, _R_WT: Rotation
@@ -349,8 +349,8 @@ class Motion(BodyMotion):
         x = sin_alpha[:, None] * n - cos_alpha[:, None] * m  # into which the forearm flexes
         return Rotation.from_quat(quat_from_matrix(np.stack((x, np.cross(n, m), -u), axis=2))), flexion
 
-    def _aim(self, t: np.ndarray) -> _Aim:
-        """Compute what torso and hands do at the times `t` (n,) [s]."""
+    def _aim(self, t: np.ndarray, *, wrists: bool = True) -> _Aim:
+        """Compute what torso and hands do at the times `t` (n,) [s]; without `wrists` they are straight."""
         moving = self._motion_share(t)
         circling = sum((make_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
         led = make_step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
@@ -385,7 +385,7 @@ class Motion(BodyMotion):
             wander = np.deg2rad(55.0 * moving + 15.0 * circling) * self.wander[f"{side}_pronation"](t)
             pronation[side] = wander + palm_down
         hand_F: dict[str, Rotation] = {}
-        if flaws.wrists.bend:
+        if flaws.wrists.bend and wrists:
             distance = np.linalg.norm(centred_T, axis=1)
             hand_F = {side: flaws.wrists.rotate(y, t, moving, circling, distance) for side, y in SIDES.items()}
         return _Aim(R_WT, palm_T, self._lead_share(t, led, table), swivel, pronation, hand_F)
@@ -398,7 +398,7 @@ class Motion(BodyMotion):
         """Compute the rate (n,) [deg/s] at which the arm is raised, the shoulder at rest."""
         elevation = []
         for step in (-_RATE_STEP_S, _RATE_STEP_S):
-            aim = self._aim(t + step)
+            aim = self._aim(t + step, wrists=False)
             R_TU, _ = self._arm(side, aim.palm_T[side] - self._shoulder(side), aim.swivel[side])
             free, lead = self._free(t + step, side), aim.lead[side][:, None]
             down = -E_Z if free is None else Rotation.from_rotvec((1.0 - lead) * free.turn).apply(-E_Z)

@@ -137,11 +137,11 @@ class Wrists:
         """True where they do."""
         return bool(self.rms.any())
 
-    def _parts(self, t: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the parts (n, 2, 2) of the angles: by the distance (n, 2) [m] of hands from the chest, at random."""
+    def _parts(self, t: np.ndarray, distance: np.ndarray, sides: slice = slice(0, 2)) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parts (n, s, 2) of the angles: by the distance (n, s) [m] of hands from the chest, at random."""
         near = (distance - self.mean) / self.std
         follows = _WRIST_SHARE[0] * near[:, :, None] * self.sign
-        return follows, _WRIST_SHARE[1] * self.wander(t).reshape(-1, 2, 2)
+        return follows, _WRIST_SHARE[1] * self.wander(t, slice(2 * sides.start, 2 * sides.stop)).reshape(len(t), -1, 2)
 
     def fit(self, t: np.ndarray, moving: np.ndarray, distance: np.ndarray) -> None:
         """Set the gains so that the angles have their rms at these times (n,), where hands move at all.
@@ -159,7 +159,7 @@ class Wrists:
     ) -> Rotation:
         """R_FH of the side y, its hand at that distance (n,); both parts in the clasp, the wandering in the circles."""
         side = 0 if y > 0.0 else 1
-        follows, wanders = self._parts(t, np.column_stack((distance, distance)))
+        follows, wanders = self._parts(t, distance[:, None], slice(side, side + 1))
         angles = moving[:, None, None] * (follows + wanders) + circling[:, None, None] * wanders
-        flexion, deviation = (self.rms * self.gain[side] * angles[:, side]).T
+        flexion, deviation = (self.rms * self.gain[side] * angles[:, 0]).T
         return turn_about("YX", np.column_stack((-flexion, y * deviation)))

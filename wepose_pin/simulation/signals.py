@@ -48,9 +48,10 @@ class Process:
         self.omega = np.tan(0.5 * np.pi * share) / correlation_s  # [rad/s]
         self.phase = rng.uniform(0.0, 2.0 * np.pi, shape)
 
-    def __call__(self, t: np.ndarray) -> np.ndarray:
-        """Return the values (n, k) at the times `t` (n,) [s]."""
-        return np.sqrt(2.0 / _WAVES) * np.sin(t[:, None, None] * self.omega + self.phase).sum(axis=2)
+    def __call__(self, t: np.ndarray, components: slice = slice(None)) -> np.ndarray:
+        """Return the values (n, k) of some components at the times `t` (n,) [s]."""
+        waves = np.sin(t[:, None, None] * self.omega[components] + self.phase[components])
+        return np.sqrt(2.0 / _WAVES) * waves.sum(axis=2)
 
 
 class RandomWalk:

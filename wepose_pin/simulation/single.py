@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..rotations import compose, log, turn_about
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, jitter_time
 from .motion import E_Z
@@ -72,7 +73,7 @@ class _HandMotion:
         return self.gain[which] * (make_pulse(t, *self.span, self.ramp) * vigour)[:, None] * waves
 
     def orientation(self, t: np.ndarray) -> Rotation:
-        return self.R_W0 * Rotation.from_euler("ZYX", self._waves(0, t))
+        return compose(self.R_W0, turn_about("ZYX", self._waves(0, t)))
 
     def position(self, t: np.ndarray) -> np.ndarray:
         return self._waves(1, t)
@@ -85,7 +86,7 @@ class _HandMotion:
     def rates(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the angular rate in S (n, 3) [rad/s] and the acceleration in W (n, 3) [m/s^2]."""
         h = _STENCIL_S
-        turn = (self.orientation(t - h).inv() * self.orientation(t + h)).as_rotvec()
+        turn = log(compose(self.orientation(t - h).inv(), self.orientation(t + h)).as_quat())
         return turn / (2.0 * h), self.acceleration(t)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadOption, one_of
+from ..rotations import compose, turn_about
 from .imperfections import Imperfections
 from .motion import MARGIN_S, SIDES, Motion
 from .sequence import make_sequence
@@ -77,7 +78,7 @@ class Touch(Motion):
         for share in np.arange(1.0, 0.2, -0.05):
             self.lean_deg = share * most
             lean = np.deg2rad(self.lean_deg) * np.column_stack([self.wander[n](t) for n in ("yaw", "pitch", "roll")])
-            R_WT = Rotation.from_euler("ZYX", lean)
+            R_WT = turn_about("ZYX", lean)
             if _is_in_reach(self, self.side, np.linalg.norm(self.point_W - R_WT.apply(shoulder_W), axis=1)):
                 break
         if self.side == "right":
@@ -120,7 +121,7 @@ class Poses(Motion):
     def _torso(self, t: np.ndarray, lean: np.ndarray) -> Rotation:
         axis = np.array((-np.sin(self.bow_axis), np.cos(self.bow_axis), 0.0))
         bow = np.deg2rad(_BOW_DEG) * make_pulse(t, *_BOW_S, _TURN_S)
-        return Rotation.from_rotvec(bow[:, None] * axis) * Rotation.from_euler("ZYX", lean)
+        return compose(Rotation.from_rotvec(bow[:, None] * axis), turn_about("ZYX", lean))
 
     def _lead_share(self, t: np.ndarray, _lead_share: np.ndarray, _table: np.ndarray) -> dict[str, np.ndarray]:
         raised = make_step(t, _T_POSE_S[0] - _TURN_S, _TURN_S) * (1.0 - make_step(t, _T_POSE_S[1], _TURN_S))
