@@ -19,10 +19,11 @@ from guided_person import GuidedPerson, UdpPerson, perform
 
 from wepose_pin.calibration import calibrate
 from wepose_pin.readers import load_session
+from wepose_pin.simulation import simulate_person
 from wepose_pin.subject import load_subject
 
 PERSON = 3, 45.0  # seed, and seconds that the clasp may last
-LENGTHS = perform(*PERSON).lengths
+LENGTHS = simulate_person(PERSON[0]).lengths
 ROOT = Path(__file__).parents[1]
 STEPS = ["Sensors", "Segments", "Check", "Start pose", "Clasp", "Result"]
 SAID = """JSON.stringify({
