@@ -10,12 +10,12 @@ The rules are physical and hold for any sensor on any body:
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
-from .. import rotations
+from ..compilation import compiled
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongUnit
+from ..rotations import fill_matrix, rotate_by_vector
 from .gaps import find_runs
 from .intervals import format_span
 from .limits import (
@@ -191,20 +191,29 @@ def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
 
 
 def _average_coherence(scale: float, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
-    """Average the coherence of `scale` times the rates over windows (k, n, 3)."""
-    return float(
-        np.mean([_compute_coherence(scale * gyro, accel, rate_hz) for gyro, accel in zip(gyro_S, accel_S, strict=True)])
-    )
+    """Average the coherence, 0 to 1, of `scale` times the rates over windows (k, n, 3).
 
-
-def _compute_coherence(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
-    """Compute the coherence, 0 to 1: how near the mean specific force, rotated by the gyroscope, is to gravity.
-
-    The specific force of a swinging arm is several times gravity and points along the arm in the sensor frame; its mean
-    in the world is gravity.
+    It is how near the mean specific force, rotated by the gyroscope, is to gravity. The specific force of a swinging
+    arm is several times gravity and points along the arm in the sensor frame; its mean in the world is gravity.
     """
-    force_W = Rotation.from_quat(rotations.integrate(gyro_S[1:] / rate_hz)).apply(accel_S)
-    return max(0.0, 1.0 - abs(float(np.linalg.norm(force_W.mean(axis=0))) / STANDARD_GRAVITY - 1.0))
+    means_W = np.linalg.norm(_average_rotated(scale / rate_hz * gyro_S, accel_S), axis=1)
+    return float(np.mean(np.maximum(0.0, 1.0 - np.abs(means_W / STANDARD_GRAVITY - 1.0))))
+
+
+@compiled
+def _average_rotated(rotvec, vectors):  # type: ignore[no-untyped-def]
+    """Mean (k, 3) of vectors (k, n, 3) that turn from one to the next by `rotvec` (k, n, 3) [rad]."""
+    means, R = np.zeros((len(vectors), 3)), np.empty((3, 3))
+    for k in range(len(vectors)):
+        quat = np.array([0.0, 0.0, 0.0, 1.0])
+        for n in range(vectors.shape[1]):
+            if n:
+                rotate_by_vector(quat, rotvec[k, n, 0], rotvec[k, n, 1], rotvec[k, n, 2])
+            fill_matrix(quat, R)
+            for i in range(3):
+                turned = R[i, 0] * vectors[k, n, 0] + R[i, 1] * vectors[k, n, 1] + R[i, 2] * vectors[k, n, 2]
+                means[k, i] += turned / vectors.shape[1]
+    return means
 
 
 def _check_range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: str) -> None:
