@@ -254,6 +254,26 @@ def test_nothing_there(tmp_path: Path, plugged, monkeypatch: pytest.MonkeyPatch)
         open_source(f"mti:{device.link}=torso").open()
 
 
+def test_a_port_is_waited_for(tmp_path: Path, plugged) -> None:
+    source, said = open_source(f"mti:{tmp_path / 'two'}=torso@100"), []
+
+    def wait(text: str) -> bool:
+        said.append(text)
+        if len(said) == 2:
+            plugged("two")
+        return len(said) < 20
+
+    source.open(wait)
+    try:
+        assert said[0].startswith(f"Waiting for the MTi of torso: mti:{tmp_path / 'two'}: cannot open the port")
+        assert collect(source, lambda p: count(p, "torso") >= 5)
+    finally:
+        source.close()
+    gone = open_source(f"mti:{tmp_path / 'three'}=torso@100")
+    gone.open(lambda _text: False)  # the user has had enough
+    assert gone.sensors == ()
+
+
 def test_close_frees_the_ports_and_may_be_repeated(plugged) -> None:
     device = plugged("one")
     source = open_source(f"mti:{device.link}=torso@100")

@@ -56,6 +56,14 @@ def read_until(source: UdpSource, count: int) -> dict[str, Samples]:
     return {name: Samples(name, *(np.concatenate([s[k] for s in of]) for k in (1, 2, 3))) for name, of in parts.items()}
 
 
+def test_a_json_line_may_say_the_charge_of_the_battery(source: UdpSource, sender: socket.socket) -> None:
+    for line in (GOOD, GOOD | {"t": 12.355, "battery": 0.4}, GOOD | {"t": 12.365}, GOOD | {"t": 12.375, "battery": 40}):
+        sender.sendto(json.dumps(line).encode(), source.address)
+    assert len(read_until(source, 3)["torso"].time) == 3
+    assert source.batteries == {"torso": 0.4}
+    assert source.problems == {"JSON lines whose battery is not a share, 0 to 1": 1}
+
+
 def test_a_json_line_of_one_sample(source: UdpSource, sender: socket.socket) -> None:
     before = time.monotonic()
     sender.sendto(json.dumps(GOOD).encode(), source.address)

@@ -17,7 +17,7 @@ from ...recording.arrivals import Samples
 from . import xbus
 from .checks import IMPLAUSIBLE, keep_plausible
 from .clocks import HostClock
-from .waiting import Waiting
+from .waiting import Waiting, wait_for
 
 PLAIN_HZ = 100  # that the plain outputs of every MTi have; above, the HR outputs are tried first
 ANSWER_S = 0.5
@@ -50,17 +50,22 @@ class MTiSource:
         self._queue: SimpleQueue[Samples | tuple[str, int]] = SimpleQueue()
         self._devices = [_Device(segment, port, rate_hz, baud, self._queue) for segment, port in devices.items()]
 
-    def open(self, _waiting: Waiting | None = None) -> None:
-        """Open and configure every port, then listen; a port that is not there is an error and not waited for.
+    def open(self, waiting: Waiting | None = None) -> None:
+        """Open and configure every port, then listen; wait for a port, with `waiting` until that returns False.
 
         Raises
         ------
         BadSource
-            A port is not there, no MTi answers, or it cannot send at the rate.
+            No MTi answers, or it cannot send at the rate; without `waiting` also a port that cannot be opened.
         """
         try:
             for device in self._devices:
-                device.open()
+                if waiting is None:
+                    device.open()
+                elif not wait_for(device.try_to_open, device.describe_wait, 0.0, waiting):
+                    self.close()
+                    self.sensors = ()
+                    return
         except BadSource:
             self.close()
             raise
@@ -97,6 +102,10 @@ class MTiSource:
             self.problems[entry[0]] += entry[1]
 
 
+class _CannotOpen(BadSource):
+    """A port is not there, or in use: it may come."""
+
+
 class _Device:
     """One port, and the thread that listens to it."""
 
@@ -109,10 +118,24 @@ class _Device:
         self._port: Any = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
+        self._problem = ""  # for which the port could not be opened
 
     def open(self) -> None:
         self._stop.clear()
         self.connect()
+
+    def try_to_open(self, timeout_s: float) -> bool:
+        """Open, or wait `timeout_s` and return False where the port cannot be opened."""
+        try:
+            self.open()
+        except _CannotOpen as error:
+            self._problem = str(error)
+            self._stop.wait(timeout_s)
+            return False
+        return True
+
+    def describe_wait(self) -> str:
+        return f"the MTi of {self._segment}: {self._problem}"
 
     def connect(self) -> None:
         """Open the port and start measurement; raises `BadSource`."""
@@ -127,7 +150,7 @@ class _Device:
         except (OSError, ValueError) as error:  # SerialException is an OSError
             self._disconnect()
             reason = getattr(error, "strerror", None) or str(error)
-            raise BadSource(
+            raise _CannotOpen(
                 f"mti:{self._path}: cannot open the port ({reason}); a serial port that is there, may be read and is "
                 f"not in use, as /dev/ttyUSB0"
             ) from None

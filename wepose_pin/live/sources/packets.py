@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 import zlib
 from collections.abc import Collection, Iterator
@@ -43,6 +44,7 @@ class Batch(NamedTuple):
     sensor: str
     time: np.ndarray  # (m,) [s]
     values: np.ndarray  # (m, 6) gyro [rad/s], accel [m/s²]
+    battery: float = math.nan  # share of its charge, 0 to 1; NaN: not said
 
 
 class _Malformed(Exception):
@@ -61,18 +63,21 @@ def decode(datagram: bytes, segments: Collection[str] | None = None) -> tuple[li
         except _Malformed as error:
             return [], [str(error)]
     sensors: dict[str, tuple[list[float], list[list[float]]]] = {}
+    charge: dict[str, float] = {}
     problems = []
     for line in datagram.splitlines():
         if line.strip():
             try:
-                sensor, time, rows = _decode_line(line, segments)
+                sensor, time, rows, battery = _decode_line(line, segments)
             except _Malformed as error:
                 problems.append(str(error))
                 continue
             times, values = sensors.setdefault(sensor, ([], []))
             times.extend(time)
             values.extend(rows)
-    return [Batch(sensor, np.array(time), np.array(rows)) for sensor, (time, rows) in sensors.items()], problems
+            charge[sensor] = battery
+    batches = [Batch(name, np.array(time), np.array(rows), charge[name]) for name, (time, rows) in sensors.items()]
+    return batches, problems
 
 
 def _decode_binary(datagram: bytes) -> Batch:
@@ -95,8 +100,8 @@ def _refuse_constant(text: str) -> NoReturn:
     raise _Malformed(f"JSON lines with {text}, which is no number")
 
 
-def _decode_line(line: bytes, segments: Collection[str]) -> tuple[str, list[float], list[list[float]]]:
-    """Sensor, times (m), and rows of gyro and accel (m, 6); lists, which are faster for a single sample."""
+def _decode_line(line: bytes, segments: Collection[str]) -> tuple[str, list[float], list[list[float]], float]:
+    """Sensor, times (m), rows of gyro and accel (m, 6), battery; lists, which are faster for a single sample."""
     try:
         message = json.loads(line, parse_constant=_refuse_constant)
     except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
@@ -111,7 +116,11 @@ def _decode_line(line: bytes, segments: Collection[str]) -> tuple[str, list[floa
         time, gyro, accel = [time], [gyro], [accel]
     if not (isinstance(gyro, list) and isinstance(accel, list) and len(time) == len(gyro) == len(accel)):
         raise _Malformed("JSON lines whose t, gyro and accel differ in length")
-    return sensor, _check_numbers(time), [_check_triple(a) + _check_triple(b) for a, b in zip(gyro, accel, strict=True)]
+    battery = message.get("battery", math.nan)
+    if type(battery) not in (int, float) or battery < 0.0 or battery > 1.0:
+        raise _Malformed("JSON lines whose battery is not a share, 0 to 1")
+    rows = [_check_triple(a) + _check_triple(b) for a, b in zip(gyro, accel, strict=True)]
+    return sensor, _check_numbers(time), rows, float(battery)
 
 
 def _check_triple(row: Any) -> list[float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import select
 import socket
 import time
@@ -53,6 +54,7 @@ class UdpSource:
         self._segments = load_table().segments if segments is None else segments
         self.rate_hz: float | None = None
         self.problems: dict[str, int] = Counter()
+        self.batteries: dict[str, float] = {}
         self.orientations: Mapping[str, bool] = {}
         self.address = (host, port)
         self._wait_s = wait_s
@@ -177,6 +179,8 @@ class UdpSource:
         if not float(np.abs(batch.time).max()) < MAX_TIME:
             self._count(IMPLAUSIBLE, len(batch.time))
             return False
+        if math.isfinite(batch.battery):
+            self.batteries[batch.sensor] = batch.battery
         return True
 
     def _join(self, sensor: str, parts: list[tuple[np.ndarray, np.ndarray]]) -> list[Samples]:
