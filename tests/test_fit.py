@@ -158,6 +158,7 @@ def test_a_person_on_48_degrees_of_freedom(data: Path, body: BodyModel) -> None:
     assert np.all((pose.q[:, at] >= lower) & (pose.q[:, at] <= upper))
 
 
+@pytest.mark.slow
 def test_limits_can_be_let_go_and_torques_are_written_as_estimates(
     body: BodyModel, person: Person, tmp_path: Path
 ) -> None:

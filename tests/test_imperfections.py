@@ -512,6 +512,7 @@ def test_single_sensor(make: Callable[..., SingleSensor], moving: tuple, rate_pe
         assert np.abs(one.p_WS).max() < 0.8  # within reach of an arm
 
 
+@pytest.mark.slow
 def test_single_sensor_at_both_rates_and_with_a_real_device() -> None:
     for make in (simulate_paper_dynamic, simulate_paper_drift):
         slow, quick = make(4, 100.0, noise=NOISE_FREE), make(4, 1000.0, noise=NOISE_FREE)

@@ -336,6 +336,7 @@ def test_a_pelvis_that_cannot_move_says_by_how_much(data: Path) -> None:
     np.testing.assert_allclose(missed["pelvis"], 0.3)
 
 
+@pytest.mark.slow
 def test_the_summary_says_what_was_not_followed(data: Path, half_minute: Recording) -> None:
     summary = track(half_minute, model=gazebo(data, 48)).summary()
     assert summary["orientation_residual_rms_deg"]["left_forearm"] > 1.0

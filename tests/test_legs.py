@@ -188,7 +188,11 @@ def run(*arguments: str | Path) -> int:
 
 
 @pytest.mark.parametrize(
-    ("activity", "preset", "most_deg"), [("walk", "ideal", 0.6), ("sit", "ideal", 0.6), ("walk", "mild", 2.5)]
+    ("activity", "preset", "most_deg"),
+    [
+        ("walk", "ideal", 0.6),
+        *(pytest.param(*row, marks=pytest.mark.slow) for row in (("sit", "ideal", 0.6), ("walk", "mild", 2.5))),
+    ],
 )
 def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, most_deg: float, tmp_path: Path) -> None:
     made, result = tmp_path / "made", tmp_path / "result"

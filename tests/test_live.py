@@ -381,7 +381,7 @@ def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recordin
     assert sum(int.from_bytes(payload[:4], "little") for payload in of_samples) == count
 
 
-@pytest.mark.parametrize("method", ["amekf", "smekf"])
+@pytest.mark.parametrize("method", ["amekf", pytest.param("smekf", marks=pytest.mark.slow)])
 def test_a_sensor_that_freezes_is_lost_and_said_to_be(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:

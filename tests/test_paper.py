@@ -368,6 +368,7 @@ def test_the_commands(
 # Validation -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_validation_has_rows_of_the_papers_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
     smekf = [each for each in contenders.list_contenders("upper body, mild") if each.label == "smekf"]
     monkeypatch.setattr("wepose_pin.validation.paper.list_contenders", lambda _: smekf)

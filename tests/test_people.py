@@ -675,6 +675,7 @@ def test_tasks_keep_the_physics() -> None:
     np.testing.assert_allclose(again.points["left_palm"], sim.points["left_palm"][::10][: len(again.time)], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_shoulders_move_in_activities_of_the_whole_body() -> None:
     options = {"seed": 3, "noise": NOISE_FREE, "seconds": 8.0, "rate_hz": 50.0}
     ideal = simulate_activity("walk", **options)

@@ -276,6 +276,7 @@ def test_files_are_found_by_their_columns_wherever_they_lie(data: Path, tmp_path
     assert read_ur5(find_ur5(tmp_path)[0]).static.stop > 50
 
 
+@pytest.mark.slow
 def test_a_trial_that_cannot_be_scored_is_told_and_skipped(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

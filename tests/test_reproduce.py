@@ -145,6 +145,7 @@ def test_retarget_again(result: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     assert "of its result, pose.parquet is gone" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_whole_study_again(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(session, tmp_path / "other")
     (tmp_path / "bad").mkdir()
@@ -220,6 +221,7 @@ def test_what_cannot_be_made_again(wrong: str, result: Path, session: Path, caps
     assert error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_an_item_of_a_batch_and_its_parts(session: Path, tmp_path: Path) -> None:
     """Each as a user types it, in a process of its own: the number of BLAS threads is then that of the workers."""
     steps = {

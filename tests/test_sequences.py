@@ -162,6 +162,7 @@ def sessions() -> list[Recording]:
     return [simulation.recording(f"session {k}") for k, simulation in enumerate(made)]
 
 
+@pytest.mark.slow
 def test_the_order_of_sessions_does_not_matter(sessions: list[Recording]) -> None:
     person = simulate_person(11)
     options = {"prior": person.prior, "measured": person.measured}

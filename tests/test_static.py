@@ -108,6 +108,7 @@ def test_no_window_before_the_first_is_full() -> None:
     assert static[49:].all()
 
 
+@pytest.mark.slow
 def test_ten_million_samples_lose_no_precision() -> None:
     """Variance conditions set within 1e-9 of the truth on either side: running sums of squares with an offset of 9.81
     would be off by far more after so long."""

@@ -45,6 +45,7 @@ def test_the_papers_order_comes_back_out_of_the_box_only() -> None:
         assert mean["ncf"][axis] < mean["ncf, default gains"][axis]
 
 
+@pytest.mark.slow
 def test_two_runs_give_the_same_figures_on_any_number_of_workers() -> None:
     jobs = list_experiments(True)["dynamic 100 Hz"] * 2
     alone, again, *_ = run_jobs(jobs, workers=1)
@@ -162,6 +163,7 @@ def test_fewer_trials() -> None:
         ValidateJob(trials=0).check()
 
 
+@pytest.mark.slow
 def test_the_command_writes_every_trial(
     tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
