@@ -1,0 +1,202 @@
+"""Motions by joints for robot learning, ROS 2 and viewers: each read back by the reader of others, or by one of ours
+that was written from the format's description."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import polars as pl
+import pytest
+from arms import JOINTS, write_arm
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.errors import WeposeError
+from wepose_pin.writers.export import export
+from wepose_pin.writers.joint_motion import (
+    JointMotion,
+    compute_link_poses_W,
+    read_joint_motion,
+    resample_joints,
+)
+from wepose_pin.writers.result import write_table
+
+RATE_HZ = 50.0
+APPROACH_S = 2.0
+
+
+def write_trajectory_folder(folder: Path, seed: int = 1, seconds: float = 8.0, rate_hz: float = RATE_HZ) -> Path:
+    """A folder as `wepose retarget` writes it, of the robot arm of `arms`: two phases, three repetitions."""
+    folder.mkdir()
+    write_arm(folder).rename(folder / "robot.urdf")
+    (folder / "arm.toml").unlink()
+    time = np.arange(round(seconds * rate_hz)) / rate_hz
+    rng = np.random.default_rng(seed)
+    columns = {"time": time, "recorded_time": np.maximum(time - APPROACH_S, 0.0) + 1.5}
+    for name in JOINTS:
+        phase, size, speed = rng.uniform(0.0, 6.0), rng.uniform(0.2, 0.8), rng.uniform(0.5, 2.0)
+        columns[name] = size * np.sin(speed * time + phase) - 0.4
+        columns[f"{name}_velocity"] = size * speed * np.cos(speed * time + phase)
+        columns[f"{name}_acceleration"] = -size * speed**2 * np.sin(speed * time + phase)
+    write_table(folder / "trajectory.parquet", pl.DataFrame(columns))
+    w, x, y, z = 0.5, 0.5, -0.5, 0.5
+    summary = {
+        "robot": "arm",
+        "recording": f"session {seed}",
+        "joints": list(JOINTS),
+        "posture": {},
+        "root": {"x": 0.1, "y": 0.0, "z": 0.7, "qx": x, "qy": y, "qz": z, "qw": w},
+        "approach_s": APPROACH_S,
+        "recorded_phases": {"reach": [[1.5, 2.5], [3.0, 4.2]], "later": [[90.0, 91.0]]},
+        "repetitions": {"source": "right_elbow_flexion", "spans": [[1.6, 2.4], [2.6, 3.4], [3.6, 4.4]]},
+    }
+    (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trajectory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_trajectory_folder(tmp_path_factory.mktemp("robot") / "arm")
+
+
+@pytest.fixture(scope="module")
+def motion(trajectory: Path) -> JointMotion:
+    return read_joint_motion(trajectory)
+
+
+# Kinematics -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{"turned": (0.3, -0.2, 0.5), "continuous": "yaw"}, {"mimic": True}])
+def test_links_are_where_pinocchio_has_them(tmp_path: Path, options: dict[str, object]) -> None:
+    folder = write_trajectory_folder(tmp_path / "arm", seconds=0.1)
+    (tmp_path / "other").mkdir()
+    write_arm(tmp_path / "other", **options).replace(folder / "robot.urdf")
+    motion = read_joint_motion(folder)
+    model = pin.buildModelFromUrdf(str(folder / "robot.urdf"))
+    data, root = model.createData(), pin.XYZQUATToSE3(np.concatenate([motion.p_WB, motion.quat_WB]))
+    poses = compute_link_poses_W(motion)
+    for k in range(5):
+        q = pin.neutral(model)
+        for joint in range(1, model.njoints):
+            name = model.names[joint]
+            value = motion.values("elbow" if name == "elbow_copy" else name)[k]
+            first = model.idx_qs[joint]
+            q[first : first + model.nqs[joint]] = value if model.nqs[joint] == 1 else (np.cos(value), np.sin(value))
+        pin.framesForwardKinematics(model, data, q)
+        for link, (quat, p) in poses.items():
+            expected = root * data.oMf[model.getFrameId(link, pin.FrameType.BODY)]
+            np.testing.assert_allclose(p[k], expected.translation, atol=1e-12)
+            np.testing.assert_allclose(Rotation.from_quat(quat[k]).as_matrix(), expected.rotation, atol=1e-12)
+
+
+def test_another_rate_is_on_the_cubics(tmp_path: Path, motion: JointMotion) -> None:
+    """A cubic through values and slopes of sin(wt) is off by at most (wh)^4 / 384."""
+    finer = resample_joints(motion, 400.0)
+    truth = read_joint_motion(write_trajectory_folder(tmp_path / "arm", rate_hz=400.0))
+    n = len(finer.time)
+    np.testing.assert_allclose(finer.time, truth.time[:n], atol=1e-12)
+    assert np.abs(finer.position - truth.position[:n]).max() < 0.8 * (2.0 / RATE_HZ) ** 4 / 384
+    again = resample_joints(finer, RATE_HZ)
+    np.testing.assert_allclose(again.position, motion.position, atol=1e-14)
+    assert again.begin == motion.begin == 100
+
+
+# LeRobot ----------------------------------------------------------------------------------------------------------
+
+
+def read_frames(folder: Path) -> pl.DataFrame:
+    return pl.read_parquet(folder / "data" / "chunk-000" / "file-000.parquet")
+
+
+def test_each_result_is_an_episode(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+    other = write_trajectory_folder(tmp_path / "other", seed=2, seconds=3.0)
+    assert export([trajectory, str(other)], tmp_path / "data", "lerobot") == ("lerobot", [])
+    frames, info = read_frames(tmp_path / "data"), json.loads((tmp_path / "data/meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", 50, "arm")
+    assert (info["total_episodes"], info["total_frames"], info["splits"]) == (2, 550, {"train": "0:2"})
+    assert info["features"]["action"] == {"dtype": "float32", "shape": [7], "names": list(JOINTS)}
+    assert not any("/" in feature for feature in info["features"])
+    state, action = (frames[name].to_numpy() for name in ("observation.state", "action"))
+    np.testing.assert_array_equal(state[:400], motion.position.astype(np.float32))
+    np.testing.assert_array_equal(action[:399], state[1:400])
+    np.testing.assert_array_equal(action[399], state[399])  # and not the first of the next episode
+    assert frames["index"].to_list() == list(range(550))
+    assert frames["frame_index"].to_list() == [*range(400), *range(150)]
+    np.testing.assert_allclose(frames["timestamp"][400:], np.arange(150) / 50.0, atol=1e-6)
+    episodes = pl.read_parquet(tmp_path / "data/meta/episodes/chunk-000/file-000.parquet")
+    assert episodes["tasks"].to_list() == [["follow session 1"], ["follow session 2"]]
+    assert episodes["dataset_to_index"].to_list() == [400, 550]
+
+
+def test_repetitions_and_phases_are_episodes(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+    export(trajectory, tmp_path / "r", "lerobot", episodes="repetitions", task="wave")
+    frames = read_frames(tmp_path / "r")
+    assert frames["episode_index"].value_counts(sort=True)["count"].to_list() == [41, 41, 41]
+    first = motion.samples((1.6, 2.4))
+    assert motion.recorded_time[[first.start, first.stop - 1]] == pytest.approx([1.6, 2.4])
+    np.testing.assert_array_equal(frames["action"].to_numpy()[40], motion.position[first.stop].astype(np.float32))
+    assert pl.read_parquet(tmp_path / "r/meta/tasks.parquet")["__index_level_0__"].to_list() == ["wave"]
+    export([trajectory], tmp_path / "p", "lerobot", episodes="reach", rate_hz=25.0)
+    assert read_frames(tmp_path / "p")["episode_index"].value_counts(sort=True)["count"].to_list() == [30, 26]
+    # The approach, during which the recording has not begun, belongs to no phase.
+    np.testing.assert_allclose(
+        read_frames(tmp_path / "p")["observation.state"].to_numpy()[0], motion.position[motion.begin], atol=1e-6
+    )
+
+
+def test_an_earlier_data_set_goes_as_a_whole(trajectory: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    export(trajectory, data, "lerobot")
+    stale = data / "data" / "chunk-000" / "file-001.parquet"
+    stale.write_bytes(b"")
+    (data / "notes.txt").write_text("mine")
+    with pytest.raises(WeposeError, match="exists and is not empty"):
+        export(trajectory, data, "lerobot")
+    export(trajectory, data, "lerobot", force=True)
+    assert not stale.exists()
+    assert (data / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.peer
+def test_lerobot_loads_it(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+    """lerobot needs PyTorch: WEPOSE_LEROBOT names the Python of an environment that has it."""
+    python = os.environ.get("WEPOSE_LEROBOT", sys.executable)
+    if subprocess.run(
+        [python, "-c", "import importlib.util as u, sys; sys.exit(not u.find_spec('lerobot'))"]
+    ).returncode:
+        pytest.skip("lerobot is not installed; WEPOSE_LEROBOT names a Python that has it")
+    other = write_trajectory_folder(tmp_path / "other", seed=2)
+    export([trajectory, other], tmp_path / "data", "lerobot", episodes="reach")
+    script = Path(__file__).with_name("lerobot_peer.py")
+    ran = subprocess.run([python, "-W", "ignore", str(script), str(tmp_path / "data")], capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    got = json.loads(ran.stdout)
+    whole = (motion, read_joint_motion(other))
+    spans = [[each.samples(span) for span in each.phases["reach"]] for each in whole]
+    state, action = (
+        np.concatenate(
+            [
+                each.position[span.start + k : span.stop + k]
+                for each, own in zip(whole, spans, strict=True)
+                for span in own
+            ]
+        ).astype(np.float32)
+        for k in (0, 1)
+    )
+    assert (got["fps"], got["robot"], got["joints"], got["dtype"]) == (50, "arm", list(JOINTS), "torch.float32")
+    assert (got["episodes"], got["lengths"], got["frames"]) == (4, [51, 61, 51, 61], 224)
+    np.testing.assert_array_equal(np.array(got["state"], dtype=np.float32), state)
+    np.testing.assert_array_equal(np.array(got["action"], dtype=np.float32), action)
+    np.testing.assert_array_equal(np.array(got["next_actions"], dtype=np.float32), action[:3])
+    np.testing.assert_allclose(got["mean"], action.mean(0, dtype=float), atol=1e-9)
+    assert got["tasks"] == ["follow session 1, reach"] * 112 + ["follow session 2, reach"] * 112
+    assert (got["ahead"], got["last_episode"]) == ([8, 3, 7], 61)
+
+
+# What is wrong ----------------------------------------------------------------------------------------------------
