@@ -18,6 +18,7 @@ from ..recording import select_interval
 from ..tracking.tracked import TrackedRecording
 from .bvh import write_bvh
 from .c3d import write_c3d
+from .gmr import RIGS, write_gmr
 from .joint_motion import (
     ROBOT_URDF,
     TRAJECTORY,
@@ -49,13 +50,14 @@ WRITERS: dict[str, Writer] = {
     "trc": write_trc,
     "bvh": write_bvh,
     "c3d": write_c3d,
+    **{f"bvh-{name}": functools.partial(write_gmr, rig=rig) for name, rig in RIGS.items()},
 }
 JOINT_WRITERS: dict[str, JointWriter] = {}
 ROBOT_WRITERS: dict[str, JointWriter] = {}
 LEROBOT = "lerobot"
 ROBOTS_ALONE = (*ROBOT_WRITERS, LEROBOT)
 FORMATS = (*WRITERS, "urdf", *JOINT_WRITERS, *ROBOT_WRITERS, LEROBOT)
-SUFFIXES = {"placement": ".sto"}  # where it is not the format's name
+SUFFIXES = {"placement": ".sto", **{f"bvh-{name}": ".bvh" for name in RIGS}}  # where it is not the format's name
 # Formats that are folders → what an earlier run left in one, which `force` replaces.
 FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*")}
 WITHOUT_MOTION = ("urdf", "placement")
