@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,8 @@ from arms import JOINTS, write_arm
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import WeposeError
+from wepose_pin.model import read_urdf
+from wepose_pin.retargeting.maps import find_example_data
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import (
     JointMotion,
@@ -197,6 +200,131 @@ def test_lerobot_loads_it(trajectory: Path, motion: JointMotion, tmp_path: Path)
     np.testing.assert_allclose(got["mean"], action.mean(0, dtype=float), atol=1e-9)
     assert got["tasks"] == ["follow session 1, reach"] * 112 + ["follow session 2, reach"] * 112
     assert (got["ahead"], got["last_episode"]) == ([8, 3, 7], 61)
+
+
+# Humanoids --------------------------------------------------------------------------------------------------------
+
+# The order in which Isaac Lab has the joints and bodies of the G1, as published for policies of several authors.
+ISAAC_JOINTS = """left_hip_pitch right_hip_pitch waist_yaw left_hip_roll right_hip_roll waist_roll left_hip_yaw
+right_hip_yaw waist_pitch left_knee right_knee left_shoulder_pitch right_shoulder_pitch left_ankle_pitch
+right_ankle_pitch left_shoulder_roll right_shoulder_roll left_ankle_roll right_ankle_roll left_shoulder_yaw
+right_shoulder_yaw left_elbow right_elbow left_wrist_roll right_wrist_roll left_wrist_pitch right_wrist_pitch
+left_wrist_yaw right_wrist_yaw""".split()
+# That of MuJoCo and of BeyondMimic's .csv.
+LEG = ["hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll"]
+ARM = ["shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw"]
+MUJOCO_JOINTS = [
+    *(f"{side}_{part}_joint" for side in ("left", "right") for part in LEG),
+    *("waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint"),
+    *(f"{side}_{part}_joint" for side in ("left", "right") for part in ARM),
+]
+
+
+@pytest.fixture(scope="module")
+def g1() -> JointMotion:
+    """The G1, each of its joints at a value of its own, standing at 0.79 m and turned by a quarter."""
+    data = find_example_data()
+    if data is None:
+        pytest.skip("example-robot-data is not installed")
+    urdf = data / "g1_description/urdf/g1_29dof_rev_1_0.urdf"
+    time, names = np.arange(40) / 50.0, MUJOCO_JOINTS[::-1]
+    position = 0.01 * np.arange(29) + 0.1 * np.sin(3.0 * time)[:, None]
+    velocity = np.repeat(0.3 * np.cos(3.0 * time)[:, None], 29, axis=1)
+    turned = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    text = urdf.read_text(encoding="utf-8")
+    return JointMotion(
+        "g1", "g1", read_urdf(urdf), text, tuple(names), time, position, velocity, {}, np.array([0.1, 0.2, 0.79]),
+        turned, time,
+    )  # fmt: skip
+
+
+class Moving:
+    """What `export` takes for a trajectory."""
+
+    def __init__(self, motion: JointMotion) -> None:
+        self._motion = motion
+
+    def joint_motion(self) -> JointMotion:
+        return self._motion
+
+
+def test_gmr_loads_the_pickle(g1: JointMotion, tmp_path: Path) -> None:
+    """As GMR's `load_robot_motion`, which turns xyzw into wxyz."""
+    export(Moving(g1), tmp_path / "x.pkl")
+    loaded = pickle.loads((tmp_path / "x.pkl").read_bytes())
+    assert (loaded["fps"], type(loaded["fps"])) == (50, int)
+    assert loaded["local_body_pos"] is loaded["link_body_list"] is None
+    np.testing.assert_allclose(
+        loaded["root_rot"][:, [3, 0, 1, 2]], np.tile([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], (40, 1))
+    )
+    np.testing.assert_array_equal(loaded["dof_pos"], g1.position[:, ::-1])
+    np.testing.assert_array_equal(loaded["root_pos"][-1], [0.1, 0.2, 0.79])
+    export(Moving(g1), tmp_path / "x.csv", "csv-beyondmimic")
+    rows = np.loadtxt(tmp_path / "x.csv", delimiter=",")
+    assert rows.shape == (40, 36)
+    np.testing.assert_allclose(rows, np.hstack([loaded["root_pos"], loaded["root_rot"], loaded["dof_pos"]]), atol=5e-9)
+
+
+def test_beyondmimic_loads_the_npz(g1: JointMotion, tmp_path: Path) -> None:
+    """As its `MotionLoader`, which takes bodies by their place in Isaac Lab's list; velocities against differences."""
+    export(Moving(g1), tmp_path / "x.npz")
+    with np.load(tmp_path / "x.npz", allow_pickle=False) as data:
+        loaded = dict(data)
+    joints = [f"{name}_joint" for name in ISAAC_JOINTS]
+    bodies = ["pelvis", *(f"{name}_link" for name in ISAAC_JOINTS)]
+    bodies[bodies.index("waist_pitch_link")] = "torso_link"
+    assert (loaded["joint_names"].tolist(), loaded["body_names"].tolist()) == (joints, bodies)
+    assert loaded["fps"].tolist() == [50]
+    assert loaded["body_pos_w"].shape == (40, 30, 3)
+    columns = [g1.joints.index(joint) for joint in joints]
+    np.testing.assert_allclose(loaded["joint_pos"], g1.position[:, columns], atol=1e-7)
+    np.testing.assert_allclose(loaded["joint_vel"], g1.velocity[:, columns], atol=1e-7)
+    fine = resample_joints(g1, 2000.0)
+    for body, (quat, p) in compute_link_poses_W(fine).items():
+        if body in bodies:
+            k = bodies.index(body)
+            np.testing.assert_allclose(loaded["body_pos_w"][:, k], p[::40], atol=1e-6)
+            np.testing.assert_allclose(
+                np.abs(np.sum(loaded["body_quat_w"][:, k] * quat[::40, [3, 0, 1, 2]], 1)), 1, atol=1e-6
+            )
+            np.testing.assert_allclose(
+                loaded["body_lin_vel_w"][1:-1, k], np.gradient(p, fine.time, axis=0)[40:-1:40], atol=1e-4
+            )
+            turn = Rotation.from_quat(quat[41:-1:40]) * Rotation.from_quat(quat[39:-2:40]).inv()
+            np.testing.assert_allclose(loaded["body_ang_vel_w"][1:-1, k], turn.as_rotvec() * 1000.0, atol=1e-4)
+
+
+@pytest.mark.peer
+@pytest.mark.parametrize("turned", [(0.0, 0.0, 0.0), (0.4, 0.1, -0.3)])
+def test_mujoco_puts_the_bodies_there(tmp_path: Path, turned: tuple[float, float, float]) -> None:
+    """MuJoCo with the same URDF and the joints of the .pkl in its own order."""
+    mujoco = pytest.importorskip("mujoco")
+    folder = write_trajectory_folder(tmp_path / "arm", seconds=0.5)
+    (tmp_path / "other").mkdir()
+    write_arm(tmp_path / "other", turned=turned).replace(folder / "robot.urdf")
+    for suffix in ("pkl", "npz"):
+        export(folder, tmp_path / f"x.{suffix}")
+    motion, bodies = pickle.loads((tmp_path / "x.pkl").read_bytes()), np.load(tmp_path / "x.npz")
+    # Massless bodies that move, as in this URDF, are refused; mass does not matter to where they are.
+    text = (
+        (folder / "robot.urdf")
+        .read_text()
+        .replace(
+            '<robot name="arm">',
+            '<robot name="arm"><mujoco><compiler balanceinertia="true" boundmass="0.1" boundinertia="0.1"/></mujoco>',
+        )
+    )
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    assert [model.joint(k).name for k in range(model.njnt)] == list(JOINTS)
+    R_WB, p_WB = Rotation.from_quat(motion["root_rot"][0]), motion["root_pos"][0]
+    worst = 0.0
+    for k in range(len(motion["dof_pos"])):
+        data.qpos[:] = motion["dof_pos"][k]
+        mujoco.mj_kinematics(model, data)
+        for name, p in zip(bodies["body_names"].tolist()[1:], bodies["body_pos_w"][k, 1:], strict=True):
+            worst = max(worst, np.abs(R_WB.apply(data.body(name).xpos) + p_WB - p).max())
+    assert worst < 1e-6
 
 
 # What is wrong ----------------------------------------------------------------------------------------------------

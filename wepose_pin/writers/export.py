@@ -19,6 +19,7 @@ from ..tracking.tracked import TrackedRecording
 from .bvh import write_bvh
 from .c3d import write_c3d
 from .gmr import RIGS, write_gmr
+from .humanoid import write_motion_csv, write_motion_npz, write_pickle
 from .joint_motion import (
     ROBOT_URDF,
     TRAJECTORY,
@@ -53,11 +54,19 @@ WRITERS: dict[str, Writer] = {
     **{f"bvh-{name}": functools.partial(write_gmr, rig=rig) for name, rig in RIGS.items()},
 }
 JOINT_WRITERS: dict[str, JointWriter] = {}
-ROBOT_WRITERS: dict[str, JointWriter] = {}
+ROBOT_WRITERS: dict[str, JointWriter] = {
+    "pkl": write_pickle,
+    "npz": write_motion_npz,
+    "csv-beyondmimic": write_motion_csv,
+}
 LEROBOT = "lerobot"
 ROBOTS_ALONE = (*ROBOT_WRITERS, LEROBOT)
 FORMATS = (*WRITERS, "urdf", *JOINT_WRITERS, *ROBOT_WRITERS, LEROBOT)
-SUFFIXES = {"placement": ".sto", **{f"bvh-{name}": ".bvh" for name in RIGS}}  # where it is not the format's name
+SUFFIXES = {
+    "placement": ".sto",
+    "csv-beyondmimic": ".csv",
+    **{f"bvh-{name}": ".bvh" for name in RIGS},
+}  # where it is not the format's name
 # Formats that are folders → what an earlier run left in one, which `force` replaces.
 FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*")}
 WITHOUT_MOTION = ("urdf", "placement")
