@@ -35,6 +35,8 @@ from .motion import Motion, check_rate, resampled
 from .opensim import write_mot, write_placement, write_sto, write_trc
 from .provenance import provenance_file, provenance_text
 from .result import SUBJECT_URDF, format_urdf, read_result
+from .ros import write_mcap, write_rosbag
+from .rrd import write_rrd
 from .tables import write_csv, write_parquet
 
 Result = PosedBody | HasJointMotion | str | Path
@@ -53,7 +55,7 @@ WRITERS: dict[str, Writer] = {
     "c3d": write_c3d,
     **{f"bvh-{name}": functools.partial(write_gmr, rig=rig) for name, rig in RIGS.items()},
 }
-JOINT_WRITERS: dict[str, JointWriter] = {}
+JOINT_WRITERS: dict[str, JointWriter] = {"rosbag": write_rosbag, "mcap": write_mcap, "rrd": write_rrd}
 ROBOT_WRITERS: dict[str, JointWriter] = {
     "pkl": write_pickle,
     "npz": write_motion_npz,
@@ -68,7 +70,7 @@ SUFFIXES = {
     **{f"bvh-{name}": ".bvh" for name in RIGS},
 }  # where it is not the format's name
 # Formats that are folders → what an earlier run left in one, which `force` replaces.
-FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*")}
+FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*"), "rosbag": ("*.db3", "*.mcap", "metadata.yaml")}
 WITHOUT_MOTION = ("urdf", "placement")
 NAMES = ("opensim", "isb")
 
