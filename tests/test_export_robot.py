@@ -138,7 +138,7 @@ def test_each_result_is_an_episode(trajectory: Path, motion: JointMotion, tmp_pa
 
 
 def test_repetitions_and_phases_are_episodes(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
-    export(trajectory, tmp_path / "r", "lerobot", episodes="repetitions", task="wave")
+    export(trajectory, tmp_path / "r", "lerobot", episodes="repetitions", instruction="wave")
     frames = read_frames(tmp_path / "r")
     assert frames["episode_index"].value_counts(sort=True)["count"].to_list() == [41, 41, 41]
     first = motion.samples((1.6, 2.4))

@@ -130,7 +130,8 @@ def test_a_step_of_a_plan_has_the_options_of_its_command(step: str) -> None:
     """What a plan may say of a step, and what its item fills in, are all fields of the job."""
     options = step_options(step)
     formats = {"format"} if "formats" in options else set()
-    filled = {"session", "out", "subject", "result", "truth", "measured", "stature", "sex", "force", "further"}
+    filled = {"session", "out", "subject", "result", "truth", "measured", "stature", "sex", "force", "further",
+              "episodes", "instruction"}  # fmt: skip
     assert {field.name for field in fields(STEPS[step])} == (set(options) - {"formats"}) | formats | (
         filled & {field.name for field in fields(STEPS[step])}
     )

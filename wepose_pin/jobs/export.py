@@ -45,7 +45,7 @@ class ExportJob:
     episodes : PHASE
         Only for lerobot: make each interval of this phase of the recording an episode, or, by the word
         repetitions, each repetition of the movement. Without it each result is an episode.
-    task : TEXT
+    instruction : TEXT
         Only for lerobot: the text that says what the robot does, in all episodes. Without it "follow NAME".
     force
         Replace an existing file.
@@ -60,7 +60,7 @@ class ExportJob:
     interval: tuple[float, float] | None = None
     phase: str | None = None
     episodes: str | None = None
-    task: str | None = None
+    instruction: str | None = None
     force: bool = False
 
     def check(self) -> None:
@@ -103,7 +103,7 @@ def run_export(
         interval=job.interval,
         phase=job.phase,
         episodes=job.episodes,
-        task=job.task,
+        instruction=job.instruction,
         force=job.force,
         provenance=provenance or None,
     )

@@ -95,7 +95,7 @@ def export(
     interval: tuple[float, float] | None = None,
     phase: str | None = None,
     episodes: str | None = None,
-    task: str | None = None,
+    instruction: str | None = None,
     force: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
@@ -121,7 +121,7 @@ def export(
     episodes : str, optional
         Of "lerobot": "repetitions" makes each repetition of the movement an episode, a phase each of its intervals;
         None: each result is one.
-    task : str, optional
+    instruction : str, optional
         Of "lerobot": what the robot does, in all episodes; None: "follow NAME".
     force : bool
         Replace an existing file, or a data set of the same format.
@@ -153,7 +153,9 @@ def export(
     results = [result] if isinstance(result, Result) else list(result)
     file = Path(file)
     format = _format(file, format)
-    _check_options(format, names=names, rate_hz=rate_hz, interval=interval, phase=phase, episodes=episodes, task=task)
+    _check_options(
+        format, names=names, rate_hz=rate_hz, interval=interval, phase=phase, episodes=episodes, instruction=instruction
+    )
     if len(results) != 1 and format != LEROBOT:
         raise BadOption(
             f"--format {format}: a file of {len(results)} results; only {LEROBOT} takes several, as episodes"
@@ -179,7 +181,7 @@ def export(
         if rate_hz is not None:
             motions = [resample_joints(each, rate_hz) for each in motions]
         if format == LEROBOT:
-            write_lerobot(partial, [one for each in motions for one in list_episodes(each, episodes, task)])
+            write_lerobot(partial, [one for each in motions for one in list_episodes(each, episodes, instruction)])
         else:
             (JOINT_WRITERS | ROBOT_WRITERS)[format](partial, motions[0])
         return Exported(format, [])
@@ -196,7 +198,7 @@ def _check_options(format: str, **options: Any) -> None:
     rate_hz = given.get("rate-hz")
     if rate_hz is not None:
         check_rate(rate_hz)
-    for name in ("episodes", "task"):
+    for name in ("episodes", "instruction"):
         if name in given and format != LEROBOT:
             raise BadOption(f"--{name} {given[name]}: only of format {LEROBOT}, and the format is {format}")
     if format in WITHOUT_MOTION and (unused := [name for name in ("rate-hz", "interval", "phase") if name in given]):

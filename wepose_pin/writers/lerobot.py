@@ -36,13 +36,13 @@ class Episode(NamedTuple):
     task: str
 
 
-def list_episodes(motion: JointMotion, by: str | None, task: str | None) -> list[Episode]:
+def list_episodes(motion: JointMotion, by: str | None, instruction: str | None) -> list[Episode]:
     """Return the episodes of a motion.
 
     Parameters
     ----------
     by : "repetitions": each repetition of the movement is one; a phase: each of its intervals; None: all of it
-    task : text of all episodes; None: "follow NAME", or with the name of the phase after it
+    instruction : text of all episodes; None: "follow NAME", or with the name of the phase after it
 
     Raises
     ------
@@ -50,14 +50,14 @@ def list_episodes(motion: JointMotion, by: str | None, task: str | None) -> list
         The recording has no repetitions, or no such phase.
     """
     if by is None:
-        return [Episode(motion, motion.position[-1], task or f"follow {motion.source or motion.name}")]
+        return [Episode(motion, motion.position[-1], instruction or f"follow {motion.source or motion.name}")]
     if not motion.phases.get(by):
         known = [name for name, spans in motion.phases.items() if spans]
         reason = "no repetitions were found in it" if by == REPETITIONS else "it has no such phase"
         choices = one_of(known, by) if known else "leave --episodes out"
         raise WrongOption("episodes", by, f"{motion.where}: {reason}; {choices}")
     following = [] if by == REPETITIONS else [by]
-    text = task or ", ".join([f"follow {motion.source or motion.name}", *following])
+    text = instruction or ", ".join([f"follow {motion.source or motion.name}", *following])
     episodes = []
     for interval in motion.phases[by]:
         end = motion.samples(interval).stop
