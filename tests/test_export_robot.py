@@ -8,6 +8,7 @@ import os
 import pickle
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,14 @@ import polars as pl
 import pytest
 from arms import JOINTS, write_arm
 from scipy.spatial.transform import Rotation
+from test_export import a_pose, write_folder
 
+from wepose_pin import cli
 from wepose_pin.errors import WeposeError
+from wepose_pin.kinematics import PosedBody
 from wepose_pin.model import read_urdf
 from wepose_pin.retargeting.maps import find_example_data
+from wepose_pin.subject import population_subject
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import (
     JointMotion,
@@ -27,7 +32,7 @@ from wepose_pin.writers.joint_motion import (
     read_joint_motion,
     resample_joints,
 )
-from wepose_pin.writers.result import write_table
+from wepose_pin.writers.result import read_result, write_table
 
 RATE_HZ = 50.0
 APPROACH_S = 2.0
@@ -166,14 +171,19 @@ def test_an_earlier_data_set_goes_as_a_whole(trajectory: Path, tmp_path: Path) -
     assert (data / "notes.txt").read_text() == "mine"
 
 
+def find_lerobot() -> str:
+    """The Python that has lerobot; the test is skipped without one."""
+    python = os.environ.get("WEPOSE_LEROBOT", sys.executable)
+    found = subprocess.run([python, "-c", "import importlib.util as u, sys; sys.exit(not u.find_spec('lerobot'))"])
+    if found.returncode:
+        pytest.skip("lerobot is not installed; WEPOSE_LEROBOT names a Python that has it")
+    return python
+
+
 @pytest.mark.peer
 def test_lerobot_loads_it(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
     """lerobot needs PyTorch: WEPOSE_LEROBOT names the Python of an environment that has it."""
-    python = os.environ.get("WEPOSE_LEROBOT", sys.executable)
-    if subprocess.run(
-        [python, "-c", "import importlib.util as u, sys; sys.exit(not u.find_spec('lerobot'))"]
-    ).returncode:
-        pytest.skip("lerobot is not installed; WEPOSE_LEROBOT names a Python that has it")
+    python = find_lerobot()
     other = write_trajectory_folder(tmp_path / "other", seed=2)
     export([trajectory, other], tmp_path / "data", "lerobot", episodes="reach")
     script = Path(__file__).with_name("lerobot_peer.py")
@@ -328,3 +338,108 @@ def test_mujoco_puts_the_bodies_there(tmp_path: Path, turned: tuple[float, float
 
 
 # What is wrong ----------------------------------------------------------------------------------------------------
+
+
+def change_summary(folder: Path, **values: object) -> None:
+    file = folder / "summary.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | values))
+
+
+def change_table(folder: Path, change: pl.Expr) -> None:
+    write_table(folder / "trajectory.parquet", pl.read_parquet(folder / "trajectory.parquet").with_columns(change))
+
+
+def change_urdf(folder: Path, old: str, new: str) -> None:
+    file = folder / "robot.urdf"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda f: (f / "robot.urdf").unlink(), "no robot.urdf in it; a folder that `wepose retarget` wrote is wanted"),
+        (lambda f: (f / "summary.json").write_text('{"robot": "arm"'), "summary.json: is damaged, or of no trajectory"),
+        (lambda f: change_summary(f, root={"x": 0.0}), "summary.json: is damaged, or of no trajectory: KeyError('y')"),
+        (lambda f: change_summary(f, root=dict.fromkeys(("x", "y", "z", "qx", "qy", "qz", "qw"), 0.0)), "unit quat"),
+        (lambda f: change_summary(f, joints=[*JOINTS, "gripper"]), "trajectory.parquet: no column 'gripper'"),
+        (lambda f: change_table(f, pl.lit("fast").alias("elbow_velocity")), "trajectory.parquet: a column holds text"),
+        (lambda f: change_table(f, pl.lit(float("nan")).alias("elbow")), "elbow has no number in row 1"),
+        (lambda f: change_table(f, pl.lit(1.0).alias("time")), "whose times do not all grow"),
+        (lambda f: change_table(f, pl.col("time") ** 1.5 + pl.col("time")), "times that are uneven; the file has only"),
+        (lambda f: change_table(f, pl.col("time") * 1.003), "49.8504 samples a second, or times that are uneven"),
+        (lambda f: change_urdf(f, "</robot>", ""), "robot.urdf: is no complete XML file"),
+        (lambda f: change_urdf(f, '"elbow"', '"knee"'), "robot.urdf: no joint 'elbow'; summary.json beside it names"),
+        (lambda f: (f / "trajectory.parquet").write_bytes(b"PAR1"), "trajectory.parquet"),
+    ],
+)  # fmt: skip
+def test_a_spoiled_trajectory_takes_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], object], said: str
+) -> None:
+    folder = write_trajectory_folder(tmp_path / "arm", seconds=3.0)
+    spoil(folder)
+    for name, format in (("data", "lerobot"), ("x.npz", "npz"), ("x.pkl", "pkl")):
+        assert_refused(capsys, [str(folder), "-o", str(tmp_path / name), "--format", format], said)
+    assert [path.name for path in tmp_path.iterdir()] == ["arm"]
+
+
+def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["export", *arguments])
+    error = capsys.readouterr().err
+    assert (stop.value.code, error.count("\n")) == (2, 1), error
+    assert said in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["-o", "d", "--format", "lerobot", "--episodes", "reachh"], "it has no such phase; did you mean 'reach'?"),
+        (["-o", "d", "--format", "lerobot", "--episodes", "later"], "0 samples follow 90 to 91 s of the recording"),
+        (["-o", "d", "--format", "lerobot", "--phase", "reach"], "reach has 2 intervals; choose reach:1"),
+        (["-o", "d", "--format", "lerobot", "--rate-hz", "33.3"], "33.3 samples a second"),
+        (["-o", "d", "--format", "lerobot", "--interval", "50", "60"], "the recording runs from 1.5 to"),
+        (["-o", "x.mcap", "--episodes", "reach"], "--episodes reach: only of format lerobot, and the format is mcap"),
+        (["-o", "x.npz", "--instruction", "go"], "--instruction go: only of format lerobot, and the format is npz"),
+        (
+            ["-o", "x.trc"],
+            "--format trc: is of a person's motion, and this is a robot's trajectory; of that there is: urdf",
+        ),
+        (["-o", "x.pickle", "--format", "pkl"], "name it x.pkl"),
+        (["-o", "d"], "-o d: '' is no format's suffix"),
+        (["{arm}", "-o", "x.mcap"], "--format mcap: a file of 2 results; only lerobot takes several, as episodes"),
+        (["{slow}", "-o", "d", "--format", "lerobot"], "its rate [Hz] '25' differs from '50'"),
+        (["{other}", "-o", "d", "--format", "lerobot"], "its joints 'flexion' differs from 'flexion, abduction"),
+        (["-o", "{arm}/summary.json", "--format", "lerobot", "--force"], "summary.json: is a file; a folder is wanted"),
+    ],
+)
+def test_a_wrong_export_of_a_robot_takes_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folders = {name: write_trajectory_folder(tmp_path / name) for name in ("arm", "other")}
+    folders["slow"] = write_trajectory_folder(tmp_path / "slow", rate_hz=25.0)
+    change_summary(folders["other"], joints=["flexion"])
+    before = sorted(tmp_path.rglob("*"))
+    assert_refused(capsys, [str(folders["arm"]), *(word.format(**folders) for word in arguments)], said)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_person_is_no_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_folder(tmp_path / "r", a_pose(n=5))
+    for arguments in (["-o", str(tmp_path / "d"), "--format", "lerobot"], ["-o", str(tmp_path / "x.npz")]):
+        assert_refused(
+            capsys, [str(folder), *arguments], "no trajectory.parquet in it; a folder that `wepose retarget`"
+        )
+    with pytest.raises(WeposeError, match="is of robots, and this is a person's motion; `wepose retarget` makes one"):
+        export(load_result_of(folder), tmp_path / "x.pkl")
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]
+
+
+def load_result_of(folder: Path) -> PosedBody:
+    pose, model, _ = read_result(folder)
+    return PosedBody("made", pose, model, population_subject())

@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..errors import BadOption
 from ..model.tree import joint_axis
 from ..rotations import wxyz_from_xyzw
-from .joint_motion import JointMotion, compute_link_poses_W
+from .joint_motion import JointMotion, compute_link_poses_W, find_whole_rate
 
 DIGITS = 8  # of the .csv
 
@@ -29,7 +28,7 @@ DIGITS = 8  # of the .csv
 def write_pickle(path: Path, motion: JointMotion) -> None:
     """Write the motion as GMR saves it; rotations of the root are xyzw."""
     values = {
-        "fps": _find_whole_rate(motion),
+        "fps": find_whole_rate(motion),
         "root_pos": np.tile(motion.p_WB, (len(motion.time), 1)),
         "root_rot": np.tile(motion.quat_WB, (len(motion.time), 1)),
         "dof_pos": _stack(motion.values, motion.moving),
@@ -41,7 +40,7 @@ def write_pickle(path: Path, motion: JointMotion) -> None:
 
 def write_motion_csv(path: Path, motion: JointMotion) -> None:
     """Write a row a sample without a header: place and xyzw of the root, then the joints."""
-    _find_whole_rate(motion)  # the reader is told the rate as a whole number
+    find_whole_rate(motion)  # the reader is told the rate as a whole number
     root = np.tile(np.concatenate([motion.p_WB, motion.quat_WB]), (len(motion.time), 1))
     np.savetxt(path, np.hstack([root, _stack(motion.values, motion.moving)]), fmt=f"%.{DIGITS}f", delimiter=",")
 
@@ -54,7 +53,7 @@ def write_motion_npz(path: Path, motion: JointMotion) -> None:
     velocities = _compute_link_velocities(motion, poses)
     names = [joint.name for joint in joints]
     arrays: dict[str, Any] = {
-        "fps": np.array([_find_whole_rate(motion)]),
+        "fps": np.array([find_whole_rate(motion)]),
         "joint_pos": _stack(motion.values, names),
         "joint_vel": _stack(motion.rates, names),
         "body_pos_w": np.stack([poses[body][1] for body in bodies], axis=1),
@@ -65,15 +64,6 @@ def write_motion_npz(path: Path, motion: JointMotion) -> None:
     arrays = {name: values.astype(np.float32) if values.ndim > 1 else values for name, values in arrays.items()}
     with path.open("wb") as file:
         np.savez(file, **arrays, joint_names=np.array(names), body_names=np.array(bodies))
-
-
-def _find_whole_rate(motion: JointMotion) -> int:
-    rate_hz = round(motion.rate_hz)
-    if abs(rate_hz - motion.rate_hz) > 1e-3:
-        raise BadOption(
-            f"{motion.where}: {motion.rate_hz:g} Hz; the file holds a whole number, choose one by --rate-hz"
-        )
-    return rate_hz
 
 
 def _stack(column: Any, joints: Any) -> np.ndarray:

@@ -24,7 +24,7 @@ from ..model.tree import joint_axis, joint_placement, parse_tree
 from ..readers.tables import read_table
 from ..recording import Intervals, select_interval
 from ..rotations import multiply
-from .motion import Motion, check_complete, resample_evenly
+from .motion import EVEN, FEW, MOST_NEW, Motion, check_complete, resample_evenly
 from .result import read_phases
 
 TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
@@ -213,6 +213,10 @@ def read_joint_motion(folder: Path) -> JointMotion:
             row = int(np.argmin(np.isfinite(values))) + 1
             raise BadData(f"{file}: {column} has no number in row {row}; a robot needs one in every row")
     time = numbers["time"]
+    if not np.isfinite(place).all() or abs(np.linalg.norm(place[3:]) - 1.0) > 1e-3:
+        raise BadData(
+            f"{folder / 'summary.json'}: root is at {place}; three coordinates and a unit quaternion are needed"
+        )
     if len(time) < 2 or np.any(np.diff(time) <= 0.0):
         raise BadData(f"{file}: {len(time)} rows whose times do not all grow; a trajectory has at least 2 that do")
     robot = read_urdf(folder / ROBOT_URDF)
@@ -274,9 +278,39 @@ def cut_interval(motion: JointMotion, interval: tuple[float, float]) -> JointMot
     return motion.cut(samples)
 
 
+def find_whole_rate(motion: JointMotion) -> int:
+    """Return the samples a second, for files that hold no times and a whole number.
+
+    Raises
+    ------
+    BadData
+        The times are uneven, or their rate is no whole number.
+    """
+    time, rate_hz = motion.time, round(motion.rate_hz)
+    grid = np.linspace(time[0], time[-1], len(time))
+    if np.abs(time - grid).max() * rate_hz > EVEN or abs(rate_hz - motion.rate_hz) > 1e-3:
+        raise BadData(
+            f"{motion.where}: {motion.rate_hz:g} samples a second, or times that are uneven; the file has only a whole "
+            f"number of them, which --rate-hz makes"
+        )
+    return rate_hz
+
+
 def resample_joints(motion: JointMotion, rate_hz: float) -> JointMotion:
-    """Return the motion at another rate, on the cubics through positions and velocities."""
-    time = motion.time[0] + np.arange(int((motion.time[-1] - motion.time[0]) * rate_hz + SLACK_S) + 1) / rate_hz
+    """Return the motion at another rate, on the cubics through positions and velocities.
+
+    Raises
+    ------
+    BadData
+        Times so far apart that nearly all samples would be new.
+    """
+    samples = int((motion.time[-1] - motion.time[0]) * rate_hz + SLACK_S) + 1
+    if samples > max(FEW, MOST_NEW * len(motion.time)):
+        raise BadData(
+            f"{motion.where}: {len(motion.time)} samples from {motion.time[0]:g} to {motion.time[-1]:g} s; at "
+            f"{rate_hz:g} Hz that is {samples}"
+        )
+    time = motion.time[0] + np.arange(samples) / rate_hz
     curve = CubicHermiteSpline(motion.time, motion.position, motion.velocity)
     inside = np.minimum(time, motion.time[-1])
     begin = int(np.searchsorted(time, motion.time[min(motion.begin, len(motion.time) - 1)] - SLACK_S))

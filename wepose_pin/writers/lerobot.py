@@ -17,8 +17,8 @@ import numpy as np
 import polars as pl
 
 from .. import __version__
-from ..errors import BadData, BadOption, WrongOption, one_of
-from .joint_motion import REPETITIONS, JointMotion, cut_interval
+from ..errors import BadData, WrongOption, one_of
+from .joint_motion import REPETITIONS, JointMotion, cut_interval, find_whole_rate
 from .result import write_table
 
 VERSION = "v3.0"
@@ -70,7 +70,7 @@ def write_lerobot(folder: Path, episodes: Sequence[Episode]) -> None:
 
     Raises
     ------
-    BadOption, BadData
+    BadData
         Episodes of several robots, of other joints or rates; a rate that is no whole number.
     """
     rate_hz = _check_alike(episodes)
@@ -129,8 +129,7 @@ def write_lerobot(folder: Path, episodes: Sequence[Episode]) -> None:
 def _check_alike(episodes: Sequence[Episode]) -> int:
     """Return the rate [Hz] that all episodes have."""
     first = episodes[0].motion
-    for episode in episodes[1:]:
-        motion = episode.motion
+    for motion in [episode.motion for episode in episodes[1:]]:
         for what, own, other in (
             ("robot", first.name, motion.name),
             ("joints", ", ".join(first.joints), ", ".join(motion.joints)),
@@ -142,10 +141,7 @@ def _check_alike(episodes: Sequence[Episode]) -> int:
                     f"{motion.where}: its {what} '{other}' differs from '{own}' of {first.where}; a data set has one"
                     f"{advice}"
                 )
-    rate_hz = round(first.rate_hz)
-    if abs(rate_hz - first.rate_hz) > 1e-3:
-        raise BadOption(f"{first.where}: {first.rate_hz:g} Hz; a data set has a whole number, choose one by --rate-hz")
-    return rate_hz
+    return find_whole_rate(first)
 
 
 def _fixed_size_lists(values: np.ndarray) -> pl.Series:
