@@ -406,6 +406,7 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
             "--format trc: is of a person's motion, and this is a robot's trajectory; of that there is: urdf",
         ),
         (["-o", "x.pickle", "--format", "pkl"], "name it x.pkl"),
+        (["-o", "x.bag", "--format", "rosbag"], "-o x.bag: format rosbag is a folder; name it x"),
         (["-o", "d"], "-o d: '' is no format's suffix"),
         (["{arm}", "-o", "x.mcap"], "--format mcap: a file of 2 results; only lerobot takes several, as episodes"),
         (["{slow}", "-o", "d", "--format", "lerobot"], "its rate [Hz] '25' differs from '50'"),

@@ -71,6 +71,7 @@ SUFFIXES = {
 }  # where it is not the format's name
 # Formats that are folders → what an earlier run left in one, which `force` replaces.
 FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*"), "rosbag": ("*.db3", "*.mcap", "metadata.yaml")}
+FILE_SUFFIXES = (*FORMATS, "bag", "db3")
 WITHOUT_MOTION = ("urdf", "placement")
 NAMES = ("opensim", "isb")
 
@@ -109,8 +110,9 @@ def export(
     file : str or Path
         The file to write; of "lerobot" and "rosbag" the folder.
     format : str, optional
-        One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "trc", "bvh", "c3d". Of either:
-        "urdf". Of a robot: "lerobot". None: that of the file's suffix, which otherwise has to be the format's own.
+        One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "trc", "c3d", "bvh", "bvh-lafan1",
+        "bvh-nokov", "bvh-xsens". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot", "pkl", "npz",
+        "csv-beyondmimic". None: that of the file's suffix, which otherwise has to be the format's own.
     names : str, optional
         Of a .mot's columns: "opensim", or "isb"; None: "opensim".
     rate_hz : float, optional
@@ -282,7 +284,10 @@ def _format(file: Path, format: str | None) -> str:
     if format not in FORMATS:
         raise BadOption(f"--format {format}: not known; {one_of(FORMATS, format)}")
     suffix = SUFFIXES.get(format, f".{format}")
-    if format not in FOLDERS and file.suffix.lower() != suffix:
+    if format in FOLDERS:
+        if file.suffix.lower().removeprefix(".") in FILE_SUFFIXES:  # readers would take the folder for a file
+            raise BadOption(f"-o {file}: format {format} is a folder; name it {file.stem}")
+    elif file.suffix.lower() != suffix:
         raise BadOption(
             f"-o {file}: format {format} is for programs that go by the suffix: name it {file.stem}{suffix}"
         )
