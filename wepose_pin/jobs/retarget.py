@@ -148,7 +148,7 @@ def run_retarget(
         summary |= {
             "recording": str(about.get("recording") or job.result.name),
             "recorded_phases": {name: list(map(list, spans)) for name, spans in read_phases(about).items()},
-            REPETITIONS: _find_repetitions(pose),
+            REPETITIONS: _find_repetitions(pose, tuple(arm.side for arm in robot.arms)),
         }
         if provenance is None:
             provenance = collect_provenance("retarget", field_values(job))
@@ -165,10 +165,14 @@ def run_retarget(
     return RetargetOutcome(summary, failures, float(trajectory.time[-1]))
 
 
-def _find_repetitions(pose: Pose) -> dict[str, Any]:
-    """The repetitions of the person's movement, as `wepose angles` finds them: by which angle, when [s]."""
+def _find_repetitions(pose: Pose, sides: tuple[str, ...]) -> dict[str, Any]:
+    """The repetitions of the arms that a robot follows, as `wepose angles` finds them: by which angle, when [s]."""
+    from dataclasses import replace
+
     from ..angles import joint_angles
     from ..angles.repetitions import find_repetitions
 
-    found = find_repetitions(joint_angles(pose))
+    angles = joint_angles(pose)
+    of_arms = {name: each for name, each in angles.joints.items() if name.startswith(sides)}
+    found = find_repetitions(replace(angles, joints=of_arms))
     return {"source": found.source, "spans": found.spans.tolist(), "reason": found.reason}

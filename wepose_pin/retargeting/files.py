@@ -78,7 +78,7 @@ def _format_joint_trajectory(trajectory: Trajectory) -> str:
 def build_joint_motion(trajectory: Trajectory) -> JointMotion:
     """Return the trajectory as writers of other programs' files take it, the robot standing on the floor."""
     robot, urdf = trajectory.robot, trajectory.robot.map.urdf
-    placement = _place_root(robot)
+    placement = place_root(robot)
     return JointMotion(
         name=robot.map.name,
         where=robot.map.name,
@@ -107,7 +107,7 @@ def _list_posture(robot: Robot) -> dict[str, float]:
     return posture
 
 
-def _place_root(robot: Robot) -> np.ndarray:
+def place_root(robot: Robot) -> np.ndarray:
     """Position [m] and xyzw (7,) of the root in W: where a standing robot is on the floor, else at its origin."""
     R_WB = robot.R_BT.T
     data, height = robot.model.createData(), 0.0
@@ -152,7 +152,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "urdf": robot.map.urdf.name,
         "joints": list(robot.names),
         "posture": _list_posture(robot),
-        "root": dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), _place_root(robot).tolist(), strict=True)),
+        "root": dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), place_root(robot).tolist(), strict=True)),
         "description": robot.map.description,
         "rate_hz": round(1.0 / dt, 3),
         "duration_s": round(float(trajectory.time[-1]), 3),
