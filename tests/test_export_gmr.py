@@ -23,6 +23,8 @@ from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import load_model
 from wepose_pin.retargeting.maps import find_example_data
 from wepose_pin.writers.export import export
+from wepose_pin.writers.gmr import RIGS, write_gmr
+from wepose_pin.writers.motion import Motion
 
 H = np.sqrt(0.5)
 ARM, FOREARM, WRIST = "{}_shoulder_yaw_link", "{}_elbow_link", "{}_wrist_yaw_link"
@@ -250,6 +252,31 @@ def test_a_walk_on_the_spot_keeps_the_heading_of_the_pelvis(tmp_path: Path) -> N
     yaw = pelvis.as_euler("ZYX")
     np.testing.assert_allclose(yaw[:, 1:], 0.0, atol=1e-7)
     np.testing.assert_allclose(yaw[:, 0], np.arctan2(forward[:, 1], forward[:, 0]), atol=0.05)
+
+
+def test_measured_legs_move_on_the_floor(tmp_path: Path) -> None:
+    """A person who squats: hips go down by as much as the knees take, feet stay where the ankles let them."""
+    angle = np.radians(np.linspace(0.0, 60.0, 30))
+
+    def bent(sign: float) -> np.ndarray:
+        return Rotation.from_rotvec(sign * angle[:, None] * [0.0, 1.0, 0.0]).as_quat()
+
+    model = load_model("whole_body")
+    quat = {name: np.tile([0.0, 0.0, 0.0, 1.0], (30, 1)) for name in ("torso", "pelvis", "left_foot", "right_foot")}
+    for side in ("left", "right"):
+        quat |= {f"{side}_thigh": bent(-1.0), f"{side}_shank": bent(1.0)}
+    pose = compute_pose(model, np.arange(30) / 100.0, quat)
+    write_gmr(tmp_path / "x.bvh", Motion(pose, model, "x", "x"), RIGS["lafan1"])
+    frames = read_lafan(tmp_path / "x.bvh", "Toe")
+    hips = frames.p["Hips"][:, 2]
+    thigh, shank = model.lengths["left_thigh"], model.lengths["left_shank"]
+    np.testing.assert_allclose(hips, hips[0] - (thigh + shank) * (1.0 - np.cos(angle)), atol=2e-6)
+    np.testing.assert_allclose(frames.p["LeftToe"][:, 2], frames.p["LeftToe"][0, 2], atol=2e-6)
+    for bone, point in (("LeftLeg", "left_knee"), ("RightFoot", "right_ankle")):
+        np.testing.assert_allclose(frames.p[bone] - frames.p["Hips"], pose.points[point], atol=2e-6)
+    targets = find_targets(frames, CONFIGS["lafan1"])
+    off = targets["left_knee_link"].inv() * Rotation.from_quat(quat["left_shank"])
+    assert off.magnitude().max() < 1e-7
 
 
 def test_gmr_needs_the_torso_of_a_person(tmp_path: Path) -> None:

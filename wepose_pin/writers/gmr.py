@@ -1,8 +1,8 @@
 """Biovision hierarchy (.bvh) as the loaders of GMR (General Motion Retargeting) ask for it: a whole person who stands.
 
 Each loader looks bones up by their names and takes their orientations for those of one rig: where the axes of a bone
-point in the N-pose is stated here for each (`_RIGS`). What no sensor measures stands: legs, and the pelvis but for its
-heading. The spine is rigid with the torso.
+point in the N-pose is stated here for each (`RIGS`). Legs that are not both known stand, and so does the pelvis but for
+its heading; legs that are have the lower foot on the floor at all times. The spine is rigid with the torso.
 
 Source: GMR, github.com/YanjieZe/GMR, utils/lafan1.py and utils/xsens.py, which read the files, and ik_configs
 bvh_lafan1_to_g1, bvh_nokov_to_g1 and xsens_bvh_to_g1, whose rotations from bones to links of the G1 give the axes. MVN
@@ -75,6 +75,8 @@ _XSENS = {
     **{"upper_leg": "{}Hip", "lower_leg": "{}Knee", "foot": "{}Ankle", "toe": "{}Toe"},
 }
 _ARM, _LEG, _FOOT = ("upper_arm", "forearm", "hand"), ("upper_leg", "lower_leg"), ("foot", "toe")
+_LEG_SEGMENTS = {"upper_leg": "thigh", "lower_leg": "shank", "foot": "foot", "toe": "foot"}
+_SOLES = tuple(f"{side}_{point}" for side in SIDES for point in ("heel", "toe"))
 _SPINE = ("Spine", "Spine1", "Spine2")
 _Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # the loader turns it back
 _Z_FORWARD = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
@@ -121,7 +123,7 @@ def write_gmr(path: Path, motion: Motion, rig: Rig) -> list[Diagnostic]:
     motion, diagnostics = resample_evenly(motion)
     joints = _build_joints(motion, rig)
     quat_WL = _orient_parts(motion)
-    root = np.tile(rig.unit * rig.R_FW @ joints[0].at, (len(motion.pose.time), 1))
+    root = rig.unit * _place_root(motion) @ rig.R_FW.T
     save_bvh(path, _format_hierarchy(joints, rig), [root, *_turn_joints(joints, quat_WL, rig)], motion.rate_hz)
     return [*diagnostics, *diagnose_gaps(motion)]
 
@@ -163,7 +165,8 @@ def _build_joints(motion: Motion, rig: Rig) -> list[Joint]:
 def _place_parts(motion: Motion) -> dict[str, np.ndarray]:
     """Part → where it begins (3,) [m] in the N-pose, from the floor below the hips; the subject's lengths."""
     _, points = find_places(motion)
-    hips = np.array([0.0, 0.0, HIP_Z])
+    legs = _knows_legs(motion)
+    hips = np.array([0.0, 0.0, -points["left_toe"][2] if legs else HIP_Z])
     places = {"hips": hips}
     for side, sign in SIDES.items():
         at = hips + points.get(f"{side}_shoulder", np.array([0.0, sign * SHOULDER_Y, TRUNK_M]))
@@ -177,6 +180,11 @@ def _place_parts(motion: Motion) -> dict[str, np.ndarray]:
             at = hips + known if known is not None else at - [0.0, 0.0, length]
         for part, (x, y, z) in LEG.items():
             places[f"{side}_{part}"] = np.array([x, sign * y, z])
+        if legs:
+            for part, point in (("upper_leg", "hip"), ("lower_leg", "knee"), ("foot", "ankle")):
+                places[f"{side}_{part}"] = hips + points[f"{side}_{point}"]
+            tip = hips + points[f"{side}_toe"]
+            places[f"{side}_toe"] = tip - [ENDS["toe"][0], 0.0, -LEG["toe"][2]]
     middle = 0.5 * (places["left_upper_arm"] + places["right_upper_arm"])
     places |= {"mid_shoulders": middle, "neck": middle + [0.0, 0.0, NECK_M], "head": middle + [0.0, 0.0, HEAD_M]}
     for side in SIDES:
@@ -184,12 +192,30 @@ def _place_parts(motion: Motion) -> dict[str, np.ndarray]:
     return places
 
 
+def _knows_legs(motion: Motion) -> bool:
+    """Whether both feet are known."""
+    return all(point in motion.pose.points for point in _SOLES)
+
+
+def _place_root(motion: Motion) -> np.ndarray:
+    """Where the hips are (n, 3) [m]: so high that the lower foot, or its lower end, is on the floor."""
+    n, height = len(motion.pose.time), HIP_Z
+    if not _knows_legs(motion):
+        return np.tile([0.0, 0.0, height], (n, 1))
+    _, standing = find_places(motion)
+    sole = standing["left_toe"][2]
+    lowest = np.min([motion.pose.points[point][:, 2] - (standing[point][2] - sole) for point in _SOLES], axis=0)
+    return np.column_stack([np.zeros((n, 2)), -lowest])
+
+
 def _orient_parts(motion: Motion) -> dict[str, np.ndarray]:
     """Part → (n, 4) xyzw in W; what is not measured goes on as what is above it, legs and a whole arm hang."""
     measured, n = motion.pose.quat_WL, len(motion.pose.time)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
     hips = upright
-    if "pelvis" in measured:
+    if "pelvis" in measured and _knows_legs(motion):
+        hips = measured["pelvis"]
+    elif "pelvis" in measured:
         hips = Rotation.from_rotvec(heading(measured["pelvis"])[:, None] * [0.0, 0.0, 1.0]).as_quat()
     torso = measured["torso"]
     head = measured.get("head", torso)
@@ -200,7 +226,9 @@ def _orient_parts(motion: Motion) -> dict[str, np.ndarray]:
         for part in _ARM:
             above = quat[f"{side}_{part}"] = measured.get(f"{side}_{part}", above)
         quat[f"{side}_collar"] = torso
-        quat |= {f"{side}_{part}": hips for part in (*_LEG, *_FOOT)}
+        above = hips
+        for part in (*_LEG, *_FOOT):
+            above = quat[f"{side}_{part}"] = measured.get(f"{side}_{_LEG_SEGMENTS[part]}", above)
     return quat
 
 
