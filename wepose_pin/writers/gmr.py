@@ -4,9 +4,10 @@ Each loader looks bones up by their names and takes their orientations for those
 point in the N-pose is stated here for each (`RIGS`). Legs that are not both known stand, and so does the pelvis but for
 its heading; legs that are have the lower foot on the floor at all times. The spine is rigid with the torso.
 
-Source: GMR, github.com/YanjieZe/GMR, utils/lafan1.py and utils/xsens.py, which read the files, and ik_configs
-bvh_lafan1_to_g1, bvh_nokov_to_g1 and xsens_bvh_to_g1, whose rotations from bones to links of the G1 give the axes. MVN
-User Manual (MV0319P): the exporter for 3ds Max ("3DSM") writes a neutral pose, arms parallel to the body.
+Source: GMR, github.com/YanjieZe/GMR, utils/lafan1.py, soma.py and xsens.py, which read the files; the axes follow from
+the rotations from bones to links of the G1 in its ik_configs bvh_lafan1_to_g1, bvh_nokov_to_g1, bvh_soma_to_g1 and
+xsens_bvh_to_g1. MVN User Manual (MV0319P): the exporter for 3ds Max ("3DSM") writes a neutral pose, arms parallel to the
+body.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from ..angles import NEAR_LOCK, euler
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..rotations import conjugate, heading, multiply
+from ..rotations import conjugate, heading, multiply, xyzw_from_wxyz
 from .bvh import find_places, save_bvh
 from .motion import Motion, check_complete, diagnose_gaps, resample_evenly
 from .standing import COLLAR_SHARE, FOREARM_M, HEAD_M, HIP_Z, LEG, NECK_M, SHOULDER_Y, SPINE, TRUNK_M, UPPER_ARM_M
@@ -36,9 +37,9 @@ class Rig(NamedTuple):
 
     Parameters
     ----------
-    names : part of a person → bone, ``{}`` for the side
+    names : part of a person → bone, ``{}`` for the side; ``root``, where there is one, is above the hips
     spine : bones from the hips to the torso; the last one has the torso's orientation
-    axes : part, with its side where the sides differ → where the bone's x, y, z point in the N-pose
+    axes : part, with its side where the sides differ → where the bone's x, y, z point in the N-pose, or its wxyz there
     default : axes of all other parts
     R_FW : (3, 3), maps W to the file's axes
     unit : of the file, in a metre
@@ -47,7 +48,7 @@ class Rig(NamedTuple):
 
     names: Mapping[str, str]
     spine: tuple[str, ...]
-    axes: Mapping[str, tuple[str, str, str]]
+    axes: Mapping[str, tuple[str, ...] | tuple[float, ...]]
     default: tuple[str, str, str]
     R_FW: np.ndarray
     unit: float
@@ -73,6 +74,11 @@ _XSENS = {
     **{"hips": "Hips", "neck": "Neck", "head": "Head", "collar": "{}Collar"},
     **{"upper_arm": "{}Shoulder", "forearm": "{}Elbow", "hand": "{}Wrist"},
     **{"upper_leg": "{}Hip", "lower_leg": "{}Knee", "foot": "{}Ankle", "toe": "{}Toe"},
+}
+_SOMA = {
+    **{"root": "Root", "hips": "Hips", "neck": "Neck", "head": "Head", "collar": "{}Shoulder"},
+    **{"upper_arm": "{}Arm", "forearm": "{}ForeArm", "hand": "{}Hand"},
+    **{"upper_leg": "{}Leg", "lower_leg": "{}Shin", "foot": "{}Foot", "toe": "{}ToeBase"},
 }
 _ARM, _LEG, _FOOT = ("upper_arm", "forearm", "hand"), ("upper_leg", "lower_leg"), ("foot", "toe")
 _LEG_SEGMENTS = {"upper_leg": "thigh", "lower_leg": "shank", "foot": "foot", "toe": "foot"}
@@ -102,6 +108,29 @@ RIGS = {
         {f"left_{part}": ("-z", "+y", "+x") for part in _ARM} | {f"right_{part}": ("+z", "-y", "+x") for part in _ARM},
         ("+y", "+z", "+x"),
         _Y_UP,
+        100.0,
+        "ZYX",
+    ),
+    # Its arms and feet are not along an axis; the numbers follow from GMR's configuration.
+    "soma": Rig(
+        _SOMA,
+        ("Spine1", "Spine2", "Chest"),
+        {
+            **{f"left_{part}": ("-z", "-x", "+y") for part in _LEG},
+            **{f"right_{part}": ("+z", "+x", "+y") for part in _LEG},
+            **{f"left_{part}": (0.69535, -0.69535, 0.1284072, 0.1284072) for part in _FOOT},
+            **{f"right_{part}": (-0.1284072, 0.1284072, 0.69535, 0.69535) for part in _FOOT},
+            "hips": (-0.4991683, 0.4991683, 0.5008303, 0.5008303),
+            "torso": (-0.4991149, 0.4991149, 0.5008836, 0.5008836),
+            "left_upper_arm": (0.4519943, 0.5658562, 0.5130639, -0.4607313),
+            "left_forearm": (0.4686334, 0.5238728, 0.4435667, -0.5560472),
+            "left_hand": (0.5084625, 0.476318, 0.4708575, -0.5411841),
+            "right_upper_arm": (-0.5130635, -0.4607314, 0.4519941, -0.5658567),
+            "right_forearm": (-0.4435663, -0.5560475, 0.4686337, -0.5238727),
+            "right_hand": (-0.4708574, -0.5411846, 0.5084624, -0.4763176),
+        },
+        ("+z", "+x", "+y"),
+        _Z_FORWARD,
         100.0,
         "ZYX",
     ),
@@ -138,12 +167,13 @@ def _build_joints(motion: Motion, rig: Rig) -> list[Joint]:
         if side not in SIDES:
             side, own = "", part
         axes = rig.axes.get(part) or rig.axes.get(own) or rig.default
-        R_LB = np.stack([_unit(axis) for axis in axes], axis=1)
+        R_LB = _read_axes(axes)
         name = name or rig.names[own].format(side.capitalize())
         joints.append(Joint(name, part, above, R_LB, places[part] if at is None else at))
         return len(joints) - 1
 
-    hips = add("hips", -1)
+    hips = add("hips", -1, rig.names["root"]) if "root" in rig.names else -1
+    hips = add("hips", hips)
     for side in SIDES:
         above = hips
         for part in (*_LEG, *_FOOT):
@@ -265,6 +295,9 @@ def _format_hierarchy(joints: list[Joint], rig: Rig) -> Iterator[str]:
     yield from grow(0, 0)
 
 
-def _unit(axis: str) -> np.ndarray:
-    """The unit vector (3,) of an axis such as ``-z``."""
-    return float(f"{axis[0]}1") * np.eye(3)["xyz".index(axis[1])]
+def _read_axes(axes: tuple[str, ...] | tuple[float, ...]) -> np.ndarray:
+    """R_LB (3, 3) of three axes such as ``-z``, or of a rotation wxyz."""
+    columns = [float(f"{axis[0]}1") * np.eye(3)["xyz".index(axis[1])] for axis in axes if isinstance(axis, str)]
+    if columns:
+        return np.stack(columns, axis=1)
+    return np.asarray(Rotation.from_quat(xyzw_from_wxyz(axes)).as_matrix())
