@@ -32,8 +32,9 @@ class ExportJob:
         Write this format instead of that of the suffix: csv, parquet (pose and joint angles), mot (joint angles for
         OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU Placer),
         trc, c3d (points, as of markers), bvh (skeleton and motion, for animation), bvh-lafan1, bvh-nokov, bvh-soma,
-        bvh-xsens (a whole person, for GMR); of persons and robots rosbag (for ROS 2, in a folder), mcap, rrd (for rerun), urdf;
-        of robots lerobot (a data set of episodes, in a folder), pkl (for GMR), npz, csv-beyondmimic (for BeyondMimic).
+        bvh-xsens (a whole person, for GMR); of persons and robots rosbag (for ROS 2, in a folder), mcap, rrd (for
+        rerun), urdf; of robots lerobot (a data set of episodes, in a folder), pkl (for GMR), npz, csv-beyondmimic (for
+        BeyondMimic).
     names
         Only for .mot: name the columns by the coordinates of OpenSim's Rajagopal model (opensim), or by the joint
         angles of the International Society of Biomechanics (isb). Without it opensim.

@@ -111,8 +111,8 @@ def export(
         The file to write; of "lerobot" and "rosbag" the folder.
     format : str, optional
         One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "trc", "c3d", "bvh", "bvh-lafan1",
-        "bvh-nokov", "bvh-soma", "bvh-xsens". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot", "pkl", "npz",
-        "csv-beyondmimic". None: that of the file's suffix, which otherwise has to be the format's own.
+        "bvh-nokov", "bvh-soma", "bvh-xsens". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot", "pkl",
+        "npz", "csv-beyondmimic". None: that of the file's suffix, which otherwise has to be the format's own.
     names : str, optional
         Of a .mot's columns: "opensim", or "isb"; None: "opensim".
     rate_hz : float, optional

@@ -6,8 +6,8 @@ its heading; legs that are have the lower foot on the floor at all times. The sp
 
 Source: GMR, github.com/YanjieZe/GMR, utils/lafan1.py, soma.py and xsens.py, which read the files; the axes follow from
 the rotations from bones to links of the G1 in its ik_configs bvh_lafan1_to_g1, bvh_nokov_to_g1, bvh_soma_to_g1 and
-xsens_bvh_to_g1. MVN User Manual (MV0319P): the exporter for 3ds Max ("3DSM") writes a neutral pose, arms parallel to the
-body.
+xsens_bvh_to_g1. MVN User Manual (MV0319P): the exporter for 3ds Max ("3DSM") writes a neutral pose, arms parallel to
+the body.
 """
 
 from __future__ import annotations
