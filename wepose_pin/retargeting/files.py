@@ -83,7 +83,7 @@ def build_joint_motion(trajectory: Trajectory) -> JointMotion:
         name=robot.map.name,
         where=robot.map.name,
         robot=read_urdf(urdf),
-        urdf=urdf.read_text(encoding="utf-8"),
+        urdf=urdf.read_text(encoding="utf-8", errors="replace"),
         joints=robot.names,
         time=trajectory.time,
         position=trajectory.joint_position,

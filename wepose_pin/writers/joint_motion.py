@@ -232,7 +232,7 @@ def read_joint_motion(folder: Path) -> JointMotion:
         name=name,
         where=str(folder),
         robot=robot,
-        urdf=(folder / ROBOT_URDF).read_text(encoding="utf-8"),
+        urdf=(folder / ROBOT_URDF).read_text(encoding="utf-8", errors="replace"),
         joints=joints,
         time=time,
         position=np.stack([numbers[joint] for joint in joints], axis=1),
