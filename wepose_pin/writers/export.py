@@ -33,7 +33,7 @@ from .joint_motion import (
 from .lerobot import list_episodes, write_lerobot
 from .motion import Motion, check_rate, resampled
 from .opensim import write_mot, write_placement, write_sto, write_trc
-from .provenance import provenance_file, provenance_text
+from .provenance import provenance_file, provenance_text, write_provenance
 from .result import SUBJECT_URDF, format_urdf, read_result
 from .ros import write_mcap, write_rosbag
 from .rrd import write_rrd
@@ -64,13 +64,14 @@ ROBOT_WRITERS: dict[str, JointWriter] = {
 LEROBOT = "lerobot"
 ROBOTS_ALONE = (*ROBOT_WRITERS, LEROBOT)
 FORMATS = (*WRITERS, "urdf", *JOINT_WRITERS, *ROBOT_WRITERS, LEROBOT)
-SUFFIXES = {
-    "placement": ".sto",
-    "csv-beyondmimic": ".csv",
-    **{f"bvh-{name}": ".bvh" for name in RIGS},
-}  # where it is not the format's name
 # Formats that are folders → what an earlier run left in one, which `force` replaces.
 FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*"), "rosbag": ("*.db3", "*.mcap", "metadata.yaml")}
+# Where it is not the format's name; a folder has none.
+SUFFIXES = {
+    **{"placement": ".sto", "csv-beyondmimic": ".csv"},
+    **{f"bvh-{name}": ".bvh" for name in RIGS},
+    **dict.fromkeys(FOLDERS, ""),
+}
 FILE_SUFFIXES = (*FORMATS, "bag", "db3")
 WITHOUT_MOTION = ("urdf", "placement")
 NAMES = ("opensim", "isb")
@@ -128,7 +129,7 @@ def export(
     force : bool
         Replace an existing file, or a data set of the same format.
     provenance : mapping, optional
-        Written beside the file, before it.
+        Written beside the file, before it; of a format that is a folder into it.
 
     Returns
     -------
@@ -167,7 +168,9 @@ def export(
             partial = files.enter_context(_replaced_folder(file, FOLDERS[format], force))
         else:
             partial = files.enter_context(whole_file(file, force))
-        if provenance is not None:
+        if provenance is not None and format in FOLDERS:
+            write_provenance(partial, provenance)
+        elif provenance is not None:
             partial_provenance = files.enter_context(whole_file(provenance_file(file), True))
             partial_provenance.write_text(provenance_text(provenance), encoding="utf-8")
         if format == "urdf":
