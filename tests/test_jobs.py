@@ -46,7 +46,7 @@ JOBS = {
         formulation="paper",
     ),
     "simulate": SimulateJob(Path("out"), 3, 50.0, preset="mild", imperfection={"bits": 12.0, "mount": "any"}),
-    "retarget": RetargetJob(Path("result"), "panda", Path("out"), "both", scale=0.8, episode=True),
+    "retarget": RetargetJob(Path("result"), "panda", Path("out"), "both", scale=0.8, strict=True),
     "demo": DemoJob(Path("out"), 4),
     "export": ExportJob(Path("result"), Path("a.mot"), names="isb", rate_hz=50.0, interval=(1.0, 2.5)),
     "angles": AnglesJob(Path("result"), Path("out"), phase="reach:2", low_pass_hz=6.0, shoulder="XZY", cycles=True),
@@ -130,7 +130,8 @@ def test_a_step_of_a_plan_has_the_options_of_its_command(step: str) -> None:
     """What a plan may say of a step, and what its item fills in, are all fields of the job."""
     options = step_options(step)
     formats = {"format"} if "formats" in options else set()
-    filled = {"session", "out", "subject", "result", "truth", "measured", "stature", "sex", "force", "further"}
+    filled = {"session", "out", "subject", "result", "truth", "measured", "stature", "sex", "force", "further",
+              "episodes", "instruction"}  # fmt: skip
     assert {field.name for field in fields(STEPS[step])} == (set(options) - {"formats"}) | formats | (
         filled & {field.name for field in fields(STEPS[step])}
     )

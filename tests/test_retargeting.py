@@ -26,7 +26,6 @@ from wepose_pin.retargeting import (
     load_robot,
     retarget,
     summarize,
-    write_episode,
     write_trajectory,
 )
 from wepose_pin.retargeting.checks import AT_REST, SelfCollisions
@@ -35,6 +34,8 @@ from wepose_pin.retargeting.controller import ControllerParams, HandTarget, Join
 from wepose_pin.retargeting.error_attribution import assess_reachability, attribute_errors
 from wepose_pin.retargeting.limits import compute_acceleration_bounds, read_joint_limits, reduce_acceleration_limits
 from wepose_pin.retargeting.targets import CLAMP_FROM, CLAMP_TO, clamp_to_reach
+from wepose_pin.writers.export import export
+from wepose_pin.writers.joint_motion import compute_link_poses_W, read_joint_motion
 
 pytest.importorskip("daqp")
 
@@ -541,13 +542,16 @@ def test_the_files_say_the_same(swung: Trajectory, tmp_path: Path) -> None:
     times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
     assert np.allclose(times, swung.time)
     assert np.allclose([p["positions"] for p in message["points"]], swung.joint_position, atol=1e-8)
-    write_episode(tmp_path / "episode", swung, "swing")
-    data = pl.read_parquet(tmp_path / "episode" / "data" / "chunk-000" / "episode_000000.parquet")
-    state, action = (np.array(data[name].to_list()) for name in ("observation.state", "action"))
-    assert np.array_equal(action[:-1], state[1:])
-    info = json.loads((tmp_path / "episode" / "meta" / "info.json").read_text())
-    assert info["total_frames"] == len(data) == len(swung.time)
-    assert info["fps"] == 100
+
+
+def test_the_links_of_a_trajectory_are_where_the_controller_had_them(swung: Trajectory) -> None:
+    """By the URDF alone, against Pinocchio's kinematics in the controller."""
+    motion = swung.joint_motion()
+    quat, p = compute_link_poses_W(motion)["hand"]
+    hand = Rotation.from_quat(quat).apply([0.0, 0.0, -0.1]) + p
+    expected = Rotation.from_quat(motion.quat_WB).apply(swung.hand["right"]) + motion.p_WB
+    np.testing.assert_allclose(hand, expected, atol=1e-12)
+    assert motion.begin == swung.approach_samples
 
 
 def test_the_same_motion_at_another_rate(arm) -> None:
@@ -590,12 +594,19 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     urdf = write_arm(tmp_path)
-    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"), "--episode")
+    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
     assert code == 0, text
     made = {path.name for path in (tmp_path / "out").iterdir()}
     assert made == {"trajectory.parquet", "trajectory.csv", "joint_trajectory.json", "joint_trajectory.yaml",
-                    "summary.json", "view.html", "episode"}  # fmt: skip
+                    "robot.urdf", "summary.json", "view.html"}  # fmt: skip
     found = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (found["recording"], found["recorded_phases"].keys()) == ("made", set())
+    motion = read_joint_motion(tmp_path / "out")
+    assert (motion.name, motion.source, motion.joints) == ("arm", "made", JOINTS)
+    assert motion.time[motion.begin] == pytest.approx(found["approach_s"], abs=1e-6)
+    assert export(tmp_path / "out", tmp_path / "data", "lerobot") == ("lerobot", [])
+    frames = pl.read_parquet(tmp_path / "data" / "data" / "chunk-000" / "file-000.parquet")
+    np.testing.assert_array_equal(frames["observation.state"].to_numpy(), motion.position.astype(np.float32))
     assert found["within_limits"] is True
     assert found["self_collisions"]["samples"] == 0
     assert "Limits kept" in text

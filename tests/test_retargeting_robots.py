@@ -24,6 +24,7 @@ from wepose_pin.retargeting import (
     retarget,
 )
 from wepose_pin.retargeting.checks import AT_REST
+from wepose_pin.retargeting.files import place_root
 from wepose_pin.retargeting.maps import find_example_data
 from wepose_pin.retargeting.targets import compute_target_reach
 
@@ -47,6 +48,14 @@ def is_sound(found: Trajectory) -> None:
 def both_arms(seconds: float, **angles: float) -> Pose:
     right, left = person(seconds, **angles), person(seconds, side="left", **({"swing": 15.0} | angles))
     return replace(right, quat_WL=right.quat_WL | left.quat_WL, points=right.points | left.points)
+
+
+@pytest.mark.parametrize(("name", "height"), [("g1", 0.792), ("talos", 1.083), ("panda", 0.0), ("ur5", 0.0)])
+def test_a_humanoid_stands_on_the_floor_in_exports(name: str, height: float) -> None:
+    robot = load_robot(find_map(name))
+    *at, qx, qy, qz, qw = place_root(robot)
+    np.testing.assert_allclose(at, [0.0, 0.0, height], atol=1e-3)
+    np.testing.assert_allclose(Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), robot.R_BT.T, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ROBOTS)

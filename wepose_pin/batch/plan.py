@@ -39,6 +39,8 @@ _ITEM_OPTIONS = (
     *_PATHS,
     "subject",
     "further",
+    "episodes",
+    "instruction",
     "measured",
     "stature",
     "sex",
@@ -196,13 +198,15 @@ def _read_option(keys: TomlTable, step: str, name: str, default: Any, folder: Pa
 
 
 def _read_formats(keys: TomlTable, value: Any) -> tuple[str, ...]:
-    from ..writers.export import FORMATS
+    from ..writers.export import FORMATS, ROBOTS_ALONE
 
     if not isinstance(value, list) or not value:
         raise BadPlan(f'{keys.at(_FORMATS)} = {value!r} is not a list of formats, such as ["trc", "mot"]')
     for each in value:
         if each not in FORMATS:
             raise BadPlan(f"{keys.at(_FORMATS)}: '{each}' is no format; {one_of(FORMATS, str(each))}")
+        if each in ROBOTS_ALONE:
+            raise BadPlan(f"{keys.at(_FORMATS)}: '{each}' is of robots, and this step writes the person's motion")
     return tuple(dict.fromkeys(value))
 
 

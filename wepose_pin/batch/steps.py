@@ -99,7 +99,7 @@ class ItemSteps:
         out.mkdir()
         formats, diagnostics = options.pop("formats"), 0
         for format in formats:
-            file = out / (f"placement{SUFFIXES[format]}" if format in SUFFIXES else f"motion.{format}")
+            file = out / (f"{format}{SUFFIXES[format]}" if format in SUFFIXES else f"motion.{format}")
             unused = {} if format == "mot" else {"names": None}
             unused |= {"rate_hz": None} if format in ("urdf", "placement") else {}
             result = {"result": self._files.folder / "track", "out": file, "format": format}

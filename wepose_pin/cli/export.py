@@ -16,4 +16,4 @@ def run(job: ExportJob) -> int:
     return 0
 
 
-COMMAND = Command(ExportJob, run, example="export result -o circles.trc", arguments=("result",))
+COMMAND = Command(ExportJob, run, example="export result -o circles.trc", arguments=("result", "further"))

@@ -16,20 +16,25 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ExportJob:
-    """Write the motion of a result for other programs: CSV, Parquet, OpenSim, BVH, C3D, URDF.
+    """Write the motion of a person or of a robot for other programs: OpenSim, BVH, C3D, LeRobot, ROS 2 and others.
 
     What each file holds: docs/formats/export.md.
 
     Parameters
     ----------
     result : RESULT
-        Folder that `wepose track` wrote.
+        Folder that `wepose track` or, of a robot, `wepose retarget` wrote.
+    further : RESULT…
+        Only for lerobot: further results, which become episodes of the same data set.
     out : FILE
         Write this file. Its suffix selects the format.
     format : FORMAT
         Write this format instead of that of the suffix: csv, parquet (pose and joint angles), mot (joint angles for
         OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU Placer),
-        trc, c3d (points, as of markers), bvh (skeleton and motion, for animation), urdf (the subject).
+        trc, c3d (points, as of markers), bvh (skeleton and motion, for animation), bvh-lafan1, bvh-nokov, bvh-soma,
+        bvh-xsens (a whole person, for GMR); of persons and robots rosbag (for ROS 2, in a folder), mcap, rrd (for
+        rerun), urdf; of robots lerobot (a data set of episodes, in a folder), pkl (for GMR), npz, csv-beyondmimic (for
+        BeyondMimic).
     names
         Only for .mot: name the columns by the coordinates of OpenSim's Rajagopal model (opensim), or by the joint
         angles of the International Society of Biomechanics (isb). Without it opensim.
@@ -39,17 +44,25 @@ class ExportJob:
         Write only this time of the recording, in seconds.
     phase : NAME
         Write only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
+    episodes : PHASE
+        Only for lerobot: make each interval of this phase of the recording an episode, or, by the word
+        repetitions, each repetition of the movement. Without it each result is an episode.
+    instruction : TEXT
+        Only for lerobot: the text that says what the robot does, in all episodes. Without it "follow NAME".
     force
         Replace an existing file.
     """
 
     result: Path
     out: Path
+    further: tuple[Path, ...] = ()
     format: str | None = None
     names: Literal["opensim", "isb"] | None = None
     rate_hz: float | None = None
     interval: tuple[float, float] | None = None
     phase: str | None = None
+    episodes: str | None = None
+    instruction: str | None = None
     force: bool = False
 
     def check(self) -> None:
@@ -84,13 +97,15 @@ def run_export(
     if provenance is None:
         provenance = collect_provenance("export", field_values(job))
     return export(
-        job.result,
+        [job.result, *job.further],
         job.out,
         job.format,
         names=job.names,
         rate_hz=job.rate_hz,
         interval=job.interval,
         phase=job.phase,
+        episodes=job.episodes,
+        instruction=job.instruction,
         force=job.force,
         provenance=provenance or None,
     )

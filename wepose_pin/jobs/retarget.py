@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic
 from . import Arms, Progress, arm_sides, no_progress
 from .fields import field_values
+
+if TYPE_CHECKING:
+    from ..kinematics import Pose
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,6 @@ class RetargetJob:
         Follow only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
     strict
         Refuse a motion that is too fast for the robot, instead of slowing it down.
-    episode
-        Write episode/ too: a data set of one episode in the format of LeRobot.
     view
         Write view.html, the animation of the robot beside the person.
     force
@@ -63,7 +64,6 @@ class RetargetJob:
     interval: tuple[float, float] | None = None
     phase: str | None = None
     strict: bool = False
-    episode: bool = False
     view: bool = True
     force: bool = False
 
@@ -116,8 +116,9 @@ def run_retarget(
     from ..report.viewer import retarget_html
     from ..retargeting.trajectory import STAGES
     from ..writers import read_result
+    from ..writers.joint_motion import REPETITIONS
     from ..writers.provenance import collect_provenance
-    from ..writers.result import as_json
+    from ..writers.result import as_json, read_phases
 
     job.check()
     without = [task for task in ("position", "orientation") if job.task not in ("both", task)]
@@ -143,9 +144,12 @@ def run_retarget(
         collisions = retargeting.find_self_collisions(robot, trajectory.time, trajectory.joint_position)
         progress("writing", 0.98)
         retargeting.write_trajectory(folder, trajectory)
-        if job.episode:
-            retargeting.write_episode(folder / "episode", trajectory, f"follow the arms of {job.result.name}")
         summary = as_json(retargeting.summarize(trajectory, check, collisions))
+        summary |= {
+            "recording": str(about.get("recording") or job.result.name),
+            "recorded_phases": {name: list(map(list, spans)) for name, spans in read_phases(about).items()},
+            REPETITIONS: _find_repetitions(pose, tuple(arm.side for arm in robot.arms)),
+        }
         if provenance is None:
             provenance = collect_provenance("retarget", field_values(job))
         text = json.dumps({**summary, "provenance": provenance}, indent=2)
@@ -159,3 +163,16 @@ def run_retarget(
         writer.save_diagnostics("summary.json")
         failures = writer.diagnostics
     return RetargetOutcome(summary, failures, float(trajectory.time[-1]))
+
+
+def _find_repetitions(pose: Pose, sides: tuple[str, ...]) -> dict[str, Any]:
+    """The repetitions of the arms that a robot follows, as `wepose angles` finds them: by which angle, when [s]."""
+    from dataclasses import replace
+
+    from ..angles import joint_angles
+    from ..angles.repetitions import find_repetitions
+
+    angles = joint_angles(pose)
+    of_arms = {name: each for name, each in angles.joints.items() if name.startswith(sides)}
+    found = find_repetitions(replace(angles, joints=of_arms))
+    return {"source": found.source, "spans": found.spans.tolist(), "reason": found.reason}

@@ -1,7 +1,7 @@
 """The whole figure of a person for programs that want one: what no sensor measures stands.
 
 Frames of segments equal W in the T-pose (arms sideways, palms down), as MVN and avatars have them; ours do in the
-N-pose. Legs stand, as long as a person of `STATURE_M` has them; the pelvis keeps its place and its heading. What lies
+N-pose. Legs stand, as long as `writers.standing` has them; the pelvis keeps its place and its heading. What lies
 between measured segments is interpolated.
 """
 
@@ -14,6 +14,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..rotations import heading
+from ..writers.standing import (
+    COLLAR_SHARE,
+    FOREARM_M,
+    HEAD_M,
+    HIP_Z,
+    LEG,
+    NECK_M,
+    SHOULDER_Y,
+    SPINE,
+    TRUNK_M,
+    UPPER_ARM_M,
+)
 from .state import LivePose, StreamInfo
 
 # Segments in the order of MVN.
@@ -24,20 +36,6 @@ SEGMENTS = (
     *("right_upper_leg", "right_lower_leg", "right_foot", "right_toe"),
     *("left_upper_leg", "left_lower_leg", "left_foot", "left_toe"),
 )
-STATURE_M = 1.75
-# Where joints of a standing person of that stature are [m]; x forward, z from the floor; y of the left side.
-HIP_Z = 0.95
-LEG = {
-    "upper_leg": (0.0, 0.09, HIP_Z),
-    "lower_leg": (0.0, 0.09, 0.51),
-    "foot": (0.0, 0.09, 0.09),
-    "toe": (0.16, 0.09, 0.02),
-}
-TRUNK_M, SHOULDER_Y, UPPER_ARM_M, FOREARM_M = 0.50, 0.19, 0.30, 0.26
-COLLAR_SHARE = 0.2  # of the way from the middle of the shoulders to a shoulder
-# Joints of the trunk as shares of the way from the hips to the line between the shoulders, and of the torso's turn.
-SPINE = {"l5": (0.15, 0.25), "l3": (0.35, 0.5), "t12": (0.5, 0.75), "torso": (0.65, 1.0)}
-NECK_M, HEAD_M = 0.06, 0.14  # above the line between the shoulders
 _SIDES = {"left": 1.0, "right": -1.0}
 _QUARTER = {side: Rotation.from_rotvec([sign * 0.5 * np.pi, 0.0, 0.0]) for side, sign in _SIDES.items()}
 

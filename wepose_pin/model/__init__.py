@@ -15,7 +15,7 @@ way from the root to each point, `girdle` moves shoulders on the trunk, `visuals
 """
 
 from .anthropometry import SEXES, LengthPrior, compute_population_lengths, convert_breadths, list_breadths
-from .body import BodyModel, load_model
+from .body import BodyModel, load_model, read_urdf
 from .chains import Chain
 from .girdle import Girdle, GirdleMotion, move_girdles
 from .reaches import LinkVector, measure_reaches
@@ -48,4 +48,5 @@ __all__ = [
     "measure_reaches",
     "move_girdles",
     "read_table",
+    "read_urdf",
 ]

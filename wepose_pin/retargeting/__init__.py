@@ -6,7 +6,7 @@ coordinates in T to B. `u` holds the values of the independent joints, `q` is Pi
 
 from .checks import LimitCheck, SelfCollisions, check_limits, find_self_collisions
 from .controller import ControllerParams
-from .files import build_table, summarize, write_episode, write_trajectory
+from .files import build_table, summarize, write_trajectory
 from .maps import ROBOTS, RobotMap, find_map, read_map
 from .robot import Robot, load_robot
 from .targets import ArmTargets, compute_arm_targets
@@ -30,6 +30,5 @@ __all__ = [
     "read_map",
     "retarget",
     "summarize",
-    "write_episode",
     "write_trajectory",
 ]

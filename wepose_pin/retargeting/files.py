@@ -1,23 +1,29 @@
-"""Files of a trajectory: tables, ROS 2's message, an episode for learning, the summary."""
+"""Files of a trajectory: tables, ROS 2's message, the robot, the summary; and what writers of other formats take."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import polars as pl
 from scipy.spatial.transform import Rotation
 
 from ..diagnostics import ERROR, INFO, Diagnostic, as_json
+from ..model import read_urdf
 from ..recording import format_time
+from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY, JointMotion
 from ..writers.result import write_table
 from .checks import AT_REST, LimitCheck, SelfCollisions
 from .collision import CLEARANCE
 from .error_attribution import CLAMPED, FAR, assess_reachability, attribute_errors
+from .robot import Robot
 from .targets import compute_target_reach
 from .trajectory import Trajectory
+from .visuals import STANDING_HEIGHT
 
 DIGITS = 8  # of angles in text
 MAX_MOMENTS = 6  # that a diagnostic names
@@ -38,9 +44,10 @@ def build_table(trajectory: Trajectory) -> pl.DataFrame:
 
 
 def write_trajectory(folder: Path, trajectory: Trajectory) -> None:
-    """Write ``trajectory.parquet``, ``.csv``, and ``joint_trajectory.json`` and ``.yaml``."""
+    """Write ``trajectory.parquet``, ``.csv``, ``joint_trajectory.json`` and ``.yaml``, and ``robot.urdf``."""
     table = build_table(trajectory)
-    write_table(folder / "trajectory.parquet", table)
+    shutil.copyfile(trajectory.robot.map.urdf, folder / ROBOT_URDF)
+    write_table(folder / TRAJECTORY, table)
     table.write_csv(folder / "trajectory.csv", float_precision=DIGITS)
     text = _format_joint_trajectory(trajectory)
     for suffix in ("json", "yaml"):  # JSON is YAML, one point a line
@@ -68,53 +75,61 @@ def _format_joint_trajectory(trajectory: Trajectory) -> str:
     )
 
 
-def write_episode(folder: Path, trajectory: Trajectory, task: str) -> None:
-    """Write a data set of one episode as LeRobot 2.1 reads it: the state, and as action the next state."""
-    n, names = len(trajectory.time), list(trajectory.robot.names)
-    state = trajectory.joint_position.astype(np.float32)
-    action = np.vstack([state[1:], state[-1:]])
-    data = pl.DataFrame(
-        {
-            "observation.state": pl.Series(state.tolist(), dtype=pl.List(pl.Float32)),
-            "action": pl.Series(action.tolist(), dtype=pl.List(pl.Float32)),
-            "timestamp": trajectory.time.astype(np.float32),
-            "frame_index": np.arange(n),
-            "episode_index": np.zeros(n, dtype=np.int64),
-            "index": np.arange(n),
-            "task_index": np.zeros(n, dtype=np.int64),
-        }
+def build_joint_motion(trajectory: Trajectory) -> JointMotion:
+    """Return the trajectory as writers of other programs' files take it, the robot standing on the floor."""
+    robot, urdf = trajectory.robot, trajectory.robot.map.urdf
+    placement = place_root(robot)
+    return JointMotion(
+        name=robot.map.name,
+        where=robot.map.name,
+        robot=read_urdf(urdf),
+        urdf=urdf.read_text(encoding="utf-8", errors="replace"),
+        joints=robot.names,
+        time=trajectory.time,
+        position=trajectory.joint_position,
+        velocity=trajectory.run.joint_velocity,
+        posture=_list_posture(robot),
+        p_WB=placement[:3],
+        quat_WB=placement[3:],
+        recorded_time=trajectory.recorded_time,
+        begin=trajectory.approach_samples,
     )
-    (folder / "data" / "chunk-000").mkdir(parents=True)
-    (folder / "meta").mkdir()
-    write_table(folder / "data" / "chunk-000" / "episode_000000.parquet", data)
-    joints = {"dtype": "float32", "shape": [len(names)], "names": names}
-    number = {"dtype": "int64", "shape": [1], "names": None}
-    info = {
-        "codebase_version": "v2.1",
-        "robot_type": trajectory.robot.map.name,
-        "total_episodes": 1,
-        "total_frames": n,
-        "total_tasks": 1,
-        "total_videos": 0,
-        "total_chunks": 1,
-        "chunks_size": 1000,
-        "fps": round(1.0 / float(trajectory.time[1] - trajectory.time[0])),
-        "splits": {"train": "0:1"},
-        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-        "video_path": None,
-        "features": {
-            "observation.state": joints,
-            "action": joints,
-            "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-            **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), number),
-        },
-    }
-    (folder / "meta" / "info.json").write_text(json.dumps(info, indent=2) + "\n", encoding="utf-8")
-    for name, line in (
-        ("tasks", {"task_index": 0, "task": task}),
-        ("episodes", {"episode_index": 0, "tasks": [task], "length": n}),
-    ):
-        (folder / "meta" / f"{name}.jsonl").write_text(json.dumps(line) + "\n", encoding="utf-8")
+
+
+def _list_posture(robot: Robot) -> dict[str, float]:
+    """Joint that the trajectory does not move → its value in the rest posture [rad or m]."""
+    full, posture = robot.full, {}
+    for name in full.names[1:]:
+        joint = full.getJointId(name)
+        if name not in robot.names and full.nvs[joint] == 1:
+            q = robot.rest_full[full.idx_qs[joint] :][: full.nqs[joint]]
+            posture[name] = float(q[0]) if len(q) == 1 else float(np.arctan2(q[1], q[0]))
+    return posture
+
+
+def place_root(robot: Robot) -> np.ndarray:
+    """Position [m] and xyzw (7,) of the root in W: where a standing robot is on the floor, else at its origin."""
+    R_WB = robot.R_BT.T
+    data, height = robot.model.createData(), 0.0
+    pin.forwardKinematics(robot.model, data, robot.configuration(robot.rest))
+    lowest = [
+        (R_WB @ (data.oMi[shape.parentJoint] * shape.placement).act(corner))[2]
+        for shape in robot.geometry.geometryObjects
+        for corner in _list_corners(shape.geometry)
+    ]
+    shoulder = np.mean([arm.shoulder for arm in robot.arms], axis=0)
+    if lowest and (R_WB @ shoulder)[2] - min(lowest) > STANDING_HEIGHT:
+        height = -min(lowest)
+    return np.concatenate([[0.0, 0.0, height], Rotation.from_matrix(R_WB).as_quat()])
+
+
+def _list_corners(geometry: Any) -> np.ndarray:
+    """The vertices (n, 3) [m] of a mesh, or the corners of the box about another shape."""
+    if hasattr(geometry, "vertices"):
+        return np.asarray(geometry.vertices(), dtype=float)
+    geometry.computeLocalAABB()
+    ends = np.array([geometry.aabb_local.min_, geometry.aabb_local.max_])
+    return ends[[[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]]
 
 
 def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:
@@ -136,6 +151,8 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "robot": robot.map.name,
         "urdf": robot.map.urdf.name,
         "joints": list(robot.names),
+        "posture": _list_posture(robot),
+        "root": dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), place_root(robot).tolist(), strict=True)),
         "description": robot.map.description,
         "rate_hz": round(1.0 / dt, 3),
         "duration_s": round(float(trajectory.time[-1]), 3),

@@ -22,6 +22,7 @@ from ..arguments import check_arguments
 from ..errors import NoSolution, WrongOption
 from ..kinematics import Pose, PosedBody
 from ..model import BodyTable
+from ..writers.joint_motion import JointMotion
 from .collision import CollisionModel
 from .controller import (
     ActiveConstraints,
@@ -137,6 +138,12 @@ class Trajectory:
     def hand(self) -> dict[str, np.ndarray]:
         """Side → position (n, 3) [m] of the hand in B."""
         return {arm.side: self.run.hand[i] for i, arm in enumerate(self.robot.arms)}
+
+    def joint_motion(self) -> JointMotion:
+        """Return the motion as `export` takes it."""
+        from .files import build_joint_motion
+
+        return build_joint_motion(self)
 
 
 def retarget(

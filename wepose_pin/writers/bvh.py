@@ -11,7 +11,7 @@ joint turns by its channels in their order, each about an axis as turned so far.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -70,7 +70,7 @@ def build_skeleton(motion: Motion) -> Bone:
         raise BadData(
             f"{motion.where}: no orientation of the {table.reference} in pose.parquet; a .bvh ties the rest to it"
         )
-    starts, points = _find_places(motion)
+    starts, points = find_places(motion)
     hips = next((segment for segment in table.segments if NAMES.get(segment) == ROOTS[0]), None)
 
     def hang(segment: str, above: str | None, above_at: np.ndarray) -> Bone | None:
@@ -93,7 +93,7 @@ def build_skeleton(motion: Motion) -> Bone:
     return Bone(ROOTS[0], hips if hips in measured else table.reference, zero, bones, bones[0].end)
 
 
-def _find_places(motion: Motion) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def find_places(motion: Motion) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Where segments begin and points are (3,) [m] in W, in the N-pose; a mechanism's while its joints are at zero."""
     model = motion.model
     if model.table.is_mechanism:
@@ -147,12 +147,17 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
     motion, diagnostics = resample_evenly(motion)
     root = build_skeleton(motion)
     columns = [100.0 * _to_file_axes(_root_position(motion, root)), *_rotations(motion, root, None)]
-    lines = ["HIERARCHY", *_hierarchy(root, root.at, 0), "MOTION"]
-    lines += [f"Frames: {len(motion.pose.time)}", f"Frame Time: {1.0 / motion.rate_hz:.8f}"]
+    save_bvh(path, _hierarchy(root, root.at, 0), columns, motion.rate_hz)
+    return [*diagnostics, *diagnose_gaps(motion)]
+
+
+def save_bvh(path: Path, hierarchy: Iterable[str], columns: Sequence[np.ndarray], rate_hz: float) -> None:
+    """Write the lines of a skeleton, and its channels (n, …) column by column."""
+    lines = ["HIERARCHY", *hierarchy, "MOTION"]
+    lines += [f"Frames: {len(columns[0])}", f"Frame Time: {1.0 / rate_hz:.8f}"]
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         np.savetxt(file, np.column_stack(columns), fmt="%.6f")
-    return [*diagnostics, *diagnose_gaps(motion)]
 
 
 def _root_position(motion: Motion, root: Bone) -> np.ndarray:

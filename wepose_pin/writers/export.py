@@ -1,31 +1,49 @@
-"""One result, one file, in a format of others."""
+"""A result, a person's or a robot's, as a file or a folder in a format of others."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..arguments import check_arguments
 from ..diagnostics import Diagnostic
-from ..documents import whole_file
+from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, MissingFile, one_of
 from ..kinematics import PosedBody, cut_pose
 from ..recording import select_interval
 from ..tracking.tracked import TrackedRecording
 from .bvh import write_bvh
 from .c3d import write_c3d
+from .gmr import RIGS, write_gmr
+from .humanoid import write_motion_csv, write_motion_npz, write_pickle
+from .joint_motion import (
+    ROBOT_URDF,
+    TRAJECTORY,
+    HasJointMotion,
+    JointMotion,
+    convert_person,
+    read_joint_motion,
+    resample_joints,
+    select_motion,
+)
+from .lerobot import list_episodes, write_lerobot
 from .motion import Motion, check_rate, resampled
 from .opensim import write_mot, write_placement, write_sto, write_trc
-from .provenance import provenance_file, provenance_text
+from .provenance import provenance_file, provenance_text, write_provenance
 from .result import SUBJECT_URDF, format_urdf, read_result
+from .ros import write_mcap, write_rosbag
+from .rrd import write_rrd
 from .tables import write_csv, write_parquet
 
+Result = PosedBody | HasJointMotion | str | Path
 Writer = Callable[[Path, Motion], list[Diagnostic]]  # gives what the file cannot hold
+JointWriter = Callable[[Path, JointMotion], None]
 
+# Of a person; of a person or a robot, by joints; of a robot alone.
 WRITERS: dict[str, Writer] = {
     "csv": write_csv,
     "parquet": write_parquet,
@@ -35,9 +53,27 @@ WRITERS: dict[str, Writer] = {
     "trc": write_trc,
     "bvh": write_bvh,
     "c3d": write_c3d,
+    **{f"bvh-{name}": functools.partial(write_gmr, rig=rig) for name, rig in RIGS.items()},
 }
-FORMATS = (*WRITERS, "urdf")
-SUFFIXES = {"placement": ".sto"}  # where it is not the format's name
+JOINT_WRITERS: dict[str, JointWriter] = {"rosbag": write_rosbag, "mcap": write_mcap, "rrd": write_rrd}
+ROBOT_WRITERS: dict[str, JointWriter] = {
+    "pkl": write_pickle,
+    "npz": write_motion_npz,
+    "csv-beyondmimic": write_motion_csv,
+}
+LEROBOT = "lerobot"
+ROBOTS_ALONE = (*ROBOT_WRITERS, LEROBOT)
+FORMATS = (*WRITERS, "urdf", *JOINT_WRITERS, *ROBOT_WRITERS, LEROBOT)
+# Formats that are folders → what an earlier run left in one, which `force` replaces.
+FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*"), "rosbag": ("*.db3", "*.mcap", "metadata.yaml")}
+# Where it is not the format's name; a folder has none.
+SUFFIXES = {
+    **{"placement": ".sto", "csv-beyondmimic": ".csv"},
+    **{f"bvh-{name}": ".bvh" for name in RIGS},
+    **dict.fromkeys(FOLDERS, ""),
+}
+FILE_SUFFIXES = (*FORMATS, "bag", "db3")
+WITHOUT_MOTION = ("urdf", "placement")
 NAMES = ("opensim", "isb")
 
 
@@ -52,7 +88,7 @@ class Exported(NamedTuple):
 
 
 def export(
-    result: PosedBody | str | Path,
+    result: Result | Sequence[Result],
     file: str | Path,
     format: str | None = None,
     *,
@@ -60,6 +96,8 @@ def export(
     rate_hz: float | None = None,
     interval: tuple[float, float] | None = None,
     phase: str | None = None,
+    episodes: str | None = None,
+    instruction: str | None = None,
     force: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
@@ -67,13 +105,15 @@ def export(
 
     Parameters
     ----------
-    result : PosedBody, str or Path
-        What `track` or `load_result` gives, or a result folder.
+    result : PosedBody, Trajectory, str or Path, or several
+        A person's motion: what `track` or `load_result` gives, or a result folder. A robot's: what `retarget` gives, or
+        a folder that `wepose retarget` wrote. Several only for "lerobot", which makes episodes of them.
     file : str or Path
-        The file to write.
+        The file to write; of "lerobot" and "rosbag" the folder.
     format : str, optional
-        One of `FORMATS`: "csv", "parquet", "mot", "sto", "placement", "trc", "bvh", "c3d", "urdf"; None: that of the
-        file's suffix, which otherwise has to be the format's own.
+        One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "trc", "c3d", "bvh", "bvh-lafan1",
+        "bvh-nokov", "bvh-soma", "bvh-xsens". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot", "pkl",
+        "npz", "csv-beyondmimic". None: that of the file's suffix, which otherwise has to be the format's own.
     names : str, optional
         Of a .mot's columns: "opensim", or "isb"; None: "opensim".
     rate_hz : float, optional
@@ -81,10 +121,15 @@ def export(
     interval, phase : optional
         Write only this interval, from and to [s], or this phase of the recording; of a phase with several intervals
         "NAME:2" is the second.
+    episodes : str, optional
+        Of "lerobot": "repetitions" makes each repetition of the movement an episode, a phase each of its intervals;
+        None: each result is one.
+    instruction : str, optional
+        Of "lerobot": what the robot does, in all episodes; None: "follow NAME".
     force : bool
-        Replace an existing file.
+        Replace an existing file, or a data set of the same format.
     provenance : mapping, optional
-        Written beside the file, before it.
+        Written beside the file, before it; of a format that is a folder into it.
 
     Returns
     -------
@@ -94,7 +139,7 @@ def export(
     Raises
     ------
     BadOption
-        A format that is not known, or an option that it has not.
+        A format that is not known, or of another kind of result; an option that it has not.
     MissingFile, BadData
         No result, or nothing in it that the format could hold.
     ExistingOutput
@@ -108,53 +153,123 @@ def export(
     []
     """
     check_arguments(export, locals())
+    results = [result] if isinstance(result, Result) else list(result)
     file = Path(file)
     format = _format(file, format)
+    _check_options(
+        format, names=names, rate_hz=rate_hz, interval=interval, phase=phase, episodes=episodes, instruction=instruction
+    )
+    if len(results) != 1 and format != LEROBOT:
+        raise BadOption(
+            f"--format {format}: a file of {len(results)} results; only {LEROBOT} takes several, as episodes"
+        )
+    with contextlib.ExitStack() as files:
+        if format in FOLDERS:
+            partial = files.enter_context(_replaced_folder(file, FOLDERS[format], force))
+        else:
+            partial = files.enter_context(whole_file(file, force))
+        if provenance is not None and format in FOLDERS:
+            write_provenance(partial, provenance)
+        elif provenance is not None:
+            partial_provenance = files.enter_context(whole_file(provenance_file(file), True))
+            partial_provenance.write_text(provenance_text(provenance), encoding="utf-8")
+        if format == "urdf":
+            _write_urdf(partial, results[0])
+            return Exported(format, [])
+        if format in WRITERS:
+            motion = _read_motion(results[0], format, interval, phase)
+            if rate_hz is not None:
+                motion = resampled(motion, rate_hz)
+            write = WRITERS[format] if names is None else functools.partial(write_mot, names=names)
+            return Exported(format, write(partial, motion))
+        motions = [_read_joint_motion(each, format, interval, phase) for each in results]
+        if rate_hz is not None:
+            motions = [resample_joints(each, rate_hz) for each in motions]
+        if format == LEROBOT:
+            write_lerobot(partial, [one for each in motions for one in list_episodes(each, episodes, instruction)])
+        else:
+            (JOINT_WRITERS | ROBOT_WRITERS)[format](partial, motions[0])
+        return Exported(format, [])
+
+
+def _check_options(format: str, **options: Any) -> None:
+    """Raise `BadOption` for an option that the format does not have."""
+    given = {name.replace("_", "-"): value for name, value in options.items() if value is not None}
+    names = given.get("names")
     if names is not None and format != "mot":
         raise BadOption(f"--names {names}: only a .mot has names to choose, and the format is {format}")
     if names not in (None, *NAMES):
         raise BadOption(f"--names {names}: not known; {one_of(NAMES, names)}")
+    rate_hz = given.get("rate-hz")
     if rate_hz is not None:
         check_rate(rate_hz)
-    if rate_hz is not None and format in ("urdf", "placement"):
-        raise BadOption(f"--rate-hz {rate_hz:g}: there is no motion in a file of format {format}")
-    if (interval is not None or phase is not None) and format in ("urdf", "placement"):
-        option = "interval" if phase is None else "phase"
-        raise BadOption(f"--{option}: there is no motion in a file of format {format}")
-    with contextlib.ExitStack() as files:
-        partial = files.enter_context(whole_file(file, force))
-        if provenance is not None:
-            partial_provenance = files.enter_context(whole_file(provenance_file(file), True))
-            partial_provenance.write_text(provenance_text(provenance), encoding="utf-8")
-        if format == "urdf":
-            _write_urdf(partial, result)
-            return Exported(format, [])
-        motion = _read_motion(result, interval, phase)
-        if rate_hz is not None:
-            motion = resampled(motion, rate_hz)
-        write = WRITERS[format] if names is None else functools.partial(write_mot, names=names)
-        return Exported(format, write(partial, motion))
+    for name in ("episodes", "instruction"):
+        if name in given and format != LEROBOT:
+            raise BadOption(f"--{name} {given[name]}: only of format {LEROBOT}, and the format is {format}")
+    if format in WITHOUT_MOTION and (unused := [name for name in ("rate-hz", "interval", "phase") if name in given]):
+        value = f" {rate_hz:g}" if rate_hz is not None else ""
+        raise BadOption(f"--{unused[0]}{value}: there is no motion in a file of format {format}")
 
 
-def _write_urdf(file: Path, result: PosedBody | str | Path) -> None:
+@contextlib.contextmanager
+def _replaced_folder(out: Path, own: Sequence[str], force: bool) -> Iterator[Path]:
+    """`whole_folder` of a data set: with `force` an earlier one goes, all other files stay."""
+    with whole_folder(out, force) as folder:
+        yield folder
+        written = {path.relative_to(folder) for path in folder.rglob("*")}
+    for pattern in own:
+        for path in out.glob(pattern):
+            if path.relative_to(out) not in written:
+                path.unlink()
+
+
+def _write_urdf(file: Path, result: Result) -> None:
     if isinstance(result, PosedBody):
         file.write_text(format_urdf(result.subject, result.model), encoding="utf-8")
-        return
-    urdf = Path(result) / SUBJECT_URDF
-    if not urdf.is_file():
-        raise MissingFile(f"{result}: no subject.urdf in it; a folder that `wepose track` wrote is wanted here")
-    shutil.copyfile(urdf, file)
+    elif isinstance(result, HasJointMotion):
+        file.write_text(result.joint_motion().urdf, encoding="utf-8")
+    else:
+        folder = Path(str(result))
+        urdf = folder / (ROBOT_URDF if _is_of_robot(result) else SUBJECT_URDF)
+        if not urdf.is_file():
+            raise MissingFile(f"{result}: no {urdf.name} in it; a folder that `wepose track` wrote is wanted here")
+        shutil.copyfile(urdf, file)
 
 
-def _read_motion(result: PosedBody | str | Path, interval: tuple[float, float] | None, phase: str | None) -> Motion:
-    """The motion of a result, or the selected part of it, of at least two samples."""
+def _is_of_robot(result: Result) -> bool:
+    """Whether a result is a robot's trajectory, and not a person's motion."""
+    if isinstance(result, str | Path):
+        return (Path(result) / TRAJECTORY).is_file()
+    return not isinstance(result, PosedBody)
+
+
+def _read_joint_motion(
+    result: Result, format: str, interval: tuple[float, float] | None, phase: str | None
+) -> JointMotion:
+    """The motion of a robot, or of a person by joints, or the selected part of it."""
+    if isinstance(result, HasJointMotion):
+        return select_motion(result.joint_motion(), interval, phase)
+    if isinstance(result, str | Path) and (format in ROBOTS_ALONE or _is_of_robot(result)):
+        return select_motion(read_joint_motion(Path(result)), interval, phase)
+    if format in ROBOTS_ALONE:
+        raise BadOption(f"--format {format}: is of robots, and this is a person's motion; `wepose retarget` makes one")
+    return convert_person(_read_motion(result, format, interval, phase))
+
+
+def _read_motion(result: Result, format: str, interval: tuple[float, float] | None, phase: str | None) -> Motion:
+    """The motion of a person, or the selected part of it, of at least two samples."""
+    if _is_of_robot(result):
+        raise BadOption(
+            f"--format {format}: is of a person's motion, and this is a robot's trajectory; "
+            f"of that there is: {', '.join(FORMATS[len(WRITERS) :])}"
+        )
     if isinstance(result, PosedBody):
         phases = result.recording.phases if isinstance(result, TrackedRecording) else getattr(result, "phases", {})
         selected = select_interval(result.time, phases, interval, phase)
         pose = result.pose if selected is None else cut_pose(result.pose, selected)
         motion = Motion(pose, result.model, result.name, result.name)
     else:
-        folder = Path(result)
+        folder = Path(str(result))
         pose, model, summary = read_result(folder, interval, phase)
         motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder))
     if len(motion.pose.time) < 2:
@@ -172,7 +287,10 @@ def _format(file: Path, format: str | None) -> str:
     if format not in FORMATS:
         raise BadOption(f"--format {format}: not known; {one_of(FORMATS, format)}")
     suffix = SUFFIXES.get(format, f".{format}")
-    if file.suffix.lower() != suffix:
+    if format in FOLDERS:
+        if file.suffix.lower().removeprefix(".") in FILE_SUFFIXES:  # readers would take the folder for a file
+            raise BadOption(f"-o {file}: format {format} is a folder; name it {file.stem}")
+    elif file.suffix.lower() != suffix:
         raise BadOption(
             f"-o {file}: format {format} is for programs that go by the suffix: name it {file.stem}{suffix}"
         )

@@ -16,7 +16,7 @@ from ..recording import format_span
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
 # Up to so many new samples for one, or up to a few, times are filled; 10 kHz of 100 Hz are a hundred for one.
-_MOST_NEW, _FEW = 200, 1_000_000
+MOST_NEW, FEW = 200, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
     pose = motion.pose
     old = pose.time
     samples = int(np.floor((old[-1] - old[0]) * rate_hz + 1e-6)) + 1
-    if samples > max(_FEW, _MOST_NEW * len(old)):
+    if samples > max(FEW, MOST_NEW * len(old)):
         jump = int(np.argmax(np.diff(old)))
         raise BadData(
             f"{motion.where}: time jumps from {format_span((old[jump], old[jump + 1]))} in row {jump + 2} of "

@@ -78,8 +78,8 @@ def build_joint_table(pose: Pose) -> pl.DataFrame:
     return pl.DataFrame({"time": pose.time, **pose.joints})
 
 
-def write_table(path: Path, table: pl.DataFrame) -> None:
-    """A Parquet file.
+def write_table(path: Path, table: pl.DataFrame, metadata: Mapping[str, str] | None = None) -> None:
+    """A Parquet file, with entries for those who read its schema.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def write_table(path: Path, table: pl.DataFrame) -> None:
     """
     try:
         with path.open("wb") as file:  # polars takes no path that is not in UTF-8
-            table.write_parquet(file)
+            table.write_parquet(file, metadata=None if metadata is None else dict(metadata))
     except (pl.exceptions.PolarsError, OSError) as error:
         reason = str(error).splitlines()[0]
         raise ExistingOutput(f"{path.name}: cannot be written: {reason}; nothing was written") from error

@@ -1,0 +1,448 @@
+"""Motions by joints for robot learning, ROS 2 and viewers: each read back by the reader of others, or by one of ours
+that was written from the format's description."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import polars as pl
+import pytest
+from arms import JOINTS, write_arm
+from scipy.spatial.transform import Rotation
+from test_export import a_pose, write_folder
+
+from wepose_pin import cli
+from wepose_pin.errors import WeposeError
+from wepose_pin.kinematics import PosedBody
+from wepose_pin.model import read_urdf
+from wepose_pin.retargeting.maps import find_example_data
+from wepose_pin.subject import population_subject
+from wepose_pin.writers.export import export
+from wepose_pin.writers.joint_motion import (
+    JointMotion,
+    compute_link_poses_W,
+    read_joint_motion,
+    resample_joints,
+)
+from wepose_pin.writers.result import read_result, write_table
+
+RATE_HZ = 50.0
+APPROACH_S = 2.0
+
+
+def write_trajectory_folder(folder: Path, seed: int = 1, seconds: float = 8.0, rate_hz: float = RATE_HZ) -> Path:
+    """A folder as `wepose retarget` writes it, of the robot arm of `arms`: two phases, three repetitions."""
+    folder.mkdir()
+    write_arm(folder).rename(folder / "robot.urdf")
+    (folder / "arm.toml").unlink()
+    time = np.arange(round(seconds * rate_hz)) / rate_hz
+    rng = np.random.default_rng(seed)
+    columns = {"time": time, "recorded_time": np.maximum(time - APPROACH_S, 0.0) + 1.5}
+    for name in JOINTS:
+        phase, size, speed = rng.uniform(0.0, 6.0), rng.uniform(0.2, 0.8), rng.uniform(0.5, 2.0)
+        columns[name] = size * np.sin(speed * time + phase) - 0.4
+        columns[f"{name}_velocity"] = size * speed * np.cos(speed * time + phase)
+        columns[f"{name}_acceleration"] = -size * speed**2 * np.sin(speed * time + phase)
+    write_table(folder / "trajectory.parquet", pl.DataFrame(columns))
+    w, x, y, z = 0.5, 0.5, -0.5, 0.5
+    summary = {
+        "robot": "arm",
+        "recording": f"session {seed}",
+        "joints": list(JOINTS),
+        "posture": {},
+        "root": {"x": 0.1, "y": 0.0, "z": 0.7, "qx": x, "qy": y, "qz": z, "qw": w},
+        "approach_s": APPROACH_S,
+        "recorded_phases": {"reach": [[1.5, 2.5], [3.0, 4.2]], "later": [[90.0, 91.0]]},
+        "repetitions": {"source": "right_elbow_flexion", "spans": [[1.6, 2.4], [2.6, 3.4], [3.6, 4.4]]},
+    }
+    (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trajectory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_trajectory_folder(tmp_path_factory.mktemp("robot") / "arm")
+
+
+@pytest.fixture(scope="module")
+def motion(trajectory: Path) -> JointMotion:
+    return read_joint_motion(trajectory)
+
+
+# Kinematics -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("options", [{"turned": (0.3, -0.2, 0.5), "continuous": "yaw"}, {"mimic": True}])
+def test_links_are_where_pinocchio_has_them(tmp_path: Path, options: dict[str, object]) -> None:
+    folder = write_trajectory_folder(tmp_path / "arm", seconds=0.1)
+    (tmp_path / "other").mkdir()
+    write_arm(tmp_path / "other", **options).replace(folder / "robot.urdf")
+    motion = read_joint_motion(folder)
+    model = pin.buildModelFromUrdf(str(folder / "robot.urdf"))
+    data, root = model.createData(), pin.XYZQUATToSE3(np.concatenate([motion.p_WB, motion.quat_WB]))
+    poses = compute_link_poses_W(motion)
+    for k in range(5):
+        q = pin.neutral(model)
+        for joint in range(1, model.njoints):
+            name = model.names[joint]
+            value = motion.values("elbow" if name == "elbow_copy" else name)[k]
+            first = model.idx_qs[joint]
+            q[first : first + model.nqs[joint]] = value if model.nqs[joint] == 1 else (np.cos(value), np.sin(value))
+        pin.framesForwardKinematics(model, data, q)
+        for link, (quat, p) in poses.items():
+            expected = root * data.oMf[model.getFrameId(link, pin.FrameType.BODY)]
+            np.testing.assert_allclose(p[k], expected.translation, atol=1e-12)
+            np.testing.assert_allclose(Rotation.from_quat(quat[k]).as_matrix(), expected.rotation, atol=1e-12)
+
+
+def test_another_rate_is_on_the_cubics(tmp_path: Path, motion: JointMotion) -> None:
+    """A cubic through values and slopes of sin(wt) is off by at most (wh)^4 / 384."""
+    finer = resample_joints(motion, 400.0)
+    truth = read_joint_motion(write_trajectory_folder(tmp_path / "arm", rate_hz=400.0))
+    n = len(finer.time)
+    np.testing.assert_allclose(finer.time, truth.time[:n], atol=1e-12)
+    assert np.abs(finer.position - truth.position[:n]).max() < 0.8 * (2.0 / RATE_HZ) ** 4 / 384
+    again = resample_joints(finer, RATE_HZ)
+    np.testing.assert_allclose(again.position, motion.position, atol=1e-14)
+    assert again.begin == motion.begin == 100
+
+
+# LeRobot ----------------------------------------------------------------------------------------------------------
+
+
+def read_frames(folder: Path) -> pl.DataFrame:
+    return pl.read_parquet(folder / "data" / "chunk-000" / "file-000.parquet")
+
+
+def test_each_result_is_an_episode(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+    other = write_trajectory_folder(tmp_path / "other", seed=2, seconds=3.0)
+    assert export([trajectory, str(other)], tmp_path / "data", "lerobot") == ("lerobot", [])
+    frames, info = read_frames(tmp_path / "data"), json.loads((tmp_path / "data/meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["robot_type"]) == ("v3.0", 50, "arm")
+    assert (info["total_episodes"], info["total_frames"], info["splits"]) == (2, 550, {"train": "0:2"})
+    assert info["features"]["action"] == {"dtype": "float32", "shape": [7], "names": list(JOINTS)}
+    assert not any("/" in feature for feature in info["features"])
+    state, action = (frames[name].to_numpy() for name in ("observation.state", "action"))
+    np.testing.assert_array_equal(state[:400], motion.position.astype(np.float32))
+    np.testing.assert_array_equal(action[:399], state[1:400])
+    np.testing.assert_array_equal(action[399], state[399])  # and not the first of the next episode
+    assert frames["index"].to_list() == list(range(550))
+    assert frames["frame_index"].to_list() == [*range(400), *range(150)]
+    np.testing.assert_allclose(frames["timestamp"][400:], np.arange(150) / 50.0, atol=1e-6)
+    episodes = pl.read_parquet(tmp_path / "data/meta/episodes/chunk-000/file-000.parquet")
+    assert episodes["tasks"].to_list() == [["follow session 1"], ["follow session 2"]]
+    assert episodes["dataset_to_index"].to_list() == [400, 550]
+
+
+def test_repetitions_and_phases_are_episodes(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+    export(trajectory, tmp_path / "r", "lerobot", episodes="repetitions", instruction="wave")
+    frames = read_frames(tmp_path / "r")
+    assert frames["episode_index"].value_counts(sort=True)["count"].to_list() == [41, 41, 41]
+    first = motion.samples((1.6, 2.4))
+    assert motion.recorded_time[[first.start, first.stop - 1]] == pytest.approx([1.6, 2.4])
+    np.testing.assert_array_equal(frames["action"].to_numpy()[40], motion.position[first.stop].astype(np.float32))
+    assert pl.read_parquet(tmp_path / "r/meta/tasks.parquet")["__index_level_0__"].to_list() == ["wave"]
+    export([trajectory], tmp_path / "p", "lerobot", episodes="reach", rate_hz=25.0)
+    assert read_frames(tmp_path / "p")["episode_index"].value_counts(sort=True)["count"].to_list() == [30, 26]
+    # The approach, during which the recording has not begun, belongs to no phase.
+    np.testing.assert_allclose(
+        read_frames(tmp_path / "p")["observation.state"].to_numpy()[0], motion.position[motion.begin], atol=1e-6
+    )
+
+
+def test_an_earlier_data_set_goes_as_a_whole(trajectory: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    export(trajectory, data, "lerobot")
+    stale = data / "data" / "chunk-000" / "file-001.parquet"
+    stale.write_bytes(b"")
+    (data / "notes.txt").write_text("mine")
+    assert not (data / "provenance.json").exists()
+    with pytest.raises(WeposeError, match="exists and is not empty"):
+        export(trajectory, data, "lerobot")
+    export(trajectory, data, "lerobot", force=True, provenance={"command": "export"})
+    assert json.loads((data / "provenance.json").read_text()) == {"command": "export"}
+    assert not stale.exists()
+    assert (data / "notes.txt").read_text() == "mine"
+
+
+def find_lerobot() -> str:
+    """The Python that has lerobot; the test is skipped without one."""
+    python = os.environ.get("WEPOSE_LEROBOT", sys.executable)
+    found = subprocess.run([python, "-c", "import importlib.util as u, sys; sys.exit(not u.find_spec('lerobot'))"])
+    if found.returncode:
+        pytest.skip("lerobot is not installed; WEPOSE_LEROBOT names a Python that has it")
+    return python
+
+
+@pytest.mark.peer
+def test_lerobot_loads_it(trajectory: Path, motion: JointMotion, tmp_path: Path) -> None:
+    """lerobot needs PyTorch: WEPOSE_LEROBOT names the Python of an environment that has it."""
+    python = find_lerobot()
+    other = write_trajectory_folder(tmp_path / "other", seed=2)
+    export([trajectory, other], tmp_path / "data", "lerobot", episodes="reach")
+    script = Path(__file__).with_name("lerobot_peer.py")
+    ran = subprocess.run([python, "-W", "ignore", str(script), str(tmp_path / "data")], capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    got = json.loads(ran.stdout)
+    whole = (motion, read_joint_motion(other))
+    spans = [[each.samples(span) for span in each.phases["reach"]] for each in whole]
+    state, action = (
+        np.concatenate(
+            [
+                each.position[span.start + k : span.stop + k]
+                for each, own in zip(whole, spans, strict=True)
+                for span in own
+            ]
+        ).astype(np.float32)
+        for k in (0, 1)
+    )
+    assert (got["fps"], got["robot"], got["joints"], got["dtype"]) == (50, "arm", list(JOINTS), "torch.float32")
+    assert (got["episodes"], got["lengths"], got["frames"]) == (4, [51, 61, 51, 61], 224)
+    np.testing.assert_array_equal(np.array(got["state"], dtype=np.float32), state)
+    np.testing.assert_array_equal(np.array(got["action"], dtype=np.float32), action)
+    np.testing.assert_array_equal(np.array(got["next_actions"], dtype=np.float32), action[:3])
+    np.testing.assert_allclose(got["mean"], action.mean(0, dtype=float), atol=1e-9)
+    assert got["tasks"] == ["follow session 1, reach"] * 112 + ["follow session 2, reach"] * 112
+    assert (got["ahead"], got["last_episode"]) == ([8, 3, 7], 61)
+
+
+# Humanoids --------------------------------------------------------------------------------------------------------
+
+# The order in which Isaac Lab has the joints and bodies of the G1, as published for policies of several authors.
+ISAAC_JOINTS = """left_hip_pitch right_hip_pitch waist_yaw left_hip_roll right_hip_roll waist_roll left_hip_yaw
+right_hip_yaw waist_pitch left_knee right_knee left_shoulder_pitch right_shoulder_pitch left_ankle_pitch
+right_ankle_pitch left_shoulder_roll right_shoulder_roll left_ankle_roll right_ankle_roll left_shoulder_yaw
+right_shoulder_yaw left_elbow right_elbow left_wrist_roll right_wrist_roll left_wrist_pitch right_wrist_pitch
+left_wrist_yaw right_wrist_yaw""".split()
+# That of MuJoCo and of BeyondMimic's .csv.
+LEG = ["hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll"]
+ARM = ["shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw"]
+MUJOCO_JOINTS = [
+    *(f"{side}_{part}_joint" for side in ("left", "right") for part in LEG),
+    *("waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint"),
+    *(f"{side}_{part}_joint" for side in ("left", "right") for part in ARM),
+]
+
+
+@pytest.fixture(scope="module")
+def g1() -> JointMotion:
+    """The G1, each of its joints at a value of its own, standing at 0.79 m and turned by a quarter."""
+    data = find_example_data()
+    if data is None:
+        pytest.skip("example-robot-data is not installed")
+    urdf = data / "g1_description/urdf/g1_29dof_rev_1_0.urdf"
+    time, names = np.arange(40) / 50.0, MUJOCO_JOINTS[::-1]
+    position = 0.01 * np.arange(29) + 0.1 * np.sin(3.0 * time)[:, None]
+    velocity = np.repeat(0.3 * np.cos(3.0 * time)[:, None], 29, axis=1)
+    turned = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    text = urdf.read_text(encoding="utf-8")
+    return JointMotion(
+        "g1", "g1", read_urdf(urdf), text, tuple(names), time, position, velocity, {}, np.array([0.1, 0.2, 0.79]),
+        turned, time,
+    )  # fmt: skip
+
+
+class Moving:
+    """What `export` takes for a trajectory."""
+
+    def __init__(self, motion: JointMotion) -> None:
+        self._motion = motion
+
+    def joint_motion(self) -> JointMotion:
+        return self._motion
+
+
+def test_gmr_loads_the_pickle(g1: JointMotion, tmp_path: Path) -> None:
+    """As GMR's `load_robot_motion`, which turns xyzw into wxyz."""
+    export(Moving(g1), tmp_path / "x.pkl")
+    loaded = pickle.loads((tmp_path / "x.pkl").read_bytes())
+    assert (loaded["fps"], type(loaded["fps"])) == (50, int)
+    assert loaded["local_body_pos"] is loaded["link_body_list"] is None
+    np.testing.assert_allclose(
+        loaded["root_rot"][:, [3, 0, 1, 2]], np.tile([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], (40, 1))
+    )
+    np.testing.assert_array_equal(loaded["dof_pos"], g1.position[:, ::-1])
+    np.testing.assert_array_equal(loaded["root_pos"][-1], [0.1, 0.2, 0.79])
+    export(Moving(g1), tmp_path / "x.csv", "csv-beyondmimic")
+    rows = np.loadtxt(tmp_path / "x.csv", delimiter=",")
+    assert rows.shape == (40, 36)
+    np.testing.assert_allclose(rows, np.hstack([loaded["root_pos"], loaded["root_rot"], loaded["dof_pos"]]), atol=5e-9)
+
+
+def test_beyondmimic_loads_the_npz(g1: JointMotion, tmp_path: Path) -> None:
+    """As its `MotionLoader`, which takes bodies by their place in Isaac Lab's list; velocities against differences."""
+    export(Moving(g1), tmp_path / "x.npz")
+    with np.load(tmp_path / "x.npz", allow_pickle=False) as data:
+        loaded = dict(data)
+    joints = [f"{name}_joint" for name in ISAAC_JOINTS]
+    bodies = ["pelvis", *(f"{name}_link" for name in ISAAC_JOINTS)]
+    bodies[bodies.index("waist_pitch_link")] = "torso_link"
+    assert (loaded["joint_names"].tolist(), loaded["body_names"].tolist()) == (joints, bodies)
+    assert loaded["fps"].tolist() == [50]
+    assert loaded["body_pos_w"].shape == (40, 30, 3)
+    columns = [g1.joints.index(joint) for joint in joints]
+    np.testing.assert_allclose(loaded["joint_pos"], g1.position[:, columns], atol=1e-7)
+    np.testing.assert_allclose(loaded["joint_vel"], g1.velocity[:, columns], atol=1e-7)
+    fine = resample_joints(g1, 2000.0)
+    for body, (quat, p) in compute_link_poses_W(fine).items():
+        if body in bodies:
+            k = bodies.index(body)
+            np.testing.assert_allclose(loaded["body_pos_w"][:, k], p[::40], atol=1e-6)
+            np.testing.assert_allclose(
+                np.abs(np.sum(loaded["body_quat_w"][:, k] * quat[::40, [3, 0, 1, 2]], 1)), 1, atol=1e-6
+            )
+            np.testing.assert_allclose(
+                loaded["body_lin_vel_w"][1:-1, k], np.gradient(p, fine.time, axis=0)[40:-1:40], atol=1e-4
+            )
+            turn = Rotation.from_quat(quat[41:-1:40]) * Rotation.from_quat(quat[39:-2:40]).inv()
+            np.testing.assert_allclose(loaded["body_ang_vel_w"][1:-1, k], turn.as_rotvec() * 1000.0, atol=1e-4)
+
+
+@pytest.mark.peer
+@pytest.mark.parametrize("turned", [(0.0, 0.0, 0.0), (0.4, 0.1, -0.3)])
+def test_mujoco_puts_the_bodies_there(tmp_path: Path, turned: tuple[float, float, float]) -> None:
+    """MuJoCo with the same URDF and the joints of the .pkl in its own order."""
+    mujoco = pytest.importorskip("mujoco")
+    folder = write_trajectory_folder(tmp_path / "arm", seconds=0.5)
+    (tmp_path / "other").mkdir()
+    write_arm(tmp_path / "other", turned=turned).replace(folder / "robot.urdf")
+    for suffix in ("pkl", "npz"):
+        export(folder, tmp_path / f"x.{suffix}")
+    motion, bodies = pickle.loads((tmp_path / "x.pkl").read_bytes()), np.load(tmp_path / "x.npz")
+    # Massless bodies that move, as in this URDF, are refused; mass does not matter to where they are.
+    text = (
+        (folder / "robot.urdf")
+        .read_text()
+        .replace(
+            '<robot name="arm">',
+            '<robot name="arm"><mujoco><compiler balanceinertia="true" boundmass="0.1" boundinertia="0.1"/></mujoco>',
+        )
+    )
+    model = mujoco.MjModel.from_xml_string(text)
+    data = mujoco.MjData(model)
+    assert [model.joint(k).name for k in range(model.njnt)] == list(JOINTS)
+    R_WB, p_WB = Rotation.from_quat(motion["root_rot"][0]), motion["root_pos"][0]
+    worst = 0.0
+    for k in range(len(motion["dof_pos"])):
+        data.qpos[:] = motion["dof_pos"][k]
+        mujoco.mj_kinematics(model, data)
+        for name, p in zip(bodies["body_names"].tolist()[1:], bodies["body_pos_w"][k, 1:], strict=True):
+            worst = max(worst, np.abs(R_WB.apply(data.body(name).xpos) + p_WB - p).max())
+    assert worst < 1e-6
+
+
+# What is wrong ----------------------------------------------------------------------------------------------------
+
+
+def change_summary(folder: Path, **values: object) -> None:
+    file = folder / "summary.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | values))
+
+
+def change_table(folder: Path, change: pl.Expr) -> None:
+    write_table(folder / "trajectory.parquet", pl.read_parquet(folder / "trajectory.parquet").with_columns(change))
+
+
+def change_urdf(folder: Path, old: str, new: str) -> None:
+    file = folder / "robot.urdf"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda f: (f / "robot.urdf").unlink(), "no robot.urdf in it; a folder that `wepose retarget` wrote is wanted"),
+        (lambda f: (f / "summary.json").write_text('{"robot": "arm"'), "summary.json: is damaged, or of no trajectory"),
+        (lambda f: change_summary(f, root={"x": 0.0}), "summary.json: is damaged, or of no trajectory: KeyError('y')"),
+        (lambda f: change_summary(f, root=dict.fromkeys(("x", "y", "z", "qx", "qy", "qz", "qw"), 0.0)), "unit quat"),
+        (lambda f: change_summary(f, joints=[*JOINTS, "gripper"]), "trajectory.parquet: no column 'gripper'"),
+        (lambda f: change_table(f, pl.lit("fast").alias("elbow_velocity")), "trajectory.parquet: a column holds text"),
+        (lambda f: change_table(f, pl.lit(float("nan")).alias("elbow")), "elbow has no number in row 1"),
+        (lambda f: change_table(f, pl.lit(1.0).alias("time")), "whose times do not all grow"),
+        (lambda f: change_table(f, pl.col("time") ** 1.5 + pl.col("time")), "times that are uneven; the file has only"),
+        (lambda f: change_table(f, pl.col("time") * 1.003), "49.8504 samples a second, or times that are uneven"),
+        (lambda f: change_urdf(f, "</robot>", ""), "robot.urdf: is no complete XML file"),
+        (lambda f: change_urdf(f, '"elbow"', '"knee"'), "robot.urdf: no joint 'elbow'; summary.json beside it names"),
+        (lambda f: (f / "trajectory.parquet").write_bytes(b"PAR1"), "trajectory.parquet"),
+    ],
+)  # fmt: skip
+def test_a_spoiled_trajectory_takes_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[Path], object], said: str
+) -> None:
+    folder = write_trajectory_folder(tmp_path / "arm", seconds=3.0)
+    spoil(folder)
+    for name, format in (("data", "lerobot"), ("x.npz", "npz"), ("x.pkl", "pkl")):
+        assert_refused(capsys, [str(folder), "-o", str(tmp_path / name), "--format", format], said)
+    assert [path.name for path in tmp_path.iterdir()] == ["arm"]
+
+
+def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["export", *arguments])
+    error = capsys.readouterr().err
+    assert (stop.value.code, error.count("\n")) == (2, 1), error
+    assert said in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["-o", "d", "--format", "lerobot", "--episodes", "reachh"], "it has no such phase; did you mean 'reach'?"),
+        (["-o", "d", "--format", "lerobot", "--episodes", "later"], "0 samples follow 90 to 91 s of the recording"),
+        (["-o", "d", "--format", "lerobot", "--phase", "reach"], "reach has 2 intervals; choose reach:1"),
+        (["-o", "d", "--format", "lerobot", "--rate-hz", "33.3"], "33.3 samples a second"),
+        (["-o", "d", "--format", "lerobot", "--interval", "50", "60"], "the recording runs from 1.5 to"),
+        (["-o", "x.mcap", "--episodes", "reach"], "--episodes reach: only of format lerobot, and the format is mcap"),
+        (["-o", "x.npz", "--instruction", "go"], "--instruction go: only of format lerobot, and the format is npz"),
+        (
+            ["-o", "x.trc"],
+            "--format trc: is of a person's motion, and this is a robot's trajectory; of that there is: urdf",
+        ),
+        (["-o", "x.pickle", "--format", "pkl"], "name it x.pkl"),
+        (["-o", "x.bag", "--format", "rosbag"], "-o x.bag: format rosbag is a folder; name it x"),
+        (["-o", "d"], "-o d: '' is no format's suffix"),
+        (["{arm}", "-o", "x.mcap"], "--format mcap: a file of 2 results; only lerobot takes several, as episodes"),
+        (["{slow}", "-o", "d", "--format", "lerobot"], "its rate [Hz] '25' differs from '50'"),
+        (["{other}", "-o", "d", "--format", "lerobot"], "its joints 'flexion' differs from 'flexion, abduction"),
+        (["-o", "{arm}/summary.json", "--format", "lerobot", "--force"], "summary.json: is a file; a folder is wanted"),
+    ],
+)
+def test_a_wrong_export_of_a_robot_takes_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folders = {name: write_trajectory_folder(tmp_path / name) for name in ("arm", "other")}
+    folders["slow"] = write_trajectory_folder(tmp_path / "slow", rate_hz=25.0)
+    change_summary(folders["other"], joints=["flexion"])
+    before = sorted(tmp_path.rglob("*"))
+    assert_refused(capsys, [str(folders["arm"]), *(word.format(**folders) for word in arguments)], said)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_person_is_no_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_folder(tmp_path / "r", a_pose(n=5))
+    for arguments in (["-o", str(tmp_path / "d"), "--format", "lerobot"], ["-o", str(tmp_path / "x.npz")]):
+        assert_refused(
+            capsys, [str(folder), *arguments], "no trajectory.parquet in it; a folder that `wepose retarget`"
+        )
+    with pytest.raises(WeposeError, match="is of robots, and this is a person's motion; `wepose retarget` makes one"):
+        export(load_result_of(folder), tmp_path / "x.pkl")
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]
+
+
+def load_result_of(folder: Path) -> PosedBody:
+    pose, model, _ = read_result(folder)
+    return PosedBody("made", pose, model, population_subject())

@@ -1,0 +1,377 @@
+"""A URDF and its joints over time, of a person or of a robot, and where its links are."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+import polars as pl
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from ..angles import NEAR_LOCK, euler
+from ..errors import BadData, MissingFile
+from ..kinematics import solve_configuration
+from ..model import BodyModel, read_urdf
+from ..model.configurations import joint_values
+from ..model.tree import joint_axis, joint_placement, parse_tree
+from ..readers.tables import read_table
+from ..recording import Intervals, select_interval
+from ..rotations import multiply
+from .motion import EVEN, FEW, MOST_NEW, Motion, check_complete, resample_evenly
+from .result import read_phases
+
+TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
+REPETITIONS = "repetitions"  # in the summary of a trajectory, and as the name of what makes episodes
+SLACK_S = 1e-6  # [s] by which times that are written with digits differ from those in the summary
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """A motion by the joints of a URDF.
+
+    Parameters
+    ----------
+    name : of the recording of a person, of the robot
+    where : the result's folder, for error texts
+    robot, urdf : the URDF as yourdfpy has it, and its text
+    joints : names of those that move
+    time : (n,) [s]
+    position, velocity : (n, joints) [rad or m, s]
+    posture : joint that stays → its value; zero where not named
+    p_WB, quat_WB : (3,) [m], (4,) xyzw of the root link in W
+    recorded_time : (n,) [s] of the recording at each sample
+    phases : of the recording; `REPETITIONS` among them are the repetitions of the movement
+    begin : the first sample after the robot's approach
+    source : name of the recording that a robot follows
+    """
+
+    name: str
+    where: str
+    robot: Any
+    urdf: str
+    joints: tuple[str, ...]
+    time: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    posture: Mapping[str, float]
+    p_WB: np.ndarray
+    quat_WB: np.ndarray
+    recorded_time: np.ndarray
+    phases: Mapping[str, Intervals] = field(default_factory=dict)
+    begin: int = 0
+    source: str = ""
+
+    @property
+    def rate_hz(self) -> float:
+        """One over the usual time step, to six digits."""
+        return float(f"{1.0 / float(np.median(np.diff(self.time))):.6g}")
+
+    @cached_property
+    def ordered(self) -> tuple[Any, ...]:
+        """The URDF's joints depth first, in the order of the file, as MuJoCo numbers them."""
+        below = parse_tree(self.robot, self.where).below
+        order: list[Any] = []
+
+        def visit(link: str) -> None:
+            for joint in below[link]:
+                order.append(joint)
+                visit(joint.child)
+
+        visit(self.root)
+        return tuple(order)
+
+    @cached_property
+    def root(self) -> str:
+        """The link without a parent."""
+        return str(parse_tree(self.robot, self.where).root)
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """All joints of one axis that copy no other, also those that stay, in the order of `ordered`."""
+        return tuple(joint.name for joint in self.ordered if joint.type in _ONE_AXIS and joint.mimic is None)
+
+    def values(self, joint: str) -> np.ndarray:
+        """Return the positions (n,) of a joint [rad or m]."""
+        return self._column(joint, self.position, self.posture.get(joint, 0.0))
+
+    def rates(self, joint: str) -> np.ndarray:
+        """Return the velocities (n,) of a joint [rad/s or m/s]."""
+        return self._column(joint, self.velocity, 0.0)
+
+    def _column(self, joint: str, table: np.ndarray, otherwise: float) -> np.ndarray:
+        if joint in self.joints:
+            return np.asarray(table[:, self.joints.index(joint)])
+        return np.full(len(self.time), otherwise)
+
+    def samples(self, interval: tuple[float, float]) -> slice:
+        """Return the samples after the approach that follow an interval [s] of the recording."""
+        recorded = self.recorded_time[self.begin :]
+        first, last = np.searchsorted(recorded, [interval[0] - SLACK_S, interval[1] + SLACK_S])
+        # At the end the robot settles while the recording stands still.
+        return slice(self.begin + int(first), self.begin + int(last))
+
+    def cut(self, samples: slice) -> JointMotion:
+        """Return the motion at some samples only."""
+        of_samples = {name: getattr(self, name)[samples] for name in ("time", "position", "velocity", "recorded_time")}
+        return replace(self, **of_samples, begin=0)
+
+
+_ONE_AXIS = ("revolute", "continuous", "prismatic")
+
+
+@runtime_checkable
+class HasJointMotion(Protocol):
+    """What moves a robot, such as a trajectory of `retarget`."""
+
+    def joint_motion(self) -> JointMotion:
+        """Return the motion."""
+
+
+class LinkTransform(NamedTuple):
+    """A link in its parent link: xyzw (n, 4) and [m] (n, 3), or of one row where it is fixed to it."""
+
+    parent: str
+    quat: np.ndarray
+    p: np.ndarray
+
+    @property
+    def fixed(self) -> bool:
+        return len(self.p) == 1
+
+
+def compute_link_transforms(motion: JointMotion) -> dict[str, LinkTransform]:
+    """Compute the transform of every link but the root, parents before children."""
+    transforms = {}
+    for joint in motion.ordered:
+        origin = joint_placement(joint)
+        quat, p = Rotation.from_matrix(origin[:3, :3]).as_quat()[None], origin[None, :3, 3]
+        if joint.type in _ONE_AXIS:
+            source, factor, offset = joint.name, 1.0, 0.0
+            if joint.mimic is not None:
+                source, factor, offset = joint.mimic.joint, joint.mimic.multiplier or 1.0, joint.mimic.offset or 0.0
+            along = (factor * motion.values(source) + offset)[:, None] * joint_axis(joint)
+            if joint.type == "prismatic":
+                p = p + along @ origin[:3, :3].T
+                quat = np.repeat(quat, len(p), axis=0)
+            else:
+                quat = multiply(np.repeat(quat, len(along), axis=0), Rotation.from_rotvec(along).as_quat())
+                p = np.repeat(p, len(quat), axis=0)
+        transforms[joint.child] = LinkTransform(joint.parent, quat, p)
+    return transforms
+
+
+def compute_link_poses_W(motion: JointMotion) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Compute xyzw (n, 4) and [m] (n, 3) of every link in W, parents before children."""
+    n = len(motion.time)
+    poses = {motion.root: (np.tile(motion.quat_WB, (n, 1)), np.tile(motion.p_WB, (n, 1)))}
+    for link, (parent, quat, p) in compute_link_transforms(motion).items():
+        quat_WP, p_WP = poses[parent]
+        offset = Rotation.from_quat(quat_WP).apply(np.array(np.broadcast_to(p, (n, 3))))
+        poses[link] = (multiply(quat_WP, np.broadcast_to(quat, (n, 4))), p_WP + offset)
+    return poses
+
+
+# Of a robot ----------------------------------------------------------------------------------------------------------
+
+
+def read_joint_motion(folder: Path) -> JointMotion:
+    """Read the trajectory that `wepose retarget` wrote.
+
+    Raises
+    ------
+    MissingFile, BadData
+        No such folder, or its files are damaged.
+    """
+    for name in (TRAJECTORY, ROBOT_URDF, "summary.json"):
+        if not (folder / name).is_file():
+            raise MissingFile(f"{folder}: no {name} in it; a folder that `wepose retarget` wrote is wanted here")
+    table, file = read_table(folder / TRAJECTORY), folder / TRAJECTORY
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        joints = tuple(map(str, summary["joints"]))
+        place = [float(summary["root"][key]) for key in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+        posture = {str(joint): float(value) for joint, value in summary["posture"].items()}
+        approach_s, name, source = float(summary["approach_s"]), str(summary["robot"]), str(summary["recording"])
+    except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
+        raise BadData(f"{folder / 'summary.json'}: is damaged, or of no trajectory: {error!r}") from error
+    lost = [c for c in ("time", "recorded_time", *joints, *(f"{j}_velocity" for j in joints)) if c not in table.columns]
+    if lost:
+        raise BadData(f"{file}: no column '{lost[0]}'; summary.json beside it states that joint")
+    try:
+        numbers = {c: table[c].cast(pl.Float64).to_numpy() for c in table.columns}
+    except pl.exceptions.PolarsError as error:
+        raise BadData(f"{file}: a column holds text: {str(error).splitlines()[0]}") from error
+    for column, values in numbers.items():
+        if not np.isfinite(values).all():
+            row = int(np.argmin(np.isfinite(values))) + 1
+            raise BadData(f"{file}: {column} has no number in row {row}; a robot needs one in every row")
+    time = numbers["time"]
+    if not np.isfinite(place).all() or abs(np.linalg.norm(place[3:]) - 1.0) > 1e-3:
+        raise BadData(
+            f"{folder / 'summary.json'}: root is at {place}; three coordinates and a unit quaternion are needed"
+        )
+    if len(time) < 2 or np.any(np.diff(time) <= 0.0):
+        raise BadData(f"{file}: {len(time)} rows whose times do not all grow; a trajectory has at least 2 that do")
+    robot = read_urdf(folder / ROBOT_URDF)
+    known = {joint.name for joint in robot.joints}
+    if unknown := [joint for joint in joints if joint not in known]:
+        raise BadData(f"{folder / ROBOT_URDF}: no joint '{unknown[0]}'; summary.json beside it names that one")
+    phases = read_phases(summary)
+    repetitions = summary.get(REPETITIONS)
+    if isinstance(repetitions, dict):
+        with contextlib.suppress(TypeError, ValueError):
+            phases[REPETITIONS] = tuple((float(begin), float(end)) for begin, end in repetitions["spans"])
+    return JointMotion(
+        name=name,
+        where=str(folder),
+        robot=robot,
+        urdf=(folder / ROBOT_URDF).read_text(encoding="utf-8", errors="replace"),
+        joints=joints,
+        time=time,
+        position=np.stack([numbers[joint] for joint in joints], axis=1),
+        velocity=np.stack([numbers[f"{joint}_velocity"] for joint in joints], axis=1),
+        posture=posture,
+        p_WB=np.array(place[:3]),
+        quat_WB=np.array(place[3:]) / np.linalg.norm(place[3:]),
+        recorded_time=numbers["recorded_time"],
+        phases=phases,
+        begin=int(np.searchsorted(time, approach_s - SLACK_S)),
+        source=source,
+    )
+
+
+def select_motion(motion: JointMotion, interval: tuple[float, float] | None, phase: str | None) -> JointMotion:
+    """Return the part of a motion that follows an interval [s] or a phase of the recording; both None: all of it.
+
+    Raises
+    ------
+    WrongOption, BadData
+        The recording has no such interval or phase; the robot has fewer than two samples there.
+    """
+    phases = {name: spans for name, spans in motion.phases.items() if name != REPETITIONS}
+    selected = select_interval(motion.recorded_time, phases, interval, phase)
+    return motion if selected is None else cut_interval(motion, selected)
+
+
+def cut_interval(motion: JointMotion, interval: tuple[float, float]) -> JointMotion:
+    """Return the part of a motion that follows an interval [s] of the recording.
+
+    Raises
+    ------
+    BadData
+        Fewer than two samples follow it.
+    """
+    samples = motion.samples(interval)
+    if samples.stop - samples.start < 2:
+        recorded = motion.recorded_time[[motion.begin, -1]]
+        raise BadData(
+            f"{motion.where}: {samples.stop - samples.start} samples follow {interval[0]:g} to {interval[1]:g} s of "
+            f"the recording; the trajectory follows {recorded[0]:g} to {recorded[1]:g} s, and 2 are needed"
+        )
+    return motion.cut(samples)
+
+
+def find_whole_rate(motion: JointMotion) -> int:
+    """Return the samples a second, for files that hold no times and a whole number.
+
+    Raises
+    ------
+    BadData
+        The times are uneven, or their rate is no whole number.
+    """
+    time, rate_hz = motion.time, round(motion.rate_hz)
+    grid = np.linspace(time[0], time[-1], len(time))
+    if np.abs(time - grid).max() * rate_hz > EVEN or abs(rate_hz - motion.rate_hz) > 1e-3:
+        raise BadData(
+            f"{motion.where}: {motion.rate_hz:g} samples a second, or times that are uneven; the file has only a whole "
+            f"number of them, which --rate-hz makes"
+        )
+    return rate_hz
+
+
+def resample_joints(motion: JointMotion, rate_hz: float) -> JointMotion:
+    """Return the motion at another rate, on the cubics through positions and velocities.
+
+    Raises
+    ------
+    BadData
+        Times so far apart that nearly all samples would be new.
+    """
+    samples = int((motion.time[-1] - motion.time[0]) * rate_hz + SLACK_S) + 1
+    if samples > max(FEW, MOST_NEW * len(motion.time)):
+        raise BadData(
+            f"{motion.where}: {len(motion.time)} samples from {motion.time[0]:g} to {motion.time[-1]:g} s; at "
+            f"{rate_hz:g} Hz that is {samples}"
+        )
+    time = motion.time[0] + np.arange(samples) / rate_hz
+    curve = CubicHermiteSpline(motion.time, motion.position, motion.velocity)
+    inside = np.minimum(time, motion.time[-1])
+    begin = int(np.searchsorted(time, motion.time[min(motion.begin, len(motion.time) - 1)] - SLACK_S))
+    return replace(
+        motion,
+        time=time,
+        position=curve(inside),
+        velocity=curve.derivative()(inside),
+        recorded_time=np.interp(inside, motion.time, motion.recorded_time),
+        begin=begin,
+    )
+
+
+# Of a person ---------------------------------------------------------------------------------------------------------
+
+
+def convert_person(motion: Motion) -> JointMotion:
+    """Return a person's motion by the joints of the subject's URDF: a spherical joint is three of one axis.
+
+    Raises
+    ------
+    BadData
+        A sample has no orientation.
+    """
+    check_complete(motion, "a file of joints")
+    motion, _ = resample_evenly(motion)
+    model, pose = motion.model, motion.pose
+    if free := [child for child in model.joints if child not in model.limits]:
+        raise BadData(f"{motion.where}: link '{free[0]}' hangs on a joint of type floating, which has no axes to state")
+    q = solve_configuration(model, pose.quat_WL) if pose.q is None else pose.q
+    values = joint_values(model.pin, q)
+    for child in model.limits:
+        values |= _split_triple(model, child, q)
+    names = tuple(values)
+    position = np.stack([values[name] for name in names], axis=1)
+    return JointMotion(
+        name=motion.name,
+        where=motion.where,
+        robot=model.robot,
+        urdf=model.urdf(),
+        joints=names,
+        time=pose.time,
+        position=position,
+        velocity=np.gradient(position, pose.time, axis=0),
+        posture={},
+        p_WB=np.zeros(3),
+        quat_WB=np.array([0.0, 0.0, 0.0, 1.0]),
+        recorded_time=pose.time,
+        source=motion.name,
+    )
+
+
+def _split_triple(model: BodyModel, child: str, q: np.ndarray) -> dict[str, np.ndarray]:
+    """The angles (n,) [rad] of the three revolute joints that are one spherical joint of the model."""
+    first = model.pin.idx_qs[model.joints[child]]
+    axes = model.limits[child].axes
+    mirrored = np.linalg.det(axes) < 0.0
+    basis = axes * [[1.0], [1.0], [-1.0 if mirrored else 1.0]]
+    # R = exp(a1 q1) exp(a2 q2) exp(a3 q3), in coordinates along the axes Rx Ry Rz.
+    quat = np.column_stack([q[:, first : first + 3] @ basis.T, q[:, first + 3]])
+    angles = euler.follow(euler.decompose(quat, "XYZ"), "XYZ", NEAR_LOCK)
+    triple = parse_tree(model.robot, child).path(child)[-3:]
+    signs = (1.0, 1.0, -1.0 if mirrored else 1.0)
+    return {joint.name: sign * angles[:, k] for k, (joint, sign) in enumerate(zip(triple, signs, strict=True))}

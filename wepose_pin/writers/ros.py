@@ -1,0 +1,144 @@
+"""ROS 2 bags of a person or a robot, by rosbags: a folder with SQLite, or one MCAP file with the same messages.
+
+Topics: ``/robot_description`` (the URDF), ``/joint_states``, ``/tf`` and ``/tf_static``. The fixed frame is ``map``.
+Stamps are the motion's times [s]; that of 0, which means none in ROS, is 1 ns.
+
+Source: sensor_msgs/JointState, tf2_msgs/TFMessage, REP 105 (frames); rosbags' documentation.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import BadOption
+from .joint_motion import JointMotion, LinkTransform, compute_link_transforms
+
+FIXED_FRAME, OTHER_FIXED_FRAME = "map", "world"  # the other one where a link has the name
+TYPES = {
+    "/robot_description": "std_msgs/msg/String",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/joint_states": "sensor_msgs/msg/JointState",
+    "/tf": "tf2_msgs/msg/TFMessage",
+}
+LATCHED = ("/robot_description", "/tf_static")
+NAME = "motion"  # of the file in a bag's folder
+BAG_VERSION = 8
+
+
+class _Message(NamedTuple):
+    topic: str
+    time_ns: int
+    value: Any
+
+
+def write_rosbag(folder: Path, motion: JointMotion) -> None:
+    """Write a bag into an existing folder: ``metadata.yaml`` and ``motion.db3``.
+
+    Raises
+    ------
+    BadOption
+        rosbags is not installed.
+    """
+    _write_bag(folder / NAME, motion, "SQLITE3")
+    for path in sorted((folder / NAME).iterdir()):
+        path.replace(folder / path.name)
+    (folder / NAME).rmdir()
+
+
+def write_mcap(path: Path, motion: JointMotion) -> None:
+    """Write the messages of a bag as one MCAP file.
+
+    Raises
+    ------
+    BadOption
+        rosbags is not installed.
+    """
+    with tempfile.TemporaryDirectory(prefix=path.name, dir=path.parent) as folder:
+        _write_bag(Path(folder) / NAME, motion, "MCAP")
+        (Path(folder) / NAME / f"{NAME}.mcap").replace(path)
+
+
+def _write_bag(folder: Path, motion: JointMotion, storage: str) -> None:
+    try:
+        from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise BadOption(
+            "--format rosbag, mcap: needs rosbags, which is not installed: pip install 'wepose-pin[ros]'"
+        ) from None
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    never = QosTime(0, 0)
+    latched = Qos(
+        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, never, never,
+        QosLiveliness.AUTOMATIC, never, False,
+    )  # fmt: skip
+    with Writer(folder, version=BAG_VERSION, storage_plugin=StoragePlugin[storage]) as writer:
+        connections = {
+            topic: writer.add_connection(
+                topic, kind, typestore=store, offered_qos_profiles=[latched] if topic in LATCHED else []
+            )
+            for topic, kind in TYPES.items()
+        }
+        for message in _list_messages(motion, store.types):
+            raw = store.serialize_cdr(message.value, TYPES[message.topic])
+            writer.write(connections[message.topic], message.time_ns, raw)
+
+
+def _list_messages(motion: JointMotion, types: Any) -> Iterator[_Message]:
+    """The messages in the order of time."""
+    time = motion.time - min(0.0, motion.time[0])
+    stamps = np.maximum(np.rint(1e9 * time), 1).astype(np.int64).tolist()
+    transforms = compute_link_transforms(motion)
+    fixed_frame = OTHER_FIXED_FRAME if FIXED_FRAME in (motion.root, *transforms) else FIXED_FRAME
+    placed = {motion.root: LinkTransform(fixed_frame, motion.quat_WB[None], motion.p_WB[None])} | transforms
+    moving = {link: each for link, each in placed.items() if not each.fixed}
+    still = {link: each for link, each in placed.items() if each.fixed}
+    build = _MessageBuilder(types)
+    yield _Message("/robot_description", stamps[0], types["std_msgs/msg/String"](data=motion.urdf))
+    yield _Message("/tf_static", stamps[0], build.transforms(stamps[0], still, 0))
+    joints = list(motion.moving)
+    position, velocity = (np.stack([get(joint) for joint in joints], axis=1) for get in (motion.values, motion.rates))
+    for k, stamp in enumerate(stamps):
+        yield _Message("/joint_states", stamp, build.joint_state(stamp, joints, position[k], velocity[k]))
+        if moving:
+            yield _Message("/tf", stamp, build.transforms(stamp, moving, k))
+
+
+class _MessageBuilder:
+    """Messages of the types of a store."""
+
+    def __init__(self, types: Any) -> None:
+        self._types = types
+
+    def joint_state(self, stamp_ns: int, joints: Sequence[str], position: np.ndarray, velocity: np.ndarray) -> Any:
+        return self._types["sensor_msgs/msg/JointState"](
+            header=self._header(stamp_ns, ""), name=joints, position=position, velocity=velocity, effort=np.empty(0)
+        )
+
+    def transforms(self, stamp_ns: int, links: dict[str, LinkTransform], k: int) -> Any:
+        """The transforms of some links at sample `k`."""
+        types, stamped = self._types, []
+        vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+        for link, (parent, quat, p) in links.items():
+            (x, y, z), (qx, qy, qz, qw) = p[k].tolist(), quat[k].tolist()
+            stamped.append(
+                types["geometry_msgs/msg/TransformStamped"](
+                    header=self._header(stamp_ns, parent),
+                    child_frame_id=link,
+                    transform=types["geometry_msgs/msg/Transform"](
+                        translation=vector(x=x, y=y, z=z), rotation=quaternion(x=qx, y=qy, z=qz, w=qw)
+                    ),
+                )
+            )
+        return types["tf2_msgs/msg/TFMessage"](transforms=stamped)
+
+    def _header(self, stamp_ns: int, frame: str) -> Any:
+        seconds, nanoseconds = divmod(stamp_ns, 10**9)
+        time = self._types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
+        return self._types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
