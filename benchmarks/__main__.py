@@ -12,7 +12,7 @@ from wepose_pin.errors import BadOption, ExistingOutput, WeposeError
 
 from .tables import Section, document, print_table, read_document
 
-KINDS = ("filters", "calibration", "live", "batch", "long", "headings", "protocols")
+KINDS = ("filters", "calibration", "live", "batch", "long", "headings", "protocols", "robots")
 DEFAULT = ("filters", "calibration")
 
 
@@ -34,17 +34,24 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "sessions on one worker, two, and two of which one is killed (stopped, the same command goes on from there); "
         "long: recordings of up to 24 hours in chunks; headings: relative headings of simulated people with and "
         "without their correction, half an hour; with --live an hour of one person who clasps the hands every ten "
-        "minutes; protocols: what each calibration protocol is worth on simulated people, an hour for eight. "
+        "minutes; protocols: what each calibration protocol is worth on simulated people, an hour for eight; robots: "
+        "the upper-body recording of --data on every robot, offline and live, half an hour. "
         f"Without any: {' and '.join(DEFAULT)}",
     )
     add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 12 sessions, up to one hour")
     add("--live", action="store_true", help="with headings: live, over a long time, with and without correction")
     add("--minutes", type=float, metavar="MIN", help="with headings --live: minutes of motion; without it 60")
     add("--sessions", type=int, metavar="N", help="number of sessions of batch")
+    add("--robot", action="append", default=[], metavar="NAME", help="with robots: only this one; may be repeated")
     add("--persons", type=int, default=8, metavar="N", help="number of simulated people of protocols")
     add("--results", type=Path, metavar="FILE", help="where protocols keeps what it has measured, to go on from there")
     add("--page", type=Path, metavar="FILE", help="write the page of protocols there, in Markdown")
-    add("--data", type=Path, help="real recordings (broad/, wepose_hr/) on which filters are measured; or WEPOSE_DATA")
+    add(
+        "--data",
+        type=Path,
+        help="real recordings (broad/, wepose_hr/) on which filters are measured, and upper_body/ "
+        "for robots; or WEPOSE_DATA",
+    )
     add("--save", type=Path, metavar="FILE", help="write the figures there with versions, machine and date, as JSON")
     add("--compare", type=Path, metavar="FILE", help="show each ratio of a file that --save wrote by that of this run")
     options = parser.parse_args(argv)
@@ -95,6 +102,10 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
             from . import protocols
 
             chosen |= protocols.sections(options.persons, options.results, options.page)
+        elif kind == "robots":
+            from . import robots
+
+            chosen |= robots.sections(options.quick, Path(named) if named else None, options.robot)
         else:
             from . import long_recordings
 
