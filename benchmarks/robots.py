@@ -37,8 +37,8 @@ ERRORS = (
     Column("infeasible", "unsolved", 3),
 )
 NOTE = (
-    "Hands against their targets inside the reach [mm]; steps without a solution [%]; margins to the limits of URDF and "
-    "map: position [rad], others [%]; samples in self-contact, by the robot's own shapes."
+    "Hands against their targets inside the reach [mm]; steps without a solution [%]; margins to the limits of URDF "
+    "and map: position [rad], others [%]; samples in self-contact, by the robot's own shapes."
 )
 
 
@@ -146,6 +146,6 @@ def check_commands(robot: Robot, commands: Sequence[Command]) -> tuple[dict[str,
     columns: dict[str, Any] = {"time": clock}
     for j, name in enumerate(robot.names):
         columns |= {name: u[:, j], f"{name}_velocity": v[:, j], f"{name}_acceleration": a[:, j]}
-    check = check_limits(pl.DataFrame(columns), robot.map.urdf, robot.map.acceleration, robot.map.jerk)
+    check = check_limits(pl.DataFrame(columns), robot.map)
     shares = {key: 100.0 * getattr(check, key) for key in ("velocity", "acceleration", "jerk")}
     return {"position": check.position} | shares, find_self_collisions(robot, clock, u).samples

@@ -692,6 +692,7 @@ def test_wrong_robots_are_one_line_before_the_source_opens(
         (["--robot", str(whole), "--to", "there"], "--to there: a port or HOST:PORT is needed"),
         (["--robot", str(whole), "--robot-hz", "5"], "--robot-hz 5: from 10 to 1000"),
         (["--robot", str(whole), "--hold-after", "2"], "--hold-after 2, --stop-after 1: seconds, the second longer"),
+        (["--robot", str(whole), "--speed-scale", "0"], "--speed-scale 0: above 0, up to 1"),
         (["--robot", "panda", "--map", str(alone / "other.toml")], "a map goes with a URDF"),
         (["--robot", str(alone / "arm.urdf"), "--map", str(tmp_path / "no.toml")], "no.toml: no such file"),
         (["--arm", "left"], "--arm left: goes with --robot, which is not given"),

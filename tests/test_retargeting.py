@@ -17,6 +17,7 @@ from wepose_pin.errors import BadData, BadModel, BadOption, MissingFile, NoSolut
 from wepose_pin.kinematics import Pose
 from wepose_pin.retargeting import (
     LimitCheck,
+    LimitMargins,
     Trajectory,
     build_table,
     check_limits,
@@ -51,8 +52,7 @@ def swung(arm) -> Trajectory:
 
 
 def checked(trajectory: Trajectory, changed: pl.DataFrame | None = None) -> LimitCheck:
-    of = trajectory.robot.map
-    return check_limits(build_table(trajectory) if changed is None else changed, of.urdf, of.acceleration, of.jerk)
+    return check_limits(build_table(trajectory) if changed is None else changed, trajectory.robot.map)
 
 
 def is_sound(trajectory: Trajectory) -> None:
@@ -138,6 +138,28 @@ def test_limits_are_read_from_the_urdf_itself(tmp_path: Path) -> None:
     assert said["flexion"] == ("revolute", -3.0, 1.5, 3.0, None)
     assert (said["roll"].lower, said["roll"].upper) == (-np.inf, np.inf)
     assert said["elbow_copy"].mimic == ("elbow", 1.0, 0.0)
+
+
+def test_a_motion_leaves_the_margins_that_are_asked_for(arm, swung: Trajectory, tmp_path: Path) -> None:
+    """Of limits in the map before the URDF's, which here differ by far."""
+    held = checked(swung)
+    assert held.position > 0.05 - 1e-9
+    assert min(held.velocity, held.acceleration, held.jerk) > 0.1 - 1e-9
+    urdf = write_arm(tmp_path)
+    stated = "[limits.position]\nelbow = [-1.5, -0.7]\n[limits.velocity]\nelbow = 0.8\n[arms.right]"
+    said = urdf.with_suffix(".toml").read_text().replace("[arms.right]", stated)
+    urdf.with_suffix(".toml").write_text(said)
+    narrow = load_robot(find_map(str(urdf)), margins=LimitMargins(0.5, 0.1))
+    found = retarget(person(3.0), narrow)
+    is_sound(found)
+    elbow = JOINTS.index("elbow")
+    assert found.joint_position[:, elbow].min() >= -1.4 - 1e-8  # the bounds are searched to 1e-9
+    assert found.joint_position[:, elbow].max() <= -0.8 + 1e-8
+    assert np.abs(found.run.joint_velocity[:, elbow]).max() <= 0.4 + 1e-8
+    assert np.abs(found.run.joint_acceleration).max() <= 6.0 + 1e-8
+    table = build_table(swung)
+    assert check_limits(table, arm.map).passed
+    assert check_limits(table, narrow.map).position < -0.3
 
 
 @pytest.mark.parametrize("spoil", ["position", "velocity", "acceleration", "jerk", "consistent", "ends_at_rest"])
@@ -448,6 +470,12 @@ def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
             "[limits]\njerk = 'high'\n[limits.acceleration]",
             "limits.jerk = 'high'; a number for",
         ),
+        ("[rest]", "[limits.velocity]\njaw = 1.0\n[rest]", "limits.velocity.jaw: no joint that moves in arm.urdf"),
+        (
+            "[rest]",
+            "[limits.position]\nyaw = [1.0, -1.0]\n[rest]",
+            r"limits.position.yaw = \[1.0, -1.0\]; \[lower, upper\]",
+        ),
         ("yaw = 12.0", "yaw = -1.0", "limits.acceleration: joint 'yaw' is -1; no URDF holds it"),
         ("[rest]", "[rest", "not valid TOML"),
     ],
@@ -458,6 +486,23 @@ def test_a_map_that_is_wrong_says_where(tmp_path: Path, old: str, new: str, text
     assert old in said
     urdf.with_suffix(".toml").write_text(said.replace(old, new, 1))
     with pytest.raises(BadModel, match=text):
+        load_robot(find_map(str(urdf)))
+
+
+def test_a_joint_that_fingers_copy_is_no_joint_of_the_arm(tmp_path: Path) -> None:
+    """A gripper of joints that rotate, one finger of which bears the hand."""
+    urdf = write_arm(tmp_path)
+    fingers = "".join(
+        f'<link name="finger_{k}"/><joint name="knuckle_{k}" type="revolute"><parent link="hand"/>'
+        f'<child link="finger_{k}"/><axis xyz="1 0 0"/><limit lower="0" upper="0.8" velocity="2" effort="1"/>'
+        + ('<mimic joint="knuckle_1" multiplier="-1"/></joint>' if k == 2 else "</joint>")
+        for k in (1, 2)
+    )
+    urdf.write_text(urdf.read_text().replace("</robot>", f"{fingers}</robot>"))
+    said = urdf.with_suffix(".toml").read_text().replace('"yaw"]', '"yaw", "knuckle_1"]')
+    said = said.replace("yaw = 12.0", "yaw = 12.0\nknuckle_1 = 1.0").replace('{ link = "hand"', '{ link = "finger_1"')
+    urdf.with_suffix(".toml").write_text(said)
+    with pytest.raises(BadModel, match="'knuckle_1' is no joint of the arm: it is copied by 'knuckle_2'"):
         load_robot(find_map(str(urdf)))
 
 
@@ -638,6 +683,8 @@ def test_the_exit_code_says_that_no_robot_should_run_it(
         ("arm.urdf", ("--arm", "both"), "--arm left: arm has no left arm"),
         ("arm.urdf", ("--scale", "-1"), "--scale -1"),
         ("arm.urdf", ("--smoothing-hz", "-1"), "--smoothing-hz -1"),
+        ("arm.urdf", ("--speed-scale", "1.2"), "--speed-scale 1.2: above 0, up to 1"),
+        ("arm.urdf", ("--limit-margin", "1.5"), "--limit-margin 1.5: joint 'elbow' moves from -2.6 to -0.02 only"),
     ],
 )
 def test_wrong_usage_is_one_line_and_writes_nothing(

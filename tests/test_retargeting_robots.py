@@ -36,8 +36,7 @@ pytestmark = [
 
 
 def is_sound(found: Trajectory) -> None:
-    of = found.robot.map
-    held = check_limits(build_table(found), of.urdf, of.acceleration, of.jerk)
+    held = check_limits(build_table(found), found.robot.map)
     assert held.passed, held
     touched = find_self_collisions(found.robot, found.time, found.joint_position)
     assert touched.samples == 0, touched.first

@@ -96,6 +96,10 @@ class LiveJob:
         Send the robot's commands as JSON to this UDP port. Without it to port 9002 of this machine. Needs --robot.
     robot_hz : HZ
         Send this many robot commands a second.
+    speed_scale : SHARE
+        Use this share of the robot's limits of velocity, acceleration and jerk, above 0, up to 1.
+    limit_margin : RAD
+        Keep this distance from the robot's position limits, in radians; of a joint that slides a tenth of it in metres.
     hold_after : SECONDS
         Brake the robot after this time without a pose. It continues by itself, slowly at first, when poses come again.
     stop_after : SECONDS
@@ -131,6 +135,8 @@ class LiveJob:
     map: Path | None = None
     to: str | None = None
     robot_hz: float = 100.0
+    speed_scale: float = 0.9
+    limit_margin: float = 0.05
     hold_after: float = 0.1
     stop_after: float = 1.0
     force: bool = False
@@ -281,11 +287,13 @@ def _open_page(
 def _connect_robot(job: LiveJob, source: Source, setup: SensorSetup, model: BodyModel) -> tuple[RobotOutput, Source]:
     """The robot's output, and the source as it needs it."""
     from ..live.robot import PORT, RobotOptions, connect_robot
+    from ..retargeting import LimitMargins
     from ..retargeting.stream import StreamOptions
 
     assert job.robot is not None
     timing = StreamOptions(job.robot_hz, job.hold_after, job.stop_after)
-    options = RobotOptions(job.robot, arm_sides(job.arm), job.map, job.to or str(PORT), timing)
+    margins = LimitMargins(job.speed_scale, job.limit_margin)
+    options = RobotOptions(job.robot, arm_sides(job.arm), job.map, job.to or str(PORT), timing, margins)
     speed = float(job.speed.replace("max", "inf")) if job.replays else 1.0
     return connect_robot(options, source, setup, speed, model.table)
 

@@ -41,6 +41,10 @@ class RetargetJob:
         the length of the person's (docs/retargeting.md).
     smoothing_hz : HZ
         Low-pass filter the person's motion at this frequency; 0 does not filter it.
+    speed_scale : SHARE
+        Use this share of the robot's limits of velocity, acceleration and jerk, above 0, up to 1.
+    limit_margin : RAD
+        Keep this distance from the position limits, in radians; of a joint that slides a tenth of it in metres.
     interval : FROM TO
         Follow only this time of the recording, in seconds.
     phase : NAME
@@ -61,6 +65,8 @@ class RetargetJob:
     task: Literal["both", "position", "orientation"] = "both"
     scale: float | None = None
     smoothing_hz: float = 6.0
+    speed_scale: float = 0.9
+    limit_margin: float = 0.05
     interval: tuple[float, float] | None = None
     phase: str | None = None
     strict: bool = False
@@ -70,7 +76,7 @@ class RetargetJob:
     def check(self) -> None:
         """Raise `WeposeError` where there is no such robot, or a number is out of its range."""
         from ..recording import check_selection
-        from ..retargeting import find_map
+        from ..retargeting import LimitMargins, find_map
         from ..retargeting.targets import check_mapping
         from ..retargeting.trajectory import check_rate
 
@@ -78,6 +84,7 @@ class RetargetJob:
         find_map(self.robot)
         check_rate(self.rate_hz)
         check_mapping(self.scale, self.smoothing_hz)
+        LimitMargins(self.speed_scale, self.limit_margin).check()
 
 
 class RetargetOutcome(NamedTuple):
@@ -126,7 +133,8 @@ def run_retarget(
     with whole_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
         pose, body, about = read_result(job.result, job.interval, job.phase)
-        robot = retargeting.load_robot(retargeting.find_map(job.robot), arm_sides(job.arm))
+        margins = retargeting.LimitMargins(job.speed_scale, job.limit_margin)
+        robot = retargeting.load_robot(retargeting.find_map(job.robot), arm_sides(job.arm), margins)
         trajectory = retargeting.retarget(
             pose,
             robot,
@@ -139,8 +147,7 @@ def run_retarget(
             progress=lambda text, fraction: progress(text, 0.48 * (fraction + STAGES.index(text))),
         )
         progress("checking", 0.96)
-        table, limits = retargeting.build_table(trajectory), robot.map
-        check = retargeting.check_limits(table, limits.urdf, limits.acceleration, limits.jerk)
+        check = retargeting.check_limits(retargeting.build_table(trajectory), robot.map)
         collisions = retargeting.find_self_collisions(robot, trajectory.time, trajectory.joint_position)
         progress("writing", 0.98)
         retargeting.write_trajectory(folder, trajectory)

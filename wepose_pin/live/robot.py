@@ -17,7 +17,7 @@ import numpy as np
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption
 from ..model import BodyModel, BodyTable, load_table
-from ..retargeting import Robot, find_map, load_robot, read_map
+from ..retargeting import LimitMargins, Robot, find_map, load_robot, read_map
 from ..retargeting.stream import ArmObserver, Command, CommandStream, StreamOptions, check_segments
 from ..subject import population_subject
 from .loop import Latencies
@@ -302,6 +302,7 @@ class RobotOptions:
     arms : sides; None: all that the robot has
     map_file : of a URDF in `robot` that has none beside it
     to : ``PORT`` or ``HOST:PORT`` of the receiver
+    margins : to the robot's limits
     """
 
     robot: str
@@ -309,6 +310,7 @@ class RobotOptions:
     map_file: Path | None = None
     to: str = str(PORT)
     stream: StreamOptions = field(default_factory=StreamOptions)
+    margins: LimitMargins = field(default_factory=LimitMargins)
 
 
 def connect_robot(
@@ -330,7 +332,7 @@ def connect_robot(
     if options.map_file is not None and path.suffix.lower() not in (".urdf", ".xml"):
         raise BadOption(f"--map {options.map_file}: --robot {options.robot} has its own; a map goes with a URDF")
     robot_map = find_map(options.robot) if options.map_file is None else read_map(options.map_file, urdf=path)
-    robot = load_robot(robot_map, options.arms)
+    robot = load_robot(robot_map, options.arms, options.margins)
     if source.sensors:
         check_segments(robot, source.sensors, table)
     if isinstance(source, ReplaySource) and math.isinf(speed):

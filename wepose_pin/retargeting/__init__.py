@@ -8,7 +8,7 @@ from .checks import LimitCheck, SelfCollisions, check_limits, find_self_collisio
 from .controller import ControllerParams
 from .files import build_table, summarize, write_trajectory
 from .maps import ROBOTS, RobotMap, find_map, read_map
-from .robot import Robot, load_robot
+from .robot import LimitMargins, Robot, load_robot
 from .targets import ArmTargets, compute_arm_targets
 from .trajectory import Trajectory, retarget
 
@@ -17,6 +17,7 @@ __all__ = [
     "ArmTargets",
     "ControllerParams",
     "LimitCheck",
+    "LimitMargins",
     "Robot",
     "RobotMap",
     "SelfCollisions",

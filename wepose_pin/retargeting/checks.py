@@ -1,9 +1,7 @@
-"""Checks of a written trajectory that share no code with the controller: the URDF's limits, coal's shapes."""
+"""Checks of a written trajectory that share no code with the controller: limits of URDF and map, coal's shapes."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +9,7 @@ import pinocchio as pin
 import polars as pl
 from scipy.interpolate import CubicHermiteSpline
 
-from .limits import read_joint_limits
+from .maps import RobotMap
 from .robot import Robot
 
 DISABLED, ADJACENT, AT_REST = "disabled in the SRDF", "adjacent", "in collision at rest"
@@ -34,21 +32,18 @@ class LimitCheck(NamedTuple):
         return min(margins) >= 0.0 and self.consistent and self.ends_at_rest
 
 
-def check_limits(
-    table: pl.DataFrame, urdf: Path, acceleration: Mapping[str, float], jerk: Mapping[str, float] | None = None
-) -> LimitCheck:
-    """Compare a table as in ``trajectory.parquet`` with the URDF's limits and the map's accelerations and jerks.
+def check_limits(table: pl.DataFrame, robot: RobotMap) -> LimitCheck:
+    """Compare a table as in ``trajectory.parquet`` with the limits of a robot's URDF and map, without any margin.
 
     Checked at the samples and at ten points between each two, on the cubics through positions and velocities.
     """
-    limits, time = read_joint_limits(urdf), table["time"].to_numpy()
+    limits, time = robot.read_joint_limits(), table["time"].to_numpy()
     joints = [name for name in table.columns if name in limits]
     q, v, a = (
         table.select([f"{j}{suffix}" for j in joints]).to_numpy() for suffix in ("", "_velocity", "_acceleration")
     )
     low, high, v_max = (np.array([getattr(limits[j], key) for j in joints]) for key in ("lower", "upper", "velocity"))
-    a_max = np.array([acceleration[j] for j in joints])
-    j_max = np.array([jerk[j] if jerk else np.inf for j in joints])
+    a_max, j_max = (np.array([values[j] for j in joints]) for values in (robot.acceleration, robot.jerk))
     dt = np.diff(time)[:, None]
     curve = CubicHermiteSpline(time, q, v)
     dense = np.unique(np.concatenate([time, (time[:-1, None] + dt * np.arange(0.1, 1.0, 0.1)).ravel()]))

@@ -163,6 +163,8 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "contact_times_s": list(trajectory.contact_times),
         "arms": arms,
         "within_limits": limits.passed,
+        "speed_scale": robot.margins.speed_scale,
+        "limit_margin_rad": robot.margins.limit_margin,
         "limit_margins": {
             "position_rad": limits.position,
             "velocity_share": limits.velocity,

@@ -1,4 +1,4 @@
-"""A robot's map (TOML): the links that are shoulder, elbow and hand, its mount, its acceleration and jerk limits."""
+"""A robot's map (TOML): the links that are shoulder, elbow and hand, its mount, its limits."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 from ..assets import asset
 from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadModel, MissingFile, one_of
+from .limits import JointLimit, read_joint_limits
 
 ROBOTS = ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1")
 SIDES = ("left", "right")
@@ -71,6 +72,7 @@ class RobotMap:
     up, forward : axes of the base that point up, and where the person faces
     rest : joint → value in the rest posture [rad or m]; zero where not named
     acceleration, jerk : joint → limit [rad/s²], [rad/s³]
+    velocity, position : joint → limit [rad/s], lower and upper limit [rad], in place of the URDF's
     description : free text, with the sources of the limits
     """
 
@@ -84,8 +86,32 @@ class RobotMap:
     rest: Mapping[str, float]
     acceleration: Mapping[str, float]
     jerk: Mapping[str, float]
+    velocity: Mapping[str, float]
+    position: Mapping[str, tuple[float, float]]
     arms: Mapping[str, ArmMap]
     description: str = ""
+
+    def read_joint_limits(self) -> dict[str, JointLimit]:
+        """Return the limits of every movable joint: those of the map, else the URDF's.
+
+        Raises
+        ------
+        MissingFile, BadModel
+            The URDF is not there, or not XML; the map has limits of a joint that the URDF lacks.
+        """
+        limits = read_joint_limits(self.urdf)
+        for key, values in (("velocity", self.velocity), ("position", self.position)):
+            for name in values:
+                if name not in limits:
+                    raise BadModel(
+                        f"{self.where}: limits.{key}.{name}: no joint that moves in {self.urdf.name}; "
+                        f"{one_of(limits, name)}"
+                    )
+        for name, velocity in self.velocity.items():
+            limits[name] = limits[name]._replace(velocity=velocity)
+        for name, (lower, upper) in self.position.items():
+            limits[name] = limits[name]._replace(lower=lower, upper=upper)
+        return limits
 
 
 def find_map(robot: str) -> RobotMap:
@@ -132,7 +158,7 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         raise BadModel(f"{top.at('arms')}: at least one of [arms.left] and [arms.right] is needed")
     arms = {side: _read_arm(tables[side]) for side in SIDES if side in tables}
     limits = top.table("limits", {})
-    limits.allow("acceleration", "jerk", "source")
+    limits.allow("position", "velocity", "acceleration", "jerk", "source")
     joints = [name for arm in arms.values() for name in arm.joints]
     acceleration = _read_joint_values(limits, "acceleration", joints)
     jerk = {name: limit / RISE_S for name, limit in acceleration.items()}
@@ -147,6 +173,8 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         rest=_read_numbers(top.table("rest", {})),
         acceleration=acceleration,
         jerk=jerk | _read_joint_values(limits, "jerk", joints),
+        velocity=_read_joint_values(limits, "velocity", joints),
+        position=_read_ranges(limits.table("position", {})),
         arms=arms,
         description=" ".join(filter(None, (_read_text(top, "description"), _read_text(limits, "source")))),
     )
@@ -236,6 +264,17 @@ def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[s
             f"{limits.at(key)} = {value!r}; a number for all joints, or a table with one for each, is needed"
         )
     return _read_numbers(limits.table(key, {}))
+
+
+def _read_ranges(table: TomlTable) -> dict[str, tuple[float, float]]:
+    """Joint → lower and upper limit."""
+    ranges = {}
+    for name, value in table.values.items():
+        is_pair = isinstance(value, list) and len(value) == 2 and all(is_number(end, MAX_VALUE) for end in value)
+        if not is_pair or not value[0] < value[1]:
+            raise BadModel(f"{table.at(name)} = {value!r}; [lower, upper] in rad or m is needed, the first smaller")
+        ranges[name] = (float(value[0]), float(value[1]))
+    return ranges
 
 
 def _read_numbers(table: TomlTable) -> dict[str, float]:

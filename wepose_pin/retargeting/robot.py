@@ -10,15 +10,42 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
-from ..errors import BadModel, BadOption, native_stderr_muted, one_of
-from .limits import JointLimit, read_joint_limits
+from ..errors import BadModel, BadOption, WrongOption, native_stderr_muted, one_of
+from .limits import JointLimit
 from .maps import AXES, ArmMap, LinkPoint, RobotMap, package_folders
 
-POSITION_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
-LIMIT_SHARE = 0.999  # of velocity, acceleration and jerk limits, for the same reason
+MIN_LIMIT_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
+MAX_SPEED_SCALE = 0.999  # of velocity, acceleration and jerk limits, for the same reason
+SLIDE_M_PER_RAD = 0.1  # of a limit margin: 0.05 rad of a joint that rotates are 5 mm of one that slides
 REST_MARGIN = 0.02  # [rad or m] of the rest posture inside the position limits
 MAX_REST_ANGLE_DEG = 60.0  # between the hand in the rest posture and the direction ahead and below its shoulder
 _REACH_STARTS = 8
+
+
+@dataclass(frozen=True)
+class LimitMargins:
+    """What a robot leaves of its limits.
+
+    Parameters
+    ----------
+    speed_scale : share of the limits of velocity, acceleration and jerk that is used, above 0, up to 1
+    limit_margin : [rad] to each position limit; of a joint that slides a tenth of it in metres
+    """
+
+    speed_scale: float = 0.9
+    limit_margin: float = 0.05
+
+    def check(self) -> None:
+        """Raise `WrongOption` for a value out of range."""
+        if not 0.0 < self.speed_scale <= 1.0:
+            raise WrongOption("speed-scale", f"{self.speed_scale:g}", "above 0, up to 1, the robot's full limits")
+        if not 0.0 <= self.limit_margin < np.pi:
+            raise WrongOption("limit-margin", f"{self.limit_margin:g}", "radians, at least 0, are needed")
+
+    def find_position_margin(self, limit: JointLimit) -> float:
+        """[rad or m] to the position limits of a joint."""
+        scale = SLIDE_M_PER_RAD if limit.kind == "prismatic" else 1.0
+        return max(scale * self.limit_margin, MIN_LIMIT_MARGIN)
 
 
 @dataclass(frozen=True)
@@ -50,7 +77,7 @@ class Robot:
     full, model : Pinocchio's model of the whole robot, and of its arms' joints only
     geometry : collision geometry on `model`
     coupling, offset : joints of `model` = coupling @ u + offset; a joint that mimics another has a row of its own
-    lower, upper, v_max, a_max, j_max : (n,) limits [rad or m, s], a little inside those of URDF and map
+    lower, upper, v_max, a_max, j_max : (n,) limits [rad or m, s], inside those of URDF and map by `margins`
     rest, rest_full : (n,) rest posture, and as a configuration of `full`
     R_BT : maps coordinates in the person's torso to B
     """
@@ -71,6 +98,7 @@ class Robot:
     rest_full: np.ndarray
     R_BT: np.ndarray
     arms: tuple[Arm, ...]
+    margins: LimitMargins
 
     def configuration(self, u: np.ndarray) -> np.ndarray:
         """Pinocchio's configuration `q` of `model`."""
@@ -93,19 +121,22 @@ class Robot:
         return np.clip(self.lower, -np.pi, np.pi), np.clip(self.upper, -np.pi, np.pi)
 
 
-def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
-    """The robot of a map, with the arms of `sides`; None: all arms of the map.
+def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: LimitMargins | None = None) -> Robot:
+    """The robot of a map, with the arms of `sides`; None: all arms of the map, the default margins.
 
     Raises
     ------
     MissingFile, BadModel, BadOption
-        A file, link or joint that does not exist; a joint without limits; an arm that the robot does not have.
+        A file, link or joint that does not exist; a joint without limits, or with a range that the margins use up; an
+        arm that the robot does not have.
     """
+    margins = margins or LimitMargins()
+    margins.check()
     for side in sides or ():
         if side not in robot.arms:
             raise BadOption(f"--arm {side}: {robot.name} has no {side} arm; {one_of(robot.arms)}")
     maps = {side: arm for side, arm in robot.arms.items() if sides is None or side in sides}
-    limits = read_joint_limits(robot.urdf)
+    limits = robot.read_joint_limits()
     try:
         with native_stderr_muted():  # urdfdom repeats the exception's text
             full = _distinguish_frames(pin.buildModelFromUrdf(str(robot.urdf)))
@@ -119,10 +150,9 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
     locked = [full.getJointId(name) for name in full.names[1:] if name not in moving]
     model, geometry = pin.buildReducedModel(full, geometry, locked, rest_full)
     names = [name for name in model.names[1:] if name in joints and not _mimics_any(limits[name], joints)]
-    coupled = _couple_joints(list(model.names[1:]), names, limits)
-    a_max, j_max = (
-        LIMIT_SHARE * np.array([values[name] for name in names]) for values in (robot.acceleration, robot.jerk)
-    )
+    coupled = _couple_joints(list(model.names[1:]), names, limits, margins)
+    scale = min(margins.speed_scale, MAX_SPEED_SCALE)
+    a_max, j_max = (scale * np.array([values[name] for name in names]) for values in (robot.acceleration, robot.jerk))
     built = Robot(
         map=robot,
         names=tuple(names),
@@ -133,7 +163,7 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
         offset=coupled.offset,
         lower=coupled.lower,
         upper=coupled.upper,
-        v_max=LIMIT_SHARE * coupled.velocity,
+        v_max=scale * coupled.velocity,
         a_max=a_max,
         j_max=j_max,
         rest=np.clip(
@@ -142,6 +172,7 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None) -> Robot:
         rest_full=rest_full,
         R_BT=_torso_rotation(robot, full, rest_full),
         arms=(),
+        margins=margins,
     )
     return replace(built, arms=tuple(_build_arm(built, side, arm) for side, arm in maps.items()))
 
@@ -191,7 +222,7 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
                 raise BadModel(
                     f"{where}.joints: no joint '{name}' that moves in {robot.urdf.name}; {one_of(limits, name)}"
                 )
-            problem = _find_joint_problem(full, name, arm.hand.link)
+            problem = _find_joint_problem(full, name, arm.hand.link, limits)
             if problem:
                 raise BadModel(
                     f"{where}.joints: '{name}' is no joint of the arm: it {problem}; leave it out, it stays where "
@@ -212,11 +243,12 @@ def _check_limits(robot: RobotMap, name: str, limit: JointLimit, mimics: bool) -
     if limit.kind != "continuous" and not limit.lower < limit.upper:
         raise BadModel(
             f"{robot.urdf}: joint '{name}' has no position limits (lower {limit.lower:g}, upper "
-            f'{limit.upper:g}); write <limit lower="…" upper="…" velocity="…"/>'
+            f'{limit.upper:g}); write <limit lower="…" upper="…" velocity="…"/>, or limits.position in the map'
         )
     if not 0.0 < limit.velocity < np.inf:
         raise BadModel(
-            f"{robot.urdf}: joint '{name}' has no velocity limit ({limit.velocity:g}); write <limit velocity=\"…\"/>"
+            f"{robot.urdf}: joint '{name}' has no velocity limit ({limit.velocity:g}); write <limit velocity=\"…\"/>, "
+            "or limits.velocity in the map"
         )
     if mimics:
         return
@@ -230,14 +262,17 @@ def _check_limits(robot: RobotMap, name: str, limit: JointLimit, mimics: bool) -
             )
 
 
-def _find_joint_problem(full: Any, name: str, hand: str) -> str:
+def _find_joint_problem(full: Any, name: str, hand: str, limits: dict[str, JointLimit]) -> str:
     """Why a joint is not between the root and the hand's link; empty where it is."""
     joint = full.getJointId(name)
-    ancestor = full.frames[full.getFrameId(hand)].parentJoint
-    while ancestor > joint:
-        ancestor = full.parents[ancestor]
-    if ancestor != joint:
+    chain = [full.frames[full.getFrameId(hand)].parentJoint]
+    while chain[-1] > 0:
+        chain.append(full.parents[chain[-1]])
+    if joint not in chain:
         return f"does not move the hand's link '{hand}'"
+    for other in full.names[1:]:
+        if other in limits and _mimics_any(limits[other], [name]) and full.getJointId(other) not in chain:
+            return f"is copied by '{other}', which does not move the hand, as a gripper's fingers are"
     siblings = [k for k in range(1, full.njoints) if k != joint and full.parents[k] == full.parents[joint]]
     slides = [full.joints[k].shortname().startswith("JointModelP") for k in (joint, *siblings)]
     if slides[0] and any(slides[1:]):
@@ -303,7 +338,9 @@ class _CoupledJoints(NamedTuple):
     velocity: np.ndarray
 
 
-def _couple_joints(names: list[str], independent: list[str], limits: dict[str, JointLimit]) -> _CoupledJoints:
+def _couple_joints(
+    names: list[str], independent: list[str], limits: dict[str, JointLimit], margins: LimitMargins
+) -> _CoupledJoints:
     n = len(independent)
     coupling, offset = np.zeros((len(names), n)), np.zeros(len(names))
     lower, upper, velocity = np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf)
@@ -317,8 +354,16 @@ def _couple_joints(names: list[str], independent: list[str], limits: dict[str, J
         coupling[k, j] = factor
         if factor == 0.0:
             continue
-        ends = sorted((value - offset[k]) / factor for value in (limit.lower, limit.upper))
-        lower[j], upper[j] = max(lower[j], ends[0] + POSITION_MARGIN), min(upper[j], ends[1] - POSITION_MARGIN)
+        margin = margins.find_position_margin(limit)
+        ends = [(value - offset[k]) / factor for value in (limit.lower + margin, limit.upper - margin)]
+        ends = ends if factor > 0.0 else ends[::-1]
+        lower[j], upper[j] = max(lower[j], ends[0]), min(upper[j], ends[1])
+        if upper[j] - lower[j] < 2.0 * REST_MARGIN:
+            raise WrongOption(
+                "limit-margin",
+                f"{margins.limit_margin:g}",
+                f"joint '{name}' moves from {limit.lower:g} to {limit.upper:g} only",
+            )
         if limit.velocity > 0.0:
             velocity[j] = min(velocity[j], limit.velocity / abs(factor))
     return _CoupledJoints(coupling, offset, lower, upper, velocity)
