@@ -71,7 +71,7 @@ def measure_offline(session: Path, robots: Sequence[str], interval: tuple[float,
             ).summary
             wall = time.perf_counter() - begin
             common = _name_margins(summary["limit_margins"]) | {
-                "infeasible": 100.0 * summary["steps"]["infeasible_share"],
+                "infeasible": 100.0 * summary["steps"]["stopping_share"],
                 "closest": summary["self_collisions"]["min_hull_distance_mm"] or np.nan,
                 "collisions": summary["self_collisions"]["samples"],
                 "slowdown": summary["slowdown"],
@@ -111,7 +111,7 @@ def measure_live(session: Path, robots: Sequence[str], interval: tuple[float, fl
             table.rows[f"{name} {arm.side}"] = check | {
                 "hand": float(np.median(error[:, i])),
                 "hand_90": float(np.quantile(error[:, i], 0.9)),
-                "infeasible": 100.0 * stream.infeasible / len(commands),
+                "infeasible": 100.0 * stream.stopping / len(commands),
                 "collisions": collisions,
                 "step": 1e3 * float(np.median(steps)),
                 "step_99": 1e3 * float(np.quantile(steps, 0.99)),

@@ -46,17 +46,17 @@ class RobotSummary(NamedTuple):
     commands: int
     skipped: int  # commands that were due while one took too long
     dropped: int  # that the system did not send
-    infeasible: int  # steps in which limits and clearance could not both be kept: the clearance was relaxed
+    stopping: int  # steps in which the robot braked, to stay clear of itself
     share: Mapping[str, float]  # state → share of the commands that had a pose
     step: Latencies  # [s] of computing a command
     error: Mapping[str, Latencies]  # side → [m] of the hand while it followed
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """Commands that did not reach the robot, and steps in which its clearance was relaxed."""
+        """Commands that did not reach the robot, and steps in which it braked to stay clear of itself."""
         diagnostics = [
             Diagnostic("robot-commands-skipped", WARNING, self.robot, self.skipped),
-            Diagnostic("robot-clearance-relaxed", WARNING, self.robot, self.infeasible),
+            Diagnostic("robot-stopped-for-clearance", WARNING, self.robot, self.stopping),
             Diagnostic("robot-commands-dropped", WARNING, self.robot, self.dropped),
         ]
         return [diagnostic for diagnostic in diagnostics if diagnostic.value]
@@ -160,7 +160,7 @@ class RobotOutput(Output):
             0 if self.newest is None else self.newest.number + 1,
             self._skipped,
             self._sender.dropped,
-            self.stream.infeasible,
+            self.stream.stopping,
             {state: count / posed for state, count in self._states.most_common()},
             self._step,
             self._error,

@@ -18,6 +18,8 @@ CLEARANCE = 0.02  # [m] that the controller keeps between hulls
 # [m] below which a pair has a constraint: two hands that approach at 2 m/s need it to stop, at the 6 m/s² of joints
 # that brake at half of 5 rad/s² each (talos).
 NEAR = 0.35
+LEAST_SHARE = 0.25  # of the clearance: nearer than that no step leads, not even one to stop
+OVERLAP = 0.005  # [m] by which hulls that overlap in the rest posture may overlap more
 _SAMPLES = 1000  # random configurations that show which pairs collide always, or never; fewer where pairs are many
 _MAX_TESTS = 400_000
 _GRID_JOINTS = 3  # joints between two shapes that can be sampled on a grid
@@ -28,6 +30,7 @@ _ALWAYS = 0.95  # share of the samples in which a pair that always collides does
 class NearPairs(NamedTuple):
     """Pairs of hulls within `NEAR`."""
 
+    pairs: np.ndarray  # (m,) int, their indices
     distance: np.ndarray  # (m,) [m]
     jacobian: np.ndarray  # (m, nv) of the distance
     clearance: np.ndarray  # (m,) [m] to keep
@@ -57,13 +60,17 @@ class CollisionModel:
         self._range = radius[self._first] + radius[self._second] + NEAR
         self._supports = _find_supporting_joints(robot.model)
         self.clearance = self._compute_clearances()
+        self.least_distance = np.where(
+            self.clearance > 0.0, LEAST_SHARE * self.clearance, self.clearance - OVERLAP
+        )  # (pairs,) [m]
+        self.levers = self._compute_levers(self._centre, radius)
         self._viewed: Any = None
         self._rotations: list[np.ndarray] = []
         self._translations: list[np.ndarray] = []
 
     def find_near_pairs(self, data: Any) -> NearPairs:
         """Pairs within `NEAR`; `data` of the model holds joint placements and Jacobians."""
-        none = NearPairs(np.empty(0), np.empty((0, self.robot.model.nv)), np.empty(0))
+        none = NearPairs(np.empty(0, dtype=int), np.empty(0), np.empty((0, self.robot.model.nv)), np.empty(0))
         if not len(self.pairs):
             return none
         if data is not self._viewed:  # views into Pinocchio's memory: to create them costs more than all the rest
@@ -89,15 +96,42 @@ class CollisionModel:
         distance, a, b = table[:, 0], table[:, 1:4], table[:, 4:7]
         first, second = self._joint[self._first[indices]], self._joint[self._second[indices]]
         jacobian = _distance_jacobian(distance, a, b, data.J, self._supports[first], self._supports[second])
-        return NearPairs(distance, jacobian, self.clearance[indices])
+        return NearPairs(np.array(indices), distance, jacobian, self.clearance[indices])
+
+    def compute_distances(self, data: Any, pairs: np.ndarray) -> np.ndarray:
+        """Distances [m] of some `pairs` (indices); `data` of the model holds joint placements."""
+        pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
+        return np.array([pin.computeDistance(self.hulls, self.data, k).min_distance for k in pairs.tolist()])
 
     def _compute_clearances(self) -> np.ndarray:
         """(pairs,) [m] `CLEARANCE`; for hulls closer in the rest posture half of their distance, or their overlap."""
         data = self.robot.model.createData()
         pin.forwardKinematics(self.robot.model, data, self.robot.configuration(self.robot.rest))
-        pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
-        distances = [pin.computeDistance(self.hulls, self.data, k).min_distance for k in range(len(self.pairs))]
+        distances = self.compute_distances(data, np.arange(len(self.pairs)))
         return np.array([min(CLEARANCE, 0.5 * d if d > 0.0 else d) for d in distances])
+
+    def _compute_levers(self, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        """(pairs, n) [m per rad or m] by which a pair's distance changes at most where a joint moves.
+
+        That is the length of the links from the joint to the far end of the shape, in whatever posture.
+        """
+        model, robot = self.robot.model, self.robot
+        moves = np.abs(robot.coupling)
+        largest = np.abs(robot.coupling) @ np.maximum(np.abs(robot.bounds[0]), np.abs(robot.bounds[1]))
+        largest += np.abs(robot.offset)  # [m] of a joint that slides
+        slides = np.array([model.joints[k].shortname().startswith("JointModelP") for k in range(model.njoints)])
+        levers = np.zeros((2, len(self.pairs), model.nv))
+        for end, shapes in enumerate((self._first, self._second)):
+            for row, shape in enumerate(shapes.tolist()):
+                joint, length = int(self._joint[shape]), float(np.linalg.norm(centre[shape]) + radius[shape])
+                while joint > 0:
+                    v = model.idx_vs[joint]
+                    levers[end, row, v] = 1.0 if slides[joint] else length
+                    length += float(np.linalg.norm(model.jointPlacements[joint].translation))
+                    length += largest[v] if slides[joint] else 0.0
+                    joint = model.parents[joint]
+        common = (levers[0] > 0.0) & (levers[1] > 0.0)  # carries both shapes
+        return np.where(common, 0.0, levers.sum(axis=0)) @ moves
 
 
 @compiled

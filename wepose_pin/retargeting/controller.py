@@ -18,17 +18,17 @@ import pinocchio as pin
 
 from ..arguments import NonNegative
 from ..errors import WeposeError
-from .collision import CollisionModel
+from .collision import NEAR, CollisionModel, NearPairs
 from .limits import compute_acceleration_bounds, compute_separation_bounds, reduce_acceleration_limits
 from .objective import add_arm_tasks
 from .robot import Arm, Robot
+from .stopping import Stop, StopCheck, compute_stop
 from .targets import HandPath
 
 HAND_POSE_DOF = 6  # an arm with no more joints has no redundancy for a swivel task
-HALT_VELOCITY_GAIN = 30.0  # [1/s] at which the remaining velocity decays while halting
+MAX_BRAKE_SHARE = 0.9  # of the range of joint velocities in a step, used at most to keep two shapes apart
 NEAR_CLEARANCE_M = 0.01  # [m] to the clearance: pairs nearer than that are counted
 _MIN_DISTANCE_JACOBIAN = 1e-3  # [m/rad] below it a joint does not change a distance
-_DAQP_SOFT = 8  # daqp's flag for a soft constraint
 _DAQP_INFINITY = 1e30  # a bound that daqp ignores
 _NO_JACOBIAN = np.empty((0, 0))
 
@@ -87,7 +87,7 @@ class StepCounts:
     steps: int = 0
     singular: int = 0  # arms near a singularity
     near_clearance: int = 0  # a pair of shapes near its clearance
-    infeasible: int = 0  # programmes without a solution: joint limits kept, clearances only as far as possible
+    stopping: int = 0  # no step keeps all limits and clearances and leaves a stop open: the robot brakes
 
 
 @dataclass
@@ -120,7 +120,9 @@ class QpController:
     dt : [s] of a step
     params : weights, gains, damping
     limit_factor : widens the limits of velocity, acceleration and jerk
+    guarded : takes only steps from which the robot can stop without self-contact; a search for postures needs none
     counts : of the steps so far
+    stopping : whether the last step was one of braking, since there was no other
     posture_reference : replaces the rest posture
     min_distance : [m] between hulls in the last step; inf where none were near
     min_clearance_ratio : smallest ratio of a pair's distance to its clearance in the last step
@@ -132,10 +134,12 @@ class QpController:
     dt: float
     params: ControllerParams = field(default_factory=ControllerParams)
     limit_factor: float = 1.0
+    guarded: bool = True
     counts: StepCounts = field(default_factory=StepCounts)
     posture_reference: PostureReference | None = None
     min_distance: float = np.inf
-    clearance_share: float = np.inf
+    min_clearance_ratio: float = np.inf
+    stopping: bool = False
     active: ActiveConstraints = field(init=False)
 
     def __post_init__(self) -> None:
@@ -160,6 +164,8 @@ class QpController:
         )  # fmt: skip
         self.active = ActiveConstraints(np.zeros(n, dtype=bool), np.zeros(len(robot.arms), dtype=bool))
         self._arms = [_ArmTasks(robot, arm, self.data) for arm in robot.arms]
+        self._stop_check = StopCheck(robot, self.collision)
+        self._stop: list[JointState] = []  # the states of the stop that the last step leaves open, the next one last
 
     def update_kinematics(self, position: np.ndarray) -> None:
         """Set the joint positions (n,), and compute Jacobians and the poses that `get_arm_pose` returns."""
@@ -173,10 +179,14 @@ class QpController:
         return ArmPose(tasks.hand.copy(), tasks.rotation.copy(), tasks.elbow.copy())
 
     def step(self, state: JointState, targets: tuple[HandTarget, ...]) -> JointState:
-        """Solve one step towards `targets` and return the next state; update `counts`, `min_distance` and `active`."""
+        """Solve one step towards `targets` and return the next state; update `counts`, `min_distance` and `active`.
+
+        Where no step keeps all limits and clearances and leaves a stop open, it is one of the stop that the step before
+        has left open.
+        """
         robot, params, dt, n = self.robot, self.params, self.dt, len(self.robot.names)
         self.counts.steps += 1
-        self.update_kinematics(state.position)
+        near = self._update_distances(state)
         H, f = np.zeros((n, n)), np.zeros(n)
         for arm, target in zip(self._arms, targets, strict=True):
             self.counts.singular += arm.add_to_objective(H, f, target, self._kernel_params, dt, state.velocity)
@@ -189,20 +199,58 @@ class QpController:
         f += params.joint_velocity_change * (velocity_mid + dt * state.acceleration)
         self._bound_accelerations(state)
         w_min, w_max = velocity_mid + dt * self._min_accel, velocity_mid + dt * self._max_accel
-        rows, bound = self._constrain_distances(state)
-        w = np.clip(self._solve_qp(H, f, rows, bound, w_min, w_max), w_min, w_max)
-        return integrate(state, np.clip((w - velocity_mid) / dt, self._min_accel, self._max_accel), dt)
+        rows, bound = self._constrain_distances(state, near)
+        # What joints cannot brake is not asked for; at rest it is enough not to approach.
+        most = np.where(rows > 0.0, rows * w_max, rows * w_min).sum(axis=1)
+        bound = np.minimum(bound, most - (1.0 - MAX_BRAKE_SHARE) * np.abs(rows) @ (w_max - w_min))
+        if not (state.velocity.any() or state.acceleration.any()):
+            bound = np.minimum(bound, 0.0)
+        w = self._solve_qp(H, f, rows, bound, w_min, w_max)
+        if w is None and not self.guarded:
+            w = np.clip(0.0, w_min, w_max)
+        if w is not None:
+            w = np.clip(w, w_min, w_max)
+            after = integrate(state, np.clip((w - velocity_mid) / dt, self._min_accel, self._max_accel), dt)
+            if not self.guarded or self._leaves_stop(state, after, near):
+                self.stopping = False
+                return after
+        self.stopping = True
+        self.counts.stopping += 1
+        self.active.joints[:] = False
+        self.active.arms_near_contact[:] = True
+        return self._take_stop(state)
 
-    def step_to_rest(self, state: JointState, steps_left: int) -> JointState:
-        """Return the state one step later, on the way to rest; after the last of `steps_left` it is exactly at rest.
+    def brake(self, state: JointState) -> JointState:
+        """Return the state one step later, on the stop that the last step has left open; at rest it stays."""
+        self._update_distances(state)
+        self.stopping = False
+        return self._take_stop(state)
 
-        Only for a robot that is almost at rest: distances between shapes are not constrained.
-        """
-        dt, velocity_mid = self.dt, state.velocity + 0.5 * self.dt * state.acceleration
-        self.update_kinematics(state.position)
-        self._bound_accelerations(state)
-        w = 0.0 if steps_left <= 2 else (1.0 - HALT_VELOCITY_GAIN * dt) * state.velocity
-        return integrate(state, np.clip((w - velocity_mid) / dt, self._min_accel, self._max_accel), dt)
+    def _take_stop(self, state: JointState) -> JointState:
+        return self._stop.pop() if self._stop else JointState.at_rest(state.position)
+
+    def _leaves_stop(self, state: JointState, after: JointState, near: NearPairs) -> bool:
+        """Whether the robot can stop from the state `after` without self-contact; if so, remember how."""
+        v_max, a_max, j_max = self._limits
+        stop = Stop(
+            *compute_stop(
+                after.position, after.velocity, after.acceleration, self.robot.lower, self.robot.upper, v_max, a_max,
+                j_max, self.dt,
+            )
+        )  # fmt: skip
+        if len(stop.position) and (stop.velocity[-1].any() or stop.acceleration[-1].any()):
+            return False
+        distance = np.full(len(self.collision.pairs), NEAR)
+        distance[near.pairs] = near.distance
+        faster = np.maximum(np.abs(state.velocity), np.abs(after.velocity))
+        travel = self.dt * (faster + 0.125 * self.dt * np.abs(after.acceleration - state.acceleration))
+        path = np.vstack([after.position, stop.position])
+        if not self._stop_check.stays_apart(distance, path, np.vstack([travel, stop.travel])):
+            return False
+        self._stop = [
+            JointState(*values) for values in zip(stop.position, stop.velocity, stop.acceleration, strict=True)
+        ][::-1]
+        return True
 
     def _bound_accelerations(self, state: JointState) -> None:
         """Fill `_min_accel` and `_max_accel`."""
@@ -219,13 +267,18 @@ class QpController:
             self._max_accel,
         )
 
-    def _constrain_distances(self, state: JointState) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows (m, n) and bound (m,) of rows @ w ≥ bound: near shapes approach no faster than they can stop."""
+    def _update_distances(self, state: JointState) -> NearPairs:
+        """Set the joint positions, and return the pairs that are near; update `min_distance`."""
+        self.update_kinematics(state.position)
         near = self.collision.find_near_pairs(self.data)
         self.min_distance = float(near.distance.min()) if len(near.distance) else np.inf
         has_clearance = near.clearance > 0.0  # 0 where hulls overlap in the rest posture, as shapes need not
         ratios = near.distance[has_clearance] / near.clearance[has_clearance]
         self.min_clearance_ratio = float(ratios.min(initial=np.inf))
+        return near
+
+    def _constrain_distances(self, state: JointState, near: NearPairs) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows (m, n) and bound (m,) of rows @ w ≥ bound: near shapes approach no faster than they can stop."""
         rows = near.jacobian if self._uncoupled else near.jacobian @ self.robot.coupling
         _, a_max, j_max = self._limits
         self.counts.near_clearance += bool((near.distance - near.clearance < NEAR_CLEARANCE_M).any())
@@ -236,24 +289,15 @@ class QpController:
 
     def _solve_qp(
         self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray, w_min: np.ndarray, w_max: np.ndarray
-    ) -> np.ndarray:
-        """Return w (n,) within `w_min` and `w_max`, with the constraints of the distances.
-
-        Without a solution these become soft constraints: the robot moves on and keeps clearances as far as possible.
-        If the solver fails again, w is as near to zero as `w_min` and `w_max` allow.
-        """
+    ) -> np.ndarray | None:
+        """Return w (n,) within `w_min` and `w_max` that keeps the constraints of the distances; None: there is none."""
         n = len(w_max)
         upper = np.concatenate([w_max, np.full(len(rows), _DAQP_INFINITY)])
         lower = np.concatenate([w_min, bound])
         sense = np.zeros(len(upper), dtype=np.int32)
         w, _, flag, info = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
-        if flag != 1:
-            sense[n:] = _DAQP_SOFT
-            w, _, flag, info = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
-            self.counts.infeasible += 1
-        if flag <= 0 or not np.isfinite(w).all():
-            self.active.joints[:] = True
-            return np.clip(0.0, w_min, w_max)
+        if flag != 1 or not np.isfinite(w).all():
+            return None
         active = info["lam"] != 0.0
         self.active.joints[:] = active[:n]
         active_rows = rows[active[n:]]

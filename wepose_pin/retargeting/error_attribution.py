@@ -63,7 +63,7 @@ def assess_reachability(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]
         posture=1e-5,
         joint_velocity=1e-4,
     )
-    controller = QpController(robot, trajectory.collision, 0.01, params, limit_factor=1e4)
+    controller = QpController(robot, trajectory.collision, 0.01, params, limit_factor=1e4, guarded=False)
     frames = np.linspace(trajectory.approach_samples, len(trajectory.time) - 1, _FRAMES).astype(int)
     distance = np.full((len(frames), len(robot.arms)), np.inf)
     for k, frame in enumerate(frames.tolist()):

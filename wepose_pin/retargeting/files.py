@@ -185,7 +185,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
             "all": counts.steps,
             "singular_share": round(counts.singular / (steps * len(robot.arms)), 4),
             "near_clearance_share": round(counts.near_clearance / steps, 4),
-            "infeasible_share": round(counts.infeasible / steps, 4),
+            "stopping_share": round(counts.stopping / steps, 4),
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
         "diagnostics": [

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadData, BadOption
 from ..model import BodyTable, load_table
 from .collision import CollisionModel
-from .controller import ControllerParams, HandTarget, JointState, PostureReference, QpController, StepCounts
+from .controller import HandTarget, JointState, QpController
 from .robot import Arm, Robot
 from .targets import (
     JUMP_SPEED,
@@ -48,9 +48,6 @@ REACHED_M, REACHED_RAD = 0.02, 0.1  # distance at which it has reached its targe
 SPEED_UP_S, SPEED_DOWN_S = 0.2, 0.1  # [s] time constants of the speed allowed
 TRUST_UP_S, TRUST_DOWN_S = 0.5, 0.1  # [s] time constants of the trust
 TRUSTED = 0.9  # below it the state is "slow"
-BRAKE_S = 0.06  # [s] time constant of the last of a velocity; above, the robot brakes at its limits
-STOP_SHARE = 0.02  # of what one step can brake: below it the velocity goes to zero at once
-STATIC_SPEED = 1e-9  # [rad/s or m/s] below it a joint is at rest
 
 
 class ArmObservation(NamedTuple):
@@ -330,14 +327,10 @@ class CommandStream:
         self.delay_s = 2.0 / self._omega
         collision = CollisionModel(robot)
         self._controller = QpController(robot, collision, self.dt)
-        braking = ControllerParams(posture=1.0, joint_velocity=0.0, joint_velocity_change=0.0, max_damping=0.0)
-        self._brake = QpController(robot, collision, self.dt, braking)
-        no_target = HandTarget(np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), 0.0)
-        self._no_targets = (no_target,) * len(robot.arms)
         self.state = JointState.at_rest(robot.rest)
-        for controller in (self._controller, self._brake):  # compiles, and reads from disk, before the robot moves
-            controller.step(self.state, self._no_targets)
-            controller.counts = StepCounts()
+        no_target = HandTarget(np.zeros(3), np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), 0.0)
+        self._controller.step(self.state, (no_target,) * len(robot.arms))  # compiles before the robot moves
+        self._controller = QpController(robot, collision, self.dt)
         self._number = 0
         self._time = np.nan
         self._observed: list[ArmObservation] = []
@@ -349,9 +342,9 @@ class CommandStream:
         self._end_reason = ""
 
     @property
-    def infeasible(self) -> int:
-        """Steps in which joint limits and clearances could not both be kept: the joint limits were."""
-        return self._controller.counts.infeasible + self._brake.counts.infeasible
+    def stopping(self) -> int:
+        """Steps in which the robot braked, since none kept all limits and clearances and left a stop open."""
+        return self._controller.counts.stopping
 
     @property
     def stopped(self) -> bool:
@@ -452,14 +445,7 @@ class CommandStream:
     def _brake_to_rest(self, reason: str, final: bool = False) -> Command:
         """A step to rest, within the limits."""
         self._restart_approach(reason)
-        state, dt = self.state, self.dt
-        if (np.abs(state.velocity) > STATIC_SPEED).any() or (np.abs(state.acceleration) > STATIC_SPEED / dt).any():
-            fades = (np.abs(state.velocity) > STOP_SHARE * self.robot.a_max * dt).any()
-            velocity = max(0.0, 1.0 - dt / BRAKE_S) * state.velocity if fades else np.zeros_like(state.velocity)
-            self._brake.posture_reference = PostureReference(state.position, velocity)
-            self.state = self._brake.step(state, self._no_targets)
-        else:
-            self.state = JointState.at_rest(state.position)
+        self.state = self._controller.brake(self.state)
         error = np.full((len(self.robot.arms), 2), np.nan)
         at_rest = not (self.state.velocity.any() or self.state.acceleration.any())
         return self._command("stopped" if final and at_rest else "hold", reason, error)

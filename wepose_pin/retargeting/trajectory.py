@@ -60,7 +60,6 @@ SETTLE_S = 1.0  # [s] in which the targets rest, after the approach and at the e
 END_S = 0.5  # [s] at the end of the motion that are stretched to twice their duration, to end at rest
 HALT_S = 0.3  # [s] at the very end, in which the remaining velocity decays to zero
 SETTLED = 1e-9  # [rad or m, s] below it a joint's last velocity and acceleration count as zero
-MIN_CLEARANCE_RATIO = 0.25  # of a pair's distance to its clearance; where it is lower, the motion is slowed
 CONTACT_BEFORE_S, CONTACT_AFTER_S = 0.6, 0.2  # [s] about such a sample that take twice as long, in each run
 CONTACT_RUNS = 3  # further runs at most, to slow such samples
 TRACKING_POSTURE_FACTOR, TRACKING_POSTURE_GAIN = 50.0, 8.0  # of the second run: weight, gain [1/s] of its posture
@@ -90,7 +89,7 @@ class ControllerRun(NamedTuple):
     rotation: np.ndarray  # (arms, n, 3, 3) of the hand
     swivel: np.ndarray  # (arms, n, 3) [m] elbow swivel direction
     hull_distance: np.ndarray  # (n,) [m] between convex hulls; inf where none were near
-    min_clearance_ratio: np.ndarray  # (n,) smallest ratio of a pair's distance to its clearance
+    stopping: np.ndarray  # (n,) bool: no step kept all limits and clearances, the robot braked
     active: ActiveConstraints  # in the step from each sample
     solve_s: np.ndarray  # (n,) [s] of each step
 
@@ -220,7 +219,7 @@ def retarget(
     motion = resample_targets(arm_targets, arm_targets.time[0] + uniform_time, uniform_time)
     motion, approach_samples = _prepend_approach(QpController(robot, collision, dt, params), motion)
     n = len(motion.time)
-    wide_controller = QpController(robot, collision, dt, params, limit_factor=WIDE_LIMIT_FACTOR)
+    wide_controller = QpController(robot, collision, dt, params, WIDE_LIMIT_FACTOR, guarded=False)
     wide_run = _run_controller(wide_controller, motion, None, 0, lambda fraction: progress(STAGES[0], fraction))
     path = gaussian_filter1d(wide_run.joint_position, PATH_SMOOTHING_S / dt, axis=0, mode="nearest")
     slowdown, limiting = _compute_slowdown(path, robot, dt, motion, approach_samples)
@@ -243,7 +242,7 @@ def retarget(
         controller = QpController(robot, collision, dt, tracking_params)
         halt_steps = round(HALT_S / dt)
         run = _run_controller(controller, targets, posture, halt_steps, lambda fraction: progress(STAGES[1], fraction))
-        near_contact = np.flatnonzero(run.min_clearance_ratio < MIN_CLEARANCE_RATIO)
+        near_contact = np.flatnonzero(run.stopping)
         # A robot that lags far behind needs longer to come to rest.
         settled = float(np.abs([run.joint_velocity[-1], run.joint_acceleration[-1]]).max()) < SETTLED
         if (settled and not len(near_contact)) or attempt == CONTACT_RUNS:
@@ -297,7 +296,7 @@ def _run_controller(
     arms, joints = len(robot.arms), len(robot.names)
     run = ControllerRun(
         np.zeros((n, joints)), np.zeros((n, joints)), np.zeros((n, joints)), np.empty((arms, n, 3)),
-        np.empty((arms, n, 3, 3)), np.empty((arms, n, 3)), np.full(n, np.inf), np.full(n, np.inf),
+        np.empty((arms, n, 3, 3)), np.empty((arms, n, 3)), np.full(n, np.inf), np.zeros(n, dtype=bool),
         ActiveConstraints(np.zeros((n, joints), dtype=bool), np.zeros((n, arms), dtype=bool)), np.zeros(n),
     )  # fmt: skip
     state = JointState.at_rest(robot.rest)
@@ -310,11 +309,11 @@ def _run_controller(
             controller.posture_reference = PostureReference(posture[k], velocity[min(k + 1, n - 1)])
         steps_left = n - 1 - k
         if steps_left < halt_steps:
-            state = controller.step_to_rest(state, steps_left)
+            state = controller.brake(state)
         else:
             state = controller.step(state, sample_hand_targets(targets.hands, k, controller.dt))
         run.solve_s[k] = time.perf_counter() - begin
-        run.hull_distance[k], run.min_clearance_ratio[k] = controller.min_distance, controller.min_clearance_ratio
+        run.hull_distance[k], run.stopping[k] = controller.min_distance, controller.stopping
         run.active.joints[k], run.active.arms_near_contact[k] = controller.active
         for i in range(arms):
             run.hand[i, k], run.rotation[i, k], run.swivel[i, k] = controller.get_arm_pose(i)

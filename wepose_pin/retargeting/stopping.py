@@ -1,0 +1,119 @@
+"""The stop that every step leaves open: its path, and whether the robot's hulls stay apart along it.
+
+A step is taken only if from the state behind it the robot can stop within its limits, and without self-contact. By
+induction there is always such a stop: that of the step before (as braking trajectories in "provably safe" motion:
+Fraichard and Asama 2004, inevitable collision states).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from ..compilation import compiled
+from .collision import CollisionModel
+from .limits import _bound_acceleration, _keeps_bound
+from .robot import Robot
+
+STOP_S = 0.06  # [s] time constant of the last of a velocity; above, joints brake at their limits
+STOP_RISES = 1.5  # of it at least, in times that a joint needs to reach its full acceleration
+STOP_SHARE = 0.02  # of what one step can brake: below it the velocity goes to zero at once
+STATIC_SPEED = 1e-9  # [rad/s or m/s] below it a joint is at rest
+MAX_STOP_S = 5.0  # [s]; a stop that takes longer counts as none
+
+
+class Stop(NamedTuple):
+    """States from one step after the present one to rest."""
+
+    position: np.ndarray  # (m, n) [rad or m]
+    velocity: np.ndarray  # (m, n)
+    acceleration: np.ndarray  # (m, n)
+    travel: np.ndarray  # (m, n) [rad or m] that a joint moves at most in each of these steps
+
+
+@compiled
+def compute_stop(u, v, a, lower, upper, v_max, a_max, j_max, dt):  # type: ignore[no-untyped-def]
+    """Return positions, velocities, accelerations, largest travel of each step (m, n): joints brake one by one to rest.
+
+    They keep the limits if the present state does, as `compute_acceleration_bounds` has it. Without rows: at rest. The
+    last state is not at rest where that takes longer than `MAX_STOP_S`.
+    """
+    n = len(u)
+    steps = int(MAX_STOP_S / dt)
+    path, length = np.zeros((4, steps, n)), 0
+    for j in range(n):
+        place, speed, accel, k = u[j], v[j], a[j], 0
+        j_step = j_max[j] * dt
+        fade = max(STOP_S, STOP_RISES * a_max[j] / j_max[j])
+        peak = abs(speed) + 0.5 * accel * accel / j_max[j]
+        far = peak * (2.0 * a_max[j] / j_max[j] + 2.0 * dt + fade) + 0.5 * peak * peak / a_max[j]
+        free = upper[j] - place > far and place - lower[j] > far  # no limit is near
+        while k < steps and (abs(speed) > STATIC_SPEED or abs(accel) > STATIC_SPEED / dt):
+            wanted = max(0.0, 1.0 - dt / fade) * speed if abs(speed) > STOP_SHARE * a_max[j] * dt else 0.0
+            after = (wanted - speed) / dt - 0.5 * accel
+            after = min(max(after, accel - j_step, -a_max[j]), accel + j_step, a_max[j])
+            if not free:
+                up, down = upper[j] - place, place - lower[j]
+                fits = _keeps_bound(False, after, speed, accel, up, v_max[j], a_max[j], j_max[j], dt)
+                fits &= _keeps_bound(False, -after, -speed, -accel, down, v_max[j], a_max[j], j_max[j], dt)
+                if not fits:
+                    high, _ = _bound_acceleration(speed, accel, up, v_max[j], a_max[j], j_max[j], dt)
+                    low, _ = _bound_acceleration(-speed, -accel, down, v_max[j], a_max[j], j_max[j], dt)
+                    after = min(max(after, -low), high)
+            faster = max(abs(speed), abs(speed + 0.5 * dt * (accel + after)))
+            path[3, k, j] = dt * (faster + 0.125 * dt * abs(after - accel))
+            place += dt * (speed + dt * (accel / 3.0 + after / 6.0))
+            speed += 0.5 * dt * (accel + after)
+            accel = after
+            path[0, k, j], path[1, k, j], path[2, k, j] = place, speed, accel
+            k += 1
+        length = max(length, k)
+        path[0, k:, j] = place
+        if k and k < steps:  # below `STATIC_SPEED`
+            path[1, k - 1, j] = path[2, k - 1, j] = 0.0
+    return path[0, :length], path[1, :length], path[2, :length], path[3, :length]
+
+
+class StopCheck:
+    """Whether hulls stay apart on the way to rest.
+
+    The way is not sampled at every step: from the distance of a pair follows how far its joints may move before the
+    hulls can meet, by the length of the links between (conservative advancement, Mirtich 1996).
+    """
+
+    def __init__(self, robot: Robot, collision: CollisionModel) -> None:
+        self._robot, self._collision = robot, collision
+        self._data: Any = robot.model.createData()
+
+    def stays_apart(self, distance: np.ndarray, path: np.ndarray, travel: np.ndarray) -> bool:
+        """Return whether no pair comes below its least distance.
+
+        Parameters
+        ----------
+        distance : (pairs,) [m] at the beginning; a lower bound where a pair is far
+        path : (m, n) joint positions, the first after one step
+        travel : (m, n) largest way of each joint in each step
+        """
+        collision = self._collision
+        if not len(collision.pairs) or not len(path):
+            return True
+        approach = np.cumsum(travel @ collision.levers.T, axis=0)  # (m, pairs) [m]
+        critical = np.flatnonzero(approach[-1] >= distance - collision.least_distance)
+        if not len(critical):
+            return True
+        approach = approach[:, critical]
+        slack = (distance - collision.least_distance)[critical]
+        at, last = -1, len(path) - 1
+        while at < last:
+            beyond = (approach[at + 1 :] >= slack).any(axis=1)
+            if not beyond.any():
+                return True
+            at = max(at + int(np.argmax(beyond)), at + 1)
+            pin.forwardKinematics(self._robot.model, self._data, self._robot.configuration(path[at]))
+            room = collision.compute_distances(self._data, critical) - collision.least_distance[critical]
+            if (room < 0.0).any():
+                return False
+            slack = approach[at] + room
+        return True
