@@ -15,11 +15,11 @@ from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadModel, MissingFile, one_of
 from .limits import JointLimit, read_joint_limits
 
-ROBOTS = ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1")
+ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1", "alex")
 SIDES = ("left", "right")
 AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
-_KEYS = ("format", "urdf", "srdf", "description", "up", "forward", "base", "rest", "limits", "arms")
+_KEYS = ("format", "urdf", "srdf", "description", "up", "forward", "base", "table", "rest", "limits", "arms")
 MAX_VALUE = 1e6  # of a number in a map
 RISE_S = 0.02  # [s] to the full acceleration, from which the jerk limit follows where the map has none
 
@@ -70,6 +70,7 @@ class RobotMap:
     urdf, srdf : files; without an SRDF pairs in collision in the rest posture, or always, are not checked
     base : link whose axes `up` and `forward` are; empty: the root
     up, forward : axes of the base that point up, and where the person faces
+    table : [m] height above the base's origin of the table on which the robot stands; None: there is none
     rest : joint → value in the rest posture [rad or m]; zero where not named
     acceleration, jerk : joint → limit [rad/s²], [rad/s³]
     velocity, position : joint → limit [rad/s], lower and upper limit [rad], in place of the URDF's
@@ -89,6 +90,7 @@ class RobotMap:
     velocity: Mapping[str, float]
     position: Mapping[str, tuple[float, float]]
     arms: Mapping[str, ArmMap]
+    table: float | None = None
     description: str = ""
 
     def read_joint_limits(self) -> dict[str, JointLimit]:
@@ -176,6 +178,7 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         velocity=_read_joint_values(limits, "velocity", joints),
         position=_read_ranges(limits.table("position", {})),
         arms=arms,
+        table=top.number("table", None),
         description=" ".join(filter(None, (_read_text(top, "description"), _read_text(limits, "source")))),
     )
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
+import coal
 import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
@@ -16,6 +17,8 @@ from .maps import AXES, ArmMap, LinkPoint, RobotMap, package_folders
 
 MIN_LIMIT_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
 MAX_SPEED_SCALE = 0.999  # of velocity, acceleration and jerk limits, for the same reason
+TABLE_NAME = "universe_table"  # of its shape: of the root, as Pinocchio names it
+TABLE_SIZE = (4.0, 4.0, 0.2)  # [m] of the box below the robot that stands for a table; the last is its thickness
 SLIDE_M_PER_RAD = 0.1  # of a limit margin: 0.05 rad of a joint that rotates are 5 mm of one that slides
 REST_MARGIN = 0.02  # [rad or m] of the rest posture inside the position limits
 MAX_REST_ANGLE_DEG = 60.0  # between the hand in the rest posture and the direction ahead and below its shoulder
@@ -145,7 +148,10 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
     joints = [name for arm in maps.values() for name in arm.joints]
     _check_map(robot, maps, full, limits)
     rest_full = _rest_configuration(robot, full, limits)
+    R_BT = _torso_rotation(robot, full, rest_full)
     geometry = _load_collision_geometry(robot, full)
+    if robot.table is not None:
+        geometry.addGeometryObject(_build_table(robot, full, rest_full, R_BT))
     moving = [name for name in full.names[1:] if name in joints or _mimics_any(limits[name], joints)]
     locked = [full.getJointId(name) for name in full.names[1:] if name not in moving]
     model, geometry = pin.buildReducedModel(full, geometry, locked, rest_full)
@@ -170,7 +176,7 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
             [robot.rest.get(name, 0.0) for name in names], coupled.lower + REST_MARGIN, coupled.upper - REST_MARGIN
         ),
         rest_full=rest_full,
-        R_BT=_torso_rotation(robot, full, rest_full),
+        R_BT=R_BT,
         arms=(),
         margins=margins,
     )
@@ -369,14 +375,25 @@ def _couple_joints(
     return _CoupledJoints(coupling, offset, lower, upper, velocity)
 
 
-def _torso_rotation(robot: RobotMap, full: Any, rest_full: np.ndarray) -> np.ndarray:
-    """R_BT."""
-    R_LT = _rotation_of(AXES[robot.forward], AXES[robot.up])
+def _build_table(robot: RobotMap, full: Any, rest_full: np.ndarray, R_BT: np.ndarray) -> Any:
+    """A box whose upper side is `RobotMap.table` above the base's origin."""
+    placement = pin.SE3(R_BT, _find_base(robot, full, rest_full).translation)
+    below = pin.SE3(np.eye(3), np.array([0.0, 0.0, float(robot.table or 0.0) - 0.5 * TABLE_SIZE[2]]))
+    return pin.GeometryObject(TABLE_NAME, 0, 0, placement * below, coal.Box(*TABLE_SIZE))
+
+
+def _find_base(robot: RobotMap, full: Any, rest_full: np.ndarray) -> Any:
+    """Placement of the base in B."""
     if not robot.base:
-        return R_LT
+        return pin.SE3.Identity()
     data = full.createData()
     pin.framesForwardKinematics(full, data, rest_full)
-    return data.oMf[full.getFrameId(robot.base)].rotation @ R_LT
+    return data.oMf[full.getFrameId(robot.base)]
+
+
+def _torso_rotation(robot: RobotMap, full: Any, rest_full: np.ndarray) -> np.ndarray:
+    """R_BT."""
+    return np.asarray(_find_base(robot, full, rest_full).rotation @ _rotation_of(AXES[robot.forward], AXES[robot.up]))
 
 
 def _hand_rotation(arm: ArmMap) -> np.ndarray:
