@@ -39,6 +39,7 @@ ERRORS = (
 NOTE = (
     "Hands against their targets inside the reach [mm]; steps without a solution [%]; margins to the limits of URDF "
     "and map: position [rad], others [%]; samples in self-contact, by the robot's own shapes."
+    " minute: processor time of a minute of the recording."
 )
 
 
@@ -65,11 +66,11 @@ def measure_offline(session: Path, robots: Sequence[str], interval: tuple[float,
         result = Path(folder) / "result"
         run_track(TrackJob(session, result, view=False, report=False))
         for name in robots:
-            begin = time.perf_counter()
+            begin = time.process_time()
             summary = run_retarget(
                 RetargetJob(result, name, Path(folder) / name, interval=interval, view=False)
             ).summary
-            wall = time.perf_counter() - begin
+            wall = time.process_time() - begin
             common = _name_margins(summary["limit_margins"]) | {
                 "infeasible": 100.0 * summary["steps"]["stopping_share"],
                 "closest": summary["self_collisions"]["min_hull_distance_mm"] or np.nan,

@@ -165,7 +165,8 @@ class QpController:
         self.active = ActiveConstraints(np.zeros(n, dtype=bool), np.zeros(len(robot.arms), dtype=bool))
         self._arms = [_ArmTasks(robot, arm, self.data) for arm in robot.arms]
         self._stop_check = StopCheck(robot, self.collision)
-        self._stop: list[JointState] = []  # the states of the stop that the last step leaves open, the next one last
+        self._stop: Stop | None = None  # that the last step leaves open
+        self._stop_steps = 0  # of it that were taken
 
     def update_kinematics(self, position: np.ndarray) -> None:
         """Set the joint positions (n,), and compute Jacobians and the poses that `get_arm_pose` returns."""
@@ -227,7 +228,11 @@ class QpController:
         return self._take_stop(state)
 
     def _take_stop(self, state: JointState) -> JointState:
-        return self._stop.pop() if self._stop else JointState.at_rest(state.position)
+        k = self._stop_steps
+        if self._stop is None or k == len(self._stop.position):
+            return JointState.at_rest(state.position)
+        self._stop_steps += 1
+        return JointState(self._stop.position[k], self._stop.velocity[k], self._stop.acceleration[k])
 
     def _leaves_stop(self, state: JointState, after: JointState, near: NearPairs) -> bool:
         """Whether the robot can stop from the state `after` without self-contact; if so, remember how."""
@@ -238,7 +243,7 @@ class QpController:
                 j_max, self.dt,
             )
         )  # fmt: skip
-        if len(stop.position) and (stop.velocity[-1].any() or stop.acceleration[-1].any()):
+        if not stop.ends_at_rest:
             return False
         distance = np.full(len(self.collision.pairs), NEAR)
         distance[near.pairs] = near.distance
@@ -247,9 +252,7 @@ class QpController:
         path = np.vstack([after.position, stop.position])
         if not self._stop_check.stays_apart(distance, path, np.vstack([travel, stop.travel])):
             return False
-        self._stop = [
-            JointState(*values) for values in zip(stop.position, stop.velocity, stop.acceleration, strict=True)
-        ][::-1]
+        self._stop, self._stop_steps = stop, 0
         return True
 
     def _bound_accelerations(self, state: JointState) -> None:

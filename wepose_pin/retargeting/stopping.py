@@ -25,12 +25,17 @@ MAX_STOP_S = 5.0  # [s]; a stop that takes longer counts as none
 
 
 class Stop(NamedTuple):
-    """States from one step after the present one to rest."""
+    """States from one step after the present one to rest; none where it is at rest."""
 
     position: np.ndarray  # (m, n) [rad or m]
     velocity: np.ndarray  # (m, n)
     acceleration: np.ndarray  # (m, n)
     travel: np.ndarray  # (m, n) [rad or m] that a joint moves at most in each of these steps
+
+    @property
+    def ends_at_rest(self) -> bool:
+        """Whether the last state is at rest."""
+        return not len(self.velocity) or not (self.velocity[-1].any() or self.acceleration[-1].any())
 
 
 @compiled
@@ -79,8 +84,8 @@ def compute_stop(u, v, a, lower, upper, v_max, a_max, j_max, dt):  # type: ignor
 class StopCheck:
     """Whether hulls stay apart on the way to rest.
 
-    The way is not sampled at every step: from the distance of a pair follows how far its joints may move before the
-    hulls can meet, by the length of the links between (conservative advancement, Mirtich 1996).
+    The way is halved until each part is covered: from the distance of a pair follows how far its joints may move before
+    the hulls can meet, by the length of the links between (as in conservative advancement, Mirtich 1996).
     """
 
     def __init__(self, robot: Robot, collision: CollisionModel) -> None:
@@ -103,17 +108,24 @@ class StopCheck:
         critical = np.flatnonzero(approach[-1] >= distance - collision.least_distance)
         if not len(critical):
             return True
-        approach = approach[:, critical]
-        slack = (distance - collision.least_distance)[critical]
-        at, last = -1, len(path) - 1
-        while at < last:
-            beyond = (approach[at + 1 :] >= slack).any(axis=1)
-            if not beyond.any():
-                return True
-            at = max(at + int(np.argmax(beyond)), at + 1)
-            pin.forwardKinematics(self._robot.model, self._data, self._robot.configuration(path[at]))
-            room = collision.compute_distances(self._data, critical) - collision.least_distance[critical]
-            if (room < 0.0).any():
-                return False
-            slack = approach[at] + room
+        # Along the way a pair has come nearer by `approach` at most: its room at both ends of a part covers the part.
+        approach = np.vstack([np.zeros(len(critical)), approach[:, critical]])
+        room = {0: (distance - collision.least_distance)[critical]}
+        parts = [(0, len(path))]
+        while parts:
+            begin, end = parts.pop()
+            for at in (begin, end):
+                if at not in room:
+                    room[at] = self._measure_room(path[at - 1], critical)
+                    if (room[at] < 0.0).any():
+                        return False
+            covered = approach[end] - approach[begin] < room[begin] + room[end]
+            if end - begin > 1 and not covered.all():
+                middle = (begin + end) // 2
+                parts += [(middle, end), (begin, middle)]
         return True
+
+    def _measure_room(self, position: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+        """Distances [m] of some pairs at joint positions (n,), less their least ones."""
+        pin.forwardKinematics(self._robot.model, self._data, self._robot.configuration(position))
+        return self._collision.compute_distances(self._data, pairs) - self._collision.least_distance[pairs]
