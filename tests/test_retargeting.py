@@ -643,7 +643,7 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert code == 0, text
     made = {path.name for path in (tmp_path / "out").iterdir()}
     assert made == {"trajectory.parquet", "trajectory.csv", "joint_trajectory.json", "joint_trajectory.yaml",
-                    "robot.urdf", "summary.json", "view.html"}  # fmt: skip
+                    "robot.urdf", "summary.json", "view.html", "report.html"}  # fmt: skip
     found = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (found["recording"], found["recorded_phases"].keys()) == ("made", set())
     motion = read_joint_motion(tmp_path / "out")
@@ -658,6 +658,11 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     page = (tmp_path / "out" / "view.html").read_text()
     assert '"robot 0"' in page
     assert '"right_robot"' in page
+    assert '"target right"' in page
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "cannot be made" not in report
+    for joint in JOINTS:
+        assert f"<td>{joint}</td>" in report
     code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
     assert (code, "--force replaces" in text) == (2, True)
 

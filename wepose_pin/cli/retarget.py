@@ -20,8 +20,7 @@ def run(job: RetargetJob) -> int:
     _print_checks(outcome.summary)
     out = job.out
     say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
-    if job.view:
-        say_pages(out, {"Motion": "view.html"})
+    say_pages(out, {"Report": "report.html", "Motion": "view.html"})
     return 0 if outcome.runnable else 3
 
 
@@ -64,6 +63,9 @@ def _print_checks(summary: Mapping[str, Any]) -> None:
     if not collisions["samples"]:
         closest = collisions["min_hull_distance_mm"]
         say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
+    braked = summary["steps"]["stopping_share"]
+    if braked:
+        say(f"Braked in {100 * braked:.2f} % of the steps, since no other kept all limits and left a way to stop")
     say(f"Solved in {summary['solve_ms']['p50']:.2f} ms (p50), {summary['solve_ms']['p99']:.2f} ms (p99) a step")
 
 

@@ -14,6 +14,8 @@ from .fields import field_values
 if TYPE_CHECKING:
     from ..kinematics import Pose
 
+PAGES = {"view.html": "view", "report.html": "report"}  # page → option
+
 
 @dataclass(frozen=True)
 class RetargetJob:
@@ -29,7 +31,8 @@ class RetargetJob:
     robot : NAME|FILE
         Move this robot: one of the names above, a URDF with a map beside it (ARM.urdf, ARM.toml), or the map.
     out : DIR
-        Write trajectory.parquet and .csv, joint_trajectory.json and .yaml, summary.json and view.html to this folder.
+        Write trajectory.parquet and .csv, joint_trajectory.json and .yaml, summary.json, view.html and report.html to
+        this folder.
     arm
         Move only this arm of the robot, or both. Without it all arms that the robot has.
     rate_hz : HZ
@@ -53,6 +56,8 @@ class RetargetJob:
         Refuse a motion that is too fast for the robot, instead of slowing it down.
     view
         Write view.html, the animation of the robot beside the person.
+    report
+        Write report.html, which shows the errors of the hands with their causes, distances and joint limits.
     force
         Replace the files of an earlier run in DIR.
     """
@@ -71,6 +76,7 @@ class RetargetJob:
     phase: str | None = None
     strict: bool = False
     view: bool = True
+    report: bool = True
     force: bool = False
 
     def check(self) -> None:
@@ -120,6 +126,7 @@ def run_retarget(
     from .. import retargeting
     from ..documents import whole_folder
     from ..report.page import PageWriter
+    from ..report.retargeting import render_retargeting_report
     from ..report.viewer import retarget_html
     from ..retargeting.trajectory import STAGES
     from ..writers import read_result
@@ -161,15 +168,19 @@ def run_retarget(
             provenance = collect_provenance("retarget", field_values(job))
         text = json.dumps({**summary, "provenance": provenance}, indent=2)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
-    failures: list[Diagnostic] = []
+    progress("making the pages", 0.99)
+    title = f"{about.get('recording') or job.result.name} on {robot.map.name}"
+    writer = PageWriter(job.out, [name for name, wanted in PAGES.items() if getattr(job, wanted)])
+    page = None
     if job.view:
-        progress("making the page", 0.99)
-        title = f"{about.get('recording') or job.result.name} on {robot.map.name}"
-        writer = PageWriter(job.out, ["view.html"])
-        writer.write("view.html", lambda _: retarget_html(body, pose, trajectory, title=title))
-        writer.save_diagnostics("summary.json")
-        failures = writer.diagnostics
-    return RetargetOutcome(summary, failures, float(trajectory.time[-1]))
+        page = writer.write("view.html", lambda _: retarget_html(body, pose, trajectory, title=title))
+    if job.report:
+        writer.write(
+            "report.html",
+            lambda failures: render_retargeting_report(trajectory, summary, title=title, view=page, failures=failures),
+        )
+    writer.save_diagnostics("summary.json")
+    return RetargetOutcome(summary, writer.diagnostics, float(trajectory.time[-1]))
 
 
 def _find_repetitions(pose: Pose, sides: tuple[str, ...]) -> dict[str, Any]:

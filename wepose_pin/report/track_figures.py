@@ -45,10 +45,10 @@ def draw_timeline(
             panel.spans(spans, "phase")
         panel.area(*envelope(time, np.degrees(signal.rate)), styles[name].split()[0])
         if signal.static is not None:
-            panel.boxes(_times(time, signal.static), (-0.13 * most, 0.0), "ink")
-        panel.spans(_times(time, signal.gap), "hatched")
+            panel.boxes(find_times(time, signal.static), (-0.13 * most, 0.0), "ink")
+        panel.spans(find_times(time, signal.gap), "hatched")
         if signal.cut.any():
-            first = _times(time, signal.cut)[:, 0]
+            first = find_times(time, signal.cut)[:, 0]
             panel.markers(first, 0.9 * most, "triangle", "before", size=5.0)
         rows.append(panel)
     rows[-1].shown_x, rows[-1].x_label = True, TIME
@@ -263,7 +263,7 @@ def _any(which: np.ndarray | None) -> bool:
     return which is not None and bool(which.any())
 
 
-def _times(time: np.ndarray, which: np.ndarray) -> np.ndarray:
+def find_times(time: np.ndarray, which: np.ndarray) -> np.ndarray:
     """(m, 2) [s]: runs of true values, those nearer to each other than a pixel made one, so that their number has a
     bound.
     """

@@ -40,6 +40,7 @@ LIGHTS = (  # meshcat's own; positions in W [m]
     ("PointLightNegativeX", 0.50, (2.5, 2.0, 2.6)),
     ("PointLightPositiveX", 0.16, (1.0, -3.0, 1.0)),
 )
+GHOST_OPACITY = 0.35  # of a hand at its target
 LEFT_COLOUR, RIGHT_COLOUR, OTHER_COLOUR = "#e8743b", "#2a7fb8", "#5b6b7d"
 
 
@@ -121,9 +122,12 @@ def find_floor(model: BodyModel) -> float:
 
 
 def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title: str = "", fps: float = 30.0) -> str:
-    """The page on which a person and the robot that does as they do move together, on the robot's time."""
+    """The page on which a person and the robot that does as they do move together, on the robot's time.
+
+    The hands at their targets, beyond the reach too, are drawn translucent.
+    """
     from ..retargeting.targets import find_person_arm
-    from ..retargeting.visuals import build_parts, compute_placements, place_beside_person
+    from ..retargeting.visuals import build_parts, compute_placements, compute_target_placements, place_beside_person
 
     frames = frame_indices(trajectory.time, fps)
     nearest = np.abs(pose.time[:, None] - trajectory.recorded_time[frames][None, :]).argmin(axis=0)
@@ -138,6 +142,8 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     floor_z = find_floor(model)
     R_WB, p_WB = place_beside_person(robot, drawn, shoulder_z, floor_z)
     moved = compute_placements(trajectory, drawn, frames, R_WB, p_WB)
+    ghosts = compute_target_placements(trajectory, frames, R_WB, p_WB)
+    hands = {arm.side: robot.model.frames[arm.hand].parentJoint for arm in robot.arms}
     colours = {side: choose_trail_colour(arm.tip, model) for side, arm in arms.items()}
     # Short names: heads are beside them.
     trails = {side: Trail(pose.points[arm.tip][nearest], colours[side]) for side, arm in arms.items()}
@@ -145,8 +151,16 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     return view_html(
         visuals,
         trajectory.time[frames],
-        placed | {f"robot {joint}": at for joint, at in moved.items()},
-        meshes=[Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in drawn],
+        placed
+        | {f"robot {joint}": at for joint, at in moved.items()}
+        | {f"target {side}": at for side, at in ghosts.items()},
+        meshes=[Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in drawn]
+        + [
+            Mesh(f"target {side}", part.vertices, part.triangles, (*part.rgba[:3], GHOST_OPACITY))
+            for side, joint in hands.items()
+            for part in drawn
+            if part.joint == joint
+        ],
         trails=trails,
         phases={"approach": [(0.0, float(trajectory.time[trajectory.approach_samples]))]},
         title=title,

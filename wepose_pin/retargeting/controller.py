@@ -125,7 +125,7 @@ class QpController:
     stopping : whether the last step was one of braking, since there was no other
     posture_reference : replaces the rest posture
     min_distance : [m] between hulls in the last step; inf where none were near
-    min_clearance_ratio : smallest ratio of a pair's distance to its clearance in the last step
+    nearest_pair : of `CollisionModel.pairs`, to which it belongs; -1 where none were near
     active : constraints of the last step
     """
 
@@ -138,7 +138,7 @@ class QpController:
     counts: StepCounts = field(default_factory=StepCounts)
     posture_reference: PostureReference | None = None
     min_distance: float = np.inf
-    min_clearance_ratio: float = np.inf
+    nearest_pair: int = -1
     stopping: bool = False
     active: ActiveConstraints = field(init=False)
 
@@ -274,10 +274,10 @@ class QpController:
         """Set the joint positions, and return the pairs that are near; update `min_distance`."""
         self.update_kinematics(state.position)
         near = self.collision.find_near_pairs(self.data)
-        self.min_distance = float(near.distance.min()) if len(near.distance) else np.inf
-        has_clearance = near.clearance > 0.0  # 0 where hulls overlap in the rest posture, as shapes need not
-        ratios = near.distance[has_clearance] / near.clearance[has_clearance]
-        self.min_clearance_ratio = float(ratios.min(initial=np.inf))
+        self.min_distance, self.nearest_pair = np.inf, -1
+        if len(near.distance):
+            k = int(np.argmin(near.distance))
+            self.min_distance, self.nearest_pair = float(near.distance[k]), int(near.pairs[k])
         return near
 
     def _constrain_distances(self, state: JointState, near: NearPairs) -> tuple[np.ndarray, np.ndarray]:

@@ -21,13 +21,19 @@ _PENETRATION = 4e-3  # [m] into the clearance, above which a posture does not co
 
 
 def attribute_errors(trajectory: Trajectory, arm: int) -> dict[str, float]:
-    """Cause → share of the motion's samples at which the hand is more than `FAR` off for it; the first that holds.
+    """Cause → share of the motion's samples at which the hand is more than `FAR` off for it, as `find_error_causes`."""
+    cause = find_error_causes(trajectory, arm)[trajectory.approach_samples :]
+    return {name: round(float(np.mean(cause == k)), 4) for k, name in enumerate(CAUSES)}
 
-    `CAUSES` in their order: a sensor was lost; the target is beyond the reach; near shapes stop the arm; a joint is at
+
+def find_error_causes(trajectory: Trajectory, arm: int) -> np.ndarray:
+    """Return the cause (n,) of the error of a hand, its place in `CAUSES`; -1 where the hand is less than `FAR` off.
+
+    The first that applies: a sensor was lost; the target is beyond the reach; near shapes stop the arm; a joint is at
     its position limit; a joint is at a limit of velocity, acceleration or jerk, or was so shortly before; none of
     these: position, orientation and swivel cannot be met together.
     """
-    robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
+    robot, run = trajectory.robot, trajectory.run
     joints, target = robot.arms[arm].joints, trajectory.targets[arm]
     u = run.joint_position[:, joints]
     at_limit = (u - robot.lower[joints] < AT_LIMIT) | (robot.upper[joints] - u < AT_LIMIT)
@@ -42,9 +48,8 @@ def attribute_errors(trajectory: Trajectory, arm: int) -> dict[str, float]:
             np.ones(len(u), dtype=bool),
         ]
     )
-    far = np.linalg.norm(run.hand[arm] - target.unclamped, axis=1)[begin:] > FAR
-    cause = np.argmax(holds, axis=0)[begin:][far]
-    return {name: round(float(np.sum(cause == k)) / len(far), 4) for k, name in enumerate(CAUSES)}
+    far = np.linalg.norm(run.hand[arm] - target.unclamped, axis=1) > FAR
+    return np.where(far, np.argmax(holds, axis=0), -1)
 
 
 def assess_reachability(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:

@@ -89,6 +89,7 @@ class ControllerRun(NamedTuple):
     rotation: np.ndarray  # (arms, n, 3, 3) of the hand
     swivel: np.ndarray  # (arms, n, 3) [m] elbow swivel direction
     hull_distance: np.ndarray  # (n,) [m] between convex hulls; inf where none were near
+    nearest_pair: np.ndarray  # (n,) int, of `CollisionModel.pairs`, to which that belongs; -1: none
     stopping: np.ndarray  # (n,) bool: no step kept all limits and clearances, the robot braked
     active: ActiveConstraints  # in the step from each sample
     solve_s: np.ndarray  # (n,) [s] of each step
@@ -296,7 +297,8 @@ def _run_controller(
     arms, joints = len(robot.arms), len(robot.names)
     run = ControllerRun(
         np.zeros((n, joints)), np.zeros((n, joints)), np.zeros((n, joints)), np.empty((arms, n, 3)),
-        np.empty((arms, n, 3, 3)), np.empty((arms, n, 3)), np.full(n, np.inf), np.zeros(n, dtype=bool),
+        np.empty((arms, n, 3, 3)), np.empty((arms, n, 3)), np.full(n, np.inf), np.full(n, -1),
+        np.zeros(n, dtype=bool),
         ActiveConstraints(np.zeros((n, joints), dtype=bool), np.zeros((n, arms), dtype=bool)), np.zeros(n),
     )  # fmt: skip
     state = JointState.at_rest(robot.rest)
@@ -313,7 +315,8 @@ def _run_controller(
         else:
             state = controller.step(state, sample_hand_targets(targets.hands, k, controller.dt))
         run.solve_s[k] = time.perf_counter() - begin
-        run.hull_distance[k], run.stopping[k] = controller.min_distance, controller.stopping
+        run.hull_distance[k], run.nearest_pair[k] = controller.min_distance, controller.nearest_pair
+        run.stopping[k] = controller.stopping
         run.active.joints[k], run.active.arms_near_contact[k] = controller.active
         for i in range(arms):
             run.hand[i, k], run.rotation[i, k], run.swivel[i, k] = controller.get_arm_pose(i)
