@@ -180,6 +180,7 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
         arms=(),
         margins=margins,
     )
+    _check_table(built)
     return replace(built, arms=tuple(_build_arm(built, side, arm) for side, arm in maps.items()))
 
 
@@ -380,6 +381,26 @@ def _build_table(robot: RobotMap, full: Any, rest_full: np.ndarray, R_BT: np.nda
     placement = pin.SE3(R_BT, _find_base(robot, full, rest_full).translation)
     below = pin.SE3(np.eye(3), np.array([0.0, 0.0, float(robot.table or 0.0) - 0.5 * TABLE_SIZE[2]]))
     return pin.GeometryObject(TABLE_NAME, 0, 0, placement * below, coal.Box(*TABLE_SIZE))
+
+
+def _check_table(robot: Robot) -> None:
+    """Raise `BadModel` where a part that moves is in the table in the rest posture."""
+    if robot.map.table is None:
+        return
+    shapes = pin.GeometryModel(robot.geometry)
+    table = shapes.getGeometryId(TABLE_NAME)
+    moving = [k for k, shape in enumerate(shapes.geometryObjects) if shape.parentJoint > 0]
+    for k in moving:
+        shapes.addCollisionPair(pin.CollisionPair(k, table))
+    data = shapes.createData()
+    pin.computeCollisions(robot.model, robot.model.createData(), shapes, data, robot.configuration(robot.rest), False)
+    for k, result in zip(moving, data.collisionResults, strict=True):
+        if result.isCollision():
+            name = shapes.geometryObjects[k].name
+            raise BadModel(
+                f"{robot.map.where}: rest, table: {name} is in the table in the rest posture; "
+                "give a rest above it, or another table"
+            )
 
 
 def _find_base(robot: RobotMap, full: Any, rest_full: np.ndarray) -> Any:

@@ -52,12 +52,13 @@ def compute_stop(u, v, a, lower, upper, v_max, a_max, j_max, dt):  # type: ignor
         place, speed, accel, k = u[j], v[j], a[j], 0
         j_step = j_max[j] * dt
         fade = max(STOP_S, STOP_RISES * a_max[j] / j_max[j])
-        peak = abs(speed) + 0.5 * accel * accel / j_max[j]
+        peak = abs(speed) + abs(accel) * (dt + 0.5 * abs(accel) / j_max[j])
         far = peak * (2.0 * a_max[j] / j_max[j] + 2.0 * dt + fade) + 0.5 * peak * peak / a_max[j]
         free = upper[j] - place > far and place - lower[j] > far  # no limit is near
         while k < steps and (abs(speed) > STATIC_SPEED or abs(accel) > STATIC_SPEED / dt):
-            wanted = max(0.0, 1.0 - dt / fade) * speed if abs(speed) > STOP_SHARE * a_max[j] * dt else 0.0
-            after = (wanted - speed) / dt - 0.5 * accel
+            after = -speed / fade
+            if abs(speed) < STOP_SHARE * a_max[j] * dt:  # in two steps to zero
+                after = -speed / dt - 0.5 * accel
             after = min(max(after, accel - j_step, -a_max[j]), accel + j_step, a_max[j])
             if not free:
                 up, down = upper[j] - place, place - lower[j]
