@@ -21,8 +21,9 @@ PAGES = {"view.html": "view", "report.html": "report"}  # page → option
 class RetargetJob:
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
-    Robots by name: panda, ur5, baxter, tiago_dual, talos, g1 (from the package example-robot-data). Any other by its
-    URDF with a map beside it, a TOML that says which links are shoulder, elbow and hand (docs/retargeting.md).
+    Robots by name: panda and ur5, both also on a table (panda_table, ur5_table), so101, baxter, tiago_dual, talos, g1,
+    alex (from the package example-robot-data). Any other by its URDF with a map beside it, a TOML that says which links
+    are shoulder, elbow and hand (docs/retargeting.md).
 
     Parameters
     ----------
