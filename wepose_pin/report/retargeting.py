@@ -87,7 +87,7 @@ def _build_hands_section(trajectory: Trajectory, summary: Mapping[str, Any]) -> 
     rows[-1].shown_x, rows[-1].x_label = True, TIME
     keys = [Key(CAUSES[k], CAUSE_STYLES[k], "box") for k in sorted(present)] + [Key("approach", "phase", "box")]
     caption = f"The line: {1e3 * FAR:g} mm. The bar below: why a hand is farther off than that."
-    header = ["", "median [mm]", "90 %", "99 %", *(f"{cause} [% of the time]" for cause in CAUSES)]
+    header = ["", "median [mm]", "90 %", "99 %", *(f"{cause} [%]" for cause in CAUSES)]
     table = [
         [
             side,
