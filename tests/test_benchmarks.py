@@ -149,6 +149,7 @@ def test_what_cannot_be_measured_is_one_line(tmp_path: Path, capsys: pytest.Capt
         ("--compare", tmp_path / "wrong.json"),
         ("--compare", tmp_path / "none.json"),
         ("filters", "--data", tmp_path / "nowhere"),
+        ("robots", "--data", tmp_path / "nowhere"),
         ("--save", tmp_path / "no" / "such.json"),
         ("live", "--sessions", 5),
     ):
