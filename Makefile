@@ -2,8 +2,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DOCS_READY := $(VENV)/.docs_ready
 
-.PHONY: demo test test-all check lint types wheel fuzz recordings bench clean
+.PHONY: demo test test-all check lint types docs picture package wheel fuzz recordings bench clean
 
 demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 	$(BIN)/wepose demo -o demo --force
@@ -21,6 +22,7 @@ check: lint types test    ## lint, types and tests
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell
 
 types: $(READY)
 	$(BIN)/mypy
@@ -37,6 +39,14 @@ BENCH ?= filters calibration
 bench: $(READY)           ## speed and accuracy on this machine; BENCH="live" and others: python -m benchmarks --help
 	$(BIN)/python -m benchmarks $(BENCH)
 
+docs: $(DOCS_READY)       ## the site: docs/_build/html/index.html; runs examples/ and checks spelling and links, offline
+	$(BIN)/codespell docs README.md CONTRIBUTING.md
+	$(BIN)/python -m sphinx -E -W --keep-going -q -b html docs docs/_build/html
+	$(BIN)/python docs/check_links.py docs/_build/html
+
+picture: $(READY)         ## the moving picture of the README, docs/demo.webp; needs Chromium
+	$(BIN)/python docs/picture.py
+
 wheel: $(READY)
 	$(BIN)/python -m build --wheel --outdir dist .
 
@@ -47,5 +57,9 @@ $(READY): pyproject.toml
 	$(BIN)/python -m pip install --quiet -e '.[dev]'
 	@touch $(READY)
 
+$(DOCS_READY): $(READY)
+	$(BIN)/python -m pip install --quiet -e '.[docs]'
+	@touch $(DOCS_READY)
+
 clean:
-	rm -rf $(VENV) build dist demo .fuzz .random_recordings *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) build dist demo docs/_build docs/generated .fuzz .random_recordings *.egg-info .mypy_cache .ruff_cache .pytest_cache
