@@ -22,7 +22,7 @@ check: lint types test    ## lint, types and tests
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/codespell
+	$(BIN)/codespell wepose_pin docs examples calibration urdf README.md CONTRIBUTING.md CHANGELOG.md
 
 types: $(READY)
 	$(BIN)/mypy
@@ -40,7 +40,6 @@ bench: $(READY)           ## speed and accuracy on this machine; BENCH="live" an
 	$(BIN)/python -m benchmarks $(BENCH)
 
 docs: $(DOCS_READY)       ## the site: docs/_build/html/index.html; runs examples/ and checks spelling and links, offline
-	$(BIN)/codespell docs README.md CONTRIBUTING.md
 	$(BIN)/python -m sphinx -E -W --keep-going -q -b html docs docs/_build/html
 	$(BIN)/python docs/check_links.py docs/_build/html
 

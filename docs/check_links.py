@@ -1,6 +1,6 @@
 """Checks the links of the built site, offline: `python docs/check_links.py FOLDER`.
 
-Files and anchors within the site must exist. Addresses elsewhere are looked at for their form alone; nothing is fetched.
+Files and anchors within the site must exist. Of addresses elsewhere only the form is checked; nothing is fetched.
 """
 
 from __future__ import annotations

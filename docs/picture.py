@@ -24,7 +24,8 @@ CROP = (110, 30, 690, 553)  # [px] left, top, right, bottom: the person
 FPS = 12
 QUALITY = 60  # of WebP
 LEAD_S = 0.4  # [s] of rest shown before and after the circle
-HIDE = "for (const name of ['#bar', '#head']) document.querySelector(name).style.display = 'none'; dispatchEvent(new Event('resize'))"
+HIDE = """for (const name of ['#bar', '#head']) document.querySelector(name).style.display = 'none';
+dispatchEvent(new Event('resize'));"""
 
 
 def track_circle() -> tuple[wp.TrackResult, float, float]:
@@ -62,9 +63,7 @@ def main() -> None:
     result, begin, end = track_circle()
     first, *others = film(result, begin - LEAD_S, end + LEAD_S)
     path = HERE / "demo.webp"
-    first.save(
-        path, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, quality=QUALITY, method=6
-    )
+    first.save(path, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, quality=QUALITY, method=6)
     print(f"{path}: {len(others) + 1} frames, {path.stat().st_size / 1e3:.0f} kB")
 
 

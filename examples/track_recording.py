@@ -2,7 +2,8 @@
 
     python examples/track_recording.py session.toml [subject.toml]
 
-Without arguments it makes a recording of its own. The motion is written to view.html, which opens in a browser, offline.
+Without arguments it makes a recording of its own. The motion is written to view.html, which opens
+in a browser, offline.
 """
 
 import sys

@@ -13,9 +13,9 @@ from wepose_pin.cli import COMMANDS, main
 
 HEAD = """# Commands
 
-What `wepose COMMAND --help` prints. Every command ends with 0 on success and with 2 on wrong options or input, with one
-line that says what is wrong. `wepose calibrate` also ends with 3 (poor) and 4 (fail). Outputs are written whole or not at
-all, and nothing is overwritten without `--force`.
+What `wepose COMMAND --help` prints. Every command ends with 0 on success and with 2 on wrong options or input, with
+one line that says what is wrong. `wepose calibrate` also ends with 3 (poor) and 4 (fail). Outputs are written whole or
+not at all, and nothing is overwritten without `--force`.
 """
 
 

@@ -88,10 +88,8 @@ def draw_label(view: View, label: Label) -> list[str]:
     end = label.x + (8.0 if label.anchor == "end" else -8.0)
     lines = [f'<path d="M{x:.1f} {y:.1f}L{end:.1f} {label.y:.1f}" class="leader"/>']
     for k, words in enumerate(label.lines):
-        css = "name" if k == 0 else "words"
-        lines.append(
-            f'<text x="{label.x:.0f}" y="{label.y + 5 + 17 * k:.0f}" class="{css}" text-anchor="{label.anchor}">{words}</text>'
-        )
+        at = f'x="{label.x:.0f}" y="{label.y + 5 + 17 * k:.0f}" text-anchor="{label.anchor}"'
+        lines.append(f'<text {at} class="{"words" if k else "name"}">{words}</text>')
     return lines
 
 
