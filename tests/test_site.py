@@ -48,6 +48,9 @@ ELSEWHERE = {
     r"--activity tasks --seconds 600": "ten minutes: tests/test_people.py",
     r"…|examples/": "no whole command; tests/test_examples.py",
 }
+# Their Python runs too; tests/test_api.py has that of the README and docs/python.md.
+PYTHON = [page for page in RUN if page == "docs/angles.md" or page.startswith("docs/formats/")]
+PRELUDE = 'import wepose_pin as wp\nrecording, subject = wp.load_session("session.toml"), wp.load_subject("anna")\n'
 
 
 class Command(NamedTuple):
@@ -135,7 +138,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for line in (
         "wepose calibrate session.toml --measured biacromial=0.41 --stature 1.78 --sex f -o anna",
         "wepose track session.toml --subject anna -o result",
-        "wepose export result -o circles.c3d",
+        "wepose export result -o circles.c3d && wepose export result -o circles.trc",
         "wepose live --source replay:session.toml --subject anna --record morning.wepose --speed max --no-page",
     ):
         assert run(line, folder, folder).returncode in (0, 3), line
@@ -174,8 +177,8 @@ def complete_session(folder: Path) -> None:
 
 
 def mask(line: str) -> str:
-    """A line without its figures and spaces, which a version may change."""
-    return "".join(re.sub(r"-?\d+(\.\d+)?", "0", line).split())
+    """A line without its figures, axes and spaces, which differ by recording and version."""
+    return "".join(re.sub(r"[-+]?\d+(\.\d+)?|[-+][xyz]\b", "0", line).split())
 
 
 @pytest.mark.slow
@@ -198,6 +201,11 @@ def test_commands_of_a_page_run(page: str, workplace: Path, tmp_path: Path) -> N
         assert [each for each in command.output if mask(each) not in printed] == [], f"{line}\n{done.stdout}"
         if "info trial.csv --write" in line:
             complete_session(tmp_path)
+    for kind, body in blocks(page):
+        if kind == "python" and page in PYTHON:
+            (tmp_path / "block.py").write_text(PRELUDE + body, encoding="utf-8")
+            done = run(f"{sys.executable} block.py", tmp_path, workplace)
+            assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.slow
