@@ -231,3 +231,43 @@ def test_links_of_the_site_are_checked(tmp_path: Path) -> None:
     for target in ("missing.html", "other.html#there", "#below", "https:/doi.org/x", "https://doi org/x"):
         page.write_text(f'<a href="{target}">a</a>', encoding="utf-8")
         assert len(module.check(tmp_path)) == 1, target
+
+
+# Packages ------------------------------------------------------------------------------------------------------------
+
+
+def lower_bounds(lines: list[str], separator: str) -> dict[str, tuple[int, ...]]:
+    """Package → its lowest version, without trailing zeros."""
+    pairs = (line.partition(separator) for line in lines)
+    return {name.strip().lower(): version_of(version) for name, _, version in pairs if version}
+
+
+def version_of(text: str) -> tuple[int, ...]:
+    numbers = [int(part) for part in text.strip().split(".")]
+    while numbers[-1] == 0:
+        numbers.pop()
+    return tuple(numbers)
+
+
+def test_oldest_versions_are_those_of_the_package() -> None:
+    """`make oldest` tests them, and the conda recipe asks for the same."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    bounds = lower_bounds(project["dependencies"], ">=")
+    assert bounds == lower_bounds((ROOT / "tests/oldest.txt").read_text(encoding="utf-8").splitlines(), "==")
+    recipe = (ROOT / "conda/recipe.yaml").read_text(encoding="utf-8")
+    run = re.findall(r"^ +- ([\w-]+ >=[\d.]+)$", recipe.partition("  run:")[2], re.MULTILINE)
+    names = {"pinocchio": "pin", "meshcat-python": "meshcat"}
+    conda = {names.get(name, name): bound for name, bound in lower_bounds(run, ">=").items() if name != "python"}
+    assert conda == bounds
+    assert f'version: "{project["version"]}"' in recipe
+
+
+def test_every_step_of_the_workflows_is_a_target() -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    steps = [
+        step
+        for file in (ROOT / ".github/workflows").glob("*.yml")
+        for step in re.findall(r"^ +- run: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+    assert len(steps) > 8
+    assert [step for step in steps if step != ".ci/run test-all" and step.split()[1] not in targets] == []
