@@ -24,6 +24,7 @@ extensions = [
     "figures",
     "gallery",
     "mathml",
+    "notebook",
 ]
 exclude_patterns = ["extensions", "_build"]
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence"]

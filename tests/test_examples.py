@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -41,3 +42,20 @@ def test_it_runs(path: Path, tmp_path: Path) -> None:
     assert run.returncode == 0, run.stderr
     assert SAYS.get(path.name, "") in run.stdout
     assert {file.name for file in tmp_path.iterdir()} == WRITES.get(path.name, set())
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a recording to a figure and a robot, cell by cell."""
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("daqp")
+    if find_example_data() is None:
+        pytest.skip("example-robot-data is not installed")
+    folder = EXAMPLES[0].parent
+    monkeypatch.setenv("PYTHONPATH", f"{folder.parent}:{os.environ.get('PYTHONPATH', '')}")
+    notebook = nbformat.read(folder / "recording_to_robot.ipynb", as_version=4)
+    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    shown = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert any("<iframe" in data.get("text/html", "") for data in shown)
+    assert any(data.get("text/plain", "").startswith("Trajectory('panda'") for data in shown)
+    assert {file.name for file in tmp_path.iterdir()} == {"circles.mot", "elbow.svg"}

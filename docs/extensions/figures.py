@@ -116,7 +116,7 @@ def draw_straps() -> str:
         Label((0.1, 0.0, 0.42), 170.0, 110.0, ("torso", "on the breastbone"), "end"),
         Label((0.0, shoulder + 0.05, upper), 520.0, 240.0, ("left_upper_arm", "outside, below the middle"), "start"),
         Label((0.0, shoulder + 0.04, fore), 520.0, 410.0, ("left_forearm", "back, above the wrist"), "start"),
-        Label((0.0, -shoulder - 0.05, upper), 150.0, 240.0, ("right_upper_arm",), "end"),
+        Label((0.0, -shoulder - 0.05, upper), 155.0, 240.0, ("right_upper_arm",), "end"),
         Label((0.0, -shoulder - 0.04, fore), 150.0, 410.0, ("right_forearm",), "end"),
     ]
     side = [
