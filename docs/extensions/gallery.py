@@ -22,11 +22,6 @@ INDEX = """# Gallery
 
 Scripts of `examples/`, each run when this site was built, with what it printed and drew.
 
-```{toctree}
-:hidden:
-:glob:
-*
-```
 """
 
 
@@ -48,13 +43,17 @@ def run_script(script: Path, folder: Path) -> str:
     return run.stdout
 
 
+def make_title(script: Path) -> str:
+    return script.stem.replace("_", " ").capitalize()
+
+
 def write_page(script: Path, pages: Path, drawn: Path) -> str:
     """Write the page of a script; returns its line in the index."""
     code = script.read_text(encoding="utf-8")
     first, _, rest = (ast.get_docstring(ast.parse(code)) or "").partition("\n")
     printed = run_script(script, drawn / script.stem)
     body = code.split('"""', 2)[2].strip()
-    parts = [f"# {first.rstrip('.')}", rest.strip(), f"```python\n{body}\n```"]
+    parts = [f"# {first.rstrip('.')}", rest.strip("\n"), f"```python\n{body}\n```"]
     parts += [f"It prints:\n```text\n{printed.rstrip()}\n```"]
     for file in sorted((drawn / script.stem).rglob("*.*")):
         address = f"../../{file.relative_to(drawn.parent).as_posix()}"
@@ -65,7 +64,7 @@ def write_page(script: Path, pages: Path, drawn: Path) -> str:
         elif file.suffix == ".svg":
             parts += [f'<img class="drawn" src="{address}" alt="{html.escape(file.stem)}">']
     (pages / f"{script.stem}.md").write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
-    return f"- [{first.rstrip('.')}]({script.stem}.md)"
+    return f"- [{make_title(script)}]({script.stem}.md): {first}"
 
 
 def write_gallery(app: Sphinx) -> None:
@@ -75,7 +74,9 @@ def write_gallery(app: Sphinx) -> None:
     shutil.rmtree(pages, ignore_errors=True)
     pages.mkdir(parents=True)
     lines = [write_page(script, pages, drawn) for script in sorted((ROOT / "examples").glob("*.py"))]
-    (pages / "index.md").write_text("\n".join([INDEX, *lines, ""]), encoding="utf-8")
+    entries = [f"{make_title(script)} <{script.stem}>" for script in sorted((ROOT / "examples").glob("*.py"))]
+    contents = ["", "```{toctree}", ":hidden:", *entries, "```", ""]
+    (pages / "index.md").write_text("\n".join([INDEX, *lines, *contents]), encoding="utf-8")
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
