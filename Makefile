@@ -2,8 +2,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DOCS_READY := $(VENV)/.docs_ready
 
-.PHONY: demo test test-all check lint types wheel fuzz recordings bench clean
+.PHONY: demo test test-all check lint types docs picture package oldest workflows wheel fuzz recordings bench clean
 
 demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 	$(BIN)/wepose demo -o demo --force
@@ -21,6 +22,7 @@ check: lint types test    ## lint, types and tests
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell wepose_pin docs examples calibration urdf README.md CONTRIBUTING.md CHANGELOG.md
 
 types: $(READY)
 	$(BIN)/mypy
@@ -37,8 +39,32 @@ BENCH ?= filters calibration
 bench: $(READY)           ## speed and accuracy on this machine; BENCH="live" and others: python -m benchmarks --help
 	$(BIN)/python -m benchmarks $(BENCH)
 
+docs: $(DOCS_READY)       ## the site: docs/_build/html/index.html; runs examples/ and checks spelling and links, offline
+	$(BIN)/python -m sphinx -E -W --keep-going -q -b html docs docs/_build/html
+	$(BIN)/python docs/check_links.py docs/_build/html
+
+picture: $(READY)         ## the moving picture of the README, docs/demo.webp; needs Chromium
+	$(BIN)/python docs/picture.py
+
 wheel: $(READY)
 	$(BIN)/python -m build --wheel --outdir dist .
+
+package: $(READY)         ## wheel and sdist in dist/, checked
+	rm -rf build dist
+	$(BIN)/python -m pip install --quiet twine check-wheel-contents
+	$(BIN)/python -m build --outdir dist .
+	$(BIN)/twine check --strict dist/*
+	$(BIN)/check-wheel-contents dist/*.whl
+
+OLDEST_TESTS ?= filters kinematics model readers calibration angles report tables export subject static parquet writers evaluation
+oldest:                   ## tests with the oldest versions that pyproject.toml allows, in .venv-oldest
+	$(PYTHON) -m venv .venv-oldest
+	.venv-oldest/bin/python -m pip install --quiet -c tests/oldest.txt . pytest pytest-xdist hypothesis pillow
+	.venv-oldest/bin/python -m pytest $(OLDEST_TESTS:%=tests/test_%.py)
+
+workflows: $(READY)       ## the workflows against their schema
+	$(BIN)/python -m pip install --quiet check-jsonschema
+	$(BIN)/check-jsonschema --builtin-schema vendor.github-workflows .github/workflows/*.yml
 
 $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "wepose-pin needs Python 3.11 or later, $(PYTHON) is " + sys.version.split()[0] + "; try: make PYTHON=python3.12")'
@@ -47,5 +73,9 @@ $(READY): pyproject.toml
 	$(BIN)/python -m pip install --quiet -e '.[dev]'
 	@touch $(READY)
 
+$(DOCS_READY): $(READY)
+	$(BIN)/python -m pip install --quiet -e '.[docs]'
+	@touch $(DOCS_READY)
+
 clean:
-	rm -rf $(VENV) build dist demo .fuzz .random_recordings *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) .venv-oldest build dist demo docs/_build docs/generated .fuzz .random_recordings *.egg-info .mypy_cache .ruff_cache .pytest_cache

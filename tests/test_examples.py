@@ -1,21 +1,27 @@
-"""Every example runs as it stands."""
+"""Every example runs as it stands, and writes what it says."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from wepose_pin.retargeting.maps import find_example_data
+
 EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.py"))
 SAYS = {
     "calibrate_subject.py": "shoulder_width",
     "estimate_orientation.py": "smekf  largest error 0.",
+    "joint_angles.py": "carrying_angle",
     "live_consumer.py": "no pose for 3 s",
+    "move_robot.py": "Trajectory('panda'",
     "track_recording.py": "right hand from its shoulder",
 }
-LONGEST = ("calibrate_subject.py", "track_recording.py")
+WRITES = {"joint_angles.py": {"figures"}, "move_robot.py": {"view.html"}, "track_recording.py": {"view.html"}}
+LONGEST = ("calibrate_subject.py", "joint_angles.py", "move_robot.py", "track_recording.py")
 
 
 def test_there_are_examples() -> None:
@@ -26,9 +32,30 @@ def test_there_are_examples() -> None:
     "path", [pytest.param(path, marks=[pytest.mark.slow] * (path.name in LONGEST), id=path.name) for path in EXAMPLES]
 )
 def test_it_runs(path: Path, tmp_path: Path) -> None:
+    if path.name == "move_robot.py":
+        pytest.importorskip("daqp")
+        if find_example_data() is None:
+            pytest.skip("example-robot-data is not installed")
     run = subprocess.run(
         [sys.executable, "-W", "error", str(path)], cwd=tmp_path, capture_output=True, text=True, timeout=300
     )
     assert run.returncode == 0, run.stderr
     assert SAYS.get(path.name, "") in run.stdout
-    assert not list(tmp_path.iterdir())
+    assert {file.name for file in tmp_path.iterdir()} == WRITES.get(path.name, set())
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a recording to a figure and a robot, cell by cell."""
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    pytest.importorskip("daqp")
+    if find_example_data() is None:
+        pytest.skip("example-robot-data is not installed")
+    folder = EXAMPLES[0].parent
+    monkeypatch.setenv("PYTHONPATH", f"{folder.parent}:{os.environ.get('PYTHONPATH', '')}")
+    notebook = nbformat.read(folder / "recording_to_robot.ipynb", as_version=4)
+    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    shown = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", ())]
+    assert any("<iframe" in data.get("text/html", "") for data in shown)
+    assert any(data.get("text/plain", "").startswith("Trajectory('panda'") for data in shown)
+    assert {file.name for file in tmp_path.iterdir()} == {"circles.mot", "elbow.svg"}

@@ -149,7 +149,7 @@ def test_the_examples_of_the_page_are_read() -> None:
         batches, problems = packets.decode(line.encode())
         assert problems == []
         assert len(batches) == 1
-    [packet] = re.findall(r"```hex\n(.*?)\n```", page, re.DOTALL)
+    [packet] = re.findall(r"```text\n(.*?)\n```", page, re.DOTALL)
     [batch], problems = packets.decode(bytes.fromhex(packet))
     assert (batch.sensor, problems) == ("torso", [])
     np.testing.assert_allclose(batch.time, [12.5, 12.51], atol=1e-9)

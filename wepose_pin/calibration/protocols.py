@@ -48,7 +48,7 @@ PROTOCOLS = (
     "touch_right",
 )
 DEFAULT = "clasp"
-ALSO = ("t_pose",)  # what makes it better within the same minute (calibration/people.md), by phases of their names
+ALSO = ("t_pose",)  # what makes it better within the same minute (docs/people.md), by phases of their names
 # How many points each kind takes, and the keys that are its own.
 KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}
 _KEYS = ("phase", "kind", "points", "slip", "in_front_of")

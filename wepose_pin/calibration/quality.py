@@ -43,7 +43,7 @@ class Limits(NamedTuple):
 
 # One standard deviation of each result. A hand is off by about as much as its arm's lengths, and by up to 6 mm a
 # degree of an arm's heading; the torso's heading moves it only as the torso leans. Soft tissue and the shoulder girdle
-# move it by 30 mm an axis whatever the calibration (calibration/people.md): a calibration passes that adds less than
+# move it by 30 mm an axis whatever the calibration (docs/people.md): a calibration passes that adds less than
 # that, as one minute of a careful person's joined hands does on simulated people (lengths 9 to 12 mm, headings 3.0 to
 # 3.6 deg, gap 33 to 42 mm).
 LENGTH = Limits(0.012, 0.020)  # [m] of an upper arm, of forearm + hand, of the shoulder width, the scale apart

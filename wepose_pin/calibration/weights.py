@@ -31,7 +31,7 @@ MANY_SAMPLES = 1000  # from twice as many on, all rounds but the last take every
 OUTLIER = 5.0  # times the usual gap, at which the palms are apart
 MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
 MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about right
-# [rad] by which people's elbows leave a hinge (calibration/people.md): an oblique axis, and one that wanders.
+# [rad] by which people's elbows leave a hinge (docs/people.md): an oblique axis, and one that wanders.
 ELBOW_STD = np.deg2rad(4.0)
 CONTRADICTED = 3.0  # standard deviations between a measured length and what is known without it
 

@@ -281,7 +281,7 @@ def simulate(
     Parameters
     ----------
     lengths : mapping
-        Length → [m]: trunk, shoulder_width, and upper_arm, forearm, hand of left_ and right_.
+        Length → [m]: trunk, shoulder_width, and upper_arm, forearm, hand with ``left_`` and ``right_`` before.
     seed : int
         The same seed gives the same bits. Motion, mounts, noise and each imperfection draw from streams of their own:
         noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.

@@ -1,0 +1,277 @@
+"""What the pages show works: commands are understood and run, TOML and Python are what they say, links are checked."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from functools import cache
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import NamedTuple
+
+import polars as pl
+import pytest
+
+import wepose_pin as wp
+from wepose_pin.cli import COMMANDS, find_command
+from wepose_pin.cli.parser import parse
+from wepose_pin.writers import write_session
+
+ROOT = Path(__file__).resolve().parents[1]
+FENCE = re.compile(r"^( *)```([\w{}-]*)\n(.*?)^ *```", re.DOTALL | re.MULTILINE)
+SHELL = ("", "console", "bash")
+PAGES = [
+    path.relative_to(ROOT).as_posix()
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")))
+    if not {"generated", "_build"} & set(path.parts)
+]
+# Pages whose commands run one after the other, each page in a folder with a recording and its result.
+RUN = [
+    *("README.md", "docs/start.md", "docs/calibrate.md", "docs/track.md", "docs/biomechanics.md", "docs/robots.md"),
+    *("docs/angles.md", "docs/tutorial-opensim.md", "docs/retargeting.md", "docs/live.md", "docs/live-robot.md"),
+    *("docs/long-recordings.md", "docs/simulated-people.md", "docs/models.md", "docs/batch.md"),
+    *(page for page in PAGES if page.startswith("docs/formats/ev") or page.startswith("docs/formats/ex")),
+]
+# What is not run on these pages, and why.
+ELSEWHERE = {
+    r"^(pip|make|cd|python3 -m venv) ": "sets up a machine: .ci/run does it",
+    r"--source (udp|mti|lsl)|--guide": "waits for sensors: tests/test_sources_*.py, test_guide.py",
+    r"humanSubject01|arm\.(toml|urdf)": "a file of the reader's: tests/test_mvnx_models.py, test_chain_calibration.py",
+    r"ours\.toml|session\.toml --method smekf": "a file of the reader's: tests/test_reference.py, test_chain.py",
+    r"before after|session.toml --model whole_body": "two sessions, legs: tests/test_repetitions.py, test_legs.py",
+    r"take_2|study|plan\.toml": "takes and plans: tests/test_live_terminal.py, test_batch_plan.py",
+    r"--activity tasks --seconds 600": "ten minutes: tests/test_people.py",
+    r"panda_2": "several trajectories: tests/test_export_robot.py",
+    r"\.rrd": "an extra of 170 MB and its viewer: tests/test_export_ros.py",
+    r"scripts/bvh_to_robot": "another program: tests/test_export_robot.py",
+    r"…|examples/": "no whole command; tests/test_examples.py",
+}
+# Their Python runs too; tests/test_api.py has that of the README and docs/python.md.
+PYTHON = [page for page in RUN if page == "docs/angles.md" or page.startswith("docs/formats/")]
+PYTHON.remove("docs/formats/export-robots.md")  # needs lerobot: tests/lerobot_peer.py
+PRELUDE = 'import wepose_pin as wp\nrecording, subject = wp.load_session("session.toml"), wp.load_subject("anna")\n'
+
+
+class Command(NamedTuple):
+    """A command of a page, with the lines that the page shows as its output."""
+
+    words: str
+    output: tuple[str, ...]
+
+
+@cache
+def blocks(page: str) -> list[tuple[str, str]]:
+    """Language and text of each code block of a page."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return [(kind, re.sub(rf"^{indent}", "", body, flags=re.MULTILINE)) for indent, kind, body in FENCE.findall(text)]
+
+
+def commands(page: str) -> list[Command]:
+    """The lines of a page's shell blocks that are commands: after $, or where a program's name begins the line."""
+    found: list[Command] = []
+    for kind, body in blocks(page):
+        prompt = kind == "console"
+        for line in body.splitlines() if kind in SHELL else ():
+            if line.startswith("$ "):
+                found.append(Command(re.sub(r"\s+#.*$", "", line[2:]), ()))
+            elif prompt and found:
+                found[-1] = found[-1]._replace(output=(*found[-1].output, line))
+            elif re.match(r"(wepose|python3?|pip|make|cd) ", line):
+                found.append(Command(re.sub(r"\s+#.*$", "", line), ()))
+    return found
+
+
+def wepose_calls(page: str) -> list[list[str]]:
+    """The words after `wepose` of every call, without what stands for something that is left out."""
+    lines = [part.strip() for command in commands(page) for part in re.split(r"&&|\|\|", command.words)]
+    return [shlex.split(line)[1:] for line in lines if line.startswith("wepose ") and "…" not in line]
+
+
+def test_pages_have_commands() -> None:
+    assert sum(len(wepose_calls(page)) for page in PAGES) > 60
+    assert set(RUN) <= set(PAGES)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if wepose_calls(page)])
+def test_commands_of_a_page_are_understood(page: str) -> None:
+    toys = {"levelled"}  # of the recipes, which the reader adds
+    for name, *words in wepose_calls(page):
+        if not name.startswith("-") and not toys & set(words) and "--help" not in words:
+            assert name in COMMANDS
+            parse(name, find_command(name), words)
+
+
+def test_toml_of_pages_is_toml() -> None:
+    read = [tomllib.loads(body) for page in PAGES for kind, body in blocks(page) if kind == "toml"]
+    assert len(read) > 20
+
+
+def test_python_of_pages_imports_what_is_there() -> None:
+    for page in PAGES:
+        for kind, body in blocks(page):
+            if kind != "python" or page == "docs/recipes.md":  # tests/test_docs.py runs the recipes
+                continue
+            compile(body, page, "exec")
+            for module, names in re.findall(r"^from (wepose_pin[\w.]*) import (.+)$", body, re.MULTILINE):
+                assert all(hasattr(import_module(module), name.strip()) for name in names.split(",")), body
+
+
+# The commands run ----------------------------------------------------------------------------------------------------
+
+STAND_S, CLASP = "[[0.5, 4.5]]", "[[7.6, 32.0]]"
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the recording of a person, as session and as CSV, what calibrating and tracking it gives."""
+    folder = tmp_path_factory.mktemp("pages")
+    lengths = {**wp.population_subject(1.78, "f").lengths, "shoulder_width": 0.83 * 0.41}
+    simulation = wp.simulate(lengths, seed=1, clasp_s=25.0, circles=2)
+    write_session(folder, simulation.recording(), simulation.truth())
+    pl.read_parquet(folder / "recording.parquet").write_csv(folder / "trial.csv")
+    bin_ = folder / "bin"
+    bin_.mkdir()
+    script = bin_ / "wepose"
+    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -c "from wepose_pin.cli import main; main()" "$@"\n')
+    script.chmod(0o755)
+    for line in (
+        "wepose calibrate session.toml --measured biacromial=0.41 --stature 1.78 --sex f -o anna",
+        "wepose track session.toml --subject anna -o result",
+        "wepose export result -o circles.c3d && wepose export result -o circles.trc",
+        "wepose live --source replay:session.toml --subject anna --record morning.wepose --speed max --no-page",
+    ):
+        assert run(line, folder, folder).returncode in (0, 3), line
+    (folder / "made").symlink_to(folder)
+    return folder
+
+
+def run(line: str, folder: Path, place: Path) -> subprocess.CompletedProcess[str]:
+    paths = {"PATH": f"{place / 'bin'}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, **paths, "BROWSER": "true", "COLUMNS": "100"}
+    return subprocess.run(
+        ["bash", "-c", line], cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def prepare(line: str, folder: Path) -> str:
+    """The line as it is run here: its output may be there, and a live session needs neither page nor real time."""
+    for out in re.findall(r"-o (\S+)", line):
+        if "--force" not in line and (folder / out).is_symlink():
+            (folder / out).unlink()
+        elif "--force" not in line and (folder / out).exists():
+            subprocess.run(["rm", "-r", str(folder / out)], check=True)
+        elif (folder / out).is_symlink():
+            target = (folder / out).resolve()
+            (folder / out).unlink()
+            subprocess.run(["cp", "-r", str(target), str(folder / out)], check=True)
+    return f"{line} --speed max --no-page" if "live --source replay" in line else line
+
+
+def complete_session(folder: Path) -> None:
+    """Put into the session that `wepose info --write` wrote what the pages ask the reader for."""
+    file = folder / "session.toml"
+    text = file.read_text(encoding="utf-8")
+    text = re.sub(r"^start = .*$", f"start = {STAND_S}\nclasp = {CLASP}", text, flags=re.MULTILINE)
+    file.write_text(re.sub(r"^# (mount = \{.*?\}).*$", r"\1", text, flags=re.MULTILINE), encoding="utf-8")
+
+
+def mask(line: str) -> str:
+    """A line without its figures, axes and spaces, which differ by recording and version."""
+    return "".join(re.sub(r"[-+]?\d+(\.\d+)?|[-+][xyz]\b", "0", line).split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUN)
+def test_commands_of_a_page_run(page: str, workplace: Path, tmp_path: Path) -> None:
+    for file in workplace.iterdir():
+        if file.name != "bin":
+            (tmp_path / file.name).symlink_to(file)
+    for command in commands(page):
+        line = command.words
+        if any(re.search(pattern, line) for pattern in ELSEWHERE):
+            continue
+        if "--robot panda" in line:
+            pytest.importorskip("daqp")
+        if "info trial.csv --write" in line:
+            (tmp_path / "session.toml").unlink()
+        done = run(prepare(line, tmp_path), tmp_path, workplace)
+        assert done.returncode in ((0, 3, 4) if "wepose calibrate" in line else (0,)), f"{line}\n{done.stdout}"
+        printed = mask(done.stdout)
+        assert [each for each in command.output if mask(each) not in printed] == [], f"{line}\n{done.stdout}"
+        if "info trial.csv --write" in line:
+            complete_session(tmp_path)
+    for kind, body in blocks(page):
+        if kind == "python" and page in PYTHON:
+            (tmp_path / "block.py").write_text(PRELUDE + body, encoding="utf-8")
+            done = run(f"{sys.executable} block.py", tmp_path, workplace)
+            assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.slow
+def test_what_is_left_out_of_the_pages_is_there() -> None:
+    lines = [command.words for page in RUN for command in commands(page)]
+    assert [pattern for pattern in ELSEWHERE if not any(re.search(pattern, line) for line in lines)] == []
+
+
+# The check of links --------------------------------------------------------------------------------------------------
+
+
+def test_links_of_the_site_are_checked(tmp_path: Path) -> None:
+    spec = spec_from_file_location("check_links", ROOT / "docs/check_links.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    other = '<h1 id="here">There</h1><a href="https://doi.org/10.1109/JSEN.2019.2940612">paper</a>'
+    (tmp_path / "other.html").write_text(other, encoding="utf-8")
+    page = tmp_path / "index.html"
+    page.write_text('<a href="other.html#here">a</a><a href="#top" id="top">b</a>', encoding="utf-8")
+    assert module.check(tmp_path) == []
+    for target in ("missing.html", "other.html#there", "#below", "https:/doi.org/x", "https://doi org/x"):
+        page.write_text(f'<a href="{target}">a</a>', encoding="utf-8")
+        assert len(module.check(tmp_path)) == 1, target
+
+
+# Packages ------------------------------------------------------------------------------------------------------------
+
+
+def lower_bounds(lines: list[str], separator: str) -> dict[str, tuple[int, ...]]:
+    """Package → its lowest version, without trailing zeros."""
+    pairs = (line.partition(separator) for line in lines)
+    return {name.strip().lower(): version_of(version) for name, _, version in pairs if version}
+
+
+def version_of(text: str) -> tuple[int, ...]:
+    numbers = [int(part) for part in text.strip().split(".")]
+    while numbers[-1] == 0:
+        numbers.pop()
+    return tuple(numbers)
+
+
+def test_oldest_versions_are_those_of_the_package() -> None:
+    """`make oldest` tests them, and the conda recipe asks for the same."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    bounds = lower_bounds(project["dependencies"], ">=")
+    assert bounds == lower_bounds((ROOT / "tests/oldest.txt").read_text(encoding="utf-8").splitlines(), "==")
+    recipe = (ROOT / "conda/recipe.yaml").read_text(encoding="utf-8")
+    run = re.findall(r"^ +- ([\w-]+ >=[\d.]+)$", recipe.partition("  run:")[2], re.MULTILINE)
+    names = {"pinocchio": "pin", "meshcat-python": "meshcat"}
+    conda = {names.get(name, name): bound for name, bound in lower_bounds(run, ">=").items() if name != "python"}
+    assert conda == bounds
+    assert f'version: "{project["version"]}"' in recipe
+
+
+def test_every_step_of_the_workflows_is_a_target() -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    steps = [
+        step
+        for file in (ROOT / ".github/workflows").glob("*.yml")
+        for step in re.findall(r"^ +- run: (.+)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+    ]
+    assert len(steps) > 8
+    assert [step for step in steps if step != ".ci/run test-all" and step.split()[1] not in targets] == []
