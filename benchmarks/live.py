@@ -67,7 +67,6 @@ class _Meter(Output):
     def status(self, status: Status) -> None:
         now = time.perf_counter(), time.process_time(), _resident()
         if status.state == "ready" and self.before is None:
-            gc.collect()
             self.before = now
         self.after = now
 
@@ -187,6 +186,7 @@ def _recording(seconds: float) -> Recording:
 
 def _measure(recording: Recording, file: Path, outputs: Sequence[Output]) -> dict[str, float]:
     meter = _Meter()
+    gc.collect()
     summary = run_session(
         ReplaySource(recording), SensorSetup.from_recording(recording), record=file, outputs=[*outputs, meter]
     )
