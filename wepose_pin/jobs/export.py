@@ -29,7 +29,7 @@ class ExportJob:
     format : FORMAT
         Write this format instead of that of the suffix: csv, parquet (pose and joint angles), mot (joint angles for
         OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU Placer),
-        trc, c3d (points, as of markers), bvh (skeleton and motion, for animation), urdf (the subject).
+        osim (OpenSim's model of the subject), trc, c3d (points, as of markers), bvh (skeleton and motion, for animation), urdf (the subject).
     names
         Only for .mot: name the columns by the coordinates of OpenSim's Rajagopal model (opensim), or by the joint
         angles of the International Society of Biomechanics (isb). Without it opensim.
@@ -39,6 +39,9 @@ class ExportJob:
         Write only this time of the recording, in seconds.
     phase : NAME
         Write only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
+    osim_model : FILE
+        Only for .osim and .sto: scale this generic model of OpenSim to the subject. With .sto the model and the set-up
+        files of OpenSim's IMU Placer and IMU Inverse Kinematics are written beside it.
     force
         Replace an existing file.
     """
@@ -50,6 +53,7 @@ class ExportJob:
     rate_hz: float | None = None
     interval: tuple[float, float] | None = None
     phase: str | None = None
+    osim_model: Path | None = None
     force: bool = False
 
     def check(self) -> None:
@@ -91,6 +95,7 @@ def run_export(
         rate_hz=job.rate_hz,
         interval=job.interval,
         phase=job.phase,
+        osim_model=job.osim_model,
         force=job.force,
         provenance=provenance or None,
     )

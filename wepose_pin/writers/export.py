@@ -19,7 +19,8 @@ from ..tracking.tracked import TrackedRecording
 from .bvh import write_bvh
 from .c3d import write_c3d
 from .motion import Motion, check_rate, resampled
-from .opensim import write_mot, write_placement, write_sto, write_trc
+from .opensim import OpenSenseFiles, write_mot, write_placement, write_setups, write_sto, write_trc
+from .osim import write_osim
 from .provenance import provenance_file, provenance_text
 from .result import SUBJECT_URDF, format_urdf, read_result
 from .tables import write_csv, write_parquet
@@ -36,7 +37,8 @@ WRITERS: dict[str, Writer] = {
     "bvh": write_bvh,
     "c3d": write_c3d,
 }
-FORMATS = (*WRITERS, "urdf")
+FORMATS = (*WRITERS, "osim", "urdf")
+WITHOUT_MOTION = ("urdf", "osim", "placement")
 SUFFIXES = {"placement": ".sto"}  # where it is not the format's name
 NAMES = ("opensim", "isb")
 
@@ -60,6 +62,7 @@ def export(
     rate_hz: float | None = None,
     interval: tuple[float, float] | None = None,
     phase: str | None = None,
+    osim_model: str | Path | None = None,
     force: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
@@ -72,8 +75,8 @@ def export(
     file : str or Path
         The file to write.
     format : str, optional
-        One of `FORMATS`: "csv", "parquet", "mot", "sto", "placement", "trc", "bvh", "c3d", "urdf"; None: that of the
-        file's suffix, which otherwise has to be the format's own.
+        One of `FORMATS`: "csv", "parquet", "mot", "sto", "placement", "trc", "bvh", "c3d", "osim", "urdf"; None: that
+        of the file's suffix, which otherwise has to be the format's own.
     names : str, optional
         Of a .mot's columns: "opensim", or "isb"; None: "opensim".
     rate_hz : float, optional
@@ -81,6 +84,9 @@ def export(
     interval, phase : optional
         Write only this interval, from and to [s], or this phase of the recording; of a phase with several intervals
         "NAME:2" is the second.
+    osim_model : str or Path, optional
+        The generic OpenSim model that an .osim is scaled from. With a .sto also the scaled model and the set-up files
+        of OpenSense's tools are written beside it.
     force : bool
         Replace an existing file.
     provenance : mapping, optional
@@ -116,13 +122,18 @@ def export(
         raise BadOption(f"--names {names}: not known; {one_of(NAMES, names)}")
     if rate_hz is not None:
         check_rate(rate_hz)
-    if rate_hz is not None and format in ("urdf", "placement"):
+    if rate_hz is not None and format in WITHOUT_MOTION:
         raise BadOption(f"--rate-hz {rate_hz:g}: there is no motion in a file of format {format}")
-    if (interval is not None or phase is not None) and format in ("urdf", "placement"):
+    if (interval is not None or phase is not None) and format in WITHOUT_MOTION:
         option = "interval" if phase is None else "phase"
         raise BadOption(f"--{option}: there is no motion in a file of format {format}")
+    _check_osim_model(osim_model, format)
     with contextlib.ExitStack() as files:
-        partial = files.enter_context(whole_file(file, force))
+
+        def begin(path: Path) -> Path:
+            return files.enter_context(whole_file(path, force))
+
+        partial = begin(file)
         if provenance is not None:
             partial_provenance = files.enter_context(whole_file(provenance_file(file), True))
             partial_provenance.write_text(provenance_text(provenance), encoding="utf-8")
@@ -132,8 +143,24 @@ def export(
         motion = _read_motion(result, interval, phase)
         if rate_hz is not None:
             motion = resampled(motion, rate_hz)
+        if format == "osim":
+            return Exported(format, write_osim(partial, motion, Path(str(osim_model))))
         write = WRITERS[format] if names is None else functools.partial(write_mot, names=names)
-        return Exported(format, write(partial, motion))
+        diagnostics = write(partial, motion)
+        if osim_model is not None:
+            beside = OpenSenseFiles.beside(file)
+            others = (beside.model, beside.placement, beside.placer, beside.ik)
+            written = OpenSenseFiles(partial, *(begin(path) for path in others))
+            diagnostics += write_osim(written.model, motion, Path(osim_model))
+            diagnostics += write_setups(beside, written, motion)
+        return Exported(format, diagnostics)
+
+
+def _check_osim_model(osim_model: str | Path | None, format: str) -> None:
+    if osim_model is None and format == "osim":
+        raise BadOption("--format osim: scales a model; --osim-model names a generic one, such as Rajagopal's")
+    if osim_model is not None and format not in ("osim", "sto"):
+        raise BadOption(f"--osim-model {osim_model}: only an .osim and a .sto have use for it; the format is {format}")
 
 
 def _write_urdf(file: Path, result: PosedBody | str | Path) -> None:
