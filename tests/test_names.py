@@ -32,6 +32,7 @@ ALLOWED = {
     "readers/mvnx.py": "the names of a format",
     "readers/opensim.py": "the names of a format",
     "writers/bvh.py": "the names of a format",
+    "writers/osim.py": "the names of a format",
     "writers/rajagopal.py": "the names of a format",
     "retargeting/maps.py": "the keys of a robot's map",
     "simulation/activities.py": "a simulated activity",

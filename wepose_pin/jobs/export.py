@@ -29,7 +29,8 @@ class ExportJob:
     format : FORMAT
         Write this format instead of that of the suffix: csv, parquet (pose and joint angles), mot (joint angles for
         OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU Placer),
-        osim (OpenSim's model of the subject), trc, c3d (points, as of markers), bvh (skeleton and motion, for animation), urdf (the subject).
+        osim (OpenSim's model of the subject), trc (points, as of markers), c3d (points and rotations of segments), bvh
+        (skeleton and motion, for animation), urdf (the subject).
     names
         Only for .mot: name the columns by the coordinates of OpenSim's Rajagopal model (opensim), or by the joint
         angles of the International Society of Biomechanics (isb). Without it opensim.
