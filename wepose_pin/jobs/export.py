@@ -30,7 +30,7 @@ class ExportJob:
         Write this format instead of that of the suffix: csv, parquet (pose and joint angles), mot (joint angles for
         OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU Placer),
         osim (OpenSim's model of the subject), trc (points, as of markers), c3d (points and rotations of segments), bvh
-        (skeleton and motion, for animation), urdf (the subject).
+        (skeleton and motion, for animation), urdf (the subject), motion-bids (a dataset, of which FILE is the folder).
     names
         Only for .mot: name the columns by the coordinates of OpenSim's Rajagopal model (opensim), or by the joint
         angles of the International Society of Biomechanics (isb). Without it opensim.
@@ -43,6 +43,9 @@ class ExportJob:
     osim_model : FILE
         Only for .osim and .sto: scale this generic model of OpenSim to the subject. With .sto the model and the set-up
         files of OpenSim's IMU Placer and IMU Inverse Kinematics are written beside it.
+    bids_name : NAME
+        Only for motion-bids: call the recording so in the dataset, such as sub-01_task-reach_run-2. What it lacks is
+        taken from the names of subject and recording.
     force
         Replace an existing file.
     """
@@ -55,6 +58,7 @@ class ExportJob:
     interval: tuple[float, float] | None = None
     phase: str | None = None
     osim_model: Path | None = None
+    bids_name: str | None = None
     force: bool = False
 
     def check(self) -> None:
@@ -97,6 +101,7 @@ def run_export(
         interval=job.interval,
         phase=job.phase,
         osim_model=job.osim_model,
+        bids_name=job.bids_name,
         force=job.force,
         provenance=provenance or None,
     )

@@ -15,10 +15,12 @@ from ..documents import whole_file
 from ..errors import BadData, BadOption, MissingFile, one_of
 from ..kinematics import PosedBody, cut_pose
 from ..recording import select_interval
+from ..subject import Subject, load_subject
 from ..tracking.tracked import TrackedRecording
 from .bvh import write_bvh
 from .c3d import write_c3d
 from .motion import Motion, check_rate, resampled
+from .motion_bids import parse_bids_name, write_motion_bids
 from .opensim import OpenSenseFiles, write_mot, write_placement, write_setups, write_sto, write_trc
 from .osim import write_osim
 from .provenance import provenance_file, provenance_text
@@ -37,9 +39,10 @@ WRITERS: dict[str, Writer] = {
     "bvh": write_bvh,
     "c3d": write_c3d,
 }
-FORMATS = (*WRITERS, "osim", "urdf")
+BIDS = "motion-bids"
+FORMATS = (*WRITERS, "osim", "urdf", BIDS)
 WITHOUT_MOTION = ("urdf", "osim", "placement")
-SUFFIXES = {"placement": ".sto"}  # where it is not the format's name
+SUFFIXES = {"placement": ".sto", BIDS: ""}  # where it is not the format's name; a folder has none
 NAMES = ("opensim", "isb")
 
 
@@ -63,6 +66,7 @@ def export(
     interval: tuple[float, float] | None = None,
     phase: str | None = None,
     osim_model: str | Path | None = None,
+    bids_name: str | None = None,
     force: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
@@ -73,10 +77,10 @@ def export(
     result : PosedBody, str or Path
         What `track` or `load_result` gives, or a result folder.
     file : str or Path
-        The file to write.
+        The file to write; of "motion-bids" a folder, to which a recording is added if it is a dataset.
     format : str, optional
-        One of `FORMATS`: "csv", "parquet", "mot", "sto", "placement", "trc", "bvh", "c3d", "osim", "urdf"; None: that
-        of the file's suffix, which otherwise has to be the format's own.
+        One of `FORMATS`: "csv", "parquet", "mot", "sto", "placement", "trc", "bvh", "c3d", "osim", "urdf",
+        "motion-bids"; None: that of the file's suffix, which otherwise has to be the format's own.
     names : str, optional
         Of a .mot's columns: "opensim", or "isb"; None: "opensim".
     rate_hz : float, optional
@@ -87,6 +91,9 @@ def export(
     osim_model : str or Path, optional
         The generic OpenSim model that an .osim is scaled from. With a .sto also the scaled model and the set-up files
         of OpenSense's tools are written beside it.
+    bids_name : str, optional
+        What the recording is called in a dataset of Motion-BIDS, such as "sub-01_task-reach_run-2"; what it lacks is
+        taken from the names of subject and recording.
     force : bool
         Replace an existing file.
     provenance : mapping, optional
@@ -128,6 +135,13 @@ def export(
         option = "interval" if phase is None else "phase"
         raise BadOption(f"--{option}: there is no motion in a file of format {format}")
     _check_osim_model(osim_model, format)
+    if bids_name is not None and format != BIDS:
+        raise BadOption(f"--bids-name {bids_name}: only {BIDS} has such names, and the format is {format}")
+    if format == BIDS:
+        motion = _read_motion(result, interval, phase)
+        motion = motion if rate_hz is None else resampled(motion, rate_hz)
+        name = parse_bids_name(bids_name, motion.subject, motion.name)
+        return Exported(format, write_motion_bids(file, motion, name, force, provenance))
     with contextlib.ExitStack() as files:
 
         def begin(path: Path) -> Path:
@@ -179,14 +193,20 @@ def _read_motion(result: PosedBody | str | Path, interval: tuple[float, float] |
         phases = result.recording.phases if isinstance(result, TrackedRecording) else getattr(result, "phases", {})
         selected = select_interval(result.time, phases, interval, phase)
         pose = result.pose if selected is None else cut_pose(result.pose, selected)
-        motion = Motion(pose, result.model, result.name, result.name)
+        motion = Motion(pose, result.model, result.name, result.name, _name_person(result.subject))
     else:
         folder = Path(result)
         pose, model, summary = read_result(folder, interval, phase)
-        motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder))
+        subject = load_subject(folder) if (folder / "subject.toml").is_file() else None
+        motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder), _name_person(subject))
     if len(motion.pose.time) < 2:
         raise BadData(f"{motion.where}: a pose of {len(motion.pose.time)} samples; a motion has at least 2")
     return motion
+
+
+def _name_person(subject: Subject | None) -> str:
+    """The name of a subject; empty where none was stated."""
+    return "" if subject is None or subject.is_population else subject.name
 
 
 def _format(file: Path, format: str | None) -> str:
@@ -199,7 +219,7 @@ def _format(file: Path, format: str | None) -> str:
     if format not in FORMATS:
         raise BadOption(f"--format {format}: not known; {one_of(FORMATS, format)}")
     suffix = SUFFIXES.get(format, f".{format}")
-    if file.suffix.lower() != suffix:
+    if suffix and file.suffix.lower() != suffix:
         raise BadOption(
             f"-o {file}: format {format} is for programs that go by the suffix: name it {file.stem}{suffix}"
         )
