@@ -73,26 +73,34 @@ def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
 
 
 def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
-    """Segment → (n, 4, 4) from its frame, at its upper joint, to W [mm]; NaN where it is not known or in a gap.
+    """Segment → (n, 4, 4) from its frame, at its upper joint, to W [mm]; at the origin where no place is ever known.
 
-    A segment whose place does not follow from what is measured has NaN for it alone.
+    NaN, all of it, where the segment or one from which it hangs has no orientation or was bridged: a transform has one
+    mark of reliability.
     """
     pose, model = motion.pose, motion.model
     segments = list(pose.quat_WL)
     if not segments:
         return {}
-    known = {segment: np.isfinite(quat).all(axis=1) for segment, quat in pose.quat_WL.items()}
+    known = {
+        segment: np.isfinite(quat).all(axis=1) & ~pose.gap.get(segment, np.zeros(len(quat), dtype=bool))
+        for segment, quat in pose.quat_WL.items()
+    }
     no_turn = np.array([0.0, 0.0, 0.0, 1.0])
     quat_WL = {segment: np.where(known[segment][:, None], quat, no_turn) for segment, quat in pose.quat_WL.items()}
+    placed = set(find_known_links(model, segments))
     links = [model.table.segments[segment].link for segment in segments]
     _, p_W = compute_link_poses(model, solve_configuration(model, quat_WL), links, rotations=False)
-    placed = set(find_known_links(model, segments))
     transforms = {}
     for k, (segment, link) in enumerate(zip(segments, links, strict=True)):
         T = np.tile(np.eye(4), (len(pose.time), 1, 1))
         T[:, :3, :3] = Rotation.from_quat(quat_WL[segment]).as_matrix()
-        T[:, :3, 3] = 1e3 * p_W[:, k] if link in placed else np.nan
-        T[~known[segment] | pose.gap.get(segment, np.zeros(len(T), dtype=bool))] = np.nan
+        good, above = known[segment], model.parents.get(segment)
+        if link in placed:
+            T[:, :3, 3] = 1e3 * p_W[:, k]
+            while above is not None:  # on which its place hangs
+                good, above = good & known.get(above, True), model.parents.get(above)
+        T[~good] = np.nan
         transforms[segment] = T
     return transforms
 
