@@ -196,3 +196,23 @@ def run_setups(folder: Path, stem: str) -> dict[str, Any]:
     finally:
         os.chdir(here)
     return read(folder / f"{stem}_ik.mot")
+
+
+def play(file: Path, labels: list[str]) -> np.ndarray:
+    """The coordinates [deg] (n, columns) through which the Analyze Tool moves the model of `arm_model`."""
+    folder = file.parent / "played"
+    folder.mkdir()
+    arm_model().printToXML(str(folder / "model.osim"))
+    tool = osim.AnalyzeTool()
+    tool.setName("x")
+    tool.setModelFilename(str(folder / "model.osim"))
+    tool.setCoordinatesFileName(str(file))
+    tool.setResultsDir(str(folder))
+    time = osim.TimeSeriesTable(str(file)).getIndependentColumn()
+    tool.setInitialTime(time[0])
+    tool.setFinalTime(time[-1])
+    tool.updAnalysisSet().cloneAndAppend(osim.Kinematics())
+    tool.printToXML(str(folder / "analyze.xml"))
+    osim.AnalyzeTool(str(folder / "analyze.xml")).run()
+    table = osim.TimeSeriesTable(str(folder / "x_Kinematics_q.sto"))
+    return np.column_stack([table.getDependentColumn(label).to_numpy() for label in labels])

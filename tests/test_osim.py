@@ -230,7 +230,7 @@ def test_opensims_ik_agrees_beyond_the_limits_of_the_generic_model(
     pose = pose_by_opensim(peer, values | dict.fromkeys(("pelvis_tilt",), 0.0 * ramp))
     quat_WL = {name: quat for name, quat in pose.quat_WL.items() if name in SEGMENT_OF.values() and name != "pelvis"}
     folder = write_folder(tmp_path / "r", type(pose)(**{**vars(pose), "quat_WL": quat_WL}))
-    export(folder, tmp_path / "x.mot")
+    export(folder, tmp_path / "x.mot", names="opensim")
     export(folder, tmp_path / "x.sto", osim_model=data / GENERIC)
     solved, ours = peer("run_setups", tmp_path, "x"), peer("read", tmp_path / "x.mot")
     theirs = solved["values"][:, [solved["labels"].index(label) for label in ours["labels"]]]

@@ -32,8 +32,8 @@ class ExportJob:
         osim (OpenSim's model of the subject), trc (points, as of markers), c3d (points and rotations of segments), bvh
         (skeleton and motion, for animation), urdf (the subject), motion-bids (a dataset, of which FILE is the folder).
     names
-        Only for .mot: name the columns by the coordinates of OpenSim's Rajagopal model (opensim), or by the joint
-        angles of the International Society of Biomechanics (isb). Without it opensim.
+        Only for .mot: write only the joint angles of the International Society of Biomechanics (isb), or only the
+        coordinates of OpenSim's Rajagopal model (opensim). Without it both, the ISB's first.
     rate_hz : HZ
         Resample the motion at this rate.
     interval : FROM TO
@@ -53,7 +53,7 @@ class ExportJob:
     result: Path
     out: Path
     format: str | None = None
-    names: Literal["opensim", "isb"] | None = None
+    names: Literal["isb", "opensim"] | None = None
     rate_hz: float | None = None
     interval: tuple[float, float] | None = None
     phase: str | None = None

@@ -43,7 +43,7 @@ BIDS = "motion-bids"
 FORMATS = (*WRITERS, "osim", "urdf", BIDS)
 WITHOUT_MOTION = ("urdf", "osim", "placement")
 SUFFIXES = {"placement": ".sto", BIDS: ""}  # where it is not the format's name; a folder has none
-NAMES = ("opensim", "isb")
+NAMES = ("isb", "opensim")
 
 
 class Exported(NamedTuple):
@@ -82,7 +82,8 @@ def export(
         One of `FORMATS`: "csv", "parquet", "mot", "sto", "placement", "trc", "bvh", "c3d", "osim", "urdf",
         "motion-bids"; None: that of the file's suffix, which otherwise has to be the format's own.
     names : str, optional
-        Of a .mot's columns: "opensim", or "isb"; None: "opensim".
+        Of a .mot's columns: only the angles of the ISB, "isb", or only the coordinates of OpenSim's model, "opensim";
+        None: both, the ISB's first.
     rate_hz : float, optional
         Resample the motion to so many samples a second first.
     interval, phase : optional

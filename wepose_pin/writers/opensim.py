@@ -40,8 +40,12 @@ IK_ACCURACY = 1e-5
 MOST_MISSED = np.deg2rad(1.0)  # [rad] rms of a body of the model, whose elbows and wrists have two axes
 
 
-def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagnostic]:
-    """Joint angles in degrees: `names` "opensim" are those of Rajagopal's model, "isb" those of `wepose_pin.angles`.
+def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
+    """Joint angles in degrees: first the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
+
+    Parameters
+    ----------
+    names : only these: "isb" or "opensim"
 
     Raises
     ------
@@ -49,16 +53,17 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagno
         No joint has both of its segments, or a sample has no orientation.
     """
     check_complete(motion, "a .mot")
-    diagnostics = diagnose_gaps(motion)
-    if names == "isb":
+    diagnostics, columns = diagnose_gaps(motion), {}
+    if names != "opensim":
         angles = joint_angles(motion.pose)
-        columns = {
+        columns |= {
             f"{joint}_{angle}": joint_table.values[:, k]
             for joint, joint_table in angles.joints.items()
             for k, angle in enumerate(joint_table.names)
         }
-    else:
-        columns, residuals = coordinates(orientations(motion.pose.quat_WL))
+    if names != "isb":
+        turned, residuals = coordinates(orientations(motion.pose.quat_WL))
+        columns |= turned
         diagnostics += [
             Diagnostic("opensim-axes-too-few", WARNING, body, float(angle), MOST_MISSED)
             for body, angle in residuals.items()
