@@ -166,7 +166,7 @@ def export(
             beside = OpenSenseFiles.beside(file)
             others = (beside.model, beside.placement, beside.placer, beside.ik)
             written = OpenSenseFiles(partial, *(begin(path) for path in others))
-            diagnostics += write_osim(written.model, motion, Path(osim_model))
+            diagnostics += write_osim(written.model, motion, Path(osim_model), begin=True)
             diagnostics += write_setups(beside, written, motion)
         return Exported(format, diagnostics)
 

@@ -28,15 +28,14 @@ from scipy.spatial.transform import Rotation
 from ..angles import joint_angles
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
-from ..readers.opensim import OWN, compute_n_pose
+from ..readers.opensim import OWN
 from .motion import Motion, check_complete, diagnose_gaps, find_measured_points, resample_evenly
-from .rajagopal import coordinates, in_ground, orientations
+from .rajagopal import compute_bodies, coordinates, find_first_values, in_ground, orientations
 
 _TRC_KEYS = (
     *("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"),
     *("OrigDataRate", "OrigDataStartFrame", "OrigNumFrames"),
 )
-IK_ACCURACY = 1e-5
 MOST_MISSED = np.deg2rad(1.0)  # [rad] rms of a body of the model, whose elbows and wrists have two axes
 
 
@@ -53,7 +52,8 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
         No joint has both of its segments, or a sample has no orientation.
     """
     check_complete(motion, "a .mot")
-    diagnostics, columns = diagnose_gaps(motion), {}
+    diagnostics = diagnose_gaps(motion)
+    columns: dict[str, np.ndarray] = {}
     if names != "opensim":
         angles = joint_angles(motion.pose)
         columns |= {
@@ -142,7 +142,7 @@ def _write_sample(path: Path, motion: Motion, pose: Mapping[str, Rotation]) -> N
 def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion) -> list[Diagnostic]:
     """Write all that OpenSense needs beside the .sto: a scaled model, set-ups of IMU Placer and IK.
 
-    The sample for the placer is the N-pose, which is the default pose of the scaled model.
+    The sample for the placer has the sensors as they are in the default pose of the model, that of the first sample.
 
     Parameters
     ----------
@@ -155,7 +155,9 @@ def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion)
     BadData
         No segment is a body of the model.
     """
-    _write_sample(written.placement, motion, {body: compute_n_pose(body) for body in _bodies(motion)})
+    bodies = _bodies(motion)
+    pose = compute_bodies(find_first_values(bodies))
+    _write_sample(written.placement, motion, {body: pose[body] for body in bodies})
     placer = {
         "model_file": files.model.name,
         "sensor_to_opensim_rotations": "0 0 0",
@@ -169,7 +171,6 @@ def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion)
         "orientations_file": files.orientations.name,
         "sensor_to_opensim_rotations": "0 0 0",
         "time_range": f"{motion.pose.time[0] - step:.6f} {motion.pose.time[-1] + step:.6f}",
-        "accuracy": f"{IK_ACCURACY:g}",
         "report_errors": "true",
         "results_directory": ".",
         "output_motion_file": files.solution,

@@ -8,7 +8,7 @@ paths over wrap surfaces, so forces, controllers, probes, wrap surfaces and cont
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,13 +16,14 @@ import numpy as np
 
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData
-from .motion import Motion
-from .osim_xml import Marker, OsimModel, Span
-from .rajagopal import BODIES, JOINTS
+from .motion import Motion, check_complete
+from .osim_xml import Marker, OsimModel, Range, Span
+from .rajagopal import JOINTS, coordinates, find_first_values, orientations
 
 _LEAST_SCALE, _MOST_SCALE = 0.4, 2.5  # of a person against a model of a person
 _CLOSE = 1e-9  # [m]
 _ROUNDS = 50
+_TURN = 2.0 * np.pi  # [rad] that a coordinate may go each way, or further where the motion does
 
 
 def _arm_spans(side: str, s: str) -> dict[str, Span]:
@@ -88,15 +89,14 @@ class ScaledModel(NamedTuple):
     left_out: dict[str, int]  # set of the generic model → members that the scaled one has not
 
 
-def scale_model(generic: Path, lengths: Mapping[str, float], segments: Iterable[str], name: str) -> ScaledModel:
+def scale_model(generic: Path, motion: Motion, begin: bool) -> ScaledModel:
     """Scale a model to a subject; the coordinates of measured segments are free, all other rotations locked.
 
     Parameters
     ----------
     generic : the .osim
-    lengths : name → [m]; what `SPANS` does not have is left out
-    segments : those that are measured
-    name : of the scaled model
+    motion : of the subject
+    begin : make the pose of the first sample the default; otherwise it is zero of all coordinates
 
     Raises
     ------
@@ -104,8 +104,9 @@ def scale_model(generic: Path, lengths: Mapping[str, float], segments: Iterable[
         Not there; no model of OpenSim 4; a body, joint or coordinate of it is not there or not as in Rajagopal's.
     """
     model = OsimModel(generic)
-    wanted = {length: value for length, value in lengths.items() if length in SPANS}
-    measured = {BODIES[segment] for segment in segments if segment in BODIES}
+    wanted = {length: value for length, value in motion.model.lengths.items() if length in SPANS}
+    quat_GB = orientations(motion.pose.quat_WL)
+    measured = set(quat_GB)
     if not wanted or not measured:
         raise BadData(f"{generic}: the subject has no length or no segment that a model of a person has")
     model.check([SPANS[length] for length in wanted], measured)
@@ -126,10 +127,17 @@ def scale_model(generic: Path, lengths: Mapping[str, float], segments: Iterable[
         raise BadData(
             f"{generic}: scaling {', '.join(wanted)} does not reach the subject's lengths; are joints misplaced?"
         )
-    model.free_coordinates(find_followed_coordinates(measured), legs=not measured <= set(JOINTS))
+    first = find_first_values(quat_GB) if begin else {}
+    turned, _ = coordinates(quat_GB)
+    free = {}
+    for coordinate in find_followed_coordinates(measured):
+        values = turned.get(coordinate, np.zeros(1))
+        low, high = min(-_TURN, float(values.min()) - np.pi), max(_TURN, float(values.max()) + np.pi)
+        free[coordinate] = Range(first.get(coordinate, 0.0), low, high)
+    model.free_coordinates(free, legs=not measured <= set(JOINTS))
     ends = {body for length in wanted for body in (*SPANS[length].start, *SPANS[length].end)}
     model.add_markers({point: marker for point, marker in MARKERS.items() if marker.body in ends})
-    model.root.set("name", name)
+    model.root.set("name", re.sub(r"[^A-Za-z0-9_.-]+", "_", motion.name) or "subject")
     scales = {
         length: Scale(value, before[length], SPANS[length].bodies, SPANS[length].axes, factors[length])
         for length, value in wanted.items()
@@ -137,16 +145,20 @@ def scale_model(generic: Path, lengths: Mapping[str, float], segments: Iterable[
     return ScaledModel(model.text(), scales, left_out)
 
 
-def write_osim(path: Path, motion: Motion, generic: Path) -> list[Diagnostic]:
+def write_osim(path: Path, motion: Motion, generic: Path, begin: bool = False) -> list[Diagnostic]:
     """Write the generic model scaled to the motion's subject; give what scaled by what, and what was left out.
+
+    Parameters
+    ----------
+    begin : make the pose of the first sample the default, as the inverse kinematics needs it
 
     Raises
     ------
     MissingFile, BadData
         As `scale_model`.
     """
-    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", motion.name) or "subject"
-    scaled = scale_model(generic, motion.model.lengths, list(motion.pose.quat_WL), name)
+    check_complete(motion, "an .osim")
+    scaled = scale_model(generic, motion, begin)
     path.write_bytes(scaled.text)
     words = "; ".join(f"{scale} ({length})" for length, scale in scaled.scales.items())
     diagnostics = [Diagnostic("osim-scaled", INFO, facts={"scales": words})]

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 _OLDEST = 40000  # document version: since OpenSim 4.0 joints are in a set of their own
 _AXES_OFF = np.radians(2.0)  # between an axis of the model and Rajagopal's
 _UPRIGHT_OFF = np.radians(0.5)  # of a body at zero of all coordinates
-_TURN = 2.0 * np.pi  # [rad] a coordinate's range each way, which only sliders still go by
 _OPTIONAL = ("patella_r", "patella_l")  # bodies that a model may lack
 _AXIS_PROPERTIES = ("coordinates", "axis")
 _X, _Y, _Z = np.eye(3)
@@ -44,6 +43,14 @@ class Marker(NamedTuple):
 
     body: str
     at_mass_centre: bool = False
+
+
+class Range(NamedTuple):
+    """What a coordinate [rad] is by default, and from where to where it goes."""
+
+    default: float
+    low: float
+    high: float
 
 
 class _Frame(NamedTuple):
@@ -381,23 +388,21 @@ class OsimModel:
             etree.SubElement(marker, "location").text = _format(mass_centre if at_mass_centre else at_joint)
             etree.SubElement(marker, "fixed").text = "true"
 
-    def free_coordinates(self, free: Collection[str], legs: bool) -> None:
-        """Free these coordinates, lock the other ones, those of legs on demand, and make the N-pose the default.
+    def free_coordinates(self, free: Mapping[str, Range], legs: bool) -> None:
+        """Free these coordinates within their ranges, lock the other ones, and those of legs on demand.
 
-        A limit of the model would stop what a person does: `clamped` goes. In the N-pose sensors are placed, and the
-        inverse kinematics begins there, in the middle of what a forearm can do.
+        Limits of the model would stop what a person does. Without any limit the inverse kinematics may turn a shoulder
+        round for ever where two of its axes fall together.
         """
         for body, joint in JOINTS.items():
             for coordinate in self._coordinates(body):
                 name = coordinate.get("name", "")
                 if name not in joint.coordinates:
                     continue
-                turned = np.pi / 2.0 if name.startswith("pro_sup") else 0.0
-                _set(coordinate, "default_value", f"{turned:.12g}")
-                _set(coordinate, "clamped", "false")
                 _set(coordinate, "locked", str(name not in free).lower())
-                if name in free:
-                    _set(coordinate, "range", _format(np.array([turned - _TURN, turned + _TURN])))
+                default, low, high = free.get(name, Range(0.0, -np.pi, np.pi))
+                _set(coordinate, "default_value", f"{default:.12g}")
+                _set(coordinate, "range", _format(np.array([low, high])))
         if not legs:
             for body in set(self.joints) - set(JOINTS):
                 for coordinate in self._coordinates(body):

@@ -131,6 +131,22 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
     return columns, residuals
 
 
+def find_first_values(quat_GB: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Coordinate → its value [rad] in the first sample."""
+    first, _ = coordinates({body: quat[:1] for body, quat in quat_GB.items()})
+    return {name: float(values[0]) for name, values in first.items()}
+
+
+def compute_bodies(values: Mapping[str, float]) -> dict[str, Rotation]:
+    """Body → its rotation to G with the coordinates at `values` [rad], 0 where not named; legs stand."""
+    turned = {"ground": Rotation.identity()}
+    for body, joint in JOINTS.items():
+        turned[body] = turned[joint.parent]
+        for name, axis in zip(joint.coordinates, joint.axes, strict=True):
+            turned[body] = turned[body] * Rotation.from_rotvec(values.get(name, 0.0) * axis / np.linalg.norm(axis))
+    return {body: turned.get(body, turned["ground"]) for body in BODIES.values()}
+
+
 def _solve_three_axes(quat: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
     values = euler.follow(euler.decompose(quat, "ZXY"), "ZXY", NEAR_LOCK)
     return {name: values[:, k] for k, name in enumerate(names)}
