@@ -245,7 +245,9 @@ def test_opensims_ik_begins_where_two_axes_of_a_shoulder_fall_together(
     off = dict(zip(ours["labels"], np.abs(solved["values"] - ours["values"]).max(axis=0), strict=True))
     near_lock = {f"arm_{angle}_{side}" for angle in ("flex", "rot") for side in "rl"}
     assert max(off[name] for name in near_lock) < 30.0
-    assert max(value for name, value in off.items() if name not in near_lock) < 0.3
+    assert (
+        max(value for name, value in off.items() if name not in near_lock) < 1.0
+    )  # what is left of its tolerance there
 
 
 def solve(
