@@ -5,6 +5,7 @@ Nothing of wepose_pin is imported here, so that it shares no code.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -131,3 +132,87 @@ def opensense(folder: Path) -> dict[str, Any]:
     tool.set_accuracy(1e-9)
     tool.run(False)
     return read(next((folder / "ik").glob("*.mot")))
+
+
+def joint_centres(file: Path) -> dict[str, np.ndarray]:
+    """Body → where the joint that moves it is (3,) [m] in ground, coordinates at their defaults; marker → its place."""
+    model = osim.Model(str(file))
+    state = model.initSystem()
+    model.realizePosition(state)
+    joints = model.getJointSet()
+    found = {}
+    for k in range(joints.getSize()):
+        child = joints.get(k).getChildFrame()
+        found[child.findBaseFrame().getName()] = child.getPositionInGround(state).to_numpy()
+    for k in range(model.getMarkerSet().getSize()):
+        marker = model.getMarkerSet().get(k)
+        found[marker.getName()] = marker.getLocationInGround(state).to_numpy()
+    return found
+
+
+def zero_pose(file: Path, out: Path) -> None:
+    """The same model with all joints at zero by default; the pelvis keeps its place."""
+    model = osim.Model(str(file))
+    coordinates = model.updCoordinateSet()
+    for k in range(coordinates.getSize()):
+        if not coordinates.get(k).getName().startswith("pelvis_t"):
+            coordinates.get(k).setDefaultValue(0.0)
+    model.printToXML(str(out))
+
+
+def scale(file: Path, factors: Mapping[str, tuple[float, float, float]], out: Path) -> None:
+    """OpenSim's own scaling of a model by factors a body along x, y, z; masses stay."""
+    model = osim.Model(str(file))
+    scales = osim.ScaleSet()
+    for body, factor in factors.items():
+        each = osim.Scale()
+        each.setSegmentName(body)
+        each.setScaleFactors(osim.Vec3(*factor))
+        each.setApply(True)
+        scales.cloneAndAppend(each)
+    model.scale(model.initSystem(), scales, True, -1.0)
+    model.printToXML(str(out))
+
+
+def mass_properties(file: Path) -> dict[str, tuple[float, np.ndarray, np.ndarray]]:
+    """Body → mass [kg], mass centre (3,) [m], inertia (6,) [kg m²]."""
+    model = osim.Model(str(file))
+    found = {}
+    for k in range(model.getBodySet().getSize()):
+        body = model.getBodySet().get(k)
+        inertia = body.get_inertia()
+        moments = np.array([inertia.get(i) for i in range(6)])
+        found[body.getName()] = (body.getMass(), body.getMassCenter().to_numpy(), moments)
+    return found
+
+
+def run_setups(folder: Path, stem: str) -> dict[str, Any]:
+    """What the IMU Placer and the inverse kinematics make of their set-up files, as the tutorial runs them."""
+    here = Path.cwd()
+    os.chdir(folder)
+    try:
+        osim.IMUPlacer(f"{stem}_placer.xml").run(False)
+        osim.IMUInverseKinematicsTool(f"{stem}_ik.xml").run(False)
+    finally:
+        os.chdir(here)
+    return read(folder / f"{stem}_ik.mot")
+
+
+def play(file: Path, labels: list[str]) -> np.ndarray:
+    """The coordinates [deg] (n, columns) through which the Analyze Tool moves the model of `arm_model`."""
+    folder = file.parent / "played"
+    folder.mkdir()
+    arm_model().printToXML(str(folder / "model.osim"))
+    tool = osim.AnalyzeTool()
+    tool.setName("x")
+    tool.setModelFilename(str(folder / "model.osim"))
+    tool.setCoordinatesFileName(str(file))
+    tool.setResultsDir(str(folder))
+    time = osim.TimeSeriesTable(str(file)).getIndependentColumn()
+    tool.setInitialTime(time[0])
+    tool.setFinalTime(time[-1])
+    tool.updAnalysisSet().cloneAndAppend(osim.Kinematics())
+    tool.printToXML(str(folder / "analyze.xml"))
+    osim.AnalyzeTool(str(folder / "analyze.xml")).run()
+    table = osim.TimeSeriesTable(str(folder / "x_Kinematics_q.sto"))
+    return np.column_stack([table.getDependentColumn(label).to_numpy() for label in labels])

@@ -17,6 +17,8 @@ from wepose_pin.angles import joint_angles
 from wepose_pin.errors import BadData, BadOption, ExistingOutput, MissingFile
 from wepose_pin.kinematics import Pose, build_pose_table, compute_pose, parse_pose_table
 from wepose_pin.model import load_model
+from wepose_pin.readers.c3d import read_c3d
+from wepose_pin.readers.markers import read_marker_table
 from wepose_pin.subject import population_subject, subject_toml
 from wepose_pin.writers import export as writers
 from wepose_pin.writers.export import export
@@ -157,6 +159,22 @@ def test_c3d_by_ezc3d(result: Path, pose: Pose, tmp_path: Path) -> None:
     for k, point in enumerate(POINTS):
         np.testing.assert_allclose(p_mm[:3, k].T, 1e3 * pose.points[point], rtol=2e-7, atol=1e-4)  # single precision
     assert (file["data"]["meta_points"]["residuals"] == 0.0).all()
+    assert file["parameters"]["ROTATION"]["LABELS"]["value"] == [f"{segment}_4X4" for segment in pose.quat_WL]
+    assert file["parameters"]["ROTATION"]["RATE"]["value"] == [100.0]
+    transforms = file["data"]["rotations"].transpose(2, 3, 0, 1)
+    np.testing.assert_array_equal(transforms[:, :, 3], np.broadcast_to([0.0, 0.0, 0.0, 1.0], (9, 301, 4)))
+    for k, (segment, quat_WL) in enumerate(pose.quat_WL.items()):
+        R_WL = Rotation.from_quat(quat_WL).as_matrix()
+        np.testing.assert_allclose(transforms[k, :, :3, :3], R_WL, atol=1e-7)  # single precision
+        begin = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist"}.get(segment.partition("_")[2])
+        if begin:
+            p_mm = 1e3 * pose.points[f"{segment.partition('_')[0]}_{begin}"]
+            np.testing.assert_allclose(transforms[k, :, :3, 3], p_mm, atol=1e-4)
+    reference = read_c3d(tmp_path / "x.c3d", read_marker_table())
+    assert set(reference.points) == set(POINTS)
+    for segment, quat_WL in pose.quat_WL.items():
+        same = np.einsum("nc,nc->n", reference.quat_VT[segment], quat_WL)
+        np.testing.assert_allclose(np.abs(same), 1.0, atol=1e-7)
     assert [path.name for path in tmp_path.iterdir()] == ["x.c3d"]
 
 
@@ -168,6 +186,22 @@ def test_c3d_marks_what_hangs_on_a_gap(tmp_path: Path, pose: Pose) -> None:
     hit = {POINTS[k]: np.flatnonzero(row).tolist() for k, row in enumerate(lost) if row.any()}
     assert hit == {name: list(range(10, 20)) for name in ("right_wrist", "right_palm")}  # a hand hangs on its wrist
     assert np.isnan(data["points"][0, POINTS.index("right_wrist"), 10:20]).all()
+    lost = np.isnan(data["rotations"])
+    hit = {
+        segment: np.flatnonzero(lost[0, 0, k]).tolist() for k, segment in enumerate(pose.quat_WL) if lost[:, :, k].any()
+    }
+    assert hit == {name: list(range(10, 20)) for name in ("right_forearm", "right_hand")}
+
+
+def test_c3d_of_a_segment_whose_place_is_not_known_has_its_rotation(tmp_path: Path) -> None:
+    ezc3d = pytest.importorskip("ezc3d")
+    lone = a_pose(("torso", "right_forearm"), n=5)
+    export(write_folder(tmp_path / "r", lone), tmp_path / "x.c3d")
+    file = ezc3d.c3d(str(tmp_path / "x.c3d"))
+    k = file["parameters"]["ROTATION"]["LABELS"]["value"].index("right_forearm_4X4")
+    R_WL = Rotation.from_quat(lone.quat_WL["right_forearm"]).as_matrix()
+    np.testing.assert_allclose(file["data"]["rotations"][:3, :3, k].transpose(2, 0, 1), R_WL, atol=1e-7)
+    np.testing.assert_array_equal(file["data"]["rotations"][:3, 3, k], 0.0)
 
 
 def test_c3d_with_more_frames_than_it_counts(tmp_path: Path) -> None:
@@ -370,7 +404,7 @@ def test_a_sample_without_orientation_is_named(tmp_path: Path, pose: Pose) -> No
         (["-o", "x.dat", "--format", "c3d"], "name it x.c3d"),
         (["-o", "x.txt", "--format", "placement"], "name it x.sto"),
         (["-o", "x.trc", "--names", "isb"], "--names isb: only a .mot has names to choose, and the format is trc"),
-        (["-o", "x.mot", "--names", "rajagopal"], "--names: 'rajagopal' is not known; there is: opensim, isb"),
+        (["-o", "x.mot", "--names", "rajagopal"], "--names: 'rajagopal' is not known; there is: isb, opensim"),
         (["-o", "x.trc", "--rate-hz", "0"], "--rate-hz 0: between 1 and 10000 samples a second"),
         (["-o", "x.trc", "--rate-hz", "nan"], "--rate-hz: 'nan' is not a number"),
         (["-o", "x.urdf", "--rate-hz", "50"], "--rate-hz 50: there is no motion in a file of format urdf"),

@@ -154,6 +154,12 @@ def test_mot_with_the_isbs_angles(result: Path, tmp_path: Path) -> None:
     table = pl.read_csv(tmp_path / "x.mot", separator="\t", skip_lines=6)
     elbow = joint_angles(a_pose())["left_elbow"]
     np.testing.assert_allclose(table["left_elbow_flexion"], np.degrees(elbow.values[:, 0]), atol=1e-6)
+    export(result, tmp_path / "model.mot", names="opensim")
+    export(result, tmp_path / "both.mot")
+    model, both = (pl.read_csv(tmp_path / name, separator="\t", skip_lines=6) for name in ("model.mot", "both.mot"))
+    assert both.columns == [*table.columns, *model.columns[1:]]  # the ISB's first
+    assert both.select(table.columns).equals(table)
+    assert both.select(model.columns).equals(model)
 
 
 def test_shoulders_and_thorax_are_the_isbs_of_zxy() -> None:
@@ -190,7 +196,7 @@ def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_pa
     values = motion(60)
     pose = pose_by_opensim(peer, values)
     folder = write_folder(tmp_path / "r", pose)
-    assert export(folder, tmp_path / "x.mot").diagnostics == []  # the model reaches all of it
+    assert export(folder, tmp_path / "x.mot", names="opensim").diagnostics == []  # the model reaches all of it
     table = peer("read", tmp_path / "x.mot")
     assert set(table["labels"]) == set(values)
     assert table["header"]["inDegrees"] == "yes"
@@ -198,6 +204,10 @@ def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_pa
     wanted = np.degrees(np.column_stack([values[label] for label in table["labels"]]))
     # The .osim has the axes of the forearm and its right angles to five digits.
     np.testing.assert_allclose(table["values"], wanted, atol=2e-3)
+    export(folder, tmp_path / "both.mot")
+    np.testing.assert_allclose(
+        peer("play", tmp_path / "both.mot", table["labels"]), wanted, atol=2e-3
+    )  # columns it has no use for
     assert peer("read_as_storage", tmp_path / "x.mot") == ("a - made² one", 60, 1 + len(values), True)
 
 
@@ -205,7 +215,7 @@ def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_pa
 def test_opensense_finds_the_same_angles_from_the_sto(peer: Callable[..., Any], tmp_path: Path) -> None:
     pose = pose_by_opensim(peer, motion(12), noise=0.15)  # what no elbow of two axes follows
     folder = write_folder(tmp_path / "r", pose)
-    assert "humerus_r" in {each.place for each in export(folder, tmp_path / "x.mot").diagnostics}
+    assert "humerus_r" in {each.place for each in export(folder, tmp_path / "x.mot", names="opensim").diagnostics}
     export(folder, tmp_path / "x.sto")
     export(folder, tmp_path / "placement.sto", "placement")
     solved, ours = peer("opensense", tmp_path), peer("read", tmp_path / "x.mot")

@@ -33,6 +33,7 @@ ALLOWED = {
     "readers/opensim.py": "the names of a format",
     "writers/bvh.py": "the names of a format",
     "writers/gmr.py": "the names of a format",
+    "writers/osim.py": "the names of a format",
     "writers/rajagopal.py": "the names of a format",
     "writers/standing.py": "the figure of formats that have a person",
     "retargeting/maps.py": "the keys of a robot's map",

@@ -31,13 +31,14 @@ class ExportJob:
     format : FORMAT
         Write this format instead of that of the suffix: csv, parquet (pose and joint angles), mot (joint angles for
         OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU Placer),
-        trc, c3d (points, as of markers), bvh (skeleton and motion, for animation), bvh-lafan1, bvh-nokov, bvh-soma,
-        bvh-xsens (a whole person, for GMR); of persons and robots rosbag (for ROS 2, in a folder), mcap, rrd (for
-        rerun), urdf; of robots lerobot (a data set of episodes, in a folder), pkl (for GMR), npz, csv-beyondmimic (for
-        BeyondMimic).
+        osim (OpenSim's model of the subject), trc (points, as of markers), c3d (points and rotations of segments), bvh
+        (skeleton and motion, for animation), bvh-lafan1, bvh-nokov, bvh-soma, bvh-xsens (a whole person, for GMR),
+        motion-bids (a dataset, of which FILE is the folder); of persons and robots rosbag (for ROS 2, in a folder),
+        mcap, rrd (for rerun), urdf; of robots lerobot (a data set of episodes, in a folder), pkl (for GMR), npz,
+        csv-beyondmimic (for BeyondMimic).
     names
-        Only for .mot: name the columns by the coordinates of OpenSim's Rajagopal model (opensim), or by the joint
-        angles of the International Society of Biomechanics (isb). Without it opensim.
+        Only for .mot: write only the joint angles of the International Society of Biomechanics (isb), or only the
+        coordinates of OpenSim's Rajagopal model (opensim). Without it both, the ISB's first.
     rate_hz : HZ
         Resample the motion at this rate.
     interval : FROM TO
@@ -49,6 +50,12 @@ class ExportJob:
         repetitions, each repetition of the movement. Without it each result is an episode.
     instruction : TEXT
         Only for lerobot: the text that says what the robot does, in all episodes. Without it "follow NAME".
+    osim_model : FILE
+        Only for .osim and .sto: scale this generic model of OpenSim to the subject. With .sto the model and the set-up
+        files of OpenSim's IMU Placer and IMU Inverse Kinematics are written beside it.
+    bids_name : NAME
+        Only for motion-bids: call the recording so in the dataset, such as sub-01_task-reach_run-2. What it lacks is
+        taken from the names of subject and recording.
     force
         Replace an existing file.
     """
@@ -57,12 +64,14 @@ class ExportJob:
     out: Path
     further: tuple[Path, ...] = ()
     format: str | None = None
-    names: Literal["opensim", "isb"] | None = None
+    names: Literal["isb", "opensim"] | None = None
     rate_hz: float | None = None
     interval: tuple[float, float] | None = None
     phase: str | None = None
     episodes: str | None = None
     instruction: str | None = None
+    osim_model: Path | None = None
+    bids_name: str | None = None
     force: bool = False
 
     def check(self) -> None:
@@ -106,6 +115,8 @@ def run_export(
         phase=job.phase,
         episodes=job.episodes,
         instruction=job.instruction,
+        osim_model=job.osim_model,
+        bids_name=job.bids_name,
         force=job.force,
         provenance=provenance or None,
     )

@@ -2,13 +2,15 @@
 
 Points in POINT:UNITS at POINT:RATE; a residual below 0, NaN or zeros mark a missing one. Labels lose a subject before a
 colon. Rotations (HAS-Motion's extension, as Theia3D writes it) are 4×4 transforms of a segment to the laboratory at
-ROTATION:RATE, labelled ``l_uarm_4X4``. Numbers are those of Intel, DEC or MIPS.
+ROTATION:RATE, labelled ``l_uarm_4X4``, or ``left_upper_arm_4X4`` by `wepose export`. Numbers are those of Intel, DEC or
+MIPS.
 
 Source: The C3D File Format user guide (c3d.org); HAS-Motion's description of ROTATION.
 """
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -66,8 +68,19 @@ def read_c3d(path: Path, table: MarkerTable) -> Reference:
         table knows.
     """
     file = _open(path)
-    if file.number("ROTATION:USED") > 0:
-        return _read_rotations(file, table)
+    if file.number("ROTATION:USED") <= 0:
+        return locate(path, *_read_markers(file), table)
+    reference = _read_rotations(file, table)
+    if file.number("POINT:USED") >= 1 and len(reference.time) == _count_frames(file):
+        time, markers = _read_markers(file)
+        with contextlib.suppress(BadData):  # markers of which no joint follows
+            reference = reference._replace(points=locate(path, time, markers, table).points)
+    return reference
+
+
+def _read_markers(file: _C3d) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Read times (n,) [s] and marker → (n, 3) [m]."""
+    path = file.path
     labels = [label.rpartition(":")[2].strip() for label in file.texts("POINT:LABELS")]
     used, frames = int(file.number("POINT:USED")), _count_frames(file)
     if used < 1 or not labels:
@@ -78,7 +91,7 @@ def read_c3d(path: Path, table: MarkerTable) -> Reference:
     time = np.arange(frames) / _find_rate(file, "POINT")
     metres = UNITS[units.pop()] * _read_points(file, used, frames)
     check_measured(path, np.nan_to_num(metres.reshape(frames, -1)), "a marker")
-    return locate(path, time, {name: metres[:, k] for k, name in enumerate(labels[:used])}, table)
+    return time, {name: metres[:, k] for k, name in enumerate(labels[:used])}
 
 
 def _open(path: Path) -> _C3d:
@@ -189,8 +202,9 @@ def _read_rotations(file: _C3d, table: MarkerTable) -> Reference:
     values = file.values("f4", int(file.number("ROTATION:DATA_START")), 17 * used * frames).reshape(frames, used, 17)
     quats = {}
     for segment, name in table.rotations.items():
-        if name in labels[:used]:
-            R = values[:, labels.index(name), :16].reshape(frames, 4, 4).transpose(0, 2, 1)[:, :3, :3]
+        label = next((each for each in (name, segment) if each in labels[:used]), None)
+        if label is not None:
+            R = values[:, labels.index(label), :16].reshape(frames, 4, 4).transpose(0, 2, 1)[:, :3, :3]
             good = np.isfinite(R).all(axis=(1, 2))
             good &= np.abs(np.linalg.det(np.where(good[:, None, None], R, 0.0)) - 1.0) < 0.01
             quats[segment] = np.full((frames, 4), np.nan)

@@ -1,7 +1,8 @@
-"""C3D: the points, in mm, by ezc3d.
+"""C3D: the points, in mm, and the segments' rotations, by ezc3d.
 
 Source: The C3D File Format user guide (c3d.org), parameters POINT:UNITS, RATE, X_SCREEN, Y_SCREEN; a residual of −1
-marks a point that is not valid.
+marks a point that is not valid. HAS-Motion's description of ROTATION: 4×4 transforms of a segment to the laboratory,
+labelled ``…_4X4``, with the translation in the unit of the points.
 """
 
 from __future__ import annotations
@@ -9,16 +10,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, ExistingOutput
+from ..kinematics import compute_link_poses, find_known_links, solve_configuration
 from .motion import Motion, find_measured_points, resample_evenly
 
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
 
 
 def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Points in W (z up, x forward), single precision. A point in a gap is NaN with a residual of −1.
+    """Points in W (z up, x forward) and segments to W, single precision; NaN in a gap, a point's residual is −1 there.
 
     Raises
     ------
@@ -53,19 +56,58 @@ def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
     file.add_parameter("POINT", "Y_SCREEN", ["+Z"])
     file["data"]["points"] = np.concatenate([1e3 * p_W, np.ones((1, *p_W.shape[1:]))])
     file["data"]["meta_points"]["residuals"] = np.where(np.isfinite(p_W).all(axis=0), 0.0, -1.0)[None]
+    segments = _compute_transforms(motion)
+    if segments:
+        file.add_parameter("ROTATION", "RATE", [motion.rate_hz])
+        file.add_parameter("ROTATION", "UNITS", ["mm"])
+        file.add_parameter("ROTATION", "LABELS", [f"{segment}_4X4" for segment in segments])
+        file["data"]["rotations"] = np.stack(list(segments.values()), axis=-1).transpose(1, 2, 3, 0)
     named = path.with_name(f"{path.name}.c3d")  # ezc3d adds the suffix where it is missing
     try:
         file.write(str(named))
-        _check(named, p_W.shape[1] * p_W.shape[2])
+        _check(named, 16 * p_W.shape[1] * n + 68 * len(segments) * n)
         named.replace(path)
     finally:
         named.unlink(missing_ok=True)
     return diagnostics
 
 
-def _check(file: Path, points: int) -> None:
-    """Raise an error on a truncated file: ezc3d does not report a full disk."""
+def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
+    """Segment → (n, 4, 4) from its frame, at its upper joint, to W [mm]; at the origin where no place is ever known.
+
+    NaN, all of it, where the segment or one from which it hangs has no orientation or was bridged: a transform has one
+    mark of reliability.
+    """
+    pose, model = motion.pose, motion.model
+    segments = list(pose.quat_WL)
+    if not segments:
+        return {}
+    known = {
+        segment: np.isfinite(quat).all(axis=1) & ~pose.gap.get(segment, np.zeros(len(quat), dtype=bool))
+        for segment, quat in pose.quat_WL.items()
+    }
+    no_turn = np.array([0.0, 0.0, 0.0, 1.0])
+    quat_WL = {segment: np.where(known[segment][:, None], quat, no_turn) for segment, quat in pose.quat_WL.items()}
+    placed = set(find_known_links(model, segments))
+    links = [model.table.segments[segment].link for segment in segments]
+    _, p_W = compute_link_poses(model, solve_configuration(model, quat_WL), links, rotations=False)
+    transforms = {}
+    for k, (segment, link) in enumerate(zip(segments, links, strict=True)):
+        T = np.tile(np.eye(4), (len(pose.time), 1, 1))
+        T[:, :3, :3] = Rotation.from_quat(quat_WL[segment]).as_matrix()
+        good, above = known[segment], model.parents.get(segment)
+        if link in placed:
+            T[:, :3, 3] = 1e3 * p_W[:, k]
+            while above is not None:  # on which its place hangs
+                good, above = good & known.get(above, True), model.parents.get(above)
+        T[~good] = np.nan
+        transforms[segment] = T
+    return transforms
+
+
+def _check(file: Path, size: int) -> None:
+    """Raise an error where a file has fewer bytes of data: ezc3d does not report a full disk."""
     with file.open("rb") as opened:
         first_block = int.from_bytes(opened.read(18)[16:], "little")  # word 9 of the header, counted from 1
-    if file.stat().st_size < 512 * (first_block - 1) + 16 * points:
+    if file.stat().st_size < 512 * (first_block - 1) + size:
         raise ExistingOutput(f"{file.name}: cannot be written whole; is the disk full? nothing was written")

@@ -15,6 +15,7 @@ from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, MissingFile, one_of
 from ..kinematics import PosedBody, cut_pose
 from ..recording import select_interval
+from ..subject import Subject, load_subject
 from ..tracking.tracked import TrackedRecording
 from .bvh import write_bvh
 from .c3d import write_c3d
@@ -32,7 +33,9 @@ from .joint_motion import (
 )
 from .lerobot import list_episodes, write_lerobot
 from .motion import Motion, check_rate, resampled
-from .opensim import write_mot, write_placement, write_sto, write_trc
+from .motion_bids import parse_bids_name, write_motion_bids
+from .opensim import OpenSenseFiles, write_mot, write_placement, write_setups, write_sto, write_trc
+from .osim import write_osim
 from .provenance import provenance_file, provenance_text, write_provenance
 from .result import SUBJECT_URDF, format_urdf, read_result
 from .ros import write_mcap, write_rosbag
@@ -63,18 +66,20 @@ ROBOT_WRITERS: dict[str, JointWriter] = {
 }
 LEROBOT = "lerobot"
 ROBOTS_ALONE = (*ROBOT_WRITERS, LEROBOT)
-FORMATS = (*WRITERS, "urdf", *JOINT_WRITERS, *ROBOT_WRITERS, LEROBOT)
+OSIM, BIDS = "osim", "motion-bids"
+OF_PERSONS = (*WRITERS, OSIM, BIDS)
+FORMATS = (*OF_PERSONS, "urdf", *JOINT_WRITERS, *ROBOT_WRITERS, LEROBOT)
 # Formats that are folders → what an earlier run left in one, which `force` replaces.
 FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*"), "rosbag": ("*.db3", "*.mcap", "metadata.yaml")}
 # Where it is not the format's name; a folder has none.
 SUFFIXES = {
     **{"placement": ".sto", "csv-beyondmimic": ".csv"},
     **{f"bvh-{name}": ".bvh" for name in RIGS},
-    **dict.fromkeys(FOLDERS, ""),
+    **dict.fromkeys((*FOLDERS, BIDS), ""),
 }
 FILE_SUFFIXES = (*FORMATS, "bag", "db3")
-WITHOUT_MOTION = ("urdf", "placement")
-NAMES = ("opensim", "isb")
+WITHOUT_MOTION = ("urdf", OSIM, "placement")
+NAMES = ("isb", "opensim")
 
 
 class Exported(NamedTuple):
@@ -98,6 +103,8 @@ def export(
     phase: str | None = None,
     episodes: str | None = None,
     instruction: str | None = None,
+    osim_model: str | Path | None = None,
+    bids_name: str | None = None,
     force: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
@@ -109,13 +116,16 @@ def export(
         A person's motion: what `track` or `load_result` gives, or a result folder. A robot's: what `retarget` gives, or
         a folder that `wepose retarget` wrote. Several only for "lerobot", which makes episodes of them.
     file : str or Path
-        The file to write; of "lerobot" and "rosbag" the folder.
+        The file to write; of "lerobot" and "rosbag" the folder, of "motion-bids" one to which a recording is added if
+        it is a dataset.
     format : str, optional
-        One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "trc", "c3d", "bvh", "bvh-lafan1",
-        "bvh-nokov", "bvh-soma", "bvh-xsens". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot", "pkl",
-        "npz", "csv-beyondmimic". None: that of the file's suffix, which otherwise has to be the format's own.
+        One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "osim", "trc", "c3d", "bvh",
+        "bvh-lafan1", "bvh-nokov", "bvh-soma", "bvh-xsens", "motion-bids". Of either: "urdf", "rosbag", "mcap", "rrd".
+        Of a robot: "lerobot", "pkl", "npz", "csv-beyondmimic". None: that of the file's suffix, which otherwise has to
+        be the format's own.
     names : str, optional
-        Of a .mot's columns: "opensim", or "isb"; None: "opensim".
+        Of a .mot's columns: only the angles of the ISB, "isb", or only the coordinates of OpenSim's model, "opensim";
+        None: both, the ISB's first.
     rate_hz : float, optional
         Resample the motion to so many samples a second first.
     interval, phase : optional
@@ -126,6 +136,12 @@ def export(
         None: each result is one.
     instruction : str, optional
         Of "lerobot": what the robot does, in all episodes; None: "follow NAME".
+    osim_model : str or Path, optional
+        The generic OpenSim model that an .osim is scaled from. With a .sto also the scaled model and the set-up files
+        of OpenSense's tools are written beside it.
+    bids_name : str, optional
+        What the recording is called in a dataset of Motion-BIDS, such as "sub-01_task-reach_run-2"; what it lacks is
+        taken from the names of subject and recording.
     force : bool
         Replace an existing file, or a data set of the same format.
     provenance : mapping, optional
@@ -157,12 +173,24 @@ def export(
     file = Path(file)
     format = _format(file, format)
     _check_options(
-        format, names=names, rate_hz=rate_hz, interval=interval, phase=phase, episodes=episodes, instruction=instruction
+        format,
+        names=names,
+        rate_hz=rate_hz,
+        interval=interval,
+        phase=phase,
+        episodes=episodes,
+        instruction=instruction,
+        osim_model=osim_model,
+        bids_name=bids_name,
     )
     if len(results) != 1 and format != LEROBOT:
         raise BadOption(
             f"--format {format}: a file of {len(results)} results; only {LEROBOT} takes several, as episodes"
         )
+    if format == BIDS:
+        motion = _read_motion(results[0], format, interval, phase, rate_hz)
+        name = parse_bids_name(bids_name, motion.subject, motion.name)
+        return Exported(format, write_motion_bids(file, motion, name, force, provenance))
     with contextlib.ExitStack() as files:
         if format in FOLDERS:
             partial = files.enter_context(_replaced_folder(file, FOLDERS[format], force))
@@ -176,12 +204,19 @@ def export(
         if format == "urdf":
             _write_urdf(partial, results[0])
             return Exported(format, [])
-        if format in WRITERS:
-            motion = _read_motion(results[0], format, interval, phase)
-            if rate_hz is not None:
-                motion = resampled(motion, rate_hz)
+        if format in OF_PERSONS:
+            motion = _read_motion(results[0], format, interval, phase, rate_hz)
+            if format == OSIM:
+                return Exported(format, write_osim(partial, motion, Path(str(osim_model))))
             write = WRITERS[format] if names is None else functools.partial(write_mot, names=names)
-            return Exported(format, write(partial, motion))
+            diagnostics = write(partial, motion)
+            if osim_model is not None:
+                beside = OpenSenseFiles.beside(file)
+                others = (beside.model, beside.placement, beside.placer, beside.ik)
+                written = OpenSenseFiles(partial, *(files.enter_context(whole_file(path, force)) for path in others))
+                diagnostics += write_osim(written.model, motion, Path(osim_model), begin=True)
+                diagnostics += write_setups(beside, written, motion)
+            return Exported(format, diagnostics)
         motions = [_read_joint_motion(each, format, interval, phase) for each in results]
         if rate_hz is not None:
             motions = [resample_joints(each, rate_hz) for each in motions]
@@ -209,6 +244,13 @@ def _check_options(format: str, **options: Any) -> None:
     if format in WITHOUT_MOTION and (unused := [name for name in ("rate-hz", "interval", "phase") if name in given]):
         value = f" {rate_hz:g}" if rate_hz is not None else ""
         raise BadOption(f"--{unused[0]}{value}: there is no motion in a file of format {format}")
+    osim_model, bids_name = given.get("osim-model"), given.get("bids-name")
+    if osim_model is None and format == OSIM:
+        raise BadOption(f"--format {OSIM}: scales a model; --osim-model names a generic one, such as Rajagopal's")
+    if osim_model is not None and format not in (OSIM, "sto"):
+        raise BadOption(f"--osim-model {osim_model}: only an .osim and a .sto have use for it; the format is {format}")
+    if bids_name is not None and format != BIDS:
+        raise BadOption(f"--bids-name {bids_name}: only {BIDS} has such names, and the format is {format}")
 
 
 @contextlib.contextmanager
@@ -256,25 +298,37 @@ def _read_joint_motion(
     return convert_person(_read_motion(result, format, interval, phase))
 
 
-def _read_motion(result: Result, format: str, interval: tuple[float, float] | None, phase: str | None) -> Motion:
-    """The motion of a person, or the selected part of it, of at least two samples."""
+def _read_motion(
+    result: Result,
+    format: str,
+    interval: tuple[float, float] | None,
+    phase: str | None,
+    rate_hz: float | None = None,
+) -> Motion:
+    """The motion of a person, or the selected part of it, of at least two samples; resampled where a rate is given."""
     if _is_of_robot(result):
         raise BadOption(
             f"--format {format}: is of a person's motion, and this is a robot's trajectory; "
-            f"of that there is: {', '.join(FORMATS[len(WRITERS) :])}"
+            f"of that there is: {', '.join(FORMATS[len(OF_PERSONS) :])}"
         )
     if isinstance(result, PosedBody):
         phases = result.recording.phases if isinstance(result, TrackedRecording) else getattr(result, "phases", {})
         selected = select_interval(result.time, phases, interval, phase)
         pose = result.pose if selected is None else cut_pose(result.pose, selected)
-        motion = Motion(pose, result.model, result.name, result.name)
+        motion = Motion(pose, result.model, result.name, result.name, _name_person(result.subject))
     else:
         folder = Path(str(result))
         pose, model, summary = read_result(folder, interval, phase)
-        motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder))
+        subject = load_subject(folder) if (folder / "subject.toml").is_file() else None
+        motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder), _name_person(subject))
     if len(motion.pose.time) < 2:
         raise BadData(f"{motion.where}: a pose of {len(motion.pose.time)} samples; a motion has at least 2")
-    return motion
+    return motion if rate_hz is None else resampled(motion, rate_hz)
+
+
+def _name_person(subject: Subject | None) -> str:
+    """The name of a subject; empty where none was stated."""
+    return "" if subject is None or subject.is_population else subject.name
 
 
 def _format(file: Path, format: str | None) -> str:
@@ -287,7 +341,7 @@ def _format(file: Path, format: str | None) -> str:
     if format not in FORMATS:
         raise BadOption(f"--format {format}: not known; {one_of(FORMATS, format)}")
     suffix = SUFFIXES.get(format, f".{format}")
-    if format in FOLDERS:
+    if format in (*FOLDERS, BIDS):
         if file.suffix.lower().removeprefix(".") in FILE_SUFFIXES:  # readers would take the folder for a file
             raise BadOption(f"-o {file}: format {format} is a folder; name it {file.stem}")
     elif file.suffix.lower() != suffix:

@@ -28,12 +28,14 @@ class Motion:
     pose, model : as `read_result` gives them
     name : of the recording
     where : the result's folder, for error texts
+    subject : name of the person; empty where none is known
     """
 
     pose: Pose
     model: BodyModel
     name: str
     where: str
+    subject: str = ""
 
     @property
     def rate_hz(self) -> float:

@@ -17,17 +17,20 @@ What OpenSim's readers demand (opensim-core, OpenSim/Common):
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 import numpy as np
 import polars as pl
+from scipy.spatial.transform import Rotation
 
 from ..angles import joint_angles
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from ..readers.opensim import OWN
 from .motion import Motion, check_complete, diagnose_gaps, find_measured_points, resample_evenly
-from .rajagopal import coordinates, in_ground, orientations
+from .rajagopal import compute_bodies, coordinates, find_first_values, in_ground, orientations
 
 _TRC_KEYS = (
     *("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"),
@@ -36,8 +39,12 @@ _TRC_KEYS = (
 MOST_MISSED = np.deg2rad(1.0)  # [rad] rms of a body of the model, whose elbows and wrists have two axes
 
 
-def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagnostic]:
-    """Joint angles in degrees: `names` "opensim" are those of Rajagopal's model, "isb" those of `wepose_pin.angles`.
+def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
+    """Joint angles in degrees: first the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
+
+    Parameters
+    ----------
+    names : only these: "isb" or "opensim"
 
     Raises
     ------
@@ -46,15 +53,17 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagno
     """
     check_complete(motion, "a .mot")
     diagnostics = diagnose_gaps(motion)
-    if names == "isb":
+    columns: dict[str, np.ndarray] = {}
+    if names != "opensim":
         angles = joint_angles(motion.pose)
-        columns = {
+        columns |= {
             f"{joint}_{angle}": joint_table.values[:, k]
             for joint, joint_table in angles.joints.items()
             for k, angle in enumerate(joint_table.names)
         }
-    else:
-        columns, residuals = coordinates(orientations(motion.pose.quat_WL))
+    if names != "isb":
+        turned, residuals = coordinates(orientations(motion.pose.quat_WL))
+        columns |= turned
         diagnostics += [
             Diagnostic("opensim-axes-too-few", WARNING, body, float(angle), MOST_MISSED)
             for body, angle in residuals.items()
@@ -69,6 +78,39 @@ def write_mot(path: Path, motion: Motion, names: str = "opensim") -> list[Diagno
     name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
     _write(path, [name, *(f"{key}={value}" for key, value in header.items()), "endheader"], rows)
     return diagnostics
+
+
+@dataclass(frozen=True)
+class OpenSenseFiles:
+    """The files of one motion that OpenSense goes by.
+
+    Parameters
+    ----------
+    orientations : the .sto
+    model, placement, placer, ik : the scaled model, and the sample and the set-ups of OpenSense's two tools
+    """
+
+    orientations: Path
+    model: Path
+    placement: Path
+    placer: Path
+    ik: Path
+
+    @classmethod
+    def beside(cls, sto: Path) -> OpenSenseFiles:
+        """The files beside a .sto, named after it."""
+        endings = (".osim", "_placement.sto", "_placer.xml", "_ik.xml")
+        return cls(sto, *(sto.with_name(f"{sto.stem}{ending}") for ending in endings))
+
+    @property
+    def placed_model(self) -> str:
+        """The name of the model with sensors, which the IMU Placer writes."""
+        return f"{self.orientations.stem}_placed.osim"
+
+    @property
+    def solution(self) -> str:
+        """The name of the motion that the IK writes."""
+        return f"{self.orientations.stem}_ik.mot"
 
 
 # Orientations -----------------------------------------------------------------------------------------------------
@@ -89,9 +131,58 @@ def write_sto(path: Path, motion: Motion) -> list[Diagnostic]:
 
 def write_placement(path: Path, motion: Motion) -> list[Diagnostic]:
     """One sample for OpenSense's IMU Placer: the same sensors while all coordinates of the model are zero."""
-    upright = {body: np.array([[0.0, 0.0, 0.0, 1.0]]) for body in _bodies(motion)}
-    _write_quaternions(path, motion, np.zeros(1), upright)
+    _write_sample(path, motion, dict.fromkeys(_bodies(motion), Rotation.identity()))
     return []
+
+
+def _write_sample(path: Path, motion: Motion, pose: Mapping[str, Rotation]) -> None:
+    _write_quaternions(path, motion, np.zeros(1), {body: R_GB.as_quat()[None] for body, R_GB in pose.items()})
+
+
+def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion) -> list[Diagnostic]:
+    """Write all that OpenSense needs beside the .sto: a scaled model, set-ups of IMU Placer and IK.
+
+    The sample for the placer has the sensors as they are in the default pose of the model, that of the first sample.
+
+    Parameters
+    ----------
+    files : names that the set-ups mention; all in one folder, from which OpenSim reads them
+    written : where to write them now
+    motion : whose .sto it is
+
+    Raises
+    ------
+    BadData
+        No segment is a body of the model.
+    """
+    bodies = _bodies(motion)
+    pose = compute_bodies(find_first_values(bodies))
+    _write_sample(written.placement, motion, {body: pose[body] for body in bodies})
+    placer = {
+        "model_file": files.model.name,
+        "sensor_to_opensim_rotations": "0 0 0",
+        "orientation_file_for_calibration": files.placement.name,
+        "output_model_file": files.placed_model,
+    }
+    _write_setup(written.placer, "IMUPlacer", placer)
+    step = 0.5 / motion.rate_hz  # past the last sample, whose time is rounded in the file
+    solver = {
+        "model_file": files.placed_model,
+        "orientations_file": files.orientations.name,
+        "sensor_to_opensim_rotations": "0 0 0",
+        "time_range": f"{motion.pose.time[0] - step:.6f} {motion.pose.time[-1] + step:.6f}",
+        "report_errors": "true",
+        "results_directory": ".",
+        "output_motion_file": files.solution,
+    }
+    _write_setup(written.ik, "IMUInverseKinematicsTool", solver)
+    return []
+
+
+def _write_setup(path: Path, tool: str, properties: Mapping[str, str]) -> None:
+    lines = [f"\t\t<{name}>{escape(text)}</{name}>" for name, text in properties.items()]
+    top = f'<?xml version="1.0" encoding="UTF-8" ?>\n<OpenSimDocument Version="40000">\n\t<{tool} name="{tool}">'
+    path.write_text("\n".join((top, *lines, f"\t</{tool}>", "</OpenSimDocument>", "")), encoding="utf-8")
 
 
 def _bodies(motion: Motion) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ are zero.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,8 +37,40 @@ BODIES = {
     "left_foot": "calcn_l",
 }
 # Axes of a right arm's joints with two, in the body above; a left arm's are mirrored on the sagittal plane.
+_X, _Y, _Z = np.eye(3)
 ELBOW = (np.array([0.22604696, 0.022269, 0.97386183]), PRONATION)
-WRIST = (np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
+WRIST = (_Z, _X)
+
+
+class Joint(NamedTuple):
+    """A joint of the model."""
+
+    parent: str  # body
+    coordinates: tuple[str, ...]
+    axes: tuple[np.ndarray, ...]  # of the coordinates, in the parent, at zero
+
+
+def _arm_joints(side: str) -> dict[str, Joint]:
+    mirror = np.array([-1.0, -1.0, 1.0]) if side == "l" else np.ones(3)  # of axes on the sagittal plane
+
+    def joint(parent: str, names: Sequence[str], axes: Sequence[np.ndarray]) -> Joint:
+        return Joint(parent, tuple(f"{name}_{side}" for name in names), tuple(mirror * axis for axis in axes))
+
+    return {
+        f"humerus_{side}": joint("torso", ("arm_flex", "arm_add", "arm_rot"), (_Z, _X, _Y)),
+        f"ulna_{side}": joint(f"humerus_{side}", ("elbow_flex",), ELBOW[:1]),
+        f"radius_{side}": joint(f"ulna_{side}", ("pro_sup",), ELBOW[1:]),
+        f"hand_{side}": joint(f"radius_{side}", ("wrist_flex", "wrist_dev"), WRIST),
+    }
+
+
+# Body → the joint that moves it.
+JOINTS = {
+    "pelvis": Joint("ground", ("pelvis_tilt", "pelvis_list", "pelvis_rotation"), (_Z, _X, _Y)),
+    "torso": Joint("pelvis", ("lumbar_extension", "lumbar_bending", "lumbar_rotation"), (_Z, _X, _Y)),
+    **_arm_joints("r"),
+    **_arm_joints("l"),
+}
 # Of each of these joints' angles the middle of its range [rad]: they are given within half a turn of it. Followed over
 # time, an elbow that was once bent as none can be might keep a full turn too much.
 _MIDDLE = {"elbow_flex": np.radians(75.0), "pro_sup": np.radians(90.0), "wrist_flex": 0.0, "wrist_dev": 0.0}
@@ -76,10 +109,10 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
     columns: dict[str, np.ndarray] = {}
     residuals: dict[str, float] = {}
     if "pelvis" in quat_GB:
-        columns |= _solve_three_axes(quat_GB["pelvis"], ("pelvis_tilt", "pelvis_list", "pelvis_rotation"))
+        columns |= _solve_three_axes(quat_GB["pelvis"], JOINTS["pelvis"].coordinates)
     if "torso" in quat_GB:
         lumbar = multiply(conjugate(quat_GB.get("pelvis", _STILL)), quat_GB["torso"])
-        columns |= _solve_three_axes(lumbar, ("lumbar_extension", "lumbar_bending", "lumbar_rotation"))
+        columns |= _solve_three_axes(lumbar, JOINTS["torso"].coordinates)
     for side in "rl":
         arm = [name for body in ("humerus", "radius", "hand") if (name := f"{body}_{side}") in quat_GB]
         if not arm or arm[0] != f"humerus_{side}":
@@ -93,9 +126,25 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
             residuals |= {name: float(np.sqrt(np.mean(angle**2))) for name, angle in zip(arm, left, strict=True)}
         if "torso" in quat_GB:
             shoulder = multiply(conjugate(quat_GB["torso"] * mirror), quat[0])
-            columns |= _solve_three_axes(shoulder, [f"arm_{angle}_{side}" for angle in ("flex", "add", "rot")])
+            columns |= _solve_three_axes(shoulder, JOINTS[f"humerus_{side}"].coordinates)
         columns |= below
     return columns, residuals
+
+
+def find_first_values(quat_GB: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Coordinate → its value [rad] in the first sample."""
+    first, _ = coordinates({body: quat[:1] for body, quat in quat_GB.items()})
+    return {name: float(values[0]) for name, values in first.items()}
+
+
+def compute_bodies(values: Mapping[str, float]) -> dict[str, Rotation]:
+    """Body → its rotation to G with the coordinates at `values` [rad], 0 where not named; legs stand."""
+    turned = {"ground": Rotation.identity()}
+    for body, joint in JOINTS.items():
+        turned[body] = turned[joint.parent]
+        for name, axis in zip(joint.coordinates, joint.axes, strict=True):
+            turned[body] = turned[body] * Rotation.from_rotvec(values.get(name, 0.0) * axis / np.linalg.norm(axis))
+    return {body: turned.get(body, turned["ground"]) for body in BODIES.values()}
 
 
 def _solve_three_axes(quat: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
