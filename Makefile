@@ -11,11 +11,12 @@ demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 
 # Compiled once: without bytecode each worker, and each command that a test runs, compiles all files anew.
 test test-all: export PYTHONDONTWRITEBYTECODE :=
+WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 2)   # many tests wait for something
 test: $(READY)            ## what must pass before a commit: minutes
-	$(BIN)/python -m pytest -n auto --dist worksteal
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 test-all: $(READY)        ## with the second tier: Monte Carlo, fuzzing, kills, peers, robots, clusters
-	$(BIN)/python -m pytest -n auto --dist worksteal -m ""
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m ""
 
 check: lint types test    ## lint, types and tests
 

@@ -243,7 +243,10 @@ PAGES_WITH_LINKS = [path.relative_to(ROOT).as_posix() for path in (*ROOT.glob("*
 def test_links_lead_somewhere(page: str) -> None:
     targets = re.findall(r"\]\(([^)\s]+)\)", FENCE.sub("", text_of(page)))
     files = [target.partition("#")[0] for target in targets if "://" not in target]
-    assert [file for file in files if file and not (ROOT / page).parent.joinpath(file).exists()] == []
+    missing = [file for file in files if file and not (ROOT / page).parent.joinpath(file).exists()]
+    # What the build of the site makes is named by what makes it.
+    making = "".join(path.read_text(encoding="utf-8") for path in ROOT.glob("docs/**/*.py"))
+    assert [file for file in missing if not file.startswith("generated/") or Path(file).name not in making] == []
 
 
 def test_the_readme_leads_to_the_pages_for_contributors() -> None:
