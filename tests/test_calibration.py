@@ -244,7 +244,7 @@ def test_wrong_requests_are_named(exact: tuple[Person, Recording]) -> None:
         calibrate(replace(recording, sensors=fewer))
 
 
-@pytest.mark.parametrize(("seed", "several"), [(1, True), (6, False), (4, True)])
+@pytest.mark.parametrize(("seed", "several"), [(1, True), pytest.param(6, False, marks=pytest.mark.slow), (4, True)])
 def test_hands_that_hardly_move_leave_the_headings_open(
     seed: int, several: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -156,6 +156,7 @@ def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> 
         assert calibration.subject.std(name) < 0.01 * moved.lengths[name]
 
 
+@pytest.mark.slow
 def test_a_known_point_two_points_and_stated_mounts(arm: BodyModel) -> None:
     moved = move_arm(arm, 3)
     known = calibrate_arm(arm, moved, on_point(at=moved.tip[0]))

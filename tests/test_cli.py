@@ -76,6 +76,7 @@ def test_help_names_each_imperfection(capsys: pytest.CaptureFixture[str]) -> Non
         assert field.name in text
 
 
+@pytest.mark.slow
 def test_demo_makes_all_of_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

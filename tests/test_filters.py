@@ -250,6 +250,7 @@ def true_vertical(quat: np.ndarray) -> np.ndarray:
     return matrix(quat).T @ [0, 0, 1]
 
 
+@pytest.mark.slow
 def test_nees_is_right_when_the_filter_is_told_the_truth() -> None:
     """Data from the filter's own model, P₀ as drawn: the normalised attitude error averages to its three states."""
     rng = np.random.default_rng(7)

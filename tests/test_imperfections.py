@@ -484,6 +484,7 @@ def test_mount_is_a_stream_of_its_own(realistic: Simulation) -> None:
 # One sensor ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "moving", "rate_peak", "accel_peak"),
     [

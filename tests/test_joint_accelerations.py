@@ -116,7 +116,7 @@ def test_pairs_are_neighbours_with_nothing_between_that_moves() -> None:
     assert find_pairs(model, dict.fromkeys(("torso", "left_forearm"), quat)) == ()
 
 
-@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("causal", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving: Simulation, causal: bool) -> None:
     recording = biased(moving, 0.15)
     rms = {}

@@ -649,7 +649,7 @@ def session(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) ->
     return folder
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_stopped_amid_a_motion_the_robot_stands(session: Path, tmp_path: Path, receiver: Receiver, number: int) -> None:
     urdf = write_arm(tmp_path)
     command = [sys.executable, "-m", "wepose_pin.cli", "live", "--source", f"replay:{session}", "--no-page"]
@@ -710,6 +710,7 @@ def test_wrong_robots_are_one_line_before_the_source_opens(
     assert "no sensor on right_upper_arm, right_forearm, which its right arm follows" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_map_may_lie_elsewhere(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     urdf = write_arm(tmp_path)
     (tmp_path / "maps").mkdir()

@@ -472,6 +472,7 @@ def check_path(sim: Simulation, start: float, stop: float) -> None:
         assert segment == "torso" or moved.max() > 0.05
 
 
+@pytest.mark.slow
 def test_accel_integrates_to_the_position() -> None:
     sim = simulate(SUBJECT, seed=4, rate_hz=300.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=5.0, circles=0)
     check_path(sim, 4.5, 12.0)

@@ -125,6 +125,7 @@ def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation, tmp_pa
     assert joined(pieces).equals(build_pose_table(whole.pose, covariance=True))
 
 
+@pytest.mark.slow
 def test_a_body_whose_joints_are_too_few(made: Simulation, tmp_path: Path, data: Path) -> None:
     """Its elbows are fitted from frame to frame: the next piece begins where the last one ended."""
     from test_kinematics import gazebo

@@ -335,6 +335,7 @@ def test_a_trunk_that_keeps_still_leaves_headings_unknown_and_says_so(monkeypatc
     assert found.subject.std("trunk") > 0.95 * person.prior.std("trunk")
 
 
+@pytest.mark.slow
 def test_a_palm_off_its_point_is_found_and_left_out() -> None:
     person, simulation = made("touch_right", 5, real=True)
     recording = simulation.recording()

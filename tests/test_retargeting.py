@@ -238,6 +238,7 @@ def test_turned_bases_move_alike(arm, tmp_path: Path) -> None:
     assert np.abs(retarget(person(4.0), by_root).joint_position - straight.joint_position).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_joint_without_end_and_one_that_copies_another(tmp_path: Path) -> None:
     (tmp_path / "c").mkdir()
     endless = load_robot(find_map(str(write_arm(tmp_path / "c", continuous="roll"))))

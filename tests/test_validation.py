@@ -116,7 +116,8 @@ def only_contenders(monkeypatch: pytest.MonkeyPatch, setting: str, *labels: str)
         monkeypatch.setattr(f"wepose_pin.validation.{module}.list_contenders", lambda *_: few)
 
 
-@pytest.mark.parametrize("half", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("half", [0, 1])
 def test_each_half_of_the_authors_trial_is_scored_with_the_other(
     half: int, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
