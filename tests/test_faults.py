@@ -53,12 +53,14 @@ def result(session: Path) -> Path:
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
     """No file of this process can grow beyond `size` bytes, as on a disk that is full."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before, kept = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # Python would keep the first bytes of a module and fail at it ever after
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        sys.dont_write_bytecode = kept
 
 
 FORMATS = ("csv", "parquet", "mot", "sto", "trc", "bvh", "urdf")
