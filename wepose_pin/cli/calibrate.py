@@ -81,6 +81,6 @@ COMMAND = Command(
     run,
     example="calibrate session.toml --measured biacromial=0.41 --stature 1.78 --sex f -o anna",
     arguments=("session", "further"),
-    exit_codes="0 quality pass, 3 poor, 4 fail, by the limits in docs/calibrate.md; the files are written in all three cases; "
-    "2 invalid input, nothing is written.",
+    exit_codes="0 quality pass, 3 poor, 4 fail, by the limits in docs/calibrate.md; the files are written in all three "
+    "cases; 2 invalid input, nothing is written.",
 )
