@@ -184,7 +184,7 @@ def test_rest_is_found_and_proposed(capsys: pytest.CaptureFixture[str], tmp_path
     text = info(capsys, tmp_path / "a.csv")
     assert "all sensors static [s]: 0.0 to 2.5" in text
     assert "start = [[0.00, 2.49]]   # CHECK" in text
-    assert 'mount = { up = "+z", forward = "+x" }' in text
+    assert 'mount = { up = "+z", forward = "?" }' in text
 
 
 @pytest.mark.parametrize(

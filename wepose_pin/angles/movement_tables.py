@@ -32,7 +32,7 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
     """A row a session: its time, how repetitions were found, their number and duration."""
     rows = []
     for movement in movements:
-        time, found = movement.angles.time, movement.repetitions
+        time, repetitions = movement.angles.time, movement.repetitions
         duration = compute_statistics(movement.durations, np.full(len(movement.durations), np.nan))
         rows.append(
             {
@@ -40,14 +40,14 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
                 "from_s": float(time[0]),
                 "to_s": float(time[-1]),
                 "low_pass_hz": movement.cutoff_hz,
-                "repetitions_by": found.source,
-                "first": {None: "", True: "rising", False: "falling"}[found.rising],
-                "n": len(found.spans),
+                "repetitions_by": repetitions.source,
+                "first": {None: "", True: "rising", False: "falling"}[repetitions.rising],
+                "n": len(repetitions.spans),
                 "duration_mean_s": duration.mean,
                 "duration_sd_s": duration.sd,
-                "cmc": found.cmc,
-                "left_out": found.left_out,
-                "why_none": found.reason,
+                "cmc": repetitions.cmc,
+                "left_out": repetitions.left_out,
+                "why_none": repetitions.reason,
             }
         )
     return pl.DataFrame(rows, schema_overrides={"low_pass_hz": pl.Float64})
@@ -80,13 +80,13 @@ def build_repetition_table(movements: Sequence[Movement]) -> pl.DataFrame:
 
 def _list_measures(movement: Movement, measures: Mapping[str, Measures], row: int) -> Iterator[dict[str, Any]]:
     for name, joint in movement.angles.joints.items():
-        found = measures[name]
+        joint_measures = measures[name]
         for k, angle in enumerate(joint.names):
             cells: dict[str, Any] = {"joint": name, "angle": angle, "sequence": joint.sequence}
             for m, (measure, unit) in enumerate(zip(MEASURES, UNITS, strict=True)):
-                cells[f"{measure}_{unit}"] = float(np.degrees(found.values[row, k, m]))
-                cells[f"{measure}_std_{unit}"] = float(np.degrees(found.std[row, k, m]))
-            yield {**cells, "near_lock": float(found.near_lock[row]), "gap": float(found.gap[row])}
+                cells[f"{measure}_{unit}"] = float(np.degrees(joint_measures.values[row, k, m]))
+                cells[f"{measure}_std_{unit}"] = float(np.degrees(joint_measures.std[row, k, m]))
+            yield {**cells, "near_lock": float(joint_measures.near_lock[row]), "gap": float(joint_measures.gap[row])}
 
 
 def build_summary_table(movements: Sequence[Movement]) -> pl.DataFrame:
@@ -94,12 +94,12 @@ def build_summary_table(movements: Sequence[Movement]) -> pl.DataFrame:
     rows = []
     for movement in (movement for movement in movements if movement.curves):
         for name, joint in movement.angles.joints.items():
-            found = movement.measures[name]
+            joint_measures = movement.measures[name]
             for k, angle in enumerate(joint.names):
                 cells: dict[str, Any] = {"session": movement.name, "joint": name, "angle": angle}
                 cells |= {"sequence": joint.sequence, "repetitions": len(movement.repetitions.spans)}
                 for m, (measure, unit) in enumerate(zip(MEASURES, UNITS, strict=True)):
-                    each = compute_statistics(found.values[:, k, m], found.std[:, k, m])
+                    each = compute_statistics(joint_measures.values[:, k, m], joint_measures.std[:, k, m])
                     cells |= {f"{measure}_n": each.n} if measure in ("range", "peak_rate") else {}
                     for part in ("mean", "sd", "std"):
                         cells[f"{measure}_{part}_{unit}"] = float(np.degrees(getattr(each, part)))

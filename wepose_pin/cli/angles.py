@@ -29,15 +29,15 @@ def run(job: AnglesJob) -> int:
 
 
 def _print_repetitions(movement: Movement) -> None:
-    found = movement.repetitions
-    by = f" by {found.source}" if found.source else ""
-    if not len(found.spans):
-        say(f"{movement.name}: no repetitions{by}: {found.reason}")
+    repetitions = movement.repetitions
+    by = f" by {repetitions.source}" if repetitions.source else ""
+    if not len(repetitions.spans):
+        say(f"{movement.name}: no repetitions{by}: {repetitions.reason}")
         return
-    text = f"{movement.name}: {len(found.spans)} repetitions{by}"
-    if found.rising is not None:
-        text += f", {'rising' if found.rising else 'falling'} first; CMC {found.cmc:.2f}"
-    say(text + (f"; {found.left_out} left out as unlike them, or in gaps" if found.left_out else ""))
+    text = f"{movement.name}: {len(repetitions.spans)} repetitions{by}"
+    if repetitions.rising is not None:
+        text += f", {'rising' if repetitions.rising else 'falling'} first; CMC {repetitions.cmc:.2f}"
+    say(text + (f"; {repetitions.left_out} left out as unlike them, or in gaps" if repetitions.left_out else ""))
 
 
 def _print_ranges(movements: Sequence[Movement]) -> None:

@@ -165,7 +165,7 @@ def _analyze(job: AnglesJob, progress: Progress) -> list[Movement]:
         except WrongOption as error:
             raise BadOption(f"{folder}: {error}" if job.further else str(error)) from None
         if job.repetitions is None and len(movement.repetitions.spans):
-            found = movement.repetitions
-            options = replace(options, main_angle=found.source, rising=found.rising)
+            repetitions = movement.repetitions
+            options = replace(options, main_angle=repetitions.source, rising=repetitions.rising)
         movements.append(movement)
     return movements

@@ -193,5 +193,5 @@ def _find_repetitions(pose: Pose, sides: tuple[str, ...]) -> dict[str, Any]:
 
     angles = joint_angles(pose)
     of_arms = {name: each for name, each in angles.joints.items() if name.startswith(sides)}
-    found = find_repetitions(replace(angles, joints=of_arms))
-    return {"source": found.source, "spans": found.spans.tolist(), "reason": found.reason}
+    repetitions = find_repetitions(replace(angles, joints=of_arms))
+    return {"source": repetitions.source, "spans": repetitions.spans.tolist(), "reason": repetitions.reason}

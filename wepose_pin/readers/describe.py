@@ -579,11 +579,10 @@ def _mount_comment(recording: Recording, segment: str, static: list[tuple[float,
             sensor.accel_S[recording.span(static[0])] if static else sensor.accel_S[: max(1, round(recording.rate_hz))]
         )
         up = max(AXES, key=lambda axis: float(AXES[axis] @ force.mean(axis=0)))
-    forward = "-z" if up[1] != "z" else "+x"
-    hint = f"up as gravity says {'where it is static' if static else 'in the first second'}; which axis is forward?"
+    hint = f"up as gravity says {'where it is static' if static else 'in the first second'}; ? is the axis ahead"
     if isinstance(sensor, OrientationSensor):
         hint = "which sensor axis is up, which forward, in the start pose? none: the segment's own orientation"
-    return [f'# mount = {{ up = "{up}", forward = "{forward}" }}   # {hint}']
+    return [f'# mount = {{ up = "{up}", forward = "?" }}   # {hint}']
 
 
 def _facts(recording: Recording) -> tuple[str, ...]:

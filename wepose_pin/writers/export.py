@@ -229,22 +229,22 @@ def export(
 
 def _check_options(format: str, **options: Any) -> None:
     """Raise `BadOption` for an option that the format does not have."""
-    given = {name.replace("_", "-"): value for name, value in options.items() if value is not None}
-    names = given.get("names")
+    stated = {name.replace("_", "-"): value for name, value in options.items() if value is not None}
+    names = stated.get("names")
     if names is not None and format != "mot":
         raise BadOption(f"--names {names}: only a .mot has names to choose, and the format is {format}")
     if names not in (None, *NAMES):
         raise BadOption(f"--names {names}: not known; {one_of(NAMES, names)}")
-    rate_hz = given.get("rate-hz")
+    rate_hz = stated.get("rate-hz")
     if rate_hz is not None:
         check_rate(rate_hz)
     for name in ("episodes", "instruction"):
-        if name in given and format != LEROBOT:
-            raise BadOption(f"--{name} {given[name]}: only of format {LEROBOT}, and the format is {format}")
-    if format in WITHOUT_MOTION and (unused := [name for name in ("rate-hz", "interval", "phase") if name in given]):
+        if name in stated and format != LEROBOT:
+            raise BadOption(f"--{name} {stated[name]}: only of format {LEROBOT}, and the format is {format}")
+    if format in WITHOUT_MOTION and (unused := [name for name in ("rate-hz", "interval", "phase") if name in stated]):
         value = f" {rate_hz:g}" if rate_hz is not None else ""
         raise BadOption(f"--{unused[0]}{value}: there is no motion in a file of format {format}")
-    osim_model, bids_name = given.get("osim-model"), given.get("bids-name")
+    osim_model, bids_name = stated.get("osim-model"), stated.get("bids-name")
     if osim_model is None and format == OSIM:
         raise BadOption(f"--format {OSIM}: scales a model; --osim-model names a generic one, such as Rajagopal's")
     if osim_model is not None and format not in (OSIM, "sto"):

@@ -89,8 +89,8 @@ class OsimModel:
         top = self.document.getroot()
         model = top.find("Model") if top.tag == "OpenSimDocument" else None
         if model is None:
-            found = f"<{top.tag}>" if top.tag != "OpenSimDocument" else "an OpenSimDocument without <Model>"
-            raise BadData(f"{self.path}: is XML, but no OpenSim model: it is {found}")
+            kind = f"<{top.tag}>" if top.tag != "OpenSimDocument" else "an OpenSimDocument without <Model>"
+            raise BadData(f"{self.path}: is XML, but no OpenSim model: it is {kind}")
         version = top.get("Version", "")
         if not version.isdecimal() or int(version) < _OLDEST:
             raise BadData(
@@ -104,10 +104,10 @@ class OsimModel:
 
     def _objects(self, name: str) -> list[Element]:
         objects = self.root.find(f"{name}/objects")
-        found = [] if objects is None else [each for each in objects if isinstance(each.tag, str)]
-        if not found:
+        children = [] if objects is None else [each for each in objects if isinstance(each.tag, str)]
+        if not children:
             raise BadData(f"{self.path}: no {name} in it, or an empty one; is it a whole model?")
-        return found
+        return children
 
     def _frame(self, joint: Element, end: str) -> _Frame:
         """The parent or the child frame of a joint."""
@@ -360,10 +360,10 @@ class OsimModel:
         """Empty the sets of muscles and of what depends on them; set → how many members it had."""
         left_out: dict[str, int] = {}
         for name in _LEFT_OUT:
-            if (found := self.root.find(name)) is not None:
-                count = len([each for each in found.iterfind("objects/*") if isinstance(each.tag, str)])
+            if (component_set := self.root.find(name)) is not None:
+                count = len([each for each in component_set.iterfind("objects/*") if isinstance(each.tag, str)])
                 left_out |= {name: count} if count else {}
-                self.root.remove(found)
+                self.root.remove(component_set)
         for wraps in list(self.root.iter("WrapObjectSet")):
             wraps.getparent().remove(wraps)
         return left_out
@@ -372,12 +372,12 @@ class OsimModel:
         """Add points as markers of their names, so that a .trc of them can be followed."""
         from lxml import etree
 
-        found = self.root.find("MarkerSet")
-        if found is None:
-            found = etree.SubElement(self.root, "MarkerSet", name="markerset")
-        objects = found.find("objects")
+        marker_set = self.root.find("MarkerSet")
+        if marker_set is None:
+            marker_set = etree.SubElement(self.root, "MarkerSet", name="markerset")
+        objects = marker_set.find("objects")
         if objects is None:
-            objects = etree.SubElement(found, "objects")
+            objects = etree.SubElement(marker_set, "objects")
         for point, (body, at_mass_centre) in markers.items():
             for old in objects.iterfind(f"Marker[@name='{point}']"):
                 objects.remove(old)
@@ -473,5 +473,5 @@ def _set(element: Element, tag: str, text: str) -> None:
     """Set the text of a property, which is made where it is missing."""
     from lxml import etree
 
-    found = element.find(tag)
-    (etree.SubElement(element, tag) if found is None else found).text = text
+    child = element.find(tag)
+    (etree.SubElement(element, tag) if child is None else child).text = text

@@ -19,11 +19,36 @@ from .waiting import Waiting, wait_for
 
 MAX_SIZE = 65536  # [bytes] of a datagram
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
-BUFFER = 1 << 20  # [bytes] that the system keeps while nobody reads
+BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
 COLLECT_S = 1.0  # [s] after the first orientation in which the other sensors may appear
 MAX_KINDS = 24  # of problems
 UNIT_ERROR = 0.05  # of a quaternion's length
 LONGEST_STEP_S = 0.02  # [s] between orientations that came together, of senders that do not tell their time
+
+
+def bind_socket(kind: str, host: str, port: int) -> socket.socket:
+    """Return a socket for datagrams at an address of this machine, which never blocks; port 0: any free one.
+
+    Raises
+    ------
+    BadSource
+        The address cannot be bound; `kind` is the source that the message names.
+    """
+    bound = None
+    try:
+        family, form, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        bound = socket.socket(family, form, protocol)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+        bound.bind(address)
+    except (OSError, UnicodeError) as error:
+        if bound is not None:
+            bound.close()
+        raise BadSource(
+            f"{kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); "
+            f"an address of this machine and a port that nobody uses are needed"
+        ) from None
+    bound.setblocking(False)
+    return bound
 
 
 class OrientationSample(NamedTuple):
@@ -90,29 +115,17 @@ class DatagramSource(ABC):
         BadSource
             The address cannot be bound, or without `waiting` nothing comes.
         """
-        host, port = self.address
-        try:
-            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-            self._socket = socket.socket(family, kind)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
-            self._socket.bind(address)
-        except (OSError, UnicodeError) as error:
-            self.close()
-            raise BadSource(
-                f"{self.kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); "
-                f"an address of this machine and a port that nobody uses are needed"
-            ) from None
-        self._socket.setblocking(False)
+        self._socket = bind_socket(self.kind, *self.address)
         self.address = self._socket.getsockname()[:2]
-        given = self.sensors
-        self.sensors = given or self._segments
-        if not given and self._wait(waiting):
+        stated = self.sensors
+        self.sensors = stated or self._segments
+        if not stated and self._wait(waiting):
             deadline = time.monotonic() + COLLECT_S
             while time.monotonic() < deadline:
                 self._waiting += self.read_new(0.1)
             present = {samples.sensor for samples in self._waiting}
             self.sensors = tuple(segment for segment in self._segments if segment in present)
-        elif not given:
+        elif not stated:
             self.close()
             self.sensors = ()
         self.orientations = dict.fromkeys(self.sensors, self._is_aligned())
@@ -145,19 +158,19 @@ class DatagramSource(ABC):
         """Samples in the socket, or the first that come within `timeout_s`."""
         if self._socket is None:
             return []
-        found: dict[str, list[OrientationSample]] = {}
+        by_segment: dict[str, list[OrientationSample]] = {}
         deadline = time.monotonic() + timeout_s
-        while not found:
+        while not by_segment:
             left = deadline - time.monotonic()
             self._serve(time.monotonic())
             ready, _, _ = select.select([self._socket], [], [], max(left, 0.0))
             if ready:
-                self._drain(self._socket, found)
+                self._drain(self._socket, by_segment)
             if left <= 0.0:
                 break
         return [
             Samples(segment, self._find_times(segment, own), *pack_orientations(np.array([each.quat for each in own])))
-            for segment, own in found.items()
+            for segment, own in by_segment.items()
         ]
 
     def _find_times(self, segment: str, samples: Sequence[OrientationSample]) -> np.ndarray:
@@ -170,7 +183,7 @@ class DatagramSource(ABC):
         self._last_times[segment] = newest
         return begin + (newest - begin) * np.arange(1, count + 1) / count
 
-    def _drain(self, udp: socket.socket, found: dict[str, list[OrientationSample]]) -> None:
+    def _drain(self, udp: socket.socket, by_segment: dict[str, list[OrientationSample]]) -> None:
         for _ in range(MAX_DATAGRAMS):
             try:
                 datagram, sender = udp.recvfrom(MAX_SIZE)
@@ -186,7 +199,7 @@ class DatagramSource(ABC):
                 elif not (math.isfinite(size) and abs(size - 1.0) < UNIT_ERROR):
                     self._count("orientations that are none")
                 else:
-                    found.setdefault(sample.segment, []).append(sample._replace(quat=sample.quat / size))
+                    by_segment.setdefault(sample.segment, []).append(sample._replace(quat=sample.quat / size))
 
     def clock(self) -> float:
         """Now [s], monotonic."""

@@ -90,13 +90,13 @@ class SlimeVrSource(DatagramSource):
     @property
     def batteries(self) -> dict[str, float]:
         """Segment → battery of its tracker, 0 to 1, where it is known."""
-        found = {}
+        batteries = {}
         for tracker in self.trackers.values():
             for sensor in tracker.places or {0: ""}:
                 segment = self._find_segment(tracker, sensor)
                 if segment is not None and np.isfinite(tracker.battery):
-                    found[segment] = tracker.battery
-        return found
+                    batteries[segment] = tracker.battery
+        return batteries
 
     def _is_aligned(self) -> bool:
         return False

@@ -16,12 +16,10 @@ from ...model import load_table
 from ...recording.arrivals import Samples
 from .checks import IMPLAUSIBLE, MAX_TIME, keep_plausible
 from .clocks import HostClock
+from .datagrams import MAX_DATAGRAMS, MAX_SIZE, bind_socket
 from .packets import AnyName, Batch, decode
 from .waiting import Waiting, wait_for
 
-MAX_SIZE = 65536  # [bytes] of a datagram
-MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
-BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
 MAX_CLOCKS = 64  # of senders
 MAX_KINDS = 24  # of problems
 MAX_SENSORS = 64  # of any name
@@ -70,19 +68,7 @@ class UdpSource:
         BadSource
             The address cannot be bound, or no samples come.
         """
-        host, port = self.address
-        try:
-            family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-            self._socket = socket.socket(family, kind, protocol)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
-            self._socket.bind(address)
-        except (OSError, UnicodeError) as error:
-            self.close()
-            raise BadSource(
-                f"udp:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); "
-                f"an address of this machine and a port that nobody uses, as udp:9000"
-            ) from None
-        self._socket.setblocking(False)
+        self._socket = bind_socket("udp", *self.address)
         self.address = self._socket.getsockname()[:2]
         if not self.sensors and not self._finds:
             self._find_sensors(waiting)
