@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from arms import write_arm
 from browser import BROWSER, Browser, pixels
 from scipy.spatial.transform import Rotation
 from tornado.httpclient import HTTPRequest
@@ -300,8 +301,8 @@ def test_another_address_than_loopback_needs_the_token(model: BodyModel) -> None
         assert get(f"{address}?token={token}", Origin="http://evil.example")[0] == 403
 
 
-def test_another_body_is_another_page(page: LivePage, person: Person, model: BodyModel) -> None:
-    robot = load_robot(find_map("ur5"))
+def test_another_body_is_another_page(page: LivePage, person: Person, model: BodyModel, tmp_path: Path) -> None:
+    robot = load_robot(find_map(str(write_arm(tmp_path))))
     first = get(page.url)[2]
 
     async def watch(connection: WebSocketClientConnection) -> None:

@@ -88,10 +88,10 @@ class RetargetJob:
         from ..retargeting.trajectory import check_rate
 
         check_selection(self.interval, self.phase)
-        find_map(self.robot)
         check_rate(self.rate_hz)
         check_mapping(self.scale, self.smoothing_hz)
         LimitMargins(self.speed_scale, self.limit_margin).check()
+        find_map(self.robot)
 
 
 class RetargetOutcome(NamedTuple):
