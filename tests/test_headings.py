@@ -117,10 +117,13 @@ def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simula
 def test_joined_hands_are_found_and_hands_apart_are_not(causal: bool) -> None:
     person = simulate_person(4)
     simulation = simulate(person.lengths, seed=4, clasp_s=30.0, circles=4)
-    subject = replace(person.prior, lengths=person.lengths, girdles=RIGID)
+    stated = replace(person.prior, lengths=person.lengths, girdles=RIGID)
     recording = simulation.recording()
     recording = replace(recording, phases={"start": recording.phases["start"]})
-    found = track(recording, subject, causal=causal).correction
+    of_stated_mounts = track(recording, stated, causal=causal).correction
+    assert of_stated_mounts is not None
+    assert of_stated_mounts.found_clasps == ()
+    found = track(recording, replace(stated, mounts=simulation.quat_LS), causal=causal).correction
     assert found is not None
     begin, end = simulation.phases["clasp"][0]
     assert sum(b - a for a, b in found.found_clasps) > 10.0
@@ -178,6 +181,28 @@ def test_only_the_filters_part_of_the_headings_variance_is_held() -> None:
     assert np.all(np.linalg.eigvalsh(held[1].pose.segment_cov[name]) > 0.0)
     end = [np.degrees(np.sqrt(of[0].pose.segment_cov[name][-1, 2, 2])) for of in (held, free)]
     assert end[0] < 0.9 * end[1]
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_the_drift_that_all_sensors_may_share_is_in_the_torsos_heading(causal: bool) -> None:
+    """After a start pose of 0.6 s the biases are hardly known, and neighbours tell differences alone."""
+    person = simulate_person(4)
+    simulation = simulate(person.lengths, seed=4, clasp_s=40.0, circles=2)
+    recording = simulation.recording()
+    begin = recording.phases["start"][0][0]
+    recording = replace(recording, phases={"start": ((begin, begin + 0.6),)})
+    order = (*LENGTHS, *mount_rows("torso"))
+    covariance = np.zeros((len(order), len(order)))
+    covariance[:8, :8] = person.prior.covariance
+    covariance[8:, 8:] = np.deg2rad(4.0) ** 2 * np.eye(3)
+    subject = replace(person.prior, mounts=simulation.quat_LS, order=order, covariance=covariance, girdles=RIGID)
+    drift = {}
+    for open_loop in (True, False):
+        of_heading = track(recording, subject, causal=causal, open_loop=open_loop).pose.segment_cov["torso"][:, 2, 2]
+        drift[open_loop] = np.degrees(np.sqrt(np.ptp(of_heading)))
+    assert drift[True] > 4.0
+    # Five sensors share what they know of the drift that is common to them.
+    assert 0.3 * drift[True] < drift[False] < 1.2 * drift[True]
 
 
 def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tmp_path: Path) -> None:

@@ -38,14 +38,20 @@ def check_time(where: str, time: np.ndarray) -> None:
 
 
 def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tuple[float, float]]]) -> None:
-    """Check that every interval [s] has a positive length and lies in the recording."""
+    """Check that every interval [s] has a positive length and lies in the recording, to one sample."""
+    step = _find_step(time)
     for name, intervals in phases.items():
         for first, last in intervals:
             place = f"{where}: phases.{name}: [{format_time(first)}, {format_time(last)}]"
             if not first < last:
                 raise BadPhase(f"{place} is empty; the first number is the earlier one, in seconds")
-            if first < time[0] - 1e-6 or last > time[-1] + 1e-6:
+            if first < time[0] - step or last > time[-1] + step:
                 raise BadPhase(f"{place} is outside the recording, which runs from {time[0]:.3f} to {time[-1]:.3f} s")
+
+
+def _find_step(time: np.ndarray) -> float:
+    """Find the time [s] from one sample to the next, and a little more."""
+    return 1.01 * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
 # What the options --interval and --phase select ----------------------------------------------------------------------
@@ -85,8 +91,8 @@ def select_interval(
     if phase is not None:
         return _find_phase(phases, phase)
     if interval is not None:
-        step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-        if interval[0] < time[0] - 1.01 * step or interval[1] > time[-1] + 1.01 * step:
+        step = _find_step(time)
+        if interval[0] < time[0] - step or interval[1] > time[-1] + step:
             shown = f"{format_time(interval[0])} {format_time(interval[1])}"
             raise WrongOption("interval", shown, f"the recording runs from {format_span((time[0], time[-1]))}")
     return interval

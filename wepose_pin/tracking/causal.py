@@ -499,7 +499,8 @@ class CausalSegmentEstimator:
             start = compute_start_heading_var(self._start_recording, self.names[i], self._subject, self._start_frames)
             var = with_heading[:, 2]
             grown = np.maximum(var - variance[:, 1], 0.0)
-            cov = replace_heading_variance(cov, R_WV.apply(with_heading), var + start, variance[:, 0] + grown)
+            corrected = np.minimum(variance[:, 0] + grown, var + start)  # the filter may have found the bias
+            cov = replace_heading_variance(cov, R_WV.apply(with_heading), var + start, corrected)
         if self._var_at_reset is not None and np.isfinite(self._var_at_reset[i]):
             var = compute_heading_variance(quat_VS, attitude_cov)
             grown = np.maximum(0.0, var - self._var_at_reset[i])

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,7 +46,8 @@ ITERATIONS = 2  # linearizations of an update
 class ClaspTest:
     """When points of a closure are found to coincide; lengths are rms over the time.
 
-    With the lengths of the population the joined hands of simulated people seem up to 25 cm apart, and are not found.
+    With the lengths of the population or stated mounts the joined hands of simulated people seem up to 25 cm apart, and
+    hands apart seem joined: clasps are found where all mounts between the points are calibrated.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ class HeadingNoise:
     Parameters
     ----------
     drift_psd : [rad²/s] of a heading in motion, beside a rate that changes slowly: scale errors, tissue's wobble
-    rate_std : [rad/s] drift of a heading, at the start
+    rate_std : [rad/s] least drift of a heading, at the start
     rate_change_psd : [rad²/s³] of its random walk: a sensor warms up under its strap
     joint_std, girdle_std : [rad] by which the acceleration of a joint is off in heading, as tissue and a travelling
         shoulder follow the motion; it changes within `joint_correlation_s`
@@ -225,6 +226,7 @@ class HeadingProblem:
     ----------
     names : segments, in the order of δ
     drift_psd : (k,) [rad²/s] most that a heading gains by what is not a rate that changes slowly
+    rate_std : (k,) [rad/s] of the headings' drift at the start
     start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
     levers_at : (pairs, 6) [m] where levers are known; None: they are unknowns
     causal : headings are corrected as samples come; a short clasp then counts as one observation
@@ -240,6 +242,7 @@ class HeadingProblem:
     knot_s: float
     samples_per_knot: int
     drift_psd: np.ndarray
+    rate_std: np.ndarray
     start_var: np.ndarray
     mount_var: np.ndarray
     levers_at: np.ndarray | None = None
@@ -253,21 +256,22 @@ class HeadingProblem:
     @property
     def size(self) -> int:
         levers = 0 if self.levers_at is not None else 6 * len(self.pairs)
-        return 2 * len(self.names) + len(self.pairs) + 3 * len(self.hinges) + levers
+        return self.kept + levers
 
     @property
     def kept(self) -> int:
         """Number of states without levers."""
-        return 2 * len(self.names) + len(self.pairs) + 3 * len(self.hinges)
+        return 3 * len(self.names) + len(self.pairs) + 3 * len(self.hinges)
 
-    def find_segment_variance(self, index: int, variance: Any) -> Any:
-        """Find the variance [rad²] of a segment's heading near the start pose, from that of its sensor's world.
+    def find_segment_variance(self, P: np.ndarray) -> np.ndarray:
+        """Find the variance (k,) [rad²] of the segments' headings near the start pose, in the covariance of the state.
 
-        δ begins at s − ε_z, by errors s of the start pose and ε_z of the mount; a segment that hangs is off by δ + ε_z.
+        δ begins at s − ε_z, by errors s of the start pose and ε_z of the mount, and grows by the drift; a segment that
+        hangs is off by δ + ε_z.
         """
-        start_var, mount_var = self.start_var[index], self.mount_var[index]
-        share = mount_var / max(start_var + mount_var, 1e-12)
-        return (1.0 - share) ** 2 * variance + share * start_var
+        k, first = len(self.names), self.column("mount", 0)
+        mounts = slice(first, first + k)
+        return np.asarray(np.diag(P)[:k] + np.diag(P)[mounts] + 2.0 * np.diag(P[:k, mounts]))
 
     def column(self, part: str, index: int) -> int:
         """Return the column of a state."""
@@ -279,6 +283,7 @@ class HeadingProblem:
             "axis": 2 * k + j,
             "twist": 2 * k + j + h,
             "tilt": 2 * k + j + 2 * h,
+            "mount": 2 * k + j + 3 * h,
         }
         return first[part] + index
 
@@ -322,8 +327,7 @@ class HeadingFilter:
         self.problem = problem
         noise, k = problem.noise, len(problem.names)
         self.x, std = np.zeros(problem.size), np.zeros(problem.size)
-        std[:k] = np.sqrt(problem.start_var + problem.mount_var)
-        std[k : 2 * k] = noise.rate_std
+        std[k : 2 * k] = problem.rate_std
         decay = np.ones(problem.size)
         for i, pair in enumerate(problem.pairs):
             column = problem.column("joint", i)
@@ -336,6 +340,7 @@ class HeadingFilter:
             std[problem.column("twist", i)] = noise.twist_std
             decay[problem.column("twist", i)] = np.exp(-problem.knot_s / noise.twist_correlation_s)
         self.P = np.diag(std**2)
+        self._set_start_covariance()
         self._decay, self._steady = decay, (1.0 - decay**2) * std**2
         self._misfit = np.full(len(problem.pairs), noise.acceleration_std**2)  # [m²/s⁴] recent mean of each axis
         self._last_var: np.ndarray | None = None
@@ -347,10 +352,19 @@ class HeadingFilter:
 
     def reset(self, headings: np.ndarray) -> None:
         """Set δ (k,) [rad] as known to within the start pose."""
-        k = len(headings)
-        self.x[:k] = headings
-        self.P[:k, :], self.P[:, :k] = 0.0, 0.0
-        self.P[np.arange(k), np.arange(k)] = self.problem.start_var + self.problem.mount_var
+        self.x[: len(headings)] = headings
+        self._set_start_covariance()
+
+    def _set_start_covariance(self) -> None:
+        """Set the covariance of δ = s − ε_z and of the mounts' ε_z after a start pose."""
+        k, problem = len(self.problem.names), self.problem
+        headings = np.arange(k)
+        mounts = problem.column("mount", 0) + headings
+        both = np.concatenate([headings, mounts])
+        self.P[both, :], self.P[:, both] = 0.0, 0.0
+        self.P[headings, headings] = problem.start_var + problem.mount_var
+        self.P[mounts, mounts] = problem.mount_var
+        self.P[headings, mounts] = self.P[mounts, headings] = -problem.mount_var
 
     def step(self, knot: Knot) -> np.ndarray:
         """Predict to a knot and update by it; return the step variance (k,) [rad²] that was added."""
@@ -601,11 +615,15 @@ class ClaspDetector:
         self._knots = max(2, int(self._test.seconds / problem.knot_s) - 1)
         self._recent: list[Knot] = []
 
+    @staticmethod
+    def _is_calibrated(closure: Closure, problem: HeadingProblem) -> bool:
+        return all(problem.names[i] in problem.subject.mounts for i in closure.gap.segments)
+
     def find(self, knot: Knot, state: HeadingFilter) -> list[tuple[tuple[str, ...], Rows]]:
         """Return the points that coincide and the rows of the gap between them in the last knot."""
         problem, test = state.problem, self._test
         names, reference = problem.names, problem.model.table.reference
-        if not problem.closures or reference not in names:
+        if reference not in names or not any(self._is_calibrated(closure, problem) for closure in problem.closures):
             return []
         self._recent = [*self._recent, knot][-self._knots :]
         if len(self._recent) < self._knots and len(self._recent) * problem.knot_s < 0.8 * test.seconds:
@@ -621,7 +639,7 @@ class ClaspDetector:
         found = []
         seen = set[tuple[str, ...]]()
         for closure in problem.closures:
-            if closure.points in seen or closure.holds(knot.time).any():
+            if closure.points in seen or closure.holds(knot.time).any() or not self._is_calibrated(closure, problem):
                 continue
             seen.add(closure.points)
             paths = [(way.turn(R, motions).sum(axis=0)[:, None] @ R_reference)[:, 0] for way in closure.ways]
@@ -704,13 +722,26 @@ def build_gap_rows(
     return Rows(sample, r[is_inlier].ravel(), H[is_inlier].reshape(-1, len(problem.names)), np.ones(len(sample)))
 
 
+class SmoothedHeadings(NamedTuple):
+    """The headings at m knots.
+
+    Parameters
+    ----------
+    errors, covariance : (m, k) [rad] and (m, k, k) [rad²] of δ
+    segment_var : (m, k) [rad²] of the segments' headings, see `HeadingProblem.find_segment_variance`
+    clasps : [s] when points were found to coincide
+    """
+
+    errors: np.ndarray
+    covariance: np.ndarray
+    segment_var: np.ndarray
+    clasps: tuple[tuple[float, float], ...]
+
+
 def smooth(
     problem: HeadingProblem, knots: Sequence[Knot]
-) -> tuple[np.ndarray, np.ndarray, tuple[tuple[float, float], ...]]:
-    """Filter and smooth the knots: means (m, k) and covariances (m, k, k) of δ, and the clasps [s] that were found.
-
-    Rauch, Tung, Striebel 1965.
-    """
+) -> SmoothedHeadings:
+    """Filter and smooth the knots (Rauch, Tung, Striebel 1965)."""
     k = len(problem.names)
     forward = HeadingFilter(problem)
     filtered, steps = [], []
@@ -719,7 +750,7 @@ def smooth(
         filtered.append((forward.x, forward.P))
     F = forward.transition()
     x, P = filtered[-1]
-    means, covs = [x[:k]], [P[:k, :k]]
+    means, covs, segment_vars = [x[:k]], [P[:k, :k]], [problem.find_segment_variance(P)]
     for i in range(len(knots) - 2, -1, -1):
         forward.x, forward.P = filtered[i]
         forward.predict(steps[i + 1])
@@ -728,4 +759,5 @@ def smooth(
         P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)
         means.append(x[:k])
         covs.append(P[:k, :k])
-    return np.array(means[::-1]), np.array(covs[::-1]), tuple(forward.clasps)
+        segment_vars.append(problem.find_segment_variance(P))
+    return SmoothedHeadings(*(np.array(each[::-1]) for each in (means, covs, segment_vars)), tuple(forward.clasps))

@@ -48,6 +48,7 @@ from .heading_filter import (
 from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, find_pairs
 
 REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
+LEAST_MOUNT_VAR = np.deg2rad(0.01) ** 2  # [rad²] of a mount's heading, so that covariances can be inverted
 # [s] between knots: causally what a knot observes is corrected by the end of the next one, offline each costs memory.
 CAUSAL_KNOT_S, OFFLINE_KNOT_S = 0.5, 2.0
 # Share of the next knot in which a knot is solved, a part with each sample; over the rest its correction fades in.
@@ -67,7 +68,7 @@ class HeadingCorrection(NamedTuple):
     found_clasps: tuple[tuple[float, float], ...] = ()  # [s] when the hands were found joined
     segments: tuple[str, ...] = ()
     time: np.ndarray | None = None  # (m,) [s] of the covariances
-    covariance: np.ndarray | None = None  # (m, k, k) [rad²] of the segments' heading errors
+    covariance: np.ndarray | None = None  # (m, k, k) [rad²] of the headings of the sensors' worlds
 
     def relative_std(self, near: str, far: str, time: np.ndarray) -> np.ndarray:
         """Return the standard deviation (n,) [rad] of the heading between two segments at these times [s]."""
@@ -166,11 +167,12 @@ def pose_problem(
     stride = find_stride(recording.rate_hz)
     samples = max(1, round((CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S) * recording.rate_hz / stride))
     knot_s = samples * stride / recording.rate_hz
-    drift_psd = np.full(len(names), noise.drift_psd)
+    drift_psd, rate_std = np.full(len(names), noise.drift_psd), np.full(len(names), noise.rate_std)
     for i, name in enumerate(names):
-        if name in orientations.orientation:  # a gyroscope's white noise may be more
-            white = float(np.trace(orientations.orientation[name].noise.gyro_cov)) / (3.0 * recording.rate_hz)
-            drift_psd[i] = max(noise.drift_psd, white)
+        if name in orientations.orientation:  # a gyroscope's white noise may be more, and a short start tells less
+            of_sensor = orientations.orientation[name].noise
+            drift_psd[i] = max(noise.drift_psd, float(np.trace(of_sensor.gyro_cov)) / (3.0 * recording.rate_hz))
+            rate_std[i] = max(noise.rate_std, np.sqrt(float(np.trace(of_sensor.gyro_bias_cov)) / 3.0))
     start_var, mount_var = np.array([find_start_variances(recording, name, subject, model) for name in names]).T
     return HeadingProblem(
         names,
@@ -183,6 +185,7 @@ def pose_problem(
         knot_s,
         samples,
         drift_psd,
+        rate_std,
         start_var,
         mount_var,
         causal=causal,
@@ -193,7 +196,7 @@ def find_start_variances(recording: Recording, segment: str, subject: Subject, m
     """Find the variances [rad²] of a sensor's heading after the start pose: by the pose, and by the mount's heading."""
     table = model.table
     mount_cov = find_mount_covariance(recording, segment, subject)
-    mount_var = 0.0 if mount_cov is None else float(mount_cov[2, 2])
+    mount_var = LEAST_MOUNT_VAR if mount_cov is None else max(float(mount_cov[2, 2]), LEAST_MOUNT_VAR)
     if segment == table.reference:
         return float(REFERENCE_START_STD**2), mount_var
     return compute_start_heading_var(recording, segment, subject, StartFrames(table=table)), mount_var
@@ -326,7 +329,7 @@ class HeadingCorrector:
                 learn.step(knot)
             levers = np.array([learn.x[problem.lever_columns(i)] for i in range(len(problem.pairs))])
             problem = replace(problem, levers_at=levers)
-        self._heading_errors, self._cov, self._clasps = smooth(problem, self._knots)
+        self._smoothed = smooth(problem, self._knots)
         ends = np.array([knot.end for knot in self._knots])
         begins = np.array([knot.time[0] for knot in self._knots])
         self._knot_times = 0.5 * (begins + ends)  # the errors are constant before the first and after the last
@@ -339,15 +342,15 @@ class HeadingCorrector:
         """Return the chunk's orientations with corrected headings, in the second pass; adds its residuals."""
         corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
         for i, name in enumerate(self._names):
-            delta = np.interp(chunk.time, self._knot_times, self._heading_errors[:, i])
+            delta = np.interp(chunk.time, self._knot_times, self._smoothed.errors[:, i])
             corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
             self._max_correction_deg[name] = max(self._max_correction_deg[name], float(np.degrees(np.abs(delta).max())))
             filter_cov = _compute_filter_covariance(orientations, name)
             if filter_cov is not None:
                 with_heading, filter_var = filter_cov
-                variance = np.interp(chunk.time, self._knot_times, self._cov[:, i, i])
-                variance = self._problem.find_segment_variance(i, variance)
+                variance = np.interp(chunk.time, self._knot_times, self._smoothed.segment_var[:, i])
                 before = filter_var + compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
+                variance = np.minimum(variance, before)  # the filter may have found the bias, which is a rate here
                 gap = chunk.sensors[name].gap
                 if gap is not None:  # where the sensor is lost, neighbours do not tell where its segment is
                     variance = np.where(gap, np.maximum(variance, before), variance)
@@ -376,10 +379,10 @@ class HeadingCorrector:
             max_correction_deg=dict(self._max_correction_deg),
             joint_accelerations=tuple(pair.far for pair in self._problem.pairs),
             hinges=tuple(hinge.joint for hinge in self._problem.hinges),
-            found_clasps=self._clasps,
+            found_clasps=self._smoothed.clasps,
             segments=self._names,
             time=self._knot_times,
-            covariance=self._cov,
+            covariance=self._smoothed.covariance,
         )
 
     def _add_residuals(self, stage: str, time: np.ndarray, R_WL: np.ndarray) -> None:
@@ -520,8 +523,7 @@ class CausalHeadings:
         return self._var, self._var_at_knot
 
     def _find_variance(self) -> np.ndarray:
-        var = np.diag(self._filter.P)[: len(self._problem.names)]
-        return np.array([self._problem.find_segment_variance(i, value) for i, value in enumerate(var)])
+        return self._problem.find_segment_variance(self._filter.P)
 
     def summarize(self) -> HeadingCorrection:
         """Return what was observed and corrected so far; residuals are not known."""
