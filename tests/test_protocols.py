@@ -98,7 +98,7 @@ def codes(found: Calibration) -> set[str]:
 
 def measured_instead(found: Calibration) -> set[tuple[str, str]]:
     """What is said of the scale, and which length to measure."""
-    scale = [d for d in found.diagnostics if d.code.startswith("scale")]
+    scale = [d for d in found.diagnostics if "scale" in d.code]
     return {(d.code, str(d.facts["measured"]).partition("=")[0]) for d in scale}
 
 
@@ -298,7 +298,7 @@ def test_a_fixed_point_says_that_it_has_no_scale_and_which_gauge_would_serve() -
     assert ("scale-from-prior", "right_upper_arm") in measured_instead(free)
     width = {"shoulder_width": person.lengths["shoulder_width"]}
     loose = calibrate(recording, measured=width, prior=person.prior, protocol="touch_right")
-    assert ("scale-uncertain", "right_upper_arm") in measured_instead(loose)
+    assert ("limb-scale-from-prior", "right_upper_arm") in measured_instead(loose)
     upper = {"right_upper_arm": person.lengths["right_upper_arm"]}
     good = calibrate(recording, measured=upper, prior=person.prior, protocol="touch_right")
     assert not measured_instead(good)

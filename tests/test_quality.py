@@ -187,7 +187,7 @@ def test_a_measured_length_that_contradicts_all_else_is_named_once(
     assert quality.quality == "fail"
     (contradicted,) = quality.reasons
     # The chain of another person closes worse: what it tells of the scale is less.
-    assert {each.code for each in quality.further} <= {"scale-uncertain"}
+    assert {each.code for each in quality.further} <= {"limb-scale-from-prior"}
     assert (contradicted.code, contradicted.place) == ("measured-length-contradicted", "shoulder_width")
     assert "Shoulder width was measured as 200 mm." in render(contradicted).what
     # Without the tape the solution finds what it said that it would; palms that slip tell a smaller person less.

@@ -15,8 +15,7 @@ from .problem import CalibrationProblem
 from .protocols import PROTOCOLS, load_protocol
 from .weights import MIN_CONTACT
 
-LOOSE_SCALE = 0.6  # of the prior's relative standard deviation, above which a measured length shows little
-LEAST_LOOSE_SCALE = 0.03  # ... but not below this: a measured shoulder width leaves 2.7 %, for shoulders move
+LOOSE_SCALE = 0.6  # of the prior's relative standard deviation, above which a measured length shows little of limbs
 MOST_OPEN = 0.10  # share of a phase in which the closure may be open
 MOST_INTERVALS = 3  # of an open closure that are named, the longest
 
@@ -59,11 +58,9 @@ def diagnose_lengths(
     share[rows] = 1.0 / lengths[rows] / max(len(rows), 1)
     covariance_before = prior.lengths_covariance(names_of_lengths)
     scale_std, before = (float(np.sqrt(share @ C @ share)) for C in (covariance, covariance_before))
-    limit = max(LOOSE_SCALE * before, LEAST_LOOSE_SCALE)
-    if free_scale_std is None and scale_std > limit:
-        diagnostics.append(
-            Diagnostic("scale-uncertain", WARNING, "", scale_std, limit, {"measured": problem.measured_example})
-        )
+    if free_scale_std is None and scale_std > LOOSE_SCALE * before:
+        facts = {"before": before, "measured": problem.measured_example}
+        diagnostics.append(Diagnostic("limb-scale-from-prior", INFO, value=scale_std, facts=facts))
     # Closures show proportions: those must be known better than from the prior and the measured lengths.
     first = [name for name in of_limbs if _is_first(problem, name)]
     for a, b in ((name, other) for name in first for other in chain if other not in first):

@@ -72,7 +72,7 @@ ENOUGH = {
     "motion-lean-small": np.deg2rad(8.0),
     "motion-twist-small": np.deg2rad(12.0),
 }
-ENOUGH_SAMPLES = 12.0  # effective sample size
+ENOUGH_SAMPLES = 12.0  # effective sample size that a minute of motion reaches
 # A direction is determined by the motion where that gives more information than the prior.
 MIN_INFORMATION = 1e-2  # of a direction, in units of the prior's, below which the motion does not show it
 
@@ -321,8 +321,11 @@ def _find_cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...
     least = min(codes, key=lambda code: codes[code] / ENOUGH[code], default="")
     if least and codes[least] < ENOUGH[least]:
         return Diagnostic(least, WARNING, "", float(codes[least]), float(ENOUGH[least]), facts)
-    if calibration.effective_sample_size < ENOUGH_SAMPLES:
-        return Diagnostic("motion-too-short", WARNING, "", calibration.effective_sample_size, ENOUGH_SAMPLES, facts)
+    size = calibration.effective_sample_size
+    if size < SAMPLES.passes:
+        return Diagnostic("motion-too-short", WARNING, "", size, SAMPLES.passes, facts)
+    if size < ENOUGH_SAMPLES:
+        return Diagnostic("motion-short", WARNING, "", size, ENOUGH_SAMPLES)
     return None
 
 

@@ -88,10 +88,11 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
             "the static phase holds no gravity: accel is zero; the filter needs specific force, +g up when static"
         )
     half_second_cov, bias_cov = _compute_half_second_cov(gyro_S, rate_hz), _compute_mean_cov(gyro_S, rate_hz)
-    if worn:
+    if worn:  # what sways comes back: its mean is less than that of independent blocks
         half_second_cov = _estimate_sway_cov(gyro_S, rate_hz, half_second_cov)
         allowed = min(1.0, 2.0 / (SWAY_RATE * len(gyro_S) / rate_hz) ** 2)
-        bias_cov = bias_cov + float(np.trace(half_second_cov)) / 3.0 * allowed * np.eye(3)
+        white_cov = _apply_floor(np.cov(gyro_S.T) / len(gyro_S), BIAS_FLOOR)
+        bias_cov = white_cov + float(np.trace(half_second_cov)) / 3.0 * allowed * np.eye(3)
     return SensorNoise(
         gyro_bias=gyro_S.mean(axis=0),
         gyro_bias_cov=bias_cov,
