@@ -32,6 +32,7 @@ from .joint_accelerations import JointPair, JointSums
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
+BIAS_FOUND_S = 10.0  # [s] over which a filter's heading variance grows slower once it has found its gyroscope's bias
 LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance within so long [s], above which it leaps
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
@@ -79,7 +80,7 @@ class HeadingNoise:
     Parameters
     ----------
     drift_psd : [rad²/s] of a heading in motion, beside a rate that changes slowly: scale errors, tissue's wobble
-    rate_std : [rad/s] least drift of a heading, at the start
+    rate_std : [rad/s] drift of a heading, at the start; more after a short start phase
     rate_change_psd : [rad²/s³] of its random walk: a sensor warms up under its strap
     joint_std, girdle_std : [rad] by which the acceleration of a joint is off in heading, as tissue and a travelling
         shoulder follow the motion; it changes within `joint_correlation_s`
@@ -207,6 +208,13 @@ class Knot(NamedTuple):
     joints: tuple[JointSums | None, ...]
     heading_var: np.ndarray  # (k,) [rad²] of each orientation filter at the end; NaN: it has none
     lost: np.ndarray  # (k,) bool, whether a sensor has lost a sample
+
+
+class Step(NamedTuple):
+    """A prediction: the variance (k,) [rad²] that headings gain beside their rates, and what share of these is left."""
+
+    heading_var: np.ndarray
+    rate_share: np.ndarray  # (k,)
 
 
 class Rows(NamedTuple):
@@ -345,6 +353,8 @@ class HeadingFilter:
         self._misfit = np.full(len(problem.pairs), noise.acceleration_std**2)  # [m²/s⁴] recent mean of each axis
         self._last_var: np.ndarray | None = None
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
+        self._rate_std = problem.rate_std.copy()  # [rad/s] that the orientation filters have left
+        self._growths: list[np.ndarray] = []  # [rad/s] of the orientation filters' heading std, of late
         self._usual_gain = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, largest of late
         self._clasps = ClaspDetector(problem)
         self._closed_before = set[tuple[str, ...]]()  # points that coincided in the last knot
@@ -366,49 +376,58 @@ class HeadingFilter:
         self.P[mounts, mounts] = problem.mount_var
         self.P[headings, mounts] = self.P[mounts, headings] = -problem.mount_var
 
-    def step(self, knot: Knot) -> np.ndarray:
-        """Predict to a knot and update by it; return the step variance (k,) [rad²] that was added."""
-        step_var = self.find_step_variance(knot)
-        self.predict(step_var)
+    def step(self, knot: Knot) -> Step:
+        """Predict to a knot and update by it; return what the prediction was."""
+        step = self.find_step(knot)
+        self.predict(step)
         for _ in self.update(knot):
             pass
-        return step_var
+        return step
 
     def step_gradually(self, knot: Knot) -> Iterator[None]:
         """Do as `step`, in parts of a millisecond or two; the state is valid after the last one."""
-        self.predict(self.find_step_variance(knot))
+        self.predict(self.find_step(knot))
         yield
         yield from self.update(knot)
 
-    def find_step_variance(self, knot: Knot) -> np.ndarray:
-        """Find the variance (k,) [rad²] that the headings have gained in a knot beside their rates.
+    def find_step(self, knot: Knot) -> Step:
+        """Find what the headings have gained in a knot beside their rates, and what is left of these.
 
-        That of the orientation filter includes its gyroscope's bias, which is a rate here: it counts up to `drift_psd`,
-        and as a whole where samples were lost or the rate was cut off, which make it leap.
+        The variance of the orientation filter includes its gyroscope's bias, which is a rate here: it counts up to
+        `drift_psd`, and as a whole where samples were lost or the rate was cut off, which make it leap. Where its
+        standard deviation grows slower than the rate's would let it, the filter has found the bias.
         """
         knot_s, k = self.problem.knot_s, len(self.problem.names)
         if self._last_var is None:
             self._last_var = knot.heading_var
+            self._growths.append(np.where(np.isfinite(knot.heading_var), np.inf, np.nan))
+        else:
+            self._growths.append((np.sqrt(knot.heading_var) - np.sqrt(self._last_var)) / knot_s)
+        self._growths = self._growths[-max(1, round(BIAS_FOUND_S / knot_s)) :]
         gained = np.maximum(knot.heading_var - self._last_var, MIN_DRIFT_PSD * knot_s)
         self._last_var = knot.heading_var
         known = np.isfinite(gained)
+        left = np.maximum(np.max(self._growths, axis=0), self.problem.noise.rate_std)
+        rate_share = np.where(known, np.minimum(left / self._rate_std, 1.0), 1.0)
+        self._rate_std = self._rate_std * rate_share
         leaps = known & (knot.lost | (gained > LEAP * np.maximum(self._usual_gain, self.problem.drift_psd * knot_s)))
         self._usual_gain = np.maximum(self._usual_gain * np.exp(-knot_s / USUAL_S), np.where(known, gained, 0.0))
         limited = np.where(leaps, gained, np.minimum(gained, self.problem.drift_psd * knot_s))
-        return np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k))
+        return Step(np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k)), rate_share)
 
-    def transition(self) -> np.ndarray:
+    def transition(self, step: Step) -> np.ndarray:
         """Return F (n, n) of one knot."""
         k = len(self.problem.names)
         F = np.diag(self._decay)
         F[:k, k : 2 * k] = self.problem.knot_s * np.eye(k)
+        F[np.arange(k, 2 * k), np.arange(k, 2 * k)] = step.rate_share
         return F
 
-    def predict(self, step_var: np.ndarray) -> None:
-        k, F = len(self.problem.names), self.transition()
+    def predict(self, step: Step) -> None:
+        k, F = len(self.problem.names), self.transition(step)
         self.x = F @ self.x
         self.P = F @ self.P @ F.T + np.diag(self._steady)
-        self.P[np.arange(k), np.arange(k)] += step_var
+        self.P[np.arange(k), np.arange(k)] += step.heading_var
         rates = np.arange(k, 2 * k)
         self.P[rates, rates] += self.problem.noise.rate_change_psd * self.problem.knot_s
 
@@ -748,13 +767,12 @@ def smooth(
     for knot in knots:
         steps.append(forward.step(knot))
         filtered.append((forward.x, forward.P))
-    F = forward.transition()
     x, P = filtered[-1]
     means, covs, segment_vars = [x[:k]], [P[:k, :k]], [problem.find_segment_variance(P)]
     for i in range(len(knots) - 2, -1, -1):
         forward.x, forward.P = filtered[i]
         forward.predict(steps[i + 1])
-        gain = np.linalg.solve(forward.P, F @ filtered[i][1]).T
+        gain = np.linalg.solve(forward.P, forward.transition(steps[i + 1]) @ filtered[i][1]).T
         x = filtered[i][0] + gain @ (x - forward.x)
         P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)
         means.append(x[:k])
