@@ -22,6 +22,9 @@ ROUNDING_DEG = 0.01
 # amekf takes the axes of a measurement one after the other and doubts each by itself: their order tells where it does.
 AXES_DEG = 0.05
 THRESHOLD_SHARE = 0.1  # of the stated standard deviation
+# gdc states none, and its step has one size: at its solution it goes to and fro, and the tenth digit of the sampling
+# time decides in which phase.
+CHATTER_DEG = 0.5
 # The others give a filter more, or other samples of the same noise: two estimates of one thing, each within its ±, of
 # which this many together are allowed; where nothing is stated, so many degrees.
 MOST_Z, UNSTATED_DEG = 4.0, 5.0
@@ -34,13 +37,14 @@ class Invariance:
     variant: Variant
     base: Variant = field(default_factory=Variant)
     most_deg: float | None = ROUNDING_DEG
+    unstated_deg: float = 0.0  # of a method that states no standard deviation, where that is more
 
 
 INVARIANCES: Mapping[str, Invariance] = {
     "sensor axes rotated": Invariance(Variant(axes=True), most_deg=AXES_DEG),
     "units changed": Invariance(Variant(other_units=True)),
     "mirrored": Invariance(Variant(mirrored=True)),
-    "time shifted by 1.7e9 s": Invariance(Variant(shift=1.7e9)),
+    "time shifted by 1.7e9 s": Invariance(Variant(shift=1.7e9), unstated_deg=CHATTER_DEG),
     "stillness before": Invariance(Variant(stillness=6.0), most_deg=None),
     "rate doubled": Invariance(Variant(finer=2), Variant(half=2), most_deg=None),
 }
@@ -127,6 +131,8 @@ def _deviation(
             found.degrees, found.of = degrees, segment
         found.z = max(found.z, z)
         most = of.most_deg if of.most_deg is not None else UNSTATED_DEG if std is None else None
+        if most is not None and std is None:
+            most = max(most, of.unstated_deg)
         if of.most_deg is not None and std is not None:  # what is known to degrees may turn on a threshold by a tenth
             most = max(of.most_deg, THRESHOLD_SHARE * float(np.degrees(std[rows][k])))
         if (most is not None and degrees > most) or z > MOST_Z:
