@@ -321,11 +321,11 @@ def _find_cause(calibration: Calibration, motion: Motion, causes: tuple[str, ...
     least = min(codes, key=lambda code: codes[code] / ENOUGH[code], default="")
     if least and codes[least] < ENOUGH[least]:
         return Diagnostic(least, WARNING, "", float(codes[least]), float(ENOUGH[least]), facts)
-    size = calibration.effective_sample_size
-    if size < SAMPLES.passes:
-        return Diagnostic("motion-too-short", WARNING, "", size, SAMPLES.passes, facts)
-    if size < ENOUGH_SAMPLES:
-        return Diagnostic("motion-short", WARNING, "", size, ENOUGH_SAMPLES)
+    samples = calibration.effective_sample_size
+    if samples < SAMPLES.passes:
+        return Diagnostic("motion-too-short", WARNING, "", samples, SAMPLES.passes, facts)
+    if samples < ENOUGH_SAMPLES:
+        return Diagnostic("motion-short", WARNING, "", samples, ENOUGH_SAMPLES)
     return None
 
 

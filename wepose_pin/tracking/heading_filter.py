@@ -757,9 +757,7 @@ class SmoothedHeadings(NamedTuple):
     clasps: tuple[tuple[float, float], ...]
 
 
-def smooth(
-    problem: HeadingProblem, knots: Sequence[Knot]
-) -> SmoothedHeadings:
+def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> SmoothedHeadings:
     """Filter and smooth the knots (Rauch, Tung, Striebel 1965)."""
     k = len(problem.names)
     forward = HeadingFilter(problem)
@@ -778,4 +776,5 @@ def smooth(
         means.append(x[:k])
         covs.append(P[:k, :k])
         segment_vars.append(problem.find_segment_variance(P))
-    return SmoothedHeadings(*(np.array(each[::-1]) for each in (means, covs, segment_vars)), tuple(forward.clasps))
+    errors, covariance, segment_var = (np.array(each[::-1]) for each in (means, covs, segment_vars))
+    return SmoothedHeadings(errors, covariance, segment_var, tuple(forward.clasps))
