@@ -32,7 +32,6 @@ CODES = {"calibrate": {0, 2, 3, 4}, "batch": {0, 2, 3}, "reproduce": {0, 2, 3}}
 USUAL_CODES = {0, 2}
 ACCEPTED = {"calibrate": {0, 3, 4}}
 COMMANDS: dict[str, str] = {}  # ours → the project's, where they differ
-NO_COVARIANCE = ("ncf", "gdc")  # methods that state no uncertainty
 EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet", "out.urdf")
 
 # Codes of diagnostics that say why a segment is not to be believed, by cause; each counts for the segment that it is

@@ -67,11 +67,6 @@ def estimate_headings(observations: Observations, x: np.ndarray, stated: Mapping
     return np.append([known.get(name, 0.0) for name in sensors], steps)
 
 
-def is_linear(conditions: Sequence[Constraint]) -> bool:
-    """Whether headings come from one closure of points that coincide, with all parts but the first vertical."""
-    return find_linear(conditions) is not None
-
-
 def find_linear(conditions: Sequence[Constraint]) -> Loop | None:
     """The one closure of points that coincide, with all parts but the first vertical, that shows all headings."""
     loops = [c for c in conditions if isinstance(c, Loop)]

@@ -37,7 +37,6 @@ from .device import Device, make_table
 from .session_file import read_phases
 
 MAGIC = b"WEPOSE-LIVE-1\n"
-SUFFIX = ".wepose"
 FORMAT = 2  # of the header
 BLOCK = struct.Struct("<4sII")
 HEAD, SAMPLES, EVENT, POSES = b"HEAD", b"SMPL", b"EVNT", b"POSE"

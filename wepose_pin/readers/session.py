@@ -211,7 +211,6 @@ class SessionReader:
         self.rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
         check_phases(str(self.path), self.time, self._head.phases)
         self.phases, self.start_pose, self.remounted = self._head.phases, start_pose, self._head.remounted
-        self.any_aligned = any(plan.aligned for plan in self._plans.values())
         self._refuse_shared_columns()
         self._scanned: Scan | None = None
 

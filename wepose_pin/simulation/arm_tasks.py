@@ -172,10 +172,6 @@ class ArmTasks(BodyMotion):
         lower = self.lengths[f"{side}_forearm"] + self.lengths[f"{side}_hand"]
         return np.sqrt(upper**2 + lower**2 + 2.0 * upper * lower * np.cos(values[:, 3]))
 
-    def _along_T(self, angles: np.ndarray) -> np.ndarray:
-        """Return the direction (n, 3) of the upper arm in T."""
-        return Rotation.from_rotvec(np.pad(angles[:, :2], ((0, 0), (0, 1)))).apply(-E_Z)
-
     def _raising(self, t: np.ndarray, side: str) -> np.ndarray:
         """Compute the rate (n,) [deg/s] at which the arm is raised."""
         before, after = (

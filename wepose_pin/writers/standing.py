@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-STATURE_M = 1.75
-# Where joints of a standing person of that stature are [m]; x forward, z from the floor; y of the left side.
+
+# Where joints of a standing person of 1.75 m are [m]; x forward, z from the floor; y of the left side.
 HIP_Z = 0.95
 LEG = {
     "upper_leg": (0.0, 0.09, HIP_Z),
