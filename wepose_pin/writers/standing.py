@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 # Where joints of a standing person of 1.75 m are [m]; x forward, z from the floor; y of the left side.
 HIP_Z = 0.95
 LEG = {
