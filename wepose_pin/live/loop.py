@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections import deque
@@ -15,7 +16,7 @@ import numpy as np
 from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession
 from ..filters import BEST
-from ..kinematics import LiveKinematics
+from ..kinematics import LiveKinematics, compute_axis_std
 from ..model import BodyModel, load_table
 from ..model.body import load_sensed_model
 from ..model.start_pose import compute_start_configuration
@@ -192,7 +193,9 @@ class LiveLoop:
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
         self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
         self._heading_reset_time = 0.0
-        self._std, self._std_interval_ticks = np.full(len(source.sensors), np.nan), 1
+        self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
+        self._covariance: Iterator[np.ndarray | None] = iter(())  # computed in parts, one or more with each tick
+        self._covariance_ticks, self._covariance_parts = 1, 1  # from one to the next, and parts with a tick
         self._latency = Latencies()
         self._recent_latencies: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s] of displayed poses
         self._first_pose = self._last_pose = 0.0
@@ -248,7 +251,8 @@ class LiveLoop:
             assert synchronizer is not None
             stated = next(iter(self.setup.phases.get("start", ())), None)
             self._start_search = StartPoseSearch(synchronizer, self.source.orientations, stated)
-            self._std_interval_ticks = max(1, round(STATUS_PERIOD_S * synchronizer.rate_hz))
+            self._covariance_ticks = max(1, round(STATUS_PERIOD_S * synchronizer.rate_hz))
+            self._covariance_parts = math.ceil((len(self.source.sensors) + 2) / self._covariance_ticks)
         return self._start_search
 
     # Ticks to poses --------------------------------------------------------------------------------------------------
@@ -268,8 +272,7 @@ class LiveLoop:
             for phase, begins in self._phase_edges.take_due(ticks.time[n]):
                 estimator.mark_phase(phase, begins=begins)
             quat_WL = estimator.step(ticks.gyro_S[n], ticks.accel_S[n])
-            if (ticks.first + n) % self._std_interval_ticks == 0:  # by ticks: a recording reproduces the values
-                self._std = estimator.std()
+            self._update_std(estimator, ticks.first + n)
             if self.log is not None:
                 self.log.pose(ticks.first + n, quat_WL)
         if quat_WL is None:
@@ -283,6 +286,14 @@ class LiveLoop:
         self._recent_latencies.append(latency)
         quat_WL = self.kinematics.orient_segments(quat_WL).copy()
         return LivePose(self._last_pose, quat_WL, points, self._std, ticks.lost[-1].copy(), latency)
+
+    def _update_std(self, estimator: CausalSegmentEstimator, tick: int) -> None:
+        """Compute some of the covariances; by ticks, so that a recording reproduces the values."""
+        if tick % self._covariance_ticks == 0:
+            self._covariance = estimator.covariance_gradually()
+        for covariance in itertools.islice(self._covariance, self._covariance_parts):
+            if covariance is not None:
+                self._std, self._heading_std = compute_axis_std(covariance), np.sqrt(covariance[:, 2, 2])
 
     def _start_tracking(self, search: StartPoseSearch, begin: int, end: int) -> CausalSegmentEstimator:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
@@ -382,9 +393,9 @@ class LiveLoop:
             counts, frozen = synchronizer.counts.copy(), synchronizer.frozen.copy()
             lost |= synchronizer.lost | frozen
             recorded_s = 0.0 if self.log is None else max(0.0, synchronizer.newest - synchronizer.begin)
-        static, bias, heading_std, heading_age = np.zeros(k, dtype=bool), np.zeros((k, 3)), np.full(k, np.nan), 0.0
+        static, bias, heading_age = np.zeros(k, dtype=bool), np.zeros((k, 3)), 0.0
         if estimator is not None:
-            static, bias, heading_std = estimator.static, estimator.gyro_bias, estimator.heading_std()
+            static, bias = estimator.static, estimator.gyro_bias
             heading_age = max(0.0, now - self._heading_reset_time)
         self._count_history.append((now, counts[:, TAKEN]))
         (first_time, first_count), (_, last_count) = self._count_history[0], self._count_history[-1]
@@ -401,7 +412,7 @@ class LiveLoop:
                     bool(lost[i]),
                     bool(static[i]),
                     (float(bias[i, 0]), float(bias[i, 1]), float(bias[i, 2])),
-                    float(heading_std[i]),
+                    float(self._heading_std[i]),
                     heading_age,
                     int(counts[i, MISSING]),
                     int(counts[i, LATE]),
@@ -524,6 +535,6 @@ def warm_up(method: str) -> None:
     estimator = tracker.segment_estimator
     for _ in range(round(2.0 * CAUSAL_KNOT_S * recording.rate_hz)):
         estimator.step(np.zeros((len(sensors), 3)), np.tile([0.0, 0.0, 9.81], (len(sensors), 1)))
-    estimator.std()
+    estimator.covariance()
     synchronizer = StreamSynchronizer(sensors, 100.0, 0.0)
     synchronizer.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))

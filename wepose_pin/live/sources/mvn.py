@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ... import rotations
-from ..mvn_frames import BODY_SEGMENTS, HEADER, ITEM, N_TO_T, SEGMENT_IDS, TYPE
+from ..figure import MEASURED, N_TO_T, SEGMENTS
+from ..mvn_frames import BODY_SEGMENTS, HEADER, ITEM, TYPE
 from .clocks import HostClock
 from .datagrams import DatagramSource, OrientationSample
 
@@ -30,7 +31,8 @@ class MvnSource(DatagramSource):
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._clock = HostClock()
-        self._segment_of = {id_: segment for segment, id_ in SEGMENT_IDS.items() if segment in self._segments}
+        ours = ((k, MEASURED.get(name)) for k, name in enumerate(SEGMENTS))
+        self._segment_of = {k: segment for k, segment in ours if segment in self._segments}
 
     def _is_aligned(self) -> bool:
         return True
@@ -55,8 +57,8 @@ class MvnSource(DatagramSource):
                 id_, *numbers = ITEM.unpack_from(datagram, HEADER.size + k * ITEM.size)
             except struct.error:  # pragma: no cover - the length has been checked
                 return
-            segment = self._segment_of.get(id_)
+            segment = self._segment_of.get(id_ - 1)
             if segment is None:
                 continue
             quat_WB = rotations.xyzw_from_wxyz(np.array(numbers[3:]))
-            yield OrientationSample(segment, time_s, rotations.multiply(quat_WB, N_TO_T[segment]))
+            yield OrientationSample(segment, time_s, rotations.multiply(quat_WB, N_TO_T[id_ - 1]))
