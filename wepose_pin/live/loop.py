@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -48,6 +50,7 @@ from .state import LivePose, Output, SensorStatus, Status, StreamInfo, join_name
 from .ticks import TickStream
 
 STATUS_PERIOD_S = 0.2  # [s]
+SWITCH_INTERVAL_S = 5e-4  # [s] after which page and robot hand over the interpreter to the loop; Python has 5 ms
 READ_TIMEOUT_S = 0.05  # [s]; keys and the status wait for a read
 MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
 MAX_LATENCIES = 1000  # newest latencies in the status
@@ -207,7 +210,9 @@ class LiveLoop:
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> SessionSummary:
         """Run until the source ends, the user presses q, or `should_stop` returns True."""
-        next_status = 0.0
+        next_status, switch_interval = 0.0, sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        gc.freeze()
         try:
             while not should_stop():
                 samples = self.source.read(READ_TIMEOUT_S)
@@ -224,6 +229,8 @@ class LiveLoop:
             self._ended = True
             self._send_status()
         finally:
+            gc.unfreeze()
+            sys.setswitchinterval(switch_interval)
             self.source.close()
             if self.log is not None:
                 self.log.close()
