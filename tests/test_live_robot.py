@@ -693,8 +693,7 @@ def test_wrong_robots_are_one_line_before_the_source_opens(
         (["--robot", str(whole), "--robot-hz", "5"], "--robot-hz 5: from 10 to 1000"),
         (["--robot", str(whole), "--hold-after", "2"], "--hold-after 2, --stop-after 1: seconds, the second longer"),
         (["--robot", str(whole), "--speed-scale", "0"], "--speed-scale 0: above 0, up to 1"),
-        (["--robot", "panda", "--map", str(alone / "other.toml")], "a map goes with a URDF"),
-        (["--robot", str(alone / "arm.urdf"), "--map", str(tmp_path / "no.toml")], "no.toml: no such file"),
+        (["--robot", str(tmp_path / "no.toml")], "no.toml: no such file"),
         (["--arm", "left"], "--arm left: goes with --robot, which is not given"),
         (["--to", "9002"], "--to 9002: goes with --robot"),
     ):
@@ -714,11 +713,12 @@ def test_wrong_robots_are_one_line_before_the_source_opens(
 def test_a_map_may_lie_elsewhere(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     urdf = write_arm(tmp_path)
     (tmp_path / "maps").mkdir()
-    (tmp_path / "arm.toml").rename(tmp_path / "maps" / "mine.toml")
+    text = (tmp_path / "arm.toml").read_text(encoding="utf-8").replace('"arm.urdf"', f'"{urdf}"')
+    (tmp_path / "maps" / "mine.toml").write_text(text, encoding="utf-8")
     with pytest.raises(SystemExit) as stop:
         cli.main(
             ["live", "--source", f"replay:{session}", "--no-page", "--speed", "max"]
-            + ["--robot", str(urdf), "--map", str(tmp_path / "maps" / "mine.toml")]
+            + ["--robot", str(tmp_path / "maps" / "mine.toml")]
         )
     assert stop.value.code == 0
     out = capsys.readouterr().out

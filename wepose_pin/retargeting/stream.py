@@ -48,6 +48,7 @@ CLOSING_GAIN = 5.0  # [1/s] at which the reference closes the distance to its ta
 REACHED_M, REACHED_RAD = 0.02, 0.1  # distance at which it has reached its target
 SPEED_UP_S, SPEED_DOWN_S = 0.2, 0.1  # [s] time constants of the speed allowed
 TRUST_UP_S, TRUST_DOWN_S = 0.5, 0.1  # [s] time constants of the trust
+WAITING = "waiting for a pose"
 TRUSTED = 0.9  # below it the state is "slow"
 
 
@@ -379,7 +380,7 @@ class CommandStream:
         if self._end_reason or self._stop_reason:
             return self._brake_to_rest(self._end_reason or self._stop_reason, final=True)
         if not self._observed:
-            return self._brake_to_rest("waiting for a pose")
+            return self._brake_to_rest(WAITING)
         if age > hold_after:
             return self._brake_to_rest(f"no sound pose for {hold_after:g} s")
         return self._follow(now)
@@ -427,7 +428,8 @@ class CommandStream:
             turn = pin.log3(target.rotation @ pose.rotation.T)
             error[i] = _norm(pose.hand - target.position), _norm(turn)
         if not all(reference.reached for reference in self._references):
-            return self._command("approach", self._approach_reason, error)
+            why = "" if self._approach_reason in ("", WAITING) else f": {self._approach_reason}"
+            return self._command("approach", f"on the way to the person's hands{why}", error)
         self._approach_reason = ""
         arms = zip(self.robot.arms, self._observed, self._trust, strict=True)
         poor = [_describe_doubt(arm.side, observation) for arm, observation, trust in arms if trust < TRUSTED]
