@@ -81,9 +81,10 @@ class AssignedSource:
         self.source, self.segments, self._is_open = source, dict(segments), is_open
         self.sensors = tuple(segment for segment in order if segment in self.segments.values())
         self.rate_hz, self.problems = source.rate_hz, source.problems
-        self.orientations = self._rename_orientations()
 
-    def _rename_orientations(self) -> Mapping[str, bool]:
+    @property
+    def orientations(self) -> dict[str, bool]:
+        """As of the source, by segment."""
         return {self.segments[name]: own for name, own in self.source.orientations.items() if name in self.segments}
 
     def open(self, waiting: Waiting | None = None) -> None:
@@ -91,7 +92,6 @@ class AssignedSource:
         if not self._is_open:
             self.source.open(waiting)
             self._is_open = True
-            self.orientations = self._rename_orientations()
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         """Samples of the assigned sensors since the last call; None at the end."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
 from ..model import BodyModel, BodyTable, load_table
-from ..retargeting import LimitMargins, Robot
+from ..retargeting import Robot
 from ..retargeting.stream import ArmObserver, Command, CommandStream, StreamOptions, check_segments
 from ..subject import population_subject
 from .loop import Latencies

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import contextlib
 import hashlib
 import hmac
 import json
@@ -18,6 +17,7 @@ from ipaddress import ip_address
 from typing import Any
 
 from ..errors import BadOption
+from .addresses import name_host
 from .encoder import PoseEncoder
 from .state import GuideView, Status, round_finite
 
@@ -82,7 +82,7 @@ class Server:
             ) from None
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
-        self.url = f"http://{_name_host(host)}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+        self.url = f"http://{name_host(host)}:{self.port}/" + (f"?token={self.token}" if self.token else "")
         self._loop = asyncio.new_event_loop()
         self._end = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="live page", daemon=True)
@@ -203,16 +203,6 @@ class Server:
             f"default-src 'none'; script-src {self._scripts}; style-src 'unsafe-inline'; img-src data:; "
             f"connect-src ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
-
-
-def _name_host(host: str) -> str:
-    """The address under which others reach `host`, as a URL has it; of "any address" that of this machine's network."""
-    if host in ("0.0.0.0", "::"):
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.socket(family, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
-            probe.connect(("2001:db8::1" if ":" in host else "192.0.2.1", 9))  # sends nothing
-            host = str(probe.getsockname()[0])
-    return f"[{host}]" if ":" in host else host
 
 
 def _build_application(server: Server) -> Any:

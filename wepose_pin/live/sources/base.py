@@ -17,14 +17,19 @@ class Source(Protocol):
     sensors : segments, in the order in which results name them
     rate_hz : nominal samples a second of each; None where it has to be measured
     problems : problem → count of what was dropped so far ("bad checksums": 3)
-    orientations : segments whose samples are measured orientations (`pack_orientations`) → whether these are the
-        segment's own, in one world; else they are the sensor's, in a world of its own
     """
 
     sensors: tuple[str, ...]
     rate_hz: float | None
     problems: dict[str, int]
-    orientations: Mapping[str, bool]
+
+    @property
+    def orientations(self) -> Mapping[str, bool]:
+        """Sensors whose samples are measured orientations (`pack_orientations`) → whether these are the segment's own.
+
+        Then they are in one world; else they are the sensor's, in a world of its own.
+        """
+        ...
 
     def open(self, waiting: Waiting | None = None) -> None:
         """Connect, or bind, and wait for what is not there yet: with `waiting` until it returns False.
@@ -54,6 +59,21 @@ class ReportsBattery(Protocol):
     def batteries(self) -> Mapping[str, float]:
         """Sensor → share of its charge, 0 to 1, of those that have said it."""
         ...
+
+
+@runtime_checkable
+class ReportsAddress(Protocol):
+    """A source that knows where it waits for what."""
+
+    @property
+    def awaited(self) -> str:
+        """What is waited for, and at which address."""
+        ...
+
+
+def find_awaited(source: Source) -> str:
+    """What a source waits for and where, as a sentence; empty where it does not know."""
+    return f"Waiting for {source.awaited}." if isinstance(source, ReportsAddress) else ""
 
 
 def find_batteries(source: Source) -> Mapping[str, float]:

@@ -17,25 +17,23 @@ from ... import rotations
 from ..figure import MEASURED, N_TO_T, SEGMENTS
 from ..mvn_frames import BODY_SEGMENTS, HEADER, ITEM, TYPE
 from .clocks import HostClock
-from .datagrams import DatagramSource, OrientationSample
+from .datagrams import OrientationSample, OrientationSource
 
 PORT = 9763
 CHARACTER = 0  # the first person
 
 
-class MvnSource(DatagramSource):
+class MvnSource(OrientationSource):
     """Orientations of the segments that MVN streams; parameters and errors as `DatagramSource`."""
 
     kind, sender, has_clock = "mvn", "frames of the MVN network streamer (type 02, quaternions)", True
+    aligned = True
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._clock = HostClock()
         ours = ((k, MEASURED.get(name)) for k, name in enumerate(SEGMENTS))
         self._segment_of = {k: segment for k, segment in ours if segment in self._segments}
-
-    def _is_aligned(self) -> bool:
-        return True
 
     def _decode(self, datagram: bytes, _sender: Any, now: float) -> Iterator[OrientationSample]:
         if len(datagram) < HEADER.size or datagram[:4] != TYPE[:4]:
