@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..documents import read_toml, toml_key, toml_string, whole_file
 from ..errors import BadSession
-from ..recording.arrivals import Samples
-from .sources.base import Source, find_batteries
+from ..recording.arrivals import Samples, unpack_orientations
+from .sources.base import Source, find_awaited, find_batteries
 from .sources.waiting import Waiting
 
 SETUP_FILE = "setup.toml"
@@ -19,6 +19,7 @@ SETUP_FORMAT = 1
 SHAKE_WINDOW_S = 0.8  # [s] newest samples by which a shake is detected
 SHAKE_RATE = 2.5  # [rad/s] rms of a sensor that is shaken; a person who stands is below 0.1
 CALM_RATE = 0.6  # [rad/s] below which all must be before the next shake counts
+SHORTEST_STEP_S = 2e-3  # [s] between two orientations: of a tracker that does not tell its time they come in bursts
 SHAKE_RATIO = 1.6  # of the shaken sensor's rms to that of every other candidate
 
 
@@ -28,14 +29,28 @@ class ShakeDetector:
     def __init__(self) -> None:
         self._recent: dict[str, deque[tuple[float, float]]] = {}  # sensor → time [s], squared rate [rad²/s²]
         self._calm = False
+        self._last: dict[str, tuple[float, np.ndarray]] = {}  # sensor → time [s] and (4,) of its last orientation
 
-    def push(self, samples: Iterable[Samples]) -> None:
-        """Add samples of any sensors."""
+    def push(self, samples: Iterable[Samples], measured: Collection[str] = ()) -> None:
+        """Add samples of any sensors; those of `measured` are orientations."""
         for chunk in samples:
             recent = self._recent.setdefault(chunk.sensor, deque())
-            recent.extend(zip(chunk.time.tolist(), np.sum(chunk.gyro_S**2, axis=1).tolist(), strict=True))
+            squares = np.sum(chunk.gyro_S**2, axis=1)
+            if chunk.sensor in measured:
+                squares = self._square_rates(chunk)
+            recent.extend(zip(chunk.time.tolist(), squares.tolist(), strict=True))
             while recent and recent[0][0] < recent[-1][0] - SHAKE_WINDOW_S:
                 recent.popleft()
+
+    def _square_rates(self, chunk: Samples) -> np.ndarray:
+        """Square the rates (n,) [rad²/s²] from each orientation to the next."""
+        quat, time_s = unpack_orientations(chunk.gyro_S, chunk.accel_S), chunk.time
+        last_time, last_quat = self._last.get(chunk.sensor, (time_s[0], quat[0]))
+        self._last[chunk.sensor] = float(time_s[-1]), quat[-1]
+        before = np.concatenate([last_quat[None], quat[:-1]])
+        half_angle = np.arccos(np.minimum(np.abs(np.sum(before * quat, axis=1)), 1.0))
+        step_s = np.maximum(np.diff(time_s, prepend=last_time), SHORTEST_STEP_S)
+        return np.asarray((2.0 * half_angle / step_s) ** 2)
 
     def find(self, candidates: Sequence[str]) -> str | None:
         """The candidate that is shaken; None: none, several, or those of the last shake still move."""
@@ -109,6 +124,11 @@ class AssignedSource:
         """Segment → share of its sensor's charge, 0 to 1, where it is known."""
         known = find_batteries(self.source).items()
         return {self.segments[name]: charge for name, charge in known if name in self.segments}
+
+    @property
+    def awaited(self) -> str:
+        """As of the source; empty where it does not know."""
+        return find_awaited(self.source)
 
     def clock(self) -> float:
         return self.source.clock()

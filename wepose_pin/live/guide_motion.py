@@ -106,7 +106,7 @@ class ExerciseStep(Step):
         self._begin = max(self._begin, now + RESUME_S)
 
     def _join_lost(self) -> str:
-        return self.guide.join_sensors([name for name in self.guide.options.order if name in self._lost_segments])
+        return self.guide.join_sensors([name for name in self.guide.order if name in self._lost_segments])
 
     def actions(self) -> list[GuideAction]:
         measured_s = 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)

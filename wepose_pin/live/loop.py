@@ -45,7 +45,7 @@ from ..tracking.headings import CAUSAL_KNOT_S
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates
 from ..writers.live_log import LiveLog
 from .setup import SensorSetup
-from .sources.base import Source, find_batteries
+from .sources.base import Source, find_awaited, find_batteries
 from .state import LivePose, Output, SensorStatus, Status, StreamInfo, join_names
 from .ticks import TickStream
 
@@ -454,7 +454,9 @@ class LiveLoop:
         if self._start_search is None:
             missing_sensors = [name for name in self.source.sensors if self._stream.newest_times[name] == -np.inf]
             if missing_sensors:
-                return "waiting", f"Waiting for {join_names(missing_sensors)}.", 0.0
+                nothing, awaited = len(missing_sensors) == len(self.source.sensors), find_awaited(self.source)
+                where = f" Waiting for {awaited}." if nothing and awaited else ""
+                return "waiting", f"Nothing has come yet from {join_names(missing_sensors)}.{where}", 0.0
             return "waiting", "Measuring the sampling rate.", 0.0
         search, detector = self._start_search, self._start_search.detector
         if search.stated is not None:

@@ -72,8 +72,8 @@ class ReportsAddress(Protocol):
 
 
 def find_awaited(source: Source) -> str:
-    """What a source waits for and where, as a sentence; empty where it does not know."""
-    return f"Waiting for {source.awaited}." if isinstance(source, ReportsAddress) else ""
+    """What a source waits for, and where; empty where it does not know."""
+    return source.awaited if isinstance(source, ReportsAddress) else ""
 
 
 def find_batteries(source: Source) -> Mapping[str, float]:
