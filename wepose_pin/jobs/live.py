@@ -80,7 +80,7 @@ class LiveJob:
         Send each pose as JSON to this UDP port (docs/live-page.md). Without HOST to this machine.
     mvn : [HOST:]PORT
         Send each pose to this UDP port as the Xsens MVN network streamer does (port 9763 by habit): the whole figure,
-        its legs standing.
+        its legs standing where no sensor measures them.
     vmc : [HOST:]PORT
         Send each pose to this UDP port by the VMC protocol (OSC; 39539 by habit), for Unity, VSeeFace or Blender.
     lsl : NAME

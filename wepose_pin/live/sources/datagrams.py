@@ -124,8 +124,11 @@ class DatagramSource(ABC):
         """
         self._socket = bind_socket(self.kind, *self.address)
         self.address = self._socket.getsockname()[:2]
-        if self.sensors or self._finds:
-            return
+        if not self.sensors and not self._finds:
+            self._find_sensors(waiting)
+
+    def _find_sensors(self, waiting: Waiting | None) -> None:
+        """Take the sensors that send."""
         self.sensors = tuple(self._segments)
         try:
             found = wait_for(self._find_any, lambda: self.awaited, self._wait_s, waiting)
