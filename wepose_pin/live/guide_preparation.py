@@ -36,11 +36,11 @@ class SensorStep(Step):
 
     def view(self) -> GuideView:
         count, needed = len(self.guide.newest_times) - len(self.guide.silent), len(self.guide.needs)
-        sentence = f"Strap the sensors on and switch them on: {count} of {needed} send."
+        sentence, note = "Strap the sensors on and switch them on", self.guide.describe_silent()
+        awaited = "" if self.guide.newest_times else find_awaited(self.guide.source)
+        sentence = f"{sentence}. Waiting for {awaited}." if awaited else f"{sentence}: {count} of {needed} send."
         if count >= needed:
             sentence = f"{count} sensors send. Are all strapped on tightly?"
-        awaited = "" if self.guide.newest_times else find_awaited(self.guide.source)
-        note = f"Waiting for {awaited}." if awaited else self.guide.describe_silent()
         return GuideView(sentence, note, progress=min(1.0, count / max(needed, 1)), reasons=self._warn_of_trackers())
 
     def _warn_of_trackers(self) -> tuple[str, ...]:

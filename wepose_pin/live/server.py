@@ -217,9 +217,7 @@ def _build_application(server: Server) -> Any:
         elif origin is not None and origin != f"http://{host}":
             handler.set_status(403)
             handler.finish("This page speaks to itself only.")
-        elif server.token and not hmac.compare_digest(
-            handler.get_query_argument("token", "").encode(), server.token.encode()
-        ):
+        elif not server.accepts_token(handler.get_query_argument("token", "")):
             handler.set_status(403)
             handler.finish("The address of this page has a token, as the terminal shows it.")
 
