@@ -221,7 +221,7 @@ def test_sensors_that_were_mistaken_are_exchanged_without_another_motion(tmp_pat
     assert session.clicks == ["next", "next", "exchange", "accept"]
     assert session.guide.segments == session.person.worn
     said = next(m.view for m in moments if m.view.quality == "fail")
-    assert said.sentence == "Some sensors sit on other segments than assigned."
+    assert said.sentence == "Some sensors sit on other segments than assigned. The same motion will do."
     assert "left forearm and right forearm seem to be exchanged" in said.reasons[0]
     recording = load_session(tmp_path / "calibration-1.wepose")
     assert calibrate_recording(recording, MEASURED)[1].quality == "pass"

@@ -145,7 +145,7 @@ class ExerciseStep(Step):
         return view._replace(
             lengths=_list_lengths(calibration),
             sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES),
-            reasons=_advise(quality),
+            reasons=() if calibration.labels.moved else _advise(quality),
         )
 
 
@@ -232,15 +232,16 @@ class CalibrationStep(Step):
         }[quality.quality]
         if quality.quality == "poor" and all(reason.code.startswith("scale-") for reason in quality.reasons):
             sentence = "The proportions are good. One measured length gives the scale too."
-        if self._moved:
-            sentence = "Some sensors sit on other segments than assigned."
+        reasons = [text.line() for _, text in render_all(quality.reasons)]
+        if self._moved:  # all other reasons follow from this one
+            sentence, reasons = "Some sensors sit on other segments than assigned. The same motion will do.", reasons[:1]
         return GuideView(
             sentence,
             progress=1.0,
             lengths=_list_lengths(calibration),
             sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES),
             quality=quality.quality,
-            reasons=tuple(text.line() for _, text in render_all(quality.reasons)),
+            reasons=tuple(reasons),
             measurable=self._measurable,
         )
 

@@ -103,7 +103,7 @@ function small(id, value, unit) {
 
 // ---- the guided session
 const MAIN = ["next", "accept", "exchange"];
-let guideSays = "", spokenCount = null, voice = false;
+let guided = false, guideSays = "", spokenCount = null, voice = false;
 function speak(what) {
   if (!voice || !what) return;
   speechSynthesis.cancel();
@@ -116,7 +116,8 @@ function button({ name, label, key }, main) {
   element.addEventListener("click", () => ask(name));
 }
 function showGuide(guide) {
-  document.body.classList.toggle("guided", guide !== null);
+  guided = guide !== null;
+  document.body.classList.toggle("guided", guided);
   $("steps").hidden = $("result").hidden = guide === null;
   $("note").hidden = !guide?.note;
   if (guide === null) { $("actions").replaceChildren(); return; }
@@ -245,7 +246,7 @@ function addAngles({ time, joints }) {
 }
 function drawCurves() {
   const canvas = $("plot"), shown = Object.keys(curves).filter((joint) => groupOf(joint) === $("joint").value);
-  if (document.body.classList.contains("guided") || !shown.length || !canvas.clientWidth) return;
+  if (guided || !shown.length || !canvas.clientWidth) return;
   const scale = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
   canvas.width = width * scale;
   canvas.height = height * scale;
@@ -354,7 +355,7 @@ addEventListener("keyup", (event) => {                                   // spac
 function draw() {
   const eye = viewer.scene.worldToLocal(viewer.camera.position.clone());
   ribbons.forEach((ribbon, k) => {
-    ribbon.mesh.visible = trailsShown && paths[k].length > 1;
+    ribbon.mesh.visible = trailsShown && !guided && paths[k].length > 1;
     if (ribbon.mesh.visible) ribbon.draw(paths[k], now, eye);
   });
   viewer.render();
