@@ -13,6 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from wepose_pin.live.sources.base import Source
 from wepose_pin.recording.arrivals import Samples, pack_orientations, unpack_orientations
 from wepose_pin.rotations import exp, multiply
 from wepose_pin.simulation import PRESETS, Simulation, simulate, simulate_person
@@ -98,19 +99,21 @@ class GuidedPerson:
         return multiply(exp([0.0, 0.0, 0.7 * list(self.worn.values()).index(segment)]), quat)
 
 
-class PersonSource:
+class PersonSource(Source):
     """A source with a clock of its own: the person acts as fast as the guide takes samples."""
 
-    rate_hz: float | None = RATE_HZ
-
     def __init__(self, person: GuidedPerson, step_s: float = 0.05) -> None:
-        self.person, self.sensors, self.problems = person, tuple(person.worn), dict[str, int]()
-        aligned = person.orientations == "segment"
-        self.orientations = dict.fromkeys(person.worn, aligned) if person.orientations else {}
+        super().__init__(person.worn, RATE_HZ)
+        self.person = person
         self._rows, self._now = round(step_s * RATE_HZ), 0.0
         self.asleep_s = 0.0  # [s] for which nothing comes
 
-    def open(self, _waiting: object = None) -> None: ...
+    @property
+    def orientations(self) -> dict[str, bool]:
+        aligned = self.person.orientations == "segment"
+        return dict.fromkeys(self.person.worn, aligned) if self.person.orientations else {}
+
+    def open(self, waiting: object = None) -> None: ...
 
     def clock(self) -> float:
         return self._now

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -258,7 +258,9 @@ def test_a_setup_with_a_wrong_segment_is_refused(tmp_path: Path) -> None:
 
 def test_the_battery_of_a_sensor_goes_with_its_segment() -> None:
     class Charged(PersonSource):
-        batteries: ClassVar = {"a7": 0.4, "zz": 0.1}
+        @property
+        def batteries(self) -> dict[str, float]:
+            return {"a7": 0.4, "zz": 0.1}
 
     person = GuidedPerson(perform(*PERSON))
     assert AssignedSource(Charged(person), person.worn, ("torso",)).batteries == {"torso": 0.4}

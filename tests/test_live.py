@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,19 +66,14 @@ class Watcher:
         self.closed = True
 
 
-class Chaos:
+class Chaos(Source):
     """A recording whose samples come as they may: a virtual clock, 20 ms from read to read."""
 
-    rate_hz: float | None
-
     def __init__(self, recording: Recording, arrivals: list[tuple[float, Samples]]) -> None:
-        self.sensors = tuple(recording.sensors)
-        self.rate_hz = recording.rate_hz
-        self.problems: dict[str, int] = {}
-        self.orientations: Mapping[str, bool] = {}
+        super().__init__(recording.sensors, recording.rate_hz)
         self._arrivals, self._now, self._at = sorted(arrivals, key=lambda a: a[0]), float(recording.time[0]), 0
 
-    def open(self, _waiting: object = None) -> None: ...
+    def open(self, waiting: object = None) -> None: ...
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         assert timeout_s > 0.0

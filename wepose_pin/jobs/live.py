@@ -275,7 +275,7 @@ def _open_page(
     page.open()
     if "token=" in page.url:
         say(f"Page: {page.url}")
-        say(f"Whoever reaches this machine at {job.host} and has this address can watch and press the page's buttons.")
+        say("Whoever reaches this machine there and has this address can watch and press the page's buttons.")
     else:
         say(f"Page: {page.url}  (this machine only)")
     if job.open:

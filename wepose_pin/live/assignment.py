@@ -11,7 +11,7 @@ import numpy as np
 from ..documents import read_toml, toml_key, toml_string, whole_file
 from ..errors import BadSession
 from ..recording.arrivals import Samples, unpack_orientations
-from .sources.base import Source, find_awaited, find_batteries
+from .sources.base import Source
 from .sources.waiting import Waiting
 
 SETUP_FILE = "setup.toml"
@@ -80,7 +80,7 @@ class ShakeDetector:
         return float(np.sqrt(np.mean([square for _, square in recent]))) if recent else 0.0
 
 
-class AssignedSource:
+class AssignedSource(Source):
     """A source whose sensors are named by the segments that they are assigned to.
 
     Parameters
@@ -93,9 +93,9 @@ class AssignedSource:
     def __init__(
         self, source: Source, segments: Mapping[str, str], order: Iterable[str], is_open: bool = False
     ) -> None:
+        super().__init__((segment for segment in order if segment in segments.values()), source.rate_hz)
         self.source, self.segments, self._is_open = source, dict(segments), is_open
-        self.sensors = tuple(segment for segment in order if segment in self.segments.values())
-        self.rate_hz, self.problems = source.rate_hz, source.problems
+        self.problems = source.problems
 
     @property
     def orientations(self) -> dict[str, bool]:
@@ -122,13 +122,12 @@ class AssignedSource:
     @property
     def batteries(self) -> dict[str, float]:
         """Segment → share of its sensor's charge, 0 to 1, where it is known."""
-        known = find_batteries(self.source).items()
-        return {self.segments[name]: charge for name, charge in known if name in self.segments}
+        return {self.segments[name]: charge for name, charge in self.source.batteries.items() if name in self.segments}
 
     @property
     def awaited(self) -> str:
-        """As of the source; empty where it does not know."""
-        return find_awaited(self.source)
+        """As of the source."""
+        return self.source.awaited
 
     def clock(self) -> float:
         return self.source.clock()

@@ -234,7 +234,10 @@ class CalibrationStep(Step):
             sentence = "The proportions are good. One measured length gives the scale too."
         reasons = [text.line() for _, text in render_all(quality.reasons)]
         if self._moved:  # all other reasons follow from this one
-            sentence, reasons = "Some sensors sit on other segments than assigned. The same motion will do.", reasons[:1]
+            sentence, reasons = (
+                "Some sensors sit on other segments than assigned. The same motion will do.",
+                reasons[:1],
+            )
         return GuideView(
             sentence,
             progress=1.0,

@@ -12,7 +12,6 @@ from ..tracking.start_pose import StartPoseDetector, TickRates
 from .assignment import ShakeDetector
 from .attempt import Attempt
 from .guide import AGAIN, GET_READY_S, NEXT, Guide, Step
-from .sources.base import find_awaited
 from .state import GuideAction, GuideView, join_names
 
 STATIC_S = 2.0  # [s] of standing still in which the sensors are checked
@@ -37,7 +36,7 @@ class SensorStep(Step):
     def view(self) -> GuideView:
         count, needed = len(self.guide.newest_times) - len(self.guide.silent), len(self.guide.needs)
         sentence, note = "Strap the sensors on and switch them on", self.guide.describe_silent()
-        awaited = "" if self.guide.newest_times else find_awaited(self.guide.source)
+        awaited = "" if self.guide.newest_times else self.guide.source.awaited
         sentence = f"{sentence}. Waiting for {awaited}." if awaited else f"{sentence}: {count} of {needed} send."
         if count >= needed:
             sentence = f"{count} sensors send. Are all strapped on tightly?"

@@ -45,7 +45,7 @@ from ..tracking.headings import CAUSAL_KNOT_S
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates
 from ..writers.live_log import LiveLog
 from .setup import SensorSetup
-from .sources.base import Source, find_awaited, find_batteries
+from .sources.base import Source
 from .state import LivePose, Output, SensorStatus, Status, StreamInfo, join_names
 from .ticks import TickStream
 
@@ -407,7 +407,7 @@ class LiveLoop:
         self._count_history.append((now, counts[:, TAKEN]))
         (first_time, first_count), (_, last_count) = self._count_history[0], self._count_history[-1]
         rates = (last_count - first_count) / (now - first_time) if now > first_time else np.zeros(k)
-        battery = find_batteries(self.source)
+        battery = self.source.batteries
         latencies_ms = 1e3 * np.array(self._recent_latencies or [0.0])
         return Status(
             *self._describe_state(lost, frozen),
@@ -454,7 +454,7 @@ class LiveLoop:
         if self._start_search is None:
             missing_sensors = [name for name in self.source.sensors if self._stream.newest_times[name] == -np.inf]
             if missing_sensors:
-                nothing, awaited = len(missing_sensors) == len(self.source.sensors), find_awaited(self.source)
+                nothing, awaited = len(missing_sensors) == len(self.source.sensors), self.source.awaited
                 where = f" Waiting for {awaited}." if nothing and awaited else ""
                 return "waiting", f"Nothing has come yet from {join_names(missing_sensors)}.{where}", 0.0
             return "waiting", "Measuring the sampling rate.", 0.0

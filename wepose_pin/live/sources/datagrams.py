@@ -6,8 +6,7 @@ import math
 import select
 import socket
 import time
-from abc import ABC, abstractmethod
-from collections import Counter
+from abc import abstractmethod
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from ...errors import BadSource
 from ...model import load_table
 from ...recording.arrivals import Samples, pack_orientations
 from ..addresses import name_host
+from .base import Source
 from .packets import AnyName
 from .waiting import Waiting, wait_for
 
@@ -63,7 +63,7 @@ class OrientationSample(NamedTuple):
     quat: np.ndarray  # (4,) xyzw, not yet of unit length
 
 
-class DatagramSource(ABC):
+class DatagramSource(Source):
     """A UDP socket that takes datagrams from any sender; `_take` makes samples of them.
 
     Parameters
@@ -92,9 +92,7 @@ class DatagramSource(ABC):
         segments: Collection[str] | None = None,
         wait_s: float = 10.0,
     ) -> None:
-        self.sensors = tuple(sensors or ())
-        self.rate_hz: float | None = None
-        self.problems: dict[str, int] = Counter()
+        super().__init__(sensors or ())
         self.address = (host, port)
         self._finds = isinstance(segments, AnyName)
         self._segments = load_table().segments if segments is None else segments
@@ -104,14 +102,13 @@ class DatagramSource(ABC):
 
     @property
     def orientations(self) -> dict[str, bool]:
-        """Of each sensor whose samples are orientations whether these are the segment's own."""
         return {} if self.aligned is None else dict.fromkeys(self.sensors, self.aligned)
 
     @abstractmethod
     def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
         """Make samples of datagrams, each with its sender's address, that came by `now` [s]; one `Samples` a sensor."""
 
-    def _serve(self, now: float) -> None:  # noqa: B027 - most senders want to hear nothing
+    def _serve(self, now: float) -> None:
         """Do what senders want to hear from time to time; `now` [s]."""
 
     def open(self, waiting: Waiting | None = None) -> None:
@@ -151,7 +148,6 @@ class DatagramSource(ABC):
 
     @property
     def awaited(self) -> str:
-        """What is waited for, and at which address."""
         host, port = self.address
         dropped = ", ".join(f"{count} {problem}" for problem, count in self.problems.items())
         here = " (this machine only)" if host.startswith("127.") or host == "::1" else ""
@@ -200,10 +196,6 @@ class DatagramSource(ABC):
         if self._finds and sensor not in self.sensors and len(self.sensors) < MAX_SENSORS:
             self.sensors += (sensor,)
         return sensor in self.sensors
-
-    def clock(self) -> float:
-        """Now [s], monotonic."""
-        return time.monotonic()
 
     def close(self) -> None:
         """Free the port."""

@@ -28,8 +28,12 @@ class UdpSource(DatagramSource):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self.batteries: dict[str, float] = {}
+        self._batteries: dict[str, float] = {}
         self._clocks: OrderedDict[tuple[str, int], HostClock] = OrderedDict()
+
+    @property
+    def batteries(self) -> dict[str, float]:
+        return self._batteries
 
     def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
         """Each sender's samples together, since its newest one determines its clock best."""
@@ -58,7 +62,7 @@ class UdpSource(DatagramSource):
             self._count(IMPLAUSIBLE, len(batch.time))
             return False
         if math.isfinite(batch.battery):
-            self.batteries[batch.sensor] = batch.battery
+            self._batteries[batch.sensor] = batch.battery
         return True
 
     def _join(self, sensor: str, parts: list[tuple[np.ndarray, np.ndarray]]) -> list[Samples]:
