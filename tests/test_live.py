@@ -20,7 +20,7 @@ from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
-from wepose_pin.live.state import LivePose, Status, StreamInfo
+from wepose_pin.live.state import LivePose, Output, Status, StreamInfo
 from wepose_pin.model import load_model
 from wepose_pin.readers.live_log import SAMPLES, read_blocks, read_live_log
 from wepose_pin.recording import OrientationSensor, Recording
@@ -37,14 +37,14 @@ def recording(simulation: Simulation) -> Recording:
     return first(simulation.recording("live"), 3000)
 
 
-class Watcher:
+class Watcher(Output):
     """An output that keeps what it was shown, and presses keys when the time has come."""
 
     def __init__(self, keys: Sequence[tuple[float, str]] = ()) -> None:
         self.info: StreamInfo | None = None
         self.poses: list[LivePose] = []
         self.statuses: list[Status] = []
-        self.closed = False
+        self.closed, self.resumed, self.said = False, 0, ""
         self._keys = list(keys)
 
     def start(self, info: StreamInfo) -> None:
@@ -55,6 +55,12 @@ class Watcher:
 
     def status(self, status: Status) -> None:
         self.statuses.append(status)
+
+    def describe(self) -> str:
+        return self.said
+
+    def resume(self) -> None:
+        self.resumed += 1
 
     def take_keys(self) -> list[str]:
         now = self.poses[-1].time if self.poses else -math.inf
@@ -260,9 +266,11 @@ def test_a_gap_in_a_named_start_pose(recording: Recording, tmp_path: Path, begin
 
 def test_heading_resets_are_in_the_file(recording: Recording, tmp_path: Path) -> None:
     watcher = Watcher([(12.0, "r"), (20.0, "r"), (28.0, "q")])
+    watcher.said = "arm: hold."
     ended = live(recording, tmp_path / "a.wepose", watcher=watcher)
     found = read_live_log(tmp_path / "a.wepose")
-    assert len(found.recording.resets) == 2
+    assert len(found.recording.resets) == watcher.resumed == 2
+    assert "Tracking. arm: hold." in {status.message for status in watcher.statuses}
     again = track(found.recording, causal=True)
     assert all(np.array_equal(found.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
     untouched = track(recording, causal=True)

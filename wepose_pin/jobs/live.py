@@ -226,7 +226,7 @@ def run_live(
             if page is not None and (job.guide or robot is not None):
                 page.set_body(model, None if robot is None else robot.figure(model))
             if robot is not None:
-                outputs = [robot, *(_add_robot_status(view, robot) for view in outputs)]
+                outputs.insert(0, robot)
             outputs += _open_senders(job)
             if robot is not None:
                 warm_up(job.method)  # compiles before commands are due
@@ -328,11 +328,3 @@ def _name_recording(folder: Path) -> Path:
     """A file in the folder that is not there yet."""
     number = next(n for n in itertools.count(1) if not (folder / f"session-{n}.wepose").exists())
     return folder / f"session-{number}.wepose"
-
-
-def _add_robot_status(view: Output, robot: RobotOutput | None) -> Output:
-    if robot is None:
-        return view
-    from ..live.robot import RobotStatusView
-
-    return RobotStatusView(view, robot)

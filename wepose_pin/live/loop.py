@@ -335,6 +335,9 @@ class LiveLoop:
                 self._segment_estimator.reset_headings()
                 self._heading_reset_time = self._start_search.synchronizer.newest
                 self._record_event("reset", tick=self._start_search.synchronizer.next_tick)
+            if key == "r":
+                for output in self.outputs:
+                    output.resume()
             self._mark(key)
         return True
 
@@ -450,7 +453,8 @@ class LiveLoop:
         if self._ended:
             return "ended", "The session has ended.", 1.0
         if self._segment_estimator is not None:
-            return "ready", self._describe_lost(lost, frozen) or "Tracking.", 1.0
+            said = [self._describe_lost(lost, frozen) or "Tracking.", *(output.describe() for output in self.outputs)]
+            return "ready", " ".join(filter(None, said)), 1.0
         if self._start_search is None:
             missing_sensors = [name for name in self.source.sensors if self._stream.newest_times[name] == -np.inf]
             if missing_sensors:

@@ -130,6 +130,15 @@ class RobotOutput(Output):
     def status(self, status: Status) -> None:  # noqa: ARG002
         self._raise_failure()
 
+    def describe(self) -> str:
+        """The robot's state and why, as a sentence."""
+        command = self.newest
+        if command is None:
+            return ""
+        state = f"{command.state} ({command.reason})" if command.reason else command.state
+        hint = "; r, in the start pose, goes on" if self.stream.stopped else ""
+        return f"{self.robot.map.name}: {state}{hint}."
+
     def resume(self) -> None:
         """Continue after a stop, by an approach."""
         self._resume = True
@@ -251,36 +260,6 @@ class RobotOutput(Output):
     def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
-
-
-class RobotStatusView(Output):
-    """A view whose message also gives the state of the robot, and whose key "r" resumes the robot too."""
-
-    def __init__(self, view: Output, robot: RobotOutput) -> None:
-        self._view, self._robot = view, robot
-
-    def start(self, info: StreamInfo) -> None:
-        self._view.start(info)
-
-    def show(self, pose: LivePose) -> None:
-        self._view.show(pose)
-
-    def status(self, status: Status) -> None:
-        command = self._robot.newest
-        if command is not None and status.state == "ready":
-            state = f"{command.state} ({command.reason})" if command.reason else command.state
-            hint = "; r, in the start pose, goes on" if self._robot.stream.stopped else ""
-            status = status._replace(message=f"{status.message} {self._robot.robot.map.name}: {state}{hint}.")
-        self._view.status(status)
-
-    def take_keys(self) -> list[str]:
-        keys = self._view.take_keys()
-        if "r" in keys:
-            self._robot.resume()
-        return keys
-
-    def close(self) -> None:
-        self._view.close()
 
 
 class TickReplay(ReplaySource):

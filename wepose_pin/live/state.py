@@ -118,6 +118,13 @@ class Output:
     def demonstrate(self, pose: LivePose, segments: tuple[str, ...]) -> None:
         """Draw a pose of these segments that nobody took: an instruction of the guide."""
 
+    def describe(self) -> str:
+        """What to add to the message to the person while tracking; empty: nothing."""
+        return ""
+
+    def resume(self) -> None:
+        """Go on: the person stands in the start pose and asks for new headings."""
+
     def take_keys(self) -> list[str]:
         """Keys since the last call: "r" to reset the headings, "q" to end; in a guided session names of its actions."""
         return []
