@@ -212,6 +212,14 @@ def test_a_short_loss_pauses_and_a_long_one_needs_the_start_pose_again(tmp_path:
     session.guide.close()
 
 
+def test_too_little_motion_asks_for_more_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{__name__}.CLASP_S", 6.0)
+    view = Session(tmp_path).run(lambda m: bool(m.view.quality))[-1].view
+    assert view.quality == "fail"
+    assert view.sentence == "There was too little of the motion. More of it may be enough."
+    assert [action.name for action in view.actions] == ["more", "restart"]
+
+
 @pytest.mark.slow
 def test_sensors_that_were_mistaken_are_exchanged_without_another_motion(tmp_path: Path) -> None:
     session = Session(tmp_path)

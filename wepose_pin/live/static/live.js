@@ -102,7 +102,7 @@ function small(id, value, unit) {
 }
 
 // ---- the guided session
-const MAIN = ["next", "accept", "exchange"];
+const MAIN = ["next", "accept", "exchange", "more"];
 let guided = false, guideSays = "", spokenCount = null, voice = false;
 function speak(what) {
   if (!voice || !what) return;
@@ -137,7 +137,7 @@ function showGuide(guide) {
   if ($("actions").dataset.offered !== offered) {                        // a button stays while it is pressed
     $("actions").dataset.offered = offered;
     $("actions").replaceChildren();
-    guide.actions.forEach((action) => button(action, MAIN.includes(action.name)));
+    guide.actions.forEach((action, k) => button(action, k === 0 && MAIN.includes(action.name)));
   }
   showResult(guide);
   if (guideSays !== guide.note + guide.sentence) speak(guide.note || guide.sentence);
