@@ -107,7 +107,5 @@ class GuidedSession:
         rate_hz = sum(count for _, count in self._counts[name]) / RATE_WINDOW_S
         segment = self.guide.segments.get(name, "")
         label = f"{segment} ({name})" if segment and segment != name else name
-        unknown = (math.nan, math.nan, math.nan)
-        lost = name in self.guide.silent
         battery = self.source.batteries.get(name, math.nan)
-        return SensorStatus(label, rate_hz, lost, False, unknown, math.nan, math.nan, 0, 0, 0, False, battery)
+        return SensorStatus(label, rate_hz, name in self.guide.silent, battery=battery)
