@@ -87,7 +87,7 @@ class SessionSummary(NamedTuple):
     poses: int
     seconds: float  # [s] from the first pose to the last, on the source's clock
     counts: Mapping[str, Mapping[str, int]]  # segment → each of `arrivals.COUNTS`
-    latency: Latencies  # of every tick: [s] from its time to its pose
+    latency: Latencies  # of every tick with a sample: [s] from its time to its pose
     diagnostics: tuple[Diagnostic, ...]
     problem: str  # of the recording; empty where it is complete
     record: Path | None  # the recording
@@ -201,7 +201,7 @@ class LiveLoop:
         self._covariance_ticks, self._covariance_parts = 1, 1  # from one to the next, and parts with a tick
         self._latency = Latencies()
         self._recent_latencies: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s] of displayed poses
-        self._first_pose = self._last_pose = 0.0
+        self._poses, self._first_pose, self._last_pose = 0, 0.0, 0.0
         self._count_history: deque[tuple[float, np.ndarray]] = deque(maxlen=round(1.0 / STATUS_PERIOD_S) + 1)
         self._events: list[tuple[str, dict[str, Any]]] = []  # that decide poses
         self._open_phases: list[str] = []
@@ -287,7 +287,8 @@ class LiveLoop:
         points = self.kinematics.compute_points(quat_WL)
         self._last_pose = float(ticks.time[-1])
         now = self.source.clock()
-        for tick in ticks.time[row:].tolist():
+        self._poses += len(ticks.time) - row
+        for tick in ticks.time[row:][~ticks.lost[row:].all(axis=1)].tolist():  # who slept is not late
             self._latency.add(now - tick)
         latency = now - self._last_pose
         self._recent_latencies.append(latency)
@@ -499,8 +500,8 @@ class LiveLoop:
             else self._start_search.synchronizer.counts
         )
         return SessionSummary(
-            self._latency.count,
-            self._last_pose - self._first_pose if self._latency.count else 0.0,
+            self._poses,
+            self._last_pose - self._first_pose if self._poses else 0.0,
             {name: dict(zip(COUNTS, row.tolist(), strict=True)) for name, row in zip(sensors, counts, strict=True)},
             self._latency,
             () if self._segment_estimator is None else self._segment_estimator.start.diagnostics,

@@ -328,24 +328,15 @@ def status_json(status: Status) -> str:
 
 def _guide_json(view: GuideView) -> dict[str, Any]:
     """The guide's view for the page: lengths in millimetres."""
-    return {
+    return view._asdict() | {
         "steps": [step._asdict() for step in view.steps],
-        "sentence": view.sentence,
-        "note": view.note,
         "countdown": None if view.countdown is None else round_finite(view.countdown, 1),
         "remaining": None if view.remaining is None else round_finite(view.remaining, 0),
         "progress": round_finite(view.progress, 3),
-        "measurable": view.measurable,
         "actions": [action._asdict() for action in view.actions],
         "lengths": [
-            {
-                "name": length.name,
-                "mm": round_finite(1e3 * length.metres, 0),
-                "std_mm": round_finite(1e3 * length.std, 1),
-            }
-            for length in view.lengths
+            {"name": name, "mm": round_finite(1e3 * metres, 0), "std_mm": round_finite(1e3 * std, 1)}
+            for name, metres, std in view.lengths
         ],
         "sample_size": None if view.sample_size is None else [round_finite(size, 1) for size in view.sample_size],
-        "quality": view.quality,
-        "reasons": list(view.reasons),
     }
