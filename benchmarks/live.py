@@ -26,6 +26,7 @@ from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.vmc_output import VmcOutput
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
+from wepose_pin.retargeting import find_map, load_robot
 from wepose_pin.simulation import simulate, simulate_person
 
 from .tables import Column, Section, Table
@@ -165,7 +166,7 @@ def live_samples(seconds: float) -> Table:
 def _connect_robot(recording: Recording, folder: Path) -> RobotOutput:
     """The output for an arm of seven joints, that of the tests."""
     write_arm = importlib.import_module("tests.arms").write_arm
-    options = RobotOptions(str(write_arm(folder)), to="9")
+    options = RobotOptions(load_robot(find_map(str(write_arm(folder)))), to="9")
     robot, _ = connect_robot(options, ReplaySource(recording), SensorSetup.from_recording(recording))
     robot.open()
     return robot

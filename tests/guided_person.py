@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import struct
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -12,7 +13,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from wepose_pin.recording.arrivals import Samples
+from wepose_pin.live.sources.base import Source
+from wepose_pin.recording.arrivals import Samples, pack_orientations, unpack_orientations
+from wepose_pin.rotations import exp, multiply
 from wepose_pin.simulation import PRESETS, Simulation, simulate, simulate_person
 
 RATE_HZ = 100.0
@@ -20,13 +23,14 @@ STAND = 60, 440  # samples of the simulation in which the person stands
 RETURN_FASTER = 12  # times, back to the start pose: samples in between are left out
 SHAKE_HZ, SHAKE_RATE = 3.0, 8.0  # amplitude in rad/s
 NAMES = ("a7", "b2", "c9", "d4", "e5")
+TRACKERS = tuple(f"4c:11:ae:00:00:a{k}/0" for k in range(5))
 
 
 @lru_cache(maxsize=4)
-def perform(seed: int = 3, clasp_s: float = 100.0, preset: str = "mild") -> Simulation:
+def perform(seed: int = 3, clasp_s: float = 100.0, preset: str = "mild", mount: str = "any") -> Simulation:
     """A person whose clasp lasts longer than the guide asks for."""
     lengths = simulate_person(seed).lengths
-    imperfections = replace(PRESETS[preset], mount="any", dropped=0.0)
+    imperfections = replace(PRESETS[preset], mount=mount, dropped=0.0)
     return simulate(lengths, seed=seed, imperfections=imperfections, clasp_s=clasp_s, circles=0)
 
 
@@ -39,10 +43,11 @@ class GuidedPerson:
     silent : segments whose sensors send nothing
     hurries : returns to the start pose faster than the motion went
     worn : sensor → segment that it sits on
+    orientations : what sensors measure in place of rates and specific forces: "sensor" or "segment" orientations
     """
 
-    def __init__(self, simulation: Simulation, worn: Mapping[str, str] | None = None) -> None:
-        self.simulation = simulation
+    def __init__(self, simulation: Simulation, worn: Mapping[str, str] | None = None, orientations: str = "") -> None:
+        self.simulation, self.orientations = simulation, orientations
         self.worn = dict(zip(NAMES, simulation.gyro_S, strict=True)) if worn is None else dict(worn)
         self.doing, self.silent, self.hurries = "stand", set[str](), True
         self.disturb: Callable[[str, np.ndarray], np.ndarray] = lambda _segment, gyro: gyro
@@ -75,23 +80,40 @@ class GuidedPerson:
             if self.doing == f"shake {segment}":
                 gyro = gyro + SHAKE_RATE * np.sin(2.0 * np.pi * SHAKE_HZ * time_s) * (time_s % 3.0 < 1.5)
             gyro = self.disturb(segment, gyro)
-            if segment not in self.silent:
+            if segment in self.silent:
+                continue
+            if self.orientations:
+                samples[sensor] = pack_orientations(self._orient(segment, time_s))
+            else:
                 samples[sensor] = gyro, simulation.accel_S[segment][self._k]
         return time_s, samples
 
+    def _orient(self, segment: str, time_s: float) -> np.ndarray:
+        """Orientation (4,) xyzw of a segment in W, or of its sensor in a world of its own; a shake turns it."""
+        if self.orientations == "segment":
+            return self.simulation.quat_WL[segment][self._k]
+        quat = self.simulation.quat_WS[segment][self._k]
+        if self.doing == f"shake {segment}" and time_s % 3.0 < 1.5:
+            angle = SHAKE_RATE / (2.0 * np.pi * SHAKE_HZ) * np.cos(2.0 * np.pi * SHAKE_HZ * time_s)
+            quat = multiply(quat, exp([angle, 0.0, 0.0]))
+        return multiply(exp([0.0, 0.0, 0.7 * list(self.worn.values()).index(segment)]), quat)
 
-class PersonSource:
+
+class PersonSource(Source):
     """A source with a clock of its own: the person acts as fast as the guide takes samples."""
 
-    rate_hz: float | None = RATE_HZ
-
     def __init__(self, person: GuidedPerson, step_s: float = 0.05) -> None:
-        self.person, self.sensors, self.problems = person, tuple(person.worn), dict[str, int]()
-        self.orientations: dict[str, bool] = {}
+        super().__init__(person.worn, RATE_HZ)
+        self.person = person
         self._rows, self._now = round(step_s * RATE_HZ), 0.0
         self.asleep_s = 0.0  # [s] for which nothing comes
 
-    def open(self, _waiting: object = None) -> None: ...
+    @property
+    def orientations(self) -> dict[str, bool]:
+        aligned = self.person.orientations == "segment"
+        return dict.fromkeys(self.person.worn, aligned) if self.person.orientations else {}
+
+    def open(self, waiting: object = None) -> None: ...
 
     def clock(self) -> float:
         return self._now
@@ -114,10 +136,10 @@ class PersonSource:
 
 
 class UdpPerson:
-    """Sends the person's samples as JSON in real time, from a thread of its own."""
+    """Sends the person's samples in real time, as JSON, from a thread of its own."""
 
     def __init__(self, person: GuidedPerson, port: int) -> None:
-        self.person, self._port, self.asleep = person, port, False
+        self.person, self._to, self.asleep = person, ("127.0.0.1", port), False
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
@@ -130,16 +152,43 @@ class UdpPerson:
         self._thread.join()
 
     def _run(self) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as self._socket:
             begin, sent = time.monotonic(), 0
             while not self._end.is_set():
                 time.sleep(max(0.0, begin + sent / RATE_HZ - time.monotonic()))
                 t, samples = self.person.step()
                 sent += 1
-                if self.asleep:
-                    continue
-                lines = [
-                    json.dumps({"sensor": sensor, "t": t, "gyro": gyro.tolist(), "accel": accel.tolist()})
-                    for sensor, (gyro, accel) in samples.items()
-                ]
-                out.sendto("\n".join(lines).encode(), ("127.0.0.1", self._port))
+                if not self.asleep:
+                    self._send(t, samples)
+
+    def _send(self, t: float, samples: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+        lines = [
+            json.dumps({"sensor": sensor, "t": t, "gyro": gyro.tolist(), "accel": accel.tolist()})
+            for sensor, (gyro, accel) in samples.items()
+        ]
+        self._socket.sendto("\n".join(lines).encode(), self._to)
+
+
+class TrackerPerson(UdpPerson):
+    """SlimeVR trackers that state no place, each from an address of its own, as their protocol's description has it."""
+
+    def __enter__(self) -> UdpPerson:
+        self._numbers = dict.fromkeys(self.person.worn, 0)
+        self._sockets = {name: socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for name in self.person.worn}
+        return super().__enter__()
+
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
+        for each in self._sockets.values():
+            each.close()
+
+    def _send(self, t: float, samples: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
+        del t
+        for name, numbers in samples.items():
+            if self._numbers[name] % 300 == 0:  # it looks for a server, and says who it is
+                mac = bytes.fromhex(name.partition("/")[0].replace(":", ""))
+                hello = struct.pack(">IQ7I", 3, 0, *(0,) * 7) + b"\x05v0.6." + mac + b"\0"
+                self._sockets[name].sendto(hello, self._to)
+            self._numbers[name] += 1
+            quat = unpack_orientations(*numbers)
+            self._sockets[name].sendto(struct.pack(">IQBB4fB", 17, self._numbers[name], 0, 1, *quat, 0), self._to)

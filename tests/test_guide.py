@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import select
+import socket
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from guided_person import RATE_HZ, GuidedPerson, PersonSource, perform
+from arms import write_arm
+from guided_person import RATE_HZ, TRACKERS, GuidedPerson, PersonSource, TrackerPerson, perform
 
+from wepose_pin.assets import asset
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, load_protocol
 from wepose_pin.errors import BadSession
+from wepose_pin.jobs.live import LiveJob, run_live
 from wepose_pin.live.assignment import AssignedSource, ShakeDetector, read_segments, write_segments
 from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
 from wepose_pin.live.guided import make_steps
 from wepose_pin.live.setup import SensorSetup
-from wepose_pin.live.state import GuideView
+from wepose_pin.live.state import GuideView, Output, Status
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.simulation import simulate_person
+from wepose_pin.subject import load_subject
 
 PERSON = 3, 45.0  # seed, and seconds that the clasp may last
 MEASURED = {"shoulder_width": simulate_person(PERSON[0]).lengths["shoulder_width"]}
@@ -45,7 +53,9 @@ def calibrate_recording(recording: Recording, measured: Mapping[str, float]) -> 
     return calibration, assess(calibration)
 
 
-def make_options(folder: Path, known: Mapping[str, str] | None = None) -> GuideOptions:
+def make_options(
+    folder: Path, known: Mapping[str, str] | None = None, mounts: Mapping[str, np.ndarray] | None = None
+) -> GuideOptions:
     """A guide whose clasp is short, and which estimates nothing on the way."""
     protocol, model = load_protocol("clasp"), load_model()
     steps = tuple(replace(step, seconds=CLASP_S) if step.phase == "clasp" else step for step in protocol.steps)
@@ -60,8 +70,8 @@ def make_options(folder: Path, known: Mapping[str, str] | None = None) -> GuideO
     return GuideOptions(
         folder,
         replace(protocol, steps=steps),
-        SensorSetup(remounted=True),
-        tuple(model.table.segments),
+        SensorSetup(remounted=True, mounts=mounts or {}),
+        model.table,
         depth,
         calibrate_file,
         estimate,
@@ -73,10 +83,12 @@ def make_options(folder: Path, known: Mapping[str, str] | None = None) -> GuideO
 class Session:
     """A person in front of a guide; presses what is offered first."""
 
-    def __init__(self, folder: Path, known: Mapping[str, str] | None = None) -> None:
-        self.person = GuidedPerson(perform(*PERSON))
+    def __init__(self, folder: Path, known: Mapping[str, str] | None = None, orientations: str = "") -> None:
+        self.person = GuidedPerson(perform(*PERSON), orientations=orientations)
         self.source = PersonSource(self.person)
-        self.guide = Guide(self.source, make_options(folder, known), make_steps)
+        # The closure does not show how a tracker on the torso is turned, and it has no accelerometer to tell.
+        mounts = {"torso": perform(*PERSON).quat_LS["torso"]} if orientations == "sensor" else {}
+        self.guide = Guide(self.source, make_options(folder, known, mounts), make_steps)
         self.clicks: list[str] = []
         self.obeys: Callable[[str, GuideView], str] = lambda _step, view: view.highlight
 
@@ -141,6 +153,24 @@ def test_from_sensors_of_any_name_to_the_calibration_of_their_recording(tmp_path
     assert counted[0] == pytest.approx(8.0, abs=0.1)
 
 
+@pytest.mark.parametrize("orientations", ["sensor", "segment"])
+def test_sensors_that_measure_orientations_are_shaken_and_calibrated_too(tmp_path: Path, orientations: str) -> None:
+    """Trackers in worlds of their own, and a suit that streams segments; both under any names."""
+    session = Session(tmp_path, orientations=orientations)
+    if orientations == "segment":
+        session.guide.options.known.update(session.person.worn)
+    session.run()
+    assert session.clicks == ["next", "next", "accept"]
+    assert session.guide.segments == session.person.worn
+    assert session.guide.accepted is not None
+    subject = session.guide.accepted.calibration.subject
+    for name, length in perform(*PERSON).lengths.items():
+        assert abs(subject.lengths[name] - length) < 3.0 * subject.std(name), name
+    recording = load_session(tmp_path / "calibration-1.wepose")
+    assert not recording.imus
+    assert set(recording.phases) == {"start", "clasp"}
+
+
 def begin(session: Session, phase: str, seconds: float) -> None:
     """Follow the guide until so many seconds of a phase are recorded."""
     session.run(lambda m: m.step == phase and session.guide.attempt.measured_s(phase) >= seconds)
@@ -182,6 +212,14 @@ def test_a_short_loss_pauses_and_a_long_one_needs_the_start_pose_again(tmp_path:
     session.guide.close()
 
 
+def test_too_little_motion_asks_for_more_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{__name__}.CLASP_S", 6.0)
+    view = Session(tmp_path).run(lambda m: bool(m.view.quality))[-1].view
+    assert view.quality == "fail"
+    assert view.sentence == "There was too little of the motion. More of it may be enough."
+    assert [action.name for action in view.actions] == ["more", "restart"]
+
+
 @pytest.mark.slow
 def test_sensors_that_were_mistaken_are_exchanged_without_another_motion(tmp_path: Path) -> None:
     session = Session(tmp_path)
@@ -191,7 +229,7 @@ def test_sensors_that_were_mistaken_are_exchanged_without_another_motion(tmp_pat
     assert session.clicks == ["next", "next", "exchange", "accept"]
     assert session.guide.segments == session.person.worn
     said = next(m.view for m in moments if m.view.quality == "fail")
-    assert said.sentence == "Some sensors sit on other segments than assigned."
+    assert said.sentence == "Some sensors sit on other segments than assigned. The same motion will do."
     assert "left forearm and right forearm seem to be exchanged" in said.reasons[0]
     recording = load_session(tmp_path / "calibration-1.wepose")
     assert calibrate_recording(recording, MEASURED)[1].quality == "pass"
@@ -228,7 +266,9 @@ def test_a_setup_with_a_wrong_segment_is_refused(tmp_path: Path) -> None:
 
 def test_the_battery_of_a_sensor_goes_with_its_segment() -> None:
     class Charged(PersonSource):
-        batteries: ClassVar = {"a7": 0.4, "zz": 0.1}
+        @property
+        def batteries(self) -> dict[str, float]:
+            return {"a7": 0.4, "zz": 0.1}
 
     person = GuidedPerson(perform(*PERSON))
     assert AssignedSource(Charged(person), person.worn, ("torso",)).batteries == {"torso": 0.4}
@@ -255,3 +295,81 @@ def test_a_shake_is_found_among_sensors_that_move_with_it() -> None:
     push(3.0, a=wave, b=0.9 * wave)
     assert detector.find(["a", "b"]) is None  # either of them
     assert detector.find(["b"]) == "b"
+
+
+class Follower(Output):
+    """A person in front of a terminal, who reads what is said and presses what is offered first."""
+
+    def __init__(self, person: GuidedPerson) -> None:
+        self.person = person
+        self.newest: Status | None = None
+        self.steps: list[str] = []
+        self._keys: list[str] = []
+
+    def status(self, status: Status) -> None:
+        self.newest, guide = status, status.guide
+        if guide is None:
+            self.person.follow("", "", None)
+            return
+        step = next(step.name for step in guide.steps if step.state == "now")
+        self.person.follow(step, guide.highlight, None)
+        if step not in self.steps:
+            self.steps.append(step)
+        if guide.actions and (step, guide.actions[0].name) in PRESSED:
+            self._keys = [guide.actions[0].name]
+
+    def take_keys(self) -> list[str]:
+        keys, self._keys = self._keys, []
+        return keys
+
+
+@pytest.mark.slow
+def test_trackers_are_guided_and_a_robot_follows_at_once(tmp_path: Path) -> None:
+    """The command as a person without a screen runs it: trackers of no stated place, a stated torso, a robot's arm."""
+    simulation = perform(*PERSON, mount="stated")
+    up, forward = simulation.stated_mount["torso"]
+    (tmp_path / "session.toml").write_text(
+        f'name = "trackers"\n[data]\nfile = "none.csv"\ntime = "t"\n[sensors.torso]\n'
+        f'orientation = ["x", "y", "z", "w"]\nmount = {{ up = "{up}", forward = "{forward}" }}\n'
+    )
+    protocol = asset("calibration", "clasp.toml").read_text(encoding="utf-8")
+    (tmp_path / "short.toml").write_text(protocol.replace("seconds = 60", "seconds = 24"), encoding="utf-8")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver, socket.socket(type=socket.SOCK_DGRAM) as free:
+        receiver.bind(("127.0.0.1", 0))
+        free.bind(("127.0.0.1", 0))
+        port, to = free.getsockname()[1], receiver.getsockname()[1]
+        free.close()
+        person = GuidedPerson(simulation, dict(zip(TRACKERS, simulation.gyro_S, strict=True)), "sensor")
+        view, states = Follower(person), set[str]()
+
+        def stop() -> bool:
+            while select.select([receiver], [], [], 0.0)[0]:
+                states.add(json.loads(receiver.recv(65535))["state"])
+            if "follow" in states:
+                return True
+            if view.newest is not None and view.newest.state == "ready":
+                person.follow("clasp", "", None)  # the arms move
+            return False
+
+        job = LiveJob(
+            f"slimevr:{port}",
+            guide=True,
+            out=tmp_path / "anna",
+            session=tmp_path / "session.toml",
+            protocol=str(tmp_path / "short.toml"),
+            measured=MEASURED,
+            page=False,
+            robot=str(write_arm(tmp_path)),
+            arm="right",
+            to=str(to),
+        )
+        with TrackerPerson(person, port):
+            outcome = run_live(job, views=[view], stop=contextlib.nullcontext(stop))
+    assert view.steps == ["sensors", "assignment", "static", "start", "clasp", "quality"]
+    assert read_segments(tmp_path / "anna", load_model().table.segments) == person.worn
+    assert {"hold", "approach", "follow"} <= states
+    assert outcome.session is not None
+    assert outcome.session.poses
+    subject = load_subject(tmp_path / "anna")
+    for name, length in simulation.lengths.items():
+        assert abs(subject.lengths[name] - length) < 3.0 * subject.std(name), name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
-from wepose_pin.live.state import LivePose, Status, StreamInfo
+from wepose_pin.live.state import LivePose, Output, Status, StreamInfo
 from wepose_pin.model import load_model
 from wepose_pin.readers.live_log import SAMPLES, read_blocks, read_live_log
 from wepose_pin.recording import OrientationSensor, Recording
@@ -37,14 +37,14 @@ def recording(simulation: Simulation) -> Recording:
     return first(simulation.recording("live"), 3000)
 
 
-class Watcher:
+class Watcher(Output):
     """An output that keeps what it was shown, and presses keys when the time has come."""
 
     def __init__(self, keys: Sequence[tuple[float, str]] = ()) -> None:
         self.info: StreamInfo | None = None
         self.poses: list[LivePose] = []
         self.statuses: list[Status] = []
-        self.closed = False
+        self.closed, self.resumed, self.said = False, 0, ""
         self._keys = list(keys)
 
     def start(self, info: StreamInfo) -> None:
@@ -56,6 +56,12 @@ class Watcher:
     def status(self, status: Status) -> None:
         self.statuses.append(status)
 
+    def describe(self) -> str:
+        return self.said
+
+    def resume(self) -> None:
+        self.resumed += 1
+
     def take_keys(self) -> list[str]:
         now = self.poses[-1].time if self.poses else -math.inf
         due = [key for at, key in self._keys if at <= now]
@@ -66,19 +72,14 @@ class Watcher:
         self.closed = True
 
 
-class Chaos:
+class Chaos(Source):
     """A recording whose samples come as they may: a virtual clock, 20 ms from read to read."""
 
-    rate_hz: float | None
-
     def __init__(self, recording: Recording, arrivals: list[tuple[float, Samples]]) -> None:
-        self.sensors = tuple(recording.sensors)
-        self.rate_hz = recording.rate_hz
-        self.problems: dict[str, int] = {}
-        self.orientations: Mapping[str, bool] = {}
+        super().__init__(recording.sensors, recording.rate_hz)
         self._arrivals, self._now, self._at = sorted(arrivals, key=lambda a: a[0]), float(recording.time[0]), 0
 
-    def open(self, _waiting: object = None) -> None: ...
+    def open(self, waiting: object = None) -> None: ...
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         assert timeout_s > 0.0
@@ -265,9 +266,11 @@ def test_a_gap_in_a_named_start_pose(recording: Recording, tmp_path: Path, begin
 
 def test_heading_resets_are_in_the_file(recording: Recording, tmp_path: Path) -> None:
     watcher = Watcher([(12.0, "r"), (20.0, "r"), (28.0, "q")])
+    watcher.said = "arm: hold."
     ended = live(recording, tmp_path / "a.wepose", watcher=watcher)
     found = read_live_log(tmp_path / "a.wepose")
-    assert len(found.recording.resets) == 2
+    assert len(found.recording.resets) == watcher.resumed == 2
+    assert "Tracking. arm: hold." in {status.message for status in watcher.statuses}
     again = track(found.recording, causal=True)
     assert all(np.array_equal(found.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
     untouched = track(recording, causal=True)

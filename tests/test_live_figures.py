@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.kinematics import LiveKinematics
 from wepose_pin.live.figure import SEGMENTS, complete_figure
 from wepose_pin.live.mvn_frames import encode_frame
 from wepose_pin.live.mvn_output import MvnOutput
 from wepose_pin.live.sources.mvn import MvnSource
 from wepose_pin.live.state import LivePose, StreamInfo
 from wepose_pin.live.vmc_output import BONES, VmcOutput, encode_message
+from wepose_pin.model import load_model
 from wepose_pin.recording.arrivals import unpack_orientations
 
 FIVE = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
@@ -75,6 +77,31 @@ def test_a_t_pose_is_the_identity_and_legs_stand() -> None:
     np.testing.assert_array_equal(bowed.quat_WB[0], figure.quat_WB[0])
     half = Rotation.from_quat(bowed.quat_WB[SEGMENTS.index("l3")]).as_rotvec()
     np.testing.assert_allclose(half, [0.0, 0.3, 0.0], atol=1e-12)
+
+
+def test_measured_legs_move_and_the_lower_foot_is_on_the_floor() -> None:
+    """A person who lifts one knee, pelvis tilted: joints are where Pinocchio has them."""
+    model = load_model("whole_body")
+    segments = ("pelvis", *(f"{side}_{part}" for side in ("left", "right") for part in ("thigh", "shank", "foot")))
+    rng = np.random.default_rng(5)
+    R = {name: Rotation.from_rotvec(0.2 * rng.standard_normal(3)) for name in segments}
+    R["left_thigh"] = Rotation.from_rotvec([0.0, -1.2, 0.0])
+    kinematics = LiveKinematics(model, segments)
+    quat_WL = np.array([R[name].as_quat() for name in segments])
+    points = kinematics.compute_points(quat_WL)
+    pose = LivePose(0.0, quat_WL, points, np.zeros(7), np.zeros(7, dtype=bool), 0.0)
+    figure = complete_figure(StreamInfo(segments, kinematics.points, 100.0), pose)
+    at, p_W = dict(zip(SEGMENTS, figure.position, strict=True)), dict(zip(kinematics.points, points, strict=True))
+    lowest = min(p_W[f"right_{end}"][2] for end in ("heel", "toe"))
+    np.testing.assert_allclose(at["pelvis"], [0.0, 0.0, -lowest])
+    for part, point in (("upper_leg", "hip"), ("lower_leg", "knee"), ("foot", "ankle")):
+        for side in ("left", "right"):
+            np.testing.assert_allclose(at[f"{side}_{part}"] - at["pelvis"], p_W[f"{side}_{point}"], atol=1e-12)
+    quat = dict(zip(SEGMENTS, figure.quat_WB, strict=True))
+    for name, segment in (("pelvis", "pelvis"), ("left_upper_leg", "left_thigh"), ("right_toe", "right_foot")):
+        assert (Rotation.from_quat(quat[name]).inv() * R[segment]).magnitude() < 1e-12
+    tip = at["left_toe"] + R["left_foot"].apply([0.06, 0.0, -0.02])
+    np.testing.assert_allclose(tip - at["pelvis"], p_W["left_toe"], atol=1e-12)
 
 
 def test_one_arm_alone_is_a_whole_figure() -> None:

@@ -19,7 +19,8 @@ from bodies import SEGMENTS
 
 from wepose_pin.errors import BadSource
 from wepose_pin.live.sources import open_source, packets
-from wepose_pin.live.sources.udp import MAX_KINDS, UdpSource
+from wepose_pin.live.sources.datagrams import MAX_KINDS
+from wepose_pin.live.sources.udp import UdpSource
 from wepose_pin.recording.arrivals import Samples
 
 GOOD = {"sensor": "torso", "t": 12.345, "gyro": [0.1, -0.2, 0.3], "accel": [0.0, 0.5, 9.81]}
@@ -233,7 +234,7 @@ def test_sensors_are_found_where_they_are_not_given(sender: socket.socket) -> No
 
 
 def test_nobody_sends() -> None:
-    source = UdpSource("127.0.0.1", 0, None, 0.2)
+    source = UdpSource("127.0.0.1", 0, wait_s=0.2)
     with pytest.raises(BadSource, match=r"nothing came within 0\.2 s from samples at UDP"):
         source.open()
 

@@ -24,7 +24,7 @@ from .filters.start import ACCEL_BIAS_STD
 from .model import BodyModel, BodyTable, load_table
 from .model.start_pose import compute_start_configuration, orient_links
 from .model.table import NEUTRAL_POSE
-from .recording import Recording, format_span
+from .recording import OrientationSensor, Recording, format_span
 from .subject import Subject
 
 # Angles [deg] between a stated mount and gravity or motion. Above them the mount is an error or gets a warning.
@@ -320,8 +320,9 @@ def find_nominal_mount(
     if subject is not None and segment in subject.mounts and not recording.remounted:
         return subject.mounts[segment]
     stated = recording.sensors[segment].stated_quat_LS
-    if stated is None and segment not in recording.imus:
-        return np.array([0.0, 0.0, 0.0, 1.0])  # a device's own orientations of segments
+    sensor = recording.sensors[segment]
+    if stated is None and isinstance(sensor, OrientationSensor) and (sensor.aligned or not recording.remounted):
+        return np.array([0.0, 0.0, 0.0, 1.0])  # a device's own orientations of segments; a tracker is strapped on
     if stated is None or segment not in start_frames.R_WL:
         return stated
     return start_frames.to_segment(segment, Rotation.from_quat(stated)).as_quat()

@@ -42,7 +42,8 @@ product = inlined(_product)
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Products of quaternions (..., 4) xyzw; on 60 000 ten times as fast as SciPy's."""
-    return np.stack(_product(*np.moveaxis(a, -1, 0), *np.moveaxis(b, -1, 0)), axis=-1)  # type: ignore[no-untyped-call]
+    parts = [quat[..., k] for quat in (a, b) for k in range(4)]  # `np.moveaxis` takes half of the time of a few
+    return np.stack(_product(*parts), axis=-1)  # type: ignore[no-untyped-call]
 
 
 def conjugate(quat: np.ndarray) -> np.ndarray:

@@ -166,6 +166,8 @@ class _Wild:
     sensors = TORSO_HEAD
     rate_hz: float | None = 100.0
     orientations: ClassVar[dict[str, bool]] = {}
+    batteries: ClassVar[dict[str, float]] = {}
+    awaited = ""
 
     def __init__(self, data: bytes) -> None:
         self.problems: dict[str, int] = {}

@@ -71,11 +71,13 @@ def run_guide(
     from ..live.assignment import write_segments
     from ..live.guided import GuidedSession
     from ..live.loop import warm_up
+    from ..live.session import open_and_wait
 
     folder = make_guide_folder(job)
     options = _make_options(job, folder, setup, model)
     threading.Thread(target=warm_up, args=(job.method,), daemon=True).start()  # tracking begins without a wait then
-    source.open()
+    if not open_and_wait(source, views, until):
+        return None
     session = GuidedSession(source, options, model, views)
     calibrated = session.run(until)
     if calibrated is None:
@@ -138,7 +140,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
         folder,
         protocol,
         replace(setup, remounted=True),
-        order,
+        model.table,
         {name: _depth(model, name) for name in order},
         calibrate_file,
         estimate,

@@ -16,7 +16,7 @@ from . import Arms, LiveMethod, arm_sides
 if TYPE_CHECKING:
     from ..live import Output, SensorSetup, SessionSummary
     from ..live.page import LivePage
-    from ..live.robot import RobotOutput, RobotSummary
+    from ..live.robot import RobotOptions, RobotOutput, RobotSummary
     from ..live.sources.base import Source
     from ..model import BodyModel
 
@@ -80,18 +80,17 @@ class LiveJob:
         Send each pose as JSON to this UDP port (docs/live-page.md). Without HOST to this machine.
     mvn : [HOST:]PORT
         Send each pose to this UDP port as the Xsens MVN network streamer does (port 9763 by habit): the whole figure,
-        its legs standing.
+        its legs standing where no sensor measures them.
     vmc : [HOST:]PORT
         Send each pose to this UDP port by the VMC protocol (OSC; 39539 by habit), for Unity, VSeeFace or Blender.
     lsl : NAME
         Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
-    robot : NAME|FILE.urdf
-        Send joint commands that let this robot follow the person (docs/live-robot.md). Names are those of `wepose
-        retarget --robot`. Bring the robot into the rest posture of its map before.
+    robot : NAME|FILE
+        Send joint commands that let this robot follow the person (docs/live-robot.md): one of the names of `wepose
+        retarget --robot`, a URDF with a map beside it (ARM.urdf, ARM.toml), or the map. Bring the robot into the rest
+        posture of its map before.
     arm
         Move only this arm of the robot, or both. Without it all arms that it has. Needs --robot.
-    map : TOML
-        Use this map of the URDF in --robot, if none lies beside it. Needs --robot.
     to : [HOST:]PORT
         Send the robot's commands as JSON to this UDP port. Without it to port 9002 of this machine. Needs --robot.
     robot_hz : HZ
@@ -132,7 +131,6 @@ class LiveJob:
     lsl: str | None = None
     robot: str | None = None
     arm: Arms | None = None
-    map: Path | None = None
     to: str | None = None
     robot_hz: float = 100.0
     speed_scale: float = 0.9
@@ -147,7 +145,7 @@ class LiveJob:
         for option, given in guided.items():
             if given is not None and not self.guide:
                 raise BadOption(f"--{option}: goes with --guide, which is not given")
-        for option, value in (("arm", self.arm), ("map", self.map), ("to", self.to)):
+        for option, value in (("arm", self.arm), ("to", self.to)):
             if value is not None and self.robot is None:
                 raise BadOption(f"--{option} {value}: goes with --robot, which is not given")
 
@@ -190,6 +188,7 @@ def run_live(
     from ..subject import load_subject
 
     job.check()
+    following = None if job.robot is None else _load_robot(job)  # a wrong one is found before the person does anything
     if job.subject is not None and not job.accept_failed:
         load_subject(job.subject).check_quality()
     setup: SensorSetup
@@ -219,12 +218,15 @@ def run_live(
                     return LiveOutcome(None, None)
                 source, setup, record = guided.source, guided.setup, record or _name_recording(guided.folder)
                 model = build_subject_model(setup, job.model, source.sensors)
-            if job.robot is not None:
-                robot, source = _connect_robot(job, source, setup, model)
+            if following is not None:
+                from ..live.robot import connect_robot
+
+                speed = float(job.speed.replace("max", "inf")) if job.replays else 1.0
+                robot, source = connect_robot(following, source, setup, speed, model.table)
             if page is not None and (job.guide or robot is not None):
                 page.set_body(model, None if robot is None else robot.figure(model))
             if robot is not None:
-                outputs = [robot, *(_add_robot_status(view, robot) for view in outputs)]
+                outputs.insert(0, robot)
             outputs += _open_senders(job)
             if robot is not None:
                 warm_up(job.method)  # compiles before commands are due
@@ -273,7 +275,7 @@ def _open_page(
     page.open()
     if "token=" in page.url:
         say(f"Page: {page.url}")
-        say(f"Whoever reaches this machine at {job.host} and has this address can watch and press the page's buttons.")
+        say("Whoever reaches this machine there and has this address can watch and press the page's buttons.")
     else:
         say(f"Page: {page.url}  (this machine only)")
     if job.open:
@@ -284,18 +286,20 @@ def _open_page(
     return page
 
 
-def _connect_robot(job: LiveJob, source: Source, setup: SensorSetup, model: BodyModel) -> tuple[RobotOutput, Source]:
-    """The robot's output, and the source as it needs it."""
-    from ..live.robot import PORT, RobotOptions, connect_robot
-    from ..retargeting import LimitMargins
-    from ..retargeting.stream import StreamOptions
+def _load_robot(job: LiveJob) -> RobotOptions:
+    """The robot, and how it is to follow."""
+    from ..calibration import load_protocol
+    from ..live.robot import PORT, RobotOptions
+    from ..retargeting import LimitMargins, find_map, load_robot
+    from ..retargeting.stream import StreamOptions, check_segments
 
     assert job.robot is not None
     timing = StreamOptions(job.robot_hz, job.hold_after, job.stop_after)
     margins = LimitMargins(job.speed_scale, job.limit_margin)
-    options = RobotOptions(job.robot, arm_sides(job.arm), job.map, job.to or str(PORT), timing, margins)
-    speed = float(job.speed.replace("max", "inf")) if job.replays else 1.0
-    return connect_robot(options, source, setup, speed, model.table)
+    robot = load_robot(find_map(job.robot), arm_sides(job.arm), margins)
+    if job.guide:
+        check_segments(robot, load_protocol(job.protocol).needs)
+    return RobotOptions(robot, job.to or str(PORT), timing)
 
 
 def _open_senders(job: LiveJob) -> list[Output]:
@@ -324,11 +328,3 @@ def _name_recording(folder: Path) -> Path:
     """A file in the folder that is not there yet."""
     number = next(n for n in itertools.count(1) if not (folder / f"session-{n}.wepose").exists())
     return folder / f"session-{number}.wepose"
-
-
-def _add_robot_status(view: Output, robot: RobotOutput | None) -> Output:
-    if robot is None:
-        return view
-    from ..live.robot import RobotStatusView
-
-    return RobotStatusView(view, robot)

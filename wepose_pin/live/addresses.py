@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
+
 from ..errors import BadOption
 
 LOOPBACK = "127.0.0.1"
@@ -30,3 +33,13 @@ def parse_listening_address(text: str, option: str, default_port: int) -> tuple[
     if text.isdigit() or ":" in text:
         return parse_address(text, option, default_port)
     return text, default_port
+
+
+def name_host(host: str) -> str:
+    """The address under which others reach `host`, as a URL has it; of "any address" that of this machine's network."""
+    if host in ("0.0.0.0", "::"):
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.socket(family, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+            probe.connect(("2001:db8::1" if ":" in host else "192.0.2.1", 9))  # sends nothing
+            host = str(probe.getsockname()[0])
+    return f"[{host}]" if ":" in host else host

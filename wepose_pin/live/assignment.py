@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..documents import read_toml, toml_key, toml_string, whole_file
 from ..errors import BadSession
-from ..recording.arrivals import Samples
-from .sources.base import Source, find_batteries
+from ..recording.arrivals import Samples, unpack_orientations
+from .sources.base import Source
 from .sources.waiting import Waiting
 
 SETUP_FILE = "setup.toml"
@@ -19,6 +19,7 @@ SETUP_FORMAT = 1
 SHAKE_WINDOW_S = 0.8  # [s] newest samples by which a shake is detected
 SHAKE_RATE = 2.5  # [rad/s] rms of a sensor that is shaken; a person who stands is below 0.1
 CALM_RATE = 0.6  # [rad/s] below which all must be before the next shake counts
+SHORTEST_STEP_S = 2e-3  # [s] between two orientations: of a tracker that does not tell its time they come in bursts
 SHAKE_RATIO = 1.6  # of the shaken sensor's rms to that of every other candidate
 
 
@@ -28,14 +29,28 @@ class ShakeDetector:
     def __init__(self) -> None:
         self._recent: dict[str, deque[tuple[float, float]]] = {}  # sensor → time [s], squared rate [rad²/s²]
         self._calm = False
+        self._last: dict[str, tuple[float, np.ndarray]] = {}  # sensor → time [s] and (4,) of its last orientation
 
-    def push(self, samples: Iterable[Samples]) -> None:
-        """Add samples of any sensors."""
+    def push(self, samples: Iterable[Samples], measured: Collection[str] = ()) -> None:
+        """Add samples of any sensors; those of `measured` are orientations."""
         for chunk in samples:
             recent = self._recent.setdefault(chunk.sensor, deque())
-            recent.extend(zip(chunk.time.tolist(), np.sum(chunk.gyro_S**2, axis=1).tolist(), strict=True))
+            squares = np.sum(chunk.gyro_S**2, axis=1)
+            if chunk.sensor in measured:
+                squares = self._square_rates(chunk)
+            recent.extend(zip(chunk.time.tolist(), squares.tolist(), strict=True))
             while recent and recent[0][0] < recent[-1][0] - SHAKE_WINDOW_S:
                 recent.popleft()
+
+    def _square_rates(self, chunk: Samples) -> np.ndarray:
+        """Square the rates (n,) [rad²/s²] from each orientation to the next."""
+        quat, time_s = unpack_orientations(chunk.gyro_S, chunk.accel_S), chunk.time
+        last_time, last_quat = self._last.get(chunk.sensor, (time_s[0], quat[0]))
+        self._last[chunk.sensor] = float(time_s[-1]), quat[-1]
+        before = np.concatenate([last_quat[None], quat[:-1]])
+        half_angle = np.arccos(np.minimum(np.abs(np.sum(before * quat, axis=1)), 1.0))
+        step_s = np.maximum(np.diff(time_s, prepend=last_time), SHORTEST_STEP_S)
+        return np.asarray((2.0 * half_angle / step_s) ** 2)
 
     def find(self, candidates: Sequence[str]) -> str | None:
         """The candidate that is shaken; None: none, several, or those of the last shake still move."""
@@ -65,7 +80,7 @@ class ShakeDetector:
         return float(np.sqrt(np.mean([square for _, square in recent]))) if recent else 0.0
 
 
-class AssignedSource:
+class AssignedSource(Source):
     """A source whose sensors are named by the segments that they are assigned to.
 
     Parameters
@@ -78,12 +93,13 @@ class AssignedSource:
     def __init__(
         self, source: Source, segments: Mapping[str, str], order: Iterable[str], is_open: bool = False
     ) -> None:
+        super().__init__((segment for segment in order if segment in segments.values()), source.rate_hz)
         self.source, self.segments, self._is_open = source, dict(segments), is_open
-        self.sensors = tuple(segment for segment in order if segment in self.segments.values())
-        self.rate_hz, self.problems = source.rate_hz, source.problems
-        self.orientations = self._rename_orientations()
+        self.problems = source.problems
 
-    def _rename_orientations(self) -> Mapping[str, bool]:
+    @property
+    def orientations(self) -> dict[str, bool]:
+        """As of the source, by segment."""
         return {self.segments[name]: own for name, own in self.source.orientations.items() if name in self.segments}
 
     def open(self, waiting: Waiting | None = None) -> None:
@@ -91,7 +107,6 @@ class AssignedSource:
         if not self._is_open:
             self.source.open(waiting)
             self._is_open = True
-            self.orientations = self._rename_orientations()
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         """Samples of the assigned sensors since the last call; None at the end."""
@@ -107,8 +122,12 @@ class AssignedSource:
     @property
     def batteries(self) -> dict[str, float]:
         """Segment → share of its sensor's charge, 0 to 1, where it is known."""
-        known = find_batteries(self.source).items()
-        return {self.segments[name]: charge for name, charge in known if name in self.segments}
+        return {self.segments[name]: charge for name, charge in self.source.batteries.items() if name in self.segments}
+
+    @property
+    def awaited(self) -> str:
+        """As of the source."""
+        return self.source.awaited
 
     def clock(self) -> float:
         return self.source.clock()

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..readers.live_log import Markers, build_recording
 from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
@@ -49,6 +51,11 @@ class Attempt:
     def segments(self) -> list[str]:
         """The segment of each sensor, in the order of the ticks' columns."""
         return [self._markers.segments.get(name, name) for name in self._source.sensors]
+
+    @property
+    def measured(self) -> np.ndarray:
+        """(k,) bool: the sensors whose samples are orientations."""
+        return np.array([name in self._source.orientations for name in self._source.sensors], dtype=np.bool_)
 
     def push(self, samples: Sequence[Samples]) -> Iterator[Ticks]:
         """Record samples of the source, and iterate over the ticks that they complete."""

@@ -1,19 +1,18 @@
 """The whole figure of a person for programs that want one: what no sensor measures stands.
 
 Frames of segments equal W in the T-pose (arms sideways, palms down), as MVN and avatars have them; ours do in the
-N-pose. Legs stand, as long as `writers.standing` has them; the pelvis keeps its place and its heading. What lies
-between measured segments is interpolated.
+N-pose. A leg without sensors stands, as `writers.standing` has it, on a pelvis that keeps its place and its heading;
+where both feet are measured the lower one is on the floor. What lies between measured segments is interpolated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..rotations import heading
+from .. import rotations
 from ..writers.standing import (
     COLLAR_SHARE,
     FOREARM_M,
@@ -23,6 +22,7 @@ from ..writers.standing import (
     NECK_M,
     SHOULDER_Y,
     SPINE,
+    TOE_TIP,
     TRUNK_M,
     UPPER_ARM_M,
 )
@@ -37,7 +37,24 @@ SEGMENTS = (
     *("left_upper_leg", "left_lower_leg", "left_foot", "left_toe"),
 )
 _SIDES = {"left": 1.0, "right": -1.0}
-_QUARTER = {side: Rotation.from_rotvec([sign * 0.5 * np.pi, 0.0, 0.0]) for side, sign in _SIDES.items()}
+_ARM, _LEG = ("upper_arm", "forearm", "hand"), ("upper_leg", "lower_leg", "foot")
+_LEG_SEGMENTS = dict(zip(_LEG, ("thigh", "shank", "foot"), strict=True))
+_OURS = {f"{side}_{part}": f"{side}_{own}" for side in _SIDES for part, own in _LEG_SEGMENTS.items()}
+# Segment of the figure that a sensor may measure → ours.
+MEASURED = {
+    name: _OURS.get(name, name)
+    for name in SEGMENTS
+    if name in ("pelvis", "torso", "head") or name.endswith((*_ARM, *_LEG))
+}
+_QUARTER = {"left": [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], "right": [-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]}
+# R_BL (23, 4) xyzw, our frame in the figure's: from the N-pose to the T-pose an arm turns by a quarter about x.
+N_TO_T = np.array(
+    [_QUARTER[name.partition("_")[0]] if name.endswith(_ARM) else [0.0, 0.0, 0.0, 1.0] for name in SEGMENTS]
+)
+_T_TO_N = rotations.conjugate(N_TO_T)
+_SOLES = tuple(f"{side}_{point}" for side in _SIDES for point in ("heel", "toe"))
+# Of a part between two others its share of the turn from one to the other: of the spine, and the neck.
+_TURN_SHARES = np.array([[share] for _, share in SPINE.values() if share < 1.0] + [[0.5]])
 
 
 class Figure(NamedTuple):
@@ -49,60 +66,50 @@ class Figure(NamedTuple):
 
 def complete_figure(info: StreamInfo, pose: LivePose) -> Figure:
     """Return the whole figure of a pose."""
-    R_WL = {name: Rotation.from_quat(quat) for name, quat in zip(info.segments, pose.quat_WL, strict=True)}
-    points = {name: point for name, point in zip(info.points, pose.points, strict=True) if np.isfinite(point).all()}
-    root = np.array([0.0, 0.0, HIP_Z])
-    upright = Rotation.identity()
-    R_pelvis = upright
-    if "pelvis" in R_WL:
-        R_pelvis = Rotation.from_rotvec([0.0, 0.0, float(heading(R_WL["pelvis"].as_quat()))])
-    R_torso = R_WL.get("torso", R_pelvis)
-    shoulders = _place_shoulders(points, R_torso)
-    neck = 0.5 * (shoulders["left"] + shoulders["right"])
-    between = (R_pelvis.inv() * R_torso).as_rotvec()
-    R_head = R_WL.get("head", R_torso)
-    position = {"pelvis": root, "neck": root + neck, "head": root + neck + R_torso.apply([0.0, 0.0, HEAD_M])}
-    turn = {"pelvis": R_pelvis, "neck": R_torso * Rotation.from_rotvec(0.5 * (R_torso.inv() * R_head).as_rotvec())}
-    turn["head"] = R_head
-    position["neck"] = position["neck"] + R_torso.apply([0.0, 0.0, NECK_M])
-    for name, (share, turned) in SPINE.items():
-        position[name], turn[name] = root + share * neck, R_pelvis * Rotation.from_rotvec(turned * between)
-    for side, sign in _SIDES.items():
-        position[f"{side}_shoulder"] = root + neck + COLLAR_SHARE * (shoulders[side] - neck)
-        turn[f"{side}_shoulder"] = R_torso
-        _place_arm(side, shoulders[side], points, R_WL, position, turn)
-        for part in ("upper_arm", "forearm", "hand"):
-            position[f"{side}_{part}"] = position[f"{side}_{part}"] + root
-            turn[f"{side}_{part}"] = turn[f"{side}_{part}"] * _QUARTER[side].inv()
-        for part, (x, y, z) in LEG.items():
-            position[f"{side}_{part}"] = R_pelvis.apply([x, sign * y, z])
-            turn[f"{side}_{part}"] = R_pelvis
-    return Figure(
-        np.array([position[name] for name in SEGMENTS]), np.array([turn[name].as_quat() for name in SEGMENTS])
-    )
-
-
-def _place_shoulders(points: Mapping[str, np.ndarray], R_torso: Rotation) -> dict[str, np.ndarray]:
-    """Place each shoulder (3,) [m] from the middle of the hips: as measured, or by the torso."""
-    return {
-        side: points.get(f"{side}_shoulder", R_torso.apply([0.0, sign * SHOULDER_Y, TRUNK_M]))
+    quat_WL = _orient_segments(dict(zip(info.segments, pose.quat_WL, strict=True)))
+    R_WL = dict(zip(SEGMENTS, Rotation.from_quat(quat_WL).as_matrix(), strict=True))
+    points = {name: pose.points[k] for k, name in enumerate(info.points) if np.isfinite(pose.points[k]).all()}
+    soles = [points[name][2] for name in _SOLES if name in points]
+    root = np.array([0.0, 0.0, -min(soles) if len(soles) == len(_SOLES) else HIP_Z])
+    shoulders = {
+        side: points.get(f"{side}_shoulder", R_WL["torso"] @ [0.0, sign * SHOULDER_Y, TRUNK_M])
         for side, sign in _SIDES.items()
     }
+    neck, up = 0.5 * (shoulders["left"] + shoulders["right"]), R_WL["torso"][:, 2]
+    position = {"pelvis": np.zeros(3), "neck": neck + NECK_M * up, "head": neck + HEAD_M * up}
+    position |= {name: share * neck for name, (share, _) in SPINE.items()}
+    for side, sign in _SIDES.items():
+        position[f"{side}_shoulder"] = neck + COLLAR_SHARE * (shoulders[side] - neck)
+        joint = shoulders[side]
+        for part, end, length in zip(_ARM, ("elbow", "wrist", ""), (UPPER_ARM_M, FOREARM_M, 0.0), strict=True):
+            position[f"{side}_{part}"] = joint
+            joint = points.get(f"{side}_{end}", joint - length * R_WL[f"{side}_{part}"][:, 2])
+        above, begin = "pelvis", np.array([0.0, 0.0, HIP_Z])
+        for part, point in (*zip(_LEG, ("hip", "knee", "ankle"), strict=True), ("toe", "")):
+            name, place = f"{side}_{part}", np.array(LEG[part]) * [1.0, sign, 1.0]
+            position[name] = points.get(f"{side}_{point}", position[above] + R_WL[above] @ (place - begin))
+            above, begin = name, place
+        if f"{side}_toe" in points:
+            position[f"{side}_toe"] = points[f"{side}_toe"] - R_WL[f"{side}_toe"] @ TOE_TIP
+    return Figure(root + np.array([position[name] for name in SEGMENTS]), rotations.multiply(quat_WL, _T_TO_N))
 
 
-def _place_arm(
-    side: str,
-    shoulder: np.ndarray,
-    points: Mapping[str, np.ndarray],
-    R_WL: Mapping[str, Rotation],
-    position: dict[str, np.ndarray],
-    turn: dict[str, Rotation],
-) -> None:
-    """Place an arm; a segment without a sensor goes on as the one above it, a whole arm hangs."""
-    R_above, joint = Rotation.identity(), shoulder
-    parts = (("upper_arm", "elbow", UPPER_ARM_M), ("forearm", "wrist", FOREARM_M), ("hand", "", 0.0))
-    for part, end, length in parts:
-        name = f"{side}_{part}"
-        R_above = R_WL.get(name, R_above)
-        position[name], turn[name] = joint, R_above
-        joint = points.get(f"{side}_{end}", joint + R_above.apply([0.0, 0.0, -length]))
+def _orient_segments(measured: dict[str, np.ndarray]) -> np.ndarray:
+    """Orient the segments (23, 4) xyzw; one without a sensor goes on as the one above it, a whole arm or leg hangs."""
+    upright = np.array([0.0, 0.0, 0.0, 1.0])
+    pelvis = measured.get("pelvis", upright)
+    if not any(name in measured for name in _OURS.values()):
+        pelvis = rotations.exp([0.0, 0.0, float(rotations.heading(pelvis))])
+    torso = measured.get("torso", pelvis)
+    head = measured.get("head", torso)
+    below, above = np.array([pelvis, pelvis, pelvis, torso]), np.array([torso, torso, torso, head])
+    turns = rotations.log(rotations.multiply(rotations.conjugate(below), above))
+    l5, l3, t12, neck = rotations.multiply(below, rotations.exp(_TURN_SHARES * turns))
+    quat = {"pelvis": pelvis, "l5": l5, "l3": l3, "t12": t12, "torso": torso, "neck": neck, "head": head}
+    for side in _SIDES:
+        quat[f"{side}_shoulder"] = torso
+        for first, limb in ((upright, _ARM), (pelvis, (*_LEG, "toe"))):
+            for part in limb:
+                name = f"{side}_{part}"
+                first = quat[name] = measured.get(_OURS.get(name, name), first)
+    return np.array([quat[name] for name in SEGMENTS])

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..calibration import Calibration, CalibrationQuality, Protocol
+from ..model import BodyTable
 from ..recording import Recording
 from ..recording.arrivals import Samples, Ticks
 from .assignment import AssignedSource
@@ -47,7 +48,7 @@ class GuideOptions:
     ----------
     folder : where recordings, calibrations and the sensors' setup go
     setup : name, start pose and body of the session; its mounts, where known
-    order : segments in the order of the body
+    table : of the body
     depth : segment → number of segments between it and the root
     calibrate : calibrates a recorded file, with lengths [m] that the person measured
     estimate : calibrates the recording so far
@@ -57,7 +58,7 @@ class GuideOptions:
     folder: Path
     protocol: Protocol
     setup: SensorSetup
-    order: tuple[str, ...]
+    table: BodyTable
     depth: Mapping[str, int]
     calibrate: Callable[[Path, Mapping[str, float]], Calibrated]
     estimate: Callable[[Recording], tuple[Calibration, CalibrationQuality]]
@@ -98,6 +99,11 @@ class Guide:
     @property
     def step(self) -> Step:
         return self.steps[self._index]
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Segments in the order of the body."""
+        return tuple(self.options.table.segments)
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -164,7 +170,7 @@ class Guide:
 
     def assigned(self) -> AssignedSource:
         """The source with the sensors named by their segments."""
-        return AssignedSource(self.source, self.segments, self.options.order, is_open=True)
+        return AssignedSource(self.source, self.segments, self.order, is_open=True)
 
     def begin_attempt(self) -> Attempt:
         """Begin to record, unless a recording of these sensors runs."""

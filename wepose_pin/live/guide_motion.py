@@ -24,6 +24,8 @@ FINISH_AFTER_S = 15.0  # [s] of a phase after which it may be finished
 MORE_S = 30.0  # [s] of motion that "more" adds
 MOST_ADVICE = 2  # sentences at a time
 APART_S, APART = 3.0, 0.10  # [s] newest motion, and its median gap [m] above which the closure seems open
+# Codes of reasons that more motion takes away, or begin so.
+TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain", "closure-open")
 MOST_LOSS_S = 2.0  # [s] of a lost sensor after which its heading has to be found anew
 
 FINISH = GuideAction("next", "Finish", "n")
@@ -106,7 +108,7 @@ class ExerciseStep(Step):
         self._begin = max(self._begin, now + RESUME_S)
 
     def _join_lost(self) -> str:
-        return self.guide.join_sensors([name for name in self.guide.options.order if name in self._lost_segments])
+        return self.guide.join_sensors([name for name in self.guide.order if name in self._lost_segments])
 
     def actions(self) -> list[GuideAction]:
         measured_s = 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)
@@ -145,7 +147,7 @@ class ExerciseStep(Step):
         return view._replace(
             lengths=_list_lengths(calibration),
             sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES),
-            reasons=_advise(quality),
+            reasons=() if calibration.labels.moved else _advise(quality),
         )
 
 
@@ -177,13 +179,19 @@ class CalibrationStep(Step):
         """Segment → the sensor's label where they seem exchanged."""
         return self._result.calibration.labels.moved or {} if isinstance(self._result, Calibrated) else {}
 
+    @property
+    def _lacks_motion(self) -> bool:
+        """Whether all that is wrong is that there was too little motion, or too little of it with the points joined."""
+        reasons = self._result.quality.reasons if isinstance(self._result, Calibrated) else ()
+        return bool(reasons) and all(reason.code.startswith(TOO_LITTLE) for reason in reasons)
+
     def actions(self) -> list[GuideAction]:
         if self._result is None:
             return [RESTART]
         if self._moved:
             return [EXCHANGE, RESTART]
         if not isinstance(self._result, Calibrated) or self._result.quality.quality == "fail":
-            return [RESTART, MORE]
+            return [MORE, RESTART] if self._lacks_motion else [RESTART, MORE]
         return [ACCEPT, MORE, RESTART]
 
     def act(self, action: str) -> None:
@@ -232,15 +240,21 @@ class CalibrationStep(Step):
         }[quality.quality]
         if quality.quality == "poor" and all(reason.code.startswith("scale-") for reason in quality.reasons):
             sentence = "The proportions are good. One measured length gives the scale too."
-        if self._moved:
-            sentence = "Some sensors sit on other segments than assigned."
+        if quality.quality == "fail" and self._lacks_motion:
+            sentence = "There was too little of the motion. More of it may be enough."
+        reasons = [text.line() for _, text in render_all(quality.reasons)]
+        if self._moved:  # all other reasons follow from this one
+            sentence, reasons = (
+                "Some sensors sit on other segments than assigned. The same motion will do.",
+                reasons[:1],
+            )
         return GuideView(
             sentence,
             progress=1.0,
             lengths=_list_lengths(calibration),
             sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES),
             quality=quality.quality,
-            reasons=tuple(text.line() for _, text in render_all(quality.reasons)),
+            reasons=tuple(reasons),
             measurable=self._measurable,
         )
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from ..recording.arrivals import Samples, Ticks
 from ..recording.limits import GRAVITY_ERROR_NOTED, STANDARD_GRAVITY
-from ..tracking.start_pose import StartPoseDetector
+from ..tracking.start_pose import StartPoseDetector, TickRates
 from .assignment import ShakeDetector
+from .attempt import Attempt
 from .guide import AGAIN, GET_READY_S, NEXT, Guide, Step
 from .state import GuideAction, GuideView, join_names
 
@@ -34,10 +35,24 @@ class SensorStep(Step):
 
     def view(self) -> GuideView:
         count, needed = len(self.guide.newest_times) - len(self.guide.silent), len(self.guide.needs)
-        sentence = f"Strap the sensors on and switch them on: {count} of {needed} send."
+        sentence, note = "Strap the sensors on and switch them on", self.guide.describe_silent()
+        awaited = "" if self.guide.newest_times else self.guide.source.awaited
+        sentence = f"{sentence}. Waiting for {awaited}." if awaited else f"{sentence}: {count} of {needed} send."
         if count >= needed:
             sentence = f"{count} sensors send. Are all strapped on tightly?"
-        return GuideView(sentence, self.guide.describe_silent(), progress=min(1.0, count / max(needed, 1)))
+        return GuideView(sentence, note, progress=min(1.0, count / max(needed, 1)), reasons=self._warn_of_trackers())
+
+    def _warn_of_trackers(self) -> tuple[str, ...]:
+        """What the motion cannot show of sensors that measure orientations in worlds of their own."""
+        table, setup = self.guide.options.table, self.guide.options.setup
+        trackers = [name for name, aligned in self.guide.source.orientations.items() if not aligned]
+        if table.is_mechanism or not trackers or table.reference in setup.mounts:
+            return ()
+        place = join_names([table.reference])
+        return (
+            f"These sensors measure orientations and no accelerations: the motion does not show how the one on the "
+            f"{place} is turned, and the calibration will not pass. State its mount, as docs/live-guide.md says.",
+        )
 
 
 class AssignmentStep(Step):
@@ -46,7 +61,7 @@ class AssignmentStep(Step):
     name, title, before_attempt = "assignment", "Segments", True
 
     def enter(self) -> None:
-        names = {name: name for name in self.guide.newest_times if name in self.guide.options.order}
+        names = {name: name for name in self.guide.newest_times if name in self.guide.order}
         known = names | dict(self.guide.options.known) | self.guide.segments
         known = {name: segment for name, segment in known.items() if name in self.guide.newest_times}
         self.repeat()
@@ -70,7 +85,7 @@ class AssignmentStep(Step):
         return [name for name in self.guide.newest_times if name not in self.guide.segments]
 
     def push_samples(self, samples: Sequence[Samples]) -> None:
-        self._shakes.push(samples)
+        self._shakes.push(samples, self.guide.source.orientations)
 
     def update(self) -> None:
         shaken = self._shakes.find(self._free)
@@ -100,33 +115,58 @@ class AssignmentStep(Step):
         return GuideView(f"Shake the sensor on the {place}.", note, progress=done, highlight=segment)
 
 
+class Stillness:
+    """Waits in the ticks of an attempt until no sensor has moved for some seconds."""
+
+    def __init__(self, attempt: Attempt, seconds: float) -> None:
+        assert attempt.rate_hz is not None
+        self._attempt, self.seconds, self.measured = attempt, seconds, attempt.measured
+        self.detector = StartPoseDetector(attempt.rate_hz, len(self.measured), seconds)
+        self._rates = TickRates(self.measured, attempt.rate_hz)
+
+    def push(self, ticks: Ticks) -> int | None:
+        """Add ticks; return the row of the one with which the seconds are full; None: not yet."""
+        for n, (gyro_S, accel_S) in enumerate(zip(ticks.gyro_S, ticks.accel_S, strict=True)):
+            if self.detector.push(self._rates.push(gyro_S, accel_S)) == "ready":
+                return n
+        return None
+
+    @property
+    def progress(self) -> float:
+        return self.detector.held_s / self.seconds
+
+    @property
+    def moving(self) -> str:
+        """The segments that have just moved, as words; empty: none."""
+        if self.detector.state != "moved":
+            return ""
+        return join_names([self._attempt.segments[k] for k in self.detector.moving])
+
+
 class StaticStep(Step):
     """Checks the sensors while the person stands still."""
 
     name, title = "static", "Check"
 
     def enter(self) -> None:
-        self._detector: StartPoseDetector | None = None
+        self._stillness: Stillness | None = None
         self._ticks: list[Ticks] = []
         self._faults: tuple[str, ...] = ()
         self.guide.begin_attempt()
 
     def push_ticks(self, ticks: Ticks) -> None:
-        if self._detector is None:
+        if self._stillness is None:
             assert self.guide.attempt is not None
-            assert self.guide.attempt.rate_hz is not None
-            self._detector = StartPoseDetector(self.guide.attempt.rate_hz, ticks.lost.shape[1], STATIC_S)
+            self._stillness = Stillness(self.guide.attempt, STATIC_S)
         self._ticks = [*self._ticks[-200:], ticks]
-        for gyro_S in ticks.gyro_S:
-            if self._detector.push(gyro_S) == "ready" and not self._faults:
-                self._check()
-                return
+        if self._stillness.push(ticks) is not None and not self._faults:
+            self._check(self._stillness.measured)
 
-    def _check(self) -> None:
-        """Compare the specific force of each sensor with gravity."""
+    def _check(self, measured: np.ndarray) -> None:
+        """Compare the specific force of each sensor with gravity; `measured` (k,) ones have none."""
         accel = np.concatenate([each.accel_S for each in self._ticks])[-round(STATIC_S * 50) :]
         force = np.linalg.norm(np.nanmean(accel, axis=0), axis=1)
-        off = np.abs(force / STANDARD_GRAVITY - 1.0) > GRAVITY_ERROR_NOTED
+        off = (np.abs(force / STANDARD_GRAVITY - 1.0) > GRAVITY_ERROR_NOTED) & ~measured
         assert self.guide.attempt is not None
         names = self.guide.attempt.segments
         self._faults = tuple(
@@ -148,10 +188,10 @@ class StaticStep(Step):
             self.enter()
 
     def view(self) -> GuideView:
-        detector, note = self._detector, self.guide.describe_silent()
-        if detector is not None and detector.state == "moved":
-            note = f"{_name_moving(self.guide, detector)} moved."
-        held = 0.0 if detector is None else detector.held_s / STATIC_S
+        stillness, note = self._stillness, self.guide.describe_silent()
+        if stillness is not None and stillness.moving:
+            note = f"{stillness.moving.capitalize()} moved."
+        held = 0.0 if stillness is None else stillness.progress
         return GuideView("Stand still for a moment.", note, progress=held, reasons=self._faults)
 
 
@@ -169,7 +209,7 @@ class StartPoseStep(Step):
     def enter(self) -> None:
         self.reason = ""
         self._begin: float | None = None
-        self._detector: StartPoseDetector | None = None
+        self._stillness: Stillness | None = None
         attempt = self.guide.begin_attempt()
         for phase in ("start", *(step.phase for step in self.guide.options.protocol.steps)):
             attempt.mark("discard", phase=phase)
@@ -178,15 +218,15 @@ class StartPoseStep(Step):
         attempt = self.guide.attempt
         if self._begin is None or self.guide.now < self._begin or attempt is None or attempt.rate_hz is None:
             return
-        if self._detector is None:
-            self._detector = StartPoseDetector(attempt.rate_hz, ticks.lost.shape[1], self._seconds)
-        for n, gyro_S in enumerate(ticks.gyro_S):
-            if self._detector.push(gyro_S) == "ready":
-                end = float(ticks.time[n])
-                attempt.mark("begin", phase="start", time=end - (self._detector.held_s - 1.0 / attempt.rate_hz))
-                attempt.mark("end", phase="start", time=end)
-                self.guide.go_on()
-                return
+        if self._stillness is None:
+            self._stillness = Stillness(attempt, self._seconds)
+        last = self._stillness.push(ticks)
+        if last is not None:
+            end = float(ticks.time[last])
+            held_s = self._stillness.detector.held_s
+            attempt.mark("begin", phase="start", time=end - (held_s - 1.0 / attempt.rate_hz))
+            attempt.mark("end", phase="start", time=end)
+            self.guide.go_on()
 
     def actions(self) -> list[GuideAction]:
         return [READY] if self._begin is None else [AGAIN]
@@ -197,18 +237,13 @@ class StartPoseStep(Step):
             self._begin = self.guide.now + GET_READY_S
 
     def view(self) -> GuideView:
-        detector, countdown, held = self._detector, None, 0.0
+        stillness, countdown, held = self._stillness, None, 0.0
         note = self.guide.describe_silent() or self.reason
         if self._begin is not None and self.guide.now < self._begin:
             countdown = self._begin - self.guide.now
-        elif detector is not None:
-            held = detector.held_s / self._seconds
-            countdown = self._seconds - detector.held_s
-            if detector.state == "moved":
-                note = f"You moved ({_name_moving(self.guide, detector)}). Once more: {self._seconds:.0f} s still."
+        elif stillness is not None:
+            held = stillness.progress
+            countdown = (1.0 - held) * self._seconds
+            if stillness.moving:
+                note = f"You moved ({stillness.moving}). Once more: {self._seconds:.0f} s still."
         return GuideView(self._do, note, countdown, progress=held)
-
-
-def _name_moving(guide: Guide, detector: StartPoseDetector) -> str:
-    assert guide.attempt is not None
-    return join_names([guide.attempt.segments[k] for k in detector.moving])

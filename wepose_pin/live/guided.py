@@ -13,7 +13,7 @@ from .demonstration import RATE_HZ, Demonstration
 from .guide import Calibrated, Guide, GuideOptions, Step
 from .guide_motion import CalibrationStep, ExerciseStep
 from .guide_preparation import AssignmentStep, SensorStep, StartPoseStep, StaticStep
-from .sources.base import Source, find_batteries
+from .sources.base import Source
 from .state import Output, SensorStatus, Status
 
 STATUS_PERIOD_S = 0.1  # [s]
@@ -107,7 +107,5 @@ class GuidedSession:
         rate_hz = sum(count for _, count in self._counts[name]) / RATE_WINDOW_S
         segment = self.guide.segments.get(name, "")
         label = f"{segment} ({name})" if segment and segment != name else name
-        unknown = (math.nan, math.nan, math.nan)
-        lost = name in self.guide.silent
-        battery = find_batteries(self.source).get(name, math.nan)
-        return SensorStatus(label, rate_hz, lost, False, unknown, math.nan, math.nan, 0, 0, 0, False, battery)
+        battery = self.source.batteries.get(name, math.nan)
+        return SensorStatus(label, rate_hz, name in self.guide.silent, battery=battery)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+import itertools
 import math
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -15,7 +18,7 @@ import numpy as np
 from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession
 from ..filters import BEST
-from ..kinematics import LiveKinematics
+from ..kinematics import LiveKinematics, compute_axis_std
 from ..model import BodyModel, load_table
 from ..model.body import load_sensed_model
 from ..model.start_pose import compute_start_configuration
@@ -42,11 +45,12 @@ from ..tracking.headings import CAUSAL_KNOT_S
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates
 from ..writers.live_log import LiveLog
 from .setup import SensorSetup
-from .sources.base import Source, find_batteries
+from .sources.base import Source
 from .state import LivePose, Output, SensorStatus, Status, StreamInfo, join_names
 from .ticks import TickStream
 
 STATUS_PERIOD_S = 0.2  # [s]
+SWITCH_INTERVAL_S = 5e-4  # [s] after which page and robot hand over the interpreter to the loop; Python has 5 ms
 READ_TIMEOUT_S = 0.05  # [s]; keys and the status wait for a read
 MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
 MAX_LATENCIES = 1000  # newest latencies in the status
@@ -83,7 +87,7 @@ class SessionSummary(NamedTuple):
     poses: int
     seconds: float  # [s] from the first pose to the last, on the source's clock
     counts: Mapping[str, Mapping[str, int]]  # segment → each of `arrivals.COUNTS`
-    latency: Latencies  # of every tick: [s] from its time to its pose
+    latency: Latencies  # of every tick with a sample: [s] from its time to its pose
     diagnostics: tuple[Diagnostic, ...]
     problem: str  # of the recording; empty where it is complete
     record: Path | None  # the recording
@@ -192,10 +196,12 @@ class LiveLoop:
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
         self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
         self._heading_reset_time = 0.0
-        self._std, self._std_interval_ticks = np.full(len(source.sensors), np.nan), 1
+        self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
+        self._covariance: Iterator[np.ndarray | None] = iter(())  # computed in parts, one or more with each tick
+        self._covariance_ticks, self._covariance_parts = 1, 1  # from one to the next, and parts with a tick
         self._latency = Latencies()
         self._recent_latencies: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s] of displayed poses
-        self._first_pose = self._last_pose = 0.0
+        self._poses, self._first_pose, self._last_pose = 0, 0.0, 0.0
         self._count_history: deque[tuple[float, np.ndarray]] = deque(maxlen=round(1.0 / STATUS_PERIOD_S) + 1)
         self._events: list[tuple[str, dict[str, Any]]] = []  # that decide poses
         self._open_phases: list[str] = []
@@ -204,7 +210,9 @@ class LiveLoop:
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> SessionSummary:
         """Run until the source ends, the user presses q, or `should_stop` returns True."""
-        next_status = 0.0
+        next_status, switch_interval = 0.0, sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        gc.freeze()
         try:
             while not should_stop():
                 samples = self.source.read(READ_TIMEOUT_S)
@@ -221,6 +229,8 @@ class LiveLoop:
             self._ended = True
             self._send_status()
         finally:
+            gc.unfreeze()
+            sys.setswitchinterval(switch_interval)
             self.source.close()
             if self.log is not None:
                 self.log.close()
@@ -248,7 +258,8 @@ class LiveLoop:
             assert synchronizer is not None
             stated = next(iter(self.setup.phases.get("start", ())), None)
             self._start_search = StartPoseSearch(synchronizer, self.source.orientations, stated)
-            self._std_interval_ticks = max(1, round(STATUS_PERIOD_S * synchronizer.rate_hz))
+            self._covariance_ticks = max(1, round(STATUS_PERIOD_S * synchronizer.rate_hz))
+            self._covariance_parts = math.ceil((len(self.source.sensors) + 2) / self._covariance_ticks)
         return self._start_search
 
     # Ticks to poses --------------------------------------------------------------------------------------------------
@@ -268,8 +279,7 @@ class LiveLoop:
             for phase, begins in self._phase_edges.take_due(ticks.time[n]):
                 estimator.mark_phase(phase, begins=begins)
             quat_WL = estimator.step(ticks.gyro_S[n], ticks.accel_S[n])
-            if (ticks.first + n) % self._std_interval_ticks == 0:  # by ticks: a recording reproduces the values
-                self._std = estimator.std()
+            self._update_std(estimator, ticks.first + n)
             if self.log is not None:
                 self.log.pose(ticks.first + n, quat_WL)
         if quat_WL is None:
@@ -277,12 +287,21 @@ class LiveLoop:
         points = self.kinematics.compute_points(quat_WL)
         self._last_pose = float(ticks.time[-1])
         now = self.source.clock()
-        for tick in ticks.time[row:].tolist():
+        self._poses += len(ticks.time) - row
+        for tick in ticks.time[row:][~ticks.lost[row:].all(axis=1)].tolist():  # who slept is not late
             self._latency.add(now - tick)
         latency = now - self._last_pose
         self._recent_latencies.append(latency)
         quat_WL = self.kinematics.orient_segments(quat_WL).copy()
         return LivePose(self._last_pose, quat_WL, points, self._std, ticks.lost[-1].copy(), latency)
+
+    def _update_std(self, estimator: CausalSegmentEstimator, tick: int) -> None:
+        """Compute some of the covariances; by ticks, so that a recording reproduces the values."""
+        if tick % self._covariance_ticks == 0:
+            self._covariance = estimator.covariance_gradually()
+        for covariance in itertools.islice(self._covariance, self._covariance_parts):
+            if covariance is not None:
+                self._std, self._heading_std = compute_axis_std(covariance), np.sqrt(covariance[:, 2, 2])
 
     def _start_tracking(self, search: StartPoseSearch, begin: int, end: int) -> CausalSegmentEstimator:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
@@ -317,6 +336,9 @@ class LiveLoop:
                 self._segment_estimator.reset_headings()
                 self._heading_reset_time = self._start_search.synchronizer.newest
                 self._record_event("reset", tick=self._start_search.synchronizer.next_tick)
+            if key == "r":
+                for output in self.outputs:
+                    output.resume()
             self._mark(key)
         return True
 
@@ -382,14 +404,14 @@ class LiveLoop:
             counts, frozen = synchronizer.counts.copy(), synchronizer.frozen.copy()
             lost |= synchronizer.lost | frozen
             recorded_s = 0.0 if self.log is None else max(0.0, synchronizer.newest - synchronizer.begin)
-        static, bias, heading_std, heading_age = np.zeros(k, dtype=bool), np.zeros((k, 3)), np.full(k, np.nan), 0.0
+        static, bias, heading_age = np.zeros(k, dtype=bool), np.zeros((k, 3)), 0.0
         if estimator is not None:
-            static, bias, heading_std = estimator.static, estimator.gyro_bias, estimator.heading_std()
+            static, bias = estimator.static, estimator.gyro_bias
             heading_age = max(0.0, now - self._heading_reset_time)
         self._count_history.append((now, counts[:, TAKEN]))
         (first_time, first_count), (_, last_count) = self._count_history[0], self._count_history[-1]
         rates = (last_count - first_count) / (now - first_time) if now > first_time else np.zeros(k)
-        battery = find_batteries(self.source)
+        battery = self.source.batteries
         latencies_ms = 1e3 * np.array(self._recent_latencies or [0.0])
         return Status(
             *self._describe_state(lost, frozen),
@@ -401,7 +423,7 @@ class LiveLoop:
                     bool(lost[i]),
                     bool(static[i]),
                     (float(bias[i, 0]), float(bias[i, 1]), float(bias[i, 2])),
-                    float(heading_std[i]),
+                    float(self._heading_std[i]),
                     heading_age,
                     int(counts[i, MISSING]),
                     int(counts[i, LATE]),
@@ -432,11 +454,14 @@ class LiveLoop:
         if self._ended:
             return "ended", "The session has ended.", 1.0
         if self._segment_estimator is not None:
-            return "ready", self._describe_lost(lost, frozen) or "Tracking.", 1.0
+            said = [self._describe_lost(lost, frozen) or "Tracking.", *(output.describe() for output in self.outputs)]
+            return "ready", " ".join(filter(None, said)), 1.0
         if self._start_search is None:
             missing_sensors = [name for name in self.source.sensors if self._stream.newest_times[name] == -np.inf]
             if missing_sensors:
-                return "waiting", f"Waiting for {join_names(missing_sensors)}.", 0.0
+                nothing, awaited = len(missing_sensors) == len(self.source.sensors), self.source.awaited
+                where = f" Waiting for {awaited}." if nothing and awaited else ""
+                return "waiting", f"Nothing has come yet from {join_names(missing_sensors)}.{where}", 0.0
             return "waiting", "Measuring the sampling rate.", 0.0
         search, detector = self._start_search, self._start_search.detector
         if search.stated is not None:
@@ -475,8 +500,8 @@ class LiveLoop:
             else self._start_search.synchronizer.counts
         )
         return SessionSummary(
-            self._latency.count,
-            self._last_pose - self._first_pose if self._latency.count else 0.0,
+            self._poses,
+            self._last_pose - self._first_pose if self._poses else 0.0,
             {name: dict(zip(COUNTS, row.tolist(), strict=True)) for name, row in zip(sensors, counts, strict=True)},
             self._latency,
             () if self._segment_estimator is None else self._segment_estimator.start.diagnostics,
@@ -524,6 +549,6 @@ def warm_up(method: str) -> None:
     estimator = tracker.segment_estimator
     for _ in range(round(2.0 * CAUSAL_KNOT_S * recording.rate_hz)):
         estimator.step(np.zeros((len(sensors), 3)), np.tile([0.0, 0.0, 9.81], (len(sensors), 1)))
-    estimator.std()
+    estimator.covariance()
     synchronizer = StreamSynchronizer(sensors, 100.0, 0.0)
     synchronizer.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))

@@ -8,9 +8,6 @@ specification, revision N, 2018; it says centimetres where the receivers that we
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
-
-import numpy as np
 
 from .. import rotations
 from .figure import SEGMENTS, Figure
@@ -22,26 +19,6 @@ HEADER = struct.Struct(">6sIBBIBBBBHH")
 ITEM = struct.Struct(">i3f4f")
 WHOLE = 0x80  # the frame is in one datagram
 BODY_SEGMENTS = len(SEGMENTS)
-# Our segment → its number in MVN, from 1 on.
-SEGMENT_IDS = {
-    "pelvis": 1,
-    "torso": 5,
-    "head": 7,
-    "right_upper_arm": 9,
-    "right_forearm": 10,
-    "right_hand": 11,
-    "left_upper_arm": 13,
-    "left_forearm": 14,
-    "left_hand": 15,
-}
-_QUARTER = np.sqrt(0.5)
-# `quat` (4,) xyzw of R_BL, our segment's frame in MVN's: from N-pose to T-pose an arm turns by a quarter about x.
-N_TO_T: Mapping[str, np.ndarray] = {
-    name: np.array([{"l": _QUARTER, "r": -_QUARTER}[name[0]], 0.0, 0.0, _QUARTER])
-    if name.startswith(("left_", "right_"))
-    else np.array([0.0, 0.0, 0.0, 1.0])
-    for name in SEGMENT_IDS
-}
 
 
 def encode_frame(figure: Figure, counter: int, time_s: float) -> bytes:

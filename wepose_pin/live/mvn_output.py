@@ -8,12 +8,16 @@ from .outputs import DatagramOutput
 from .state import LivePose, StreamInfo
 
 PORT = 9763
+RATE_HZ = 60.0  # of a suit of 17 wireless sensors
 
 
 class MvnOutput(DatagramOutput):
     """Sends each pose as a datagram of type 02."""
 
     option, port = "--mvn", PORT
+
+    def __init__(self, to: str, rate_hz: float | None = RATE_HZ) -> None:
+        super().__init__(to, rate_hz)
 
     def start(self, info: StreamInfo) -> None:
         super().start(info)

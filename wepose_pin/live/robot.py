@@ -9,15 +9,13 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadOption
 from ..model import BodyModel, BodyTable, load_table
-from ..retargeting import LimitMargins, Robot, find_map, load_robot, read_map
+from ..retargeting import Robot
 from ..retargeting.stream import ArmObserver, Command, CommandStream, StreamOptions, check_segments
 from ..subject import population_subject
 from .loop import Latencies
@@ -131,6 +129,15 @@ class RobotOutput(Output):
 
     def status(self, status: Status) -> None:  # noqa: ARG002
         self._raise_failure()
+
+    def describe(self) -> str:
+        """The robot's state and why, as a sentence."""
+        command = self.newest
+        if command is None:
+            return ""
+        state = f"{command.state} ({command.reason})" if command.reason else command.state
+        hint = "; r, in the start pose, goes on" if self.stream.stopped else ""
+        return f"{self.robot.map.name}: {state}{hint}."
 
     def resume(self) -> None:
         """Continue after a stop, by an approach."""
@@ -255,36 +262,6 @@ class RobotOutput(Output):
             raise self._failure
 
 
-class RobotStatusView(Output):
-    """A view whose message also gives the state of the robot, and whose key "r" resumes the robot too."""
-
-    def __init__(self, view: Output, robot: RobotOutput) -> None:
-        self._view, self._robot = view, robot
-
-    def start(self, info: StreamInfo) -> None:
-        self._view.start(info)
-
-    def show(self, pose: LivePose) -> None:
-        self._view.show(pose)
-
-    def status(self, status: Status) -> None:
-        command = self._robot.newest
-        if command is not None and status.state == "ready":
-            state = f"{command.state} ({command.reason})" if command.reason else command.state
-            hint = "; r, in the start pose, goes on" if self._robot.stream.stopped else ""
-            status = status._replace(message=f"{status.message} {self._robot.robot.map.name}: {state}{hint}.")
-        self._view.status(status)
-
-    def take_keys(self) -> list[str]:
-        keys = self._view.take_keys()
-        if "r" in keys:
-            self._robot.resume()
-        return keys
-
-    def close(self) -> None:
-        self._view.close()
-
-
 class TickReplay(ReplaySource):
     """A replay as fast as possible, one tick a read: the robot gets every pose."""
 
@@ -298,19 +275,13 @@ class RobotOptions:
 
     Parameters
     ----------
-    robot : name or file, as for `find_map`
-    arms : sides; None: all that the robot has
-    map_file : of a URDF in `robot` that has none beside it
+    robot : of `load_robot`
     to : ``PORT`` or ``HOST:PORT`` of the receiver
-    margins : to the robot's limits
     """
 
-    robot: str
-    arms: tuple[str, ...] | None = None
-    map_file: Path | None = None
+    robot: Robot
     to: str = str(PORT)
     stream: StreamOptions = field(default_factory=StreamOptions)
-    margins: LimitMargins = field(default_factory=LimitMargins)
 
 
 def connect_robot(
@@ -326,19 +297,14 @@ def connect_robot(
     Raises
     ------
     WeposeError
-        What is wrong with robot, map or options; an arm without sensors.
+        What is wrong with the options; an arm without sensors.
     """
-    path = Path(options.robot)
-    if options.map_file is not None and path.suffix.lower() not in (".urdf", ".xml"):
-        raise BadOption(f"--map {options.map_file}: --robot {options.robot} has its own; a map goes with a URDF")
-    robot_map = find_map(options.robot) if options.map_file is None else read_map(options.map_file, urdf=path)
-    robot = load_robot(robot_map, options.arms, options.margins)
     if source.sensors:
-        check_segments(robot, source.sensors, table)
+        check_segments(options.robot, source.sensors, table)
     if isinstance(source, ReplaySource) and math.isinf(speed):
         source = TickReplay(source.recording, speed)
     lengths_cov = (setup.subject or population_subject(body=table)).lengths_covariance((table or load_table()).lengths)
-    stream = CommandStream(robot, options.stream)
+    stream = CommandStream(options.robot, options.stream)
     return RobotOutput(stream, options.to, lengths_cov=lengths_cov, speed=speed, table=table), source
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import base64
-import contextlib
 import hashlib
 import hmac
 import json
@@ -18,6 +17,7 @@ from ipaddress import ip_address
 from typing import Any
 
 from ..errors import BadOption
+from .addresses import name_host
 from .encoder import PoseEncoder
 from .state import GuideView, Status, round_finite
 
@@ -82,7 +82,7 @@ class Server:
             ) from None
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
-        self.url = f"http://{_name_host(host)}:{self.port}/" + (f"?token={self.token}" if self.token else "")
+        self.url = f"http://{name_host(host)}:{self.port}/" + (f"?token={self.token}" if self.token else "")
         self._loop = asyncio.new_event_loop()
         self._end = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="live page", daemon=True)
@@ -205,16 +205,6 @@ class Server:
         )
 
 
-def _name_host(host: str) -> str:
-    """The address under which others reach `host`, as a URL has it; of "any address" that of this machine's network."""
-    if host in ("0.0.0.0", "::"):
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.socket(family, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
-            probe.connect(("2001:db8::1" if ":" in host else "192.0.2.1", 9))  # sends nothing
-            host = str(probe.getsockname()[0])
-    return f"[{host}]" if ":" in host else host
-
-
 def _build_application(server: Server) -> Any:
     from tornado.web import Application, RequestHandler
     from tornado.websocket import WebSocketClosedError, WebSocketHandler
@@ -227,9 +217,7 @@ def _build_application(server: Server) -> Any:
         elif origin is not None and origin != f"http://{host}":
             handler.set_status(403)
             handler.finish("This page speaks to itself only.")
-        elif server.token and not hmac.compare_digest(
-            handler.get_query_argument("token", "").encode(), server.token.encode()
-        ):
+        elif not server.accepts_token(handler.get_query_argument("token", "")):
             handler.set_status(403)
             handler.finish("The address of this page has a token, as the terminal shows it.")
 
@@ -340,24 +328,15 @@ def status_json(status: Status) -> str:
 
 def _guide_json(view: GuideView) -> dict[str, Any]:
     """The guide's view for the page: lengths in millimetres."""
-    return {
+    return view._asdict() | {
         "steps": [step._asdict() for step in view.steps],
-        "sentence": view.sentence,
-        "note": view.note,
         "countdown": None if view.countdown is None else round_finite(view.countdown, 1),
         "remaining": None if view.remaining is None else round_finite(view.remaining, 0),
         "progress": round_finite(view.progress, 3),
-        "measurable": view.measurable,
         "actions": [action._asdict() for action in view.actions],
         "lengths": [
-            {
-                "name": length.name,
-                "mm": round_finite(1e3 * length.metres, 0),
-                "std_mm": round_finite(1e3 * length.std, 1),
-            }
-            for length in view.lengths
+            {"name": name, "mm": round_finite(1e3 * metres, 0), "std_mm": round_finite(1e3 * std, 1)}
+            for name, metres, std in view.lengths
         ],
         "sample_size": None if view.sample_size is None else [round_finite(size, 1) for size in view.sample_size],
-        "quality": view.quality,
-        "reasons": list(view.reasons),
     }

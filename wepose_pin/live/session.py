@@ -64,7 +64,9 @@ def run_session(
         raise ExistingOutput(f"{record}: exists; --force replaces it, --record names another file")
     _check_mounts(source, setup)
     warm_up(method)  # before samples come
-    if not _open(source, outputs, until):
+    if not open_and_wait(source, outputs, until):
+        for output in outputs:
+            output.close()
         return EMPTY_SESSION
     log = None
     try:
@@ -91,7 +93,7 @@ def run_session(
     return loop.run(until)
 
 
-def _open(source: Source, outputs: Sequence[Output], until: Callable[[], bool]) -> bool:
+def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[], bool]) -> bool:
     """Open the source and show what it waits for; return False where the user ends that by a key.
 
     Raises
@@ -117,8 +119,6 @@ def _open(source: Source, outputs: Sequence[Output], until: Callable[[], bool]) 
         raise
     if stopped:
         source.close()
-        for output in outputs:
-            output.close()
     return not stopped
 
 

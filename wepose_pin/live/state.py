@@ -33,14 +33,14 @@ class SensorStatus(NamedTuple):
     segment: str
     rate_hz: float  # samples a second over the last second, on the source's clock
     lost: bool  # silent for longer than the loop waits, or frozen
-    static: bool
-    gyro_bias: tuple[float, float, float]  # [rad/s]
-    heading_std: float  # [rad]; NaN where the filter has no covariance
-    heading_age: float  # [s] since the start, or the last reset of the headings
-    missing: int  # ticks without a sample of it
-    late: int  # samples that came after their tick
-    duplicate: int
-    frozen: bool  # its values repeat bit for bit, though it has noise
+    static: bool = False
+    gyro_bias: tuple[float, float, float] = (math.nan, math.nan, math.nan)  # [rad/s]
+    heading_std: float = math.nan  # [rad]; NaN where the filter has no covariance
+    heading_age: float = math.nan  # [s] since the start, or the last reset of the headings
+    missing: int = 0  # ticks without a sample of it
+    late: int = 0  # samples that came after their tick
+    duplicate: int = 0
+    frozen: bool = False  # its values repeat bit for bit, though it has noise
     battery: float = math.nan  # share of its charge, 0 to 1; NaN where it is not known
 
 
@@ -117,6 +117,13 @@ class Output:
 
     def demonstrate(self, pose: LivePose, segments: tuple[str, ...]) -> None:
         """Draw a pose of these segments that nobody took: an instruction of the guide."""
+
+    def describe(self) -> str:
+        """What to add to the message to the person while tracking; empty: nothing."""
+        return ""
+
+    def resume(self) -> None:
+        """Go on: the person stands in the start pose and asks for new headings."""
 
     def take_keys(self) -> list[str]:
         """Keys since the last call: "r" to reset the headings, "q" to end; in a guided session names of its actions."""

@@ -6,7 +6,7 @@ pose is filtered when it has ended; later samples change no earlier result.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
 
@@ -34,7 +34,6 @@ from ..filters import BEST, Orientation
 from ..filters.bank import LiveBank, OneByOne, create_bank
 from ..filters.sensors import SensorFilters, combine_chunk
 from ..filters.static import StaticTest
-from ..kinematics import compute_axis_std
 from ..recording import ImuSensor, OrientationSensor, Recording, join_recordings
 from ..recording.arrivals import list_numbers, unpack_orientations
 from ..rotations import product
@@ -445,37 +444,37 @@ class CausalSegmentEstimator:
         variance[~self._measured] = compute_heading_variance(newest[~self._measured], cov)
         return variance
 
-    def heading_std(self) -> np.ndarray:
-        """Return the standard deviation (k,) [rad] of each segment's heading, that of the mounts included.
+    def covariance(self) -> np.ndarray:
+        """Return the covariances (k, 3, 3) [rad²] of the segments in W after the last step, mounts included.
 
-        NaN where the filter has no covariance.
+        NaN where the filter has none.
         """
-        return np.sqrt([cov[2, 2] for cov in self._covariances_W()])
+        *_, covariance = self.covariance_gradually()
+        assert covariance is not None
+        return covariance
 
-    def std(self) -> np.ndarray:
-        """Return the standard deviation (k,) [rad] of each segment, per axis; NaN where the filter has none."""
-        return compute_axis_std(self._covariances_W())
+    def covariance_gradually(self) -> Iterator[np.ndarray | None]:
+        """Do as `covariance`, in parts of less than half a millisecond; only the last one is not None.
 
-    def _covariances_W(self) -> np.ndarray:
-        """Return the covariance (k, 3, 3) [rad²] of each segment in W after the last step; NaN: the filter has none."""
+        There may be steps between the parts: the result is that of the step before the first one.
+        """
         cov = np.full((len(self.names), 3, 3), np.nan)
         cov[self._measured] = _MEASURED_COV
         filtered = None if self._bank is None else self._bank.attitude_cov
         if filtered is not None:
             cov[~self._measured] = filtered
-        if not np.isfinite(cov).any():
-            return cov
-        newest = self._recent[self._oldest - 1]
-        soft = compute_soft_tissue_covariances(
-            self._start_frames.table, {name: self.quat_WL[i : i + 1] for i, name in enumerate(self.names)}
-        )
-        variance = np.full((2, len(cov)), np.nan) if self.headings is None else np.array(self.headings.variance)
-        return np.concatenate(
-            [
-                self._covariance_W(i, newest[i : i + 1], cov[i : i + 1], variance[None, :, i]) + soft[name]
-                for i, name in enumerate(self.names)
-            ]
-        )
+        if np.isfinite(cov).any():
+            newest = self._recent[self._oldest - 1].copy()
+            variance = np.full((2, len(cov)), np.nan) if self.headings is None else np.array(self.headings.variance)
+            soft = compute_soft_tissue_covariances(
+                self._start_frames.table, {name: self.quat_WL[i : i + 1] for i, name in enumerate(self.names)}
+            )
+            yield None
+            for i, name in enumerate(self.names):
+                parts = newest[i : i + 1], cov[i : i + 1], variance[None, :, i]
+                cov[i] = (self._covariance_W(i, *parts) + soft[name])[0]
+                yield None
+        yield cov
 
     def _covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment, error on the left of `quat_WL`, in W.

@@ -51,8 +51,9 @@ REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at
 LEAST_MOUNT_VAR = np.deg2rad(0.01) ** 2  # [rad²] of a mount's heading, so that covariances can be inverted
 # [s] between knots: causally what a knot observes is corrected by the end of the next one, offline each costs memory.
 CAUSAL_KNOT_S, OFFLINE_KNOT_S = 0.5, 2.0
-# Share of the next knot in which a knot is solved, a part with each sample; over the rest its correction fades in.
-SOLVE_SHARE = 0.4
+# Share of the next knot in which a knot is solved, in so many parts at even distances (a few more where it closes
+# several gaps); over the rest its correction fades in.
+SOLVE_SHARE, SOLVE_PARTS = 0.4, 20
 SAMPLE_RATE_HZ = 8.0
 E_Z = np.array([0.0, 0.0, 1.0])
 
@@ -403,7 +404,7 @@ class HeadingCorrector:
 class CausalHeadings:
     """Corrects headings as samples come; what a knot observes is corrected by the end of the next one.
 
-    When a knot is complete it is solved in parts, one with each sample, so that no pose waits for long. From the sample
+    When a knot is complete it is solved in parts, with samples between, so that no pose waits for long. From the sample
     `lead` of the next knot on, by which all parts are done, the correction fades in.
 
     Attributes
@@ -454,10 +455,10 @@ class CausalHeadings:
         self._reader.push(time, quat_VS, accel_S)
         self._samples += len(quat_VS)
         if self._solving is not None:
-            if self._reader.count < self._lead:
-                next(self._solving, None)
-            else:
+            if self._reader.count >= self._lead:
                 self._apply()
+            elif self._reader.count % max(1, self._lead // SOLVE_PARTS) == 0:
+                next(self._solving, None)
         return not self._reader.remaining
 
     def close(self, heading_var: np.ndarray, *, record: bool = False) -> None:

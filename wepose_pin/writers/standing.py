@@ -10,6 +10,7 @@ LEG = {
     "foot": (0.0, 0.09, 0.09),
     "toe": (0.16, 0.09, 0.02),
 }
+TOE_TIP = (0.06, 0.0, -0.02)  # [m] from the joint of the toes to their tip on the sole
 TRUNK_M, SHOULDER_Y, UPPER_ARM_M, FOREARM_M = 0.50, 0.19, 0.30, 0.26
 COLLAR_SHARE = 0.2  # of the way from the middle of the shoulders to a shoulder
 # Joints of the trunk as shares of the way from the hips to the line between the shoulders, and of the torso's turn.

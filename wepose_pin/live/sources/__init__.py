@@ -45,7 +45,8 @@ def open_source(
     baud : of serial ports
     wait_s : how long `open` waits for streams or senders [s]
     segments : names that sensors of a stream may have, those of the body; None: the upper body's. A replay has its own
-    any_name : take sensors of any name from UDP; they are assigned to segments later
+    any_name : take sensors of any name from UDP and SlimeVR, whenever they begin to send; they are assigned to segments
+        later
 
     Raises
     ------
@@ -66,9 +67,9 @@ def open_source(
     if kind == "udp":
         return _open_udp(spec, rest, sensors, wait_s, AnyName() if any_name else segments)
     if kind == "slimevr":
-        return _open_slimevr(spec, rest, sensors, wait_s, segments)
+        return _open_slimevr(spec, rest, sensors, wait_s, segments, any_name)
     if kind == "mvn":
-        return _open_mvn(spec, rest, sensors, wait_s, segments)
+        return _open_mvn(spec, rest, sensors or (segments if any_name else None), wait_s, segments)
     if kind == "ximu3":
         return _open_ximu3(spec, rest, sensors, baud, wait_s, segments)
     return _open_mti(spec, rest, sensors, baud, segments)
@@ -110,7 +111,7 @@ def _open_udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float
     from .udp import UdpSource
 
     host, port = parse_address(rest, f"source '{spec}':", 9000)
-    return UdpSource(host, port, sensors, wait_s, segments)
+    return UdpSource(host, port, sensors, segments, wait_s)
 
 
 def _open_mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int, segments: Sequence[str]) -> Source:
@@ -138,7 +139,12 @@ def _open_ximu3(
 
 
 def _open_slimevr(
-    spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]
+    spec: str,
+    rest: str,
+    sensors: Sequence[str] | None,
+    wait_s: float,
+    segments: Sequence[str],
+    any_name: bool,
 ) -> Source:
     from .slimevr import PORT, SlimeVrSource
 
@@ -150,7 +156,8 @@ def _open_slimevr(
             tracker.lower(): segment
             for segment, tracker in _read_pairs(spec, pairs, segments, "4c:11:ae:00:00:01/0").items()
         }
-    return SlimeVrSource(host, port, sensors or list(assigned.values()), segments, wait_s, assigned=assigned)
+    names = AnyName() if any_name else segments
+    return SlimeVrSource(host, port, sensors or list(assigned.values()), names, wait_s, assigned=assigned)
 
 
 def _open_mvn(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]) -> Source:

@@ -1,15 +1,17 @@
-"""The protocol of a source: it is opened, read in the order of arrival, and closed."""
+"""`Source`: it is opened, read in the order of arrival, and closed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterable, Mapping
 
 from ...recording.arrivals import Samples
 from .waiting import Waiting
 
 
-class Source(Protocol):
+class Source(ABC):
     """Samples of several sensors as they come.
 
     Attributes
@@ -17,45 +19,45 @@ class Source(Protocol):
     sensors : segments, in the order in which results name them
     rate_hz : nominal samples a second of each; None where it has to be measured
     problems : problem → count of what was dropped so far ("bad checksums": 3)
-    orientations : segments whose samples are measured orientations (`pack_orientations`) → whether these are the
-        segment's own, in one world; else they are the sensor's, in a world of its own
     """
 
-    sensors: tuple[str, ...]
-    rate_hz: float | None
-    problems: dict[str, int]
-    orientations: Mapping[str, bool]
+    def __init__(self, sensors: Iterable[str] = (), rate_hz: float | None = None) -> None:
+        self.sensors, self.rate_hz = tuple(sensors), rate_hz
+        self.problems: dict[str, int] = Counter()
 
+    @property
+    def orientations(self) -> Mapping[str, bool]:
+        """Sensors whose samples are measured orientations (`pack_orientations`) → whether these are the segment's own.
+
+        Then they are in one world; else they are the sensor's, in a world of its own.
+        """
+        return {}
+
+    @property
+    def batteries(self) -> Mapping[str, float]:
+        """Sensor → share of its charge, 0 to 1, of those that have said it."""
+        return {}
+
+    @property
+    def awaited(self) -> str:
+        """What is waited for, and at which address; empty where that is not known."""
+        return ""
+
+    @abstractmethod
     def open(self, waiting: Waiting | None = None) -> None:
         """Connect, or bind, and wait for what is not there yet: with `waiting` until it returns False.
 
         Raises `WeposeError` with one line on what is missing, without `waiting` after some seconds.
         """
-        ...
 
+    @abstractmethod
     def read(self, timeout_s: float) -> list[Samples] | None:
         """Samples since the last call, in the order of arrival; [] after `timeout_s` without any; None at the end."""
-        ...
 
     def clock(self) -> float:
         """Now [s], on the clock of the samples' times."""
-        ...
+        return time.monotonic()
 
+    @abstractmethod
     def close(self) -> None:
         """Disconnect and free what `open` took. May be called twice."""
-        ...
-
-
-@runtime_checkable
-class ReportsBattery(Protocol):
-    """A source whose sensors say how much charge they have."""
-
-    @property
-    def batteries(self) -> Mapping[str, float]:
-        """Sensor → share of its charge, 0 to 1, of those that have said it."""
-        ...
-
-
-def find_batteries(source: Source) -> Mapping[str, float]:
-    """Sensor → share of its charge, 0 to 1; empty where the source does not know."""
-    return source.batteries if isinstance(source, ReportsBattery) else {}

@@ -1,4 +1,4 @@
-"""`DatagramSource`: what sources of measured orientations over UDP share."""
+"""What sources over UDP share: `DatagramSource`, and `OrientationSource` where senders measure orientations."""
 
 from __future__ import annotations
 
@@ -6,21 +6,25 @@ import math
 import select
 import socket
 import time
-from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import BadSource
+from ...model import load_table
 from ...recording.arrivals import Samples, pack_orientations
+from ..addresses import name_host
+from .base import Source
+from .packets import AnyName
 from .waiting import Waiting, wait_for
 
 MAX_SIZE = 65536  # [bytes] of a datagram
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
 BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
-COLLECT_S = 1.0  # [s] after the first orientation in which the other sensors may appear
+COLLECT_S = 1.0  # [s] after the first sample in which the other sensors may appear
+MAX_SENSORS = 64  # of any name
 MAX_KINDS = 24  # of problems
 UNIT_ERROR = 0.05  # of a quaternion's length
 LONGEST_STEP_S = 0.02  # [s] between orientations that came together, of senders that do not tell their time
@@ -59,52 +63,52 @@ class OrientationSample(NamedTuple):
     quat: np.ndarray  # (4,) xyzw, not yet of unit length
 
 
-class DatagramSource(ABC):
-    """A UDP socket from whose datagrams `_decode` reads orientations.
+class DatagramSource(Source):
+    """A UDP socket that takes datagrams from any sender; `_take` makes samples of them.
 
     Parameters
     ----------
+    port : 0 for any free one; then see `address`
     sensors : to take; None: those that send while `open` waits
-    segments : names that sensors may have
-    wait_s : [s] for which `open` waits for the first orientation where `sensors` are not given
+    segments : names that sensors may have; None: those of the upper body; `AnyName`: `sensors` grows as new ones send
+    wait_s : [s] for which `open` waits for the first sample where `sensors` are not given
 
     Attributes
     ----------
-    kind, sender : of the source, and who sends to it, for messages
-    has_clock : whether datagrams hold the sender's time; else that of their arrival is taken
+    kind, sender, hint : of the source, who sends to it, and in what form, for messages
+    aligned : whether orientations are the segments' own; None: it has rates and specific forces
     """
 
     kind: str
     sender: str
-    has_clock: bool
+    hint = ""
+    aligned: bool | None = None
 
     def __init__(
         self,
         host: str,
         port: int,
-        sensors: Sequence[str] | None,
-        segments: Sequence[str],
+        sensors: Sequence[str] | None = None,
+        segments: Collection[str] | None = None,
         wait_s: float = 10.0,
     ) -> None:
-        self.sensors = tuple(sensors or ())
-        self.rate_hz: float | None = None
-        self.problems: dict[str, int] = Counter()
-        self.orientations: Mapping[str, bool] = {}
+        super().__init__(sensors or ())
         self.address = (host, port)
-        self._segments, self._wait_s = tuple(segments), wait_s
+        self._finds = isinstance(segments, AnyName)
+        self._segments = load_table().segments if segments is None else segments
+        self._wait_s = wait_s
         self._socket: socket.socket | None = None
         self._waiting: list[Samples] = []
-        self._last_times: dict[str, float] = {}
+
+    @property
+    def orientations(self) -> dict[str, bool]:
+        return {} if self.aligned is None else dict.fromkeys(self.sensors, self.aligned)
 
     @abstractmethod
-    def _decode(self, datagram: bytes, sender: Any, now: float, /) -> Iterator[OrientationSample]:
-        """Iterate over the orientations of a datagram that came at `now` [s]; what cannot be read is counted."""
+    def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
+        """Make samples of datagrams, each with its sender's address, that came by `now` [s]; one `Samples` a sensor."""
 
-    @abstractmethod
-    def _is_aligned(self) -> bool:
-        """Whether the orientations are the segments' own."""
-
-    def _serve(self, now: float) -> None:  # noqa: B027 - most senders want to hear nothing
+    def _serve(self, now: float) -> None:
         """Do what senders want to hear from time to time; `now` [s]."""
 
     def open(self, waiting: Waiting | None = None) -> None:
@@ -117,35 +121,39 @@ class DatagramSource(ABC):
         """
         self._socket = bind_socket(self.kind, *self.address)
         self.address = self._socket.getsockname()[:2]
-        stated = self.sensors
-        self.sensors = stated or self._segments
-        if not stated and self._wait(waiting):
-            deadline = time.monotonic() + COLLECT_S
-            while time.monotonic() < deadline:
-                self._waiting += self.read_new(0.1)
-            present = {samples.sensor for samples in self._waiting}
-            self.sensors = tuple(segment for segment in self._segments if segment in present)
-        elif not stated:
-            self.close()
-            self.sensors = ()
-        self.orientations = dict.fromkeys(self.sensors, self._is_aligned())
+        if not self.sensors and not self._finds:
+            self._find_sensors(waiting)
 
-    def _wait(self, waiting: Waiting | None) -> bool:
+    def _find_sensors(self, waiting: Waiting | None) -> None:
+        """Take the sensors that send."""
+        self.sensors = tuple(self._segments)
         try:
-            return wait_for(self._find_any, self._describe_wait, self._wait_s, waiting)
+            found = wait_for(self._find_any, lambda: self.awaited, self._wait_s, waiting)
         except BadSource:
             self.close()
             raise
+        if not found:
+            self.close()
+            self.sensors = ()
+            return
+        deadline = time.monotonic() + COLLECT_S
+        while time.monotonic() < deadline:
+            self._waiting += self.read_new(0.1)
+        present = {samples.sensor for samples in self._waiting}
+        self.sensors = tuple(segment for segment in self._segments if segment in present)
 
     def _find_any(self, timeout_s: float) -> bool:
         self._waiting += self.read_new(timeout_s)
         return bool(self._waiting)
 
-    def _describe_wait(self) -> str:
+    @property
+    def awaited(self) -> str:
         host, port = self.address
         dropped = ", ".join(f"{count} {problem}" for problem, count in self.problems.items())
         here = " (this machine only)" if host.startswith("127.") or host == "::1" else ""
-        return f"{self.sender} at UDP {host}:{port}{here}" + (f"; dropped so far: {dropped}" if dropped else "")
+        every = " (all addresses of this machine)" if host in ("0.0.0.0", "::") else ""
+        where = f"{self.sender} at UDP {name_host(host)}:{port}{here}{every}{self.hint}"
+        return where + (f"; dropped so far: {dropped}" if dropped else "")
 
     def read(self, timeout_s: float) -> list[Samples]:
         """Samples since the last call, one `Samples` a sensor."""
@@ -158,16 +166,78 @@ class DatagramSource(ABC):
         """Samples in the socket, or the first that come within `timeout_s`."""
         if self._socket is None:
             return []
-        by_segment: dict[str, list[OrientationSample]] = {}
+        samples: list[Samples] = []
         deadline = time.monotonic() + timeout_s
-        while not by_segment:
+        while not samples:
             left = deadline - time.monotonic()
             self._serve(time.monotonic())
             ready, _, _ = select.select([self._socket], [], [], max(left, 0.0))
             if ready:
-                self._drain(self._socket, by_segment)
+                samples = self._take(self._receive(self._socket), time.monotonic())
             if left <= 0.0:
                 break
+        return samples
+
+    def _receive(self, udp: socket.socket) -> list[tuple[bytes, Any]]:
+        datagrams: list[tuple[bytes, Any]] = []
+        while len(datagrams) < MAX_DATAGRAMS:
+            try:
+                datagram, sender = udp.recvfrom(MAX_SIZE)
+            except BlockingIOError:
+                break
+            except OSError:  # an ICMP reply to another datagram
+                self._count("errors of the socket")
+                break
+            datagrams.append((datagram, sender[:2]))
+        return datagrams
+
+    def _tracks(self, sensor: str) -> bool:
+        """Whether a sensor is tracked; where names are found, a new one is from now on."""
+        if self._finds and sensor not in self.sensors and len(self.sensors) < MAX_SENSORS:
+            self.sensors += (sensor,)
+        return sensor in self.sensors
+
+    def close(self) -> None:
+        """Free the port."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _count(self, problem: str, number: int = 1) -> None:
+        if problem not in self.problems and len(self.problems) >= MAX_KINDS:
+            problem = "other problems"
+        self.problems[problem] += number
+
+
+class OrientationSource(DatagramSource):
+    """Measured orientations, which `_decode` reads from datagrams.
+
+    Attributes
+    ----------
+    has_clock : whether datagrams hold the sender's time; else that of their arrival is taken
+    """
+
+    has_clock: bool
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._last_times: dict[str, float] = {}
+
+    @abstractmethod
+    def _decode(self, datagram: bytes, sender: Any, now: float, /) -> Iterator[OrientationSample]:
+        """Iterate over the orientations of a datagram that came at `now` [s]; what cannot be read is counted."""
+
+    def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
+        by_segment: dict[str, list[OrientationSample]] = {}
+        for datagram, sender in datagrams:
+            for sample in self._decode(datagram, sender, now):
+                size = float(np.linalg.norm(sample.quat))
+                if not self._tracks(sample.segment):
+                    self._count(f"orientations of {sample.segment}, which is not tracked")
+                elif not (math.isfinite(size) and abs(size - 1.0) < UNIT_ERROR):
+                    self._count("orientations that are none")
+                else:
+                    by_segment.setdefault(sample.segment, []).append(sample._replace(quat=sample.quat / size))
         return [
             Samples(segment, self._find_times(segment, own), *pack_orientations(np.array([each.quat for each in own])))
             for segment, own in by_segment.items()
@@ -183,34 +253,6 @@ class DatagramSource(ABC):
         self._last_times[segment] = newest
         return begin + (newest - begin) * np.arange(1, count + 1) / count
 
-    def _drain(self, udp: socket.socket, by_segment: dict[str, list[OrientationSample]]) -> None:
-        for _ in range(MAX_DATAGRAMS):
-            try:
-                datagram, sender = udp.recvfrom(MAX_SIZE)
-            except BlockingIOError:
-                return
-            except OSError:  # an ICMP reply to another datagram
-                self._count("errors of the socket")
-                return
-            for sample in self._decode(datagram, sender[:2], time.monotonic()):
-                size = float(np.linalg.norm(sample.quat))
-                if sample.segment not in self.sensors:
-                    self._count(f"orientations of {sample.segment}, which is not tracked")
-                elif not (math.isfinite(size) and abs(size - 1.0) < UNIT_ERROR):
-                    self._count("orientations that are none")
-                else:
-                    by_segment.setdefault(sample.segment, []).append(sample._replace(quat=sample.quat / size))
-
-    def clock(self) -> float:
-        """Now [s], monotonic."""
-        return time.monotonic()
-
-    def close(self) -> None:
-        """Free the port."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
-
     def _send(self, data: bytes, to: Any) -> None:
         """Send a datagram; one that cannot be sent is left out."""
         if self._socket is not None:
@@ -218,8 +260,3 @@ class DatagramSource(ABC):
                 self._socket.sendto(data, to)
             except OSError:
                 self._count("answers that could not be sent")
-
-    def _count(self, problem: str, number: int = 1) -> None:
-        if problem not in self.problems and len(self.problems) >= MAX_KINDS:
-            problem = "other problems"
-        self.problems[problem] += number

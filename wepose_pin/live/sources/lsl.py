@@ -11,8 +11,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from ...errors import BadOption, BadSource, one_of
 from ...model import load_table
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
+from .base import Source
 from .checks import IMPLAUSIBLE, keep_plausible
 from .waiting import Waiting
 
@@ -111,7 +111,7 @@ def find_channels(
     return parts
 
 
-class LslSource:
+class LslSource(Source):
     """Streams called `name`, `name`-segment or `name`_segment; lost ones are reconnected.
 
     Parameters
@@ -137,11 +137,8 @@ class LslSource:
     ) -> None:
         if not name or "'" in name:
             raise BadOption(f"lsl:{name}: a stream's name has at least one letter and no quote, as lsl:wepose")
-        self.sensors = tuple(sensors or ())
+        super().__init__(sensors or ())
         self._segments = tuple(load_table().segments if segments is None else segments)
-        self.rate_hz: float | None = None
-        self.problems: dict[str, int] = Counter()
-        self.orientations: Mapping[str, bool] = {}
         self._name, self._scope, self._wait_s = name, scope, wait_s
         self._streams: dict[str, _Stream] = {}
         self._lock = threading.Lock()

@@ -6,7 +6,6 @@ import os
 import select
 import threading
 import time
-from collections import Counter
 from collections.abc import Mapping
 from queue import Empty, SimpleQueue
 from types import ModuleType
@@ -15,6 +14,7 @@ from typing import Any
 from ...errors import BadSource
 from ...recording.arrivals import Samples
 from . import xbus
+from .base import Source
 from .checks import IMPLAUSIBLE, keep_plausible
 from .clocks import HostClock
 from .waiting import Waiting, wait_for
@@ -29,7 +29,7 @@ PAUSE_S = 0.002  # [s] between two reads: at 1 kHz two packets come at once, and
 MAX_WAITING = 20_000  # blocks while nobody reads; then the newest are dropped
 
 
-class MTiSource:
+class MTiSource(Source):
     """Sensors on `devices` (segment → port); a lost port is reopened when it is back.
 
     Parameters
@@ -43,10 +43,7 @@ class MTiSource:
     """
 
     def __init__(self, devices: Mapping[str, str], rate_hz: int | None = None, baud: int = 115200) -> None:
-        self.sensors = tuple(devices)
-        self.rate_hz: float | None = rate_hz
-        self.problems: dict[str, int] = Counter()
-        self.orientations: Mapping[str, bool] = {}
+        super().__init__(devices, rate_hz)
         self._queue: SimpleQueue[Samples | tuple[str, int]] = SimpleQueue()
         self._devices = [_Device(segment, port, rate_hz, baud, self._queue) for segment, port in devices.items()]
 
@@ -84,10 +81,6 @@ class MTiSource:
         for _ in range(self._queue.qsize()):
             self._dispatch(self._queue.get(), samples)
         return samples
-
-    def clock(self) -> float:
-        """Now [s], monotonic."""
-        return time.monotonic()
 
     def close(self) -> None:
         """Stop listening and free the ports."""

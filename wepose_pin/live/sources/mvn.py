@@ -14,26 +14,26 @@ from typing import Any
 import numpy as np
 
 from ... import rotations
-from ..mvn_frames import BODY_SEGMENTS, HEADER, ITEM, N_TO_T, SEGMENT_IDS, TYPE
+from ..figure import MEASURED, N_TO_T, SEGMENTS
+from ..mvn_frames import BODY_SEGMENTS, HEADER, ITEM, TYPE
 from .clocks import HostClock
-from .datagrams import DatagramSource, OrientationSample
+from .datagrams import OrientationSample, OrientationSource
 
 PORT = 9763
 CHARACTER = 0  # the first person
 
 
-class MvnSource(DatagramSource):
+class MvnSource(OrientationSource):
     """Orientations of the segments that MVN streams; parameters and errors as `DatagramSource`."""
 
     kind, sender, has_clock = "mvn", "frames of the MVN network streamer (type 02, quaternions)", True
+    aligned = True
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._clock = HostClock()
-        self._segment_of = {id_: segment for segment, id_ in SEGMENT_IDS.items() if segment in self._segments}
-
-    def _is_aligned(self) -> bool:
-        return True
+        ours = ((k, MEASURED.get(name)) for k, name in enumerate(SEGMENTS))
+        self._segment_of = {k: segment for k, segment in ours if segment in self._segments}
 
     def _decode(self, datagram: bytes, _sender: Any, now: float) -> Iterator[OrientationSample]:
         if len(datagram) < HEADER.size or datagram[:4] != TYPE[:4]:
@@ -55,8 +55,8 @@ class MvnSource(DatagramSource):
                 id_, *numbers = ITEM.unpack_from(datagram, HEADER.size + k * ITEM.size)
             except struct.error:  # pragma: no cover - the length has been checked
                 return
-            segment = self._segment_of.get(id_)
+            segment = self._segment_of.get(id_ - 1)
             if segment is None:
                 continue
             quat_WB = rotations.xyzw_from_wxyz(np.array(numbers[3:]))
-            yield OrientationSample(segment, time_s, rotations.multiply(quat_WB, N_TO_T[segment]))
+            yield OrientationSample(segment, time_s, rotations.multiply(quat_WB, N_TO_T[id_ - 1]))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
 
 import numpy as np
 
 from ...errors import BadOption
 from ...recording import OrientationSensor, Recording
 from ...recording.arrivals import Samples, list_numbers
+from .base import Source
 from .waiting import Waiting
 
 BLOCK = 64  # samples of every sensor at once, as fast as possible
@@ -18,7 +18,7 @@ BLOCK = 64  # samples of every sensor at once, as fast as possible
 MIN_SLEEP_S = 0.0005
 
 
-class ReplaySource:
+class ReplaySource(Source):
     """A recording at `speed` times its own pace.
 
     Samples in marked gaps are left out, as of a silent sensor. Samples that become due between two reads come together.
@@ -40,10 +40,8 @@ class ReplaySource:
     def __init__(self, recording: Recording, speed: float = 1.0) -> None:
         if not speed > 0.0:
             raise BadOption(f"speed: {speed:g}; it must be positive: 1.0 is the recording's own, 4.0 four times that")
-        self.sensors = tuple(recording.sensors)
-        self.rate_hz: float | None = recording.rate_hz
-        self.problems: dict[str, int] = {}
-        self.orientations: Mapping[str, bool] = {
+        super().__init__(recording.sensors, recording.rate_hz)
+        self._orientations = {
             segment: sensor.aligned
             for segment, sensor in recording.sensors.items()
             if isinstance(sensor, OrientationSensor)
@@ -56,7 +54,11 @@ class ReplaySource:
         self._next = 0
         self._begin = 0.0
 
-    def open(self, _waiting: Waiting | None = None) -> None:
+    @property
+    def orientations(self) -> dict[str, bool]:
+        return self._orientations
+
+    def open(self, waiting: Waiting | None = None) -> None:  # noqa: ARG002
         """Start: the first sample is due now."""
         self._next = 0
         self._begin = time.monotonic()

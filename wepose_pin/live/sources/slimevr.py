@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .datagrams import DatagramSource, OrientationSample
+from .datagrams import OrientationSample, OrientationSource
 
 PORT = 6969
 HEARTBEAT_S = 0.5  # [s] from one to the next
@@ -67,8 +67,10 @@ class Tracker:
     battery: float = float("nan")
 
 
-class SlimeVrSource(DatagramSource):
+class SlimeVrSource(OrientationSource):
     """Orientations of SlimeVR trackers; other parameters and errors as `DatagramSource`.
+
+    With `AnyName` a tracker that states no place is ``MAC/SENSOR``.
 
     Parameters
     ----------
@@ -80,6 +82,7 @@ class SlimeVrSource(DatagramSource):
     """
 
     kind, sender, has_clock = "slimevr", "SlimeVR trackers", False
+    aligned = False
 
     def __init__(self, *args: Any, assigned: Mapping[str, str] | None = None, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -97,9 +100,6 @@ class SlimeVrSource(DatagramSource):
                 if segment is not None and np.isfinite(tracker.battery):
                     batteries[segment] = tracker.battery
         return batteries
-
-    def _is_aligned(self) -> bool:
-        return False
 
     def _serve(self, now: float) -> None:
         if now - self._heartbeat < HEARTBEAT_S:
@@ -178,12 +178,16 @@ class SlimeVrSource(DatagramSource):
         yield OrientationSample(segment, now, quat)
 
     def _find_segment(self, tracker: Tracker, sensor: int) -> str | None:
+        named = f"{tracker.mac}/{sensor}"
+        if named in self.sensors:
+            return named
         stated = self._assigned.get(f"{tracker.mac}/{sensor}") or (
             self._assigned.get(tracker.mac) if not sensor else None
         )
-        return stated or tracker.places.get(sensor)
+        return stated or tracker.places.get(sensor) or (named if self._finds and tracker.mac else None)
 
-    def _describe_wait(self) -> str:
+    @property
+    def awaited(self) -> str:
         known = ", ".join(tracker.mac or address[0] for address, tracker in self.trackers.items())
-        text = super()._describe_wait()
+        text = super().awaited
         return f"{text}; connected: {known}" if known else text

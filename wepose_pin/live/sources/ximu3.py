@@ -9,7 +9,6 @@ from __future__ import annotations
 import ipaddress
 import threading
 import time
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +18,7 @@ from ...errors import BadOption, BadSource
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
 from ..addresses import parse_address
+from .base import Source
 from .checks import IMPLAUSIBLE, keep_plausible
 from .clocks import HostClock
 from .waiting import Waiting, wait_for
@@ -29,7 +29,7 @@ MAX_ROWS = 100_000  # that wait for a read
 _SCALE = np.repeat([np.pi / 180.0, STANDARD_GRAVITY], 3)
 
 
-class Ximu3Source:
+class Ximu3Source(Source):
     """One connection a sensor; one that is lost is opened again by the package.
 
     Parameters
@@ -39,10 +39,7 @@ class Ximu3Source:
     """
 
     def __init__(self, devices: Mapping[str, str], baud: int = 115200, wait_s: float = 10.0) -> None:
-        self.sensors = tuple(devices)
-        self.rate_hz: float | None = None
-        self.problems: dict[str, int] = Counter()
-        self.orientations: Mapping[str, bool] = {}
+        super().__init__(devices)
         self._devices, self._baud, self._wait_s = dict(devices), baud, wait_s
         self._clocks = {segment: HostClock() for segment in devices}
         self._lock = threading.Lock()
@@ -120,10 +117,6 @@ class Ximu3Source:
             if samples or left <= 0.0:
                 return samples
             time.sleep(min(POLL_S, left))
-
-    def clock(self) -> float:
-        """Now [s], monotonic."""
-        return time.monotonic()
 
     def close(self) -> None:
         """Disconnect."""

@@ -102,8 +102,8 @@ function small(id, value, unit) {
 }
 
 // ---- the guided session
-const MAIN = ["next", "accept", "exchange"];
-let guideSays = "", spokenCount = null, voice = false;
+const MAIN = ["next", "accept", "exchange", "more"];
+let guided = false, guideSays = "", spokenCount = null, voice = false;
 function speak(what) {
   if (!voice || !what) return;
   speechSynthesis.cancel();
@@ -116,7 +116,8 @@ function button({ name, label, key }, main) {
   element.addEventListener("click", () => ask(name));
 }
 function showGuide(guide) {
-  document.body.classList.toggle("guided", guide !== null);
+  guided = guide !== null;
+  document.body.classList.toggle("guided", guided);
   $("steps").hidden = $("result").hidden = guide === null;
   $("note").hidden = !guide?.note;
   if (guide === null) { $("actions").replaceChildren(); return; }
@@ -136,7 +137,7 @@ function showGuide(guide) {
   if ($("actions").dataset.offered !== offered) {                        // a button stays while it is pressed
     $("actions").dataset.offered = offered;
     $("actions").replaceChildren();
-    guide.actions.forEach((action) => button(action, MAIN.includes(action.name)));
+    guide.actions.forEach((action, k) => button(action, k === 0 && MAIN.includes(action.name)));
   }
   showResult(guide);
   if (guideSays !== guide.note + guide.sentence) speak(guide.note || guide.sentence);
@@ -198,7 +199,7 @@ function show(status) {
     if (sensor.battery !== null) text(place, "small", ` ${Math.round(100 * sensor.battery)} %`, "charge of its battery").className = sensor.battery < .15 ? "low" : "";
     text(row, "td", known(sensor.rate_hz, 0));
     text(row, "td", sensor.bias_deg_s.map((axis) => known(begun ? axis : null, 2).padStart(5, "\u2007")).join(" "));
-    text(row, "td", known(sensor.heading_std_deg, 1));
+    text(row, "td", sensor.heading_std_deg > 90 ? "> 90" : known(sensor.heading_std_deg, 1));
     text(row, "td", duration(begun ? sensor.heading_age_s : null));
     text(row, "td", sensor.missing + sensor.late + sensor.duplicate,
          `never came: ${sensor.missing}, too late: ${sensor.late}, twice: ${sensor.duplicate}`);
@@ -245,7 +246,7 @@ function addAngles({ time, joints }) {
 }
 function drawCurves() {
   const canvas = $("plot"), shown = Object.keys(curves).filter((joint) => groupOf(joint) === $("joint").value);
-  if (document.body.classList.contains("guided") || !shown.length || !canvas.clientWidth) return;
+  if (guided || !shown.length || !canvas.clientWidth) return;
   const scale = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
   canvas.width = width * scale;
   canvas.height = height * scale;
@@ -354,7 +355,7 @@ addEventListener("keyup", (event) => {                                   // spac
 function draw() {
   const eye = viewer.scene.worldToLocal(viewer.camera.position.clone());
   ribbons.forEach((ribbon, k) => {
-    ribbon.mesh.visible = trailsShown && paths[k].length > 1;
+    ribbon.mesh.visible = trailsShown && !guided && paths[k].length > 1;
     if (ribbon.mesh.visible) ribbon.draw(paths[k], now, eye);
   });
   viewer.render();
