@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import compress, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -232,33 +232,39 @@ def find_collision_pairs(robot: Robot) -> list[tuple[int, int]]:
     for _ in range(samples):
         hits += find_hits(rng.uniform(*robot.bounds))
     checked = (hits < _ALWAYS * samples) & ~find_hits(robot.rest)
-    return [
-        pair
-        for pair, check, count in zip(candidates, checked, hits, strict=True)
-        if check and not (count == 0 and _never_collides(robot, shapes, pair))
-    ]
+    seldom = {pair for pair, count in zip(candidates, hits, strict=True) if count == 0}
+    never = _find_never_colliding(robot, shapes, seldom.intersection(compress(candidates, checked)))
+    return [pair for pair, check in zip(candidates, checked, strict=True) if check and pair not in never]
 
 
-def _never_collides(robot: Robot, shapes: Any, pair: tuple[int, int]) -> bool:
-    """Whether few joints of one arm lie between two shapes, and no posture on a grid of them brings a collision."""
-    objects, model = shapes.geometryObjects, robot.model
-    a, b = sorted(int(objects[k].parentJoint) for k in pair)
-    between = np.zeros(len(robot.names), dtype=bool)
-    joints = 0
-    while b > a:
-        between |= robot.coupling[model.idx_vs[b]] != 0.0
-        b, joints = model.parents[b], joints + 1
-    if b < a or joints > _GRID_JOINTS:
-        return False
+def _find_never_colliding(robot: Robot, shapes: Any, pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Pairs with few joints of one arm between them that collide in no posture on a grid of these joints."""
+    by_joints: dict[tuple[int, ...], set[tuple[int, int]]] = {}
+    for pair in pairs:
+        joints = _find_joints_between(robot, *sorted(int(shapes.geometryObjects[k].parentJoint) for k in pair))
+        if joints is not None:
+            by_joints.setdefault(joints, set()).add(pair)
     low, high = robot.bounds
-    data, geometry, u = model.createData(), shapes.createData(), robot.rest.copy()
-    k = shapes.findCollisionPair(pin.CollisionPair(*pair))
-    for values in product(*(np.linspace(low[j], high[j], _GRID) for j in np.flatnonzero(between))):
-        u[between] = values
-        pin.updateGeometryPlacements(model, data, shapes, geometry, robot.configuration(u))
-        if pin.computeCollision(shapes, geometry, k):
-            return False
-    return True
+    data, geometry = robot.model.createData(), shapes.createData()
+    for joints, clear in by_joints.items():
+        indices = {pair: shapes.findCollisionPair(pin.CollisionPair(*pair)) for pair in clear}
+        u = robot.rest.copy()
+        for values in product(*(np.linspace(low[j], high[j], _GRID) for j in joints)):
+            u[list(joints)] = values
+            pin.updateGeometryPlacements(robot.model, data, shapes, geometry, robot.configuration(u))
+            clear -= {pair for pair in clear if pin.computeCollision(shapes, geometry, indices[pair])}
+            if not clear:
+                break
+    return set().union(*by_joints.values())
+
+
+def _find_joints_between(robot: Robot, a: int, b: int) -> tuple[int, ...] | None:
+    """The joints (of `Robot.names`) between two joints of the model; None where these are not on one arm, or many."""
+    between, count = np.zeros(len(robot.names), dtype=bool), 0
+    while b > a:
+        between |= robot.coupling[robot.model.idx_vs[b]] != 0.0
+        b, count = robot.model.parents[b], count + 1
+    return tuple(np.flatnonzero(between).tolist()) if b == a and count <= _GRID_JOINTS else None
 
 
 def _link_name(shape: str) -> str:
