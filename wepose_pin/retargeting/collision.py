@@ -50,6 +50,7 @@ class CollisionModel:
         for i, j in self.pairs:
             self.hulls.addCollisionPair(pin.CollisionPair(i, j))
         self.data = self.hulls.createData()
+        self._active = np.ones(len(self.pairs), dtype=bool)
         objects = self.hulls.geometryObjects
         for shape in objects:
             shape.geometry.computeLocalAABB()
@@ -80,23 +81,29 @@ class CollisionModel:
         R, p = np.array(self._rotations), np.array(self._translations)
         centre = np.einsum("kij,kj->ki", R[self._joint], self._centre) + p[self._joint]
         gap = centre[self._first] - centre[self._second]
-        close = np.flatnonzero(np.einsum("ki,ki->k", gap, gap) < self._range**2)
-        if not len(close):
+        close = np.einsum("ki,ki->k", gap, gap) < self._range**2
+        if not close.any():
             return none
+        self._activate(close)
         pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
-        rows, indices = [], []
-        for k in close.tolist():
-            result = pin.computeDistance(self.hulls, self.data, k)
-            if result.min_distance < NEAR:
-                rows.append((result.min_distance, *result.getNearestPoint1(), *result.getNearestPoint2()))
-                indices.append(k)
-        if not rows:
+        pin.computeDistances(self.hulls, self.data)
+        results = self.data.distanceResults
+        near = [(k, result) for k in np.flatnonzero(close).tolist() if (result := results[k]).min_distance < NEAR]
+        if not near:
             return none
-        table = np.array(rows)
-        distance, a, b = table[:, 0], table[:, 1:4], table[:, 4:7]
+        indices = np.array([k for k, _ in near])
+        distance = np.array([result.min_distance for _, result in near])
+        a = np.concatenate([result.getNearestPoint1() for _, result in near]).reshape(-1, 3)
+        b = np.concatenate([result.getNearestPoint2() for _, result in near]).reshape(-1, 3)
         first, second = self._joint[self._first[indices]], self._joint[self._second[indices]]
         jacobian = _distance_jacobian(distance, a, b, data.J, self._supports[first], self._supports[second])
-        return NearPairs(np.array(indices), distance, jacobian, self.clearance[indices])
+        return NearPairs(indices, distance, jacobian, self.clearance[indices])
+
+    def _activate(self, pairs: np.ndarray) -> None:
+        """Let Pinocchio compute the distances of these pairs (pairs,) bool only."""
+        for k in np.flatnonzero(pairs != self._active).tolist():
+            (self.data.activateCollisionPair if pairs[k] else self.data.deactivateCollisionPair)(k)
+        self._active = pairs
 
     def name_pair(self, pair: int) -> str:
         """The names of the two shapes of a pair."""

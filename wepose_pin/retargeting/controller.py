@@ -265,7 +265,8 @@ class QpController:
         faster = np.maximum(np.abs(state.velocity), np.abs(after.velocity))
         travel = self.dt * (faster + 0.125 * self.dt * np.abs(after.acceleration - state.acceleration))
         shortfall = np.zeros(len(distance))
-        for braking in (a_max, balance_braking(after.velocity, a_max)):
+        for together in (False, True):
+            braking = balance_braking(after.velocity, a_max) if together else a_max
             stop = Stop(
                 *compute_stop(
                     after.position, after.velocity, after.acceleration, robot.lower, robot.upper, v_max, a_max, j_max,
