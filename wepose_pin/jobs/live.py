@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadOption
-from . import Arms, LiveMethod, arm_sides
+from . import Arms, LiveMethod
 
 if TYPE_CHECKING:
     from ..live import Output, SensorSetup, SessionSummary
@@ -288,12 +288,13 @@ def _connect_robot(job: LiveJob, source: Source, setup: SensorSetup, model: Body
     """The robot's output, and the source as it needs it."""
     from ..live.robot import PORT, RobotOptions, connect_robot
     from ..retargeting import LimitMargins
+    from ..retargeting.maps import list_sides
     from ..retargeting.stream import StreamOptions
 
     assert job.robot is not None
     timing = StreamOptions(job.robot_hz, job.hold_after, job.stop_after)
     margins = LimitMargins(job.speed_scale, job.limit_margin)
-    options = RobotOptions(job.robot, arm_sides(job.arm), job.map, job.to or str(PORT), timing, margins)
+    options = RobotOptions(job.robot, list_sides(job.arm), job.map, job.to or str(PORT), timing, margins)
     speed = float(job.speed.replace("max", "inf")) if job.replays else 1.0
     return connect_robot(options, source, setup, speed, model.table)
 

@@ -239,6 +239,11 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     )
 
 
+def list_sides(arm: str | None) -> tuple[str, ...] | None:
+    """Return the sides of "left", "right" or "both"; None: all arms that a robot has."""
+    return SIDES if arm == "both" else None if arm is None else (arm,)
+
+
 def package_folders(urdf: Path) -> list[str]:
     """Folders in which ``package://`` paths of a URDF are looked up."""
     folders = [str(folder) for folder in urdf.absolute().parents]
