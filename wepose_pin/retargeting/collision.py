@@ -192,14 +192,14 @@ def build_hulls(robot: Robot) -> tuple[Any, list[int]]:
     for joint, shapes in hands.items():
         hull = model.geometryObjects[model.getGeometryId(f"hand {joint}")]
         corners = coal.StdVec_Vec3s()
-        corners.extend(list(np.vstack([_corners(shape) for shape in shapes])))
+        corners.extend(list(np.vstack([list_corners(shape) for shape in shapes])))
         hull.geometry = coal.Convex.convexHull(corners, True, "Qt")
         hull.placement = pin.SE3.Identity()
     return model, hull_of
 
 
-def _corners(shape: Any) -> np.ndarray:
-    """Points in the joint's frame whose hull contains the shape; of a round one the corners of its box."""
+def list_corners(shape: Any) -> np.ndarray:
+    """Return points (n, 3) [m] in the joint's frame whose hull contains a shape; of a round one its box's corners."""
     geometry = shape.geometry
     if hasattr(geometry, "buildConvexHull"):
         points = np.asarray(geometry.vertices())

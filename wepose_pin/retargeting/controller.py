@@ -160,7 +160,6 @@ class QpController:
         v_max, a_max, j_max = (self.limit_factor * limit for limit in (robot.v_max, robot.a_max, robot.j_max))
         a_max = reduce_acceleration_limits(a_max, v_max, j_max, robot.upper - robot.lower, self.dt)
         self._limits = (v_max, a_max, j_max)
-        self._uncoupled = _is_uncoupled(robot)
         self._kernel_params = np.array(
             [
                 p.position, p.orientation, p.swivel, p.task_gain, p.max_correction_deceleration, p.singular_value_limit,
@@ -202,7 +201,10 @@ class QpController:
         reference = self.posture_reference or PostureReference(robot.rest, 0.0)
         f += params.posture * (params.posture_gain * (reference.position - state.position) + reference.velocity)
         f += params.joint_velocity_change * (velocity_mid + dt * state.acceleration)
-        self._bound_accelerations(state)
+        compute_acceleration_bounds(
+            state.position, state.velocity, state.acceleration, robot.lower, robot.upper, *self._limits, dt,
+            self._min_accel, self._max_accel,
+        )  # fmt: skip
         after = self._solve_step(state, near, H, f)
         self.stopping = after is None
         if after is not None:
@@ -283,21 +285,6 @@ class QpController:
             shortfall = np.maximum(shortfall, violation)
         return shortfall
 
-    def _bound_accelerations(self, state: JointState) -> None:
-        """Fill `_min_accel` and `_max_accel`."""
-        lower, upper = self.robot.lower, self.robot.upper
-        compute_acceleration_bounds(
-            state.position,
-            state.velocity,
-            state.acceleration,
-            lower,
-            upper,
-            *self._limits,
-            self.dt,
-            self._min_accel,
-            self._max_accel,
-        )
-
     def _update_distances(self, state: JointState) -> NearPairs:
         """Set the joint positions, and return the pairs that are near; update `min_distance`."""
         self.update_kinematics(state.position)
@@ -310,7 +297,7 @@ class QpController:
 
     def _constrain_distances(self, state: JointState, near: NearPairs) -> tuple[np.ndarray, np.ndarray]:
         """Return rows (m, n) and bound (m,) of rows @ w ≥ bound: near shapes approach no faster than they can stop."""
-        rows = near.jacobian if self._uncoupled else near.jacobian @ self.robot.coupling
+        rows = near.jacobian @ self.robot.coupling
         _, a_max, j_max = self._limits
         bound = compute_separation_bounds(
             rows, near.distance, near.clearance, state.velocity, state.acceleration, a_max, j_max, self.dt
@@ -374,7 +361,6 @@ class _ArmTasks:
             self._R_E, self._p_E = placement.rotation, placement.translation
             self._moves_elbow = _build_ancestor_mask(robot, elbow.parentJoint)
         self._moves_hand = _build_ancestor_mask(robot, frame.parentJoint)
-        self._uncoupled = _is_uncoupled(robot)
         self.hand, self.rotation, self.elbow = np.zeros(3), np.eye(3), np.full(3, np.nan)
 
     def update_pose(self) -> None:
@@ -388,11 +374,8 @@ class _ArmTasks:
         self, H: np.ndarray, f: np.ndarray, target: HandTarget, params: np.ndarray, dt: float, v: np.ndarray
     ) -> bool:
         """Add the arm's tasks to H and f; return whether the arm is near a singularity."""
-        J_hand = self.data.J * self._moves_hand
-        J_elbow = self.data.J * self._moves_elbow if self._has_swivel else _NO_JACOBIAN
-        if not self._uncoupled:
-            J_hand = J_hand @ self.robot.coupling
-            J_elbow = J_elbow @ self.robot.coupling if self._has_swivel else J_elbow
+        J_hand = self.data.J * self._moves_hand @ self.robot.coupling
+        J_elbow = self.data.J * self._moves_elbow @ self.robot.coupling if self._has_swivel else _NO_JACOBIAN
         rotation_error = pin.log3(target.rotation @ self.rotation.T)
         return bool(
             add_arm_tasks(
@@ -418,10 +401,6 @@ def sample_hand_targets(hands: tuple[HandPath, ...], k: int, dt: float) -> tuple
         )
         for hand in hands
     )
-
-
-def _is_uncoupled(robot: Robot) -> bool:
-    return np.array_equal(robot.coupling, np.eye(*robot.coupling.shape))
 
 
 def _build_ancestor_mask(robot: Robot, joint: int) -> np.ndarray:

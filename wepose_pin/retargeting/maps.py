@@ -68,14 +68,6 @@ def list_keys(table: str = "") -> tuple[str, ...]:
     return tuple(dict.fromkeys(name.partition(".")[0] for name in inside))
 
 
-def format_keys() -> str:
-    """Return the table of all keys as Markdown."""
-    rows = [
-        f"| `{name}` | {key.unit} | {key.default or '**required**'} | {key.meaning} |" for name, key in KEYS.items()
-    ]
-    return "\n".join(["| key | unit or type | without it | what |", "|---|---|---|---|", *rows])
-
-
 class LinkPoint(NamedTuple):
     """A point of the robot, at `offset` [m] in the frame of a link."""
 
