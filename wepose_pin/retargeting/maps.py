@@ -77,17 +77,7 @@ class LinkPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class ArmMap:
-    """One arm of the robot.
-
-    Parameters
-    ----------
-    joints : from the shoulder to the hand; all others keep the rest posture
-    shoulder : corresponds to the person's shoulder; does not move
-    elbow : None: the controller is free to choose it
-    hand : corresponds to the person's palm
-    fingers, thumb : axes of the hand's link along the fingers, and to the side of the thumb
-    reach : [m] of the person's straight arm; None: 95 % of what the joints allow
-    """
+    """One arm of the robot: the keys of ``arms.SIDE``, as `KEYS` has them."""
 
     joints: tuple[str, ...]
     shoulder: LinkPoint
@@ -106,20 +96,10 @@ class ArmMap:
 
 @dataclass(frozen=True)
 class RobotMap:
-    """What retargeting needs of a robot beyond its URDF.
+    """What retargeting needs of a robot beyond its URDF: the keys of its map, as `KEYS` has them, and the map's file.
 
-    Parameters
-    ----------
-    where : the map's file name, for error messages
-    urdf, srdf : files; without an SRDF pairs in collision in the rest posture, or always, are not checked
-    base : link whose axes `up` and `forward` are; empty: the root
-    up, forward : axes of the base that point up, and where the person faces
-    table : [m] height above the base's origin of the table on which the robot stands; None: there is none
-    rest : joint → value in the rest posture [rad or m]; zero where not named
-    acceleration, jerk : joint → limit [rad/s²], [rad/s³]
-    velocity, position : joint → limit [rad/s], lower and upper limit [rad], in place of the URDF's
-    description : free text, with the sources of the limits
-    collision : link → origin of its collision shape in place of the URDF's: x, y, z [m], roll, pitch, yaw [rad]
+    `where` is the file's name, for error messages; `description` has the source of the limits too; `collision` is x, y,
+    z [m], roll, pitch, yaw [rad] of a link's shape.
     """
 
     name: str
