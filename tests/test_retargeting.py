@@ -626,6 +626,10 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         find_map("pandas")
     with pytest.raises(BadOption, match=r"--arm left: arm has no left arm; there is: right"):
         load_robot(find_map(str(urdf)), ("left",))
+    text = urdf.with_suffix(".toml").read_text()
+    urdf.with_suffix(".toml").write_text(f"{text}[collision.w1]\nxyz = [0.0, 0.0, 0.1]\n")
+    with pytest.raises(BadModel, match=r"arm.toml: collision.w1: the link has 0 collision shapes in arm.urdf"):
+        load_robot(find_map(str(urdf)))
     urdf.with_suffix(".toml").unlink()
     with pytest.raises(MissingFile, match=r"no arm.toml beside it; a map says which links"):
         find_map(str(urdf))
