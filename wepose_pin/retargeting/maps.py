@@ -34,7 +34,7 @@ class MapKey(NamedTuple):
 KEYS = {
     "format": MapKey("1", "", "version of the map's format"),
     "urdf": MapKey("file", "", "beside the map, or a path in example-robot-data"),
-    "srdf": MapKey("file", "none", "its `disable_collisions` are not checked, as pairs that collide at rest, or always"),
+    "srdf": MapKey("file", "none", "`disable_collisions` are not checked, as pairs that collide at rest, or always"),
     "description": MapKey("text", "none", "in the report and in `summary.json`"),
     "base": MapKey("link", "the root", "`up`, `forward` and `table` are in its frame"),
     "up": MapKey("axis", "", "of the base, points up: `+x`, `-x`, …, `-z`"),
