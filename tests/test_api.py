@@ -9,7 +9,7 @@ import re
 import sys
 import types
 import webbrowser
-from dataclasses import replace
+from dataclasses import fields, replace
 from html import escape, unescape
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,9 @@ from arms import write_arm
 
 import wepose_pin as wp
 from wepose_pin.cli import main
+from wepose_pin.jobs.retarget import RetargetJob
 from wepose_pin.kinematics import PosedBody
+from wepose_pin.retargeting import LimitMargins
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import subject_toml
 from wepose_pin.writers import write_session
@@ -194,9 +196,28 @@ def test_a_result_goes_into_each_step_as_object_and_as_folder(
 def test_a_result_is_retargeted_as_object_and_as_folder(result: wp.TrackResult, saved: Path, tmp_path: Path) -> None:
     pytest.importorskip("daqp")
     urdf = write_arm(tmp_path)
-    moved, read = (wp.retarget(given, robot, rate_hz=10.0) for given, robot in ((result, urdf), (saved, str(urdf))))
+    chosen = {"arm": "right", "task": "position", "speed_scale": 0.5, "limit_margin": 0.1, "interval": (10.0, 16.0)}
+    moved, read = (
+        wp.retarget(given, robot, rate_hz=10.0, **chosen) for given, robot in ((result, urdf), (saved, str(urdf)))
+    )
     np.testing.assert_allclose(moved.joint_position, read.joint_position, atol=1e-6)
     assert repr(moved) == repr(read)
+    assert (moved.robot.margins.speed_scale, moved.robot.margins.limit_margin) == (0.5, 0.1)
+    assert moved.params.orientation == 0.0
+    assert moved.recorded_time[[0, -1]] == pytest.approx([10.0, 16.0], abs=0.02)
+    with pytest.raises(wp.WeposeError, match="a Robot has arms and margins of its own"):
+        wp.retarget(result, moved.robot, speed_scale=0.9)
+    with pytest.raises(wp.WeposeError, match="--arm left: arm has no left arm"):
+        wp.retarget(result, urdf, arm="left")
+
+
+def test_a_robot_is_moved_by_the_options_of_the_command() -> None:
+    by_command = {field.name: field.default for field in fields(RetargetJob)}
+    in_python = inspect.signature(wp.retarget).parameters
+    margins = LimitMargins()
+    for name in by_command.keys() - {"result", "robot", "out", "view", "report", "force"}:
+        default = in_python[name].default
+        assert by_command[name] == (getattr(margins, name) if hasattr(margins, name) else default), name
 
 
 def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult) -> None:

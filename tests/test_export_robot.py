@@ -158,6 +158,15 @@ def test_repetitions_and_phases_are_episodes(trajectory: Path, motion: JointMoti
     )
 
 
+def test_an_episode_that_the_trajectory_cuts_is_named(trajectory: Path, tmp_path: Path) -> None:
+    whole = export(trajectory, tmp_path / "whole", "lerobot", episodes="repetitions")
+    cut = export(trajectory, tmp_path / "cut", "lerobot", episodes="reach", interval=(1.5, 3.7))
+    [diagnostic] = cut.diagnostics
+    assert (diagnostic.code, diagnostic.place, diagnostic.value) == ("episode-shortened", "reach", 1.0)
+    assert diagnostic.facts["span"] == "3 to 4.2 s"
+    assert whole.diagnostics == []
+
+
 def test_an_earlier_data_set_goes_as_a_whole(trajectory: Path, tmp_path: Path) -> None:
     data = tmp_path / "data"
     export(trajectory, data, "lerobot")

@@ -34,6 +34,7 @@ from wepose_pin.retargeting.collision import CollisionModel
 from wepose_pin.retargeting.controller import ControllerParams, HandTarget, JointState, QpController
 from wepose_pin.retargeting.error_attribution import assess_reachability, attribute_errors
 from wepose_pin.retargeting.limits import compute_acceleration_bounds, read_joint_limits, reduce_acceleration_limits
+from wepose_pin.retargeting.maps import KEYS, read_map
 from wepose_pin.retargeting.targets import CLAMP_FROM, CLAMP_TO, clamp_to_reach
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import compute_link_poses_W, read_joint_motion
@@ -131,6 +132,64 @@ def test_a_joint_that_is_pushed_against_its_limit_lies_still_there(dt: float) ->
 def test_a_robot_without_limits_is_refused_with_the_joint_named(tmp_path: Path, key: str, text: str) -> None:
     with pytest.raises(BadModel, match=text):
         load_robot(find_map(str(write_arm(tmp_path, without=key))))
+
+
+STATED = {
+    "format": "1",
+    "urdf": '"arm.urdf"',
+    "srdf": '"arm.srdf"',
+    "description": '"a test"',
+    "base": '"base"',
+    "up": '"+z"',
+    "forward": '"+x"',
+    "table": "-2.0",
+    "rest.JOINT": "-1.2",
+    "limits.source": '"nobody"',
+    "limits.acceleration": "12.0",
+    "limits.jerk": "600.0",
+    "limits.velocity": "2.0",
+    "limits.position.JOINT": "[-2.0, -0.1]",
+    "collision.LINK.xyz": "[0.0, 0.0, -0.2]",
+    "collision.LINK.rpy": "[0.0, 0.5, 0.0]",
+    "arms.SIDE.joints": json.dumps(JOINTS),
+    "arms.SIDE.shoulder.link": '"upper_arm"',
+    "arms.SIDE.shoulder.offset": "[0.0, 0.0, 0.0]",
+    "arms.SIDE.elbow.link": '"forearm"',
+    "arms.SIDE.elbow.offset": "[0.0, 0.0, 0.0]",
+    "arms.SIDE.hand.link": '"hand"',
+    "arms.SIDE.hand.offset": "[0.0, 0.0, -0.1]",
+    "arms.SIDE.hand.fingers": '"-z"',
+    "arms.SIDE.hand.thumb": '"+x"',
+    "arms.SIDE.reach": "0.6",
+}  # a map with every key
+
+
+@pytest.mark.parametrize("without", ["nothing", *STATED])
+def test_a_map_needs_the_keys_that_its_table_calls_required(tmp_path: Path, without: str) -> None:
+    urdf = write_arm(tmp_path)
+    (tmp_path / "arm.srdf").write_text("<robot name='arm'/>")
+    left_out = "arms.SIDE.elbow" if without == "arms.SIDE.elbow.link" else without  # an elbow has a link
+    lines = [f"{key} = {value}" for key, value in STATED.items() if not key.startswith(left_out)]
+    text = "\n".join(lines).replace("SIDE", "right").replace("JOINT", "elbow").replace("LINK", "forearm")
+    urdf.with_suffix(".toml").write_text(text)
+    if without != "nothing" and not KEYS[without].default:
+        with pytest.raises(BadModel):
+            load_robot(read_map(tmp_path / "arm.toml"))
+        return
+    robot = load_robot(read_map(tmp_path / "arm.toml"))
+    shape = next(shape for shape in robot.geometry.geometryObjects if shape.name == "forearm_0")
+    stated = {key: not key.startswith(left_out) for key in STATED}
+    assert shape.placement.translation[2] == (-0.2 if stated["collision.LINK.xyz"] else 0.0)
+    assert shape.placement.rotation[0, 0] == pytest.approx(np.cos(0.5 if stated["collision.LINK.rpy"] else 0.0))
+
+
+def test_the_page_and_the_loader_have_the_same_keys_of_a_map() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "retargeting.md").read_text(encoding="utf-8")
+    rows = [
+        f"| `{name}` | {key.unit} | {key.default or '**required**'} | {key.meaning} |" for name, key in KEYS.items()
+    ]
+    assert "\n".join(["| key | unit or type | without it | what |", "|---|---|---|---|", *rows, ""]) in page
+    assert set(STATED) == set(KEYS)
 
 
 def test_limits_are_read_from_the_urdf_itself(tmp_path: Path) -> None:
@@ -567,6 +626,10 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         find_map("pandas")
     with pytest.raises(BadOption, match=r"--arm left: arm has no left arm; there is: right"):
         load_robot(find_map(str(urdf)), ("left",))
+    text = urdf.with_suffix(".toml").read_text()
+    urdf.with_suffix(".toml").write_text(f"{text}[collision.w1]\nxyz = [0.0, 0.0, 0.1]\n")
+    with pytest.raises(BadModel, match=r"arm.toml: collision.w1: the link has 0 collision shapes in arm.urdf"):
+        load_robot(find_map(str(urdf)))
     urdf.with_suffix(".toml").unlink()
     with pytest.raises(MissingFile, match=r"no arm.toml beside it; a map says which links"):
         find_map(str(urdf))

@@ -101,7 +101,7 @@ def test_violent_arms_do_not_touch(motion: tuple[float, ...]) -> None:
 
 
 def test_what_cannot_stop_in_time_is_slowed_and_strict_refuses_it() -> None:
-    rng = np.random.default_rng(4)
+    rng = np.random.default_rng(6)
     motion = [rng.uniform(*of) for of in ((1.0, 2.5), (20.0, 80.0), (30.0, 100.0), (20.0, 60.0), (0.0, 6.28))]
     robot = load_robot(find_map("talos"))
     found = retarget(violent(*motion), robot)
@@ -159,4 +159,4 @@ def test_the_real_recording(tracked: Pose, name: str) -> None:
     robot = load_robot(find_map(name))
     found = retarget(pose, robot)
     is_sound(found)
-    assert np.isfinite(found.joint_position).all()
+    assert found.counts.stopping == 0

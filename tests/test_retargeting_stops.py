@@ -16,7 +16,7 @@ from wepose_pin.kinematics import Pose
 from wepose_pin.retargeting import Robot, find_map, find_self_collisions, load_robot, retarget
 from wepose_pin.retargeting.collision import NEAR, CollisionModel
 from wepose_pin.retargeting.limits import compute_acceleration_bounds, reduce_acceleration_limits
-from wepose_pin.retargeting.stopping import StopCheck, compute_stop
+from wepose_pin.retargeting.stopping import StopCheck, balance_braking, compute_stop
 
 pytest.importorskip("daqp")
 
@@ -45,7 +45,8 @@ def test_a_stop_keeps_the_limits_and_ends_at_rest(dt: float) -> None:
         u, v, a = u + dt * (v + dt * (a / 3.0 + after / 6.0)), v + 0.5 * dt * (a + after), after
         if k % round(0.05 / dt):
             continue
-        path, velocity, acceleration, travel = compute_stop(u, v, a, *limits, dt)
+        braking = rng.choice([a_max, balance_braking(v, a_max)])
+        path, velocity, acceleration, travel = compute_stop(u, v, a, *limits, braking, dt)
         assert not velocity[-1].any()
         assert not acceleration[-1].any()
         assert (path >= lower - 1e-7).all()
@@ -76,7 +77,7 @@ def test_the_way_to_rest_is_as_clear_as_a_dense_search_finds(arm: Robot) -> None
         if room[0].min() < 0.0:
             continue
         travel = np.abs(np.diff(path, axis=0))
-        clear = check.stays_apart(np.minimum(rooms[0], NEAR), path[1:], travel)
+        clear = check.find_shortfall(np.minimum(rooms[0], NEAR), path[1:], travel) is None
         assert clear == (room.min() >= 0.0) or abs(room.min()) < 1e-3
         refused += not clear
         moved = np.abs(np.diff(np.array(rooms), axis=0))

@@ -372,13 +372,11 @@ def orientation_values(
     return {"quat_WS": found.quat_WS, "gyro_bias": found.gyro_bias, "static": found.static}
 
 
-def robots() -> list[str]:
-    """Robots by name whose models are installed."""
+def has_robot(name: str) -> bool:
+    """Whether a robot's model is installed."""
     from wepose_pin.retargeting import find_map, load_robot
 
-    found = []
-    for name in ("panda", "ur5", "baxter", "tiago_dual", "talos", "g1"):
-        with contextlib.suppress(Exception):
-            load_robot(find_map(name), None)
-            found.append(name)
-    return found
+    with contextlib.suppress(Exception):
+        load_robot(find_map(name))
+        return True
+    return False

@@ -19,6 +19,8 @@ BROAD = (
     "16_undisturbed_fast_translation_B.mat",
     "25_disturbed_tapping_B.mat",
 )
+# One of each kind: five joints on a table, two arms, shapes that the map places. The others are of these kinds.
+OTHER_ROBOTS = ("so101", "baxter", "alex")
 DEVICE_FILES = (
     ("mvnx", "test_mocap.mvnx"),
     ("mvnx", "Meri-020.mvnx"),
@@ -179,7 +181,7 @@ def _simulate(seed: int, preset: str, protocol: str, *changes: str) -> Callable[
 
 def _retarget(robot: str, *options: str) -> Callable[[Places], Arrays]:
     def run(places: Places) -> Arrays:
-        if robot not in adapter.robots():
+        if not adapter.has_robot(robot):
             raise Missing(f"no model of {robot}")
         session, result = places.session("mild"), places.work / "result"
         known = read_known(session)
@@ -298,7 +300,7 @@ def tasks() -> list[Task]:
         Task("retarget/panda", _retarget("panda"), 20.0),
         Task("retarget/panda_position", _retarget("panda", "--task=position"), 20.0),
         Task("retarget/ur5", _retarget("ur5"), 20.0),
-        Task("retarget/baxter", _retarget("baxter"), 30.0),
+        *(Task(f"retarget/{robot}", _retarget(robot), 30.0) for robot in OTHER_ROBOTS),
         Task("live/amekf", _live("amekf")),
         Task("live/smekf", _live("smekf")),
         Task("orientation/authors_trial", _authors_trial),

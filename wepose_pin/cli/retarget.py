@@ -43,9 +43,11 @@ def _print_arms(summary: Mapping[str, Any]) -> None:
             )
         )
         reasons.append((side, *(f"{100 * share:.1f}" for share in arm["error_attribution"].values())))
+    slowdown = summary["slowdown"]
     hand = ("hand [mm] median", "90 %", "where reachable: median", "90 %")
     print_table(
-        f"{summary['robot']}: {summary['duration_s']:.1f} s for {summary['recorded_s']:.1f} s recorded",
+        f"{summary['robot']}: {summary['duration_s']:.1f} s, of which {summary['approach_s']:.1f} s are the approach; "
+        f"{summary['recorded_s']:.1f} s recorded" + (f", {slowdown:.2f} times as long" if slowdown is not None else ""),
         ("arm", "scale", *hand, "orientation [deg]", "elbow swivel [deg]", "reachable [%]"),
         rows,
     )

@@ -21,8 +21,3 @@ Progress = Callable[[str, float], None]  # the current step, and the fraction of
 
 def no_progress(_text: str, _fraction: float) -> None:
     """Progress that is not shown."""
-
-
-def arm_sides(arms: Arms | None) -> tuple[str, ...] | None:
-    """The sides of `arms`; None where all arms of a robot are meant."""
-    return None if arms is None else ("left", "right") if arms == "both" else (arms,)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadOption
-from . import Arms, LiveMethod, arm_sides
+from . import Arms, LiveMethod
 
 if TYPE_CHECKING:
     from ..live import Output, SensorSetup, SessionSummary
@@ -291,12 +291,13 @@ def _load_robot(job: LiveJob) -> RobotOptions:
     from ..calibration import load_protocol
     from ..live.robot import PORT, RobotOptions
     from ..retargeting import LimitMargins, find_map, load_robot
+    from ..retargeting.maps import list_sides
     from ..retargeting.stream import StreamOptions, check_segments
 
     assert job.robot is not None
     timing = StreamOptions(job.robot_hz, job.hold_after, job.stop_after)
     margins = LimitMargins(job.speed_scale, job.limit_margin)
-    robot = load_robot(find_map(job.robot), arm_sides(job.arm), margins)
+    robot = load_robot(find_map(job.robot), list_sides(job.arm), margins)
     if job.guide:
         check_segments(robot, load_protocol(job.protocol).needs)
     return RobotOptions(robot, job.to or str(PORT), timing)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic
-from . import Arms, Progress, arm_sides, no_progress
+from . import Arms, Progress, no_progress
 from .fields import field_values
 
 if TYPE_CHECKING:
@@ -122,7 +122,6 @@ def run_retarget(
         No result, no such robot, an arm without sensors; with `strict` a motion that is too fast.
     """
     import json
-    from dataclasses import replace
 
     from .. import retargeting
     from ..documents import whole_folder
@@ -136,24 +135,24 @@ def run_retarget(
     from ..writers.result import as_json, read_phases
 
     job.check()
-    without = [task for task in ("position", "orientation") if job.task not in ("both", task)]
-    params = replace(retargeting.ControllerParams(), **dict.fromkeys(without, 0.0))
     with whole_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
         pose, body, about = read_result(job.result, job.interval, job.phase)
-        margins = retargeting.LimitMargins(job.speed_scale, job.limit_margin)
-        robot = retargeting.load_robot(retargeting.find_map(job.robot), arm_sides(job.arm), margins)
         trajectory = retargeting.retarget(
             pose,
-            robot,
+            job.robot,
+            arm=job.arm,
+            task=job.task,
             rate_hz=job.rate_hz,
-            params=params,
-            table=body.table,
             scale=job.scale,
             smoothing_hz=job.smoothing_hz,
+            speed_scale=job.speed_scale,
+            limit_margin=job.limit_margin,
             strict=job.strict,
+            table=body.table,
             progress=lambda text, fraction: progress(text, 0.48 * (fraction + STAGES.index(text))),
         )
+        robot = trajectory.robot
         progress("checking", 0.96)
         check = retargeting.check_limits(retargeting.build_table(trajectory), robot.map)
         collisions = retargeting.find_self_collisions(robot, trajectory.time, trajectory.joint_position)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import compress, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -50,6 +50,7 @@ class CollisionModel:
         for i, j in self.pairs:
             self.hulls.addCollisionPair(pin.CollisionPair(i, j))
         self.data = self.hulls.createData()
+        self._active = np.ones(len(self.pairs), dtype=bool)
         objects = self.hulls.geometryObjects
         for shape in objects:
             shape.geometry.computeLocalAABB()
@@ -80,23 +81,29 @@ class CollisionModel:
         R, p = np.array(self._rotations), np.array(self._translations)
         centre = np.einsum("kij,kj->ki", R[self._joint], self._centre) + p[self._joint]
         gap = centre[self._first] - centre[self._second]
-        close = np.flatnonzero(np.einsum("ki,ki->k", gap, gap) < self._range**2)
-        if not len(close):
+        close = np.einsum("ki,ki->k", gap, gap) < self._range**2
+        if not close.any():
             return none
+        self._activate(close)
         pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
-        rows, indices = [], []
-        for k in close.tolist():
-            result = pin.computeDistance(self.hulls, self.data, k)
-            if result.min_distance < NEAR:
-                rows.append((result.min_distance, *result.getNearestPoint1(), *result.getNearestPoint2()))
-                indices.append(k)
-        if not rows:
+        pin.computeDistances(self.hulls, self.data)
+        results = self.data.distanceResults
+        near = [(k, result) for k in np.flatnonzero(close).tolist() if (result := results[k]).min_distance < NEAR]
+        if not near:
             return none
-        table = np.array(rows)
-        distance, a, b = table[:, 0], table[:, 1:4], table[:, 4:7]
+        indices = np.array([k for k, _ in near])
+        distance = np.array([result.min_distance for _, result in near])
+        a = np.concatenate([result.getNearestPoint1() for _, result in near]).reshape(-1, 3)
+        b = np.concatenate([result.getNearestPoint2() for _, result in near]).reshape(-1, 3)
         first, second = self._joint[self._first[indices]], self._joint[self._second[indices]]
         jacobian = _distance_jacobian(distance, a, b, data.J, self._supports[first], self._supports[second])
-        return NearPairs(np.array(indices), distance, jacobian, self.clearance[indices])
+        return NearPairs(indices, distance, jacobian, self.clearance[indices])
+
+    def _activate(self, pairs: np.ndarray) -> None:
+        """Let Pinocchio compute the distances of these pairs (pairs,) bool only."""
+        for k in np.flatnonzero(pairs != self._active).tolist():
+            (self.data.activateCollisionPair if pairs[k] else self.data.deactivateCollisionPair)(k)
+        self._active = pairs
 
     def name_pair(self, pair: int) -> str:
         """The names of the two shapes of a pair."""
@@ -185,14 +192,14 @@ def build_hulls(robot: Robot) -> tuple[Any, list[int]]:
     for joint, shapes in hands.items():
         hull = model.geometryObjects[model.getGeometryId(f"hand {joint}")]
         corners = coal.StdVec_Vec3s()
-        corners.extend(list(np.vstack([_corners(shape) for shape in shapes])))
+        corners.extend(list(np.vstack([list_corners(shape) for shape in shapes])))
         hull.geometry = coal.Convex.convexHull(corners, True, "Qt")
         hull.placement = pin.SE3.Identity()
     return model, hull_of
 
 
-def _corners(shape: Any) -> np.ndarray:
-    """Points in the joint's frame whose hull contains the shape; of a round one the corners of its box."""
+def list_corners(shape: Any) -> np.ndarray:
+    """Return points (n, 3) [m] in the joint's frame whose hull contains a shape; of a round one its box's corners."""
     geometry = shape.geometry
     if hasattr(geometry, "buildConvexHull"):
         points = np.asarray(geometry.vertices())
@@ -232,33 +239,39 @@ def find_collision_pairs(robot: Robot) -> list[tuple[int, int]]:
     for _ in range(samples):
         hits += find_hits(rng.uniform(*robot.bounds))
     checked = (hits < _ALWAYS * samples) & ~find_hits(robot.rest)
-    return [
-        pair
-        for pair, check, count in zip(candidates, checked, hits, strict=True)
-        if check and not (count == 0 and _never_collides(robot, shapes, pair))
-    ]
+    seldom = {pair for pair, count in zip(candidates, hits, strict=True) if count == 0}
+    never = _find_never_colliding(robot, shapes, seldom.intersection(compress(candidates, checked)))
+    return [pair for pair, check in zip(candidates, checked, strict=True) if check and pair not in never]
 
 
-def _never_collides(robot: Robot, shapes: Any, pair: tuple[int, int]) -> bool:
-    """Whether few joints of one arm lie between two shapes, and no posture on a grid of them brings a collision."""
-    objects, model = shapes.geometryObjects, robot.model
-    a, b = sorted(int(objects[k].parentJoint) for k in pair)
-    between = np.zeros(len(robot.names), dtype=bool)
-    joints = 0
-    while b > a:
-        between |= robot.coupling[model.idx_vs[b]] != 0.0
-        b, joints = model.parents[b], joints + 1
-    if b < a or joints > _GRID_JOINTS:
-        return False
+def _find_never_colliding(robot: Robot, shapes: Any, pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Pairs with few joints of one arm between them that collide in no posture on a grid of these joints."""
+    by_joints: dict[tuple[int, ...], set[tuple[int, int]]] = {}
+    for pair in pairs:
+        joints = _find_joints_between(robot, *sorted(int(shapes.geometryObjects[k].parentJoint) for k in pair))
+        if joints is not None:
+            by_joints.setdefault(joints, set()).add(pair)
     low, high = robot.bounds
-    data, geometry, u = model.createData(), shapes.createData(), robot.rest.copy()
-    k = shapes.findCollisionPair(pin.CollisionPair(*pair))
-    for values in product(*(np.linspace(low[j], high[j], _GRID) for j in np.flatnonzero(between))):
-        u[between] = values
-        pin.updateGeometryPlacements(model, data, shapes, geometry, robot.configuration(u))
-        if pin.computeCollision(shapes, geometry, k):
-            return False
-    return True
+    data, geometry = robot.model.createData(), shapes.createData()
+    for joints, clear in by_joints.items():
+        indices = {pair: shapes.findCollisionPair(pin.CollisionPair(*pair)) for pair in clear}
+        u = robot.rest.copy()
+        for values in product(*(np.linspace(low[j], high[j], _GRID) for j in joints)):
+            u[list(joints)] = values
+            pin.updateGeometryPlacements(robot.model, data, shapes, geometry, robot.configuration(u))
+            clear -= {pair for pair in clear if pin.computeCollision(shapes, geometry, indices[pair])}
+            if not clear:
+                break
+    return set().union(*by_joints.values())
+
+
+def _find_joints_between(robot: Robot, a: int, b: int) -> tuple[int, ...] | None:
+    """The joints (of `Robot.names`) between two joints of the model; None where these are not on one arm, or many."""
+    between, count = np.zeros(len(robot.names), dtype=bool), 0
+    while b > a:
+        between |= robot.coupling[robot.model.idx_vs[b]] != 0.0
+        b, count = robot.model.parents[b], count + 1
+    return tuple(np.flatnonzero(between).tolist()) if b == a and count <= _GRID_JOINTS else None
 
 
 def _link_name(shape: str) -> str:

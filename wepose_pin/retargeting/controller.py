@@ -22,14 +22,19 @@ from .collision import NEAR, CollisionModel, NearPairs
 from .limits import compute_acceleration_bounds, compute_separation_bounds, reduce_acceleration_limits
 from .objective import add_arm_tasks
 from .robot import Arm, Robot
-from .stopping import Stop, StopCheck, compute_stop
+from .stopping import Stop, StopCheck, balance_braking, compute_stop
 from .targets import HandPath
 
 HAND_POSE_DOF = 6  # an arm with no more joints has no redundancy for a swivel task
 MAX_BRAKE_SHARE = 0.9  # of the range of joint velocities in a step, used at most to keep two shapes apart
+# Where a step leaves no stop open, it is solved again with larger clearances: by this share of what a pair lacks along
+# the stop and by that distance for all pairs, both so many times more from one attempt to the next.
+MAX_RAISES, RAISE_SHARE, MIN_RAISE_M, RAISE_GROWTH = 8, 1.5, 1e-4, 3.0
 NEAR_CLEARANCE_M = 0.01  # [m] to the clearance: pairs nearer than that are counted
 _MIN_DISTANCE_JACOBIAN = 1e-3  # [m/rad] below it a joint does not change a distance
 _DAQP_INFINITY = 1e30  # a bound that daqp ignores
+_DAQP_SOFT = 8  # a constraint that may be violated, by as little as possible
+_DAQP_SOLVED = (1, 2)  # flags: all constraints kept, or all but soft ones
 _NO_JACOBIAN = np.empty((0, 0))
 
 
@@ -155,7 +160,6 @@ class QpController:
         v_max, a_max, j_max = (self.limit_factor * limit for limit in (robot.v_max, robot.a_max, robot.j_max))
         a_max = reduce_acceleration_limits(a_max, v_max, j_max, robot.upper - robot.lower, self.dt)
         self._limits = (v_max, a_max, j_max)
-        self._uncoupled = _is_uncoupled(robot)
         self._kernel_params = np.array(
             [
                 p.position, p.orientation, p.swivel, p.task_gain, p.max_correction_deceleration, p.singular_value_limit,
@@ -188,38 +192,55 @@ class QpController:
         robot, params, dt, n = self.robot, self.params, self.dt, len(self.robot.names)
         self.counts.steps += 1
         near = self._update_distances(state)
+        self.counts.near_clearance += bool((near.distance - near.clearance < NEAR_CLEARANCE_M).any())
         H, f = np.zeros((n, n)), np.zeros(n)
         for arm, target in zip(self._arms, targets, strict=True):
             self.counts.singular += arm.add_to_objective(H, f, target, self._kernel_params, dt, state.velocity)
-        velocity_mid = (
-            state.velocity + 0.5 * dt * state.acceleration
-        )  # half a step on; the accelerations so far determine it
+        velocity_mid = _predict_mid_velocity(state, dt)
         H[np.diag_indices(n)] += params.posture + params.joint_velocity + params.joint_velocity_change
         reference = self.posture_reference or PostureReference(robot.rest, 0.0)
         f += params.posture * (params.posture_gain * (reference.position - state.position) + reference.velocity)
         f += params.joint_velocity_change * (velocity_mid + dt * state.acceleration)
-        self._bound_accelerations(state)
-        w_min, w_max = velocity_mid + dt * self._min_accel, velocity_mid + dt * self._max_accel
-        rows, bound = self._constrain_distances(state, near)
-        # What joints cannot brake is not asked for; at rest it is enough not to approach.
-        most = np.where(rows > 0.0, rows * w_max, rows * w_min).sum(axis=1)
-        bound = np.minimum(bound, most - (1.0 - MAX_BRAKE_SHARE) * np.abs(rows) @ (w_max - w_min))
-        if not (state.velocity.any() or state.acceleration.any()):
-            bound = np.minimum(bound, 0.0)
-        w = self._solve_qp(H, f, rows, bound, w_min, w_max)
-        if w is None and not self.guarded:
-            w = np.clip(0.0, w_min, w_max)
-        if w is not None:
-            w = np.clip(w, w_min, w_max)
-            after = integrate(state, np.clip((w - velocity_mid) / dt, self._min_accel, self._max_accel), dt)
-            if not self.guarded or self._leaves_stop(state, after, near):
-                self.stopping = False
-                return after
-        self.stopping = True
+        compute_acceleration_bounds(
+            state.position, state.velocity, state.acceleration, robot.lower, robot.upper, *self._limits, dt,
+            self._min_accel, self._max_accel,
+        )  # fmt: skip
+        after = self._solve_step(state, near, H, f)
+        self.stopping = after is None
+        if after is not None:
+            return after
         self.counts.stopping += 1
         self.active.joints[:] = False
         self.active.arms_near_contact[:] = True
         return self._take_stop(state)
+
+    def _solve_step(self, state: JointState, near: NearPairs, H: np.ndarray, f: np.ndarray) -> JointState | None:
+        """Return the next state, within all limits, that leaves a stop open; None: none was found.
+
+        A solution that leaves no stop open is sought again with larger clearances, up to `MAX_RAISES` times.
+        """
+        velocity_mid = _predict_mid_velocity(state, self.dt)
+        w_min, w_max = (velocity_mid + self.dt * limit for limit in (self._min_accel, self._max_accel))
+        is_static = not (state.velocity.any() or state.acceleration.any())
+        brake_share = MAX_BRAKE_SHARE
+        for attempt in range(1 + MAX_RAISES):
+            rows, bound = self._constrain_distances(state, near)
+            # What joints cannot brake is not asked for; at rest it is enough not to approach.
+            most = np.where(rows > 0.0, rows * w_max, rows * w_min).sum(axis=1)
+            bound = np.minimum(bound, most - (1.0 - brake_share) * np.abs(rows) @ (w_max - w_min))
+            if is_static:
+                bound = np.minimum(bound, 0.0)
+            w = self._solve_qp(H, f, rows, bound, w_min, w_max)
+            if w is None and self.guarded:
+                return None
+            w = np.clip(0.0 if w is None else w, w_min, w_max)
+            after = integrate(state, np.clip((w - velocity_mid) / self.dt, self._min_accel, self._max_accel), self.dt)
+            shortfall = self._find_stop(state, after, near) if self.guarded else None
+            if shortfall is None:
+                return after
+            more = RAISE_GROWTH**attempt * (RAISE_SHARE * shortfall[near.pairs] + MIN_RAISE_M)
+            near, brake_share = near._replace(clearance=near.clearance + more), 1.0
+        return None
 
     def brake(self, state: JointState) -> JointState:
         """Return the state one step later, on the stop that the last step has left open; at rest it stays."""
@@ -234,41 +255,35 @@ class QpController:
         self._stop_steps += 1
         return JointState(self._stop.position[k], self._stop.velocity[k], self._stop.acceleration[k])
 
-    def _leaves_stop(self, state: JointState, after: JointState, near: NearPairs) -> bool:
-        """Whether the robot can stop from the state `after` without self-contact; if so, remember how."""
-        v_max, a_max, j_max = self._limits
-        stop = Stop(
-            *compute_stop(
-                after.position, after.velocity, after.acceleration, self.robot.lower, self.robot.upper, v_max, a_max,
-                j_max, self.dt,
-            )
-        )  # fmt: skip
-        if not stop.ends_at_rest:
-            return False
+    def _find_stop(self, state: JointState, after: JointState, near: NearPairs) -> np.ndarray | None:
+        """Return None where the robot can stop from the state `after` without self-contact, and remember how.
+
+        Else how far (pairs,) [m] pairs would come below their least distance. First each joint brakes as hard as it
+        can, then so that all come to rest together: the hands stay closer to their path.
+        """
+        robot, (v_max, a_max, j_max) = self.robot, self._limits
         distance = np.full(len(self.collision.pairs), NEAR)
         distance[near.pairs] = near.distance
         faster = np.maximum(np.abs(state.velocity), np.abs(after.velocity))
         travel = self.dt * (faster + 0.125 * self.dt * np.abs(after.acceleration - state.acceleration))
-        path = np.vstack([after.position, stop.position])
-        if not self._stop_check.stays_apart(distance, path, np.vstack([travel, stop.travel])):
-            return False
-        self._stop, self._stop_steps = stop, 0
-        return True
-
-    def _bound_accelerations(self, state: JointState) -> None:
-        """Fill `_min_accel` and `_max_accel`."""
-        lower, upper = self.robot.lower, self.robot.upper
-        compute_acceleration_bounds(
-            state.position,
-            state.velocity,
-            state.acceleration,
-            lower,
-            upper,
-            *self._limits,
-            self.dt,
-            self._min_accel,
-            self._max_accel,
-        )
+        shortfall = np.zeros(len(distance))
+        for together in (False, True):
+            braking = balance_braking(after.velocity, a_max) if together else a_max
+            stop = Stop(
+                *compute_stop(
+                    after.position, after.velocity, after.acceleration, robot.lower, robot.upper, v_max, a_max, j_max,
+                    braking, self.dt,
+                )
+            )  # fmt: skip
+            if not stop.ends_at_rest:
+                continue
+            path = np.vstack([after.position, stop.position])
+            violation = self._stop_check.find_shortfall(distance, path, np.vstack([travel, stop.travel]))
+            if violation is None:
+                self._stop, self._stop_steps = stop, 0
+                return None
+            shortfall = np.maximum(shortfall, violation)
+        return shortfall
 
     def _update_distances(self, state: JointState) -> NearPairs:
         """Set the joint positions, and return the pairs that are near; update `min_distance`."""
@@ -282,9 +297,8 @@ class QpController:
 
     def _constrain_distances(self, state: JointState, near: NearPairs) -> tuple[np.ndarray, np.ndarray]:
         """Return rows (m, n) and bound (m,) of rows @ w ≥ bound: near shapes approach no faster than they can stop."""
-        rows = near.jacobian if self._uncoupled else near.jacobian @ self.robot.coupling
+        rows = near.jacobian @ self.robot.coupling
         _, a_max, j_max = self._limits
-        self.counts.near_clearance += bool((near.distance - near.clearance < NEAR_CLEARANCE_M).any())
         bound = compute_separation_bounds(
             rows, near.distance, near.clearance, state.velocity, state.acceleration, a_max, j_max, self.dt
         )  # fmt: skip
@@ -293,13 +307,20 @@ class QpController:
     def _solve_qp(
         self, H: np.ndarray, f: np.ndarray, rows: np.ndarray, bound: np.ndarray, w_min: np.ndarray, w_max: np.ndarray
     ) -> np.ndarray | None:
-        """Return w (n,) within `w_min` and `w_max` that keeps the constraints of the distances; None: there is none."""
+        """Return w (n,) within `w_min` and `w_max` that keeps the constraints of the distances; None: there is none.
+
+        Where these exclude each other they are violated by as little as possible; whether a stop is open is checked.
+        """
         n = len(w_max)
         upper = np.concatenate([w_max, np.full(len(rows), _DAQP_INFINITY)])
         lower = np.concatenate([w_min, bound])
         sense = np.zeros(len(upper), dtype=np.int32)
-        w, _, flag, info = self._solve(H, -f, np.ascontiguousarray(rows), upper, lower, sense)
-        if flag != 1 or not np.isfinite(w).all():
+        rows = np.ascontiguousarray(rows)
+        w, _, flag, info = self._solve(H, -f, rows, upper, lower, sense)
+        if flag not in _DAQP_SOLVED:
+            sense[n:] = _DAQP_SOFT
+            w, _, flag, info = self._solve(H, -f, rows, upper, lower, sense)
+        if flag not in _DAQP_SOLVED or not np.isfinite(w).all():
             return None
         active = info["lam"] != 0.0
         self.active.joints[:] = active[:n]
@@ -315,6 +336,11 @@ def integrate(state: JointState, acceleration: np.ndarray, dt: float) -> JointSt
     velocity = state.velocity + 0.5 * dt * (state.acceleration + acceleration)
     position = state.position + dt * (state.velocity + dt * (state.acceleration / 3.0 + acceleration / 6.0))
     return JointState(position, velocity, acceleration)
+
+
+def _predict_mid_velocity(state: JointState, dt: float) -> np.ndarray:
+    """Return the joint velocities half a step on, which the accelerations so far determine."""
+    return state.velocity + 0.5 * dt * state.acceleration
 
 
 class _ArmTasks:
@@ -335,7 +361,6 @@ class _ArmTasks:
             self._R_E, self._p_E = placement.rotation, placement.translation
             self._moves_elbow = _build_ancestor_mask(robot, elbow.parentJoint)
         self._moves_hand = _build_ancestor_mask(robot, frame.parentJoint)
-        self._uncoupled = _is_uncoupled(robot)
         self.hand, self.rotation, self.elbow = np.zeros(3), np.eye(3), np.full(3, np.nan)
 
     def update_pose(self) -> None:
@@ -349,11 +374,8 @@ class _ArmTasks:
         self, H: np.ndarray, f: np.ndarray, target: HandTarget, params: np.ndarray, dt: float, v: np.ndarray
     ) -> bool:
         """Add the arm's tasks to H and f; return whether the arm is near a singularity."""
-        J_hand = self.data.J * self._moves_hand
-        J_elbow = self.data.J * self._moves_elbow if self._has_swivel else _NO_JACOBIAN
-        if not self._uncoupled:
-            J_hand = J_hand @ self.robot.coupling
-            J_elbow = J_elbow @ self.robot.coupling if self._has_swivel else J_elbow
+        J_hand = self.data.J * self._moves_hand @ self.robot.coupling
+        J_elbow = self.data.J * self._moves_elbow @ self.robot.coupling if self._has_swivel else _NO_JACOBIAN
         rotation_error = pin.log3(target.rotation @ self.rotation.T)
         return bool(
             add_arm_tasks(
@@ -379,10 +401,6 @@ def sample_hand_targets(hands: tuple[HandPath, ...], k: int, dt: float) -> tuple
         )
         for hand in hands
     )
-
-
-def _is_uncoupled(robot: Robot) -> bool:
-    return np.array_equal(robot.coupling, np.eye(*robot.coupling.shape))
 
 
 def _build_ancestor_mask(robot: Robot, joint: int) -> np.ndarray:

@@ -18,7 +18,7 @@ from ..recording import format_time
 from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY, JointMotion
 from ..writers.result import write_table
 from .checks import AT_REST, LimitCheck, SelfCollisions
-from .collision import CLEARANCE
+from .collision import CLEARANCE, list_corners
 from .error_attribution import CLAMPED, FAR, assess_reachability, attribute_errors
 from .robot import Robot
 from .targets import compute_target_reach
@@ -113,23 +113,14 @@ def place_root(robot: Robot) -> np.ndarray:
     data, height = robot.model.createData(), 0.0
     pin.forwardKinematics(robot.model, data, robot.configuration(robot.rest))
     lowest = [
-        (R_WB @ (data.oMi[shape.parentJoint] * shape.placement).act(corner))[2]
+        (R_WB @ data.oMi[shape.parentJoint].act(corner))[2]
         for shape in robot.geometry.geometryObjects
-        for corner in _list_corners(shape.geometry)
+        for corner in list_corners(shape)
     ]
     shoulder = np.mean([arm.shoulder for arm in robot.arms], axis=0)
     if lowest and (R_WB @ shoulder)[2] - min(lowest) > STANDING_HEIGHT:
         height = -min(lowest)
     return np.concatenate([[0.0, 0.0, height], Rotation.from_matrix(R_WB).as_quat()])
-
-
-def _list_corners(geometry: Any) -> np.ndarray:
-    """The vertices (n, 3) [m] of a mesh, or the corners of the box about another shape."""
-    if hasattr(geometry, "vertices"):
-        return np.asarray(geometry.vertices(), dtype=float)
-    geometry.computeLocalAABB()
-    ends = np.array([geometry.aabb_local.min_, geometry.aabb_local.max_])
-    return ends[[[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], [0, 1, 2]]
 
 
 def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:

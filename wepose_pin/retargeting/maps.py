@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,9 +19,53 @@ ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_
 SIDES = ("left", "right")
 AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
 EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
-_KEYS = ("format", "urdf", "srdf", "description", "up", "forward", "base", "table", "rest", "limits", "arms")
 MAX_VALUE = 1e6  # of a number in a map
 RISE_S = 0.02  # [s] to the full acceleration, from which the jerk limit follows where the map has none
+
+
+class MapKey(NamedTuple):
+    """One key of a map, or all of one kind: JOINT and LINK stand for a name, SIDE for left or right."""
+
+    unit: str  # or type
+    default: str  # what holds without it; empty: it is required
+    meaning: str
+
+
+KEYS = {
+    "format": MapKey("1", "", "version of the map's format"),
+    "urdf": MapKey("file", "", "beside the map, or a path in example-robot-data"),
+    "srdf": MapKey("file", "none", "`disable_collisions` are not checked, as pairs that collide at rest, or always"),
+    "description": MapKey("text", "none", "in the report and in `summary.json`"),
+    "base": MapKey("link", "the root", "`up`, `forward` and `table` are in its frame"),
+    "up": MapKey("axis", "", "of the base, points up: `+x`, `-x`, …, `-z`"),
+    "forward": MapKey("axis", "", "of the base, points where the person faces"),
+    "table": MapKey("m", "there is none", "height above the base's origin of the table on which it stands"),
+    "rest.JOINT": MapKey("rad or m", "0", "posture where the motion begins, and to which free joints tend"),
+    "limits.source": MapKey("text", "none", "where the limits are from"),
+    "limits.acceleration": MapKey("rad/s² or m/s²", "", "of all arm joints, or a table with one for each"),
+    "limits.jerk": MapKey("rad/s³ or m/s³", "the full acceleration in 20 ms", "the same"),
+    "limits.velocity": MapKey("rad/s or m/s", "the URDF's", "the same"),
+    "limits.position.JOINT": MapKey("rad or m", "the URDF's", "lower and upper limit"),
+    "collision.LINK.xyz": MapKey("m", "0, 0, 0", "origin of the link's collision shape, in place of the URDF's"),
+    "collision.LINK.rpy": MapKey("rad", "0, 0, 0", "its roll, pitch and yaw"),
+    "arms.SIDE.joints": MapKey("joints", "", "from the shoulder to the hand; all others stay at rest"),
+    "arms.SIDE.shoulder.link": MapKey("link", "", "the person's shoulder; does not move"),
+    "arms.SIDE.shoulder.offset": MapKey("m", "0, 0, 0", "in the link's frame"),
+    "arms.SIDE.elbow.link": MapKey("link", "the elbow is free", "the person's elbow"),
+    "arms.SIDE.elbow.offset": MapKey("m", "0, 0, 0", "in the link's frame"),
+    "arms.SIDE.hand.link": MapKey("link", "", "the person's palm"),
+    "arms.SIDE.hand.offset": MapKey("m", "0, 0, 0", "in the link's frame"),
+    "arms.SIDE.hand.fingers": MapKey("axis", "", "of the link, along the fingers"),
+    "arms.SIDE.hand.thumb": MapKey("axis", "", "of the link, to the thumb's side"),
+    "arms.SIDE.reach": MapKey("m", "95 % of what the joints allow", "what a straight arm becomes"),
+}  # of a map
+
+
+def list_keys(table: str = "") -> tuple[str, ...]:
+    """Return the keys of one of a map's tables, such as ``arms.SIDE``; of the map itself without a name."""
+    prefix = f"{table}." if table else ""
+    inside = [name.removeprefix(prefix) for name in KEYS if name.startswith(prefix)]
+    return tuple(dict.fromkeys(name.partition(".")[0] for name in inside))
 
 
 class LinkPoint(NamedTuple):
@@ -33,17 +77,7 @@ class LinkPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class ArmMap:
-    """One arm of the robot.
-
-    Parameters
-    ----------
-    joints : from the shoulder to the hand; all others keep the rest posture
-    shoulder : corresponds to the person's shoulder; does not move
-    elbow : None: the controller is free to choose it
-    hand : corresponds to the person's palm
-    fingers, thumb : axes of the hand's link along the fingers, and to the side of the thumb
-    reach : [m] of the person's straight arm; None: 95 % of what the joints allow
-    """
+    """One arm of the robot: the keys of ``arms.SIDE``, as `KEYS` has them."""
 
     joints: tuple[str, ...]
     shoulder: LinkPoint
@@ -62,19 +96,10 @@ class ArmMap:
 
 @dataclass(frozen=True)
 class RobotMap:
-    """What retargeting needs of a robot beyond its URDF.
+    """What retargeting needs of a robot beyond its URDF: the keys of its map, as `KEYS` has them, and the map's file.
 
-    Parameters
-    ----------
-    where : the map's file name, for error messages
-    urdf, srdf : files; without an SRDF pairs in collision in the rest posture, or always, are not checked
-    base : link whose axes `up` and `forward` are; empty: the root
-    up, forward : axes of the base that point up, and where the person faces
-    table : [m] height above the base's origin of the table on which the robot stands; None: there is none
-    rest : joint → value in the rest posture [rad or m]; zero where not named
-    acceleration, jerk : joint → limit [rad/s²], [rad/s³]
-    velocity, position : joint → limit [rad/s], lower and upper limit [rad], in place of the URDF's
-    description : free text, with the sources of the limits
+    `where` is the file's name, for error messages; `description` has the source of the limits too; `collision` is x, y,
+    z [m], roll, pitch, yaw [rad] of a link's shape.
     """
 
     name: str
@@ -92,6 +117,7 @@ class RobotMap:
     arms: Mapping[str, ArmMap]
     table: float | None = None
     description: str = ""
+    collision: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     def read_joint_limits(self) -> dict[str, JointLimit]:
         """Return the limits of every movable joint: those of the map, else the URDF's.
@@ -151,7 +177,7 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         As `find_map`.
     """
     top = TomlTable(read_toml(path, "a robot's map (docs/retargeting.md)", BadModel), path.name, error=BadModel)
-    top.allow(*_KEYS)
+    top.allow(*list_keys())
     if top.values.get("format") != 1:
         raise BadModel(f"{top.at('format')} = {top.values.get('format')!r}; this version reads format = 1")
     up, forward = _read_axes(top, "up", "forward")
@@ -160,7 +186,8 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         raise BadModel(f"{top.at('arms')}: at least one of [arms.left] and [arms.right] is needed")
     arms = {side: _read_arm(tables[side]) for side in SIDES if side in tables}
     limits = top.table("limits", {})
-    limits.allow("position", "velocity", "acceleration", "jerk", "source")
+    limits.allow(*list_keys("limits"))
+    origins = top.table("collision", {})
     joints = [name for arm in arms.values() for name in arm.joints]
     acceleration = _read_joint_values(limits, "acceleration", joints)
     jerk = {name: limit / RISE_S for name, limit in acceleration.items()}
@@ -180,7 +207,13 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         arms=arms,
         table=top.number("table", None),
         description=" ".join(filter(None, (_read_text(top, "description"), _read_text(limits, "source")))),
+        collision={link: _read_origin(origins.table(link)) for link in origins.values},
     )
+
+
+def list_sides(arm: str | None) -> tuple[str, ...] | None:
+    """Return the sides of "left", "right" or "both"; None: all arms that a robot has."""
+    return SIDES if arm == "both" else None if arm is None else (arm,)
 
 
 def package_folders(urdf: Path) -> list[str]:
@@ -222,31 +255,43 @@ def _read_text(table: TomlTable, key: str) -> str:
 
 
 def _read_arm(table: TomlTable) -> ArmMap:
-    table.allow("joints", "shoulder", "elbow", "hand", "reach")
+    table.allow(*list_keys("arms.SIDE"))
     joints = table.values.get("joints")
     if not isinstance(joints, list) or not joints or not all(isinstance(name, str) for name in joints):
         raise BadModel(f"{table.at('joints')} = {joints!r}; a list of joints from the shoulder to the hand is needed")
     fingers, thumb = _read_axes(table.table("hand"), "fingers", "thumb")
     return ArmMap(
         joints=tuple(joints),
-        shoulder=_read_point(table.table("shoulder")),
-        elbow=_read_point(table.table("elbow")) if "elbow" in table else None,
-        hand=_read_point(table.table("hand"), "fingers", "thumb"),
+        shoulder=_read_point(table.table("shoulder"), "shoulder"),
+        elbow=_read_point(table.table("elbow"), "elbow") if "elbow" in table else None,
+        hand=_read_point(table.table("hand"), "hand"),
         fingers=fingers,
         thumb=thumb,
         reach=table.number("reach", None, positive=True),
     )
 
 
-def _read_point(table: TomlTable, *more: str) -> LinkPoint:
-    """A point; `more` are other keys of its table."""
-    table.allow("link", "offset", *more)
-    link, offset = table.text("link", None), table.values.get("offset", [0.0, 0.0, 0.0])
+def _read_point(table: TomlTable, key: str) -> LinkPoint:
+    """A point of an arm."""
+    table.allow(*list_keys(f"arms.SIDE.{key}"))
+    link = table.text("link", None)
     if link is None:
         raise BadModel(f"{table.at('link')} is missing; the name of a link is needed")
-    if not isinstance(offset, list) or len(offset) != 3 or not all(is_number(value, MAX_VALUE) for value in offset):
-        raise BadModel(f"{table.at('offset')} = {offset!r}; three numbers in metres are needed")
-    return LinkPoint(link, (float(offset[0]), float(offset[1]), float(offset[2])))
+    return LinkPoint(link, _read_triple(table, "offset", "metres"))
+
+
+def _read_origin(table: TomlTable) -> tuple[float, ...]:
+    """x, y, z [m], roll, pitch, yaw [rad]."""
+    table.allow(*list_keys("collision.LINK"))
+    return (*_read_triple(table, "xyz", "metres"), *_read_triple(table, "rpy", "radians"))
+
+
+def _read_triple(table: TomlTable, key: str, unit: str) -> tuple[float, float, float]:
+    """Three numbers; zeros where the key is missing."""
+    value = table.values.get(key, [0.0, 0.0, 0.0])
+    if not isinstance(value, list) or len(value) != 3 or not all(is_number(number, MAX_VALUE) for number in value):
+        raise BadModel(f"{table.at(key)} = {value!r}; three numbers in {unit} are needed")
+    return float(value[0]), float(value[1]), float(value[2])
 
 
 def _read_axes(table: TomlTable, first: str, second: str) -> tuple[str, str]:

@@ -326,13 +326,24 @@ def _rest_configuration(robot: RobotMap, full: Any, limits: dict[str, JointLimit
 
 
 def _load_collision_geometry(robot: RobotMap, full: Any) -> Any:
-    """Pinocchio's geometry model; empty where the URDF has no collision shapes."""
+    """Pinocchio's geometry model, placed as the map has it; empty where the URDF has no collision shapes."""
     try:
-        return pin.buildGeomFromUrdf(
+        geometry = pin.buildGeomFromUrdf(
             full, str(robot.urdf), pin.GeometryType.COLLISION, package_dirs=package_folders(robot.urdf)
         )
     except Exception as error:  # what C++ throws
         raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {_first_line(error)}") from error
+    names = [shape.name for shape in geometry.geometryObjects]
+    for link, (x, y, z, *rpy) in robot.collision.items():
+        own = [k for k, name in enumerate(names) if name.rpartition("_")[0] == link]
+        if len(own) != 1:
+            raise BadModel(
+                f"{robot.where}: collision.{link}: the link has {len(own)} collision shapes in {robot.urdf.name}, "
+                "one is needed"
+            )
+        placement = full.frames[full.getFrameId(link)].placement
+        geometry.geometryObjects[own[0]].placement = placement * pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
+    return geometry
 
 
 class _CoupledJoints(NamedTuple):

@@ -21,6 +21,7 @@ STOP_S = 0.06  # [s] time constant of the last of a velocity; above, joints brak
 STOP_RISES = 1.5  # of it at least, in times that a joint needs to reach its full acceleration
 STOP_SHARE = 0.02  # of what one step can brake: below it the velocity goes to zero at once
 STATIC_SPEED = 1e-9  # [rad/s or m/s] below it a joint is at rest
+MIN_BRAKING_SHARE = 0.05  # of the acceleration limit, with which a joint brakes that comes to rest with the others
 MAX_STOP_S = 5.0  # [s]; a stop that takes longer counts as none
 
 
@@ -39,11 +40,12 @@ class Stop(NamedTuple):
 
 
 @compiled
-def compute_stop(u, v, a, lower, upper, v_max, a_max, j_max, dt):  # type: ignore[no-untyped-def]
+def compute_stop(u, v, a, lower, upper, v_max, a_max, j_max, braking, dt):  # type: ignore[no-untyped-def]
     """Return positions, velocities, accelerations, largest travel of each step (m, n): joints brake one by one to rest.
 
-    They keep the limits if the present state does, as `compute_acceleration_bounds` has it. Without rows: at rest. The
-    last state is not at rest where that takes longer than `MAX_STOP_S`.
+    Each brakes at `braking` (n,), up to `a_max`, and harder where its position limit asks for it. They keep the limits
+    if the present state does, as `compute_acceleration_bounds` has it. Without rows: at rest. The last state is not at
+    rest where that takes longer than `MAX_STOP_S`.
     """
     n = len(u)
     steps = int(MAX_STOP_S / dt)
@@ -53,13 +55,13 @@ def compute_stop(u, v, a, lower, upper, v_max, a_max, j_max, dt):  # type: ignor
         j_step = j_max[j] * dt
         fade = max(STOP_S, STOP_RISES * a_max[j] / j_max[j])
         peak = abs(speed) + abs(accel) * (dt + 0.5 * abs(accel) / j_max[j])
-        far = peak * (2.0 * a_max[j] / j_max[j] + 2.0 * dt + fade) + 0.5 * peak * peak / a_max[j]
+        far = peak * (2.0 * a_max[j] / j_max[j] + 2.0 * dt + fade) + 0.5 * peak * peak / braking[j]
         free = upper[j] - place > far and place - lower[j] > far  # no limit is near
         while k < steps and (abs(speed) > STATIC_SPEED or abs(accel) > STATIC_SPEED / dt):
             after = -speed / fade
             if abs(speed) < STOP_SHARE * a_max[j] * dt:  # in two steps to zero
                 after = -speed / dt - 0.5 * accel
-            after = min(max(after, accel - j_step, -a_max[j]), accel + j_step, a_max[j])
+            after = min(max(min(max(after, -braking[j]), braking[j]), accel - j_step), accel + j_step)
             if not free:
                 up, down = upper[j] - place, place - lower[j]
                 fits = _keeps_bound(False, after, speed, accel, up, v_max[j], a_max[j], j_max[j], dt)
@@ -82,6 +84,12 @@ def compute_stop(u, v, a, lower, upper, v_max, a_max, j_max, dt):  # type: ignor
     return path[0, :length], path[1, :length], path[2, :length], path[3, :length]
 
 
+def balance_braking(v: np.ndarray, a_max: np.ndarray) -> np.ndarray:
+    """Return the accelerations (n,) with which joints brake from velocities `v` and come to rest together."""
+    duration = np.abs(v) / a_max
+    return a_max * np.maximum(duration / max(float(duration.max()), STATIC_SPEED), MIN_BRAKING_SHARE)
+
+
 class StopCheck:
     """Whether hulls stay apart on the way to rest.
 
@@ -93,8 +101,8 @@ class StopCheck:
         self._robot, self._collision = robot, collision
         self._data: Any = robot.model.createData()
 
-    def stays_apart(self, distance: np.ndarray, path: np.ndarray, travel: np.ndarray) -> bool:
-        """Return whether no pair comes below its least distance.
+    def find_shortfall(self, distance: np.ndarray, path: np.ndarray, travel: np.ndarray) -> np.ndarray | None:
+        """Return how far (pairs,) [m] pairs come below their least distance at a point of the way; None: nowhere.
 
         Parameters
         ----------
@@ -104,11 +112,11 @@ class StopCheck:
         """
         collision = self._collision
         if not len(collision.pairs) or not len(path):
-            return True
+            return None
         approach = np.cumsum(travel @ collision.levers.T, axis=0)  # (m, pairs) [m]
         critical = np.flatnonzero(approach[-1] >= distance - collision.least_distance)
         if not len(critical):
-            return True
+            return None
         # Along the way a pair has come nearer by `approach` at most: its room at both ends of a part covers the part.
         approach = np.vstack([np.zeros(len(critical)), approach[:, critical]])
         room = {0: (distance - collision.least_distance)[critical]}
@@ -119,12 +127,14 @@ class StopCheck:
                 if at not in room:
                     room[at] = self._measure_room(path[at - 1], critical)
                     if (room[at] < 0.0).any():
-                        return False
+                        shortfall = np.zeros(len(distance))
+                        shortfall[critical] = np.maximum(-room[at], 0.0)
+                        return shortfall
             covered = approach[end] - approach[begin] < room[begin] + room[end]
             if end - begin > 1 and not covered.all():
                 middle = (begin + end) // 2
                 parts += [(middle, end), (begin, middle)]
-        return True
+        return None
 
     def _measure_room(self, position: np.ndarray, pairs: np.ndarray) -> np.ndarray:
         """Distances [m] of some pairs at joint positions (n,), less their least ones."""

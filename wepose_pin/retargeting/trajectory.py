@@ -8,10 +8,10 @@ motion within the true limits, with the joint path of the first run as posture r
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -19,9 +19,11 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..arguments import check_arguments
-from ..errors import NoSolution, WrongOption
-from ..kinematics import Pose, PosedBody
+from ..errors import BadOption, NoSolution, WrongOption
+from ..kinematics import Pose, PosedBody, cut_pose
 from ..model import BodyTable
+from ..recording import Intervals, select_interval
+from ..tracking import TrackedRecording
 from ..writers.joint_motion import JointMotion
 from .collision import CollisionModel
 from .controller import (
@@ -33,8 +35,8 @@ from .controller import (
     StepCounts,
     sample_hand_targets,
 )
-from .maps import find_map
-from .robot import Robot, load_robot
+from .maps import find_map, list_sides
+from .robot import LimitMargins, Robot, load_robot
 from .targets import (
     SMOOTHING_HZ,
     ArmTargets,
@@ -150,35 +152,52 @@ def retarget(
     pose: Pose | PosedBody | str | Path,
     robot: Robot | str | Path,
     *,
+    arm: Literal["left", "right", "both"] | None = None,
+    task: Literal["both", "position", "orientation"] = "both",
     rate_hz: float = RATE_HZ,
-    params: ControllerParams | None = None,
-    table: BodyTable | None = None,
     scale: float | None = None,
     smoothing_hz: float = SMOOTHING_HZ,
+    speed_scale: float | None = None,
+    limit_margin: float | None = None,
+    interval: tuple[float, float] | None = None,
+    phase: str | None = None,
     strict: bool = False,
+    params: ControllerParams | None = None,
+    table: BodyTable | None = None,
     progress: Callable[[str, float], None] = lambda _text, _fraction: None,
 ) -> Trajectory:
-    """Compute the robot's joint trajectory for a person's motion. It begins and ends at rest.
+    """Compute the robot's joint trajectory for a person's motion, as `wepose retarget`. It begins and ends at rest.
 
     Parameters
     ----------
     pose : Pose, PosedBody, str or Path
         What `track` or `load_result` gives, or its `pose`; or a result folder.
     robot : Robot, str or Path
-        A name such as "panda", a URDF with a map beside it, or the map, as for `find_map`, with all its arms; or what
-        `load_robot` gives.
+        A name such as "panda", a URDF with a map beside it, or the map; or what `wepose_pin.retargeting.load_robot`
+        gives, with its own arms and margins.
+    arm : str, optional
+        Only this arm of the robot, "left" or "right", or "both"; None: all that it has.
+    task : str
+        Follow the "position" of the hands, their "orientation", or "both".
     rate_hz : float
         Samples a second of the trajectory, 10 to 2000 Hz.
-    params : ControllerParams, optional
-        Weights and gains of the controller; None: the default ones.
-    table : BodyTable, optional
-        Of the person's body; None: that of `pose`, where it has a body, else the upper body's.
     scale : float, optional
         Factor on the way from shoulder to hand; None: the reach of the robot's arm over the length of the person's.
     smoothing_hz : float
         Cut-off frequency of the person's motion; 0: not filtered.
+    speed_scale : float, optional
+        Share of the limits of velocity, acceleration and jerk that is used, above 0, up to 1; None: 0.9.
+    limit_margin : float, optional
+        Distance [rad] kept from the position limits; of a joint that slides a tenth of it in metres; None: 0.05.
+    interval, phase : optional
+        Follow only this interval, from and to [s], or this phase of the recording; of a phase with several intervals
+        "NAME:2" is the second.
     strict : bool
         Raise `NoSolution` for a motion that is too fast for the robot, instead of slowing it.
+    params : ControllerParams, optional
+        Weights and gains of the controller; None: the default ones.
+    table : BodyTable, optional
+        Of the person's body; None: that of `pose`, where it has a body, else the upper body's.
     progress : callable
         Called with the current stage (`STAGES`) and the fraction of it that is done.
 
@@ -190,7 +209,7 @@ def retarget(
     Raises
     ------
     MissingFile, BadData, BadOption
-        No result, no such robot; the pose lacks an arm; a rate out of range.
+        No result, no such robot, arm or phase; the pose lacks an arm; a number out of range.
     NoSolution
         `strict`, and the motion is too fast.
 
@@ -203,18 +222,47 @@ def retarget(
     True
     """
     check_arguments(retarget, locals())
+    check_rate(rate_hz)
+    pose, body_table = _select_pose(pose, interval, phase)
+    stated = {"arm": arm, "speed_scale": speed_scale, "limit_margin": limit_margin}
+    if not isinstance(robot, Robot):
+        chosen = {name: stated[name] for name in ("speed_scale", "limit_margin") if stated[name] is not None}
+        robot = load_robot(find_map(str(robot)), list_sides(arm), LimitMargins(**chosen))  # type: ignore[arg-type]
+    elif any(value is not None for value in stated.values()):
+        raise BadOption(f"{', '.join(stated)}: a Robot has arms and margins of its own; `load_robot` takes them")
+    left_out = [name for name in ("position", "orientation") if task not in ("both", name)]
+    params = replace(params or ControllerParams(), **dict.fromkeys(left_out, 0.0))
+    arm_targets = compute_arm_targets(pose, robot, table=table or body_table, scale=scale, smoothing_hz=smoothing_hz)
+    return _compute_trajectory(arm_targets, robot, params, 1.0 / rate_hz, strict, progress)
+
+
+def _select_pose(
+    pose: Pose | PosedBody | str | Path, interval: tuple[float, float] | None, phase: str | None
+) -> tuple[Pose, BodyTable | None]:
+    """Return an interval or a phase of a motion, and the table of its body where it has one."""
     if isinstance(pose, str | Path):
         from ..writers import read_result
 
-        pose, body, _ = read_result(Path(pose))
-        table = table or body.table
-    elif isinstance(pose, PosedBody):
-        table, pose = table or pose.model.table, pose.pose
-    if not isinstance(robot, Robot):
-        robot = load_robot(find_map(str(robot)))
-    check_rate(rate_hz)
-    params, dt = params or ControllerParams(), 1.0 / rate_hz
-    arm_targets = compute_arm_targets(pose, robot, table=table, scale=scale, smoothing_hz=smoothing_hz)
+        selected_pose, body, _ = read_result(Path(pose), interval, phase)
+        return selected_pose, body.table
+    phases: Mapping[str, Intervals] = {}
+    table = None
+    if isinstance(pose, PosedBody):
+        phases = pose.recording.phases if isinstance(pose, TrackedRecording) else getattr(pose, "phases", {})
+        table, pose = pose.model.table, pose.pose
+    selected = select_interval(pose.time, phases, interval, phase)
+    return (pose if selected is None else cut_pose(pose, selected)), table
+
+
+def _compute_trajectory(
+    arm_targets: ArmTargets,
+    robot: Robot,
+    params: ControllerParams,
+    dt: float,
+    strict: bool,
+    progress: Callable[[str, float], None],
+) -> Trajectory:
+    """Solve the motion with wide limits, slow it, and solve it with the robot's; where it brakes, slower again."""
     collision = CollisionModel(robot)
     uniform_time = np.arange(0.0, arm_targets.time[-1] - arm_targets.time[0] + 0.5 * dt, dt)
     motion = resample_targets(arm_targets, arm_targets.time[0] + uniform_time, uniform_time)

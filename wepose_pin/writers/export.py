@@ -31,7 +31,7 @@ from .joint_motion import (
     resample_joints,
     select_motion,
 )
-from .lerobot import list_episodes, write_lerobot
+from .lerobot import diagnose_episodes, list_episodes, write_lerobot
 from .motion import Motion, check_rate, resampled
 from .motion_bids import parse_bids_name, write_motion_bids
 from .opensim import OpenSenseFiles, write_mot, write_placement, write_setups, write_sto, write_trc
@@ -222,8 +222,8 @@ def export(
             motions = [resample_joints(each, rate_hz) for each in motions]
         if format == LEROBOT:
             write_lerobot(partial, [one for each in motions for one in list_episodes(each, episodes, instruction)])
-        else:
-            (JOINT_WRITERS | ROBOT_WRITERS)[format](partial, motions[0])
+            return Exported(format, [one for each in motions for one in diagnose_episodes(each, episodes)])
+        (JOINT_WRITERS | ROBOT_WRITERS)[format](partial, motions[0])
         return Exported(format, [])
 
 

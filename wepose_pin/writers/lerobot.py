@@ -17,8 +17,9 @@ import numpy as np
 import polars as pl
 
 from .. import __version__
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongOption, one_of
-from .joint_motion import REPETITIONS, JointMotion, cut_interval, find_whole_rate
+from .joint_motion import REPETITIONS, SLACK_S, JointMotion, cut_interval, find_whole_rate
 from .result import write_table
 
 VERSION = "v3.0"
@@ -63,6 +64,21 @@ def list_episodes(motion: JointMotion, by: str | None, instruction: str | None) 
         end = motion.samples(interval).stop
         episodes.append(Episode(cut_interval(motion, interval), motion.position[min(end, len(motion.time) - 1)], text))
     return episodes
+
+
+def diagnose_episodes(motion: JointMotion, by: str | None) -> list[Diagnostic]:
+    """Return what `list_episodes` cuts off the intervals of a phase, or off the repetitions."""
+    spans = motion.phases.get(by, ()) if by is not None else ()
+    first, last = motion.recorded_time[[motion.begin, -1]].tolist()
+    shortened = [(a, b) for a, b in spans if max(first - a, b - last) > 1.0 / motion.rate_hz + SLACK_S]
+    if not shortened or by is None:
+        return []
+    facts: dict[str, float | str] = {
+        "count": float(len(spans)),
+        "span": "{:g} to {:g} s".format(*shortened[0]),
+        "recorded": f"{first:g} to {last:g} s",
+    }
+    return [Diagnostic("episode-shortened", WARNING, by, float(len(shortened)), facts=facts)]
 
 
 def write_lerobot(folder: Path, episodes: Sequence[Episode]) -> None:
