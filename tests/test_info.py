@@ -18,7 +18,7 @@ from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, WARNING, Diagnostic, render
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.recording import Recording
-from wepose_pin.tracking import track
+from wepose_pin.tracking import summarize, track
 
 
 def info(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> str:
@@ -302,7 +302,8 @@ def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simul
     assert "a subject, '" in text
     assert "left_upper_arm" in text
     (tmp_path / "result").mkdir()
-    write_result(tmp_path / "result", track(recording, person.prior), phases=recording.phases)
+    tracked = track(recording, person.prior)
+    write_result(tmp_path / "result", tracked, summarize(tracked), phases=recording.phases)
     text = info(capsys, tmp_path / "result")
     assert "a result of `wepose track`" in text
     assert json.loads((tmp_path / "result" / "summary.json").read_text())["recording"] in text

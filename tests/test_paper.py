@@ -24,10 +24,10 @@ from wepose_pin.errors import BadOption, BadSession, NoSolution
 from wepose_pin.model import load_model
 from wepose_pin.model.table import NEUTRAL_POSE
 from wepose_pin.recording import CONFIGURATION, OrientationSensor, Recording
-from wepose_pin.report.track_diagnostics import describe_heading_remedy
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.subject import load_subject, population_subject
 from wepose_pin.tracking import TrackOptions, track, track_chunks
+from wepose_pin.tracking.pose_diagnostics import describe_heading_remedy
 from wepose_pin.validation import contenders, list_experiments, summarize
 from wepose_pin.validation.tables import (
     LENGTHS_ALONE,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from ..diagnostics import INFO, WARNING, Diagnostic, gravest_first, merge, render
+from ..diagnostics import INFO, WARNING, Diagnostic, render
 from ..recording import OrientationSensor
 from ..recording.limits import STANDARD_GRAVITY
-from ..tracking import TrackedRecording
 from .measures import (
     BENT,
     Budget,
@@ -23,7 +22,7 @@ from .measures import (
     finite_max,
     longest_run_s,
 )
-from .words import plain
+from .tracked import TrackedRecording
 
 GRAVITY_OFF = 0.02
 BIAS_LARGE = np.deg2rad(1.5)  # [rad/s], three times what is usual from the factory
@@ -43,10 +42,10 @@ APART = np.deg2rad(15.0)  # between the halves of a recording
 LASTING_S = 1.0
 
 
-def diagnose_pose(tracked: TrackedRecording, measures: Measures, known: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """All diagnostics, the gravest first; `known` are those of the pose's summary."""
+def diagnose_pose(tracked: TrackedRecording, measures: Measures) -> list[Diagnostic]:
+    """The diagnostics of the motion; `measures` are the recording's."""
     budgets, tips = measures.budgets, measures.tips
-    diagnostics = [
+    return [
         *_diagnose_signals(tracked, measures.signals),
         *_diagnose_headings(tracked, budgets),
         *_diagnose_tips(tracked, tips),
@@ -55,7 +54,6 @@ def diagnose_pose(tracked: TrackedRecording, measures: Measures, known: Sequence
         *_diagnose_hinges(tracked, measures.hinges),
         *_diagnose_subject(tracked),
     ]
-    return gravest_first(merge(known, diagnostics))
 
 
 def _diagnose_signals(tracked: TrackedRecording, signals: Mapping[str, Signal]) -> Iterator[Diagnostic]:
@@ -181,9 +179,9 @@ def _diagnose_hinges(tracked: TrackedRecording, hinges: Mapping[str, HingeMotion
         back = in_plane & (motion.flexion < extended) & (motion.bend < np.deg2rad(90.0))
         seconds = np.count_nonzero(back) / rate_hz
         facts: dict[str, float | str] = {
-            "joint": plain(table.shared_name(name)),
-            "above": plain(table.shared_name(hinge.on)),
-            "below": plain(table.shared_name(hinge.moves)),
+            "joint": table.shared_name(name),
+            "above": table.shared_name(hinge.on),
+            "below": table.shared_name(hinge.moves),
         }
         if seconds > LASTING_S:
             most = float(-motion.flexion[back].min())
