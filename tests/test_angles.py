@@ -19,6 +19,7 @@ from wepose_pin.angles import (
     NEAR_LOCK,
     RATE_WINDOW_S,
     SHOULDER_SEQUENCES,
+    Angles,
     angle_table,
     compose,
     joint_angles,
@@ -26,6 +27,8 @@ from wepose_pin.angles import (
     summary_table,
 )
 from wepose_pin.angles.euler import UNKNOWN, decompose, follow, wrap
+from wepose_pin.angles.joints import diagnose_lock
+from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.kinematics import Pose
 from wepose_pin.simulation import Person, Simulation
@@ -168,6 +171,32 @@ def test_what_a_hanging_arm_does_decides_nothing_about_the_motions_after_it(side
     assert (
         Rotation.from_quat(compose(found.values, "YXY")).inv() * Rotation.from_quat(found.quat)
     ).magnitude().max() < 1e-12
+
+
+@pytest.mark.parametrize("raised", ["never", "before", "after", "both"])
+def test_full_turns_do_not_add_up_while_an_arm_hangs(raised: str) -> None:
+    """A minute in which the arm swings in circles of 2° about the vertical, 30 of them, and turns about its length."""
+    n = 6000
+    around, about_length = np.linspace(0.0, 60.0 * np.pi, n), 0.5 * np.sin(np.linspace(0.0, np.pi, n))
+    way = np.radians(2.0) * np.column_stack([np.cos(around), np.zeros(n), np.sin(around)])
+    hang = Rotation.from_rotvec(way) * Rotation.from_rotvec(np.outer(about_length, [0.0, 1.0, 0.0]))
+    lift = -np.radians(90.0) * np.sin(np.linspace(0.0, np.pi, 400)) ** 2 - np.radians(2.0)
+    lifted = Rotation.from_euler("YXY", np.column_stack([np.full(400, 0.5), lift, np.full(400, -0.5)]))
+    parts = [lifted] * (raised in ("before", "both")) + [hang] + [lifted] * (raised in ("after", "both"))
+    found = joint_angles(pose_with(arm_of("right", Rotation.concatenate(parts).as_matrix())))["right_shoulder"]
+    expected = np.degrees(0.5) if len(parts) > 1 else 0.0
+    plane, _, internal = np.degrees(found.values).T
+    assert np.abs(plane - expected).max() <= 180.0 + 1e-9
+    assert np.abs(internal + expected).max() <= 180.0 + np.degrees(about_length.max()) + 180.0 * (len(parts) == 1) + 5.0
+    assert np.abs(np.diff(plane + internal)).max() < 5.0  # how far the arm is turned about its length
+    clear = np.abs(np.diff(plane)) > 60.0
+    assert not np.any(clear & ~(found.near_lock[1:] & found.near_lock[:-1]))
+    turned_back = Rotation.from_quat(compose(found.values, "YXY")).inv() * Rotation.from_quat(found.quat)
+    assert turned_back.magnitude().max() < 1e-12
+    [hangs] = diagnose_lock(Angles(np.arange(1.0), {"right_shoulder": found}))
+    assert (hangs.code, hangs.place) == ("angles-near-lock", "right_shoulder")
+    assert hangs.value == pytest.approx(np.mean(found.near_lock))
+    assert "XZY" in render(hangs).do
 
 
 # Against SciPy, on frames from bony landmarks as Wu et al. define them ----------------------------------------------
