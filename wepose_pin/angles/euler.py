@@ -151,8 +151,8 @@ def drop_turns(values: np.ndarray, gimbal: np.ndarray, name: str, near_lock: flo
     """`values` (n, 3) of `follow` without the full turns that the first and third angle add up in a stay near the lock.
 
     There they are within half a turn of those with which the motion came, and from the sample nearest to the lock on of
-    those with which it left. The sum or difference of the two that is determined goes on. A motion that is never further
-    from the lock has the first within half a turn of zero, and begins with that sum or difference so.
+    those with which it left. The sum or difference of the two that is determined goes on. A motion that is never
+    further from the lock has the first within half a turn of zero, and begins with that sum or difference so.
     """
     s, n = sequence(name), len(values)
     first, near = values[:, 0], gimbal < near_lock
