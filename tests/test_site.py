@@ -266,6 +266,22 @@ def test_oldest_versions_are_those_of_the_package() -> None:
     assert f'version: "{project["version"]}"' in recipe
 
 
+def test_one_function_says_how_to_install_and_knows_the_packages_of_the_extras() -> None:
+    """No release is on an index: a message names packages, and a page the extra of a clone."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    known = {re.split("[>;]", package)[0] for packages in extras.values() for package in packages}
+    for room in ("wepose_pin", "benchmarks", "docs", "examples"):
+        for file in (ROOT / room).rglob("*.*"):
+            if file.suffix not in (".py", ".md", ".ipynb", ".toml") or "_build" in file.parts:
+                continue
+            text = file.read_text(encoding="utf-8")
+            assert "wepose-pin[" not in text, file
+            if room == "wepose_pin" and file.name not in ("errors.py", "maps.py"):  # without their dependencies: robots
+                assert "pip install" not in text, file
+            for call in re.findall(r"how_to_install\(([^)]*)\)", text):
+                assert set(re.findall(r"[\w-]+", call)) <= known | {"packages", "str"}, file
+
+
 def test_every_step_of_the_workflows_is_a_target() -> None:
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     steps = [

@@ -157,6 +157,11 @@ def reason(error: Exception) -> str:
     return f"{type(error).__name__}: {text[:200]}" if text else type(error).__name__
 
 
+def how_to_install(*packages: str) -> str:
+    """The command that brings packages which are missing, of an installed wheel and of a clone alike."""
+    return f"pip install {' '.join(packages)}"
+
+
 def one_of(names: Iterable[str], found: str | None = None, most: int = 12) -> str:
     """The choices for an error's end: ``a, b, c`` with the closest to `found` named first.
 
