@@ -20,7 +20,7 @@ _BARE = _OPTIONS | ({"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {})
 
 
 class _CompilationNotice(Listener):  # type: ignore[misc]
-    """Prints a line when the first of our functions is compiled, which takes seconds; unless `wanted`, on a terminal."""
+    """Prints a line when the first of our functions is compiled; unless `wanted`, on a terminal only."""
 
     printed, wanted = False, False
 
