@@ -87,11 +87,11 @@ class LiveJob:
         Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
     robot : NAME|FILE.urdf
         Send joint commands that let this robot follow the person (docs/live-robot.md). Names are those of `wepose
-        retarget --robot`. Bring the robot into the rest posture of its map before.
+        retarget --robot`. Bring the robot into the rest posture of its robot map before.
     arm
         Move only this arm of the robot, or both. Without it all arms that it has. Needs --robot.
     map : TOML
-        Use this map of the URDF in --robot, if none lies beside it. Needs --robot.
+        Use this robot map of the URDF in --robot, if none lies beside it. Needs --robot.
     to : [HOST:]PORT
         Send the robot's commands as JSON to this UDP port. Without it to port 9002 of this machine. Needs --robot.
     robot_hz : HZ
