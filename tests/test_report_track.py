@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -450,9 +451,13 @@ def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.Captu
         with pytest.raises(SystemExit) as ended:
             main(["track", str(tmp_path), "-o", str(tmp_path / folder), *options])
         assert ended.value.code == 0
-        assert ("report.html" in capsys.readouterr().out) == (not options)
+        said = capsys.readouterr()
+        assert ("report.html" in said.out) == (not options)
         assert (tmp_path / folder / "report.html").exists() == (not options)
         assert (tmp_path / folder / "view.html").exists()
+        saved = json.loads((tmp_path / folder / "summary.json").read_text(encoding="utf-8"))["diagnostics"]
+        assert [each["code"] for each in saved] == ["population-lengths"]  # of the motion, with a report or without
+        assert f"info: {saved[0]['text']['what']}" in said.err
     assert "Motion of short" in (tmp_path / "with" / "report.html").read_text(encoding="utf-8")
 
 

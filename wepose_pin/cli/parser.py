@@ -147,11 +147,15 @@ class _Option:
 
 
 def _parser(name: str, command: Command, options: Sequence[_Option]) -> argparse.ArgumentParser:
-    required = " ".join(option.shown for option in options if option.required)
+    several = [f"[{option.shown}]" for option in options if not option.switch and get_origin(option.kinds[0]) is tuple]
+    named = [
+        [option.shown for option in options if option.required and bool(option.switch) is k] for k in (False, True)
+    ]
+    shown = " ".join([*named[False], *several, *named[True]])
     texts = [_description(command.job), f"Exit code: {command.exit_codes or EXIT_CODES}"]
     parser = argparse.ArgumentParser(
         prog=f"wepose {name}",
-        usage=" ".join(f"wepose {name} {required} [options]".split()),
+        usage=" ".join(f"wepose {name} {shown} [options]".split()),
         description="\n\n".join(filter(None, texts)),
         epilog=f"{_EXAMPLE}wepose {command.example}\n\nTerms: docs/glossary.md.",
         formatter_class=_Formatter,

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrackJob:
-    """Estimate the pose of a recording: segment orientations, joint centres, and joint angles of a mechanism.
+    """Estimate the pose of a person from a recording: segment orientations and joint centres, with their uncertainty.
+
+    Joint angles of a person are made of the result by `wepose angles` and `wepose export`.
 
     A recording of `wepose live` is tracked causally, with the subject and the method of that session, and gives the
     displayed poses again, bit-identical. With --subject or --method it is tracked as any other recording.

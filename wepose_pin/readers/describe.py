@@ -49,7 +49,7 @@ _STATED_RATE = re.compile(r"(sampl\w*|frame|data)[ _]*(frequency|rate)[^0-9]{0,1
 # standing person is below.
 BLOCK_S, STATIC_GYRO, STATIC_ACCEL = 0.25, np.deg2rad(3.0), 0.4
 SHORTEST_STATIC_S = 1.0
-JOINED_S = 0.5  # intervals nearer than this are listed as one
+JOINED_S = 0.5  # static intervals nearer than this are one: a person twitches
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
 _YEAR_2000, _YEAR_2100 = 946_684_800.0, 4_102_444_800.0  # [s] since 1970
@@ -549,7 +549,7 @@ def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[l
 
 
 def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
-    """Find the intervals [s] of at least `SHORTEST_STATIC_S` in which all sensors are static."""
+    """Find the intervals [s], of at least `SHORTEST_STATIC_S`, in which all sensors are static but for `JOINED_S`."""
     size = max(2, round(BLOCK_S * recording.rate_hz))
     blocks = len(recording) // size
     static = np.ones(blocks, dtype=bool)
@@ -565,7 +565,10 @@ def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
             )
         if sensor.gap is not None:
             static &= ~sensor.gap[: blocks * size].reshape(blocks, size).any(axis=1)
-    spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in find_runs(static)]
+    spans: list[tuple[float, float]] = []
+    for a, b in find_runs(static):
+        begin, end = float(recording.time[a * size]), float(recording.time[b * size - 1])
+        spans.append((spans.pop()[0] if spans and begin - spans[-1][1] < JOINED_S else begin, end))
     return [(first, last) for first, last in spans if last - first >= SHORTEST_STATIC_S - BLOCK_S]
 
 
@@ -589,10 +592,7 @@ def _mount_comment(recording: Recording, segment: str, static: list[tuple[float,
 def _facts(recording: Recording) -> tuple[str, ...]:
     first, last = float(recording.time[0]), float(recording.time[-1])
     facts = [f"{len(recording)} samples at {recording.rate_hz:g} Hz, {format_span((first, last))}"]
-    static: list[tuple[float, float]] = []
-    for begin, end in find_static_intervals(recording):
-        is_near = bool(static) and begin - static[-1][1] < JOINED_S
-        static.append((static.pop()[0] if is_near else begin, end))
+    static = find_static_intervals(recording)
     listed = ", ".join(f"{a:.1f} to {b:.1f}" for a, b in static[:8]) + (" …" if len(static) > 8 else "")
     facts.append(f"all sensors static [s]: {listed}" if static else "all sensors are never static for a second")
     for name, spans in recording.phases.items():

@@ -20,6 +20,7 @@ from .measures import (
     find_flexion_sign,
     find_samples_after_start,
     finite_max,
+    has_stated_mounts,
     longest_run_s,
 )
 from .tracked import TrackedRecording
@@ -101,7 +102,8 @@ def _diagnose_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget])
     if tracked.correction is not None:
         for name, turned in tracked.correction.max_correction_deg.items():
             if np.deg2rad(turned) > TURNED:
-                yield Diagnostic("heading-corrected-far", WARNING, name, np.deg2rad(turned), TURNED)
+                variant = {"variant": "stated"} if has_stated_mounts(tracked) else {}
+                yield Diagnostic("heading-corrected-far", WARNING, name, np.deg2rad(turned), TURNED, variant)
 
 
 def _diagnose_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> Iterator[Diagnostic]:
