@@ -109,13 +109,13 @@ def test_in_the_lock_the_first_angle_is_held(name: str) -> None:
     first = np.radians(np.concatenate([np.linspace(20.0, 30.0, 11), np.full(20, 30.0)]))
     third = np.radians(np.concatenate([np.zeros(11), np.linspace(0.0, 40.0, 20)]))
     second = lock - np.radians(np.concatenate([np.linspace(40.0, 10.0, 11), np.zeros(20)]))
-    given = np.column_stack([first, second, third])
-    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler(name, given).as_matrix())), name)[
+    angles = np.column_stack([first, second, third])
+    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler(name, angles).as_matrix())), name)[
         "right_shoulder"
     ]
-    np.testing.assert_allclose(found.values, given, atol=1e-8)
+    np.testing.assert_allclose(found.values, angles, atol=1e-8)
     assert np.all(found.near_lock[-20:])
-    later = decompose(compose(given[::-1], name), name).values  # begins in the lock: the first angle that there is
+    later = decompose(compose(angles[::-1], name), name).values  # begins in the lock: the first angle that there is
     same_angles(later[:20, 0], np.full(20, later[20, 0]), 1e-12)
 
 
@@ -128,13 +128,13 @@ def test_in_the_lock_the_first_angle_is_held(name: str) -> None:
 def test_a_motion_straight_through_the_lock_keeps_its_angles(name: str, side: str, samples: int) -> None:
     t = np.linspace(0.0, 1.0, samples)
     reach = (-80.0, 60.0) if name == "YXY" else (-20.0, 150.0)
-    given = np.radians(
+    angles = np.radians(
         np.column_stack([35.0 + 10.0 * np.sin(4.0 * t), reach[0] + (reach[1] - reach[0]) * t, -50.0 + 20.0 * t**2])
     )
-    pose = pose_with(arm_of(side, Rotation.from_euler(name, given).as_matrix()))
+    pose = pose_with(arm_of(side, Rotation.from_euler(name, angles).as_matrix()))
     found = joint_angles(pose, name)[f"{side}_shoulder"]
-    np.testing.assert_allclose(found.values, given, atol=1e-9)
-    lock = np.abs(given[:, 1]) if name == "YXY" else np.abs(given[:, 1] - np.pi / 2.0)
+    np.testing.assert_allclose(found.values, angles, atol=1e-9)
+    lock = np.abs(angles[:, 1]) if name == "YXY" else np.abs(angles[:, 1] - np.pi / 2.0)
     expected = np.minimum(lock, np.pi / 2.0 - np.abs(lock - np.pi / 2.0) if name == "YXY" else np.pi - lock)
     np.testing.assert_allclose(found.gimbal, expected, atol=1e-9)
     clear = np.abs(expected - NEAR_LOCK) > 1e-6
@@ -143,11 +143,11 @@ def test_a_motion_straight_through_the_lock_keeps_its_angles(name: str, side: st
 
 
 def test_angles_do_not_stop_at_a_half_turn() -> None:
-    given = np.column_stack([np.linspace(0.0, 9.0, 500), np.full(500, -1.0), np.linspace(0.0, -7.0, 500)])
-    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler("YXY", given).as_matrix())))["right_shoulder"]
-    shift = found.values - given
+    angles = np.column_stack([np.linspace(0.0, 9.0, 500), np.full(500, -1.0), np.linspace(0.0, -7.0, 500)])
+    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler("YXY", angles).as_matrix())))["right_shoulder"]
+    shift = found.values - angles
     np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=1e-9)
-    same_angles(found.values, given, 1e-9)
+    same_angles(found.values, angles, 1e-9)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -425,9 +425,9 @@ def test_standard_deviations_are_those_of_drawn_errors(name: str) -> None:
 
 def test_towards_the_lock_the_deviation_grows_to_that_of_any_angle() -> None:
     away = np.radians([90.0, 45.0, 20.0, 5.0, 1.0, 1e-3, 0.0])
-    given = np.column_stack([np.full(7, 0.5), -away, np.full(7, 0.2)])
+    angles = np.column_stack([np.full(7, 0.5), -away, np.full(7, 0.2)])
     cov = {s: np.tile(np.radians(1.0) ** 2 * np.eye(3), (7, 1, 1)) for s in SEGMENTS}
-    pose = pose_with(arm_of("right", Rotation.from_euler("YXY", given).as_matrix()), segment_cov=cov)
+    pose = pose_with(arm_of("right", Rotation.from_euler("YXY", angles).as_matrix()), segment_cov=cov)
     found = joint_angles(pose)["right_shoulder"]
     assert found.std is not None
     each = np.radians(1.0) * np.sqrt(2.0)

@@ -194,7 +194,7 @@ def test_a_result_goes_into_each_step_as_object_and_as_folder(
 def test_a_result_is_retargeted_as_object_and_as_folder(result: wp.TrackResult, saved: Path, tmp_path: Path) -> None:
     pytest.importorskip("daqp")
     urdf = write_arm(tmp_path)
-    moved, read = (wp.retarget(given, robot, rate_hz=10.0) for given, robot in ((result, urdf), (saved, str(urdf))))
+    moved, read = (wp.retarget(result_, robot, rate_hz=10.0) for result_, robot in ((result, urdf), (saved, str(urdf))))
     np.testing.assert_allclose(moved.joint_position, read.joint_position, atol=1e-6)
     assert repr(moved) == repr(read)
 

@@ -140,8 +140,8 @@ def test_what_the_links_leave_open_is_named_and_the_rest_is_right(urdf: Path) ->
     np.testing.assert_allclose(joints["shoulder_pan_joint"], q[:, 0], atol=np.deg2rad(1.0))
     both = joints["shoulder_lift_joint"] + joints["elbow_joint"]
     np.testing.assert_allclose(both, q[:, 1] + q[:, 2], atol=np.deg2rad(1.0))
-    (told,) = [d for d in summarize(tracked).content["diagnostics"] if d["code"] == "joints-undetermined"]
-    assert told["facts"]["joints"].startswith("shoulder_lift_joint, elbow_joint")
+    (diagnostic,) = [d for d in summarize(tracked).content["diagnostics"] if d["code"] == "joints-undetermined"]
+    assert diagnostic["facts"]["joints"].startswith("shoulder_lift_joint, elbow_joint")
 
 
 def test_the_pose_is_that_of_the_start_configuration_at_the_start(urdf: Path) -> None:

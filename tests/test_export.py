@@ -117,12 +117,12 @@ def test_a_phase_is_exported_by_itself(tmp_path: Path, pose: Pose) -> None:
         assert (table["time"][0], table["time"][-1]) == pytest.approx((first, last))
         k = int(np.argmin(np.abs(pose.time - first)))
         np.testing.assert_allclose(table["left_forearm_qw"][0], pose.quat_WL["left_forearm"][k, 3], atol=1e-12)
-    for phase, said in (
+    for phase, expected in (
         ("take_2", "no such phase; did you mean .take_1."),
         ("trial 3", "has 2 intervals; choose trial 3:1"),
         ("late", "the interval 90 to 91 s has no sample"),
     ):
-        with pytest.raises((BadOption, BadData), match=said):
+        with pytest.raises((BadOption, BadData), match=expected):
             export(folder, tmp_path / "a.csv", phase=phase)
     with pytest.raises(BadOption, match="no motion in a file of format urdf"):
         export(folder, tmp_path / "a.urdf", phase="take_1")
@@ -450,8 +450,8 @@ def test_no_result_and_no_points(tmp_path: Path) -> None:
         with pytest.raises(MissingFile, match="wepose track"):
             export(tmp_path, tmp_path / name)
     folder = write_folder(tmp_path / "r", a_pose(("head",), n=5))
-    for name, said in (("x.trc", "no points"), ("x.mot", "no joint"), ("x.sto", "no segment")):
-        with pytest.raises(BadData, match=said):
+    for name, expected in (("x.trc", "no points"), ("x.mot", "no joint"), ("x.sto", "no segment")):
+        with pytest.raises(BadData, match=expected):
             export(folder, tmp_path / name)
     short = write_folder(tmp_path / "s", a_pose(n=1))
     with pytest.raises(BadData, match="1 samples; a motion has at least 2"):
@@ -462,6 +462,6 @@ def test_the_command_says_what_it_wrote(result: Path, tmp_path: Path, capsys: py
     with pytest.raises(SystemExit) as stop:
         cli.main(["export", str(result), "-o", str(tmp_path / "x.mot")])
     assert stop.value.code == 0
-    said = capsys.readouterr()
-    assert said.out == f"Written: {tmp_path / 'x.mot'}  (mot)\n"
-    assert said.err.startswith("warning: The orientation of ")
+    captured = capsys.readouterr()
+    assert captured.out == f"Written: {tmp_path / 'x.mot'}  (mot)\n"
+    assert captured.err.startswith("warning: The orientation of ")

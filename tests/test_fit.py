@@ -171,7 +171,7 @@ def test_limits_can_be_let_go_and_torques_are_written_as_estimates(
     table = pl.read_parquet(tmp_path / "torques.parquet")
     assert {"time", "LeftUpperArm_x_nm", "jLeftElbow_rotz_nm"} <= set(table.columns)
     assert not [name for name in table.columns if "Knee" in name]
-    told = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["torques"]
-    assert told["note"].startswith("estimates")
-    assert told["cutoff_hz"] == 6.0
-    assert told["95_percent_below"].keys() == told["rms"].keys() >= {"LeftUpperArm", "jRightElbow_rotz"}
+    torques = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["torques"]
+    assert torques["note"].startswith("estimates")
+    assert torques["cutoff_hz"] == 6.0
+    assert torques["95_percent_below"].keys() == torques["rms"].keys() >= {"LeftUpperArm", "jRightElbow_rotz"}

@@ -161,8 +161,8 @@ def test_a_page_that_fails_is_a_warning(
     monkeypatch.setattr(broken, fails)
     assert run("track", session, *options, "--force", "-o", tmp_path / "out") == 0
     assert names(tmp_path / "out") == RESULT | left
-    said = capsys.readouterr()
-    (line,) = [line for line in said.err.splitlines() if page in line]
+    captured = capsys.readouterr()
+    (line,) = [line for line in captured.err.splitlines() if page in line]
     assert "ValueError: cannot convert float NaN to integer" in line
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     (saved,) = [each for each in summary["diagnostics"] if each["code"] == "page-incomplete"]
@@ -171,7 +171,7 @@ def test_a_page_that_fails_is_a_warning(
     for name in left:
         assert "of another motion" not in (tmp_path / "out" / name).read_text()
     for name in {"view.html", "report.html"} - left:
-        assert str(tmp_path / "out" / name) not in said.out
+        assert str(tmp_path / "out" / name) not in captured.out
     assert run("evaluate", tmp_path / "out", tmp_path / "out" / "pose.parquet") == 0
 
 

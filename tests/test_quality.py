@@ -327,9 +327,9 @@ def test_exit_code_and_file_carry_the_quality(
         with pytest.raises(SystemExit) as stop:
             main(["calibrate", "session.toml", "-o", wanted, *words, *options])
         assert int(stop.value.code or 0) == code
-        said = capsys.readouterr().out
-        assert f"Quality: {wanted}" in said
-        assert max(map(len, said.splitlines())) <= 100
+        printed = capsys.readouterr().out
+        assert f"Quality: {wanted}" in printed
+        assert max(map(len, printed.splitlines())) <= 100
         content = json.loads((tmp_path / wanted / "calibration.json").read_text(encoding="utf-8"))
         assert content["quality"] == wanted
         warned = [from_json(each) for each in content["diagnostics"] if each["severity"] != "info"]

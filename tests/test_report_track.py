@@ -208,12 +208,12 @@ def test_motion_beyond_the_range(simulation: Simulation) -> None:
     assert saturated.value == pytest.approx(count / 100)
     page = render_track_report(summarize(pose))
     assert f"{count / 100:.2f} s" in next(row for row in rows(page) if row[0] == "right forearm")
-    told = Diagnostic("signal-saturated", WARNING, "right_forearm", 0.4, facts={"variant": "gyro", "range": 2.1})
+    known = Diagnostic("signal-saturated", WARNING, "right_forearm", 0.4, facts={"variant": "gyro", "range": 2.1})
     assert [
         each
-        for each in summarize(replace(pose, segments=replace(pose.segments, diagnostics=(told,)))).diagnostics
-        if each.code == told.code
-    ] == [told]  # the reader has said it
+        for each in summarize(replace(pose, segments=replace(pose.segments, diagnostics=(known,)))).diagnostics
+        if each.code == known.code
+    ] == [known]  # the reader has said it
 
 
 def test_gaps(simulation: Simulation) -> None:
@@ -451,13 +451,13 @@ def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.Captu
         with pytest.raises(SystemExit) as ended:
             main(["track", str(tmp_path), "-o", str(tmp_path / folder), *options])
         assert ended.value.code == 0
-        said = capsys.readouterr()
-        assert ("report.html" in said.out) == (not options)
+        captured = capsys.readouterr()
+        assert ("report.html" in captured.out) == (not options)
         assert (tmp_path / folder / "report.html").exists() == (not options)
         assert (tmp_path / folder / "view.html").exists()
         saved = json.loads((tmp_path / folder / "summary.json").read_text(encoding="utf-8"))["diagnostics"]
         assert [each["code"] for each in saved] == ["population-lengths"]  # of the motion, with a report or without
-        assert f"info: {saved[0]['text']['what']}" in said.err
+        assert f"info: {saved[0]['text']['what']}" in captured.err
     assert "Motion of short" in (tmp_path / "with" / "report.html").read_text(encoding="utf-8")
 
 

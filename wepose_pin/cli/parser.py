@@ -62,16 +62,16 @@ def parse(name: str, command: Command, argv: Sequence[str]) -> Any:
             raise BadOption(f"{switch} is not an option of wepose {name}; {one_of(known, switch)}; {see}")
     parser = _parser(name, command, list(options.values()))
     try:
-        found, more = parser.parse_known_args(argv)
+        arguments, more = parser.parse_known_args(argv)
     except argparse.ArgumentError as error:
         raise BadOption(f"{error.argument_name}: {error.message}; {see}") from None
     if more:
         raise BadOption(f"'{more[0]}' is one word too many for wepose {name}; {see}")
-    given = {field: value for field, value in vars(found).items() if value is not None}
-    missing = [options[field].shown for field in options if options[field].required and field not in given]
+    values = {field: value for field, value in vars(arguments).items() if value is not None}
+    missing = [options[field].shown for field in options if options[field].required and field not in values]
     if missing:
         raise BadOption(f"wepose {name} needs {' and '.join(missing)}; {see}")
-    return command.job(**{field: options[field].collect(value) for field, value in given.items()})
+    return command.job(**{field: options[field].collect(value) for field, value in values.items()})
 
 
 class _Option:

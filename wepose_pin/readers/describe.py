@@ -418,8 +418,8 @@ def _siblings(path: Path, format: str) -> list[Path]:
         same = [own if folder == own.absolute() else folder for folder in beside]
     else:
         same = [file for file in sorted(path.parent.iterdir()) if file.suffix == path.suffix and file.is_file()]
-    found = [file for file in same[: 10 * MOST_SIBLINGS] if file == path or detect_format(file) == format]
-    return found[:MOST_SIBLINGS] if path in found[:MOST_SIBLINGS] else [path]
+    siblings = [file for file in same[: 10 * MOST_SIBLINGS] if file == path or detect_format(file) == format]
+    return siblings[:MOST_SIBLINGS] if path in siblings[:MOST_SIBLINGS] else [path]
 
 
 def _read(path: Path, format: str, table: BodyTable) -> tuple[Device, list[str]]:
@@ -494,14 +494,14 @@ def _find_tables_beside(
     if others or own is None or not owner.startswith("?"):
         return {}
     same = [file for file in sorted(path.parent.iterdir()) if file.suffix == path.suffix and file.is_file()]
-    found = {own: _relative(path, folder)}
+    files = {own: _relative(path, folder)}
     for file in same[:MOST_SIBLINGS]:
         segment = body.guess_segment(file.stem)
-        if segment is not None and segment not in found:
+        if segment is not None and segment not in files:
             with contextlib.suppress(WeposeError):
                 if list(Rows(file).names) == list(names):
-                    found[segment] = _relative(file, folder)
-    return found
+                    files[segment] = _relative(file, folder)
+    return files
 
 
 def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str], list[str]]:

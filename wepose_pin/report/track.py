@@ -166,9 +166,9 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
     worst_sample = int(np.argmax(stds[worst]))
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     fastest = max(growth, key=growth.__getitem__) if growth else None
-    found = tracked.correction
-    has_clasp = found is not None and (found.gap_rms_mm is not None or bool(found.found_clasps))
-    has_accelerations = found is not None and bool(found.joint_accelerations)
+    correction = tracked.correction
+    has_clasp = correction is not None and (correction.gap_rms_mm is not None or bool(correction.found_clasps))
+    has_accelerations = correction is not None and bool(correction.joint_accelerations)
     segments = [
         [
             plain(name),

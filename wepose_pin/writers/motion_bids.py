@@ -178,7 +178,7 @@ def _describe(
         **{f"{kind}ChannelCount": counts[kind] for kind in _TYPES},
     }
     if provenance:  # without the user's paths: datasets are shared
-        inputs = {name: given["files"] for name, given in provenance["inputs"].items()}
+        inputs = {name: entry["files"] for name, entry in provenance["inputs"].items()}
         described["Provenance"] = {**provenance, "inputs": inputs}
     return described
 
