@@ -14,7 +14,7 @@ from .decimation import Decimator
 from .error_budget import ErrorBudget
 from .headings import HeadingCorrection
 from .pose_diagnostics import diagnose_pose
-from .tracked import TrackedRecording, find_start_joints
+from .tracked import TrackedRecording
 
 MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment
 _MOST_LATER = 10  # diagnostics of the later chunks of a long recording
@@ -176,10 +176,11 @@ class SummaryAccumulator:
 
     def _summarize_joints(self) -> dict[str, Any]:
         """Start configuration, ranges and undetermined joints of a mechanism; of a person nothing."""
-        if not self.last.model.table.is_mechanism:
+        table, recording = self.last.model.table, self.last.recording
+        if not table.is_mechanism:
             return {}
         return {
-            "start_joints": find_start_joints(self.last.model, self.last.recording),
+            "start_joints": dict(table.poses.get(recording.start_pose, recording.joints)),  # others are at zero
             "joints": {name: {"min": round(a, 5), "max": round(b, 5)} for name, (a, b) in self._ranges.items()},
             "undetermined_joints": self.last.find_undetermined_joints(),
         }

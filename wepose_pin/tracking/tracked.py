@@ -46,11 +46,6 @@ class TrackedRecording(PosedBody):
         return find_undetermined_joints(self.model.pin, list(self.quat_WL))
 
 
-def find_start_joints(model: BodyModel, recording: Recording) -> dict[str, float]:
-    """Joint → its value [rad or m] in the start pose; those that are not named are at zero."""
-    return dict(model.table.poses.get(recording.start_pose, recording.joints))
-
-
 @dataclass(frozen=True)
 class TrackedBody:
     """The body of a recording.
