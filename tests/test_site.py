@@ -46,6 +46,7 @@ ELSEWHERE = {
     r"before after|session.toml --model whole_body": "two sessions, legs: tests/test_repetitions.py, test_legs.py",
     r"take_2|study|plan\.toml": "takes and plans: tests/test_live_terminal.py, test_batch_plan.py",
     r"--activity tasks --seconds 600": "ten minutes: tests/test_people.py",
+    r"export other": "a second result: tests/test_motion_bids.py",
     r"panda_2": "several trajectories: tests/test_export_robot.py",
     r"\.rrd": "an extra of 170 MB and its viewer: tests/test_export_ros.py",
     r"scripts/bvh_to_robot": "another program: tests/test_export_robot.py",
@@ -177,7 +178,8 @@ def complete_session(folder: Path) -> None:
     file = folder / "session.toml"
     text = file.read_text(encoding="utf-8")
     text = re.sub(r"^start = .*$", f"start = {STAND_S}\nclasp = {CLASP}", text, flags=re.MULTILINE)
-    file.write_text(re.sub(r"^# (mount = \{.*?\}).*$", r"\1", text, flags=re.MULTILINE), encoding="utf-8")
+    text = re.sub(r"^# (mount = \{.*?\}).*$", r"\1", text, flags=re.MULTILINE)
+    file.write_text(text.replace('forward = "?"', 'forward = "-z"'), encoding="utf-8")
 
 
 def mask(line: str) -> str:
