@@ -3,6 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs_ready
+PEERS_READY := $(VENV)/.peers_ready
 
 .PHONY: demo test test-all check lint types docs picture package oldest workflows wheel fuzz recordings bench clean
 
@@ -15,7 +16,7 @@ WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 2)   # many tests wait f
 test: $(READY)            ## what must pass before a commit: minutes
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-test-all: $(READY)        ## with the second tier: Monte Carlo, fuzzing, kills, peers, robots, clusters
+test-all: $(PEERS_READY)  ## with the second tier: Monte Carlo, fuzzing, kills, peers, robots, clusters
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m ""
 
 check: lint types test    ## lint, types and tests
@@ -29,7 +30,7 @@ types: $(READY)
 	$(BIN)/mypy
 
 SECONDS ?= 60
-fuzz: $(READY)            ## fuzz all that is parsed, SECONDS=60 a target; TARGETS="csv body" for some
+fuzz: $(PEERS_READY)      ## fuzz all that is parsed, SECONDS=60 a target; TARGETS="csv body" for some
 	$(BIN)/python tests/fuzz/run.py $(TARGETS) --seconds $(SECONDS)
 
 SEEDS ?= 0:1000
@@ -37,7 +38,7 @@ recordings: $(READY)      ## random recordings of ordinary behaviour, SEEDS=0:10
 	$(BIN)/python tests/random_recordings/run.py --seeds $(SEEDS) --jobs 2
 
 BENCH ?= filters calibration
-bench: $(READY)           ## speed and accuracy on this machine; BENCH="live" and others: python -m benchmarks --help
+bench: $(PEERS_READY)     ## speed and accuracy on this machine; BENCH="live" and others: python -m benchmarks --help
 	$(BIN)/python -m benchmarks $(BENCH)
 
 docs: $(DOCS_READY)       ## the site: docs/_build/html/index.html; runs examples/ and checks spelling and links, offline
@@ -77,6 +78,10 @@ $(READY): pyproject.toml
 $(DOCS_READY): $(READY)
 	$(BIN)/python -m pip install --quiet -e '.[docs]'
 	@touch $(DOCS_READY)
+
+$(PEERS_READY): $(READY)
+	$(BIN)/python -m pip install --quiet -e '.[peers]'
+	@touch $(PEERS_READY)
 
 clean:
 	rm -rf $(VENV) .venv-oldest build dist demo docs/_build docs/generated .fuzz .random_recordings *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -1,7 +1,7 @@
 """Speed of the filters beside VQF and imufusion, as ratios within one run.
 
 A section is a function that gives a `Table`; `sections` lists them. Absolute times belong to the machine and to what
-else it does: everything is timed in turn with VQF's C++ (``pip install wepose-pin[peers]``) and its ratio is the median
+else it does: everything is timed in turn with VQF's C++ (``pip install vqf imufusion``) and its ratio is the median
 of the ratios of each round.
 """
 
@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wepose_pin import rotations
+from wepose_pin.errors import how_to_install
 from wepose_pin.filters import METHODS, OFFLINE, Smekf, run_filter
 from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.base import count_processors, run_in_parallel
@@ -30,7 +31,7 @@ from wepose_pin.simulation import simulate_paper_dynamic
 
 from .tables import Column, Section, Table, is_installed, time_in_turn
 
-NO_PEERS = "No ratios: VQF is not installed; pip install 'wepose-pin[peers]' brings it and imufusion."
+NO_PEERS = f"No ratios, they need VQF: {how_to_install('vqf', 'imufusion')}."
 STANDARD_GRAVITY = 9.80665  # [m/s²] in which imufusion wants its accelerations
 
 

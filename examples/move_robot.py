@@ -1,9 +1,10 @@
 """A person's right arm moves a robot arm, within the robot's limits.
 
-    python examples/move_robot.py result panda
+    python examples/move_robot.py result panda_table
 
 `result` is a folder that `wepose track` wrote. Without arguments it simulates a person and takes the Panda of
-example-robot-data (`pip install '.[retarget]'`). Both are shown side by side in view.html.
+example-robot-data (`pip install '.[retarget]'`), upright on a table; `panda` lies on its side, as an arm hangs on a
+torso. Both are shown side by side in view.html.
 """
 
 import sys
@@ -19,7 +20,7 @@ if len(sys.argv) > 2:
 else:
     subject = wp.population_subject(1.75, "f")
     recording = wp.simulate(subject.lengths, seed=1, clasp_s=10.0, circles=2).recording()
-    result, robot = wp.track(recording, subject), "panda"
+    result, robot = wp.track(recording, subject), "panda_table"
 
 trajectory = wp.retarget(result, robot)
 print(trajectory)

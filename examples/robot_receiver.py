@@ -1,15 +1,27 @@
-"""Commands of `wepose live … --robot NAME`, as a robot's driver reads them; ends where they cease."""
+"""Commands of `wepose live … --robot NAME`, as a robot's driver reads them; waits for ever, ends by Ctrl-C."""
 
+import argparse
+import contextlib
 import json
 import socket
 
-with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as incoming:
-    incoming.bind(("127.0.0.1", 9002))
-    incoming.settimeout(3.0)  # for the first; from then on a tenth of a second without one is too long
-    try:
+parser = argparse.ArgumentParser()
+parser.add_argument("--port", type=int, default=9002)
+parser.add_argument("--timeout", type=float, metavar="SECONDS", help="end after so long without a command")
+options = parser.parse_args()
+SILENCE = 0.1  # s without a command, after which the robot is to be stopped
+
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as incoming, contextlib.suppress(KeyboardInterrupt):
+    incoming.bind(("127.0.0.1", options.port))
+    print(f"waiting for commands on 127.0.0.1:{options.port}; Ctrl-C ends", flush=True)
+    incoming.settimeout(options.timeout)
+    with contextlib.suppress(TimeoutError):
         while True:
             command = json.loads(incoming.recv(65535))
-            incoming.settimeout(0.1)
             print(command["n"], command["state"], command["position"], flush=True)
-    except TimeoutError:
-        print("no command: the robot is to be stopped here")
+            incoming.settimeout(SILENCE)
+            try:
+                incoming.recv(1, socket.MSG_PEEK)
+            except TimeoutError:
+                print("no command: the robot is to be stopped here; waiting", flush=True)
+                incoming.settimeout(options.timeout)

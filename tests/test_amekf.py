@@ -374,9 +374,9 @@ def test_a_clipped_gyroscope_is_known_to_be_wrong() -> None:
     of = case(6)
     limit = 0.6 * np.abs(of.gyro).max()
     clipped = of._replace(gyro=np.clip(of.gyro, -limit, limit))
-    told, untold = run(clipped, AmekfParams(gyro_range=limit)), run(clipped)
-    assert within(of, told, 500)
-    assert not within(of, untold, 500)
+    with_range, without_range = run(clipped, AmekfParams(gyro_range=limit)), run(clipped)
+    assert within(of, with_range, 500)
+    assert not within(of, without_range, 500)
 
 
 def test_an_impact_does_not_tip_the_attitude() -> None:

@@ -19,6 +19,7 @@ from wepose_pin.angles import (
     NEAR_LOCK,
     RATE_WINDOW_S,
     SHOULDER_SEQUENCES,
+    Angles,
     angle_table,
     compose,
     joint_angles,
@@ -26,6 +27,8 @@ from wepose_pin.angles import (
     summary_table,
 )
 from wepose_pin.angles.euler import UNKNOWN, decompose, follow, wrap
+from wepose_pin.angles.joints import diagnose_lock
+from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.kinematics import Pose
 from wepose_pin.simulation import Person, Simulation
@@ -106,13 +109,13 @@ def test_in_the_lock_the_first_angle_is_held(name: str) -> None:
     first = np.radians(np.concatenate([np.linspace(20.0, 30.0, 11), np.full(20, 30.0)]))
     third = np.radians(np.concatenate([np.zeros(11), np.linspace(0.0, 40.0, 20)]))
     second = lock - np.radians(np.concatenate([np.linspace(40.0, 10.0, 11), np.zeros(20)]))
-    given = np.column_stack([first, second, third])
-    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler(name, given).as_matrix())), name)[
+    angles = np.column_stack([first, second, third])
+    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler(name, angles).as_matrix())), name)[
         "right_shoulder"
     ]
-    np.testing.assert_allclose(found.values, given, atol=1e-8)
+    np.testing.assert_allclose(found.values, angles, atol=1e-8)
     assert np.all(found.near_lock[-20:])
-    later = decompose(compose(given[::-1], name), name).values  # begins in the lock: the first angle that there is
+    later = decompose(compose(angles[::-1], name), name).values  # begins in the lock: the first angle that there is
     same_angles(later[:20, 0], np.full(20, later[20, 0]), 1e-12)
 
 
@@ -125,13 +128,13 @@ def test_in_the_lock_the_first_angle_is_held(name: str) -> None:
 def test_a_motion_straight_through_the_lock_keeps_its_angles(name: str, side: str, samples: int) -> None:
     t = np.linspace(0.0, 1.0, samples)
     reach = (-80.0, 60.0) if name == "YXY" else (-20.0, 150.0)
-    given = np.radians(
+    angles = np.radians(
         np.column_stack([35.0 + 10.0 * np.sin(4.0 * t), reach[0] + (reach[1] - reach[0]) * t, -50.0 + 20.0 * t**2])
     )
-    pose = pose_with(arm_of(side, Rotation.from_euler(name, given).as_matrix()))
+    pose = pose_with(arm_of(side, Rotation.from_euler(name, angles).as_matrix()))
     found = joint_angles(pose, name)[f"{side}_shoulder"]
-    np.testing.assert_allclose(found.values, given, atol=1e-9)
-    lock = np.abs(given[:, 1]) if name == "YXY" else np.abs(given[:, 1] - np.pi / 2.0)
+    np.testing.assert_allclose(found.values, angles, atol=1e-9)
+    lock = np.abs(angles[:, 1]) if name == "YXY" else np.abs(angles[:, 1] - np.pi / 2.0)
     expected = np.minimum(lock, np.pi / 2.0 - np.abs(lock - np.pi / 2.0) if name == "YXY" else np.pi - lock)
     np.testing.assert_allclose(found.gimbal, expected, atol=1e-9)
     clear = np.abs(expected - NEAR_LOCK) > 1e-6
@@ -140,11 +143,11 @@ def test_a_motion_straight_through_the_lock_keeps_its_angles(name: str, side: st
 
 
 def test_angles_do_not_stop_at_a_half_turn() -> None:
-    given = np.column_stack([np.linspace(0.0, 9.0, 500), np.full(500, -1.0), np.linspace(0.0, -7.0, 500)])
-    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler("YXY", given).as_matrix())))["right_shoulder"]
-    shift = found.values - given
+    angles = np.column_stack([np.linspace(0.0, 9.0, 500), np.full(500, -1.0), np.linspace(0.0, -7.0, 500)])
+    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler("YXY", angles).as_matrix())))["right_shoulder"]
+    shift = found.values - angles
     np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=1e-9)
-    same_angles(found.values, given, 1e-9)
+    same_angles(found.values, angles, 1e-9)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -168,6 +171,32 @@ def test_what_a_hanging_arm_does_decides_nothing_about_the_motions_after_it(side
     assert (
         Rotation.from_quat(compose(found.values, "YXY")).inv() * Rotation.from_quat(found.quat)
     ).magnitude().max() < 1e-12
+
+
+@pytest.mark.parametrize("raised", ["never", "before", "after", "both"])
+def test_full_turns_do_not_add_up_while_an_arm_hangs(raised: str) -> None:
+    """A minute in which the arm swings in circles of 2° about the vertical, 30 of them, and turns about its length."""
+    n = 6000
+    around, about_length = np.linspace(0.0, 60.0 * np.pi, n), 0.5 * np.sin(np.linspace(0.0, np.pi, n))
+    way = np.radians(2.0) * np.column_stack([np.cos(around), np.zeros(n), np.sin(around)])
+    hang = Rotation.from_rotvec(way) * Rotation.from_rotvec(np.outer(about_length, [0.0, 1.0, 0.0]))
+    lift = -np.radians(90.0) * np.sin(np.linspace(0.0, np.pi, 400)) ** 2 - np.radians(2.0)
+    lifted = Rotation.from_euler("YXY", np.column_stack([np.full(400, 0.5), lift, np.full(400, -0.5)]))
+    parts = [lifted] * (raised in ("before", "both")) + [hang] + [lifted] * (raised in ("after", "both"))
+    found = joint_angles(pose_with(arm_of("right", Rotation.concatenate(parts).as_matrix())))["right_shoulder"]
+    expected = np.degrees(0.5) if len(parts) > 1 else 0.0
+    plane, _, internal = np.degrees(found.values).T
+    assert np.abs(plane - expected).max() <= 180.0 + 1e-9
+    assert np.abs(internal + expected).max() <= 180.0 + np.degrees(about_length.max()) + 180.0 * (len(parts) == 1) + 5.0
+    assert np.abs(np.diff(plane + internal)).max() < 5.0  # how far the arm is turned about its length
+    clear = np.abs(np.diff(plane)) > 60.0
+    assert not np.any(clear & ~(found.near_lock[1:] & found.near_lock[:-1]))
+    turned_back = Rotation.from_quat(compose(found.values, "YXY")).inv() * Rotation.from_quat(found.quat)
+    assert turned_back.magnitude().max() < 1e-12
+    [hangs] = diagnose_lock(Angles(np.arange(1.0), {"right_shoulder": found}))
+    assert (hangs.code, hangs.place) == ("angles-near-lock", "right_shoulder")
+    assert hangs.value == pytest.approx(np.mean(found.near_lock))
+    assert "XZY" in render(hangs).do
 
 
 # Against SciPy, on frames from bony landmarks as Wu et al. define them ----------------------------------------------
@@ -396,9 +425,9 @@ def test_standard_deviations_are_those_of_drawn_errors(name: str) -> None:
 
 def test_towards_the_lock_the_deviation_grows_to_that_of_any_angle() -> None:
     away = np.radians([90.0, 45.0, 20.0, 5.0, 1.0, 1e-3, 0.0])
-    given = np.column_stack([np.full(7, 0.5), -away, np.full(7, 0.2)])
+    angles = np.column_stack([np.full(7, 0.5), -away, np.full(7, 0.2)])
     cov = {s: np.tile(np.radians(1.0) ** 2 * np.eye(3), (7, 1, 1)) for s in SEGMENTS}
-    pose = pose_with(arm_of("right", Rotation.from_euler("YXY", given).as_matrix()), segment_cov=cov)
+    pose = pose_with(arm_of("right", Rotation.from_euler("YXY", angles).as_matrix()), segment_cov=cov)
     found = joint_angles(pose)["right_shoulder"]
     assert found.std is not None
     each = np.radians(1.0) * np.sqrt(2.0)

@@ -198,7 +198,7 @@ def test_a_result_is_retargeted_as_object_and_as_folder(result: wp.TrackResult, 
     urdf = write_arm(tmp_path)
     chosen = {"arm": "right", "task": "position", "speed_scale": 0.5, "limit_margin": 0.1, "interval": (10.0, 16.0)}
     moved, read = (
-        wp.retarget(given, robot, rate_hz=10.0, **chosen) for given, robot in ((result, urdf), (saved, str(urdf)))
+        wp.retarget(result_, robot, rate_hz=10.0, **chosen) for result_, robot in ((result, urdf), (saved, str(urdf)))
     )
     np.testing.assert_allclose(moved.joint_position, read.joint_position, atol=1e-6)
     assert repr(moved) == repr(read)

@@ -61,21 +61,21 @@ def test_what_has_changed_is_made_again_by_force_only(
         file = study / "data" / "one" / f"{change}.parquet"
         table = pl.read_parquet(file)
         table.head(table.height - 5).write_parquet(file)
-        said = "another session"
+        reason = "another session"
     elif change == "options":
         changed = item(study, steps=QUICK | {"evaluate": {"interval": (6.0, 10.0)}})
-        said = "other options"
+        reason = "other options"
     elif change == "subject":
         shutil.copy(study / "items" / "one" / "track" / "subject.toml", study)
         changed = item(study, subject_file=str(study / "subject.toml"))
-        said = "other inputs"
+        reason = "other inputs"
     else:
         now = items.code() | {"code": "0" * 64, "version": "0.2.0"}
         monkeypatch.setattr(items, "code", lambda: now)
-        said = "other code, version 0.1.0"
+        reason = "other code, version 0.1.0"
     (row,) = run_items([changed], place)
     assert (row["status"], row["error"]) == ("changed", "ExistingOutput")
-    assert said in row["message"]
+    assert reason in row["message"]
     assert "--force" in row["message"]
     assert row["samples"] > 0, "its figures stay in the table, as its folder does"
     assert files(study / "items") == before

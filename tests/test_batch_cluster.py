@@ -43,11 +43,11 @@ def test_a_study_on_this_machine(study: Path) -> None:
             '["data/*/session.toml"]', '["data/*/session.toml"]\nsubject = "x"'
         )
     )
-    told = []
+    calls = []
     job = BatchJob(study / "plan.toml", str(study / "out"), workers=2)
-    done = run_batch(job, lambda *counts: told.append(counts))
-    assert told[0] == (0, 0, 5)
-    assert told[-1] == (5, 1, 5)
+    done = run_batch(job, lambda *counts: calls.append(counts))
+    assert calls[0] == (0, 0, 5)
+    assert calls[-1] == (5, 1, 5)
     table = pl.read_parquet(study / "out" / "results.parquet")
     assert table.equals(done.table)
     assert table["item"].to_list() == ["subject-x", "data-bad", "data-one", "data-three", "data-two"]

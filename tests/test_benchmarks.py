@@ -51,7 +51,7 @@ def test_every_method_is_measured() -> None:
             assert set(row) <= {column.key for column in table.columns}
             assert all(value >= 0.0 for value in row.values())
             assert not any("ratio" in key for key in row)
-    assert any("pip install 'wepose-pin[peers]'" in note for note in measured["filters"].notes)
+    assert any("pip install vqf imufusion" in note for note in measured["filters"].notes)
     for causal in ("smekf", "ncf", "gdc"):
         assert measured["filters"].rows[causal]["live_ns"] > 0.0
     assert 0.0 < measured["accuracy"].rows["smekf"]["total_rmse"] < 1.0

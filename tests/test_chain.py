@@ -29,7 +29,7 @@ from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.readers.trials import find_ur5, read_ur5
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.subject import Subject, load_subject
-from wepose_pin.tracking import Tracker, track
+from wepose_pin.tracking import Tracker, summarize, track
 from wepose_pin.validation.real import UNSCORED_S, UR5_EXCLUDED
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import read_result, write_subject
@@ -140,8 +140,8 @@ def test_what_the_links_leave_open_is_named_and_the_rest_is_right(urdf: Path) ->
     np.testing.assert_allclose(joints["shoulder_pan_joint"], q[:, 0], atol=np.deg2rad(1.0))
     both = joints["shoulder_lift_joint"] + joints["elbow_joint"]
     np.testing.assert_allclose(both, q[:, 1] + q[:, 2], atol=np.deg2rad(1.0))
-    (told,) = [d for d in tracked.summary()["diagnostics"] if d["code"] == "joints-undetermined"]
-    assert told["facts"]["joints"].startswith("shoulder_lift_joint, elbow_joint")
+    (diagnostic,) = [d for d in summarize(tracked).content["diagnostics"] if d["code"] == "joints-undetermined"]
+    assert diagnostic["facts"]["joints"].startswith("shoulder_lift_joint, elbow_joint")
 
 
 def test_the_pose_is_that_of_the_start_configuration_at_the_start(urdf: Path) -> None:
@@ -295,7 +295,7 @@ def test_what_a_session_of_a_chain_may_not_say(
     pl.DataFrame(table, schema=["gx", "gy", "gz", "ax", "ay", "az"], orient="row").write_csv(tmp_path / "arm.csv")
     file = tmp_path / "session.toml"
     file.write_text(SESSION, encoding="utf-8")
-    assert track(load_session(file), model=urdf).summary()["start_joints"] == {"elbow_joint": 0.5}
+    assert summarize(track(load_session(file), model=urdf)).content["start_joints"] == {"elbow_joint": 0.5}
     file.write_text(SESSION.replace(old, new), encoding="utf-8")
     with pytest.raises(error, match=text):
         track(load_session(file), model=urdf)

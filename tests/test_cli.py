@@ -106,9 +106,9 @@ def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: py
         run("calibrate", session, "--measured", "shoulder_width=0.35", "--stature", 1.67, "-o", tmp_path / "subject")
         == 0
     )
-    said = capsys.readouterr().out
-    assert "Gap between left palm and right palm" in said
-    assert "Quality: pass" in said
+    printed = capsys.readouterr().out
+    assert "Gap between left palm and right palm" in printed
+    assert "Quality: pass" in printed
     assert run("track", session, "--subject", tmp_path / "subject", "-o", tmp_path / "result") == 0
     assert "static" in capsys.readouterr().out
     assert run("evaluate", tmp_path / "result", tmp_path / "truth.parquet", "--interval", 72, 100) == 0
@@ -124,10 +124,10 @@ def test_without_a_gauge_it_says_whose_scale_it_is(
     short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("calibrate", short, "-o", tmp_path / "subject") == 3
-    said = capsys.readouterr()
-    assert "Quality: poor" in said.out
-    assert "No length was measured." in said.out
-    assert "No length was measured." not in said.err  # not twice
+    captured = capsys.readouterr()
+    assert "Quality: poor" in captured.out
+    assert "No length was measured." in captured.out
+    assert "No length was measured." not in captured.err  # not twice
 
 
 def test_simulate_is_seeded(tmp_path: Path) -> None:
@@ -206,11 +206,11 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
         time.sleep(seconds)
         process.send_signal(number)
-        _, said = process.communicate(timeout=60)
+        _, printed = process.communicate(timeout=60)
         left = {path.name for path in tmp_path.iterdir()} - {"session.toml", "recording.parquet", "truth.parquet"}
         if process.returncode == 130:
             assert left == set()
-            assert said.count("Traceback") == 0
+            assert printed.count("Traceback") == 0
         else:
             assert left <= {"subject"}
             break
@@ -258,9 +258,9 @@ def test_a_mistake_is_one_line_and_exit_2(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(*words) == 2
-    said = capsys.readouterr()
-    assert said.err.startswith("wepose: ")
-    assert said.err.count("\n") == 1
-    assert says in said.err
-    assert said.out == ""
+    captured = capsys.readouterr()
+    assert captured.err.startswith("wepose: ")
+    assert captured.err.count("\n") == 1
+    assert says in captured.err
+    assert captured.out == ""
     assert list(tmp_path.iterdir()) == []

@@ -567,15 +567,15 @@ def test_spoiled_contents(format: str, change: tuple[bytes, bytes], says: str, t
 
 
 @pytest.mark.parametrize(
-    ("format", "module", "extra"), [("rosbag", "rosbags.highlevel", "ros"), ("xdf", "pyxdf", "xdf")]
+    ("format", "module", "package"), [("rosbag", "rosbags.highlevel", "rosbags"), ("xdf", "pyxdf", "pyxdf")]
 )
 def test_what_to_install_is_said(
-    format: str, module: str, extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    format: str, module: str, package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name, make = MAKERS[format]
     path = make(tmp_path / name)
     monkeypatch.setitem(__import__("sys").modules, module, None)
-    with pytest.raises(BadData, match=rf"pip install 'wepose-pin\[{extra}\]'"):
+    with pytest.raises(BadData, match=f"pip install {package}"):
         read_device(path, format)
 
 

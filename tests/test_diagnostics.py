@@ -103,8 +103,8 @@ def test_every_text_is_filled_by_its_example_and_needs_all_of_it(code: str, vari
     fields = {name for part in parts for _, name, _, _ in string.Formatter().parse(part) if name}
     own = {name for part in entry.variants.get(variant, entry.text) for _, name, _, _ in string.Formatter().parse(part)}
     assert own & {"place", "value", "limit"} <= set(entry.examples[variant])
-    given = set(entry.examples[variant]) - {"variant", "place", "value", "limit"}
-    assert given <= fields, f"the texts do not use {given - fields}"
+    facts = set(entry.examples[variant]) - {"variant", "place", "value", "limit"}
+    assert facts <= fields, f"the texts do not use {facts - fields}"
 
 
 def test_tables_of_the_catalogue_have_nothing_else() -> None:

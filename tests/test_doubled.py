@@ -17,7 +17,7 @@ from wepose_pin.errors import BadSession
 from wepose_pin.recording import DoubledSensor, ImuSensor, Recording
 from wepose_pin.simulation import Person, Simulation, simulate, simulate_person
 from wepose_pin.subject import parse_subject, subject_toml
-from wepose_pin.tracking import track, track_chunks
+from wepose_pin.tracking import summarize, track, track_chunks
 from wepose_pin.writers import write_session
 
 TURN = Rotation.from_euler("xyz", [90, 0, 30], degrees=True)  # the second sensor against the first
@@ -55,7 +55,7 @@ def test_both_are_used_and_their_difference_is_said(made: tuple[Person, Simulati
     assert error.mean() < 0.85 * worse.mean()
     std = np.degrees(np.sqrt(np.trace(both.pose.segment_cov["torso"], axis1=1, axis2=2) / 3.0))
     assert np.all(error < 3.0 * std)
-    [diagnostic] = [each for each in both.diagnostics if each.code == "sensors-differ"]
+    [diagnostic] = [each for each in summarize(both).diagnostics if each.code == "sensors-differ"]
     assert (diagnostic.place, diagnostic.facts["sensor"]) == ("torso", "torso_back")
     assert diagnostic.value == pytest.approx(np.deg2rad(worse.mean()), rel=0.5)
     chunks = list(track_chunks(lambda: recording.chunks(10.0)))

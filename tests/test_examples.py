@@ -12,12 +12,14 @@ import pytest
 from wepose_pin.retargeting.maps import find_example_data
 
 EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.py"))
+ARGUMENTS = {"robot_receiver.py": ("--timeout", "0.1")}
 SAYS = {
     "calibrate_subject.py": "shoulder_width",
     "estimate_orientation.py": "smekf  largest error 0.",
     "joint_angles.py": "carrying_angle",
     "live_consumer.py": "no pose for 3 s",
-    "move_robot.py": "Trajectory('panda'",
+    "move_robot.py": "Trajectory('panda_table'",
+    "robot_receiver.py": "waiting for commands on 127.0.0.1:9002",
     "track_recording.py": "right hand from its shoulder",
 }
 WRITES = {"joint_angles.py": {"figures"}, "move_robot.py": {"view.html"}, "track_recording.py": {"view.html"}}
@@ -36,9 +38,8 @@ def test_it_runs(path: Path, tmp_path: Path) -> None:
         pytest.importorskip("daqp")
         if find_example_data() is None:
             pytest.skip("example-robot-data is not installed")
-    run = subprocess.run(
-        [sys.executable, "-W", "error", str(path)], cwd=tmp_path, capture_output=True, text=True, timeout=300
-    )
+    words = [sys.executable, "-W", "error", str(path), *ARGUMENTS.get(path.name, ())]
+    run = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert run.returncode == 0, run.stderr
     assert SAYS.get(path.name, "") in run.stdout
     assert {file.name for file in tmp_path.iterdir()} == WRITES.get(path.name, set())

@@ -154,10 +154,14 @@ def test_mot_with_the_isbs_angles(result: Path, tmp_path: Path) -> None:
     table = pl.read_csv(tmp_path / "x.mot", separator="\t", skip_lines=6)
     elbow = joint_angles(a_pose())["left_elbow"]
     np.testing.assert_allclose(table["left_elbow_flexion"], np.degrees(elbow.values[:, 0]), atol=1e-6)
+    shoulder = joint_angles(a_pose())["left_shoulder"]
+    assert table["left_shoulder_near_lock"].to_list() == shoulder.near_lock.astype(int).tolist()
     export(result, tmp_path / "model.mot", names="opensim")
     export(result, tmp_path / "both.mot")
     model, both = (pl.read_csv(tmp_path / name, separator="\t", skip_lines=6) for name in ("model.mot", "both.mot"))
-    assert both.columns == [*table.columns, *model.columns[1:]]  # the ISB's first
+    marks = [name for name in table.columns if name.endswith("_near_lock")]
+    own = [name for name in table.columns if name not in marks]
+    assert both.columns == [*own, *model.columns[1:], *marks]  # the ISB's first
     assert both.select(table.columns).equals(table)
     assert both.select(model.columns).equals(model)
 

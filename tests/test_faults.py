@@ -87,10 +87,10 @@ def test_a_full_disk(
     capsys.readouterr()
     with files_of_at_most(size), pytest.raises(SystemExit) as stop:
         main(command)
-    said = capsys.readouterr()
-    assert stop.value.code == 2, said.err
-    assert said.err.count("\n") == 1
-    assert "too large" in said.err
+    captured = capsys.readouterr()
+    assert stop.value.code == 2, captured.err
+    assert captured.err.count("\n") == 1
+    assert "too large" in captured.err
     assert [path.name for path in tmp_path.rglob("*")] == (["out"] if "OUT/" in words else [])
 
 
@@ -98,9 +98,9 @@ def test_a_full_disk(
 def test_a_full_disk_is_told_with_the_name_of_the_output(number: int, tmp_path: Path) -> None:
     """The system's error names no file, or the one that was copied from."""
     for whole in (whole_file, whole_folder):
-        with pytest.raises(ExistingOutput) as told, whole(tmp_path / "out"):
+        with pytest.raises(ExistingOutput) as raised, whole(tmp_path / "out"):
             raise OSError(number, os.strerror(number), "somewhere/else")
-        assert str(told.value) == f"{tmp_path / 'out'}: cannot be written: {os.strerror(number)}; nothing was written"
+        assert str(raised.value) == f"{tmp_path / 'out'}: cannot be written: {os.strerror(number)}; nothing was written"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -300,8 +300,8 @@ def test_where_the_papers_start_and_bias_noise_are_wrong() -> None:
         noise = estimate_noise(gyro[:180], accel[:180], RATE)
         for name, found in rows.items():
             params = SmekfParams(first_order=True) if name == "paper" else None
-            told = replace(noise, bias_step_cov=real_step) if name.endswith("bias") else noise
-            out = run_filter(gyro, accel, RATE, told, "smekf", params, measured_start=True)
+            stated_noise = replace(noise, bias_step_cov=real_step) if name.endswith("bias") else noise
+            out = run_filter(gyro, accel, RATE, stated_noise, "smekf", params, measured_start=True)
             heading = heading_error_deg(out.quat_WS, true)
             aligned = Rotation.from_rotvec([0, 0, np.deg2rad(heading[100])]) * Rotation.from_quat(true)
             error = (Rotation.from_quat(out.quat_WS).inv() * aligned).as_rotvec()

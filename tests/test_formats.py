@@ -530,7 +530,7 @@ def test_a_mat_file_of_version_7_3_is_hdf5(tmp_path: Path) -> None:
 def test_without_h5py_the_error_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hdf5(tmp_path / "a.h5")
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
-    with pytest.raises(BadData, match=r"a\.h5: is HDF5 .* pip install 'wepose-pin\[hdf5\]'"):
+    with pytest.raises(BadData, match=r"a\.h5: is HDF5 .* pip install h5py"):
         load(tmp_path, ARRAYS.format(file="a.h5"))
 
 

@@ -69,10 +69,10 @@ def test_names_in_a_file_do_not_steer_the_terminal(tmp_path: Path, capsys: pytes
     for command in (["info", str(session)], ["track", str(session), "-o", str(tmp_path / "out")]):
         with pytest.raises(SystemExit) as stop:
             main(command)
-        said = capsys.readouterr()
+        captured = capsys.readouterr()
         assert stop.value.code == 0
-        assert "\x1b[31m" not in said.out + said.err
-        assert "\\x1b[31mred" in said.out
+        assert "\x1b[31m" not in captured.out + captured.err
+        assert "\\x1b[31mred" in captured.out
 
 
 # TOML --------------------------------------------------------------------------------------------------------------

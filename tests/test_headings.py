@@ -16,7 +16,7 @@ from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
-from wepose_pin.tracking import track
+from wepose_pin.tracking import summarize, track
 from wepose_pin.tracking.heading_filter import ClaspDetector
 
 # The simulated person's shoulders stay in place, against the law of the table.
@@ -60,7 +60,7 @@ def test_a_forearm_that_drifts_is_brought_back(made: tuple[Simulation, Subject])
         pose.correction.hinge_residual_rms_deg["right_elbow"][1]
         < pose.correction.hinge_residual_rms_deg["right_elbow"][0]
     )
-    summary = pose.summary()["heading_correction"]
+    summary = summarize(pose).content["heading_correction"]
     assert (
         summary["largest_correction_deg"]["right_forearm"] > 4.0 > summary["largest_correction_deg"]["left_upper_arm"]
     )

@@ -16,9 +16,9 @@ from test_mvnx import mvnx, turning
 import wepose_pin as wp
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, WARNING, Diagnostic, render
-from wepose_pin.readers.describe import describe_file
-from wepose_pin.recording import Recording
-from wepose_pin.tracking import track
+from wepose_pin.readers.describe import describe_file, find_static_intervals
+from wepose_pin.recording import ImuSensor, Recording
+from wepose_pin.tracking import summarize, track
 
 
 def info(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> str:
@@ -302,7 +302,8 @@ def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simul
     assert "a subject, '" in text
     assert "left_upper_arm" in text
     (tmp_path / "result").mkdir()
-    write_result(tmp_path / "result", track(recording, person.prior), phases=recording.phases)
+    tracked = track(recording, person.prior)
+    write_result(tmp_path / "result", tracked, summarize(tracked), phases=recording.phases)
     text = info(capsys, tmp_path / "result")
     assert "a result of `wepose track`" in text
     assert json.loads((tmp_path / "result" / "summary.json").read_text())["recording"] in text
@@ -357,3 +358,12 @@ def test_sensors_without_a_segment_are_left_to_the_user(capsys: pytest.CaptureFi
     assert text.count("# [sensors.SEGMENT]") == 3
     assert "[sensors.torso]" not in text
     assert "name the segment of each sensor" in info(capsys, tmp_path / "a.csv", "--write")
+
+
+@pytest.mark.parametrize(("twitch", "expected"), [(20, [(0.0, 9.99)]), (80, [(0.0, 3.99), (5.0, 9.99)])])
+def test_a_twitch_does_not_end_a_static_interval(twitch: int, expected: list[tuple[float, float]]) -> None:
+    rate = np.zeros((1000, 3))
+    rate[405 : 405 + twitch, 1] = 0.5 * (-1.0) ** np.arange(twitch)
+    sensor = ImuSensor(gyro_S=rate, accel_S=np.tile([0.0, 0.0, 9.81], (1000, 1)))
+    recording = Recording("stands", np.arange(1000) / 100.0, 100.0, {"torso": sensor}, {})
+    np.testing.assert_allclose(find_static_intervals(recording), expected)

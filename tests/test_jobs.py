@@ -142,17 +142,17 @@ def test_a_step_of_a_plan_has_the_options_of_its_command(step: str) -> None:
 
 
 def test_jobs_print_nothing_and_tell_a_growing_share(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    told: list[tuple[str, float]] = []
+    shares: list[tuple[str, float]] = []
     made = simulate(simulate_person(1).lengths, seed=1, clasp_s=8.0, circles=0)
     (tmp_path / "session").mkdir()
     write_session(tmp_path / "session", made.recording("made"), made.truth())
-    outcome = run_track(TrackJob(tmp_path / "session", tmp_path / "result"), lambda *of: told.append(of))
+    outcome = run_track(TrackJob(tmp_path / "session", tmp_path / "result"), lambda *of: shares.append(of))
     assert outcome.tracked is not None
     assert outcome.page_failures == []
     assert outcome.summary["method"] == "amekf"
-    assert [text for text, _ in told] == ["reading", "tracking by amekf", "making the pages"]
-    assert told[0][1] == 0.0
-    assert sorted(share for _, share in told) == [share for _, share in told]
-    assert all(0.0 <= share < 1.0 for _, share in told)
+    assert [text for text, _ in shares] == ["reading", "tracking by amekf", "making the pages"]
+    assert shares[0][1] == 0.0
+    assert sorted(share for _, share in shares) == [share for _, share in shares]
+    assert all(0.0 <= share < 1.0 for _, share in shares)
     run_simulate(SimulateJob(tmp_path / "made", protocol="poses"))
     assert capfd.readouterr() == ("", "")

@@ -13,7 +13,7 @@ from wepose_pin.model import load_model
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
-from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.tracking import TrackedRecording, summarize, track
 from wepose_pin.tracking.heading_filter import HingeAxis, linearize_hinge
 from wepose_pin.tracking.joint_accelerations import JointAccelerationFilter, JointPair, _sum_products, find_pairs
 
@@ -138,7 +138,7 @@ def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving
     for near, far in pairwise(LIMB):
         by_std = heading_errors(moving, tracked, 30.0)[near, far] / np.degrees(found.relative_std(near, far, rows))
         assert np.sqrt(np.mean(by_std**2)) < 1.6
-    summary = tracked.summary()["heading_correction"]
+    summary = summarize(tracked).content["heading_correction"]
     assert summary["hinges"] == ["left_elbow", "right_elbow"]
     assert len(summary["joint_accelerations"]) == 4
 

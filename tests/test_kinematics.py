@@ -28,7 +28,7 @@ from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.girdle import displace
 from wepose_pin.model.orientation_ik import OrientationIk
 from wepose_pin.recording import Recording
-from wepose_pin.tracking import track
+from wepose_pin.tracking import summarize, track
 
 CORE = ["torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"]
 SEGMENTS = [*CORE, "pelvis", "head", "left_hand", "right_hand"]
@@ -338,14 +338,14 @@ def test_a_pelvis_that_cannot_move_says_by_how_much(data: Path) -> None:
 
 @pytest.mark.slow
 def test_the_summary_says_what_was_not_followed(data: Path, half_minute: Recording) -> None:
-    summary = track(half_minute, model=gazebo(data, 48)).summary()
+    summary = summarize(track(half_minute, model=gazebo(data, 48))).content
     assert summary["orientation_residual_rms_deg"]["left_forearm"] > 1.0
     residual = {d["place"]: d["value"] for d in summary["diagnostics"] if d["code"] == "orientation-residual"}
     rms_deg = summary["orientation_residual_rms_deg"]
     assert set(residual) == {name for name, angle in rms_deg.items() if angle > 1.0}
     assert np.degrees(residual["left_forearm"]) == pytest.approx(rms_deg["left_forearm"], abs=1e-3)
-    assert track(half_minute, model=gazebo(data, 66)).summary()["orientation_residual_rms_deg"] == {}
-    assert track(half_minute).summary()["orientation_residual_rms_deg"] == {}
+    assert summarize(track(half_minute, model=gazebo(data, 66))).content["orientation_residual_rms_deg"] == {}
+    assert summarize(track(half_minute)).content["orientation_residual_rms_deg"] == {}
 
 
 def arm(elbow: list[tuple[str, str]]) -> str:

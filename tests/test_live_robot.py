@@ -550,9 +550,10 @@ def test_the_example_reads_it_and_notices_the_end(robot_out, arm: Robot) -> None
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         number = str(free.getsockname()[1])
-    script = (ROOT / "examples" / "robot_receiver.py").read_text(encoding="utf-8").replace("9002", number)
-    run = subprocess.Popen([sys.executable, "-W", "error", "-c", script], stdout=subprocess.PIPE, text=True)
+    script = [str(ROOT / "examples" / "robot_receiver.py"), "--port", number, "--timeout", "2"]
+    run = subprocess.Popen([sys.executable, "-W", "error", *script], stdout=subprocess.PIPE, text=True)
     assert run.stdout is not None
+    assert run.stdout.readline() == f"waiting for commands on 127.0.0.1:{number}; Ctrl-C ends\n"
     out = robot_out(CommandStream(arm), number)
     out.open()
     first_line = run.stdout.readline()
@@ -562,7 +563,7 @@ def test_the_example_reads_it_and_notices_the_end(robot_out, arm: Robot) -> None
     assert re.match(r"\d+ hold \[", first_line)
     if len(said) > 2:  # on a machine that is too busy a tenth of a second may pass before
         assert " stopped " in said[-2] or " hold " in said[-2]
-    assert said[-1] == "no command: the robot is to be stopped here"
+    assert said[-1] == "no command: the robot is to be stopped here; waiting"
 
 
 @pytest.mark.parametrize("to", ["", "here", "127.0.0.1:", "0", "70000", "no such host:9002"])

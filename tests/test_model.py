@@ -19,7 +19,7 @@ from wepose_pin.errors import BadModel, BadOption, MissingFile
 from wepose_pin.kinematics import compute_link_poses, compute_pose
 from wepose_pin.model import BodyModel, convert_breadths, load_model, load_table
 from wepose_pin.recording import Recording
-from wepose_pin.tracking import track
+from wepose_pin.tracking import summarize, track
 
 OURS = Path(__file__).resolve().parent.parent / "urdf" / "upper_body.urdf"
 SEGMENTS = ["torso", "pelvis", "head"] + [
@@ -623,7 +623,7 @@ def test_a_torso_that_cannot_move_is_warned_of(tmp_path: Path) -> None:
 
 def test_warnings_of_the_body_reach_the_summary(half_minute: Recording) -> None:
     body = load_model(lengths={"left_upper_arm": 1.1})
-    found = map(from_json, track(half_minute, model=body).summary()["diagnostics"])
+    found = map(from_json, summarize(track(half_minute, model=body)).content["diagnostics"])
     assert [d.place for d in found if d.code == "model-length-implausible"] == ["left_upper_arm"]
 
 

@@ -227,9 +227,9 @@ def test_two_sessions_become_tables_figures_and_a_page(
 ) -> None:
     out = tmp_path / "angles"
     assert run(*results, "-o", out, "--low-pass-hz", 6) == 0
-    said = capsys.readouterr().out
-    assert "before: 7 repetitions by right_elbow_flexion, rising first; CMC 1.00" in said
-    assert "low-passed at 6 Hz" in said
+    printed = capsys.readouterr().out
+    assert "before: 7 repetitions by right_elbow_flexion, rising first; CMC 1.00" in printed
+    assert "low-passed at 6 Hz" in printed
     tables = {path.stem: pl.read_csv(path) for path in out.glob("*.csv")}
     assert set(tables) == {
         *("sessions", "repetitions", "phases", "summary", "curves", "comparison", "definitions"),

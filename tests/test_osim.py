@@ -91,8 +91,8 @@ def test_scaling_twice_is_scaling_once(result: Path, data: Path, tmp_path: Path)
 
 
 def test_the_setups_name_each_other(result: Path, data: Path, tmp_path: Path) -> None:
-    said = export(result, tmp_path / "a.sto", osim_model=data / GENERIC).diagnostics
-    assert [each.code for each in said] == ["osim-scaled"]
+    diagnostics = export(result, tmp_path / "a.sto", osim_model=data / GENERIC).diagnostics
+    assert [each.code for each in diagnostics] == ["osim-scaled"]
     names = {"a.sto", "a.osim", "a_placement.sto", "a_placer.xml", "a_ik.xml"}
     assert {path.name for path in tmp_path.iterdir()} == names
     placer, ik = (etree.parse(tmp_path / f"a_{tool}.xml").getroot()[0] for tool in ("placer", "ik"))
@@ -148,7 +148,7 @@ SPOILED: dict[str, tuple[Callable[[str], str], str]] = {
 def test_a_wrong_model_gives_one_line_and_no_file(
     name: str, result: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    spoil, said = SPOILED[name]
+    spoil, expected = SPOILED[name]
     generic, out = tmp_path / "generic.osim", tmp_path / "out"
     text = (data / GENERIC).read_text(encoding="utf-8")
     out.mkdir()
@@ -161,17 +161,17 @@ def test_a_wrong_model_gives_one_line_and_no_file(
         error = capsys.readouterr().err.splitlines()
         assert len(error) == 1, error
         assert "generic.osim: " in error[0]
-        assert re.search(said, error[0]), error[0]
+        assert re.search(expected, error[0]), error[0]
         assert list(out.iterdir()) == []
 
 
 def test_options_that_do_not_go_together(result: Path, data: Path, tmp_path: Path) -> None:
-    for file, options, said in (
+    for file, options, expected in (
         ("a.osim", {}, "--osim-model names a generic one"),
         ("a.mot", {"osim_model": data / GENERIC}, "only an .osim and a .sto have use for it"),
         ("a.osim", {"osim_model": data / GENERIC, "rate_hz": 10.0}, "no motion in a file of format osim"),
     ):
-        with pytest.raises(BadOption, match=said):
+        with pytest.raises(BadOption, match=expected):
             export(result, tmp_path / file, **options)
     assert list(tmp_path.iterdir()) == []
 
@@ -199,9 +199,11 @@ def test_opensim_measures_the_subjects_lengths(peer: Callable[..., Any], data: P
 
 @pytest.mark.peer
 def test_scaled_as_opensim_scales(peer: Callable[..., Any], result: Path, data: Path, tmp_path: Path) -> None:
-    [said] = export(result, tmp_path / "subject.osim", osim_model=data / GENERIC).diagnostics
+    [diagnostic] = export(result, tmp_path / "subject.osim", osim_model=data / GENERIC).diagnostics
     factors: dict[str, list[float]] = {}
-    for bodies, factor, axes in re.findall(r"([a-z_, ]+) by ([0-9.]+)(?: in ([xyz]+))? \(", str(said.facts["scales"])):
+    for bodies, factor, axes in re.findall(
+        r"([a-z_, ]+) by ([0-9.]+)(?: in ([xyz]+))? \(", str(diagnostic.facts["scales"])
+    ):
         for body in bodies.strip(" ;").split(", "):
             entry = factors.setdefault(body, [1.0, 1.0, 1.0])
             for k, axis in enumerate("xyz"):

@@ -20,9 +20,9 @@ from wepose_pin.readers.describe import Wearer, describe_file
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report import render_track_report
 from wepose_pin.report.calibration_figures import direction
-from wepose_pin.report.measures import measure_hinge, measure_tips
 from wepose_pin.report.viewer import FLOOR_Z, find_floor, pose_html
-from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.tracking import TrackedRecording, summarize, track
+from wepose_pin.tracking.measures import measure_hinge, measure_tips
 from wepose_pin.writers.bvh import write_bvh
 from wepose_pin.writers.export import export
 from wepose_pin.writers.motion import Motion, find_measured_points
@@ -169,7 +169,7 @@ def test_its_report_has_its_words(tracked: TrackedRecording) -> None:
         )
     measured = track(replace(tracked.recording, sensors=sensors), model=tracked.model)
     failures: list[str] = []
-    page = render_track_report(measured, failures=failures)
+    page = render_track_report(summarize(measured), failures=failures)
     assert failures == []
     assert "The feet" in headings(page)
     text = text_of(page)
@@ -201,7 +201,7 @@ def test_its_page_draws_trails_of_the_toes(tracked: TrackedRecording) -> None:
 def test_its_result_is_read_exported_and_evaluated(tracked: TrackedRecording, tmp_path: Path) -> None:
     folder = tmp_path / "result"
     folder.mkdir()
-    write_result(folder, tracked)
+    write_result(folder, tracked, summarize(tracked))
     (folder / "model.toml").write_text(format_table(tracked.model.table, "subject.urdf"), encoding="utf-8")
     pose, model, _ = read_result(folder)
     assert model.table.paths == ("left_toe", "right_toe")

@@ -16,11 +16,9 @@ from wepose_pin.batch.items import run_items
 from wepose_pin.batch.page import build_study_page
 from wepose_pin.batch.plan import Item, Plan, step_options
 from wepose_pin.cli import main
-from wepose_pin.diagnostics import as_json
 from wepose_pin.recording import ImuSensor, Recording, check_recording, compute_mount
-from wepose_pin.report import render_track_report, write_decimated_pages
-from wepose_pin.report.decimation import Decimator
-from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.report import render_track_report
+from wepose_pin.tracking import TrackedRecording, summarize, track
 from wepose_pin.writers import write_session
 
 RESULT = {"pose.parquet", "subject.toml", "subject.urdf", "summary.json"}
@@ -99,7 +97,7 @@ def test_an_arm_that_hangs_throughout_is_tracked(
 def test_a_report_of_nothing_that_moves(sensors: str, seconds: float, noise: float) -> None:
     failures: list[str] = []
     found = track(recorded({}, seconds=seconds, noise=noise, sensors=sensors))
-    page = render_track_report(found, view="<p>", failures=failures)
+    page = render_track_report(summarize(found), view="<p>", failures=failures)
     assert failures == []
     assert "nan" not in page.split("<body>")[1].replace("svg", "")
 
@@ -123,7 +121,7 @@ def test_a_report_where_segments_are_not_known(pose: TrackedRecording, rows: sli
         point_cov={k: nowhere(v, rows) for k, v in pose.pose.point_cov.items()},
     )
     failures: list[str] = []
-    render_track_report(replace(pose, pose=changed), view="<p>", failures=failures)
+    render_track_report(summarize(replace(pose, pose=changed)), view="<p>", failures=failures)
     assert failures == []
 
 
@@ -141,7 +139,6 @@ def test_a_study_whose_figures_are_all_one_up_to_rounding() -> None:
 
 BROKEN = {
     "wepose_pin.report.track.draw_timeline": ("report.html", {"view.html", "report.html"}),
-    "wepose_pin.report.track.diagnose_pose": ("report.html", {"view.html", "report.html"}),
     "wepose_pin.report.pages.render_track_report": ("report.html", {"view.html"}),
     "wepose_pin.report.pages.pose_html": ("view.html", {"report.html"}),
 }
@@ -164,8 +161,8 @@ def test_a_page_that_fails_is_a_warning(
     monkeypatch.setattr(broken, fails)
     assert run("track", session, *options, "--force", "-o", tmp_path / "out") == 0
     assert names(tmp_path / "out") == RESULT | left
-    said = capsys.readouterr()
-    (line,) = [line for line in said.err.splitlines() if page in line]
+    captured = capsys.readouterr()
+    (line,) = [line for line in captured.err.splitlines() if page in line]
     assert "ValueError: cannot convert float NaN to integer" in line
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     (saved,) = [each for each in summary["diagnostics"] if each["code"] == "page-incomplete"]
@@ -174,19 +171,24 @@ def test_a_page_that_fails_is_a_warning(
     for name in left:
         assert "of another motion" not in (tmp_path / "out" / name).read_text()
     for name in {"view.html", "report.html"} - left:
-        assert str(tmp_path / "out" / name) not in said.out
+        assert str(tmp_path / "out" / name) not in captured.out
     assert run("evaluate", tmp_path / "out", tmp_path / "out" / "pose.parquet") == 0
 
 
-def test_a_recording_in_pieces_whose_pages_cannot_be_gathered(pose: TrackedRecording, tmp_path: Path) -> None:
-    decimator = Decimator(len(pose.time))
-    decimator.add(replace(pose, segments=None))
-    (tmp_path / "summary.json").write_text('{"diagnostics": [{}]}')
-    (warning,) = write_decimated_pages(tmp_path, decimator, {}, [])
-    assert (warning.code, warning.place) == ("page-incomplete", "view.html and report.html")
-    saved = json.loads((tmp_path / "summary.json").read_text())["diagnostics"]
-    assert saved == [{}, as_json(warning)]
-    assert names(tmp_path) == {"summary.json"}
+def test_a_motion_that_cannot_be_assessed_is_written_all_the_same(
+    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("wepose_pin.tracking.summary.diagnose_pose", fails)
+    assert run("track", session, "-o", tmp_path / "assessed") == 0
+    assert names(tmp_path / "assessed") == RESULT | {"view.html", "report.html"}
+    assert "signs of wrong mounts" in capsys.readouterr().err
+    monkeypatch.setattr("wepose_pin.tracking.decimation.measure_signal", fails)
+    assert run("track", session, "--chunk-seconds", 3, "-o", tmp_path / "gathered") == 0
+    assert names(tmp_path / "gathered") == RESULT
+    summary = json.loads((tmp_path / "gathered" / "summary.json").read_text())
+    codes = {(each["code"], each["place"]) for each in summary["diagnostics"]}
+    failed = {("motion-not-assessed", ""), ("page-incomplete", "view.html"), ("page-incomplete", "report.html")}
+    assert failed <= codes
 
 
 def test_the_result_is_there_when_the_page_is_stopped(

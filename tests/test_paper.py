@@ -24,10 +24,10 @@ from wepose_pin.errors import BadOption, BadSession, NoSolution
 from wepose_pin.model import load_model
 from wepose_pin.model.table import NEUTRAL_POSE
 from wepose_pin.recording import CONFIGURATION, OrientationSensor, Recording
-from wepose_pin.report.track_diagnostics import describe_heading_remedy
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.subject import load_subject, population_subject
 from wepose_pin.tracking import TrackOptions, track, track_chunks
+from wepose_pin.tracking.pose_diagnostics import describe_heading_remedy
 from wepose_pin.validation import contenders, list_experiments, summarize
 from wepose_pin.validation.tables import (
     LENGTHS_ALONE,
@@ -228,8 +228,8 @@ def test_what_it_needs_is_said(options: dict[str, Any], said: str, made: tuple[P
 def test_another_start_pose_is_refused(start_pose: str, made: tuple[Person, Simulation, Recording]) -> None:
     """Its orientations are relative to the start pose: in the T-pose they would be those of other arms."""
     recording = replace(made[2], start_pose=start_pose)
-    said = f"start_pose = '{start_pose}'; record a start in n_pose, or use --formulation full"
-    with pytest.raises(BadOption, match=re.escape(said)):
+    expected = f"start_pose = '{start_pose}'; record a start in n_pose, or use --formulation full"
+    with pytest.raises(BadOption, match=re.escape(expected)):
         calibrate(recording, measured={"shoulder_width": 0.4}, formulation="paper")
 
 
@@ -335,14 +335,14 @@ def test_the_commands(
     write_session(tmp_path / "session", recording, simulation.truth())
     words = ["calibrate", tmp_path / "session", "--formulation", "paper", "--method", "smekf", "-o", tmp_path / "anna"]
     assert run(*words) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert "--measured biacromial=0.41" in said
+    captured = capsys.readouterr().err
+    assert captured.count("\n") == 1
+    assert "--measured biacromial=0.41" in captured
     assert not (tmp_path / "anna").exists()
     assert run(*words, "--measured", f"shoulder_width={person.lengths['shoulder_width']:.4f}") in (0, 3)
-    said = capsys.readouterr()
-    assert "`--formulation paper` estimates the lengths alone" in said.err
-    assert "Mounts" not in said.out
+    captured = capsys.readouterr()
+    assert "`--formulation paper` estimates the lengths alone" in captured.err
+    assert "Mounts" not in captured.out
     content = json.loads((tmp_path / "anna" / "calibration.json").read_text())
     assert content["provenance"]["options"]["formulation"] == "paper"
     assert "lengths-alone-estimated" in {each["code"] for each in content["diagnostics"]}

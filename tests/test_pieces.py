@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from benchmarks.long_recordings import there_and_back
 from wepose_pin.calibration import calibrate
 from wepose_pin.cli import main
-from wepose_pin.diagnostics import from_json
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.filters import METHODS, SensorRun, chunk_multiple, run_filter
 from wepose_pin.filters.noise import estimate_noise
@@ -26,10 +25,10 @@ from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.report import render_track_report
-from wepose_pin.report.decimation import Decimator, compute_totals
 from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.subject import Subject
-from wepose_pin.tracking import SummaryAccumulator, TrackedRecording, TrackOptions, track, track_session
+from wepose_pin.tracking import SummaryAccumulator, TrackedRecording, TrackOptions, summarize, track, track_session
+from wepose_pin.tracking.measures import measure
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import write_subject
 
@@ -77,7 +76,7 @@ def test_pieces_put_together_are_the_whole(session: Path, subject: Subject, meth
     accumulator = SummaryAccumulator()
     for piece in pieces:
         accumulator.add(piece)
-    assert accumulator.summary() == whole.summary()
+    assert accumulator.finish().content == summarize(whole).content
 
 
 def test_of_a_csv_too_and_with_lost_samples(session: Path, subject: Subject, monkeypatch) -> None:
@@ -99,7 +98,7 @@ def test_of_a_csv_too_and_with_lost_samples(session: Path, subject: Subject, mon
     ours, wanted = joined(pieces), build_pose_table(whole.pose, covariance=True)
     assert ours.equals(wanted)
     assert wanted["left_forearm_gap"].sum() == pytest.approx(100 * (13.0 + 14.0), abs=3)
-    found, of_whole = (of["sensors"]["torso"] for of in (summary_of(pieces), whole.summary()))
+    found, of_whole = (of["sensors"]["torso"] for of in (summary_of(pieces), summarize(whole).content))
     assert (
         (found["gaps"], found["gap_s"]) == (of_whole["gaps"], of_whole["gap_s"]) == (2, pytest.approx(14.8, abs=0.03))
     )
@@ -111,7 +110,7 @@ def summary_of(pieces: list[TrackedRecording]) -> dict:
     accumulator = SummaryAccumulator()
     for piece in pieces:
         accumulator.add(piece)
-    return accumulator.summary()
+    return accumulator.finish().content
 
 
 def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation, tmp_path: Path) -> None:
@@ -139,7 +138,7 @@ def test_a_body_whose_joints_are_too_few(made: Simulation, tmp_path: Path, data:
     whole = track(load_session(session), model=body)
     pieces = list(track_session(session, model=body, seconds=4.0))
     assert joined(pieces).equals(build_pose_table(whole.pose, covariance=True))
-    missed = whole.summary()["orientation_residual_rms_deg"]
+    missed = summarize(whole).content["orientation_residual_rms_deg"]
     assert max(missed.values()) > 1.0
     assert summary_of(pieces)["orientation_residual_rms_deg"] == missed
 
@@ -259,15 +258,14 @@ def test_what_has_no_pieces(session: Path, tmp_path: Path, capsys, options: list
 
 def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monkeypatch) -> None:
     """What lasts, what is lost and what was largest are those of all samples, though one in eighteen is kept."""
-    monkeypatch.setattr("wepose_pin.report.decimation.MOST", 300)
+    monkeypatch.setattr("wepose_pin.tracking.decimation.MOST", 300)
     pose = track(load_session(session), subject)
-    decimator = Decimator(len(pose.time))
+    accumulator = SummaryAccumulator(len(pose.time))
     for piece in track_session(session, subject, seconds=7.31):
-        decimator.add(piece)
-    thin, totals = decimator.decimated(
-        pose.recording.phases, [from_json(each) for each in pose.summary()["diagnostics"]]
-    )
-    wanted = compute_totals(pose)
+        accumulator.add(piece)
+    summary = accumulator.finish()
+    thin, totals = summary.decimator.decimated
+    wanted = measure(pose)
     assert totals.samples == len(pose.time) == 5698
     assert len(thin.time) == 317
     np.testing.assert_array_equal(thin.time, pose.time[::18])
@@ -281,8 +279,8 @@ def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monk
         assert signal.static is not None
         np.testing.assert_array_equal(ours.static, [signal.static[k : k + 18].all() for k in range(0, 5698, 18)])
         np.testing.assert_array_equal(ours.bias, signal.bias)
-    for name, speed in wanted.peak_speed.items():
-        assert 0.8 * speed < totals.peak_speed[name] <= speed
-    page = render_track_report(thin, totals=totals)
+    for name, tip in wanted.tips.items():
+        assert 0.8 * tip.peak_speed < totals.tips[name].peak_speed <= tip.peak_speed
+    page = render_track_report(summary)
     assert "5698 samples at 100 Hz" in text_of(page)
     assert "for 317 samples, one in 18" in text_of(page)

@@ -79,12 +79,12 @@ def test_mujoco_plays_it(tmp_path: Path) -> None:
     spec = mujoco.MjSpec.from_string(text)
     spec.compile()
     (tmp_path / "arm.xml").write_text(spec.to_xml(), encoding="utf-8")
-    said = run("play_mujoco.py", tmp_path, folder, tmp_path / "arm.xml")
-    assert said.startswith("7 joints, 120 samples; the last body at [")
+    printed = run("play_mujoco.py", tmp_path, folder, tmp_path / "arm.xml")
+    assert printed.startswith("7 joints, 120 samples; the last body at [")
     motion = read_joint_motion(folder)
     placed = {name: values for name, values in vars(motion).items() if name not in ("p_WB", "quat_WB")}
     at_root = type(motion)(**placed, p_WB=np.zeros(3), quat_WB=np.array([0.0, 0.0, 0.0, 1.0]))
-    numbers = [float(number) for number in re.findall(r"-?\d+\.\d+(?:e-\d+)?", said.partition("[")[2])]
+    numbers = [float(number) for number in re.findall(r"-?\d+\.\d+(?:e-\d+)?", printed.partition("[")[2])]
     np.testing.assert_allclose(numbers, compute_link_poses_W(at_root)["hand"][1][-1], atol=1e-6)
 
 
@@ -95,8 +95,8 @@ def test_a_controller_gets_the_trajectory(tmp_path: Path) -> None:
     points = [point | {"time_from_start": {"sec": k // 2, "nanosec": 500_000_000 * (k % 2)}} for k in range(5)]
     trajectory = {"header": {}, "joint_names": list(JOINTS), "points": points}
     (tmp_path / "joint_trajectory.json").write_text(json.dumps(trajectory), encoding="utf-8")
-    said = run("send_trajectory.py", tmp_path, ".", "/controller/joint_trajectory", before=FAKE_RCLPY)
-    assert said == "sent 5 points for 7 joints to /controller/joint_trajectory\n"
+    printed = run("send_trajectory.py", tmp_path, ".", "/controller/joint_trajectory", before=FAKE_RCLPY)
+    assert printed == "sent 5 points for 7 joints to /controller/joint_trajectory\n"
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     sent = store.deserialize_cdr((tmp_path / "sent.cdr").read_bytes(), "trajectory_msgs/msg/JointTrajectory")
     assert sent.joint_names == list(JOINTS)
@@ -112,7 +112,7 @@ def test_lerobot_learns_from_it(tmp_path: Path) -> None:
     python = find_lerobot()
     folders = [write_trajectory_folder(tmp_path / f"reach_{seed}", seed=seed, seconds=4.0) for seed in (1, 2)]
     export(folders, tmp_path / "data", "lerobot", rate_hz=25.0, instruction="reach for the cup")
-    said = run("clone.py", tmp_path, tmp_path / "data", python=python)
-    assert said.startswith("2 episodes, 200 frames at 25 Hz: reach for the cup\n")
-    losses = [float(number) for number in re.findall(r"epoch \d: ([\d.]+)", said)]
+    printed = run("clone.py", tmp_path, tmp_path / "data", python=python)
+    assert printed.startswith("2 episodes, 200 frames at 25 Hz: reach for the cup\n")
+    losses = [float(number) for number in re.findall(r"epoch \d: ([\d.]+)", printed)]
     assert losses[2] < 0.7 * losses[0]

@@ -247,11 +247,11 @@ def test_a_handle_fixes_the_scale_by_itself() -> None:
     person, simulation = made("handle", 4, real=True, seconds=20.0)
     recording = simulation.recording()
     found = calibrate(recording, prior=person.prior, protocol="handle")
-    given = calibrate(recording, prior=person.prior, protocol="handle", measured={"handle": 0.40})
+    shorter = calibrate(recording, prior=person.prior, protocol="handle", measured={"handle": 0.40})
     (assumed,) = [d for d in found.diagnostics if d.code == "protocol-distance-assumed"]
     assert (assumed.place, assumed.value) == ("handle", 0.4)
-    assert not {"protocol-distance-assumed", "scale-from-prior"} & codes(given)
-    assert given.subject.lengths == pytest.approx(found.subject.lengths)
+    assert not {"protocol-distance-assumed", "scale-from-prior"} & codes(shorter)
+    assert shorter.subject.lengths == pytest.approx(found.subject.lengths)
     assert found.subject.note == "hands on a handle; scale measured: handle"
     # The bar fixes the scale better than the population prior.
     arms = [name for name in LENGTHS if name.endswith("upper_arm")]

@@ -15,7 +15,7 @@ from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
-from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate
+from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, quality
 from wepose_pin.calibration.anatomy import LimbMotion, check_labels
 from wepose_pin.calibration.quality import OPEN_SHARE, QUALITIES
 from wepose_pin.cli import main
@@ -327,9 +327,9 @@ def test_exit_code_and_file_carry_the_quality(
         with pytest.raises(SystemExit) as stop:
             main(["calibrate", "session.toml", "-o", wanted, *words, *options])
         assert int(stop.value.code or 0) == code
-        said = capsys.readouterr().out
-        assert f"Quality: {wanted}" in said
-        assert max(map(len, said.splitlines())) <= 100
+        printed = capsys.readouterr().out
+        assert f"Quality: {wanted}" in printed
+        assert max(map(len, printed.splitlines())) <= 100
         content = json.loads((tmp_path / wanted / "calibration.json").read_text(encoding="utf-8"))
         assert content["quality"] == wanted
         warned = [from_json(each) for each in content["diagnostics"] if each["severity"] != "info"]
@@ -342,3 +342,23 @@ def test_exit_code_and_file_carry_the_quality(
         assert content["conditioning"]["rank"] < content["conditioning"]["unknowns"]
         assert {"wepose-pin", "casadi"} <= content["versions"].keys()
     assert QUALITIES == ("pass", "poor", "fail")
+
+
+def test_the_page_has_the_limits_of_the_code() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "calibrate.md").read_text(encoding="utf-8")
+    deg = (np.degrees(1.0), "°")
+    rows: list[list[tuple[quality.Limits, float, str]]] = [
+        [(quality.LENGTH, 1e3, " mm")],
+        [(limits, *deg) for limits in (quality.ARM_HEADING, quality.TORSO_HEADING, quality.HAND_HEADING)],
+        [(quality.SCALE, 1e2, " %")],
+        [(quality.GAP, 1e3, " mm"), (quality.OPEN_SHARE, 1e2, " %")],
+        [(quality.SAMPLES, 1.0, "")],
+        [(quality.TILT, *deg), (quality.UNUSUAL, 1.0, " std")],
+        [(quality.MEASURED, 1.0, " std")],
+    ]
+    for row in rows:
+        cells = ("; ".join(f"{factor * limits[k]:.3g}{unit}" for limits, factor, unit in row) for k in range(2))
+        assert f"| {' | '.join(cells)} |" in page
+    assert quality.LONE_HEADING == quality.HAND_HEADING
+    assert f"above {quality.ENOUGH_SAMPLES:g}" in page
+    assert f"below {1e3 * quality.GAP.passes:g} mm" in page

@@ -508,9 +508,9 @@ def test_saturation_is_told_from_noise_of_any_size(noise: float) -> None:
         measured = motion + noise * digit * rng.standard_normal(2000)
         whole, cut = (np.round(np.clip(measured, -m, m) / digit) * digit for m in (9.0, 0.9 * np.abs(motion).max()))
         values = np.column_stack([whole, cut, 0.0 * time])
-        told = find_cut_off(values, 2.0)
-        assert not told[:, 0].any()
-        found += bool(told[:, 1].any())
+        cut_off = find_cut_off(values, 2.0)
+        assert not cut_off[:, 0].any()
+        found += bool(cut_off[:, 1].any())
     assert found == 50
 
 

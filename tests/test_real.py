@@ -291,8 +291,8 @@ def test_a_trial_that_cannot_be_scored_is_told_and_skipped(
     with pytest.raises(SystemExit) as stop:
         main(["validate", "--data", str(tmp_path), "-o", str(out)])
     assert not stop.value.code
-    said = capsys.readouterr()
-    (line,) = said.err.splitlines()
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
     for words in ("BROAD", "00_damaged", "was not run", "is no trial"):
         assert words in line
     document = json.loads((out / "validation.json").read_text())

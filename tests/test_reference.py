@@ -20,7 +20,7 @@ from wepose_pin.kinematics import Pose, build_pose_table
 from wepose_pin.readers.markers import read_marker_table
 from wepose_pin.readers.reference import Reference, read_reference
 from wepose_pin.simulation import Person, Simulation
-from wepose_pin.tracking import track
+from wepose_pin.tracking import summarize, track
 from wepose_pin.writers import write_result
 
 # The laboratory: y is up, turned by 70 deg, its origin somewhere, its clock late.
@@ -323,7 +323,8 @@ def result(person: Person, simulation: Simulation, tmp_path_factory: pytest.Temp
     folder.mkdir()
     recording = simulation.recording("made").cut(slice(0, 4500))
     recording = replace(recording, phases={"start": recording.phases["start"]})
-    write_result(folder, track(recording, person.prior), phases=recording.phases)
+    tracked = track(recording, person.prior)
+    write_result(folder, tracked, summarize(tracked), phases=recording.phases)
     return folder
 
 

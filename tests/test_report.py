@@ -70,10 +70,10 @@ def test_the_quality_comes_first_with_its_reasons(made: Made, page: str) -> None
     failed = render_calibration_report(
         made[0], made[1], quality=replace(poor(made[0]), quality="fail"), tracked=made[2]
     )
-    for text, word, said in ((page, "poor", "Poor:"), (failed, "fail", "Fail:")):
+    for text, word, heading in ((page, "poor", "Poor:"), (failed, "fail", "Fail:")):
         text = without_frame(text)
-        assert text.index(f'<section class="banner {word}">') < text.index(said)
-        assert text.index(said) < text.index(render(UNCERTAIN).what) < text.index("<h2")
+        assert text.index(f'<section class="banner {word}">') < text.index(heading)
+        assert text.index(heading) < text.index(render(UNCERTAIN).what) < text.index("<h2")
 
 
 def test_the_quality_with_its_checks(made: Made) -> None:
@@ -215,10 +215,10 @@ WHERE: Mapping[str, tuple[int, int]] = {
 def test_tilts_are_named_by_where_the_free_end_goes(segment: str, angle: float, across: int) -> None:
     rotvec = [angle, 0.0, 0.0] if across == 1 else [0.0, angle, 0.0]
     end = Rotation.from_rotvec(rotvec).apply([0.0, 0.0, 1.0 if segment == "torso" else -1.0])
-    said = direction(TABLE, segment, across, angle)
+    named = direction(TABLE, segment, across, angle)
     side = "to the left" if segment.startswith("left") else "to the right"
-    said = {"outwards": side, "inwards": "to the left" if side == "to the right" else "to the right"}.get(said, said)
-    axis, sign = WHERE[said]
+    named = {"outwards": side, "inwards": "to the left" if side == "to the right" else "to the right"}.get(named, named)
+    axis, sign = WHERE[named]
     assert np.sign(round(float(end[axis]), 6)) == sign
 
 

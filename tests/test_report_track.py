@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
@@ -25,20 +26,17 @@ from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.plausibility import find_cut_off
 from wepose_pin.report import render_track_report
 from wepose_pin.report.chart import COLUMNS, envelope
-from wepose_pin.report.measures import (
-    Measures,
+from wepose_pin.report.words import listed, signed, whole
+from wepose_pin.simulation import Simulation, simulate, simulate_person
+from wepose_pin.subject import Hinge, Subject, population_subject
+from wepose_pin.tracking import TrackedRecording, TrackOptions, summarize, track
+from wepose_pin.tracking.measures import (
     compute_heading_uncertainties,
     compute_joint_heading_stds,
     longest_run_s,
     measure_hinge,
-    measure_signal,
     measure_tips,
 )
-from wepose_pin.report.track_diagnostics import diagnose_pose
-from wepose_pin.report.words import listed, signed, whole
-from wepose_pin.simulation import Simulation, simulate, simulate_person
-from wepose_pin.subject import Hinge, Subject, population_subject
-from wepose_pin.tracking import TrackedRecording, TrackOptions, track
 from wepose_pin.writers import write_session
 
 BUDGET = "What the ± of the points is made of"
@@ -61,7 +59,7 @@ def pose(simulation: Simulation) -> TrackedRecording:
 
 @pytest.fixture(scope="module")
 def page(pose: TrackedRecording) -> str:
-    return render_track_report(pose)
+    return render_track_report(summarize(pose))
 
 
 def changed(recording: Recording, name: str, **signals: np.ndarray) -> Recording:
@@ -73,17 +71,9 @@ def with_pose(tracked: TrackedRecording, **changes: Any) -> TrackedRecording:
     return replace(tracked, pose=replace(tracked.pose, **changes))
 
 
-def looked_at(pose: TrackedRecording, known: Sequence[Diagnostic] = ()) -> list[Diagnostic]:
-    signals = {name: measure_signal(pose.recording, name, pose) for name in pose.recording.sensors}
-    found = {name: measure_hinge(pose.pose, TABLE, name, pose.subject) for name in TABLE.hinges}
-    hinges = {name: hinge for name, hinge in found.items() if hinge is not None}
-    tips = measure_tips(pose.pose, pose.recording.rate_hz, TABLE)
-    return diagnose_pose(pose, Measures(signals, compute_heading_uncertainties(pose), hinges, tips), known)
-
-
 def the(code: str, pose: TrackedRecording, place: str | None = None) -> Diagnostic:
     """The one diagnostic of that code, at that place."""
-    found = looked_at(pose)
+    found = summarize(pose).diagnostics
     matching = [each for each in found if each.code == code and place in (None, each.place)]
     assert len(matching) == 1, found
     return matching[0]
@@ -129,7 +119,7 @@ def test_it_gives_what_the_headings_may_be_off_by(page: str, pose: TrackedRecord
 def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedRecording, page: str) -> None:
     guessed = Diagnostic("start-pose-guessed", WARNING, facts={"start": 0.5, "end": 2.5})
     warned = replace(pose, segments=replace(pose.segments, diagnostics=(guessed,)))
-    text = without_frame(render_track_report(warned))
+    text = without_frame(render_track_report(summarize(warned)))
     assert '<section class="banner poor">' in text
     first = text.index(render(guessed).what)
     assert first < text.index("Let the person hold the hands together") < text.index("<h2") < text.index("<figure")
@@ -139,8 +129,8 @@ def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedReco
 
 def test_a_known_person_and_nothing_to_say(pose: TrackedRecording) -> None:
     quiet = replace(pose, subject=replace(pose.subject, name="anna", note=""))
-    assert looked_at(quiet) == []
-    assert "No warnings." in text_of(render_track_report(quiet))
+    assert summarize(quiet).diagnostics == ()
+    assert "No warnings." in text_of(render_track_report(summarize(quiet)))
 
 
 def test_it_opens_offline_prints_and_has_no_nan(page: str) -> None:
@@ -153,14 +143,14 @@ def test_it_opens_offline_prints_and_has_no_nan(page: str) -> None:
 
 
 def test_equal_arguments_give_equal_text_and_a_ready_view_is_taken(pose: TrackedRecording, page: str) -> None:
-    assert render_track_report(pose) == page
-    assert 'srcdoc="&lt;p&gt;mine&lt;/p&gt;"' in render_track_report(pose, view="<p>mine</p>")
+    assert render_track_report(summarize(pose)) == page
+    assert 'srcdoc="&lt;p&gt;mine&lt;/p&gt;"' in render_track_report(summarize(pose), view="<p>mine</p>")
 
 
 @pytest.mark.slow
 def test_it_does_not_grow_with_the_recording() -> None:
     simulation = simulate(simulate_person(3).lengths, seed=3, rate_hz=20.0, clasp_s=600.0, circles=0)
-    page = render_track_report(track(simulation.recording("long")))
+    page = render_track_report(summarize(track(simulation.recording("long"))))
     assert len(page) < 5e6
     assert re.search(r"at 8\.\d frames a second", page)
 
@@ -169,7 +159,7 @@ def test_it_does_not_grow_with_the_recording() -> None:
 
 
 def test_without_a_covariance_it_says_so(simulation: Simulation) -> None:
-    page = render_track_report(track(simulation.recording("ncf"), method="ncf"))
+    page = render_track_report(summarize(track(simulation.recording("ncf"), method="ncf")))
     assert headings(page) == [name for name in SECTIONS if name != BUDGET]
     assert "The filter ncf has no covariance: the uncertainty of the headings is not known" in text_of(page)
     assert "± nan" not in page
@@ -181,7 +171,7 @@ def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedRec
         name: OrientationSensor(quat_WS=pose.quat_WL[name]) for name in ("torso", "right_upper_arm", "right_forearm")
     }  # orientations of segments
     ready = track(replace(recording, sensors=sensors))
-    page = render_track_report(ready)
+    page = render_track_report(summarize(ready))
     assert headings(page) == [name for name in SECTIONS if name != "Noise and bias"]
     assert "The device gave orientations without an uncertainty" in text_of(page)
     assert the("measured-orientations", ready).facts["segments"] == "torso, right_upper_arm, right_forearm"
@@ -192,10 +182,12 @@ def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedRec
 def test_a_torso_alone_has_no_hands(simulation: Simulation) -> None:
     recording = simulation.recording("torso")
     alone = track(replace(recording, sensors={"torso": recording.sensors["torso"]}))
-    page = render_track_report(alone)
+    page = render_track_report(summarize(alone))
     assert headings(page) == [name for name in SECTIONS if name != "The hands"]
     head = render_track_report(
-        track(replace(recording, sensors={"head": recording.sensors["torso"]}, phases={"start": ((0.5, 4.5),)}))
+        summarize(
+            track(replace(recording, sensors={"head": recording.sensors["torso"]}, phases={"start": ((0.5, 4.5),)}))
+        )
     )
     assert headings(head) == [name for name in SECTIONS if name not in ("The hands", "Joint angles", BUDGET)]
 
@@ -214,17 +206,21 @@ def test_motion_beyond_the_range(simulation: Simulation) -> None:
     saturated = the("signal-saturated", pose)
     assert (saturated.severity, saturated.place) == (WARNING, "right_forearm")
     assert saturated.value == pytest.approx(count / 100)
-    page = render_track_report(pose)
+    page = render_track_report(summarize(pose))
     assert f"{count / 100:.2f} s" in next(row for row in rows(page) if row[0] == "right forearm")
-    told = Diagnostic("signal-saturated", WARNING, "right_forearm", 0.4, facts={"variant": "gyro", "range": 2.1})
-    assert [each for each in looked_at(pose, [told]) if each.code == told.code] == [told]  # the reader has said it
+    known = Diagnostic("signal-saturated", WARNING, "right_forearm", 0.4, facts={"variant": "gyro", "range": 2.1})
+    assert [
+        each
+        for each in summarize(replace(pose, segments=replace(pose.segments, diagnostics=(known,)))).diagnostics
+        if each.code == known.code
+    ] == [known]  # the reader has said it
 
 
 def test_gaps(simulation: Simulation) -> None:
     recording = simulation.recording("gaps")
     gap = np.zeros(len(recording), dtype=bool)
     gap[3000:3400] = True
-    page = render_track_report(pose := track(changed(recording, "torso", gap=gap)))
+    page = render_track_report(summarize(pose := track(changed(recording, "torso", gap=gap))))
     lost = the("samples-lost", pose)
     assert (lost.place, lost.value) == ("torso", pytest.approx(400 / len(gap)))
     assert next(row for row in rows(page) if row[0] == "torso")[4] == "4.00 s"
@@ -260,7 +256,11 @@ def test_a_person_who_never_rests(pose: TrackedRecording) -> None:
     restless = {name: of._replace(static=np.zeros_like(of.static)) for name, of in pose.segments.orientation.items()}
     never = replace(pose, segments=replace(pose.segments, orientation=restless))
     for method, severity in (("amekf", INFO), ("smekf", WARNING)):
-        rare = [d for d in looked_at(replace(never, options=TrackOptions(method))) if d.code == "static-phases-rare"]
+        rare = [
+            d
+            for d in summarize(replace(never, options=TrackOptions(method))).diagnostics
+            if d.code == "static-phases-rare"
+        ]
         assert [d.place for d in rare] == list(restless)
         assert {d.severity for d in rare} == {severity}
     assert longest_run_s(np.array([True, False, True, True, True, False]), 2.0) == 1.5
@@ -276,7 +276,7 @@ def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
         name: of._replace(attitude_cov=100.0 * of.attitude_cov) for name, of in pose.segments.orientation.items()
     }
     wide = replace(pose, correction=None, segments=replace(pose.segments, orientation=drifting))
-    uncertain = [d for d in looked_at(wide) if d.code == "heading-uncertain"]
+    uncertain = [d for d in summarize(wide).diagnostics if d.code == "heading-uncertain"]
     assert {d.place for d in uncertain} == {"left_shoulder", "left_elbow", "right_shoulder", "right_elbow"}
     assert {d.severity for d in uncertain} == {WARNING}
     assert "correct their headings as the joint between them moves" in render(uncertain[0]).do
@@ -311,7 +311,7 @@ def with_elbow(
 
 def test_elbows_that_cannot_be(pose: TrackedRecording) -> None:
     n = len(pose.time)
-    usual = {each.code for each in looked_at(with_elbow(pose, np.linspace(-10.0, 140.0, n)))}
+    usual = {each.code for each in summarize(with_elbow(pose, np.linspace(-10.0, 140.0, n))).diagnostics}
     assert not usual & {"hinge-hyperextended", "hinge-overflexed", "hinge-out-of-plane"}
     back = the("hinge-hyperextended", with_elbow(pose, np.full(n, -30.0)))
     assert (back.severity, back.place, back.value) == (WARNING, "left_elbow", pytest.approx(np.deg2rad(30.0)))
@@ -451,9 +451,13 @@ def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.Captu
         with pytest.raises(SystemExit) as ended:
             main(["track", str(tmp_path), "-o", str(tmp_path / folder), *options])
         assert ended.value.code == 0
-        assert ("report.html" in capsys.readouterr().out) == (not options)
+        captured = capsys.readouterr()
+        assert ("report.html" in captured.out) == (not options)
         assert (tmp_path / folder / "report.html").exists() == (not options)
         assert (tmp_path / folder / "view.html").exists()
+        saved = json.loads((tmp_path / folder / "summary.json").read_text(encoding="utf-8"))["diagnostics"]
+        assert [each["code"] for each in saved] == ["population-lengths"]  # of the motion, with a report or without
+        assert f"info: {saved[0]['text']['what']}" in captured.err
     assert "Motion of short" in (tmp_path / "with" / "report.html").read_text(encoding="utf-8")
 
 
@@ -503,11 +507,13 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
 
     late = replace(pose, segments=replace(pose.segments, start=(begin, begin + 2.0)))
     peak = with_pose(late, point_cov={name: wider(cov, 60.0) for name, cov in late.pose.point_cov.items()})
-    assert rows_of_hands(render_track_report(peak, view="<p>")) == rows_of_hands(render_track_report(late, view="<p>"))
+    assert rows_of_hands(render_track_report(summarize(peak), view="<p>")) == rows_of_hands(
+        render_track_report(summarize(late), view="<p>")
+    )
     most = max(float(compute_axis_std(peak.pose.point_cov[name]).max()) for name in ("left_palm", "right_palm"))
     assert the("position-uncertain-before-start", peak).value == pytest.approx(most)
-    assert not any(each.code.endswith("-before-start") for each in looked_at(late))
-    text = text_of(render_track_report(peak, view="<p>"))
+    assert not any(each.code.endswith("-before-start") for each in summarize(late).diagnostics)
+    text = text_of(render_track_report(summarize(peak), view="<p>"))
     assert "No warnings" not in text
     assert "the 7 s before its end are left out" in text
 

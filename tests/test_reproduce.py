@@ -81,8 +81,8 @@ def test_track_again_is_the_same(result: Path, capsys: pytest.CaptureFixture[str
     before = {path: path.read_bytes() for path in result.rglob("*")}
     capsys.readouterr()
     assert run("reproduce", result) == 0
-    said = capsys.readouterr()
-    assert said.out == f"{result}: the same, made again by wepose track\n"
+    captured = capsys.readouterr()
+    assert captured.out == f"{result}: the same, made again by wepose track\n"
     assert {path: path.read_bytes() for path in result.rglob("*")} == before
 
 
@@ -121,10 +121,10 @@ def test_what_another_version_has_made_is_made_again_and_said(result: Path, caps
     (result / "summary.json").write_text(json.dumps(summary))
     capsys.readouterr()
     assert run("reproduce", result) == 0
-    said = capsys.readouterr()
-    assert "warning: The result was made by wepose-pin 0.0.9 (abc); this is " in said.err
-    assert "warning: Other versions are installed now: numpy " in said.err
-    assert "the same, made again by wepose track" in said.out
+    captured = capsys.readouterr()
+    assert "warning: The result was made by wepose-pin 0.0.9 (abc); this is " in captured.err
+    assert "warning: Other versions are installed now: numpy " in captured.err
+    assert "the same, made again by wepose track" in captured.out
 
 
 def test_retarget_again(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -155,17 +155,17 @@ def test_a_whole_study_again(session: Path, tmp_path: Path, capsys: pytest.Captu
     assert run("batch", tmp_path / "plan.toml", "--workers", 1, "-o", tmp_path / "study") == 3
     capsys.readouterr()
     assert run("reproduce", tmp_path / "study") == 0
-    said = capsys.readouterr()
-    assert said.out == f"{tmp_path / 'study'}: the same, made again by wepose batch\n"
-    assert "1 items had failed" in said.err
+    captured = capsys.readouterr()
+    assert captured.out == f"{tmp_path / 'study'}: the same, made again by wepose batch\n"
+    assert "1 items had failed" in captured.err
     pose = tmp_path / "study" / "items" / "other" / "track" / "pose.parquet"
     pl.read_parquet(pose).head(3).write_parquet(pose)
     (session / "recording.parquet").unlink()
     assert run("reproduce", tmp_path / "study") == 3
-    said = capsys.readouterr()
-    assert "other: track/pose.parquet: " in said.out
-    assert "session: cannot be made again: " in said.out
-    assert "recording.parquet is gone" in said.out
+    captured = capsys.readouterr()
+    assert "other: track/pose.parquet: " in captured.out
+    assert "session: cannot be made again: " in captured.out
+    assert "recording.parquet is gone" in captured.out
     (tmp_path / "study" / "results.parquet").unlink()
     assert run("reproduce", tmp_path / "study") == 2
 
@@ -179,45 +179,45 @@ def test_differences_are_named(result: Path, capsys: pytest.CaptureFixture[str])
     (result / "subject.urdf").unlink()
     capsys.readouterr()
     assert run("reproduce", result) == 3
-    said = capsys.readouterr().out
-    assert f"pose.parquet: column left_palm_x differs in 1 of {table.height} rows, by 0.25 at most" in said
-    assert "summary.json: rate_hz was 99.0, is 50.0" in said
-    assert "subject.urdf: is missing, or new" in said
+    printed = capsys.readouterr().out
+    assert f"pose.parquet: column left_palm_x differs in 1 of {table.height} rows, by 0.25 at most" in printed
+    assert "summary.json: rate_hz was 99.0, is 50.0" in printed
+    assert "subject.urdf: is missing, or new" in printed
 
 
 @pytest.mark.parametrize("wrong", ["gone", "changed", "data", "none", "damaged", "format", "unknown", "nothing"])
 def test_what_cannot_be_made_again(wrong: str, result: Path, session: Path, capsys: pytest.CaptureFixture[str]) -> None:
     summary = json.loads((result / "summary.json").read_text())
     block: dict[str, Any] = summary["provenance"]
-    said = "provenance"
+    expected = "provenance"
     if wrong == "gone":
         (session / "session.toml").unlink()
-        said = f"of its session, session.toml is gone: {session / 'session.toml'}"
+        expected = f"of its session, session.toml is gone: {session / 'session.toml'}"
     elif wrong == "changed":
         (session / "session.toml").write_text((session / "session.toml").read_text() + "\n")
-        said = f"of its session, {session / 'session.toml'} has changed: SHA-256 was "
+        expected = f"of its session, {session / 'session.toml'} has changed: SHA-256 was "
     elif wrong == "data":
         (session / "recording.parquet").unlink()
-        said = "recording.parquet is gone"
+        expected = "recording.parquet is gone"
     elif wrong == "none":
         summary.pop("provenance")
-        said = "does not say what made it"
+        expected = "does not say what made it"
     elif wrong == "damaged":
         block["inputs"] = []
-        said = "provenance is damaged"
+        expected = "provenance is damaged"
     elif wrong == "format":
         block["format"] = 2
-        said = "provenance is not of format 1"
+        expected = "provenance is not of format 1"
     elif wrong == "unknown":
         block["options"]["speed"] = 3
-        said = "wepose track of this version: speed is not an option"
+        expected = "wepose track of this version: speed is not an option"
     (result / "summary.json").write_text(json.dumps(summary))
     if wrong == "nothing":
-        result, said = result / "nothing", "no such result"
+        result, expected = result / "nothing", "no such result"
     capsys.readouterr()
     assert run("reproduce", result) == 2
     error = capsys.readouterr().err
-    assert said in error
+    assert expected in error
     assert error.count("\n") == 1
 
 

@@ -681,13 +681,13 @@ def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from wepose_pin import tracking
     from wepose_pin.simulation import simulate, simulate_person
-    from wepose_pin.tracking import track
     from wepose_pin.writers import write_result
 
     folder = tmp_path_factory.mktemp("result")
     made = simulate(simulate_person(2).lengths, seed=2)
-    tracked = track(made.recording("made"))
+    tracked = tracking.track(made.recording("made"))
     pose, keep = tracked.pose, slice(0, 600)
     short = replace(
         pose,
@@ -697,7 +697,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
         segment_cov={name: cov[keep] for name, cov in pose.segment_cov.items()},
         point_cov={name: cov[keep] for name, cov in pose.point_cov.items()},
     )
-    write_result(folder, replace(tracked, pose=short))
+    write_result(folder, replace(tracked, pose=short), tracking.summarize(tracked))
     return folder
 
 

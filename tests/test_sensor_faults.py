@@ -219,8 +219,8 @@ def test_an_axis_that_stops_is_found_by_where_up_goes(axis: str, clean: Simulati
     """Without any noise: up, as the gyroscope takes it along, is another place."""
     assert found(clean.recording("clean")) == {}
     for first, value in ((0.0, 0.0), (9.0, None)):
-        told = found(axis_stopped(clean.recording("clean"), axis, first, value))
-        assert told[BROKEN][0] == (axis, first)
+        diagnostics = found(axis_stopped(clean.recording("clean"), axis, first, value))
+        assert diagnostics[BROKEN][0] == (axis, first)
 
 
 def test_a_recording_with_a_dead_axis_is_refused(

@@ -46,6 +46,7 @@ ELSEWHERE = {
     r"before after|session.toml --model whole_body": "two sessions, legs: tests/test_repetitions.py, test_legs.py",
     r"take_2|study|plan\.toml": "takes and plans: tests/test_live_terminal.py, test_batch_plan.py",
     r"--activity tasks --seconds 600": "ten minutes: tests/test_people.py",
+    r"export other": "a second result: tests/test_motion_bids.py",
     r"panda_2": "several trajectories: tests/test_export_robot.py",
     r"\.rrd": "an extra of 170 MB and its viewer: tests/test_export_ros.py",
     r"scripts/bvh_to_robot": "another program: tests/test_export_robot.py",
@@ -177,7 +178,8 @@ def complete_session(folder: Path) -> None:
     file = folder / "session.toml"
     text = file.read_text(encoding="utf-8")
     text = re.sub(r"^start = .*$", f"start = {STAND_S}\nclasp = {CLASP}", text, flags=re.MULTILINE)
-    file.write_text(re.sub(r"^# (mount = \{.*?\}).*$", r"\1", text, flags=re.MULTILINE), encoding="utf-8")
+    text = re.sub(r"^# (mount = \{.*?\}).*$", r"\1", text, flags=re.MULTILINE)
+    file.write_text(text.replace('forward = "?"', 'forward = "-z"'), encoding="utf-8")
 
 
 def mask(line: str) -> str:
@@ -264,6 +266,22 @@ def test_oldest_versions_are_those_of_the_package() -> None:
     conda = {names.get(name, name): bound for name, bound in lower_bounds(run, ">=").items() if name != "python"}
     assert conda == bounds
     assert f'version: "{project["version"]}"' in recipe
+
+
+def test_one_function_says_how_to_install_and_knows_the_packages_of_the_extras() -> None:
+    """No release is on an index: a message names packages, and a page the extra of a clone."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
+    known = {re.split("[>;]", package)[0] for packages in extras.values() for package in packages}
+    for room in ("wepose_pin", "benchmarks", "docs", "examples"):
+        for file in (ROOT / room).rglob("*.*"):
+            if file.suffix not in (".py", ".md", ".ipynb", ".toml") or "_build" in file.parts:
+                continue
+            text = file.read_text(encoding="utf-8")
+            assert "wepose-pin[" not in text, file
+            if room == "wepose_pin" and file.name not in ("errors.py", "maps.py"):  # without their dependencies: robots
+                assert "pip install" not in text, file
+            for call in re.findall(r"how_to_install\(([^)]*)\)", text):
+                assert set(re.findall(r"[\w-]+", call)) <= known | {"packages", "str"}, file
 
 
 def test_every_step_of_the_workflows_is_a_target() -> None:

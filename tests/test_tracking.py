@@ -16,7 +16,7 @@ from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording, join_recordings
 from wepose_pin.simulation import NOISE_FREE, Person, Simulation, simulate
 from wepose_pin.subject import population_subject
-from wepose_pin.tracking import SummaryAccumulator, Tracker, track
+from wepose_pin.tracking import SummaryAccumulator, Tracker, summarize, track
 
 
 def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
@@ -39,7 +39,7 @@ def test_a_noisy_world_is_tracked_by_every_filter(simulation: Simulation, person
     pose = track(simulation.recording(), subject, method=method)
     errors = evaluate(pose.pose, simulation.truth(), simulation.phases["circles"][0])
     assert errors.position["right_palm"].mean < 20.0
-    summary = pose.summary()
+    summary = summarize(pose).content
     assert summary["method"] == method
     assert set(summary["sensors"]) == set(simulation.gyro_S)
 
@@ -50,7 +50,7 @@ def test_sensors_that_are_missing_leave_out_what_cannot_be_known(half_minute: Re
     pose = track(replace(recording, sensors=fewer))
     assert set(pose.quat_WL) == set(fewer)
     assert set(pose.points) == {"left_shoulder", "left_elbow", "right_shoulder"}
-    assert pose.summary()["points"] == sorted(pose.points)
+    assert summarize(pose).content["points"] == sorted(pose.points)
     only_arm = {"left_upper_arm": recording.sensors["left_upper_arm"]}
     assert track(replace(recording, sensors=only_arm)).points == {}
 
@@ -89,9 +89,14 @@ def test_the_real_person_hangs_the_arms_again(data: Path) -> None:
 def test_what_reading_finds_reaches_the_result(half_minute: Recording) -> None:
     gaps = Diagnostic("short-gaps-bridged", INFO, "torso", 2, 0.05, {"samples": 3, "longest": 0.02})
     tracked = track(replace(half_minute, phases={}, diagnostics=(gaps,)))
-    assert tracked.diagnostics[0] == gaps
-    assert tracked.diagnostics[1].code == "start-pose-guessed"
-    assert tracked.summary()["diagnostics"] == [as_json(each) for each in tracked.diagnostics]
+    summary = summarize(tracked)
+    assert [each.code for each in summary.diagnostics] == [
+        "start-pose-guessed",
+        "short-gaps-bridged",
+        "population-lengths",
+    ]
+    assert gaps in summary.diagnostics
+    assert summary.content["diagnostics"] == [as_json(each) for each in summary.diagnostics]
 
 
 def test_diagnostics_of_later_chunks_are_listed_once_and_not_without_end(half_minute: Recording) -> None:
@@ -102,7 +107,7 @@ def test_diagnostics_of_later_chunks_are_listed_once_and_not_without_end(half_mi
         done += tracker.push(replace(chunk, diagnostics=(cut[0], cut[min(k, 14)])))
     for tracked in [*done, *tracker.finish()]:
         accumulator.add(tracked)
-    found = accumulator.diagnostics()
+    found = accumulator.finish().diagnostics
     assert list(found[:12]) == [cut[0], *cut[:11]]
     assert (found[12].code, found[12].value) == ("diagnostics-omitted", 4)
 

@@ -174,9 +174,9 @@ def test_the_command_writes_every_trial(
     with pytest.raises(SystemExit) as stop:
         main(["validate", "--quick", "--data", str(data), "-o", str(tmp_path / "out")])
     assert not stop.value.code
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for words in ("dynamic 100 Hz", "BROAD, 1 trial", "UR5"):
-        assert words in said
+        assert words in printed
     document = json.loads((tmp_path / "out" / "validation.json").read_text())
     assert {result["experiment"] for result in document["results"]} == set(few)
 

@@ -253,10 +253,10 @@ def test_which_imperfections_were_on(document: Document) -> None:
 def test_pages_anew_from_a_file(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "docs"
     assert run("validate", "--from", file, "-o", out) == 0
-    said = capsys.readouterr().out
-    assert "dynamic 100 Hz, 2 trials [deg], a quick run" in said
-    assert "Targets for the mean errors" in said
-    assert all(len(line) <= 110 for line in said.splitlines() if "/" not in line)
+    printed = capsys.readouterr().out
+    assert "dynamic 100 Hz, 2 trials [deg], a quick run" in printed
+    assert "Targets for the mean errors" in printed
+    assert all(len(line) <= 110 for line in printed.splitlines() if "/" not in line)
     assert not (out / "validation.json").exists()
     text = (out / "validation.md").read_text(encoding="utf-8")
     assert (out / "validation.html").is_file()

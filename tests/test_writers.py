@@ -17,7 +17,7 @@ from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import population_subject
-from wepose_pin.tracking import track
+from wepose_pin.tracking import summarize, track
 from wepose_pin.writers import read_result, write_result, write_session
 from wepose_pin.writers.result import write_subject
 
@@ -104,7 +104,7 @@ def test_ready_orientations_are_written_too(simulation: Simulation, tmp_path: Pa
 
 def test_a_result_reads_back(simulation: Simulation, tmp_path: Path) -> None:
     pose = track(simulation.recording("made"))
-    write_result(tmp_path, pose)
+    write_result(tmp_path, pose, summarize(pose))
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "pose.parquet",
         "subject.toml",

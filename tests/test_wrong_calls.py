@@ -422,19 +422,21 @@ def wrong_calls() -> list[Wrong]:
         for name, values in parameters.items()
         for value in values
     ]
-    given = right()
+    arguments = right()
     for function in ("track", "calibrate"):
-        calls += [Wrong(function, name, {"recording": r}) for name, r in wrong_recordings(given[function]["recording"])]
-    for name, subject in wrong_subjects(given["track"]["subject"]):
+        calls += [
+            Wrong(function, name, {"recording": r}) for name, r in wrong_recordings(arguments[function]["recording"])
+        ]
+    for name, subject in wrong_subjects(arguments["track"]["subject"]):
         calls += [Wrong("track", name, {"subject": subject}), Wrong("calibrate", name, {"prior": subject})]
-    for name, pose in wrong_poses(given["evaluate"]["pose"]):
+    for name, pose in wrong_poses(arguments["evaluate"]["pose"]):
         calls += [Wrong("evaluate", name, {parameter: pose}) for parameter in ("pose", "truth")]
         calls.append(Wrong("joint_angles", name, {"pose": pose}))
-    for name, pose in wrong_poses(given["retarget"]["pose"]):
+    for name, pose in wrong_poses(arguments["retarget"]["pose"]):
         calls.append(Wrong("retarget", name, {"pose": pose}))
     calls += [Wrong(function, names, {parameter: options}) for function, parameter, names, options in wrong_options()]
-    calls += [Wrong(function, "nonsense", {"nonsense": 1}) for function in given]
-    calls += [Wrong(f, name, {name: ...}) for f, of in given.items() for name in of if name in _needed(f)]
+    calls += [Wrong(function, "nonsense", {"nonsense": 1}) for function in arguments]
+    calls += [Wrong(f, name, {name: ...}) for f, of in arguments.items() for name in of if name in _needed(f)]
     return calls
 
 
@@ -476,7 +478,7 @@ def test_every_wrong_call_is_refused_and_says_what_is_wrong(function: str) -> No
     pytest.importorskip("daqp")
     found = {str(wrong): outcome(wrong) for wrong in wrong_calls() if wrong.function == function}
     assert len(found) > 5
-    assert {call: said for call, said in found.items() if said != "named"} == {}
+    assert {call: answer for call, answer in found.items() if answer != "named"} == {}
 
 
 def test_right_calls_go_through() -> None:

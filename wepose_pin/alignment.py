@@ -184,7 +184,11 @@ def suggest_mounts(segments: Sequence[str], table: BodyTable) -> str:
     calibrated = [segment for segment in segments if segment in measured]
     others = [segment for segment in segments if segment not in measured]
     if calibrated:
-        remedy += f"; or find that of {', '.join(calibrated)} by `wepose calibrate`, and track with its --subject"
+        target = f"that of {', '.join(calibrated)}" if others else "it" if len(calibrated) == 1 else "them"
+        remedy += (
+            f"; or find {target} by `wepose calibrate` (--protocol free without joined hands), and track with its "
+        )
+        remedy += "--subject"
     if others:
         remedy += f"; no calibration finds that of {', '.join(others)}"
     return remedy

@@ -162,8 +162,9 @@ class TrackResult(PosedBody):
         from .report import write_track_pages
 
         with result_folder(out, force) as partial:
-            write_result(partial, self.source, phases=self.phases)
-        write_track_pages(out, self.source)
+            summary = tracking.summarize(self.source)
+            write_result(partial, self.source, summary, phases=self.phases)
+        write_track_pages(out, summary)
         return out
 
     def __repr__(self) -> str:
@@ -254,14 +255,15 @@ def track(
         causal=causal,
         limits=limits,
     )
+    summary = tracking.summarize(tracked)
     return TrackResult(
         name=tracked.name,
         pose=tracked.pose,
         model=tracked.model,
         subject=tracked.subject,
         phases=recording.phases,
-        summary=tracked.summary(),
-        diagnostics=tracked.diagnostics,
+        summary=summary.content,
+        diagnostics=summary.diagnostics,
         source=tracked,
     )
 

@@ -20,22 +20,28 @@ _BARE = _OPTIONS | ({"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {})
 
 
 class _CompilationNotice(Listener):  # type: ignore[misc]
-    """Prints one line on a terminal when the first of our functions is compiled, which takes seconds."""
+    """Prints a line when the first of our functions is compiled; unless `wanted`, on a terminal only."""
 
-    printed = False
+    printed, wanted = False, False
 
     def on_start(self, event: Event) -> None:
         if self.printed or not event.data["dispatcher"].py_func.__module__.startswith("wepose_pin."):
             return
         self.printed = True
-        if sys.stderr.isatty():
-            print("compiling for this machine: some ten seconds, kept for the next time …", file=sys.stderr, flush=True)
+        if self.wanted or sys.stderr.isatty():
+            print("compiling the filters for this machine, once: 10 to 30 seconds …", file=sys.stderr, flush=True)
 
     def on_end(self, event: Event) -> None:
         pass
 
 
-register("numba:compile", _CompilationNotice())
+_NOTICE = _CompilationNotice()
+register("numba:compile", _NOTICE)
+
+
+def announce_compilation() -> None:
+    """From here on say that functions are compiled, also where nobody sits at a terminal."""
+    _NOTICE.wanted = True
 
 
 def _compile_cached(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:

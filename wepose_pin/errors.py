@@ -157,15 +157,20 @@ def reason(error: Exception) -> str:
     return f"{type(error).__name__}: {text[:200]}" if text else type(error).__name__
 
 
-def one_of(names: Iterable[str], found: str | None = None, most: int = 12) -> str:
+def how_to_install(*packages: str) -> str:
+    """The command that brings packages which are missing, of an installed wheel and of a clone alike."""
+    return f"pip install {' '.join(packages)}"
+
+
+def one_of(names: Iterable[str], value: str | None = None, most: int = 12) -> str:
     """The choices for an error's end: ``a, b, c`` with the closest to `found` named first.
 
     Of more than `most` those are listed that are nearest to `found`, the nearest first.
     """
     choices = list(names)
     nearest = choices
-    if found and len(choices) > most:
-        nearest = sorted(choices, key=lambda name: -SequenceMatcher(None, found.lower(), name.lower()).ratio())
+    if value and len(choices) > most:
+        nearest = sorted(choices, key=lambda name: -SequenceMatcher(None, value.lower(), name.lower()).ratio())
     listed = ", ".join(nearest[:most]) + (f", … ({len(choices)} in all)" if len(choices) > most else "")
-    close = get_close_matches(found, choices, n=1) if found else []
+    close = get_close_matches(value, choices, n=1) if value else []
     return f"did you mean '{close[0]}'? there is: {listed}" if close else f"there is: {listed or 'none'}"

@@ -20,6 +20,7 @@ from .joints import (
     SHOULDER_SEQUENCES,
     Angles,
     JointAngles,
+    diagnose_lock,
     group_sides,
     joint_angles,
 )
@@ -37,6 +38,7 @@ __all__ = [
     "JointSummary",
     "angle_table",
     "compose",
+    "diagnose_lock",
     "group_sides",
     "joint_angles",
     "summary",

@@ -20,6 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..recording.gaps import find_runs
+
 # The standard deviation [rad] of an unknown angle: uniform over the circle.
 UNKNOWN = np.pi / np.sqrt(3.0)
 # Below this sine or cosine of half the tip the first angle is rounding error.
@@ -139,13 +141,36 @@ def follow(angles: Angles3, name: str, near_lock: float) -> np.ndarray:
 
 def _find_passages(near: np.ndarray, gimbal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Last sample before, first after, and nearest to the lock, of each stay near it that has both."""
-    inside = np.concatenate([[False], near, [False]])
-    edges = np.flatnonzero(np.diff(inside.astype(int)))
-    starts, stops = edges[::2], edges[1::2]
-    whole = (starts > 0) & (stops < len(gimbal))
-    starts, stops = starts[whole], stops[whole]
-    nearest = [a + int(np.argmin(gimbal[a:b])) for a, b in zip(starts, stops, strict=True)]
-    return starts - 1, stops, np.array(nearest, dtype=int)
+    whole = [(a, b) for a, b in find_runs(near) if a > 0 and b < len(gimbal)]
+    passages = [(a - 1, b, a + int(np.argmin(gimbal[a:b]))) for a, b in whole]
+    before, after, nearest = np.array(passages, dtype=int).reshape(-1, 3).T
+    return before, after, nearest
+
+
+def drop_turns(values: np.ndarray, gimbal: np.ndarray, name: str, near_lock: float) -> np.ndarray:
+    """`values` (n, 3) of `follow` without the full turns that the first and third angle add up in a stay near the lock.
+
+    There they are within half a turn of those with which the motion came, and from the sample nearest to the lock on of
+    those with which it left. The sum or difference of the two that is determined goes on. A motion that is never
+    further from the lock has the first within half a turn of zero, and begins with that sum or difference so.
+    """
+    s, n = sequence(name), len(values)
+    first, near = values[:, 0], gimbal < near_lock
+    expected = first.copy()
+    for a, b in find_runs(near):
+        nearest = a + int(np.argmin(gimbal[a:b]))
+        edges = [first[k] for k in (a - 1, b) if 0 <= k < n] or [0.0]
+        expected[a:nearest], expected[nearest:b] = edges[0], edges[-1]
+    turns = 2.0 * np.pi * _count_turns(first - expected)
+    sign = np.where(
+        np.cos(values[:, 1] - s.offset) > 0.0, 1.0, -1.0
+    )  # the sum of both is determined, or the difference
+    values = values.copy()
+    values[:, 0] -= turns
+    values[:, 2] += sign * turns
+    if n and near.all():
+        values[:, 2] -= 2.0 * np.pi * _count_turns(values[0, 2] + sign[0] * values[0, 0])
+    return values
 
 
 def _sum_steps(steps: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:

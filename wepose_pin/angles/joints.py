@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..arguments import check_arguments
+from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData, BadOption, UnknownKey, one_of
 from ..kinematics import Pose, PosedBody
 from ..recording import AXES
@@ -42,6 +43,7 @@ _MIRRORED_TURN = np.array([-1.0, 1.0, -1.0])
 # Nearer than this to the lock [rad] an angle is flagged: there an error of the orientation is 5.8 times that in the
 # first and third angle, or more.
 NEAR_LOCK = np.radians(10.0)
+MAX_NEAR_LOCK = 0.01  # of the samples: of an angle that is read as a whole
 # Nearer than this [rad] the first and third angle follow from noise, whatever the sensors.
 LEAST_NEAR_LOCK = np.radians(2.0)
 
@@ -109,9 +111,9 @@ class JointAngles:
     ----------
     sequence : intrinsic axes, such as "ZXY"
     names : of the three angles
-    values : (n, 3) [rad], unwrapped; NaN where the pose has none
+    values : (n, 3) [rad], continuous but for what is near the lock; NaN where the pose has none
     gimbal : (n,) [rad], how far from gimbal lock, at most π/2
-    near_lock : (n,) bool, nearer than asked: first and third angle say little there, and may jump
+    near_lock : (n,) bool, nearer than asked: first and third angle say little there, and jump by full turns
     gap : (n,) bool, one of the segments was bridged over a gap of its sensor, or is not known
     std : (n, 3) [rad], one standard deviation, at most that of an angle even over the circle (104°); None where the
         pose has no covariances
@@ -170,6 +172,19 @@ class Angles:
         return f"Angles({', '.join(self.joints)}: {len(self.time)} samples)"
 
 
+def diagnose_lock(angles: Angles) -> list[Diagnostic]:
+    """The joints that are near gimbal lock for more than `MAX_NEAR_LOCK` of the samples."""
+    diagnostics = []
+    for name, joint in angles.joints.items():
+        share = float(np.mean(joint.near_lock))
+        if share > MAX_NEAR_LOCK:
+            facts = {"first": joint.names[0], "third": joint.names[2]}
+            if joint.sequence == "YXY":
+                facts["variant"] = "hanging"
+            diagnostics.append(Diagnostic("angles-near-lock", INFO, name, share, MAX_NEAR_LOCK, facts))
+    return diagnostics
+
+
 def group_sides(joints: Iterable[str]) -> dict[str, dict[str, str]]:
     """Joint without its side → side ("left", "right", or its name where it has none) → joint."""
     groups: dict[str, dict[str, str]] = {}
@@ -183,8 +198,8 @@ def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float
     """Joint angles after the ISB: thorax and pelvis in W, shoulders, elbows, wrists, hips, knees, ankles, as measured.
 
     Left joints are mirrored on the sagittal plane first, so that an angle has the same sign and meaning on both sides.
-    Angles are followed over time (`euler.follow`); standard deviations are to first order, with the errors of two
-    segments taken as independent.
+    Angles are followed over time (`euler.follow`), without full turns near gimbal lock (`euler.drop_turns`). Standard
+    deviations are to first order, with the errors of two segments taken as independent.
 
     Parameters
     ----------
@@ -247,6 +262,7 @@ def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngl
     quat = multiply(conjugate(quat_WP), quat_WD)
     angles = euler.decompose(quat, joint.sequence)
     values = euler.follow(angles, joint.sequence, near_lock)
+    values = euler.drop_turns(values, angles.gimbal, joint.sequence, near_lock)
     std = None
     if all(segment in pose.segment_cov for segment in members):
         cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)

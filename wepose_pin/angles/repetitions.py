@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import WrongOption, one_of
 from ..filters.butterworth import low_pass
 from .curves import compute_cmc, normalize_time
-from .joints import JOINTS, Angles
+from .joints import JOINTS, MAX_NEAR_LOCK, Angles
 
 # Found on the angle below this frequency [Hz]; voluntary motion of limbs is slower (Winter 2009, 2.2.3).
 CUTOFF_HZ = 5.0
@@ -32,7 +32,7 @@ MIN_CMC = 0.85
 _REST_SHARE = 0.15  # of the range; nearer than this to an end of it the angle dwells there
 _CLEARLY_LONGER = 1.5  # times as long at one end: the angle rests there
 _NO_SPANS = np.empty((0, 2))
-MAX_NEAR_LOCK, MAX_GAP = 0.01, 0.2  # of the samples of a main angle
+MAX_GAP = 0.2  # of the samples of a main angle
 MAX_HIDDEN = 0.1  # of the samples of a repetition, which the main angle is not determined for
 
 

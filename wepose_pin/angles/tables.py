@@ -21,8 +21,8 @@ class JointSummary(NamedTuple):
     Gaps count nowhere; what is near the lock counts in the lowest and highest of the second angle and in `peak_speed`.
     """
 
-    lowest: np.ndarray  # (3,) [rad], unwrapped
-    highest: np.ndarray  # (3,) [rad], unwrapped
+    lowest: np.ndarray  # (3,) [rad]
+    highest: np.ndarray  # (3,) [rad]
     peak_rate: np.ndarray  # (3,) [rad/s], the greatest absolute rate of the angle over `RATE_WINDOW_S`
     peak_speed: float  # [rad/s], greatest length of the joint's angular velocity over `RATE_WINDOW_S`
     near_lock: float  # share of the samples

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from ..errors import BadOption, LostWorker
+from ..errors import BadOption, LostWorker, how_to_install
 from ..filters.base import count_processors
 from .isolation import run_isolated
 from .items import build_failed_row, run_items
@@ -59,7 +59,8 @@ def connect(scheduler: str | None = None, workers: int | None = None) -> Iterato
         from distributed import Client, LocalCluster
         from distributed.security import Security
     except ImportError as error:
-        raise BadOption(f"{error}; pip install 'wepose-pin[batch]' brings what wepose batch needs") from None
+        remedy = how_to_install("dask", "distributed", "cryptography", "fsspec")
+        raise BadOption(f"wepose batch: {error}: {remedy}") from None
     with contextlib.ExitStack() as stack:
         stack.enter_context(dask.config.set(SETTINGS))
         stack.callback(_restore_environment, dict(os.environ))

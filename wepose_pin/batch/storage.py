@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ..errors import BadData, BadOption, ExistingOutput, MissingFile
+from ..errors import BadData, BadOption, ExistingOutput, MissingFile, how_to_install
 from ..writers.provenance import list_named_files
 
 DONE_FILE = "done.json"  # written last: a folder without it is not complete
@@ -35,7 +35,7 @@ def _filesystem(url: str) -> tuple[Any, str]:
         # No cache of listings: a worker lives longer than they stay true.
         return fsspec.core.url_to_fs(url, use_listings_cache=False)
     except ImportError as error:
-        raise BadOption(f"{url}: {error}; pip install 'wepose-pin[batch,s3]' brings fsspec and s3fs") from None
+        raise BadOption(f"{url}: {error}: {how_to_install('fsspec', 's3fs')}") from None
     except ValueError as error:
         raise BadOption(f"{url}: {error}") from None
 

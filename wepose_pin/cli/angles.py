@@ -15,9 +15,12 @@ if TYPE_CHECKING:
 
 def run(job: AnglesJob) -> int:
     """Write the folder; print what was repeated, and the ranges."""
+    from ..angles import diagnose_lock
+
     with progress_bar() as progress:
         outcome = run_angles(job, progress)
-    print_diagnostics(outcome.page_failures)
+    lock = {each.place: each for movement in outcome.movements for each in diagnose_lock(movement.angles)}
+    print_diagnostics([*lock.values(), *outcome.page_failures])
     for movement in outcome.movements:
         _print_repetitions(movement)
     _print_ranges(outcome.movements)

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 
 def run(job: LiveJob) -> int:
     """Track the stream in the terminal; print a summary at its end."""
+    from ..compilation import announce_compilation
     from ..live.terminal import TerminalView
 
+    announce_compilation()  # a stream is waiting
     outcome = run_live(job, views=[TerminalView()], stop=stop_requests(), say=say, tell=print_diagnostics)
     session = outcome.session
     if session is None:

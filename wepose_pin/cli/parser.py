@@ -62,16 +62,16 @@ def parse(name: str, command: Command, argv: Sequence[str]) -> Any:
             raise BadOption(f"{switch} is not an option of wepose {name}; {one_of(known, switch)}; {see}")
     parser = _parser(name, command, list(options.values()))
     try:
-        found, more = parser.parse_known_args(argv)
+        arguments, more = parser.parse_known_args(argv)
     except argparse.ArgumentError as error:
         raise BadOption(f"{error.argument_name}: {error.message}; {see}") from None
     if more:
         raise BadOption(f"'{more[0]}' is one word too many for wepose {name}; {see}")
-    given = {field: value for field, value in vars(found).items() if value is not None}
-    missing = [options[field].shown for field in options if options[field].required and field not in given]
+    values = {field: value for field, value in vars(arguments).items() if value is not None}
+    missing = [options[field].shown for field in options if options[field].required and field not in values]
     if missing:
         raise BadOption(f"wepose {name} needs {' and '.join(missing)}; {see}")
-    return command.job(**{field: options[field].collect(value) for field, value in given.items()})
+    return command.job(**{field: options[field].collect(value) for field, value in values.items()})
 
 
 class _Option:
@@ -147,11 +147,15 @@ class _Option:
 
 
 def _parser(name: str, command: Command, options: Sequence[_Option]) -> argparse.ArgumentParser:
-    required = " ".join(option.shown for option in options if option.required)
+    several = [f"[{option.shown}]" for option in options if not option.switch and get_origin(option.kinds[0]) is tuple]
+    named = [
+        [option.shown for option in options if option.required and bool(option.switch) is k] for k in (False, True)
+    ]
+    shown = " ".join([*named[False], *several, *named[True]])
     texts = [_description(command.job), f"Exit code: {command.exit_codes or EXIT_CODES}"]
     parser = argparse.ArgumentParser(
         prog=f"wepose {name}",
-        usage=" ".join(f"wepose {name} {required} [options]".split()),
+        usage=" ".join(f"wepose {name} {shown} [options]".split()),
         description="\n\n".join(filter(None, texts)),
         epilog=f"{_EXAMPLE}wepose {command.example}\n\nTerms: docs/glossary.md.",
         formatter_class=_Formatter,

@@ -74,7 +74,7 @@ def _print_checks(summary: Mapping[str, Any]) -> None:
 COMMAND = Command(
     RetargetJob,
     run,
-    example="retarget result --robot panda -o panda",
+    example="retarget result --robot panda_table -o panda",
     arguments=("result",),
     exit_codes="0 the trajectory keeps the robot's limits and has no self-collision (checked on what is written); 3 it "
     "does not: the files are written, but no robot may run them; 2 invalid input, nothing is written.",

@@ -173,10 +173,10 @@ def _find_offset(pose: Pose, truth: Pose, common: _Common, fitted: tuple[float, 
         shifted = _compute_speeds(truth, common, fitted[0] - offset, fitted[1] - offset)
         return 1.0 - float(np.mean([_compare(a, b) for a, b in zip(ours, shifted[:, : ours.shape[1]], strict=True)]))
 
-    found = minimize_scalar(
+    minimum = minimize_scalar(
         compute_loss, bounds=(coarse - STEP_S, coarse + STEP_S), method="bounded", options={"xatol": 1e-4}
     )
-    return float(found.x), 1.0 - float(found.fun)
+    return float(minimum.x), 1.0 - float(minimum.fun)
 
 
 def _compute_speeds(pose: Pose, common: _Common, begin: float, end: float) -> np.ndarray:

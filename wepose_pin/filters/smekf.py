@@ -175,8 +175,8 @@ class Smekf:
 
 def _matrix(cov: float | np.ndarray) -> np.ndarray:
     """A covariance (3, 3) that may be given as one variance."""
-    given = np.asarray(cov, dtype=float)
-    matrix = given if given.ndim == 2 else given * np.eye(3)
+    array = np.asarray(cov, dtype=float)
+    matrix = array if array.ndim == 2 else array * np.eye(3)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] < -1e-15:
         raise BadOption(f"covariance {cov!r}: a variance from 0 on is needed, or a positive semidefinite (3, 3)")
     return matrix

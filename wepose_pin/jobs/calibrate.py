@@ -31,7 +31,7 @@ class CalibrateJob:
     session : SESSION
         The recording: session.toml, or the folder that holds it. It names the phases of the protocol, such as clasp, in
         which the palms are held together.
-    further : SESSION
+    further : SESSION…
         Further sessions of the same person, of the same protocol. Lengths and shoulders come from all of them, mounts
         from the last one.
     out : DIR

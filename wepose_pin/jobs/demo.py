@@ -72,7 +72,7 @@ def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
     from ..filters import BEST, METHODS
     from ..report import write_track_pages
     from ..simulation import simulate, simulate_person
-    from ..tracking import track
+    from ..tracking import summarize, track
     from ..writers import write_result, write_session
     from ..writers.provenance import collect_provenance, write_provenance
     from ..writers.result import as_json, write_subject
@@ -102,9 +102,10 @@ def run_demo(job: DemoJob, progress: Progress = no_progress) -> DemoOutcome:
                 playback = tracked
         best = calibrations[BEST]
         write_subject(folder / "subject", best.subject, playback.model)
-        write_result(folder / "result", playback, phases=recording.phases)
+        summary = summarize(playback)
+        write_result(folder / "result", playback, summary, phases=recording.phases)
         progress("making the page", (steps - 1) / steps)
-        failures = write_track_pages(folder / "result", playback, report=False)
+        failures = write_track_pages(folder / "result", summary, report=False)
         lengths = {
             name: {"true": value, "estimated": best.subject.lengths[name], "std": best.subject.std(name)}
             for name, value in person.lengths.items()

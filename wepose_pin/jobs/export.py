@@ -34,8 +34,8 @@ class ExportJob:
         osim (OpenSim's model of the subject), trc (points, as of markers), c3d (points and rotations of segments), bvh
         (skeleton and motion, for animation), bvh-lafan1, bvh-nokov, bvh-soma, bvh-xsens (a whole person, for GMR),
         motion-bids (a dataset, of which FILE is the folder); of persons and robots rosbag (for ROS 2, in a folder),
-        mcap, rrd (for rerun), urdf; of robots lerobot (a data set of episodes, in a folder), pkl (for GMR), npz,
-        csv-beyondmimic (for BeyondMimic).
+        mcap, rrd (for rerun), urdf; of robots lerobot (a data set of episodes, in a folder; joints in rad, not in units
+        of LeRobot's drivers), pkl (for GMR), npz, csv-beyondmimic (for BeyondMimic).
     names
         Only for .mot: write only the joint angles of the International Society of Biomechanics (isb), or only the
         coordinates of OpenSim's Rajagopal model (opensim). Without it both, the ISB's first.

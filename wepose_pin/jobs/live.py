@@ -87,8 +87,8 @@ class LiveJob:
         Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
     robot : NAME|FILE
         Send joint commands that let this robot follow the person (docs/live-robot.md): one of the names of `wepose
-        retarget --robot`, a URDF with a map beside it (ARM.urdf, ARM.toml), or the map. Bring the robot into the rest
-        posture of its map before.
+        retarget --robot`, a URDF with a robot map beside it (ARM.urdf, ARM.toml), or the robot map. Bring the robot
+        into the rest posture of its robot map before.
     arm
         Move only this arm of the robot, or both. Without it all arms that it has. Needs --robot.
     to : [HOST:]PORT

@@ -22,15 +22,16 @@ class RetargetJob:
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
     Robots by name: panda and ur5, both also on a table (panda_table, ur5_table), so101, baxter, tiago_dual, talos, g1,
-    alex (from the package example-robot-data). Any other by its URDF with a map beside it, a TOML that says which links
-    are shoulder, elbow and hand (docs/retargeting.md).
+    alex (from the package example-robot-data). Any other by its URDF with a robot map beside it, a TOML that says which
+    links are shoulder, elbow and hand (docs/retargeting.md).
 
     Parameters
     ----------
     result : RESULT
         Folder that `wepose track` wrote.
     robot : NAME|FILE
-        Move this robot: one of the names above, a URDF with a map beside it (ARM.urdf, ARM.toml), or the map.
+        Move this robot: one of the names above, a URDF with a robot map beside it (ARM.urdf, ARM.toml), or the robot
+        map itself.
     out : DIR
         Write trajectory.parquet and .csv, joint_trajectory.json and .yaml, summary.json, view.html and report.html to
         this folder.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ..diagnostics import Diagnostic, from_json
+from ..diagnostics import Diagnostic
 from ..errors import BadOption, WrongOption
 from . import Method, Progress, no_progress
 from .fields import field_values
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrackJob:
-    """Estimate the pose of a recording: segment orientations, joint centres, and joint angles of a mechanism.
+    """Estimate the pose of a person from a recording: segment orientations and joint centres, with their uncertainty.
+
+    Joint angles of a person are made of the result by `wepose angles` and `wepose export`.
 
     A recording of `wepose live` is tracked causally, with the subject and the method of that session, and gives the
     displayed poses again, bit-identical. With --subject or --method it is tracked as any other recording.
@@ -151,7 +153,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
     from ..readers import is_live_log, load_session, read_live_log
     from ..report import write_track_pages
     from ..subject import parse_subject
-    from ..tracking import track
+    from ..tracking import summarize, track
     from ..writers import write_result
     from ..writers.folder import result_folder
 
@@ -177,25 +179,25 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
             open_loop=job.open_loop,
             limits=job.limits,
         )
-        torques = None
+        summary, torques = summarize(tracked), None
         if job.torques:
             from ..angles.torques import pose_torques
 
             torques = pose_torques(tracked)
-        write_result(folder, tracked, job.covariance, recording.phases, torques, _provenance_of(job, provenance))
+        stated = _provenance_of(job, provenance)
+        write_result(folder, tracked, summary, job.covariance, recording.phases, torques, stated)
     failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 2 / 3)
-        failures = write_track_pages(job.out, tracked, view=job.view, report=job.report)
-    return TrackOutcome(tracked.summary(), failures, tracked=tracked)
+        failures = write_track_pages(job.out, summary, view=job.view, report=job.report)
+    return TrackOutcome(summary.content, failures, tracked=tracked)
 
 
 def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
     """In a memory that does not grow with the recording."""
     from ..filters import BEST
     from ..readers.session import SessionReader
-    from ..report import write_decimated_pages
-    from ..report.decimation import Decimator
+    from ..report import write_track_pages
     from ..report.track import MOST_FRAMES
     from ..tracking import TrackOptions, track_session
     from ..writers.chunks import ChunkWriter
@@ -205,25 +207,20 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
         progress("reading the times", 0.0)
         subject = _load_subject(job)
         reader = SessionReader(job.session, gaps=job.gaps, in_memory=False)
-        writer, decimator = ChunkWriter(folder, job.covariance), Decimator(len(reader.time))
+        writer = ChunkWriter(folder, len(reader.time), job.covariance)
         options = TrackOptions(job.method or BEST, causal=job.causal, open_loop=job.open_loop, limits=job.limits)
         for chunk in track_session(
             reader, subject, seconds=job.chunk_seconds, model=job.model, options=options, progress=progress
         ):
             writer.add(chunk)
-            decimator.add(chunk)
         progress("writing the result", 1.0)
-        writer.finish(reader.phases, _provenance_of(job, provenance))
-        summary = writer.accumulator.summary()
-    view_rate_hz = min(30.0, MOST_FRAMES / max(summary["duration_s"], 1e-3))
+        summary = writer.finish(reader.phases, _provenance_of(job, provenance))
+    view_rate_hz = min(30.0, MOST_FRAMES / max(summary.content["duration_s"], 1e-3))
     failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 1.0)
-        diagnostics = [from_json(each) for each in summary["diagnostics"]]
-        failures = write_decimated_pages(
-            job.out, decimator, reader.phases, diagnostics, view=job.view, report=job.report, fps=view_rate_hz
-        )
-    return TrackOutcome(summary, failures, view_rate_hz)
+        failures = write_track_pages(job.out, summary, view=job.view, report=job.report, fps=view_rate_hz)
+    return TrackOutcome(summary.content, failures, view_rate_hz)
 
 
 def _load_subject(job: TrackJob) -> Subject | None:

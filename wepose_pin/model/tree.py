@@ -291,10 +291,10 @@ def _inertia(inertial: Any, where: str) -> pin.Inertia:
         raise BadModel(f"{where}: mass {inertial.mass:g} kg, or its origin or inertia is NaN; a mass is above 0")
     # The constructor refuses what no body can have, as some URDFs state it; Pinocchio's own reader does not, nor do we:
     # `find_impossible_inertia` names it.
-    found = pin.Inertia.Zero()
-    found.mass, found.lever = float(inertial.mass), placement.translation
-    found.inertia = placement.rotation @ inertia @ placement.rotation.T
-    return found
+    total = pin.Inertia.Zero()
+    total.mass, total.lever = float(inertial.mass), placement.translation
+    total.inertia = placement.rotation @ inertia @ placement.rotation.T
+    return total
 
 
 def find_impossible_inertia(robot: Any) -> list[str]:

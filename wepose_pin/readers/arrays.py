@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from ..errors import BadData, MissingFile, UnknownColumn, one_of
+from ..errors import BadData, MissingFile, UnknownColumn, how_to_install, one_of
 from .mat5 import is_level_5, read_mat5
 from .tables import explain_size, limit_bytes
 
@@ -144,9 +144,7 @@ def import_h5py(path: Path) -> Any:
     try:
         import h5py
     except ImportError:
-        raise BadData(
-            f"{path}: is HDF5 (MATLAB's v7.3 is too), which h5py reads: pip install 'wepose-pin[hdf5]'"
-        ) from None
+        raise BadData(f"{path}: is HDF5 (MATLAB's v7.3 is too), which needs h5py: {how_to_install('h5py')}") from None
     return h5py
 
 

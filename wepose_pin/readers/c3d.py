@@ -116,7 +116,7 @@ def _open(path: Path) -> _C3d:
 def _read_parameters(raw: bytes, at: int, processor: int) -> dict[str, list[float] | list[str]]:
     """Read the parameters from a byte on; group:name → values."""
     groups: dict[int, str] = {}
-    found: list[tuple[int, str, list[float] | list[str]]] = []
+    parameters: list[tuple[int, str, list[float] | list[str]]] = []
     order = ">" if processor == MIPS else "<"
     while at + 2 < len(raw) and raw[at]:
         length, group = struct.unpack_from("bb", raw, at)
@@ -130,13 +130,13 @@ def _read_parameters(raw: bytes, at: int, processor: int) -> dict[str, list[floa
             shape = list(raw[at + 4 : at + 4 + rank])
             count = int(np.prod(shape, dtype=int)) if rank else 1
             data = raw[at + 4 + rank : at + 4 + rank + count * _TYPES.get(kind, 1)]
-            found.append((group, name, _parse_values(data, kind, shape, processor)))
+            parameters.append((group, name, _parse_values(data, kind, shape, processor)))
         if not offset:
             break
         if offset < 0:
             raise ValueError(f"{name} leads back")
         at += offset
-    return {f"{groups.get(group, '')}:{name}": values for group, name, values in found}
+    return {f"{groups.get(group, '')}:{name}": values for group, name, values in parameters}
 
 
 def _parse_values(data: bytes, kind: int, shape: list[int], processor: int) -> list[float] | list[str]:

@@ -51,10 +51,10 @@ def read_delsys(path: Path, use: str | None = None, rate_hz: float | None = None
         raise BadData(f"{path}: orientations of Delsys are not read; leave out data.use")
     lines = read_first_lines(path, MOST_LINES)
     units = {match["name"].strip(): match["unit"] for match in map(_LABEL.match, lines) if match}
-    found = _find_channels(lines)
-    if found is None:
+    by_sensor = _find_channels(lines)
+    if by_sensor is None:
         raise BadData(f"{path}: is no CSV of Delsys: no line of channels such as 'ACC X Time Series (s), ACC X (G)'")
-    at, separator = found
+    at, separator = by_sensor
     channels = _split(lines[at], separator)
     owners = _name_owners(_split(lines[at - 2], separator), len(channels)) if at > 1 else []
     body = path.read_bytes().split(b"\n")

@@ -49,6 +49,7 @@ _STATED_RATE = re.compile(r"(sampl\w*|frame|data)[ _]*(frequency|rate)[^0-9]{0,1
 # standing person is below.
 BLOCK_S, STATIC_GYRO, STATIC_ACCEL = 0.25, np.deg2rad(3.0), 0.4
 SHORTEST_STATIC_S = 1.0
+JOINED_S = 0.5  # static intervals nearer than this are one: a person twitches
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
 _YEAR_2000, _YEAR_2100 = 946_684_800.0, 4_102_444_800.0  # [s] since 1970
@@ -417,8 +418,8 @@ def _siblings(path: Path, format: str) -> list[Path]:
         same = [own if folder == own.absolute() else folder for folder in beside]
     else:
         same = [file for file in sorted(path.parent.iterdir()) if file.suffix == path.suffix and file.is_file()]
-    found = [file for file in same[: 10 * MOST_SIBLINGS] if file == path or detect_format(file) == format]
-    return found[:MOST_SIBLINGS] if path in found[:MOST_SIBLINGS] else [path]
+    siblings = [file for file in same[: 10 * MOST_SIBLINGS] if file == path or detect_format(file) == format]
+    return siblings[:MOST_SIBLINGS] if path in siblings[:MOST_SIBLINGS] else [path]
 
 
 def _read(path: Path, format: str, table: BodyTable) -> tuple[Device, list[str]]:
@@ -493,14 +494,14 @@ def _find_tables_beside(
     if others or own is None or not owner.startswith("?"):
         return {}
     same = [file for file in sorted(path.parent.iterdir()) if file.suffix == path.suffix and file.is_file()]
-    found = {own: _relative(path, folder)}
+    files = {own: _relative(path, folder)}
     for file in same[:MOST_SIBLINGS]:
         segment = body.guess_segment(file.stem)
-        if segment is not None and segment not in found:
+        if segment is not None and segment not in files:
             with contextlib.suppress(WeposeError):
                 if list(Rows(file).names) == list(names):
-                    found[segment] = _relative(file, folder)
-    return found
+                    files[segment] = _relative(file, folder)
+    return files
 
 
 def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[list[str], list[str]]:
@@ -548,7 +549,7 @@ def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[l
 
 
 def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
-    """Find the intervals [s] of at least `SHORTEST_STATIC_S` in which all sensors are static."""
+    """Find the intervals [s], of at least `SHORTEST_STATIC_S`, in which all sensors are static but for `JOINED_S`."""
     size = max(2, round(BLOCK_S * recording.rate_hz))
     blocks = len(recording) // size
     static = np.ones(blocks, dtype=bool)
@@ -564,7 +565,10 @@ def find_static_intervals(recording: Recording) -> list[tuple[float, float]]:
             )
         if sensor.gap is not None:
             static &= ~sensor.gap[: blocks * size].reshape(blocks, size).any(axis=1)
-    spans = [(float(recording.time[a * size]), float(recording.time[b * size - 1])) for a, b in find_runs(static)]
+    spans: list[tuple[float, float]] = []
+    for a, b in find_runs(static):
+        begin, end = float(recording.time[a * size]), float(recording.time[b * size - 1])
+        spans.append((spans.pop()[0] if spans and begin - spans[-1][1] < JOINED_S else begin, end))
     return [(first, last) for first, last in spans if last - first >= SHORTEST_STATIC_S - BLOCK_S]
 
 

@@ -108,11 +108,11 @@ def convert(path: Path, signal: str, values: np.ndarray, unit: str, column: str)
         The unit is none that is known.
     """
     known = GYRO_UNITS if signal == "gyro" else ACCEL_UNITS
-    found = guess_unit(signal, unit)
-    if found is None:
+    guess = guess_unit(signal, unit)
+    if guess is None:
         stated = f"'{unit}'" if unit else "no unit that it states"
         raise BadData(f"{path}: '{column}' is in {stated}; {one_of(known, unit)}")
-    return known[found] * values
+    return known[guess] * values
 
 
 def read_converted(path: Path, table: pl.DataFrame, signal: str, columns: Sequence[str], unit: str) -> np.ndarray:

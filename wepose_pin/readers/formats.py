@@ -96,8 +96,8 @@ def detect_format(path: Path) -> str | None:
         return "mvnx"
     if is_apdm(lines):
         return "apdm"
-    if suffix == ".csv" and (found := _detect_csv(path, lines)):
-        return found
+    if suffix == ".csv" and (detected := _detect_csv(path, lines)):
+        return detected
     if lines[0].startswith(("Timestamp (us),", "Time (s),")) and (
         "(deg/s)" in lines[0] or lines[0].endswith("W,X,Y,Z")
     ):

@@ -299,12 +299,12 @@ def _is_quat(value: Any) -> bool:
 
 def _json(path: Path, payload: bytes) -> dict[str, Any]:
     try:
-        found = json.loads(payload)
+        content = json.loads(payload)
     except (ValueError, RecursionError) as error:
         raise BadData(f"{path}: holds JSON that is none: {error}; the file is damaged") from error
-    if not isinstance(found, dict):
-        raise BadData(f"{path}: holds {str(found)[:40]!r} in place of an object; the file is damaged")
-    return found
+    if not isinstance(content, dict):
+        raise BadData(f"{path}: holds {str(content)[:40]!r} in place of an object; the file is damaged")
+    return content
 
 
 def _event(path: Path, payload: bytes) -> tuple[str, dict[str, Any]]:

@@ -45,7 +45,7 @@ def read_mat5(path: Path, most: int) -> dict[str, np.ndarray]:
     """
     content = path.read_bytes()
     order = "<" if content[126:128] == b"IM" else ">"
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     for element in _elements(memoryview(content)[HEADER:], order):
         inner = element
         if element.kind == _COMPRESSED:
@@ -53,8 +53,8 @@ def read_mat5(path: Path, most: int) -> dict[str, np.ndarray]:
             most -= len(unpacked)
             inner = next(_elements(memoryview(unpacked), order), _Element(0, element.data[:0]))
         if inner.kind == _MATRIX:
-            _walk("", inner.data, order, found, 0)
-    return found
+            _walk("", inner.data, order, arrays, 0)
+    return arrays
 
 
 def _unpacked(data: memoryview, most: int) -> bytes:
@@ -86,7 +86,7 @@ def _elements(data: memoryview, order: str) -> Iterator[_Element]:
         at += step
 
 
-def _walk(at: str, data: memoryview, order: str, found: dict[str, np.ndarray], depth: int, name: str = "") -> None:
+def _walk(at: str, data: memoryview, order: str, arrays: dict[str, np.ndarray], depth: int, name: str = "") -> None:
     """Collect the arrays of a matrix at the path `at`; `name` is that of a struct's field."""
     parts = _elements(data, order)
     flags, shape, own = (_numbers(next(parts, None), order) for _ in range(3))
@@ -101,14 +101,14 @@ def _walk(at: str, data: memoryview, order: str, found: dict[str, np.ndarray], d
             if element is None or element.kind != _MATRIX:
                 raise ValueError("a struct is cut off")
             if len(element.data):  # none: an empty field
-                _walk(where, element.data, order, found, depth + 1, field)
+                _walk(where, element.data, order, arrays, depth + 1, field)
     elif _FIRST_NUMERIC <= kind <= _LAST_NUMERIC and not int(flags[0]) & _COMPLEX:
         values = _numbers(next(parts, None), order)
         if len(values) != size:
             raise ValueError(f"an array of {size} numbers holds {len(values)}")
         array = values.reshape(shape.tolist(), order="F").squeeze()
         if array.ndim <= 2:
-            found[where] = array
+            arrays[where] = array
 
 
 def _fields(parts: Iterator[_Element], order: str) -> list[str]:

@@ -102,8 +102,8 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
             if label in SEGMENT_OF
         }
     if not values:
-        found = ", ".join(frames.segments[:12])
-        raise BadData(f"{path}: none of the upper body's segments, such as T8; there is: {found}")
+        listed = ", ".join(frames.segments[:12])
+        raise BadData(f"{path}: none of the upper body's segments, such as T8; there is: {listed}")
     return Device(
         "mvnx",
         make_table(frames.time, values),

@@ -129,10 +129,10 @@ def _chunk(file: int, end: int, leaf: _Leaf, rows: int, chunk: Any, where: str) 
         raise ValueError(f"{where} is said to hold {values} values, the row group {rows} rows")
     if at < (4 if values else 0) or size < 0 or at + size > end:
         raise ValueError(f"{where} is said to lie at {at} to {at + size}, the columns end at {end}")
-    until, found, unpacked = at + size, 0, 0
-    while found < values:
+    until, value_count, unpacked = at + size, 0, 0
+    while value_count < values:
         if at >= until:
-            raise ValueError(f"{where} is said to hold {values} values, its pages hold {found}")
+            raise ValueError(f"{where} is said to hold {values} values, its pages hold {value_count}")
         header, at = _page_header(file, at, until, where)
         kind, grown, packed = (_field(header, number, int, where) for number in (1, 2, 3))
         if not 0 <= packed <= until - at or grown < 0 or (not codec and grown != packed):
@@ -140,16 +140,16 @@ def _chunk(file: int, end: int, leaf: _Leaf, rows: int, chunk: Any, where: str) 
                 f"a page of {where} is said to take {packed} bytes, {grown} unpacked; there are {until - at}"
             )
         if kind == _DATA:
-            found += _count(_field(header, 5, dict, where), 1, values - found, where)
+            value_count += _count(_field(header, 5, dict, where), 1, values - value_count, where)
         elif kind == _DATA_V2:
             page = _field(header, 8, dict, where)
-            count = _count(page, 1, values - found, where)
+            count = _count(page, 1, values - value_count, where)
             _count(page, 2, count, where)
             if _field(page, 3, int, where) != count:
                 raise ValueError(f"a page of {where} is said to hold {count} values, in other than {count} rows")
             if _count(page, 5, packed, where) + _count(page, 6, packed, where) > min(packed, grown):
                 raise ValueError(f"a page of {where} is said to be shorter than its parts")
-            found += count
+            value_count += count
         elif kind == _DICTIONARY:
             _count(_field(header, 7, dict, where), 1, grown // max(leaf.width, 1), where)
         elif kind != _INDEX:

@@ -45,13 +45,13 @@ def read_phyphox(path: Path, use: str | None = None, rate_hz: float | None = Non
     if use == "orientation":
         raise BadData(f"{path}: the attitude of phyphox is not read; leave out data.use")
     with open_folder(path, "recording of a phone") as files:
-        found = _find_signals(files)
-        lacking = [name for name in ("gyro", "accel") if name not in found]
+        signals = _find_signals(files)
+        lacking = [name for name in ("gyro", "accel") if name not in signals]
         if lacking:
             names = " and ".join({"gyro": "Gyroscope x (rad/s)", "accel": "Acceleration x (m/s^2)"}[k] for k in lacking)
             raise BadData(f"{path}: no file with Time (s) and {names}; export both sensors, into one folder or zip")
         read = {}
-        for signal, (file, columns) in found.items():
+        for signal, (file, columns) in signals.items():
             table = read_table(file)
             time = read_columns(table, table.columns[:1], str(file), str(file))[:, 0]
             read[signal] = time, read_converted(file, table, signal, columns, split_unit(columns[0])[1])
@@ -66,12 +66,12 @@ def read_phyphox(path: Path, use: str | None = None, rate_hz: float | None = Non
 
 def _find_signals(files: dict[str, Path]) -> dict[str, tuple[Path, list[str]]]:
     """Find the file and the columns of gyro and accel, the axes of which follow on a time."""
-    found: dict[str, tuple[Path, list[str]]] = {}
+    by_signal: dict[str, tuple[Path, list[str]]] = {}
     for file in [file for name, file in files.items() if name.lower().endswith(".csv")][:MOST_FILES]:
         names = read_layout(file).names
         if not names or not _TIME.fullmatch(names[0].strip()):
             continue
         for signals in group_columns(names).values():
             for signal, columns in signals.items():
-                found.setdefault(signal, (file, columns))
-    return found
+                by_signal.setdefault(signal, (file, columns))
+    return by_signal

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import BadData
+from ..errors import BadData, how_to_install
 from ..model import load_table
 from .device import Device, check_measured, make_device
 
@@ -69,7 +69,7 @@ def _read_messages(path: Path) -> dict[tuple[str, str], list[list[float]]]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise BadData(f"{path}: is a ROS bag, which rosbags reads: pip install 'wepose-pin[ros]'") from None
+        raise BadData(f"{path}: is a ROS bag, which needs rosbags: {how_to_install('rosbags')}") from None
     frames: dict[tuple[str, str], list[list[float]]] = {}
     first = 0
     try:

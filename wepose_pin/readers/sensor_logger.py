@@ -79,8 +79,8 @@ def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None
         (time, quat), kind = signals["Orientation"], "orientation"
         values = {"orientation": quat}
     else:
-        found = ", ".join(signals) or "none of its files"
-        raise BadData(f"{path}: no Gyroscope with TotalAcceleration, and no Orientation; there is: {found}")
+        listed = ", ".join(signals) or "none of its files"
+        raise BadData(f"{path}: no Gyroscope with TotalAcceleration, and no Orientation; there is: {listed}")
     folder = path if path.is_dir() or path.suffix.lower() in (".zip", ".json") else path.absolute().parent
     label = folder.stem if folder.is_file() else folder.absolute().name
     clock = np.arange(len(time)) / rate_hz if rate_hz else time

@@ -307,9 +307,9 @@ class SessionReader:
             elif "time_unit" in keys and rate_hz is not None:
                 raise BadSession(f"{keys.at('time_unit')}: {_explain_unused('time_unit')}; leave it out")
         if (name is None) == (rate_hz is None):
-            found = "neither" if name is None else "both"
+            text = "neither" if name is None else "both"
             raise BadSession(
-                f"{own.at('time')} or rate_hz is needed, one of the two, and {found} is there: a column of times, "
+                f"{own.at('time')} or rate_hz is needed, one of the two, and {text} is there: a column of times, "
                 f"or a rate"
             )
         offset = keys.number("offset_s", 0.0) or 0.0

@@ -82,17 +82,17 @@ def _choose_columns(
     path: Path, table: pl.DataFrame, kinds: dict[str, dict[str, str]], kind: str
 ) -> dict[str, list[str]] | None:
     """Choose the columns by signal, the scalar of a quaternion first; None: the device has not what is wanted."""
-    found = {name: [axes[axis] for axis in AXES["accel"] if axis in axes] for name, axes in kinds.items()}
+    columns = {name: [axes[axis] for axis in AXES["accel"] if axis in axes] for name, axes in kinds.items()}
     if kind == "orientation":
         quat = kinds.get("Quat", {})
         return {kind: [quat[axis] for axis in "wxyz"]} if set(quat) == set("wxyz") else None
-    accels = [name for name in ("Accel_LN", "Accel_WR") if len(found.get(name, ())) == 3]
-    if len(found.get("Gyro", ())) < 3 or not accels:
+    accels = [name for name in ("Accel_LN", "Accel_WR") if len(columns.get(name, ())) == 3]
+    if len(columns.get("Gyro", ())) < 3 or not accels:
         return None
-    accel = found[accels[0]]
+    accel = columns[accels[0]]
     if len(accels) == 2 and (np.abs(read_columns(table, accel, str(path), str(path))) > LOW_NOISE_RANGE).any():
-        accel = found["Accel_WR"]
-    return {"gyro": found["Gyro"], "accel": accel}
+        accel = columns["Accel_WR"]
+    return {"gyro": columns["Gyro"], "accel": accel}
 
 
 def _read_time(path: Path, table: pl.DataFrame, name: str) -> np.ndarray:

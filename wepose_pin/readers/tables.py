@@ -108,8 +108,8 @@ def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str, first_r
             right = f"write decimals with a point: {text.replace(',', '.', 1)}" if numeric else "it must be a number"
             raise BadData(f"{file}: column '{name}' holds text in row {first_row + row + 1}: '{text[:40]}'; {right}")
     elif not series.dtype.is_numeric() and series.dtype != pl.Null:
-        found = "true and false" if series.dtype == pl.Boolean else f"values of type {series.dtype}"
-        raise BadData(f"{file}: column '{name}' holds {found}; it must hold numbers")
+        content = "true and false" if series.dtype == pl.Boolean else f"values of type {series.dtype}"
+        raise BadData(f"{file}: column '{name}' holds {content}; it must hold numbers")
     numbers = series.cast(pl.Float64)
     if numbers.is_infinite().any():
         row = int(numbers.is_infinite().arg_max() or 0)
@@ -229,11 +229,11 @@ def explain_size(path: Path) -> str:
 
 def _check_parquet(path: Path) -> Contents:
     """Read the contents of a Parquet file before polars does: some damaged files make polars end the process."""
-    found = read_contents(path)
-    if max(8 * found.rows, sum(found.sizes.values())) > limit_bytes(path):
-        rows, width = found.rows, len(found.sizes)
+    contents = read_contents(path)
+    if max(8 * contents.rows, sum(contents.sizes.values())) > limit_bytes(path):
+        rows, width = contents.rows, len(contents.sizes)
         raise BadData(f"{path}: says that it holds {rows} rows of {width} columns, {explain_size(path)}")
-    return found
+    return contents
 
 
 def _check_table(path: Path) -> None:

@@ -141,7 +141,7 @@ def find_ring(data: Path) -> list[RingFiles]:
 
     Which of two IMU files is that of the loose mounts their names say (``nonrigid``, ``loose`` or ``foam``).
     """
-    found = []
+    trials = []
     for folder, files in _by_folder(data).items():
         optical = [file for file, names in files.items() if {"seg1_quat_w", "seg1_marker1_x"} <= names]
         imus = [file for file, names in files.items() if {"seg1_gyr_x", "seg1_acc_x"} <= names]
@@ -149,10 +149,10 @@ def find_ring(data: Path) -> list[RingFiles]:
         rigid = [file for file in imus if file not in loose]
         if len(optical) == 1 and len(rigid) <= 1 and len(loose) <= 1 and imus:
             imu = dict(zip(RING_MOUNTS, ([*rigid, None][0], [*loose, None][0]), strict=True))
-            found.append(
+            trials.append(
                 RingFiles(folder, optical[0], {mount: file for mount, file in imu.items() if file is not None})
             )
-    return found
+    return trials
 
 
 def find_ur5(data: Path) -> list[Ur5Files]:
@@ -165,21 +165,21 @@ def find_ur5(data: Path) -> list[Ur5Files]:
     for files in _by_folder(data).values():
         imus += [f for f, names in files.items() if {"gyr_x", "gyr_y", "gyr_z", "acc_x", "acc_y", "acc_z"} <= names]
         encoders += [f for f, names in files.items() if {"TIME", "QUATERNION_0", "QUATERNION_3"} <= names]
-    found = []
+    trials = []
     for imu in imus:
         same = [e for e in encoders if e.parent.name == imu.parent.name and imu.stem.startswith(e.stem)]
         if same:  # the nearest of several data sets
             nearest = max(same, key=lambda e: sum(a == b for a, b in zip(e.parts, imu.parts, strict=False)))
-            found.append(Ur5Files(imu.parent.name, nearest.stem, imu, nearest))
-    return found
+            trials.append(Ur5Files(imu.parent.name, nearest.stem, imu, nearest))
+    return trials
 
 
 def _by_folder(data: Path) -> dict[Path, dict[Path, set[str]]]:
     """List folder → CSV file → its columns, of all below a folder, in the order of their names."""
-    found: dict[Path, dict[Path, set[str]]] = {}
+    folders: dict[Path, dict[Path, set[str]]] = {}
     for file in sorted(data.rglob("*.csv")):
-        found.setdefault(file.parent, {})[file] = _column_names(file)
-    return found
+        folders.setdefault(file.parent, {})[file] = _column_names(file)
+    return folders
 
 
 def _column_names(path: Path) -> set[str]:

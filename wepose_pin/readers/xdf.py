@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadData
+from ..errors import BadData, how_to_install
 from ..model import load_table
 from ..recording.limits import STANDARD_GRAVITY
 from .device import ACCEL_UNITS, Device, check_measured, convert, join_signals, make_device
@@ -93,7 +93,7 @@ def _load(path: Path) -> list[dict[str, Any]]:
     try:
         import pyxdf
     except ImportError:
-        raise BadData(f"{path}: is an XDF, which pyxdf reads: pip install 'wepose-pin[xdf]'") from None
+        raise BadData(f"{path}: is an XDF, which needs pyxdf: {how_to_install('pyxdf')}") from None
     with path.open("rb") as file:
         if not file.read(4).startswith(MAGIC):
             raise BadData(f"{path}: is no XDF: it does not begin with 'XDF:'")

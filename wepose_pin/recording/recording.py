@@ -156,6 +156,7 @@ class Recording:
             raise BadPhase(
                 f"{self.where()}: phases.{name} is needed here and missing; add [phases] {name} = "
                 f"[[from, to]] in seconds; {one_of(self.phases, name)}"
+                f"{'; without joined hands: --protocol free' if name == 'clasp' else ''}"
             )
         return intervals
 

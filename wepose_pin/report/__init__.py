@@ -10,14 +10,12 @@ _WHERE = {
     "render_calibration_report": "calibration",
     "render_track_report": "track",
     "write_calibration_page": "calibration",
-    "write_decimated_pages": "pages",
     "write_track_pages": "pages",
 }
 __all__ = [
     "render_calibration_report",
     "render_track_report",
     "write_calibration_page",
-    "write_decimated_pages",
     "write_track_pages",
 ]
 

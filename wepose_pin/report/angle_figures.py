@@ -29,16 +29,16 @@ def draw_repetitions(movements: Sequence[Movement]) -> Picture | None:
     """The angle by which repetitions were found over time, a row a session; None where a phase marks them in all."""
     rows = []
     for k, movement in enumerate(movements):
-        found = movement.repetitions
-        if found.source not in list_angles(movement.angles):
+        repetitions = movement.repetitions
+        if repetitions.source not in list_angles(movement.angles):
             continue
-        joint, place = list_angles(movement.angles)[found.source]
+        joint, place = list_angles(movement.angles)[repetitions.source]
         each, time = movement.angles[joint], movement.angles.time
-        n = f"n = {len(found.spans)}" if len(found.spans) else "no repetitions"
-        title = f"{movement.name}: {plain(found.source)} [°], {n}"
+        n = f"n = {len(repetitions.spans)}" if len(repetitions.spans) else "no repetitions"
+        title = f"{movement.name}: {plain(repetitions.source)} [°], {n}"
         panel = Panel(title, TIME, x=(float(time[0]), float(time[-1])))
         for parity, css in ((0, "phase"), (1, "band")):
-            panel.spans(found.spans[parity::2], css)
+            panel.spans(repetitions.spans[parity::2], css)
         panel.line(
             *envelope(time, np.degrees(np.where(each.hidden(place), np.nan, each.values[:, place]))), session_style(k)
         )

@@ -76,17 +76,17 @@ def _describe(movements: Sequence[Movement]) -> dict[str, Any]:
 def _tabulate_sessions(movements: Sequence[Movement]) -> Table:
     rows = []
     for movement in movements:
-        time, found = movement.angles.time, movement.repetitions
+        time, repetitions = movement.angles.time, movement.repetitions
         lasting = compute_statistics(movement.durations, np.full(len(movement.durations), np.nan))
         rows.append(
             [
                 movement.name,
                 intervals([(float(time[0]), float(time[-1]))]),
-                plain(found.source),
-                str(len(found.spans)),
+                plain(repetitions.source),
+                str(len(repetitions.spans)),
                 f"{_pair(lasting.mean, lasting.sd, 2)} s" if lasting.n else "",
-                f"{found.cmc:.2f}" if np.isfinite(found.cmc) else "",
-                str(found.left_out or ""),
+                f"{repetitions.cmc:.2f}" if np.isfinite(repetitions.cmc) else "",
+                str(repetitions.left_out or ""),
             ]
         )
     header = ["session", "time", "repetitions by", "n", "duration", "CMC", "left out"]

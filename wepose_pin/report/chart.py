@@ -280,7 +280,7 @@ def resolve_style(svg: str) -> str:
     style = svg[start:end].partition("@media")[0].replace(" vector-effect: non-scaling-stroke;", "")
     colours = dict(re.findall(r"(--\w+): (#\w+);", style))
     style = re.sub(r"--\w+: #\w+;\s*", "", style)
-    style = re.sub(r"var\((--\w+)\)", lambda found: colours[found[1]], style)
+    style = re.sub(r"var\((--\w+)\)", lambda match: colours[match[1]], style)
     lines = [line if _UNSCALED.match(line) else _STROKE.sub(_scale_stroke, line) for line in style.split("\n")]
     return svg[:start] + "\n".join(lines) + svg[end:]
 
@@ -289,9 +289,9 @@ _UNSCALED = re.compile(r"\.chart (text|\.grid|\.axes|\.hatch )")
 _STROKE = re.compile(r"(stroke-(?:width|dasharray): )([\d. px]+)")
 
 
-def _scale_stroke(found: re.Match[str]) -> str:
-    numbers = " ".join(f"{_UNITS_A_PIXEL * float(number):g}" for number in re.findall(r"[\d.]+", found[2]))
-    return found[1] + numbers
+def _scale_stroke(match: re.Match[str]) -> str:
+    numbers = " ".join(f"{_UNITS_A_PIXEL * float(number):g}" for number in re.findall(r"[\d.]+", match[2]))
+    return match[1] + numbers
 
 
 def envelope(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,8 +9,8 @@ import numpy as np
 from ..angles import Angles, JointAngles, group_sides, joint_angles, summary
 from ..errors import BadData
 from ..tracking import TrackedRecording
+from ..tracking.measures import finite_median, has_stated_mounts
 from .chart import Picture
-from .measures import finite_median, has_stated_mounts
 from .page import Table
 from .track_figures import draw_over_time
 from .words import plain, plural, whole

@@ -17,9 +17,9 @@ from ..angles import joint_angles
 from ..documents import whole_file, whole_folder
 from ..errors import BadData, UnknownKey, one_of
 from ..kinematics import PosedBody
+from ..tracking.measures import measure_tips
 from .chart import Picture
 from .joints import draw_joint_angles
-from .measures import measure_tips
 from .page import load_template
 from .track_figures import draw_paths, draw_reach, find_sides, group_tips
 

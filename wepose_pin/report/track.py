@@ -11,27 +11,23 @@ from ..diagnostics import INFO, Diagnostic, lines
 from ..kinematics import compute_axis_std, compute_orientation_residuals
 from ..model import BodyTable
 from ..recording import Recording, Sensor
-from ..tracking import TrackedRecording
+from ..tracking import TrackedRecording, TrackSummary
 from ..tracking.error_budget import ErrorBudget, group_by_source
-from .decimation import Totals, compute_totals
-from .joints import build_joint_angles_section
-from .measures import (
+from ..tracking.measures import (
     Budget,
     Measures,
     Signal,
     TipMotion,
-    compute_heading_uncertainties,
     compute_joint_heading_stds,
     find_samples_after_start,
     finite_max,
     finite_median,
     has_stated_mounts,
     longest_run_s,
-    measure_hinge,
-    measure_tips,
 )
+from ..tracking.pose_diagnostics import GRAVITY_OFF, describe_heading_remedy
+from .joints import build_joint_angles_section
 from .page import Page, Table
-from .track_diagnostics import GRAVITY_OFF, describe_heading_remedy, diagnose_pose
 from .track_figures import (
     draw_headings,
     draw_noise,
@@ -51,52 +47,31 @@ MOST_FRAMES = 5000  # of the 3D view
 LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 
 
-def render_track_report(
-    tracked: TrackedRecording,
-    *,
-    view: str | None = None,
-    totals: Totals | None = None,
-    failures: list[str] | None = None,
-) -> str:
+def render_track_report(summary: TrackSummary, *, view: str | None = None, failures: list[str] | None = None) -> str:
     """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic.
 
     Its size does not grow with the recording's length.
 
     Parameters
     ----------
-    tracked : of `track`
+    summary : of `summarize`
     view : the page of `pose_html`, embedded up to `LARGEST_VIEW`; None: a view is made here
-    totals : of all samples, if `tracked` was decimated by `Decimator`; None: those of `tracked`
     failures : gets a line for each section that cannot be made; the page has the line in place of the section
     """
-    recording = tracked.recording
-    totals = totals or compute_totals(tracked)
-    signals = totals.signals
-    budgets = compute_heading_uncertainties(tracked)
-    table = tracked.model.table
-    measured = {name: measure_hinge(tracked.pose, table, name, tracked.subject) for name in table.hinges}
-    hinges = {name: motion for name, motion in measured.items() if motion is not None}
-    tips = {
-        name: tip._replace(peak_speed=totals.peak_speed[name])
-        for name, tip in measure_tips(tracked.pose, recording.rate_hz, table).items()
-    }
-    measures = Measures(signals, budgets, hinges, tips)
-    page = Page(TEMPLATE, f"Motion of {recording.name or 'a recording'}", failures)
-    page.add(
-        "first",
-        lambda: _build_diagnostics_section(diagnose_pose(tracked, measures, totals.diagnostics), table),
-        name="Diagnostics",
-    )
-    page.add("short", lambda: _build_summary_section(tracked, totals, budgets), name="In short")
-    page.add("recorded", lambda: _build_recorded_section(recording, totals, table), "What was recorded")
+    tracked, measures = summary.decimator.decimated
+    table, signals, budgets = tracked.model.table, measures.signals, measures.budgets
+    page = Page(TEMPLATE, f"Motion of {tracked.recording.name or 'a recording'}", failures)
+    page.add("first", lambda: _build_diagnostics_section(summary.diagnostics, table), name="Diagnostics")
+    page.add("short", lambda: _build_summary_section(tracked, measures), name="In short")
+    page.add("recorded", lambda: _build_recorded_section(tracked.recording, measures, table), "What was recorded")
     page.add("noise", lambda: _build_noise_section(signals), "Noise and bias")
     page.add("drift", lambda: _build_drift_section(tracked, budgets), "Drift of the headings")
-    page.add("tips", lambda: _build_tips_section(tracked, tips), f"The {_name_tips(table)}")
+    page.add("tips", lambda: _build_tips_section(tracked, measures.tips), f"The {_name_tips(table)}")
     page.add("budget", lambda: _build_error_budget_section(tracked), "What the ± of the points is made of")
     page.add("angles", lambda: build_joint_angles_section(tracked), "Joint angles")
     page.add("view", lambda: _build_view_section(tracked, view), "The motion in 3D")
     page.add("run", lambda: _build_run_section(tracked), "What was run")
-    return page.html(f"Motion of {recording.name}" if recording.name else "Motion")
+    return page.html(f"Motion of {tracked.recording.name}" if tracked.recording.name else "Motion")
 
 
 # The sections: the values that the macros of the template take --------------------------------------------------------
@@ -108,28 +83,28 @@ def _build_diagnostics_section(diagnostics: Sequence[Diagnostic], table: BodyTab
     return {"has_warning": has_warning, "entries": lines(diagnostics, titled=True), "checked": checked}
 
 
-def _build_summary_section(tracked: TrackedRecording, totals: Totals, budgets: Mapping[str, Budget]) -> dict[str, Any]:
+def _build_summary_section(tracked: TrackedRecording, measures: Measures) -> dict[str, Any]:
     recording = tracked.recording
     after_start = find_samples_after_start(tracked)
     headings = {
         plain(joint): float(np.degrees(finite_max(std[after_start])))
-        for joint, std in compute_joint_heading_stds(budgets, tracked.model).items()
+        for joint, std in compute_joint_heading_stds(measures.budgets, tracked.model).items()
     }
     stds = {name: compute_axis_std(cov[after_start]) for name, cov in tracked.pose.point_cov.items()}
     return {
         "duration": _format_duration(float(recording.time[-1] - recording.time[0])),
-        "rate_hz": totals.rate_hz,
-        "sensors": len(totals.signals),
+        "rate_hz": measures.rate_hz,
+        "sensors": len(measures.signals),
         "worst": max(headings.items(), key=lambda item: item[1]) if headings else None,
         "tips": {name: 1e3 * finite_median(stds[name]) for name in tracked.model.table.paths if name in stds},
         "root": _name_root(tracked.model.table),
         "lengths": plain(tracked.subject.note or tracked.subject.name),
         "shown_samples": len(recording),
-        "samples": totals.samples,
+        "samples": measures.samples,
     }
 
 
-def _build_recorded_section(recording: Recording, totals: Totals, table: BodyTable) -> dict[str, Any]:
+def _build_recorded_section(recording: Recording, measures: Measures, table: BodyTable) -> dict[str, Any]:
     rows = [
         [
             plain(name),
@@ -140,7 +115,7 @@ def _build_recorded_section(recording: Recording, totals: Totals, table: BodyTab
             f"{100 * float(signal.static.mean()):.0f} %" if signal.static is not None else "not measured",
             f"{longest_run_s(~signal.static, recording.rate_hz):.0f} s" if signal.static is not None else "",
         ]
-        for name, signal in totals.signals.items()
+        for name, signal in measures.signals.items()
     ]
     header = [
         "sensor",
@@ -151,16 +126,19 @@ def _build_recorded_section(recording: Recording, totals: Totals, table: BodyTab
         "static",
         "longest motion without static phase",
     ]
-    low, high = (f"{step:.2f}" for step in totals.steps_ms)
+    low, high = (f"{step:.2f}" for step in measures.steps_ms)
     return {
-        "samples": totals.samples,
-        "rate_hz": totals.rate_hz,
+        "samples": measures.samples,
+        "rate_hz": measures.rate_hz,
         "begin": recording.time[0],
         "end": recording.time[-1],
         "step": low if low == high else f"{low} to {high}",
         "phases": [f"{name} {intervals(spans)}" for name, spans in recording.phases.items()],
         "picture": draw_timeline(
-            recording.time, totals.signals, recording.phases, {name: line_style(name, table) for name in totals.signals}
+            recording.time,
+            measures.signals,
+            recording.phases,
+            {name: line_style(name, table) for name in measures.signals},
         ),
         "sensors": Table(header, rows),
     }
@@ -188,9 +166,9 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
     worst_sample = int(np.argmax(stds[worst]))
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     fastest = max(growth, key=growth.__getitem__) if growth else None
-    found = tracked.correction
-    has_clasp = found is not None and (found.gap_rms_mm is not None or bool(found.found_clasps))
-    has_accelerations = found is not None and bool(found.joint_accelerations)
+    correction = tracked.correction
+    has_clasp = correction is not None and (correction.gap_rms_mm is not None or bool(correction.found_clasps))
+    has_accelerations = correction is not None and bool(correction.joint_accelerations)
     segments = [
         [
             plain(name),

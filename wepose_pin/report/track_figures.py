@@ -9,8 +9,8 @@ import numpy as np
 
 from ..model import ROOT, BodyTable
 from ..recording.gaps import find_runs
+from ..tracking.measures import Signal, TipMotion, finite_max
 from .chart import WIDTH, Chart, Key, Panel, Picture, category_rows, envelope
-from .measures import Signal, TipMotion, finite_max
 from .words import listed, plain, plural
 
 TIME = "time in the recording [s]"

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from ..arguments import NonNegative
-from ..errors import WeposeError
+from ..errors import WeposeError, how_to_install
 from .collision import NEAR, CollisionModel, NearPairs
 from .limits import compute_acceleration_bounds, compute_separation_bounds, reduce_acceleration_limits
 from .objective import add_arm_tasks
@@ -151,7 +151,7 @@ class QpController:
         try:
             import daqp
         except ImportError:
-            raise WeposeError("retargeting needs daqp: pip install 'wepose-pin[retarget]'") from None
+            raise WeposeError(f"retargeting needs daqp: {how_to_install('daqp')}") from None
         self._solve = daqp.solve
         robot, p = self.robot, self.params
         self.data: Any = robot.model.createData()

@@ -15,7 +15,8 @@ from ..recording import Recording
 from ..subject import Subject
 from .options import TrackOptions
 from .session import CHUNK_S, LARGE, SMOOTHER_CHUNK_S, track_session
-from .tracked import SummaryAccumulator, TrackedRecording
+from .summary import SummaryAccumulator, TrackSummary, summarize
+from .tracked import TrackedRecording
 from .tracker import Tracker, track_chunks
 
 __all__ = [
@@ -24,8 +25,10 @@ __all__ = [
     "SMOOTHER_CHUNK_S",
     "SummaryAccumulator",
     "TrackOptions",
+    "TrackSummary",
     "TrackedRecording",
     "Tracker",
+    "summarize",
     "track",
     "track_chunks",
     "track_session",

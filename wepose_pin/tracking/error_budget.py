@@ -7,15 +7,12 @@ the lengths.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..alignment import compute_soft_tissue_covariances
 from ..kinematics import compute_point_covariances
-
-if TYPE_CHECKING:
-    from .tracked import TrackedRecording
+from .tracked import TrackedRecording
 
 PERIOD_S = 1.0  # [s] from one sample to the next
 SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES = "soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle"

@@ -59,22 +59,22 @@ def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
     MissingFile
         Nothing of them does.
     """
-    found = {}
+    experiments = {}
     paths = sorted((data / "broad").glob("*.mat"))
     authors = data / "wepose_hr" / "prova_HR.txt"
     if paths:
-        found["BROAD"] = [
+        experiments["BROAD"] = [
             Job("BROAD", path.stem, _broad, (path, n == 0)) for n, path in enumerate(paths[: 2 if quick else None])
         ]
     if authors.is_file():
-        found["the authors' trial"] = [
+        experiments["the authors' trial"] = [
             Job("the authors' trial", f"{begin:g} to {end:g} s", _authors, (authors, (begin, end)))
             for begin, end in AUTHORS_HALVES[: 1 if quick else None]
         ]
     rings = find_ring(data)[: 1 if quick else None]
     for mount, bias in product(RING_MOUNTS, ("", ", bias unknown")):
         name = f"RING, {mount} mounts{bias}"
-        found[name] = [
+        experiments[name] = [
             Job(
                 name,
                 segment if len(rings) == 1 else f"{ring.folder.name} {segment}",
@@ -87,21 +87,21 @@ def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
         ]
     for mount in RING_MOUNTS:
         name = f"RING, link lengths, {mount} mounts"
-        found[name] = [
+        experiments[name] = [
             Job(name, ring.folder.name, _compare_links, (ring, mount)) for ring in rings if mount in ring.imu
         ]
     ur5 = [files for files in find_ur5(data) if (files.recording, files.sensor) not in UR5_EXCLUDED]
-    found["UR5"] = [
+    experiments["UR5"] = [
         Job("UR5", f"{files.recording} {files.sensor}", _ur5, (files, n == 0))
         for n, files in enumerate(ur5[: 1 if quick else None])
     ]
-    found = {name: jobs for name, jobs in found.items() if jobs}
-    if not found:
+    experiments = {name: jobs for name, jobs in experiments.items() if jobs}
+    if not experiments:
         raise MissingFile(
             f"{data}: neither broad/*.mat nor wepose_hr/prova_HR.txt, nor files with the columns of RING or UR5 in it; "
             f"see docs/validation.md"
         )
-    return found
+    return experiments
 
 
 def _broad(experiment: str, name: str, path: Path, first: bool) -> list[Result]:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..diagnostics import Diagnostic
-from ..errors import BadData, BadOption, ExistingOutput
+from ..errors import BadData, BadOption, ExistingOutput, how_to_install
 from ..kinematics import compute_link_poses, find_known_links, solve_configuration
 from .motion import Motion, find_measured_points, resample_evenly
 
@@ -35,7 +35,7 @@ def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
     try:
         import ezc3d
     except ImportError:
-        raise BadOption("--format c3d: needs ezc3d, which is not installed: pip install 'wepose-pin[export]'") from None
+        raise BadOption(f"--format c3d: needs ezc3d: {how_to_install('ezc3d')}") from None
     motion, diagnostics = resample_evenly(motion)
     points = find_measured_points(motion)
     n = len(motion.pose.time)

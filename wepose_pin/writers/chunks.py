@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,8 @@ import polars as pl
 
 from ..errors import ExistingOutput
 from ..kinematics import build_pose_table
-from ..tracking import SummaryAccumulator, TrackedRecording
+from ..recording import Intervals
+from ..tracking import SummaryAccumulator, TrackedRecording, TrackSummary
 from .result import JOINTS, build_joint_table, write_about, write_table
 
 ROW_GROUP = 50_000  # rows that are put together at a time
@@ -20,13 +21,13 @@ ROW_GROUP = 50_000  # rows that are put together at a time
 class ChunkWriter:
     """`write_result`, a chunk at a time: a part of each table, made one at the end.
 
-    Attributes
+    Parameters
     ----------
-    accumulator : of the summary
+    samples : of the whole recording
     """
 
-    def __init__(self, folder: Path, covariance: bool = False) -> None:
-        self.accumulator = SummaryAccumulator()
+    def __init__(self, folder: Path, samples: int, covariance: bool = False) -> None:
+        self._accumulator = SummaryAccumulator(samples)
         self._folder, self._covariance = folder, covariance
         self._parts = {name: folder / f"{name}.parts" for name in ("pose.parquet", JOINTS)}
         for parts in self._parts.values():
@@ -46,15 +47,17 @@ class ChunkWriter:
         if chunk.joints:
             write_table(self._parts[JOINTS] / name, build_joint_table(chunk.pose))
         self._seen += len(chunk.time)
-        self.accumulator.add(chunk)
+        self._accumulator.add(chunk)
 
-    def finish(self, phases: Mapping[str, Sequence[tuple[float, float]]], provenance: Mapping[str, Any]) -> None:
-        """Write the other files."""
+    def finish(self, phases: Mapping[str, Intervals], provenance: Mapping[str, Any]) -> TrackSummary:
+        """Write the other files; return the summary."""
         for name, parts in self._parts.items():
             if any(parts.iterdir()):
                 _concatenate(parts, self._folder / name)
             shutil.rmtree(parts)
-        write_about(self._folder, self.accumulator.last, self.accumulator.summary(), phases, provenance)
+        summary = self._accumulator.finish()
+        write_about(self._folder, self._accumulator.last, summary.content, phases, provenance)
+        return summary
 
 
 def _concatenate(parts: Path, path: Path) -> None:

@@ -165,8 +165,8 @@ def export(
     --------
     >>> wp.export(result, "circles.mot").format
     'mot'
-    >>> wp.export("result", "circles.csv", rate_hz=50.0).diagnostics
-    []
+    >>> [each.place for each in wp.export("result", "circles.csv", rate_hz=50.0).diagnostics]  # near gimbal lock
+    ['left_shoulder', 'right_shoulder']
     """
     check_arguments(export, locals())
     results = [result] if isinstance(result, Result) else list(result)

@@ -18,7 +18,7 @@ import numpy as np
 import polars as pl
 
 from .. import __version__
-from ..angles import joint_angles
+from ..angles import Angles, diagnose_lock, joint_angles
 from ..diagnostics import Diagnostic
 from ..documents import whole_folder
 from ..errors import BadData, BadOption, ExistingOutput
@@ -36,7 +36,8 @@ its origin midway between the hips, which stay in place. Joint angles are those 
 Biomechanics. How a column is called and what it holds is in the channels.tsv beside it.
 """
 _HEADER = ("name", "component", "type", "tracked_point", "units", "sampling_frequency", "reference_frame")
-_TYPES = ("ACCEL", "ANGACCEL", "GYRO", "JNTANG", "LATENCY", "MAGN", "ORNT", "POS", "VEL")  # that motion.json counts
+# That motion.json counts.
+_TYPES = ("ACCEL", "ANGACCEL", "GYRO", "JNTANG", "LATENCY", "MAGN", "MISC", "ORNT", "POS", "VEL")
 _FRAME = "W"
 
 
@@ -116,7 +117,8 @@ def write_motion_bids(
             f"{out / folder / stem}_motion.tsv: exists; --force replaces it, --bids-name names another"
         )
     participants = _add_participant(out / _PARTICIPANTS, f"sub-{name.entities['sub']}")
-    channels = list(_list_channels(motion))
+    angles = joint_angles(motion.pose)
+    channels = list(_list_channels(motion, angles))
     with whole_folder(out, force or exists) as partial:
         files = partial / folder
         files.mkdir(parents=True)
@@ -132,10 +134,10 @@ def write_motion_bids(
         if not exists:
             _write_json(partial / _DESCRIPTION, _describe_dataset(motion))
             (partial / "README.md").write_text(_README.format(version=__version__), encoding="utf-8")
-    return diagnose_gaps(motion)
+    return diagnose_gaps(motion) + diagnose_lock(angles)
 
 
-def _list_channels(motion: Motion) -> Iterator[Channel]:
+def _list_channels(motion: Motion, angles: Angles) -> Iterator[Channel]:
     """Time, orientations, positions and joint angles of a motion."""
     pose = motion.pose
     yield Channel("latency", _MISSING, "LATENCY", _MISSING, "s", pose.time - pose.time[0])
@@ -145,9 +147,10 @@ def _list_channels(motion: Motion) -> Iterator[Channel]:
     for point, p_W in pose.points.items():
         for k, axis in enumerate("xyz"):
             yield Channel(f"{point}_{axis}", axis, "POS", point, "m", p_W[:, k])
-    for joint, angles in joint_angles(pose).joints.items():
-        for k, angle in enumerate(angles.names):
-            yield Channel(f"{joint}_{angle}", _MISSING, "JNTANG", joint, "deg", np.degrees(angles.values[:, k]))
+    for name, joint in angles.joints.items():
+        for angle in joint:
+            yield Channel(f"{name}_{angle}", _MISSING, "JNTANG", name, "deg", np.degrees(joint[angle]))
+        yield Channel(f"{name}_near_lock", _MISSING, "MISC", name, _MISSING, joint.near_lock.astype(int))
 
 
 def _channel_row(channel: Channel, rate_hz: float) -> tuple[str, ...]:
@@ -175,7 +178,7 @@ def _describe(
         **{f"{kind}ChannelCount": counts[kind] for kind in _TYPES},
     }
     if provenance:  # without the user's paths: datasets are shared
-        inputs = {name: given["files"] for name, given in provenance["inputs"].items()}
+        inputs = {name: entry["files"] for name, entry in provenance["inputs"].items()}
         described["Provenance"] = {**provenance, "inputs": inputs}
     return described
 

@@ -25,7 +25,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..angles import joint_angles
+from ..angles import diagnose_lock, joint_angles
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from ..readers.opensim import OWN
@@ -42,6 +42,8 @@ MOST_MISSED = np.deg2rad(1.0)  # [rad] rms of a body of the model, whose elbows 
 def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
     """Joint angles in degrees: first the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
 
+    Beside the three angles of a joint ``<joint>_near_lock`` is 1 where the first and the third are not to be read.
+
     Parameters
     ----------
     names : only these: "isb" or "opensim"
@@ -53,14 +55,13 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
     """
     check_complete(motion, "a .mot")
     diagnostics = diagnose_gaps(motion)
-    columns: dict[str, np.ndarray] = {}
+    columns, marks = dict[str, np.ndarray](), dict[str, np.ndarray]()
     if names != "opensim":
         angles = joint_angles(motion.pose)
-        columns |= {
-            f"{joint}_{angle}": joint_table.values[:, k]
-            for joint, joint_table in angles.joints.items()
-            for k, angle in enumerate(joint_table.names)
-        }
+        diagnostics += diagnose_lock(angles)
+        for name, joint in angles.joints.items():
+            columns |= {f"{name}_{angle}": joint[angle] for angle in joint}
+            marks[f"{name}_near_lock"] = joint.near_lock.astype(int)
     if names != "isb":
         turned, residuals = coordinates(orientations(motion.pose.quat_WL))
         columns |= turned
@@ -73,7 +74,8 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
         raise BadData(
             f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles to write"
         )
-    rows = pl.DataFrame({"time": motion.pose.time, **{name: np.degrees(angle) for name, angle in columns.items()}})
+    degrees = {name: np.degrees(angle) for name, angle in columns.items()}
+    rows = pl.DataFrame({"time": motion.pose.time, **degrees, **marks})
     header = {"version": 1, "nRows": rows.height, "nColumns": rows.width, "inDegrees": "yes"}
     name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
     _write(path, [name, *(f"{key}={value}" for key, value in header.items()), "endheader"], rows)

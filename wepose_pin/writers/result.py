@@ -28,7 +28,7 @@ from ..model.table import MODEL_TABLE, format_table
 from ..readers.tables import read_table
 from ..recording import Intervals, select_interval
 from ..subject import Subject, load_subject, subject_toml
-from ..tracking import TrackedRecording
+from ..tracking import TrackedRecording, TrackSummary
 
 JOINTS = "joints.parquet"
 SUBJECT_URDF = "subject.urdf"
@@ -37,6 +37,7 @@ SUBJECT_URDF = "subject.urdf"
 def write_result(
     folder: Path,
     tracked: TrackedRecording,
+    summary: TrackSummary,
     covariance: bool = False,
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     torques: Torques | None = None,
@@ -50,11 +51,11 @@ def write_result(
     write_table(folder / "pose.parquet", build_pose_table(tracked.pose, covariance))
     if tracked.joints:
         write_table(folder / JOINTS, build_joint_table(tracked.pose))
-    summary = tracked.summary()
+    content = summary.content
     if torques is not None:
         write_table(folder / "torques.parquet", torque_table(torques))
-        summary["torques"] = torques.summary()
-    write_about(folder, tracked, summary, phases, provenance)
+        content = {**content, "torques": torques.summary()}
+    write_about(folder, tracked, content, phases, provenance)
 
 
 def write_about(

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import BadOption
+from ..errors import BadOption, how_to_install
 from .joint_motion import JointMotion, LinkTransform, compute_link_transforms
 
 FIXED_FRAME, OTHER_FIXED_FRAME = "map", "world"  # the other one where a link has the name
@@ -69,9 +69,7 @@ def _write_bag(folder: Path, motion: JointMotion, storage: str) -> None:
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise BadOption(
-            "--format rosbag, mcap: needs rosbags, which is not installed: pip install 'wepose-pin[ros]'"
-        ) from None
+        raise BadOption(f"--format rosbag, mcap: needs rosbags: {how_to_install('rosbags')}") from None
     store = get_typestore(Stores.ROS2_HUMBLE)
     never = QosTime(0, 0)
     latched = Qos(

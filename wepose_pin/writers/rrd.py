@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import BadOption
+from ..errors import BadOption, how_to_install
 from ..model.visuals import Visual, visuals
 from .joint_motion import JointMotion, compute_link_poses_W, compute_link_transforms
 
@@ -33,7 +33,7 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
     try:
         import rerun as rr
     except ImportError:
-        raise BadOption("--format rrd: needs rerun, which is not installed: pip install 'wepose-pin[rerun]'") from None
+        raise BadOption(f"--format rrd: needs rerun: {how_to_install('rerun-sdk')}") from None
     recording = rr.RecordingStream(APPLICATION, recording_id=f"{motion.name} {motion.time[0]:g}", send_properties=False)
     recording.save(path)
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import polars as pl
 
-from ..angles import angle_table, joint_angles
+from ..angles import angle_table, diagnose_lock, joint_angles
 from ..diagnostics import Diagnostic
 from ..errors import BadData
 from ..kinematics import build_pose_table
@@ -14,26 +14,28 @@ from .motion import Motion
 from .result import write_table
 
 
-def table(motion: Motion) -> pl.DataFrame:
+def table(motion: Motion) -> tuple[pl.DataFrame, list[Diagnostic]]:
     """`build_pose_table`, and beside it `angle_table` where a joint has both of its segments."""
     pose = build_pose_table(motion.pose)
     try:
-        angles = angle_table(joint_angles(motion.pose))
+        angles = joint_angles(motion.pose)
     except BadData:
-        return pose
-    return pl.concat([pose, angles.drop("time")], how="horizontal")
+        return pose, []
+    return pl.concat([pose, angle_table(angles).drop("time")], how="horizontal"), diagnose_lock(angles)
 
 
 def write_parquet(path: Path, motion: Motion) -> list[Diagnostic]:
     """Every number to its last bit; what is not known is NaN."""
-    write_table(path, table(motion))
-    return []
+    rows, diagnostics = table(motion)
+    write_table(path, rows)
+    return diagnostics
 
 
 def write_csv(path: Path, motion: Motion) -> list[Diagnostic]:
     """Every number to its last bit (the shortest text that reads back as it); what is not known is empty."""
-    write_table_csv(path, table(motion))
-    return []
+    rows, diagnostics = table(motion)
+    write_table_csv(path, rows)
+    return diagnostics
 
 
 def write_table_csv(path: Path, table: pl.DataFrame) -> None:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...errors import BadOption, BadSource, one_of
+from ...errors import BadOption, BadSource, how_to_install, one_of
 from ...model import load_table
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
@@ -307,7 +307,7 @@ def configure_pylsl(scope: str | None) -> tuple[Any, str]:
     try:
         import pylsl
     except (ImportError, RuntimeError) as error:  # RuntimeError: pylsl is there and finds no liblsl
-        raise BadSource(f"lsl: pylsl is not usable ({error}); pip install 'wepose-pin[live]'") from None
+        raise BadSource(f"lsl: needs pylsl ({error}): {how_to_install('pylsl')}") from None
     wanted = scope or ("your LSLAPICFG" if os.environ.get("LSLAPICFG") else "machine")
     if _scope is None:
         if wanted in SCOPES:

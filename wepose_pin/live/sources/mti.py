@@ -11,7 +11,7 @@ from queue import Empty, SimpleQueue
 from types import ModuleType
 from typing import Any
 
-from ...errors import BadSource
+from ...errors import BadSource, how_to_install
 from ...recording.arrivals import Samples
 from . import xbus
 from .base import Source
@@ -291,6 +291,6 @@ def _import_pyserial() -> ModuleType:
     try:
         import serial
     except ImportError:
-        raise BadSource("mti: pyserial is not installed; pip install 'wepose-pin[live]'") from None
+        raise BadSource(f"mti: needs pyserial: {how_to_install('pyserial')}") from None
     module: ModuleType = serial
     return module

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import BadOption, BadSource
+from ...errors import BadOption, BadSource, how_to_install
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
 from ..addresses import parse_address
@@ -58,7 +58,7 @@ class Ximu3Source(Source):
         try:
             import ximu3
         except ImportError as error:
-            raise BadSource(f"ximu3: the package is not usable ({error}); pip install 'wepose-pin[ximu3]'") from None
+            raise BadSource(f"ximu3: needs the package ximu3 ({error}): {how_to_install('ximu3')}") from None
         try:
             found = wait_for(lambda _: self._connect_all(ximu3), self._describe_wait, self._wait_s, waiting)
         except BadSource:

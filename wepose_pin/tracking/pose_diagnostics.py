@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from ..diagnostics import INFO, WARNING, Diagnostic, gravest_first, merge, render
+from ..diagnostics import INFO, WARNING, Diagnostic, render
 from ..recording import OrientationSensor
 from ..recording.limits import STANDARD_GRAVITY
-from ..tracking import TrackedRecording
 from .measures import (
     BENT,
     Budget,
@@ -21,9 +20,10 @@ from .measures import (
     find_flexion_sign,
     find_samples_after_start,
     finite_max,
+    has_stated_mounts,
     longest_run_s,
 )
-from .words import plain
+from .tracked import TrackedRecording
 
 GRAVITY_OFF = 0.02
 BIAS_LARGE = np.deg2rad(1.5)  # [rad/s], three times what is usual from the factory
@@ -43,10 +43,10 @@ APART = np.deg2rad(15.0)  # between the halves of a recording
 LASTING_S = 1.0
 
 
-def diagnose_pose(tracked: TrackedRecording, measures: Measures, known: Sequence[Diagnostic]) -> list[Diagnostic]:
-    """All diagnostics, the gravest first; `known` are those of the pose's summary."""
+def diagnose_pose(tracked: TrackedRecording, measures: Measures) -> list[Diagnostic]:
+    """The diagnostics of the motion; `measures` are the recording's."""
     budgets, tips = measures.budgets, measures.tips
-    diagnostics = [
+    return [
         *_diagnose_signals(tracked, measures.signals),
         *_diagnose_headings(tracked, budgets),
         *_diagnose_tips(tracked, tips),
@@ -55,7 +55,6 @@ def diagnose_pose(tracked: TrackedRecording, measures: Measures, known: Sequence
         *_diagnose_hinges(tracked, measures.hinges),
         *_diagnose_subject(tracked),
     ]
-    return gravest_first(merge(known, diagnostics))
 
 
 def _diagnose_signals(tracked: TrackedRecording, signals: Mapping[str, Signal]) -> Iterator[Diagnostic]:
@@ -103,7 +102,8 @@ def _diagnose_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget])
     if tracked.correction is not None:
         for name, turned in tracked.correction.max_correction_deg.items():
             if np.deg2rad(turned) > TURNED:
-                yield Diagnostic("heading-corrected-far", WARNING, name, np.deg2rad(turned), TURNED)
+                variant = {"variant": "stated"} if has_stated_mounts(tracked) else {}
+                yield Diagnostic("heading-corrected-far", WARNING, name, np.deg2rad(turned), TURNED, variant)
 
 
 def _diagnose_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> Iterator[Diagnostic]:
@@ -181,9 +181,9 @@ def _diagnose_hinges(tracked: TrackedRecording, hinges: Mapping[str, HingeMotion
         back = in_plane & (motion.flexion < extended) & (motion.bend < np.deg2rad(90.0))
         seconds = np.count_nonzero(back) / rate_hz
         facts: dict[str, float | str] = {
-            "joint": plain(table.shared_name(name)),
-            "above": plain(table.shared_name(hinge.on)),
-            "below": plain(table.shared_name(hinge.moves)),
+            "joint": table.shared_name(name),
+            "above": table.shared_name(hinge.on),
+            "below": table.shared_name(hinge.moves),
         }
         if seconds > LASTING_S:
             most = float(-motion.flexion[back].min())

@@ -1,4 +1,4 @@
-"""Measures of a tracked recording's report: the sensors' signals, static phases, headings, hinges, tips of limbs."""
+"""Measures of a tracked recording: the sensors' signals, static phases, headings, hinges, tips of limbs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
 from ..recording.plausibility import find_cut_off
 from ..subject import Subject
-from ..tracking import TrackedRecording
+from .tracked import TrackedRecording
 
 BENT = np.deg2rad(20.0)  # above which a hinge shows the plane in which it bends
 PEAK_OVER_S = 0.1  # a tip's speed is that of its mean over so long
@@ -90,24 +90,6 @@ def longest_run_s(mask: np.ndarray, rate_hz: float) -> float:
 def has_stated_mounts(tracked: TrackedRecording) -> bool:
     """Whether the mounts are the session's and not calibrated ones."""
     return not tracked.subject.mounts or tracked.recording.remounted
-
-
-@dataclass(frozen=True)
-class Measures:
-    """All measures of a tracked recording.
-
-    Parameters
-    ----------
-    signals : sensor → its signal
-    budgets : segment → the uncertainty of its heading
-    hinges : name → its motion
-    tips : point whose path is drawn → its motion
-    """
-
-    signals: Mapping[str, Signal]
-    budgets: Mapping[str, Budget]
-    hinges: Mapping[str, HingeMotion]
-    tips: Mapping[str, TipMotion]
 
 
 # Headings -------------------------------------------------------------------------------------------------------------
@@ -248,6 +230,49 @@ def measure_tips(pose: Pose, rate_hz: float, table: BodyTable) -> dict[str, TipM
         std = compute_axis_std(pose.point_cov[name]) if name in pose.point_cov else None
         tips[name] = TipMotion(reach, std, peak)
     return tips
+
+
+# All ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Measures:
+    """All measures of a tracked recording.
+
+    Parameters
+    ----------
+    samples : of the recording
+    rate_hz : of its samples
+    steps_ms : shortest and longest step between samples
+    signals : sensor → its signal
+    budgets : segment → the uncertainty of its heading
+    hinges : name → its motion
+    tips : point whose path is drawn → its motion
+    """
+
+    samples: int
+    rate_hz: float
+    steps_ms: tuple[float, float]
+    signals: Mapping[str, Signal]
+    budgets: Mapping[str, Budget]
+    hinges: Mapping[str, HingeMotion]
+    tips: Mapping[str, TipMotion]
+
+
+def measure(tracked: TrackedRecording, signals: Mapping[str, Signal] | None = None) -> Measures:
+    """All measures of a recording; `signals`, where they are measured already."""
+    recording, table = tracked.recording, tracked.model.table
+    steps = 1e3 * np.diff(recording.time)
+    hinges = {name: measure_hinge(tracked.pose, table, name, tracked.subject) for name in table.hinges}
+    return Measures(
+        len(recording),
+        recording.rate_hz,
+        (float(steps.min()), float(steps.max())),
+        signals or {name: measure_signal(recording, name, tracked) for name in recording.sensors},
+        compute_heading_uncertainties(tracked),
+        {name: motion for name, motion in hinges.items() if motion is not None},
+        measure_tips(tracked.pose, recording.rate_hz, table),
+    )
 
 
 def _rotations(quat: np.ndarray, known: np.ndarray) -> Rotation:

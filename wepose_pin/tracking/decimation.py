@@ -2,56 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import reduce
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
 
-from ..diagnostics import Diagnostic
 from ..kinematics import Pose
-from ..recording import Intervals, join_recordings
-from ..tracking import TrackedRecording
-from .measures import Signal, measure_signal, measure_tips
+from ..recording import join_recordings
+from .measures import Measures, Signal, measure, measure_signal, measure_tips
+from .tracked import TrackedRecording
 
 MOST = 20_000  # samples that are kept
 _OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov")  # in `Orientation`
 
 
-@dataclass(frozen=True)
-class Totals:
-    """Values of the whole recording that a decimated pose has lost."""
-
-    samples: int
-    rate_hz: float
-    steps_ms: tuple[float, float]  # shortest and longest step between samples
-    signals: Mapping[str, Signal]  # a row for each kept sample, of all from it to the next
-    peak_speed: Mapping[str, float]  # point whose path is drawn → [m/s]
-    diagnostics: Sequence[Diagnostic]
-
-
-def compute_totals(tracked: TrackedRecording) -> Totals:
-    """The totals of a pose with all its samples."""
-    recording = tracked.recording
-    steps = 1e3 * np.diff(recording.time)
-    tips = measure_tips(tracked.pose, recording.rate_hz, tracked.model.table)
-    return Totals(
-        len(recording),
-        recording.rate_hz,
-        (float(steps.min()), float(steps.max())),
-        {name: measure_signal(recording, name, tracked) for name in recording.sensors},
-        {name: tip.peak_speed for name, tip in tips.items()},
-        tracked.diagnostics,
-    )
-
-
 class Decimator:
-    """Takes the chunks of `tracking.track_session`; `decimated` is for `render_track_report` and the page.
+    """Takes the chunks of a tracked recording and keeps so many samples that they can be shown.
 
     Parameters
     ----------
-    samples : of the whole recording
+    samples : of the whole recording; 0: all are kept
     """
 
     def __init__(self, samples: int) -> None:
@@ -82,22 +54,26 @@ class Decimator:
         self._steps = min(self._steps[0], float(np.nanmin(steps))), max(self._steps[1], float(np.nanmax(steps)))
         self._seen, self._last = self._seen + len(recording), float(recording.time[-1])
         if len(at):
-            self._kept.append(_decimate(chunk, at, recording.rate_hz / self._every))
+            kept = chunk if len(at) == len(recording) else _decimate(chunk, at, recording.rate_hz / self._every)
+            self._kept.append(kept)
 
-    def decimated(
-        self, phases: Mapping[str, Intervals], diagnostics: Sequence[Diagnostic]
-    ) -> tuple[TrackedRecording, Totals]:
-        """The decimated pose and the totals; `phases` and `diagnostics` of the whole recording.
+    @cached_property
+    def decimated(self) -> tuple[TrackedRecording, Measures]:
+        """The kept samples, and the measures: extremes and what lasts of all samples, the rest of the kept ones.
 
         Raises the first error of `add`, of any kind.
         """
         if self._error is not None:
             raise self._error
-        last = self._kept[-1]
-        pose = _join_recordings(self._kept, phases)
-        signals = {name: _join_signals(parts) for name, parts in self._signals.items()}
-        rate_hz = last.recording.rate_hz * self._every
-        return pose, Totals(self._seen, rate_hz, self._steps, signals, self._peak_speed, diagnostics)
+        tracked = _join_recordings(self._kept)
+        measures = measure(tracked, {name: _join_signals(parts) for name, parts in self._signals.items()})
+        return tracked, replace(
+            measures,
+            samples=self._seen,
+            rate_hz=tracked.recording.rate_hz * self._every,
+            steps_ms=self._steps,
+            tips={name: tip._replace(peak_speed=self._peak_speed[name]) for name, tip in measures.tips.items()},
+        )
 
     def _take_signal(self, name: str, signal: Signal, at: np.ndarray) -> None:
         """Bins that begin at the kept samples; what comes before the first belongs to the last bin so far."""
@@ -169,8 +145,10 @@ def _rows(values: Any, at: np.ndarray) -> Any:
     return None if values is None else values[at]
 
 
-def _join_recordings(parts: list[TrackedRecording], phases: Mapping[str, Intervals]) -> TrackedRecording:
+def _join_recordings(parts: list[TrackedRecording]) -> TrackedRecording:
     """One of many; what is one number comes from the last."""
+    if len(parts) == 1:
+        return parts[0]
     last = parts[-1]
     segments = [part.segments for part in parts]
     orientation = {
@@ -185,7 +163,7 @@ def _join_recordings(parts: list[TrackedRecording], phases: Mapping[str, Interva
     return replace(
         last,
         pose=Pose(*(_concatenate([getattr(part.pose, entry.name) for part in parts]) for entry in fields(Pose))),
-        recording=replace(reduce(join_recordings, [part.recording for part in parts]), phases=phases),
+        recording=reduce(join_recordings, [part.recording for part in parts]),
         segments=replace(
             segments[-1],
             time=np.concatenate([part.time for part in segments]),
