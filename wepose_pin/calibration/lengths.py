@@ -85,33 +85,34 @@ def calibrate(
     measured_std: Positive = MEASURED_STD,
     formulation: Formulation = "full",
 ) -> Calibration:
-    """Calibrate a subject: lengths and mounts with their covariance from hands held together, or another protocol.
+    """Calibrate a subject: estimate lengths and mounts with their covariance from joined hands, or another protocol.
 
     Joined hands determine the proportions of the arms and not their scale: that comes from a measured length. A poor
-    or failed calibration is returned as well, and says so.
+    or failed calibration raises nothing: it is returned, and its `quality` says so.
 
     Parameters
     ----------
     recording : Recording
-        Has the phases of the protocol.
+        With the phases of the protocol, "clasp" for joined hands.
     measured : mapping, optional
-        Measured lengths, breadths that give one (`model.list_breadths`, as biacromial), and distances that the protocol
-        names, name → [m]; without one the scale is the prior's.
+        Name → [m] that was measured on the person: a length of the body such as "shoulder_width"; the breadth
+        "biacromial", from which a length follows; or a distance that the protocol names. Without any the scale is the
+        prior's.
     prior : Subject, optional
-        Lengths before, with covariance, and mounts; None: `population_subject`. The subject of an earlier calibration
-        is fused with the result (`sessions`).
+        Lengths with covariance, and mounts, as known before; None: `population_subject`. The subject of an earlier
+        calibration is combined with what this recording shows.
     model : BodyModel, str or Path, optional
         The body, or its file or name as for `load_model`; None: that which the recording states, else the upper body.
     protocol : str, Path or Protocol, optional
-        What was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave; None: by the
-        recording's phases (`protocols.choose_protocol`).
+        What the person did in which phase: the name of a protocol, such as "clasp" or "free", a .toml file, or what
+        `wepose_pin.calibration.load_protocol` returned; None: "clasp", and "t_pose" if the recording has that phase.
     method : str
-        The orientation filter, a key of `wepose_pin.filters.METHODS`.
+        The orientation filter: "amekf", "smoother", "smekf", "ncf" or "gdc", as in `estimate_orientation`.
     measured_std : float
-        Standard deviation [m] of what was measured.
+        Standard deviation [m] of each measured value; 3 mm by default.
     formulation : str
-        "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone, by plain
-        least squares with one measured length at least (`paper`).
+        "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone, by the
+        plain least squares of Lisini Baldi et al. 2019, which needs a measured length.
 
     Returns
     -------
@@ -121,11 +122,12 @@ def calibrate(
     Raises
     ------
     BadOption
-        An unknown protocol or formulation, or a measured length that is none, not plausible, or missing.
+        An unknown protocol, method or formulation; a measured name that is no length of the body, an implausible value,
+        or none where one is needed.
     BadSession, BadPhase
-        A sensor that the protocol needs is missing; there is no such phase.
+        The recording lacks a sensor or a phase that the protocol needs.
     BadModel
-        The body has no lengths.
+        The table of the body names no lengths.
 
     Examples
     --------
