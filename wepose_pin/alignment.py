@@ -56,23 +56,23 @@ class StartFrames:
 
     @property
     def sways(self) -> bool:
-        """Whether a person stands in it, whom nothing holds still."""
+        """True for a person, who sways while standing; False for a mechanism."""
         return not self.table.is_mechanism
 
     def std(self, segment: str) -> np.ndarray:
-        """(3,) [rad] between a segment and the start pose, one standard deviation about each axis."""
+        """Return (3,) [rad], one standard deviation about each axis of a segment's rotation off the start pose."""
         return np.array(self.table.segments[segment].start_std)
 
     def repeat_std(self, segment: str) -> np.ndarray:
-        """(3,) [rad] the same between two start poses of one person."""
+        """Return (3,) [rad], the same of the rotation between two start poses of one person."""
         return np.array(self.table.segments[segment].repeat_std)
 
     def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
-        """R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
+        """Return R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
         return self.R_WL[segment] * R_LS if segment in self.R_WL else R_LS
 
     def to_segment(self, segment: str, R_WS: Rotation) -> Rotation:
-        """R_LS of the sensor's orientation in W in the start pose."""
+        """Return the mount R_LS of the sensor's orientation in W in the start pose."""
         return self.R_WL[segment].inv() * R_WS if segment in self.R_WL else R_WS
 
 
@@ -106,7 +106,7 @@ class SegmentOrientations:
     quat_WL : segment → (n, 4) xyzw
     quat_LS : segment → (4,) xyzw, the mount used
     heading_offset : segment → ψ [rad], heading of its sensor's world V in W
-    orientation : segment → result of its sensor's filter; no entry for measured orientations
+    orientation : segment → result of its sensor's filter, in V; no entry for measured orientations
     covariance_W : segment → (n, 3, 3) [rad²] of the error on the left of `quat_WL`, in W: the sum of the filter's
         covariance, the tilt by the accelerometer's bias, the uncertainty of mount and start pose, and soft tissue. No
         entry for filters without a covariance (ncf, gdc)
@@ -198,12 +198,13 @@ def align_sensors(
     Parameters
     ----------
     recording : that of `filtered`, or its chunk that contains the start pose
+    subject : its mounts go before those that the session states; None: the stated ones alone
     start_frames : `find_start_frames` of the body; left out: the N-pose
 
     Raises
     ------
     BadSession
-        A mount that is not known, or that gravity contradicts.
+        No mount is known for a sensor, or gravity contradicts it.
     """
     start, diagnostics = filtered.start, list(filtered.diagnostics)
     start_guessed = recording.start_is_guessed or not recording.phases.get("start")
@@ -328,7 +329,7 @@ def find_nominal_mount(
 
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
-    """Compute the variance (n,) [rad²] about the vertical of attitude errors in S, on the right (n, 3, 3)."""
+    """Compute the variance (n,) [rad²] of the heading from that (n, 3, 3) of the attitude error, in S on the right."""
     up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
     return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
 
@@ -407,10 +408,11 @@ def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.n
 def compute_start_heading_var(
     recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames = N_POSE
 ) -> float:
-    """Compute the variance [rad²] of a segment's heading offset by the inexact start pose.
+    """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset.
 
-    Zero for the segment whose heading defines x. A calibrated mount turns as the person stood then, which is nearly
-    repeated; a stated one is as far off as people are off the start pose.
+    It is zero for the segment whose heading defines x. With a calibrated mount it is that between two start poses of
+    one person: the mount contains the heading error of the calibration's start pose. With a stated one it is that
+    between a person and the stated pose.
     """
     if segment == start_frames.table.reference:
         return 0.0

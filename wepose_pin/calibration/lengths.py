@@ -445,7 +445,7 @@ def _hinges(
     layout_hinges = find_hinges(problem.model, problem.start_pose, problem.sensors)
     for i, (hinge, (across, tilted)) in enumerate(zip(layout_hinges, unknown.reshape(-1, 2), strict=True)):
         axis = np.array(hinge.axis) + across * np.array(hinge.across) + tilted * np.array(hinge.tilted)
-        axis_L = problem.turn(hinge.on).inv().apply(axis / np.linalg.norm(axis))
+        axis_L = problem.start_rotation(hinge.on).inv().apply(axis / np.linalg.norm(axis))
         rms = HINGE_STD * _rms(hinge_residuals[:, i])
         hinges[hinge.name] = Hinge(axis_L, max(rms, problem.model.table.hinges[hinge.name].softness)), rms
     return hinges
@@ -459,11 +459,11 @@ def _make_subject(
     mounts = {}
     for i, name in enumerate(layout.sensors):
         tilt = Rotation.from_rotvec(-np.append(x[layout.tilt][2 * i : 2 * i + 2], 0.0))
-        R_LS = problem.turn(name).inv() * tilt * _about_z(x[layout.heading][i]) * filtered.R_VS_start[name]
+        R_LS = problem.start_rotation(name).inv() * tilt * _about_z(x[layout.heading][i]) * filtered.R_VS_start[name]
         mounts[name] = R_LS.as_quat()
     # The mounts of sensors outside the chain are those of the start pose.
     for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
-        mounts[name] = (problem.turn(name).inv() * _about_z(psi) * filtered.R_VS_start[name]).as_quat()
+        mounts[name] = (problem.start_rotation(name).inv() * _about_z(psi) * filtered.R_VS_start[name]).as_quat()
     order, covariance = project_to_subject(layout, solution.covariance, problem.start_pose)
     std = np.sqrt(np.diag(solution.covariance))
     offset_stds = np.minimum(std[layout.tilt], np.pi).reshape(-1, 2)  # no angle is more uncertain than half a turn
