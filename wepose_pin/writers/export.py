@@ -121,8 +121,8 @@ def export(
     format : str, optional
         One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "osim", "trc", "c3d", "bvh",
         "bvh-lafan1", "bvh-nokov", "bvh-soma", "bvh-xsens", "motion-bids". Of either: "urdf", "rosbag", "mcap", "rrd".
-        Of a robot: "lerobot", "pkl", "npz", "csv-beyondmimic". None: by the suffix of `file`, which
-        must be that of the format.
+        Of a robot: "lerobot", "pkl", "npz", "csv-beyondmimic". None: by the suffix of `file`; a stated
+        format needs a file with its own suffix.
     names : str, optional
         Of a .mot's columns: only the angles of the ISB, "isb", or only the coordinates of OpenSim's model, "opensim";
         None: both, the ISB's first.
