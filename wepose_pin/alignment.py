@@ -56,23 +56,23 @@ class StartFrames:
 
     @property
     def sways(self) -> bool:
-        """Whether a person stands in it, whom nothing holds still."""
+        """True for a person, who sways while standing; False for a mechanism."""
         return not self.table.is_mechanism
 
     def std(self, segment: str) -> np.ndarray:
-        """(3,) [rad] between a segment and the start pose, one standard deviation about each axis."""
+        """Return (3,) [rad], one standard deviation about each axis of a segment's rotation off the start pose."""
         return np.array(self.table.segments[segment].start_std)
 
     def repeat_std(self, segment: str) -> np.ndarray:
-        """(3,) [rad] the same between two start poses of one person."""
+        """Return (3,) [rad], the same of the rotation between two start poses of one person."""
         return np.array(self.table.segments[segment].repeat_std)
 
     def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
-        """R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
+        """Return R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
         return self.R_WL[segment] * R_LS if segment in self.R_WL else R_LS
 
     def to_segment(self, segment: str, R_WS: Rotation) -> Rotation:
-        """R_LS of the sensor's orientation in W in the start pose."""
+        """Return the mount R_LS of the sensor's orientation in W in the start pose."""
         return self.R_WL[segment].inv() * R_WS if segment in self.R_WL else R_WS
 
 
@@ -106,7 +106,7 @@ class SegmentOrientations:
     quat_WL : segment → (n, 4) xyzw
     quat_LS : segment → (4,) xyzw, the mount used
     heading_offset : segment → ψ [rad], heading of its sensor's world V in W
-    orientation : segment → result of its sensor's filter; no entry for measured orientations
+    orientation : segment → result of its sensor's filter, in V; no entry for measured orientations
     covariance_W : segment → (n, 3, 3) [rad²] of the error on the left of `quat_WL`, in W: the sum of the filter's
         covariance, the tilt by the accelerometer's bias, the uncertainty of mount and start pose, and soft tissue. No
         entry for filters without a covariance (ncf, gdc)
@@ -202,49 +202,34 @@ def align_sensors(
     Parameters
     ----------
     recording : that of `filtered`, or its chunk that contains the start pose
+    subject : its mounts go before those that the session states; None: the stated ones alone
     start_frames : `find_start_frames` of the body; left out: the N-pose
 
     Raises
     ------
     BadSession
-        A mount that is not known, or that gravity contradicts.
+        No mount is known for a sensor, or gravity contradicts it.
     """
     start, diagnostics = filtered.start, list(filtered.diagnostics)
-    start_guessed = recording.start_is_guessed or not recording.phases.get("start")
-    facts = {"variant": "guessed"} if start_guessed else {}
+    facts = {"variant": "guessed"} if _start_is_guessed(recording) else {}
     nominal_mounts = collect_nominal_mounts(recording, subject, start_frames)
     mounts, heading_offsets = {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
         # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
         first = aligned[0]
-        R_WS_start = start_frames.to_world(first, Rotation.identity())
-        aligned_heading_offset = compute_heading_offset(filtered.R_VS_start[first], R_WS_start)
+        R_WL_start = start_frames.to_world(first, Rotation.identity())
+        aligned_heading_offset = compute_heading_offset(filtered.R_VS_start[first], R_WL_start)
     for segment, R_VS_start in filtered.R_VS_start.items():
         if recording.sensors[segment].aligned:
             mounts[segment], heading_offsets[segment] = Rotation.identity(), aligned_heading_offset
             continue
-        R_nominal = start_frames.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
-        psi = compute_heading_offset(R_VS_start, R_nominal)
-        R_LS = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS_start
-        tilt_error_deg = np.degrees((R_LS * R_nominal.inv()).magnitude())
+        R_WS_nominal = start_frames.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
+        psi = compute_heading_offset(R_VS_start, R_WS_nominal)
+        R_WS_start = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS_start
+        tilt_error_deg = np.degrees((R_WS_start * R_WS_nominal.inv()).magnitude())
         if tilt_error_deg > MAX_MOUNT_ERROR_DEG:
-            calibrated = subject is not None and segment in subject.mounts and not recording.remounted
-            name, remedy = ".mount", "check which sensor axis points up and which forward"
-            if start_guessed:
-                remedy = f"state its seconds, or {remedy}"
-            if calibrated:
-                name, remedy = (
-                    ": its calibrated mount",
-                    "if the sensor was mounted again, state remounted = true and its mount",
-                )
-                if start_guessed:
-                    remedy = f"state its seconds; {remedy}"
-            reason = ", which was only guessed: [phases] start = [[from, to]] is missing" if start_guessed else ""
-            raise BadSession(
-                f"{recording.where()}: sensors.{segment}{name} is {tilt_error_deg:.0f} deg off gravity in the start "
-                f"pose ({format_span(start)}){reason}; {remedy}"
-            )
+            raise BadSession(_describe_mount_error(recording, segment, subject, tilt_error_deg, start))
         if tilt_error_deg > MOUNT_WARNING_DEG:
             value, limit = float(np.deg2rad(tilt_error_deg)), float(np.deg2rad(MOUNT_WARNING_DEG))
             diagnostics.append(Diagnostic("mount-contradicts-gravity", WARNING, segment, value, limit, facts))
@@ -252,10 +237,10 @@ def align_sensors(
         if mount_cov is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
-            misfit = (R_LS * R_nominal.inv()).as_rotvec()[:2]
+            misfit = (R_WS_start * R_WS_nominal.inv()).as_rotvec()[:2]
             misfit_cov = mount_cov[:2, :2] + np.diag(start_frames.std(segment)[:2] ** 2)
-            R_LS = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_nominal
-            psi = compute_heading_offset(R_VS_start, R_LS)
+            R_WS_start = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_WS_nominal
+            psi = compute_heading_offset(R_VS_start, R_WS_start)
             calibrated_offset = subject.start_pose_offset.get(segment) if subject is not None else None
             if calibrated_offset is not None:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
@@ -264,9 +249,32 @@ def align_sensors(
             if misfit @ np.linalg.solve(misfit_cov, misfit) > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
                 diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOUNT_MOVED_STDS, facts))
-        mounts[segment], heading_offsets[segment] = start_frames.to_segment(segment, R_LS), psi
+        mounts[segment], heading_offsets[segment] = start_frames.to_segment(segment, R_WS_start), psi
     R_WV = {segment: Rotation.from_rotvec([0.0, 0.0, psi]) for segment, psi in heading_offsets.items()}
     return SensorAlignment(mounts, R_WV, heading_offsets, start, filtered.static_phase, tuple(diagnostics))
+
+
+def _start_is_guessed(recording: Recording) -> bool:
+    """Whether the user has not stated the seconds of the start pose."""
+    return recording.start_is_guessed or not recording.phases.get("start")
+
+
+def _describe_mount_error(
+    recording: Recording, segment: str, subject: Subject | None, tilt_error_deg: float, start: tuple[float, float]
+) -> str:
+    """Return the text of the error that gravity contradicts a mount in the start pose, and what to do."""
+    guessed = _start_is_guessed(recording)
+    if subject is not None and segment in subject.mounts and not recording.remounted:
+        name, remedy = ": its calibrated mount", "if the sensor was mounted again, state remounted = true and its mount"
+        remedy = f"state its seconds; {remedy}" if guessed else remedy
+    else:
+        name, remedy = ".mount", "check which sensor axis points up and which forward"
+        remedy = f"state its seconds, or {remedy}" if guessed else remedy
+    reason = ", which was only guessed: [phases] start = [[from, to]] is missing" if guessed else ""
+    return (
+        f"{recording.where()}: sensors.{segment}{name} is {tilt_error_deg:.0f} deg off gravity in the start pose "
+        f"({format_span(start)}){reason}; {remedy}"
+    )
 
 
 def orient_segments(
@@ -333,7 +341,7 @@ def find_nominal_mount(
 
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
-    """Compute the variance (n,) [rad²] about the vertical of attitude errors in S, on the right (n, 3, 3)."""
+    """Compute the variance (n,) [rad²] of the heading from that (n, 3, 3) of the attitude error, in S on the right."""
     up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
     return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
 
@@ -412,10 +420,11 @@ def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.n
 def compute_start_heading_var(
     recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames = N_POSE
 ) -> float:
-    """Compute the variance [rad²] of a segment's heading offset by the inexact start pose.
+    """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset.
 
-    Zero for the segment whose heading defines x. A calibrated mount turns as the person stood then, which is nearly
-    repeated; a stated one is as far off as people are off the start pose.
+    It is zero for the segment whose heading defines x. With a calibrated mount it is that between two start poses of
+    one person: the mount contains the heading error of the calibration's start pose. With a stated one it is that
+    between a person and the stated pose.
     """
     if segment == start_frames.table.reference:
         return 0.0

@@ -57,9 +57,9 @@ class TrackResult(PosedBody):
     summary : mapping
         The content of ``summary.json``: inputs, options and results.
     diagnostics : tuple of Diagnostic
-        What the user should know.
+        What the user should know, each with a code, severity, place, value and limit.
     source : TrackedRecording or Path
-        What it was made of: the recording with intermediate results, such as `source.segments`, or the folder.
+        From `track` the recording with intermediate results, such as `source.segments`; from `load_result` the folder.
     """
 
     phases: Mapping[str, Intervals]
@@ -71,7 +71,8 @@ class TrackResult(PosedBody):
         """Return the table of ``pose.parquet``, a row a sample; ``.to_pandas()`` of it needs pandas and pyarrow.
 
         Columns: ``time`` [s]; ``<segment>_qx,_qy,_qz,_qw``, segment to W, and ``<segment>_std`` [rad];
-        ``<point>_x,_y,_z`` [m] in W and ``<point>_std`` [m]; ``<segment>_gap``. Standard deviations are of one axis.
+        ``<point>_x,_y,_z`` [m] in W and ``<point>_std`` [m]; ``<segment>_gap``, true where the sensor lost samples.
+        A ``_std`` is one standard deviation of one axis.
 
         Examples
         --------
@@ -128,7 +129,9 @@ class TrackResult(PosedBody):
         return page
 
     def save(self, folder: str | Path, force: bool = False) -> Path:
-        """Write what `wepose track -o` writes: pose, subject, summary, view and report; of a loaded result its files.
+        """Write what `wepose track -o` writes: pose, subject, summary, view and report.
+
+        Of a result that `load_result` read, its files are copied.
 
         Parameters
         ----------
@@ -203,23 +206,24 @@ def track(
     recording : Recording
         As `load_session` reads it, or built in code.
     subject : Subject or Calibration, optional
-        Lengths and mounts; None: the population's mean lengths and the session's stated mounts.
+        Lengths and mounts; None: the mean lengths of the population, or of a chosen model its own, and the mounts that
+        the session states.
     method : str
-        The orientation filter, a key of `wepose_pin.filters.METHODS`: "amekf", "smoother", "smekf", "ncf" or "gdc".
+        The orientation filter: "amekf", "smoother", "smekf", "ncf" or "gdc", as in `estimate_orientation`.
     model : BodyModel, str or Path, optional
-        A body; its file, as for `load_model`, or the URDF of a mechanism whose links bear the sensors; or the name of
-        one of the package's. None: that which the recording names, else the upper body. It gets the subject's lengths;
-        without a subject its own stand.
+        A body; or its file, as for `load_model`, or the URDF of a mechanism whose links carry the sensors; or the name
+        of a body of the package. None: the one that the recording names, else the upper body. It is scaled to the
+        subject's lengths.
     static_test : StaticTest, optional
         When a sensor counts as static; None: the default values.
     open_loop : bool
         Do not correct heading drift: orientations are the filter's from the start pose on.
     causal : bool
-        Begin at the end of the start pose and look at nothing ahead, as a live session does.
+        Begin at the end of the start pose and use no later samples, as a live session does.
     limits : bool
-        Keep the limits of the model's joints of one axis.
+        Keep joints of one axis, such as those of a mechanism, within the limits that the model states.
     force : bool
-        Use a subject whose calibration failed.
+        Use the subject even if its calibration failed.
 
     Returns
     -------
@@ -229,8 +233,8 @@ def track(
     Raises
     ------
     WeposeError
-        What the recording, the subject or the model lacks; a subject whose calibration failed; sensors on links that
-        are no segments.
+        The recording, the subject or the model lacks something that is needed; the calibration of the subject failed;
+        a sensor is on no segment of the model.
 
     Examples
     --------
@@ -279,13 +283,13 @@ def load_result(folder: str | Path) -> TrackResult:
     Returns
     -------
     TrackResult
-        What its files hold. Of covariances a file has the standard deviations alone, unless `wepose track --covariance`
-        wrote it: all axes then have the same.
+        The content of its files. These have no covariances but standard deviations, the same for all axes, unless
+        `wepose track --covariance` wrote them.
 
     Raises
     ------
     MissingFile, BadData, BadSubject, BadModel
-        It is no result folder, or its files are damaged.
+        The folder is not there or lacks a file, or a file is damaged.
 
     Examples
     --------

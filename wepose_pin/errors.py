@@ -17,7 +17,11 @@ _END = 500  # of these, what is kept of the end, where it says what would be rig
 
 
 class WeposeError(Exception):
-    """Wrong input; the base of all errors this package raises on purpose."""
+    """Wrong input, in one line that names the place, the value and what would be right.
+
+    It is the base of all errors that this package raises on purpose. The others, such as `BadData` and `BadOption`, are
+    in `wepose_pin.errors`. `BadOption` is a `ValueError` too, and a name that a result does not have a `KeyError`.
+    """
 
     def __str__(self) -> str:
         text = printable(Exception.__str__(self))  # not that of KeyError, which is a repr
@@ -108,7 +112,7 @@ class LostWorker(WeposeError):
 
 
 class WeposeWarning(UserWarning):
-    """A result that can be used, but is worth less than it should be: what is wrong with it, and what to do."""
+    """A result that can be used, but is less certain than it could be; the text says why, and what to do."""
 
 
 class NoSolution(WeposeError):

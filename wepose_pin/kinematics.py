@@ -47,16 +47,17 @@ class Pose:
     Parameters
     ----------
     time : (n,) [s]
-    quat_WL : segment → (n, 4) xyzw; only segments that are known. Of a person as measured, of a mechanism as its joints
-        can be
-    points : point → (n, 3) [m] in W, from the root, of a person midway between the hips; only points that are known
-    q : (n, nq) configuration of the Pinocchio model; an unmeasured segment is rigid with its parent segment; None for
-        a pose from a table
-    segment_cov : segment → (n, 3, 3) [rad²], covariance of the orientation's error in W (on the left of `quat_WL`)
-    point_cov : point → (n, 3, 3) [m²], in W
-    gap : segment → (n,) bool, true where its sensor has no samples and a long gap was bridged; empty where long gaps
-        are not allowed
-    joints : joint of one axis → (n,) [rad or m], of a mechanism
+    quat_WL : segment → (n, 4) xyzw, segment frame L to W; only segments that are known. Of a person it is the measured
+        orientation, of a mechanism the nearest that its joints can take
+    points : point → (n, 3) [m] in W, whose origin is the root: of a person midway between the hips; only points that
+        are known
+    q : (n, nq) configuration of the Pinocchio model, in which a segment without a sensor is rigid with the one above;
+        None for a pose from a table
+    segment_cov : segment → (n, 3, 3) [rad²], covariance of the error rotation vector in W (on the left of `quat_WL`);
+        empty where none is known
+    point_cov : point → (n, 3, 3) [m²], covariance of the position in W
+    gap : segment → (n,) bool, true where its sensor lost samples for longer than 50 ms; only segments with such gaps
+    joints : joint of one axis → (n,) [rad or m], of a mechanism alone
     """
 
     time: np.ndarray

@@ -66,18 +66,21 @@ class Subject:
 
     Parameters
     ----------
+    name : of the person
     lengths : name → [m], as the table of the body names them
-    order : the rows of `covariance`: names of lengths [m], then ``mounts.<segment>.x``, ``.y``, ``.z``
-        [rad], the error of a mount as a small turn about the segment's axes, then ``girdles.<point>.rest_x`` … [m]
-    covariance : (k, k)
-    mounts : segment → `quat_LS` (4,) xyzw, the calibrated mounts; empty where none are calibrated
+    order : names of the k rows of `covariance`: lengths [m]; ``mounts.<segment>.x``, ``.y``, ``.z`` [rad], the error of
+        a mount as a rotation vector in the segment's frame L; ``girdles.<point>.law`` (no unit), ``.rest_x`` … [m]
+    covariance : (k, k) of the errors of what `order` names
+    mounts : segment → `quat_LS` (4,) xyzw, its sensor's mount (S to L); empty where none is calibrated
     note : where the numbers come from, in a few words
-    hinges : joint → its axis, where a calibration estimated it
-    start_pose_offset : segment → its offset from the start pose in the calibration, which a person nearly repeats
-    heading_drift : segment → that of its sensor in the calibration; on another day it has a similar size
-    doubled : second sensor → its segment; its mount is under its own name
-    girdles : point that a girdle moves → (7,) what the person differs by from its law, `model.girdle.PARAMETERS`
-    quality : of the calibration that estimated it; empty where none did
+    hinges : joint → `Hinge`, its axis, where a calibration estimated it
+    start_pose_offset : segment → `StartPoseOffset`, its angles to the start pose in the calibration, which a person
+        nearly repeats
+    heading_drift : segment → `HeadingDrift` of its sensor in the calibration; on another day it has a similar size
+    doubled : name of the second sensor on a segment → that segment; its mount is in `mounts` under the sensor's name
+    girdles : shoulder point → (7,) by which the person differs from the body's law of the shoulder girdle: a share of
+        the law, then a displacement x, y, z [m] at rest and another [m] with the arm raised by 90°
+    quality : "pass", "poor" or "fail", of the calibration that estimated it; empty where none did
     """
 
     name: str
@@ -102,17 +105,17 @@ class Subject:
 
     @property
     def is_population(self) -> bool:
-        """Whether it stands for the population, before any calibration."""
+        """Whether it is the population prior, without any calibration."""
         return self.name == POPULATION
 
     def check(self) -> Subject:
-        """The same subject, if all its fields are valid.
+        """Check all fields and return the subject.
 
         Raises
         ------
         BadOption, BadSubject
-            A field that is not of its kind; a length, mount, hinge, offset or drift that cannot be; a covariance that
-            is none, or has not the rows of `order`.
+            A field of a wrong type; a length, mount, hinge, offset or drift with an impossible value; a covariance that
+            is not symmetric and positive, or whose size is not that of `order`.
         """
         where = f"subject {self.name!r}: "
         check_fields(self, where)
@@ -141,7 +144,7 @@ class Subject:
         return self
 
     def check_quality(self) -> None:
-        """Raise `BadSubject` where the calibration failed that estimated it."""
+        """Raise `BadSubject` where `quality` is "fail"."""
         if self.quality == "fail":
             raise BadSubject(
                 f"subject '{self.name}': its calibration failed (quality = \"fail\"), so that lengths and mounts are "
@@ -150,7 +153,7 @@ class Subject:
             )
 
     def check_body(self, table: BodyTable) -> None:
-        """Raise `BadSubject` where a name is none of the body's, or a length of the body is missing."""
+        """Raise `BadSubject` where a name is not one of the body's, or a length of the body is missing."""
         where = f"subject '{self.name}': "
         try:
             check_names(f"{where}lengths", self.lengths, (*table.lengths, *table.absent))
@@ -167,25 +170,25 @@ class Subject:
             raise BadSubject(str(error)) from None
 
     def shape(self, body: BodyModel) -> BodyModel:
-        """The body with this person's lengths and girdles."""
+        """Return the body with this person's lengths and shoulder girdles."""
         body = body.with_lengths({name: self.lengths[name] for name in body.lengths if name in self.lengths})
         return replace(body, girdles=self.girdles)
 
     def fix_girdles(self, table: BodyTable) -> Subject:
-        """The subject with shoulders fixed on the trunk, which no girdle moves."""
+        """Return the subject with shoulders fixed on the trunk: its girdles move nothing."""
         fixed = np.zeros(len(PARAMETERS))
         fixed[PARAMETERS.index("law")] = -1.0
         return replace(self, girdles=dict.fromkeys(table.girdles, fixed))
 
     def std(self, name: str) -> float:
-        """One standard deviation of a length [m], or of a mount's axis [rad]; NaN where nothing is known."""
+        """Return one standard deviation of a row of `order`, in its unit; NaN where there is no such row."""
         if name not in self.order:
             return float("nan")
         k = self.order.index(name)
         return float(np.sqrt(self.covariance[k, k]))
 
     def lengths_covariance(self, names: Iterable[str] | None = None) -> np.ndarray:
-        """Covariance (n, n) [m²] of the named lengths, or of all; zero where nothing is known of a length's error."""
+        """Return the covariance (n, n) [m²] of the named lengths, or of all; zero for a length that has no row."""
         names = list(self.lengths if names is None else names)
         known = [k for k, name in enumerate(names) if name in self.order]
         rows = [self.order.index(names[k]) for k in known]
@@ -194,10 +197,10 @@ class Subject:
         return covariance
 
     def shape_covariance(self, table: BodyTable) -> np.ndarray:
-        """Covariance (k + 7 g, k + 7 g) [m², or a share of the law] of a body's lengths and then its girdles'
-        parameters.
+        """Return the covariance (k + 7 g, k + 7 g) of a body's k lengths [m] and of the parameters of its g girdles.
 
-        Parameters of which nothing is known have the spread that the table states.
+        The parameters are in the order and units of `girdles`. Where this subject has no covariance of them, it is the
+        spread of people that the table states.
         """
         rows = girdle_rows(table)
         k = len(table.lengths)
@@ -214,7 +217,7 @@ class Subject:
         return covariance
 
     def mount_covariance(self, segment: str) -> np.ndarray | None:
-        """Covariance (3, 3) [rad²] of a calibrated mount's error in L; None where nothing is known of it."""
+        """Return the covariance (3, 3) [rad²] of a calibrated mount's error in L; None: the mount has none."""
         rows = mount_rows(segment)
         if segment not in self.mounts or not set(rows) <= set(self.order):
             return None
@@ -222,7 +225,7 @@ class Subject:
         return self.covariance[np.ix_(at, at)]
 
     def sample(self, rng: np.random.Generator) -> Subject:
-        """A random person from this one's distribution of lengths, for simulation."""
+        """Return a random person from this one's distribution of lengths, for simulation."""
         mean = np.array(list(self.lengths.values()))
         drawn = rng.multivariate_normal(mean, self.lengths_covariance())
         # Guards the far tails of the distribution.
@@ -238,17 +241,17 @@ class Subject:
 
 
 def mount_rows(segment: str) -> list[str]:
-    """The names of a mount's rows in a subject's covariance."""
+    """Return the names of a mount's rows in a subject's covariance."""
     return [f"mounts.{segment}.{axis}" for axis in "xyz"]
 
 
 def girdle_rows(table: BodyTable) -> list[str]:
-    """The names of the rows of all girdles' parameters in a subject's covariance."""
+    """Return the names of the rows of all girdles' parameters in a subject's covariance."""
     return [f"girdles.{name}.{parameter}" for name in table.girdles for parameter in PARAMETERS]
 
 
 def compute_girdle_prior(table: BodyTable) -> np.ndarray:
-    """Covariance (7 g, 7 g) of the girdles' parameters before a calibration."""
+    """Compute the covariance (7 g, 7 g) of the parameters of a body's g girdles before a calibration."""
     names = list(table.girdles)
     std = np.array([table.girdles[name].parameter_std for name in names]).reshape(len(names), len(PARAMETERS))
     correlation = np.eye(std.size)
@@ -271,10 +274,11 @@ def check_lengths(place: str, lengths: Mapping[str, float]) -> None:
 def population_subject(
     stature: float | None = None, sex: str | None = None, body: BodyModel | BodyTable | None = None
 ) -> Subject:
-    """The prior of a body's lengths: those that people have, with their covariance.
+    """Return the population prior: the mean lengths of people of this stature and sex, with their covariance.
 
-    Lengths share the stature's spread where it is not given, left and right share the person's shape. A length that is
-    no share of stature, of a robot say, is that of the model, to within the percentage that the table states.
+    Errors of all lengths are correlated by the stature where it is not given, those of left and right by the shape of
+    the person. A length that the body's table does not relate to stature, such as a robot's, is that of the model, with
+    the standard deviation that the table states in percent.
 
     Parameters
     ----------
@@ -295,7 +299,8 @@ def population_subject(
     BadOption
         A stature outside 1.0 to 2.5 m, or another sex.
     BadModel
-        The table names a share that is not known, or a length that is none without a model.
+        The table relates a length to stature in a way that is not known; or it does not, and `body` is a table without
+        the model that has the length.
 
     Examples
     --------
@@ -324,7 +329,7 @@ def population_subject(
 
 
 def subject_toml(subject: Subject) -> str:
-    """The text of ``subject.toml``."""
+    """Return the text of ``subject.toml``."""
     lines = [f"format = {FORMAT}", f"name = {toml_string(subject.name)}"]
     if subject.note:
         lines.append(f"note = {toml_string(subject.note)}")
@@ -385,7 +390,7 @@ def load_subject(path: str | Path) -> Subject:
     Raises
     ------
     MissingFile, BadSubject
-        Not there; a length missing, not positive, unknown; a covariance that does not fit.
+        There is no such file; a length is missing, not positive or unknown; the covariance does not fit its order.
 
     Examples
     --------
@@ -401,7 +406,7 @@ def load_subject(path: str | Path) -> Subject:
 
 
 def parse_subject(text: str, path: Path) -> Subject:
-    """The subject of the text of ``subject.toml``; `path` is for messages.
+    """Return the subject of the text of ``subject.toml``; `path` is for messages.
 
     Raises
     ------
@@ -415,6 +420,7 @@ def parse_subject(text: str, path: Path) -> Subject:
 
 
 def _subject(values: Mapping[str, Any], path: Path) -> Subject:
+    """Return the subject of the parsed file."""
     top = TomlTable(values, str(path), error=BadSubject)
     if "sensors" in top:
         raise BadSubject(f"{path}: is a session; a subject is needed here, as `wepose calibrate` writes one")
@@ -462,7 +468,7 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
 
 
 def _read_lengths(table: TomlTable) -> dict[str, float]:
-    """The lengths [m]."""
+    """Return name → length [m]."""
     for name, value in table.values.items():
         if not is_number(value, LONGEST) or value <= 0.0:
             raise BadSubject(f"{table.at(name)} = {value!r}; a number in metres is needed, above 0")
@@ -470,7 +476,7 @@ def _read_lengths(table: TomlTable) -> dict[str, float]:
 
 
 def _read_covariance(table: TomlTable, std: TomlTable, lengths: Collection[str]) -> tuple[tuple[str, ...], np.ndarray]:
-    """What the rows are, and the matrix; without a table of its own that of the lengths' standard deviations [m]."""
+    """Return the names of the rows, and the matrix; without [covariance] that of the standard deviations of lengths."""
     std.allow(*lengths)
     for name, value in std.values.items():
         if not is_number(value, LONGEST) or value < 0.0:
@@ -503,7 +509,7 @@ def _read_covariance(table: TomlTable, std: TomlTable, lengths: Collection[str])
 
 
 def _read_unit(table: TomlTable, names: tuple[str, ...]) -> np.ndarray:
-    """The vector or quaternion of these components, brought to length 1."""
+    """Return the vector or quaternion of these components, scaled to length 1."""
     values = np.array(table.numbers(*names))
     length = np.linalg.norm(values)
     if not abs(length - 1.0) < 1e-3:

@@ -206,9 +206,9 @@ def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float
     pose : Pose or PosedBody
         What `track` or `load_result` gives, or its `pose`; n samples.
     sequence : str
-        Of the shoulder, one of `SHOULDER_SEQUENCES`: "YXY", "XZY" or "ZXY"; other joints have ZXY.
+        Intrinsic axes of the shoulder's angles: "YXY", "XZY" or "ZXY"; all other joints have ZXY.
     near_lock : float
-        [rad]. What is nearer to gimbal lock is flagged, and does not decide how angles go on after it.
+        [rad], 10° by default. Samples nearer to gimbal lock are flagged; after them angles go on as before.
 
     Returns
     -------
@@ -219,7 +219,7 @@ def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float
     Raises
     ------
     BadOption
-        Another sequence; `near_lock` below 2° or above 45°.
+        An unknown sequence; `near_lock` below 2° or above 45°.
     BadData
         No joint has both of its segments in the pose.
 

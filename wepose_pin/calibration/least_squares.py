@@ -9,14 +9,14 @@ stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(st
 with ψ the heading, d its drift since the start, s its steps where samples were lost since (`losses`), and A the
 soft-tissue artefact: soft tissue rotates a sensor as the direction of gravity in the segment changes. A segment's
 points may move, as the shoulders do by collarbones and shoulder blades while the arms are raised (`model.girdle`). d,
-s, A and the hinges are nuisance parameters: the covariance of lengths and mounts includes their
-effect.
+s, A and the hinges are nuisance parameters: the covariance of lengths and mounts includes their effect.
 
-A sample is one of the protocol's condition that holds then. A closure gives the gap, whitened by the covariance that
-errors of the orientations and slipping palms give it, which makes it as homogeneous in the lengths as the gap itself
-(see `lengths`), and of each hinge by how much the segment that it moves leaves its plane. A pose gives the deviation of
-a segment from its stated direction, an axis its deviation from the level. Each sample has the same residuals: three of
-its condition and one a hinge; those that do not apply are zero.
+Each sample belongs to one condition of the protocol. A closure (`Loop`) gives the gap, whitened by the covariance that
+errors of the orientations and slipping palms give it, and of each hinge the angle by which the segment that it moves
+leaves its plane. The covariance depends on the lengths, so that scaling all lengths does not shrink the residual (see
+`lengths`). A stated pose (`Pointing`) gives the deviation of a segment from its direction, an axis (`Level`) its
+deviation from the horizontal. Each sample has the same residuals: three of its condition and one a hinge; those that do
+not apply are zero.
 """
 
 from __future__ import annotations
@@ -42,18 +42,18 @@ GAP_ROWS = 3  # residuals of a sample's condition
 
 @dataclass(frozen=True)
 class Layout:
-    """The places of the unknowns in x; each follows the one before, so it is computed once.
+    """The places of the unknowns in their vector x, and of the data of a sample; the properties are slices of them.
 
     Parameters
     ----------
     lengths : names, in the order of the table
-    sensors : by their segments, in the order of the table
-    hinges, girdles : of these sensors
-    fixed : how many unknown points
-    planes : how many level planes of unknown height
+    sensors : names of their segments, in the order of the table
+    hinges, girdles : between segments of these sensors
+    fixed : number of unknown fixed points
+    planes : number of level planes of unknown height
     distance_names : of the unknown distances outside the body
     steps : the sensor of each heading step
-    recorded : whether the samples hold a recorded place
+    recorded : the samples have a recorded place
     rigid : sensors without a soft-tissue artefact
     attitude_std : [rad] of each sensor's orientation about an axis across its segment; only the ratios matter
     """
@@ -97,7 +97,7 @@ class Layout:
 
     @cached_property
     def hinge(self) -> slice:
-        """Of each hinge's axis, by how much it is turned across and tilted."""
+        """Two numbers a hinge: the displacements of its axis, of length 1, along `across` and `tilted`."""
         return slice(self.drift.stop, self.drift.stop + 2 * len(self.hinges))
 
     @cached_property
@@ -107,7 +107,7 @@ class Layout:
 
     @cached_property
     def girdle(self) -> slice:
-        """`model.girdle.PARAMETERS` of each girdle [m]."""
+        """`model.girdle.PARAMETERS` of each girdle: a share of its law, then [m]."""
         return slice(self.soft_tissue.stop, self.soft_tissue.stop + len(PARAMETERS) * len(self.girdles))
 
     @cached_property
@@ -136,7 +136,7 @@ class Layout:
 
     @cached_property
     def rows(self) -> int:
-        """Length of a sample's data."""
+        """Number of values that a sample has."""
         return self.place.stop + 1
 
     @cached_property
@@ -151,15 +151,15 @@ class Layout:
 
     @cached_property
     def residuals(self) -> int:
-        """How many residuals a sample has."""
+        """Number of residuals of a sample."""
         return GAP_ROWS + len(self.hinges)
 
 
 class Gaussian(NamedTuple):
-    """A Gaussian over x."""
+    """A normal distribution of x, of m unknowns."""
 
     mean: np.ndarray  # (m,)
-    information: np.ndarray  # (m, m)
+    information: np.ndarray  # (m, m), the inverse of the covariance
 
 
 @dataclass(frozen=True)
@@ -169,14 +169,14 @@ class Observations:
     layout: Layout
     data: np.ndarray  # (rows, n): Q of each sensor xyzw, `Layout.beyond`, `Layout.place`, [s] since the start pose
     conditions: tuple[Constraint, ...]
-    condition_index: np.ndarray  # (n,) of each sample's condition, never falling
+    condition_index: np.ndarray  # (n,) number of each sample's condition, in ascending order
     step_std: np.ndarray = field(default_factory=lambda: np.empty(0))  # [rad] of each step, before the motion
 
     def __len__(self) -> int:
         return self.data.shape[1]
 
     def take(self, columns: np.ndarray) -> Observations:
-        """Some of the samples: growing indices, or bool (n,)."""
+        """Return some of the samples: ascending numbers, or bool (n,)."""
         return replace(self, data=self.data[:, columns], condition_index=self.condition_index[columns])
 
     @property
@@ -185,7 +185,7 @@ class Observations:
         return self.data[self.layout.beyond] > 0.5
 
     def apply_steps(self, x: np.ndarray) -> Observations:
-        """The same samples with the heading steps of `x` applied to Q."""
+        """Return the same samples with the heading steps of `x` applied to Q, and without steps among the unknowns."""
         data = self.data.copy()
         for name, step, beyond in zip(self.layout.steps, x[self.layout.step], self.beyond, strict=True):
             i = 4 * self.layout.sensors.index(name)
@@ -195,7 +195,7 @@ class Observations:
         return replace(self, layout=replace(self.layout, steps=()), data=data, step_std=np.empty(0))
 
     def spans(self) -> list[tuple[Constraint, slice]]:
-        """Each condition with its samples; none may be empty."""
+        """Return each condition with the slice of its samples."""
         edges = np.searchsorted(self.condition_index, np.arange(len(self.conditions) + 1))
         return [(c, slice(int(edges[i]), int(edges[i + 1]))) for i, c in enumerate(self.conditions)]
 
@@ -206,12 +206,12 @@ class Observations:
 
     @property
     def bending(self) -> np.ndarray:
-        """(n,) bool: samples of a closure or of free motion, at which hinges are looked at."""
+        """(n,) bool: samples of a closure or of free motion, which have the residuals of hinges."""
         return np.array([isinstance(c, Loop | Moving) for c in self.conditions], dtype=bool)[self.condition_index]
 
 
 def residuals(x: np.ndarray, observations: Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (n, k), their Jacobian (n, k, len(x)), gaps (n, 3) [m], which are zero without a closure."""
+    """Compute the residuals (n, k), their Jacobian (n, k, len(x)), and the gaps (n, 3) [m], zero without a closure."""
     parts, k = [], observations.layout.residuals
     for (condition, span), place in zip(observations.spans(), _unknown_places(observations.conditions), strict=True):
         program = _residual_program(observations.layout, condition, place)
@@ -224,7 +224,7 @@ def residuals(x: np.ndarray, observations: Observations) -> tuple[np.ndarray, np
 
 
 def _unknown_places(conditions: Sequence[Constraint]) -> list[int]:
-    """Of each condition which of the unknown points, or heights of planes, is its own."""
+    """Return of each condition the number of its unknown point, or of its plane's height, among those of its kind."""
     places, counts = [], {"fixed_point": 0, "plane": 0}
     for condition in conditions:
         kind = condition.kind if isinstance(condition, Loop) else ""
@@ -235,7 +235,7 @@ def _unknown_places(conditions: Sequence[Constraint]) -> list[int]:
 
 
 def place_points(x: np.ndarray, observations: Observations) -> np.ndarray:
-    """The same x with each unknown point and height at the mean of the body's points."""
+    """Return x with each unknown fixed point and height at the mean of the body's points that lie on it."""
     layout = observations.layout
     if not layout.fixed and not layout.planes:
         return x
@@ -255,7 +255,7 @@ def _residual_program(layout: Layout, condition: Constraint, place: int) -> Prog
 
 
 def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any:
-    """CasADi function of a sample: (x, data) → residuals (k), transposed Jacobian (len(x), k), gap (3)."""
+    """Return the CasADi function of a sample: (x, data) → residuals (k), transposed Jacobian (len(x), k), gap (3)."""
     sensors = layout.sensors
     x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", layout.rows)
     heading, tilt, drift, soft_tissue = x[layout.heading], x[layout.tilt], x[layout.drift], x[layout.soft_tissue]
@@ -295,7 +295,7 @@ _UP = ca.vertcat(0.0, 0.0, 1.0)
 
 
 def orient_parts(layout: Layout, x: Any, quat_WL: Mapping[str, Any], parts: Sequence[Part]) -> list[tuple[str, Any]]:
-    """Sensor and vector (3,) [m] in W of each part of a way, in CasADi."""
+    """Return sensor and vector (3,) [m] in W of each part of a way between points, in CasADi."""
     lengths, vectors = x[layout.length], []
     for part in parts:
         rows = [
@@ -308,7 +308,7 @@ def orient_parts(layout: Layout, x: Any, quat_WL: Mapping[str, Any], parts: Sequ
 
 
 def _displace_girdle(layout: Layout, x: Any, quat_WL: Mapping[str, Any], k: int) -> Any:
-    """The displacement (3,) [m] in W of what the k-th girdle moves, in CasADi."""
+    """Return the displacement (3,) [m] in W of the point that the k-th girdle moves, in CasADi."""
     term = layout.girdles[k]
     R_on, law = ca.DM(np.reshape(term.R_on, (3, 3))), term.law
     along = R_on.T @ rotate(inverse(quat_WL[law.on]), rotate(quat_WL[law.moves], ca.DM(term.along)))
@@ -320,7 +320,10 @@ def _displace_girdle(layout: Layout, x: Any, quat_WL: Mapping[str, Any], k: int)
 def _closure_residual(
     layout: Layout, loop: Loop, x: Any, quat_WL: Mapping[str, Any], place: int, recorded: Any
 ) -> tuple[Any, Any]:
-    """Whitened residual (3) and gap (3) [m] of a closure; `recorded` (3) [m] is the sample's recorded place."""
+    """Return the whitened residual (3) and the gap (3) [m] of a closure, in CasADi.
+
+    `place` is the number of its unknown point or plane, `recorded` (3) [m] the sample's recorded place.
+    """
     gaps, covariances = [], []
     names, on = [term.name for term in layout.girdles], loop.closure.on
     for way, girdles in zip(loop.ways, loop.girdles, strict=True):
@@ -334,7 +337,7 @@ def _closure_residual(
             if sensor not in (UNIVERSE, on):
                 others += v
                 covariance += _spread(layout, sensor, v)
-        if on:  # seen from the segment, an error of its sensor turns all the others
+        if on:  # in the segment's frame an error of its own sensor rotates all other parts
             inward = inverse(quat_WL[on])
             R = ca.horzcat(*(rotate(inward, ca.DM(axis)) for axis in np.eye(3)))
             gap, covariance = R @ gap, R @ (covariance + _spread(layout, on, others)) @ R.T
@@ -359,7 +362,7 @@ def _closure_residual(
 
 
 def _spread(layout: Layout, sensor: str, v: Any) -> Any:
-    """The covariance (3, 3) [m²] of the end of a part v (3,) by errors of its sensor, in CasADi.
+    """Return the covariance (3, 3) [m²] that errors of its sensor give the end of a part v (3,) [m], in CasADi.
 
     An error of variance σ² about each axis moves the end by a vector of covariance σ² (‖v‖² 1 − v vᵀ). Only the ratios
     of these weights matter.
@@ -369,7 +372,7 @@ def _spread(layout: Layout, sensor: str, v: Any) -> Any:
 
 
 def _hinge_residuals(layout: Layout, x: Any, quat_WL: Mapping[str, Any]) -> Any:
-    """By how much each segment leaves the plane of its hinge, in units of `HINGE_STD`."""
+    """Return the angles by which segments leave the planes of their hinges, in units of `HINGE_STD`, in CasADi."""
     unknown, residual = x[layout.hinge], []
     for i, hinge in enumerate(layout.hinges):
         along = rotate(inverse(quat_WL[hinge.on]), rotate(quat_WL[hinge.moves], ca.DM(hinge.along)))

@@ -85,33 +85,34 @@ def calibrate(
     measured_std: Positive = MEASURED_STD,
     formulation: Formulation = "full",
 ) -> Calibration:
-    """Calibrate a subject: lengths and mounts with their covariance from hands held together, or another protocol.
+    """Calibrate a subject: estimate lengths and mounts with their covariance from joined hands, or another protocol.
 
     Joined hands determine the proportions of the arms and not their scale: that comes from a measured length. A poor
-    or failed calibration is returned as well, and says so.
+    or failed calibration raises nothing: it is returned, and its `quality` says so.
 
     Parameters
     ----------
     recording : Recording
-        Has the phases of the protocol.
+        With the phases of the protocol, "clasp" for joined hands.
     measured : mapping, optional
-        Measured lengths, breadths that give one (`model.list_breadths`, as biacromial), and distances that the protocol
-        names, name → [m]; without one the scale is the prior's.
+        Name → [m] that was measured on the person: a length of the body such as "shoulder_width"; the breadth
+        "biacromial", from which a length follows; or a distance that the protocol names. Without any the scale is the
+        prior's.
     prior : Subject, optional
-        Lengths before, with covariance, and mounts; None: `population_subject`. The subject of an earlier calibration
-        is fused with the result (`sessions`).
+        Lengths with covariance, and mounts, as known before; None: `population_subject`. The subject of an earlier
+        calibration is combined with what this recording shows.
     model : BodyModel, str or Path, optional
         The body, or its file or name as for `load_model`; None: that which the recording states, else the upper body.
     protocol : str, Path or Protocol, optional
-        What was done in which phase: a name, a .toml of one's own, or what `load_protocol` gave; None: by the
-        recording's phases (`protocols.choose_protocol`).
+        What the person did in which phase: the name of a protocol, such as "clasp" or "free", a .toml file, or what
+        `wepose_pin.calibration.load_protocol` returned; None: "clasp", and "t_pose" if the recording has that phase.
     method : str
-        The orientation filter, a key of `wepose_pin.filters.METHODS`.
+        The orientation filter: "amekf", "smoother", "smekf", "ncf" or "gdc", as in `estimate_orientation`.
     measured_std : float
-        Standard deviation [m] of what was measured.
+        Standard deviation [m] of each measured value; 3 mm by default.
     formulation : str
-        "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone, by plain
-        least squares with one measured length at least (`paper`).
+        "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone, by the
+        plain least squares of Lisini Baldi et al. 2019, which needs a measured length.
 
     Returns
     -------
@@ -121,11 +122,12 @@ def calibrate(
     Raises
     ------
     BadOption
-        An unknown protocol or formulation, or a measured length that is none, not plausible, or missing.
+        An unknown protocol, method or formulation; a measured name that is no length of the body, an implausible value,
+        or none where one is needed.
     BadSession, BadPhase
-        A sensor that the protocol needs is missing; there is no such phase.
+        The recording lacks a sensor or a phase that the protocol needs.
     BadModel
-        The body has no lengths.
+        The table of the body names no lengths.
 
     Examples
     --------
@@ -443,7 +445,7 @@ def _hinges(
     layout_hinges = find_hinges(problem.model, problem.start_pose, problem.sensors)
     for i, (hinge, (across, tilted)) in enumerate(zip(layout_hinges, unknown.reshape(-1, 2), strict=True)):
         axis = np.array(hinge.axis) + across * np.array(hinge.across) + tilted * np.array(hinge.tilted)
-        axis_L = problem.turn(hinge.on).inv().apply(axis / np.linalg.norm(axis))
+        axis_L = problem.start_rotation(hinge.on).inv().apply(axis / np.linalg.norm(axis))
         rms = HINGE_STD * _rms(hinge_residuals[:, i])
         hinges[hinge.name] = Hinge(axis_L, max(rms, problem.model.table.hinges[hinge.name].softness)), rms
     return hinges
@@ -457,11 +459,11 @@ def _make_subject(
     mounts = {}
     for i, name in enumerate(layout.sensors):
         tilt = Rotation.from_rotvec(-np.append(x[layout.tilt][2 * i : 2 * i + 2], 0.0))
-        R_LS = problem.turn(name).inv() * tilt * _about_z(x[layout.heading][i]) * filtered.R_VS_start[name]
+        R_LS = problem.start_rotation(name).inv() * tilt * _about_z(x[layout.heading][i]) * filtered.R_VS_start[name]
         mounts[name] = R_LS.as_quat()
     # The mounts of sensors outside the chain are those of the start pose.
     for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
-        mounts[name] = (problem.turn(name).inv() * _about_z(psi) * filtered.R_VS_start[name]).as_quat()
+        mounts[name] = (problem.start_rotation(name).inv() * _about_z(psi) * filtered.R_VS_start[name]).as_quat()
     order, covariance = project_to_subject(layout, solution.covariance, problem.start_pose)
     std = np.sqrt(np.diag(solution.covariance))
     offset_stds = np.minimum(std[layout.tilt], np.pi).reshape(-1, 2)  # no angle is more uncertain than half a turn

@@ -38,8 +38,8 @@ from .recorded import read_recorded_places
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
 MIN_SAMPLES = 10  # of each condition
-FREE_S = 120.0  # [s] of free motion without a phase; headings drift beyond
-USUAL_ELEVATION = np.deg2rad(60.0)  # [rad] of arms, hands joined before the chest
+FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phase states it: headings drift
+USUAL_ELEVATION = np.deg2rad(60.0)  # [rad] of the arms off hanging, hands joined before the chest
 RIGID_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a link's orientation where nothing is soft; only ratios matter
 
 _T = TypeVar("_T")
@@ -47,15 +47,16 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """What a calibration starts from.
+    """The inputs of a calibration, and what follows from them before anything is estimated.
 
     Parameters
     ----------
-    recording, filtered : the samples, and the orientations of the sensors
+    recording : the samples
+    filtered : the orientations of its sensors, each in its own world
     protocol : what the person did in which phase
     prior : lengths with their covariance, and mounts
-    model : the body
     measured : name of a length, or of a distance of the protocol → value and standard deviation [m]
+    model : the body
     """
 
     recording: Recording
@@ -74,7 +75,7 @@ class CalibrationProblem:
 
     @cached_property
     def conditions(self) -> tuple[Constraint, ...]:
-        """The protocol's conditions on the body with these sensors.
+        """The protocol's conditions on the body with these sensors, in the protocol's order.
 
         Raises
         ------
@@ -88,11 +89,11 @@ class CalibrationProblem:
 
     @cached_property
     def lengths_in_closures(self) -> tuple[str, ...]:
-        """The lengths in some closure."""
+        """The names of the lengths that some closure contains."""
         return find_measured_lengths(self.protocol, self.model)
 
     def intervals(self, condition: Condition) -> Intervals:
-        """The intervals [s] in which a condition holds.
+        """Return the intervals [s] in which a condition holds.
 
         Raises
         ------
@@ -112,8 +113,8 @@ class CalibrationProblem:
 
     @property
     def measured_example(self) -> str:
-        """What would fix the scale best, as ``name=metres``: the protocol's, else the longest length in a closure that
-        was not measured.
+        """The measurement that would fix the scale best, as ``name=metres``: the protocol's, else the longest length in
+        a closure that was not measured.
         """
         example = self.protocol.measured_example
         breadth = list_breadths(self.model.table).get(example.partition("=")[0])
@@ -138,18 +139,18 @@ class CalibrationProblem:
         return tuple(name for name in self.model.table.segments if name in used)
 
     def mount(self, segment: str) -> np.ndarray | None:
-        """The mount `quat_LS` (4,) xyzw of prior or session, of L that equals W in the start pose; None: unknown."""
+        """Return the mount (4,) xyzw of prior or session, with an L that equals W in the start pose; None: unknown."""
         mount = find_nominal_mount(self.recording, segment, self.prior)
         if mount is None or segment not in self.prior.mounts or self.recording.remounted:
-            return mount  # a stated one names the sensor's axes in the start pose
-        return (self.turn(segment) * Rotation.from_quat(mount)).as_quat()
+            return mount  # a stated mount is by the sensor's axes in the start pose
+        return (self.start_rotation(segment) * Rotation.from_quat(mount)).as_quat()
 
-    def turn(self, segment: str) -> Rotation:
-        """R_WL of a segment in the start pose."""
+    def start_rotation(self, segment: str) -> Rotation:
+        """Return R_WL of a segment in the start pose; L is the segment's frame."""
         return Rotation.from_matrix(self.start_pose.R_WK[segment])
 
     def stated_headings(self, segments: Collection[str]) -> dict[str, float]:
-        """Segment → ψ [rad] at which its sensor is nearest to its mount, of those that have a mount."""
+        """Return segment → ψ [rad] by its mount, of those of these segments whose mount is known."""
         mounts = {segment: self.mount(segment) for segment in segments}
         return {
             segment: compute_heading_offset(self.filtered.R_VS_start[segment], Rotation.from_quat(mount))
@@ -158,7 +159,7 @@ class CalibrationProblem:
         }
 
     def remove_mounts(self, segments: Collection[str]) -> CalibrationProblem:
-        """The same problem without the mounts of these segments."""
+        """Return the same problem without the mounts of these segments."""
         sensors = {
             name: replace(sensor, stated_quat_LS=None) if name in segments else sensor
             for name, sensor in self.recording.sensors.items()
@@ -168,7 +169,7 @@ class CalibrationProblem:
         return replace(self, recording=recording, prior=prior)
 
     def relabel(self, moved: Mapping[str, str]) -> CalibrationProblem:
-        """The same problem with other sensors on the segments; a stated mount goes with its sensor.
+        """Return the same problem with sensors exchanged between segments; a stated mount goes with its sensor.
 
         Parameters
         ----------
@@ -186,7 +187,7 @@ class CalibrationProblem:
         )
 
     def mounts_against_gravity(self) -> dict[str, float]:
-        """Segment → angle [deg] between its mount and gravity in the start pose, where it is beyond the limit."""
+        """Return segment → angle [deg] between its mount and gravity in the start pose, above `MAX_MOUNT_ERROR_DEG`."""
         angles = {}
         for segment, R_VS_start in self.filtered.R_VS_start.items():
             mount = self.mount(segment)
@@ -196,27 +197,27 @@ class CalibrationProblem:
         return {segment: angle for segment, angle in angles.items() if angle > MAX_MOUNT_ERROR_DEG}
 
     def mounts_against_motion(self, estimated: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Segment → angle [deg] between its mount and the estimated `quat_LS`, where it is beyond the limit."""
+        """Return segment → angle [deg] between its mount and the estimated `quat_LS`, above `MOUNT_WARNING_DEG`."""
         angles = {}
         for segment, quat_LS in estimated.items():
             mount = self.mount(segment)
             if mount is not None and segment in self.recording.imus:
-                turn = self.turn(segment) * Rotation.from_quat(quat_LS) * Rotation.from_quat(mount).inv()
-                angles[segment] = float(np.degrees(turn.magnitude()))
+                R_estimated = self.start_rotation(segment) * Rotation.from_quat(quat_LS)
+                angles[segment] = float(np.degrees((R_estimated * Rotation.from_quat(mount).inv()).magnitude()))
         return {segment: angle for segment, angle in angles.items() if angle > MOUNT_WARNING_DEG}
 
     def orient_segments(self, mounts: Mapping[str, np.ndarray], samples: np.ndarray) -> dict[str, np.ndarray]:
-        """Segment → `quat_WL` (n, 4) xyzw at some samples (n,), with mounts `quat_LS`, as tracking gives it."""
+        """Return segment → `quat_WL` (n, 4) xyzw at samples (n,), with mounts `quat_LS`; headings not corrected."""
         filtered, quat_WL = self.filtered, {}
         for name in (name for name in filtered.R_VS if name in mounts):
-            R_start = self.turn(name)
-            R_LS = R_start * Rotation.from_quat(mounts[name])
-            turn = Rotation.from_rotvec([0.0, 0.0, compute_heading_offset(filtered.R_VS_start[name], R_LS)])
-            quat_WL[name] = (turn * filtered.R_VS[name][samples] * R_LS.inv() * R_start).as_quat()
+            R_start = self.start_rotation(name)
+            R_WS_start = R_start * Rotation.from_quat(mounts[name])
+            R_WV = Rotation.from_rotvec([0.0, 0.0, compute_heading_offset(filtered.R_VS_start[name], R_WS_start)])
+            quat_WL[name] = (R_WV * filtered.R_VS[name][samples] * R_WS_start.inv() * R_start).as_quat()
         return quat_WL
 
     def observe(self, rate_hz: float = SAMPLE_RATE_HZ) -> tuple[Observations, np.ndarray]:
-        """The observations of all conditions, and their samples (n,) of the recording.
+        """Return the observations of all conditions, and the numbers (n,) of their samples in the recording.
 
         Raises
         ------
@@ -281,16 +282,16 @@ class CalibrationProblem:
         samples = np.concatenate(parts)
         steps, step_std, beyond = group_steps(losses, samples)
         layout = replace(layout, steps=steps)
-        turns = [
+        rotations_since_start = [
             (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
         ]
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         recorded = np.concatenate(places).T if layout.recorded else np.empty((0, len(samples)))
-        data = np.vstack([*turns, beyond, recorded, recording.time[samples] - filtered.start[1]])
+        data = np.vstack([*rotations_since_start, beyond, recorded, recording.time[samples] - filtered.start[1]])
         return Observations(layout, data, self.conditions, condition_index, step_std), samples
 
     def check_start_pose(self) -> None:
-        """Raises `BadPhase` where lost samples keep the motion from showing a mount that is not known."""
+        """Raise `BadPhase` where lost samples keep the motion from showing a mount that is not known."""
         observations, samples = self.observe()
         sensors = observations.layout.sensors
         unknown = [name for name in sensors if self.mount(name) is None]
@@ -299,7 +300,7 @@ class CalibrationProblem:
 
 
 def _estimate_attitude_std(segment: Segment) -> float:
-    """[rad] of a sensor's orientation about an axis across its segment while the arms are half raised."""
+    """Return [rad], one standard deviation about an axis across its segment of a sensor's orientation, arms raised."""
     tissue = segment.soft_tissue
     growth = USUAL_ELEVATION * np.hypot(tissue.per_tilt, tissue.per_raised)
     return float(np.sqrt(np.mean(np.square(tissue.std) + growth**2))) or RIGID_ATTITUDE_STD

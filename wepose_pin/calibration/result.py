@@ -23,37 +23,40 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The estimates of a calibration, its quality and diagnostics; n samples are those of the least squares.
+    """What `calibrate` returns: the calibrated subject, the quality of the calibration and its diagnostics.
 
-    It prints itself in one line, with what to do first where it does not pass.
+    It prints itself in one line, with what to do first where it does not pass. Most users need `subject`, `quality` and
+    `diagnostics`; the rest is for reports. The least squares takes n samples of the recording, about 8 a second. The
+    gap is the residual of the closure: the vector between the palms of joined hands, or what another protocol closes.
 
     Parameters
     ----------
-    subject : lengths and mounts with their joint covariance; it states the quality
-    prior : what was known before
-    rms_gap : palm-to-palm residual [m], root mean square of its length, where the palms touch
+    subject : lengths and mounts with their joint covariance; its `quality` is that of the calibration
+    prior : the subject before the calibration
+    rms_gap : [m] root mean square of the gap's length, where the hands are joined
     prior_rms_gap : the same with the prior's lengths
-    effective_sample_size : effective sample size of the gap
-    measured : the measured lengths [m]; empty: the scale is the prior's
+    effective_sample_size : number of independent samples with as much information as the gaps
+    measured : name → measured length [m]; empty: the scale is the prior's
     scale_std : relative standard deviation of the overall scale, with the proportions as estimated
-    remarks : diagnostics of the estimation, besides those of its quality
-    time, gap, prior_gap : (n,) [s], (n,) [m] the residual's length at each sample, and with the prior's lengths
-    contact : (n,) the weight of each sample's gap, near 0 where the palms are apart
-    start_pose_offset : segment → (2,) [rad] about x and y of W, how far it was off the start pose
-    heading_drift : segment → [rad/s] of its sensor's heading
+    remarks : diagnostics of the estimation, without those of its quality; `diagnostics` has both
+    time : (n,) [s] of the samples
+    gap, prior_gap : (n,) [m] length of the gap, as estimated and with the prior's lengths; NaN outside of closures
+    contact : (n,) weight of each sample's gap, near 0 where the palms are apart
+    start_pose_offset : segment → (2,) [rad] about x and y of W, by which it was off the start pose
+    heading_drift : segment → [rad/s] drift of its sensor's heading
     hinge_axes : joint → (3,) its axis in the frame of the segment above, unit length
-    hinge_rms : joint → [rad] of the segment below against the plane of that hinge
+    hinge_rms : joint → [rad] rms angle of the segment below to the plane across that axis
     information_shares : name as in the subject's covariance, or ``left_forearm + left_hand`` → (n,) share of the
         information on it that each sample brings; their sum and the prior's share make 1
-    prior_covariance : (k, k) before the motion, in the order of the subject's
+    prior_covariance : (k, k) before the motion, rows as `subject.order`
     quat_WL : segment → (n, 4) xyzw at each sample, as tracking gives it
     protocol : its name
-    closure : the kind of its closure, as in `protocols.KINDS`; empty where it has none
+    closure : the kind of its closure, "coincide" for joined hands; empty where it has none
     measured_example : the length that would fix the scale best, as ``name=metres``
-    measured_lengths : each measured length beside what is known without it
-    labels : whether the sensors sit where the session says
-    unused_mounts : stated mounts that gravity or the motion contradicts
-    scale_lengths : measured lengths that fix the scale; empty: the prior does
+    measured_lengths : name → measured length beside the estimate without it
+    labels : the check that each sensor is on the segment that the session states
+    unused_mounts : diagnostics of stated mounts that gravity or the motion contradicts
+    scale_lengths : names of the measured lengths that fix the scale; empty: the prior does
     model, start_pose, conditions : the body, its links in the start pose, and the protocol's conditions on it
     formulation : "full" or "paper"
     """
@@ -91,14 +94,14 @@ class Calibration:
 
     @cached_property
     def quality(self) -> CalibrationQuality:
-        """Pass, poor or fail, with all checks and reasons (`assess`)."""
+        """The quality, `quality.quality` "pass", "poor" or "fail", with all checks and reasons."""
         from .quality import assess
 
         return assess(self)
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
-        """What the user should know, the reasons of its quality first."""
+        """What the user should know: the reasons of its quality first, then the remarks."""
         return self.quality.diagnostics
 
     def state_quality(self) -> Calibration:
@@ -122,7 +125,7 @@ class Calibration:
 
     @property
     def variant(self) -> str:
-        """Which words fit: of a mechanism, of the kind of closure, or none without a closure."""
+        """The variant of texts about it: "mechanism", else the kind of its closure; empty without a closure."""
         return "mechanism" if self.model.table.is_mechanism else self.closure
 
     @property
@@ -131,7 +134,7 @@ class Calibration:
         return self.subject.shape(self.model)
 
     def limbs(self) -> LimbMotion:
-        """How the limbs moved while the chain was closed."""
+        """Return how the limbs moved while the closure held; without a closure, in all samples."""
         closed = np.isfinite(self.gap)
         rows = closed & (self.contact > MIN_CONTACT) if closed.any() else np.ones(len(self.gap), dtype=bool)
         gap = np.sqrt(np.average(self.gap[closed] ** 2, weights=self.contact[closed])) if closed.any() else 0.0

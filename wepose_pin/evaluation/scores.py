@@ -95,29 +95,30 @@ def evaluate(
     interval: tuple[float, float] | None = None,
     table: BodyTable | None = None,
 ) -> Evaluation:
-    """Errors of a pose against a reference, which is interpolated to the pose's times.
+    """Compute the errors of a pose against a reference in the same W, which is interpolated to the pose's times.
 
     Parameters
     ----------
     pose : Pose or PosedBody
         What `track` or `load_result` gives, or its `pose`.
     truth : Pose or PosedBody
-        The reference. Samples without a truth are left out.
+        The reference. Where it is NaN, or has no sample near a time of the pose, that time is left out.
     interval : (float, float), optional
         From, to [s]; None: all of the time that both have.
     table : BodyTable, optional
-        Of the body, which says where limbs hang; None: that of `pose`, where it has a body, else the upper body's.
+        Of the body: it names the limbs, for errors of a hand relative to the shoulders. None: that of `pose`, where it
+        has a body, else the upper body's.
 
     Returns
     -------
     Evaluation
-        By segment `attitude` [deg], by joint and angle `joints` [deg], by point `position` [mm], and whether the
-        stated standard deviations are consistent with the errors.
+        `attitude[segment]` [deg], `joints[joint][angle]` [deg], `position[point]` [mm] relative to the root, and in
+        `attitude_uncertainty` and `position_uncertainty` how far the stated covariances agree with the errors.
 
     Raises
     ------
     BadOption
-        An interval that is none.
+        The interval's end is not after its beginning.
     BadData
         No time in common, or nothing to compare.
 

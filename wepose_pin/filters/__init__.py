@@ -70,7 +70,8 @@ TYPICAL = SensorNoise(
 class Orientation(NamedTuple):
     """Orientation of one sensor over time.
 
-    W is the sensor's own world, called V outside of the filters: z up, zero heading where the start phase begins.
+    W is the sensor's own world, called V outside of the filters: z up, zero heading at the first sample of the phase
+    from which the filter starts.
     """
 
     quat_WS: np.ndarray  # (n, 4) xyzw
@@ -114,10 +115,10 @@ def estimate_orientation(
     """Estimate the orientation of a sensor from its gyroscope and accelerometer.
 
     W of the returned `quat_WS` is the sensor's own world: z up, and a heading that has no relation to the worlds
-    of other sensors (`wepose_pin.alignment` finds it from a start pose). The static phase begins with zero heading
-    and the tilt of the accelerometer, averaged over it (without one: over the first window of `static_test`); the
-    filter goes forward and backward from there. Where gyro_S is cut off by the sensor's range, `attitude_cov` grows
-    by what it may have turned beyond.
+    of other sensors (`track` aligns them by the start pose). At the first sample of the static phase the heading is
+    zero and the tilt is that of the mean accelerometer over the phase (without a phase: over the first window of
+    `static_test`); the filter goes forward and backward in time from there. Where `gyro_S` is at the limit of the
+    sensor's range, `attitude_cov` grows by the rotation that may have gone unmeasured.
 
     Parameters
     ----------
@@ -128,26 +129,29 @@ def estimate_orientation(
     rate_hz : float
         Samples a second, uniform.
     method : str
-        A key of `METHODS`: "amekf", "smoother", "smekf", "ncf" or "gdc".
+        "amekf": Kalman filter that corrects the tilt in motion too; "smoother": the same forward and backward over all
+        samples; "smekf": Kalman filter that corrects in static phases alone; "ncf": complementary filter (Mahony 2008);
+        "gdc": gradient descent (Madgwick 2011). "ncf" and "gdc" have no covariance.
     static : (float, float) or None
-        From, to [s] after the first sample: the sensor is static there, and noise and bias are measured. None: no
-        static phase; noise is `TYPICAL`, and the bias starts at zero.
+        The static phase, from and to [s] after the first sample: the sensor does not move there, and its noise and bias
+        are measured. None: there is none; the noise is that of a usual MEMS sensor, and the bias starts at zero.
     params : optional
-        The filter's own frozen parameters; None: its defaults.
+        The filter's own parameters, such as `wepose_pin.filters.AmekfParams`; None: its defaults.
     static_test : StaticTest, optional
         When the sensor counts as static; None: the default values.
 
     Returns
     -------
     Orientation
-        `quat_WS` (n, 4) xyzw, `gyro_bias` (n, 3) [rad/s], `static` (n,) bool, `attitude_cov` (n, 3, 3) [rad²] in S or
-        None, `noise`, `diagnostics`.
+        `quat_WS` (n, 4) xyzw, `gyro_bias` (n, 3) [rad/s], `static` (n,) bool: the sensor did not move, `attitude_cov`
+        (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_WS`, or None, `noise` of the static
+        phase, `diagnostics`.
 
     Raises
     ------
     BadOption, BadData, BadPhase
-        An unknown method; arrays that do not fit each other; samples in which the sensor does not measure; a static
-        phase outside the data.
+        An unknown method; arrays that do not fit each other; samples that are not finite, frozen or otherwise no
+        measurement; a static phase outside the data.
 
     Warns
     -----
@@ -210,12 +214,22 @@ def chunk_multiple(method: str, rate_hz: float) -> int:
 
 
 class SensorRun:
-    """`run_filter` of a recording in chunks; the joined results are those of the whole recording.
+    """One filter on one sensor's samples, which come in chunks; the joined results are those of the whole recording.
 
     The filter starts with the tilt of the start phase and runs forward from its first sample, and backward over earlier
     samples, so that a recording may begin in motion. The smoother runs forward over all samples, from the end of the
     backward run. The smoother alone uses the next chunk: its `push` returns the chunk before. Its chunks are multiples
-    of `chunk_multiple`. Parameters as in `run_filter`; the start phase is in the first chunk.
+    of `chunk_multiple`.
+
+    Parameters
+    ----------
+    noise : of the sensor, from its static phase
+    method : a key of `METHODS`
+    params : the filter's own; None: its defaults
+    static_test : when the sensor counts as static; None: the default values
+    measured_start : without `params`, smekf takes P₀ from `noise` in place of the paper's (`smekf.starting_params`)
+    start : samples of the start phase, in the first chunk; None: the first window of `static_test`, static or not
+    gyro_range : [rad/s] at which an axis of gyro saturates
 
     Raises
     ------
@@ -244,7 +258,7 @@ class SensorRun:
         self._static = np.zeros(0, dtype=np.bool_)  # of the smoother's chunk
 
     def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation | None:
-        """Take a chunk (n, 3) [rad/s], (n, 3) [m/s²]; returns it filtered, or the one before it smoothed."""
+        """Take a chunk (n, 3) [rad/s], (n, 3) [m/s²]; return it filtered, or the one before it smoothed, first None."""
         if self._filter is None:
             first = self._begin(gyro_S, accel_S)
             gyro_S, accel_S = gyro_S[first:], accel_S[first:]
@@ -255,11 +269,11 @@ class SensorRun:
         return self._orientation(self._filter.run(gyro_S, accel_S, static), static)
 
     def finish(self) -> Orientation:
-        """Return the smoother's last chunk."""
+        """Return the smoother's last chunk; other filters have returned all in `push`."""
         return self._orientation(self._filter.finish(), self._static)
 
     def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> int:
-        """Create the filter, and filter the samples before the start phase; returns the filter's first sample."""
+        """Create the filter, and filter the samples before the start phase; return the filter's first sample."""
         phase = self._start or slice(0, self.test.samples(self._rate_hz))
         first = phase.start
         start = estimate_start_tilt(gyro_S[phase], accel_S[phase], self._noise, self._rate_hz)
@@ -278,9 +292,10 @@ class SensorRun:
         return first
 
     def _run_backward(self, start: StartTilt, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation:
-        """Filter the samples `accel_S` before the start phase; `gyro_S` has the first sample of the phase as well.
+        """Return the orientations (n,) before the start phase: `accel_S` (n, 3), `gyro_S` (n + 1, 3).
 
-        Backward in time, rates and bias change their sign; specific forces do not.
+        `gyro_S` has the first sample of the phase as well, whose rate leads back to the sample before. Rates and bias
+        change their sign backward in time; specific forces do not.
         """
         turn = np.nan_to_num(gyro_S[-1] - self._noise.gyro_bias) / self._rate_hz
         quat_WS = (Rotation.from_quat(start.quat_WS) * Rotation.from_rotvec(turn)).as_quat()
@@ -304,6 +319,7 @@ class SensorRun:
         return METHODS[method](noise, self._rate_hz, start.quat_WS, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
+        """Return a run as orientations, joined to those before the start phase where it is the first."""
         live = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
         before, self._before = self._before, None
         if before is not None and self._method in OFFLINE:
@@ -331,10 +347,6 @@ def run_filter(
     measured_start: bool = False,
     start: slice | None = None,
 ) -> Orientation:
-    """Run a filter as `estimate_orientation`, with known noise and checked arrays.
-
-    `measured_start`: without `params`, smekf takes P₀ from `noise` in place of the paper's (`smekf.starting_params`).
-    `start`: samples of the start phase; None: the first window of `static_test`, static or not.
-    """
+    """Return the orientations of one sensor, of checked arrays and known noise; parameters as of `SensorRun`."""
     run = SensorRun(rate_hz, noise, method, params, static_test, measured_start, start)
     return run.push(gyro_S, accel_S) or run.finish()

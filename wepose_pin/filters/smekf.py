@@ -1,12 +1,14 @@
-"""sMEKF: the multiplicative Kalman filter that corrects only at rest (Lisini Baldi 2019, Algorithm 1).
+"""sMEKF: the multiplicative Kalman filter that corrects in static phases alone (Lisini Baldi 2019, Algorithm 1).
 
-One thing differs from the paper, which works to first order: its transition Φ = I − [ω δt]× lets the covariance grow by
-√(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz to 10⁶ deg in 20 s, and leaves it as it is where a correction turns
-the attitude, so that rests seem to measure the heading. Here Φ = exp(−[ω δt]×), and the covariance turns with the
-correction; `SmekfParams.first_order` is the paper's.
+One thing differs from the paper, which works to first order. Its transition Φ = I − [ω δt]× lets the standard deviation
+grow by √(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz to 10⁶ deg in 20 s. Its corrections rotate the attitude and not
+the covariance, so that static phases seem to measure the heading. Here Φ = exp(−[ω δt]×), and a correction rotates the
+covariance too; `SmekfParams.first_order` is the paper's.
 
 The state is x = [a; b]: the attitude error a [rad] on the right of `quat_WS`, in the sensor frame, and the gyroscope
-bias b [rad/s]. Measurement model: gyro = ω + b + w_ω, accel/g = R_WSᵀ e_z + w_g. At rest ω = 0, so gyro measures b.
+bias b [rad/s]. Measurement model: gyro = ω + b + w_ω, accel/g = R_WSᵀ e_z + w_g. In a static phase ω = 0, so gyro
+measures b. Σ_ω and Σ_g are the covariances of the white noises w_ω and w_g, Σ_b that of the bias's random walk, P₀ that
+of the state at the first sample.
 """
 
 from __future__ import annotations
@@ -32,17 +34,17 @@ HEADING_FLOOR = 1e-5  # [rad] keeps P₀ positive definite about the vertical
 
 @dataclass(frozen=True)
 class SmekfParams:
-    """P₀ and Σ_b; the defaults are those of the authors' published software.
+    """Covariances of the filter; the defaults are those of the authors' published software.
 
-    Their P₀ gives the heading, which nothing measures, a standard deviation of 1.8 deg. `starting_params` says what a
-    still start is really worth. Their Σ_b is some 2 Σ_ω, orders above the drift of a real bias, so every rest forgets
-    the ones before and the covariance is too large.
+    Their P₀ gives the heading, which nothing measures, a standard deviation of 1.8 deg; `starting_params` takes P₀ from
+    the start phase. Their Σ_b is some 2 Σ_ω, orders of magnitude above the drift of a real bias, so that each static
+    phase forgets the ones before and the covariance is too large.
 
-    By how much, over two minutes of simulated motion with rests (`tests/test_filters.py` measures it; a NEES of 3 is
-    right, below is a covariance too large): NEES 1.9 and 0.57 deg of heading (rms) with the paper's P₀, Σ_b and first
-    order, 0.5 and 0.10 deg exact and with `starting_params`, 0.7 and 0.08 deg with the Σ_b of a bias that drifts by
-    10 deg/h as well. The simulated accelerometer has no bias and the gyroscope no wrong scale, which `starting_params`
-    allows for.
+    Over two minutes of simulated motion with static phases (`tests/test_filters.py`) the normalised estimation error
+    squared, which is 3 for a right covariance and less for one that is too large, and the rms heading error are: 1.9
+    and 0.57 deg with the paper's P₀, Σ_b and first order; 0.5 and 0.10 deg exact and with `starting_params`; 0.7 and
+    0.08 deg with the Σ_b of a bias that drifts by 10 deg/h as well. The simulated accelerometer has no bias and the
+    gyroscope no wrong scale, which `starting_params` allows for.
     """
 
     attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
@@ -52,19 +54,19 @@ class SmekfParams:
     static_accel_cov: np.ndarray | None = None  # (3, 3) of static accel/g about the vertical; None: Σ_g
     static_turn_noise: float = 0.0  # [rad/√s] by which a static sensor may turn about the vertical unseen; the paper: 0
     first_order: bool = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
-    gyro_scale_std: float = 0.0  # of the gyroscope's scale, which no rest shows; the paper: 0
-    gyro_range: float = np.inf  # [rad/s]; a sample at it is cut off: turned by it, but what is beyond went unseen
+    gyro_scale_std: float = 0.0  # of the gyroscope's scale, which no static phase shows; the paper: 0
+    gyro_range: float = np.inf  # [rad/s]; a sample at it is used, and the covariance grows by what may be beyond
 
 
 def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, tilt_std: float) -> SmekfParams:
-    """P₀ from what the start phase says: the tilt as good as it is known, the heading exact by definition.
+    """Return the parameters with P₀ of the start phase: the tilt as it is known, the heading exact by definition.
 
-    A person's sway goes on from sample to sample, where Σ_ω and Σ_g are taken for white, and so does the bias of the
-    accelerometer: what gyro says of its bias at rest, and accel of the vertical, counts as little as that allows.
+    A person's sway and the accelerometer's bias are correlated from sample to sample, while Σ_ω and Σ_g stand for white
+    noise. The covariances of static samples are therefore inflated: many samples of a static phase count as few.
 
     Parameters
     ----------
-    quat_WS : (4,) xyzw, the orientation the filter starts from
+    quat_WS : (4,) xyzw, the orientation from which the filter starts
     tilt_std : [rad] one standard deviation of its roll and pitch
     """
     up_S = np.array(up_in_sensor(quat_WS))
@@ -79,20 +81,21 @@ def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, til
     )
 
 
-# At a missing sample (`recording.limits`) the last rate is held and fades away with HOLD_S, the correction is left out,
-# and the attitude is trusted less by the motion that may have gone unseen: after T seconds σ T²/(T + HOLD_S), up to π.
+# At a missing sample (NaN, or beyond `recording.limits`) the last rate is held and fades with the time constant HOLD_S,
+# no correction is made, and the attitude's standard deviation grows by the motion that may have gone unseen: after T
+# seconds by UNSEEN_RATE_STD T²/(T + HOLD_S), up to π.
 HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
 UNSEEN_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
 
-# The state of a sensor is one record, what does not change is another. Upper triangles are xx xy xz yy yz zz.
+# The state of a sensor is one record, its constants (the model) are another. Upper triangles are xx xy xz yy yz zz.
 STATE = np.dtype(
     [
         ("quat_WS", float, 4),  # xyzw
         ("gyro_bias", float, 3),  # [rad/s]
         ("attitude_cov", float, 6),  # [rad²] upper triangle: P_aa, and what the gyroscope's scale adds to the heading
-        ("turned", float),  # [rad] about the vertical, less what was turned back
+        ("turned", float),  # [rad] net rotation about the vertical since the start
         ("P_aa", float, 6),  # [rad²] upper triangle
-        ("P_ab", float, (3, 3)),
+        ("P_ab", float, (3, 3)),  # [rad²/s]
         ("P_bb", float, 6),  # [rad²/s²] upper triangle
         ("held_rate", float, 3),  # [rad/s] the last that was measured
         ("unseen_s", float),  # [s] since then
@@ -104,10 +107,10 @@ MODEL = np.dtype(
         ("dt", float),  # [s]
         ("inverse_gravity", float),  # [s²/m]
         ("attitude_step", float, 6),  # [rad²] δt² Σ_ω
-        ("bias_step", float, 6),  # δt² Σ_b
-        ("static_gyro_cov", float, 6),
-        ("static_accel_cov", float, 6),
-        ("fade", float),  # what a sample leaves of a held rate
+        ("bias_step", float, 6),  # [rad²/s²] δt² Σ_b
+        ("static_gyro_cov", float, 6),  # [rad²/s²]
+        ("static_accel_cov", float, 6),  # of accel/g
+        ("fade", float),  # factor on a held rate at each missing sample
         ("first_order", np.bool_),
         ("static_turn", float),  # [rad²] variance of an unseen turn in a static sample
         ("scale_var", float),  # of the gyroscope's scale
@@ -135,10 +138,10 @@ class SmekfState:
 
 
 class Smekf:
-    """sMEKF of one sensor. Σ_ω, Σ_g, Σ_b, the first bias and the gravity scale come from `noise`.
+    """sMEKF of one sensor. Σ_ω, Σ_g, Σ_b, the first bias and the size of gravity come from `noise`.
 
-    A sample that is no number does not stay in the state: the last rate is held for a tenth of a second and fades, and
-    `attitude_cov` grows by the motion that may have gone unseen (HOLD_S, UNSEEN_RATE_STD).
+    Missing samples are NaN: the last rate is held and fades, and `attitude_cov` grows by the motion that may have gone
+    unseen (HOLD_S, UNSEEN_RATE_STD). `run` and `update` are those of `base.OrientationFilter`.
     """
 
     def __init__(
@@ -183,17 +186,17 @@ def _matrix(cov: float | np.ndarray) -> np.ndarray:
 
 
 def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
-    """(1,) of `MODEL`."""
+    """Return the constants of a sensor's filter, (1,) of `MODEL`."""
 
-    def chosen(cov: np.ndarray | None, default: np.ndarray) -> np.ndarray:
+    def upper(cov: np.ndarray | None, default: np.ndarray) -> np.ndarray:
         return (default if cov is None else _matrix(cov))[_UPPER]
 
     model = np.zeros(1, MODEL)
     model["dt"], model["inverse_gravity"] = dt, 1.0 / noise.gravity
     model["attitude_step"] = (dt * dt * noise.gyro_cov)[_UPPER]
-    model["bias_step"] = dt * dt * chosen(params.bias_step_cov, noise.bias_step_cov)
-    model["static_gyro_cov"] = chosen(params.static_gyro_cov, noise.gyro_cov)
-    model["static_accel_cov"] = chosen(params.static_accel_cov, noise.accel_cov)
+    model["bias_step"] = dt * dt * upper(params.bias_step_cov, noise.bias_step_cov)
+    model["static_gyro_cov"] = upper(params.static_gyro_cov, noise.gyro_cov)
+    model["static_accel_cov"] = upper(params.static_accel_cov, noise.accel_cov)
     model["fade"], model["first_order"] = np.exp(-dt / HOLD_S), params.first_order
     model["static_turn"], model["gyro_range"] = params.static_turn_noise**2 * dt, params.gyro_range
     model["scale_var"] = params.gyro_scale_std**2
@@ -202,7 +205,7 @@ def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
 
 @inlined
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
-    """One sample of one sensor: records of `STATE` and `MODEL`, gyro [rad/s], accel [m/s²]."""
+    """Take one sample of one sensor: records of `STATE` and `MODEL`, gyro [rad/s], accel [m/s²]."""
     dt, bias, held = model.dt, state.gyro_bias, state.held_rate
     seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
     unseen_cov = 0.0
@@ -222,15 +225,15 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
     predict(state, model, wx * dt, wy * dt, wz * dt, unseen_cov)
     if static and seen and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
         correct(state, model, gx, gy, gz, ax, ay, az)
-    state_covariance(state, model, wx * dt, wy * dt, wz * dt)
+    update_attitude_cov(state, model, wx * dt, wy * dt, wz * dt)
 
 
 @inlined
-def state_covariance(state, model, wx, wy, wz):  # type: ignore[no-untyped-def]
-    """The attitude's stated covariance after the rotation w [rad]: P_aa and the error of the gyroscope's scale.
+def update_attitude_cov(state, model, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """Set the stated attitude covariance after the rotation w [rad]: P_aa and the error of the gyroscope's scale.
 
-    A scale that is wrong by s turns the heading by s times the rotation about the vertical, and tilts, which static
-    phases correct, by as much. It is no part of the state: the paper's corrections are as they were.
+    A scale that is wrong by s gives the heading an error of s times the rotation about the vertical. It gives the tilt
+    an error too, which static phases correct. The scale is no part of the filter's state, as in the paper.
     """
     ux, uy, uz = up_in_sensor(state.quat_WS)
     state.turned += wx * ux + wy * uy + wz * uz
@@ -387,8 +390,8 @@ def correct(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-de
     turn = d[0] + e[0], d[1] + e[1], d[2] + e[2]
     rotate_by_vector(state.quat_WS, turn[0], turn[1], turn[2])
     if not model.first_order:
-        # The vertical, which accel does not measure about, turns in S with the correction, and P with it: left as it
-        # was, P would lie askew and the next sample would take its long axis for one that accel measures.
+        # The direction of the vertical in S changes with the correction. The long axis of P, the heading, has to follow
+        # it: otherwise it would have a horizontal part, which the next sample of accel would correct.
         propagate(state, turn[0], turn[1], turn[2], 0.0, False)
     for i in range(3):
         bias[i] += d[3 + i] + e[3 + i]
@@ -412,10 +415,10 @@ def difference(a, x, b, y):  # type: ignore[no-untyped-def]
 
 @inlined
 def fuse(state, rows, S, innovation):  # type: ignore[no-untyped-def]
-    """Three measurements: P ← P − (H P)ᵀ S⁻¹ (H P) in the state; gives the error state (6,) (H P)ᵀ S⁻¹ (y − h).
+    """Correct by three measurements: P ← P − (H P)ᵀ S⁻¹ (H P); return the error state (6,) (H P)ᵀ S⁻¹ (y − h).
 
     With S = L D Lᵀ and V = L⁻¹ H P these are P − Vᵀ D⁻¹ V and Vᵀ D⁻¹ L⁻¹ (y − h). `rows` are those of H P (3, 6), S is
-    its upper triangle. A direction without any variance, of P and of the noise, says nothing and is left out.
+    its upper triangle, `innovation` is y − h. A direction in which S is zero corrects nothing.
     """
     i0 = 1.0 / S[0] if S[0] > 0.0 else 0.0
     l10, l20 = S[1] * i0, S[2] * i0

@@ -72,28 +72,39 @@ _UPPER = np.triu_indices(3)
 
 @dataclass(frozen=True)
 class StaticTest:
-    """When a sensor counts as static; the defaults of (1) to (4) are the paper's, which leaves the window open.
+    """When a sensor counts as static: where all six conditions hold for the window that ends with the sample.
 
-    The covariance conditions hold as matrices: ``alpha * Σ̂ − S`` is positive semidefinite. Conditions (5) and (6) are
-    ours, and ``rate_stds=inf`` leaves the paper's test alone. (5) holds for the window and for an average over
-    `averaging_s`, in which sway cancels; the standard deviation is that of the known bias, which grows by `bias_walk`,
-    of the mean's noise and sway as measured in the start phase, and of `bias_spread`. (6) is an ellipsoid of noise and
-    sway of the start phase, as probable as that many standard deviations of one axis.
+    Conditions (1) to (4) and their limits are those of Lisini Baldi et al. 2019, who do not state a window. (5) and (6)
+    are additions of this package; ``rate_stds=inf`` leaves them out. "Static phase" is that of the recording, in which
+    noise and bias were measured.
+
+    Parameters
+    ----------
+    window_s : [s] length of the window
+    alpha : (1) the covariance of gyro in the window is at most so many times that of the static phase, along any axis
+    beta : (2) the same of accel/g
+    gamma1 : (3) the mean of ‖accel/g‖ differs from 1 by at most this
+    gamma2 : (4) the variance of ‖accel/g‖ is at most this
+    rate_stds : (5) the mean rate about the vertical differs from the known bias by at most so many standard deviations,
+        in the window and in an average over `averaging_s`. (6) the mean rate in the newest `newest_s` differs from that
+        of the window by no more, on an ellipsoid that is as probable as so many standard deviations of one axis
+    newest_s : [s] of (6), about as long as the fastest smooth motion takes to begin
+    averaging_s : [s] of (5), about two periods of a standing person's sway, which cancels in the average
+    bias_spread : [rad/s] of (5), one standard deviation by which the bias depends on how the sensor lies
+    bias_walk : [rad/s/√s] of (5), by which the bias drifts
     """
 
-    window_s: Annotated[float, Range(0.0, closed=False, high=60.0)] = 0.5  # [s] W
-    alpha: NonNegative = 2.0  # (1) gyro covariance against that of the static phase
-    beta: NonNegative = 2.0  # (2) accel/g covariance against that of the static phase
-    gamma1: NonNegative = 0.01  # (3) |mean ‖accel/g‖ − 1| at most
-    gamma2: NonNegative = 0.01  # (4) variance of ‖accel/g‖ at most
-    # standard deviations by which (5) the rate about the vertical may be off the known bias, (6) the rate may change
+    window_s: Annotated[float, Range(0.0, closed=False, high=60.0)] = 0.5
+    alpha: NonNegative = 2.0
+    beta: NonNegative = 2.0
+    gamma1: NonNegative = 0.01
+    gamma2: NonNegative = 0.01
     rate_stds: float = 3.0
-    newest_s: Positive = 0.05  # [s] of (6)'s newest part: about the fastest that a smooth motion begins
-    averaging_s: Positive = 4.0  # [s] of (5)'s average, about two periods of a standing person's sway
-    # [rad/s] by which the bias depends on how the sensor lies; 0.01 deg/s, twice what BROAD's sensors show at rest
-    bias_spread: NonNegative = float(np.deg2rad(0.01))
-    # [rad/s/√s] by which it drifts: a strapped sensor warms by 5 to 10 K in a quarter of an hour, at 0.02 deg/s a
-    # kelvin that is 0.2 deg/s, here three standard deviations
+    newest_s: Positive = 0.05
+    averaging_s: Positive = 4.0
+    bias_spread: NonNegative = float(np.deg2rad(0.01))  # twice what BROAD's sensors show at rest
+    # A strapped sensor warms by 5 to 10 K in a quarter of an hour, at 0.02 deg/s a kelvin that is 0.2 deg/s, here three
+    # standard deviations.
     bias_walk: NonNegative = float(np.deg2rad(0.002))
 
     def __post_init__(self) -> None:
@@ -104,7 +115,7 @@ class StaticTest:
             )
 
     def samples(self, rate_hz: float) -> int:
-        """N, the window in samples (at least 4: a covariance of three axes needs them)."""
+        """Return the window's length in samples, at least 4: a covariance of three axes needs them."""
         return max(4, round(self.window_s * rate_hz))
 
 

@@ -181,19 +181,22 @@ def load_model(
         A URDF, or a table (TOML) that names one, or the name of a body that comes with the package ("whole_body"); None
         for the upper body, a person of 1.75 m.
     lengths : mapping, optional
-        Length → [m] to stretch the body to; None: as the file has them.
+        Length → [m] to scale the body to; None: as the file has them.
     like : str
-        The body whose names and lengths `segments` and `points` are.
+        The body of the package whose names of segments, points and lengths `segments` and `points` use.
     segments : mapping, optional
-        Segment → its link; or → ``{"link": …, "up": "+z", "forward": "+x"}`` with the link's axes in the N-pose, where
-        they do not follow from the segment's direction at zero. None: a table beside the URDF, the segments' own
-        names, or a table of ours that fits (human-gazebo, the human of example-robot-data).
+        Segment → name of its link in the URDF; or → ``{"link": …, "up": "+z", "forward": "+x"}``, where the link's axes
+        that point up and forward in the N-pose do not follow from the segment's direction with all joints at zero.
+        None: from the table beside the URDF, else links with the segments' names, else a table of the package whose
+        links the URDF has (human-gazebo, the human of example-robot-data).
     points : mapping, optional
-        Point → its link, or ``{"link": …, "at": [x, y, z]}`` [m], where it is not the origin of the segment's link.
+        Point → its link, or ``{"link": …, "at": [x, y, z]}`` [m] in the link, where the point is not at the origin of
+        its segment's link.
     up, forward : str
-        Axes of the URDF's root link while all joints are at zero.
+        Axes of the URDF's root link that point up and forward while all joints are at zero.
     root : str or sequence of str, optional
-        Link at whose origin W begins, or the two hips, midway between which it does; None: the URDF's root.
+        The link whose origin is that of W, or two links, such as the hips, midway between which it is; None: the root
+        link of the URDF.
 
     Returns
     -------
@@ -203,8 +206,8 @@ def load_model(
     Raises
     ------
     MissingFile, BadModel
-        Not there; not a URDF; no tree with one root; a table that names what is not there; no links for the segments;
-        a segment without a joint that could move it.
+        There is no such file; it is not a URDF; its links are no tree with one root; the table names a link that the
+        URDF lacks; segments have no link, or no joint that could move it.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""The table beside a URDF: what there is on a body, and what calibration, tracking and pages may rely on.
+"""The table of a body, a TOML file beside its URDF: names and properties of its segments, points and lengths.
 
-`BodyTable` names segments, points, lengths, hinges, poses, pairs, usual places of sensors and what to draw. Nothing
-else of the package names a segment, a point or a length. docs/models.md explains the file.
+`BodyTable` names segments, points, lengths, hinges, poses, pairs, usual places of sensors and what to draw. No other
+module of the package names a segment, a point or a length. docs/models.md explains the file.
 """
 
 from __future__ import annotations
@@ -28,22 +28,25 @@ ROOT = "root"  # the origin of W, as the end of a length
 MODEL_TABLE = "model.toml"
 PERSON, MECHANISM = "person", "mechanism"
 NEUTRAL_POSE = "n_pose"
-# What says the side in a sensor's name, in English and German.
+# Regular expressions of the side in a sensor's name, in English and German.
 _SIDES = {"left": "left|lt?|link(s|e[rsmn]?)", "right": "right|rt?|recht(s|e[rsmn]?)"}
 _KEYS = ("segments", "points", "lengths", "hinges", "girdles", "poses", "pairs", "sensors", "draw")
 _SETTINGS = ("kind", "up", "forward", "root")
 
 
 class SoftTissue(NamedTuple):
-    """How much soft tissue turns a sensor on its segment in motion; standard deviations about x, y, z of the segment.
+    """How far soft tissue rotates a sensor on its segment in motion; standard deviations about x, y, z of the segment.
+
+    Its parts are independent, so that their squares add up.
 
     Parameters
     ----------
     std : (3,) [rad] in any pose
-    relative_to : the segment against which tilt and twist count; empty: W
-    per_tilt : (3,) per angle by which the long axis is tilted since the start pose
-    per_twist : about the long axis, per angle by which the segment is turned about it since the start pose
-    raised, per_raised : segments, and (3,) per angle by which they are raised off hanging, their mean
+    relative_to : the segment against which tilt and twist are measured; empty: W
+    per_tilt : (3,) [rad/rad] per angle by which the segment's long axis is tilted since the start pose
+    per_twist : [rad/rad] about the long axis, per angle by which the segment is rotated about it since the start pose
+    raised : segments on which it depends too, such as the arms for a sensor on the torso
+    per_raised : (3,) [rad/rad] per mean angle of their long axes off hanging
     """
 
     std: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -55,6 +58,7 @@ class SoftTissue(NamedTuple):
 
 
 def _same(degrees: float) -> tuple[float, float, float]:
+    """Return the angle [rad] for each of three axes."""
     angle = float(np.deg2rad(degrees))
     return angle, angle, angle
 
@@ -64,17 +68,18 @@ class Segment(NamedTuple):
 
     Parameters
     ----------
-    link : the link that it is
-    up, forward : the link's axes that point up and forward in the N-pose; None: found from the URDF at zero
-    along : (3,) its long axis in its own frame, from its first point on
-    spine : whether it shares its rotation with all joints between it and the root
-    rigid_without_sensor : whether it follows the segment above where it has no sensor; else it is unknown then
+    link : its link in the URDF
+    up, forward : the link's axes that point up and forward in the N-pose; None: found from the URDF with all joints at
+        zero
+    along : (3,) unit, its long axis in its own frame, away from the joint to the segment above
+    spine : its rotation is shared by all joints between it and the root
+    rigid_without_sensor : without a sensor it is rigid with the segment above; False: it is unknown then
     labels : a regular expression of words that mean it in a sensor's name
-    joint : the name of the joint to the segment above, where no point is there to name it
-    soft_tissue_std : [rad] by which soft tissue turns a sensor as the segment turns by a radian, in a calibration
-    soft_tissue : by how much it turns a sensor while the body is tracked
-    start_mean : (3,) [rad] by which people are off the neutral pose on average, as a turn about its axes
-    start_std : (3,) [rad] between the segment and the start pose about its axes, one person to another
+    joint : the name of the joint to the segment above, where no point names it
+    soft_tissue_std : [rad/rad] of the rotation of a sensor by soft tissue per rotation of the segment, in a calibration
+    soft_tissue : the same while the body is tracked
+    start_mean : (3,) [rad] mean rotation vector, in its axes, of people off the neutral pose
+    start_std : (3,) [rad] about its axes, one standard deviation of its rotation off the start pose among people
     repeat_std : (3,) [rad] the same between two start poses of one person
     """
 
@@ -94,7 +99,7 @@ class Segment(NamedTuple):
 
     @classmethod
     def of_mechanism(cls, link: str) -> Segment:
-        """A link of a mechanism, on which nothing is soft; its start configuration is known well (assumption)."""
+        """Return a segment of a mechanism: no soft tissue, and a start configuration to 0.5° (assumption)."""
         rigid = SoftTissue()
         return cls(
             link,
@@ -114,11 +119,11 @@ class Point(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """What a length scales: a segment, along the line from the middle of some points to that of others at zero."""
+    """A part of a length, which scales a segment along the line between two places."""
 
     segment: str
-    start: tuple[str, ...]
-    end: tuple[str, ...]
+    start: tuple[str, ...]  # a point, or two in whose middle the line begins, with all joints at zero
+    end: tuple[str, ...]  # the same of its end
 
 
 class Length(NamedTuple):
@@ -127,8 +132,9 @@ class Length(NamedTuple):
     Parameters
     ----------
     stretches : what it scales; more than one where parts of the body share it
-    share : its name among the shares of stature in ``calibration/anthropometry.toml``; empty: the model's own value
-    relative_std : of the model's own value, one standard deviation, where there is no share
+    share : its name among the ratios to stature in ``calibration/anthropometry.toml``; empty: it has none, and the
+        prior is the model's own value
+    relative_std : standard deviation of the model's own value, as a share of it
     """
 
     stretches: tuple[Stretch, ...]
@@ -141,12 +147,13 @@ class HingeJoint(NamedTuple):
 
     Parameters
     ----------
-    on, moves : segments; the long axis of `moves` stays in a plane of `on` across the axis
+    on, moves : segments; the long axis of `moves` stays in the plane of `on` that is normal to the axis
     axis : (3,) unit, in the frame of `on`
-    range : from and to which `moves` rotates about the axis
-    softness : by which the long axis leaves the plane
-    common_std, mirror_std : of the axis about the long axis of `on`, with its counterpart alike and against it
-    tilt_std : of the axis about the third axis
+    range : [rad] least and largest rotation of `moves` about the axis
+    softness : of the angle between the long axis and the plane
+    common_std, mirror_std : of the axis's rotation about the long axis of `on`, the part that is equal and the part
+        that is opposite on both sides of the body
+    tilt_std : of the axis's rotation about the direction across both, the long axis and itself
     """
 
     on: str
@@ -160,14 +167,14 @@ class HingeJoint(NamedTuple):
 
 
 class Limb(NamedTuple):
-    """A line of points that hangs on the body.
+    """An arm, a leg or another line of points from the body to a tip.
 
     Parameters
     ----------
-    points : from the one at which it hangs to its tip
-    segments : between these points, from the body on; as far as they have lengths
-    base : the segment on which it hangs; None: the root
-    origin : its first point, with the counterpart of that where there is one, left before right; distances of the tip
+    points : from the one on the body to the tip
+    segments : between these points, in that order; only those that have a length
+    base : the segment of the body to which it belongs; None: the root
+    origin : its first point, with that of the other side where there is one, left before right; distances of the tip
         are from their middle
     """
 
@@ -182,36 +189,36 @@ class Limb(NamedTuple):
 
 
 class SensorPlace(NamedTuple):
-    """Where a sensor usually sits, and its axes that point up and forward in the N-pose; None: not usual."""
+    """Where a sensor usually sits, and its axes that point up and forward in the N-pose; None: not stated."""
 
-    place: str = ""
+    place: str = ""  # in words, for pages
     up: str | None = None
     forward: str | None = None
 
 
 @dataclass(frozen=True)
 class BodyTable:
-    """What there is on a body.
+    """The names and properties of what a body has.
 
     Parameters
     ----------
-    name : of the table, for messages and files
+    name : of the body, for messages and files
     segments : name → segment; the first one faces x of W in the start pose
-    points : name → its link
+    points : name → its link, and its place in it
     lengths : name → what it scales
     hinges : name → joint of nearly one axis
-    girdles : point that moves on the segment on which its limb hangs → how
+    girdles : shoulder point → the law by which it moves on the trunk as the arm is raised
     poses : name → joint of the URDF → value [rad or m]
-    pairs : what lies left → its counterpart on the right: segments, points, lengths, hinges
+    pairs : name on the left → name on the right, of segments, points, lengths and hinges
     sensors : segment → where its sensor usually sits
-    limbs : lines through points
+    limbs : the points of each line that is drawn
     paths : points whose path is drawn
-    kind : "person": triples of revolute joints are spherical, segment frames are W's in the N-pose; "mechanism": the
-        URDF stands as it is, with its links' frames
+    kind : "person": three revolute joints in a row are one spherical joint, segment frames equal W in the N-pose;
+        "mechanism": joints and frames are those of the URDF
     up, forward : the root link's axes that point up and forward while all joints are at zero
-    root : the link at whose origin W begins, or links whose middle it is; none: the root link
-    absent : lengths of the body that it is like, which this one lacks
-    where : for error texts
+    root : the link whose origin is that of W, or links midway between which it is; empty: the root link
+    absent : names of lengths that this body lacks, and the one after which it is modelled has
+    where : the table's file, for messages
     """
 
     name: str
@@ -243,7 +250,7 @@ class BodyTable:
 
     @property
     def links(self) -> set[str]:
-        """All links that it names."""
+        """The links of segments, points and root."""
         segments = {segment.link for segment in self.segments.values()}
         return segments | {point.link for point in self.points.values()} | set(self.root)
 
@@ -257,35 +264,35 @@ class BodyTable:
         return {**self.pairs, **{right: left for left, right in self.pairs.items()}}
 
     def counterpart(self, name: str) -> str | None:
-        """The same on the other side; None where there is none."""
+        """Return the name of the same thing on the other side; None where there is none."""
         return self._counterparts.get(name)
 
     def side(self, name: str) -> str:
-        """ "left", "right", or empty where it has no counterpart."""
+        """Return the side of a name, "left" or "right"; empty where it has no counterpart."""
         return "left" if name in self.pairs else "right" if name in self._counterparts else ""
 
     def shared_name(self, name: str) -> str:
-        """What a name has in common with that of its counterpart; the name itself where there is none."""
+        """Return the name without its side, "elbow" of "left_elbow"; the name itself where it has no counterpart."""
         other = set((self.counterpart(name) or name).split("_"))
         return "_".join(word for word in name.split("_") if word in other)
 
     def joint_name(self, segment: str) -> str:
-        """The joint between a segment and the one above: the point at which the segment begins, or the segment's own
-        name for it, or the segment.
+        """Return the name of the joint to the segment above: `Segment.joint`, else the point at which the segment
+        begins, else the segment's name.
         """
         ends = self.ends(segment)
         beginning = ends[0] if ends else ()
         return self.segments[segment].joint or (beginning[0] if len(beginning) == 1 else segment)
 
     def find_length(self, *points: str) -> str | None:
-        """The length that lies between these points, some of them maybe as their middle; None: there is none."""
+        """Return the name of the length between these points, or their middles; None: there is none."""
         for name, length in self.lengths.items():
             if len(length.stretches) == 1 and {*length.stretches[0].start, *length.stretches[0].end} == set(points):
                 return name
         return None
 
     def find_limb(self, point: str) -> Limb | None:
-        """The limb that a point ends; None where it lies on none, or at the beginning of one.
+        """Return the limb up to a point; None where the point is on none, or is the first one of its limb.
 
         A line between a point and its counterpart, as between the shoulders, is no limb.
         """
@@ -310,12 +317,12 @@ class BodyTable:
         return {point: limb for point in self.paths if (limb := self.find_limb(point)) is not None}
 
     def ends(self, segment: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
-        """The points between which a segment's own length lies; None where it has none."""
+        """Return the points at which the length of a segment begins and ends; None where not just one length is its."""
         stretches = [part for length in self.lengths.values() for part in length.stretches if part.segment == segment]
         return (stretches[0].start, stretches[0].end) if len(stretches) == 1 else None
 
     def check_segments(self, names: Iterable[str], where: str, error: type[Exception]) -> None:
-        """Raise an `error` where a name is no segment."""
+        """Raise an `error` whose text begins with `where` if a name is no segment."""
         for name in names:
             if name not in self.segments:
                 others = [body for body in _list_bodies() if name in load_table(body).segments]
@@ -339,7 +346,7 @@ class BodyTable:
         return matches.pop() if len(matches) == 1 else None
 
     def drop(self, segments: Collection[str]) -> BodyTable:
-        """The table without these segments and all that needs them."""
+        """Return the table without these segments, and without points, lengths and hinges that need them."""
         kept = {name: segment for name, segment in self.segments.items() if name not in segments}
         links = {self.segments[name].link for name in segments} - {segment.link for segment in kept.values()}
         points = {name: point for name, point in self.points.items() if point.link not in links}
@@ -347,7 +354,7 @@ class BodyTable:
 
 
 def _prune(table: BodyTable) -> BodyTable:
-    """The table without lengths, hinges, pairs, places and lines whose segments or points are not there."""
+    """Return the table without lengths, hinges, girdles, pairs, sensors and lines whose segments or points it lacks."""
     points = {*table.points, ROOT}
     lengths = {
         name: length
@@ -380,7 +387,7 @@ def _prune(table: BodyTable) -> BodyTable:
 
 @lru_cache(maxsize=8)
 def load_table(name: str = DEFAULT_BODY) -> BodyTable:
-    """The table of a body that comes with the package.
+    """Return the table of a body that comes with the package.
 
     Raises
     ------
@@ -393,19 +400,19 @@ def load_table(name: str = DEFAULT_BODY) -> BodyTable:
 
 
 def _list_bodies() -> list[str]:
-    """The names of the bodies that come with the package."""
+    """Return the names of the bodies that come with the package."""
     return sorted(path.stem for path in asset("urdf", f"{DEFAULT_BODY}.toml").parent.glob("*.toml"))
 
 
 def read_table(path: Path, *, needs_urdf: bool = False) -> tuple[BodyTable, Path | None]:
-    """The table in a TOML file, and the URDF that it names or that lies beside it under its name; None without.
+    """Read a table from a TOML file; return it and its URDF: the one that it names, else that beside it; None: neither.
 
-    With `needs_urdf` a table without one is an error.
+    With `needs_urdf` a table without a URDF is an error.
 
     Raises
     ------
     MissingFile, BadModel
-        Not there; no TOML; not a table.
+        The file is not there, is not TOML, or is not the table of a body.
     """
     values = read_toml(path, "the table of a body", BadModel)
     urdf = values.pop("urdf", None)
@@ -421,15 +428,15 @@ def read_table(path: Path, *, needs_urdf: bool = False) -> tuple[BodyTable, Path
 
 
 def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
-    """The table that a TOML file or keywords spell.
+    """Return the table of the parsed TOML file, or of the arguments of `load_model`.
 
-    With ``like`` the names and all else are those of that body, and `values` say what differs: of its segments those
-    are there that `values` name, and all where they name none.
+    With the key ``like`` the table is that of another body, except for what `values` state. It then has the segments
+    that `values` name, or all where they name none of them.
 
     Raises
     ------
     BadModel
-        A key, a name or an axis that is not known, or a value of the wrong kind.
+        An unknown key, name or axis, or a value of the wrong type.
     """
     top = TomlTable(values, where, error=BadModel)
     top.allow("like", *_SETTINGS, *_KEYS)
@@ -479,7 +486,7 @@ def parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
     for point in (*(point for limb in limbs for point in limb), *_read_names(draw, "paths")):
         if point not in table.points:
             raise BadModel(f"{draw.where}: '{point}' is no point; {one_of(table.points, str(point))}")
-    table = _check_soft_tissue(table)
+    table = _prune_soft_tissue(table)
     return replace(
         table,
         pairs={**table.pairs, **pairs.values},
@@ -565,8 +572,8 @@ def _read_soft_tissue(entry: TomlTable, default: SoftTissue) -> SoftTissue:
     )
 
 
-def _check_soft_tissue(table: BodyTable) -> BodyTable:
-    """The table without what a segment's soft tissue has of segments that the body lacks, as one like another may."""
+def _prune_soft_tissue(table: BodyTable) -> BodyTable:
+    """Return the table without terms of soft tissue by segments that the body lacks, and one that it is like has."""
     segments = {}
     for name, segment in table.segments.items():
         tissue = segment.soft_tissue
@@ -722,7 +729,7 @@ def _read_girdles(top: TomlTable, table: BodyTable) -> dict[str, Girdle]:
 def _read_millimetres(
     table: TomlTable, key: str, count: int, default: Sequence[float] | None, least: float = -1e3
 ) -> list[float]:
-    """Numbers [m] of a key in millimetres."""
+    """Return the numbers [m] of a key in millimetres."""
     values = _read_numbers(table, key, count, default)
     if min(values) < least:
         raise BadModel(f"{table.at(key)} = {values}; numbers of at least {least:g} mm are needed")
@@ -749,13 +756,14 @@ def _read_sensors(top: TomlTable, table: BodyTable) -> dict[str, SensorPlace]:
 
 
 def _read_tables(top: TomlTable, key: str) -> Iterator[tuple[str, TomlTable]]:
+    """Iterate over name and table of each entry of a key."""
     entries = top.table(key, {})
     for name in entries.values:
         yield name, entries.table(name)
 
 
 def _read_links(top: TomlTable, key: str) -> Iterator[tuple[str, TomlTable]]:
-    """Segment or point, and the table that names its link; a link's name stands for a table of that alone."""
+    """Iterate over name and table of each segment or point; a string in place of the table is the name of its link."""
     entries = top.table(key, {})
     for name, value in entries.values.items():
         if isinstance(value, Segment | Point):
@@ -769,6 +777,7 @@ def _read_links(top: TomlTable, key: str) -> Iterator[tuple[str, TomlTable]]:
 
 
 def _read_names(table: TomlTable, key: str) -> tuple[str, ...]:
+    """Return the names of a key: a string, or a list of strings; empty without the key."""
     value = table.values.get(key) or ()
     value = (value,) if isinstance(value, str) else value
     if not isinstance(value, list | tuple) or not all(isinstance(name, str) for name in value):
@@ -777,6 +786,7 @@ def _read_names(table: TomlTable, key: str) -> tuple[str, ...]:
 
 
 def _read_numbers(table: TomlTable, key: str, count: int, default: Sequence[float] | None) -> list[float]:
+    """Return `count` numbers of a key; `default` None: the key is needed."""
     value = table.values.get(key, default)
     if not isinstance(value, list) or len(value) != count or not all(is_number(v, 1e6) for v in value):
         raise BadModel(f"{table.at(key)} = {value!r}; {count} numbers are wanted")
@@ -784,7 +794,7 @@ def _read_numbers(table: TomlTable, key: str, count: int, default: Sequence[floa
 
 
 def _read_triple(table: TomlTable, key: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Three numbers of at least 0."""
+    """Return three numbers of at least 0."""
     x, y, z = _read_numbers(table, key, 3, list(default))
     if min(x, y, z) < 0.0:
         raise BadModel(f"{table.at(key)} = {[x, y, z]}; numbers from 0 on are needed")
@@ -792,7 +802,7 @@ def _read_triple(table: TomlTable, key: str, default: tuple[float, float, float]
 
 
 def _read_angles(table: TomlTable, key: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Three angles [rad] of a key in degrees."""
+    """Return three angles [rad] of a key in degrees."""
     if key not in table:
         return default
     x, y, z = np.deg2rad(_read_triple(table, key, default)).tolist()
@@ -800,7 +810,7 @@ def _read_angles(table: TomlTable, key: str, default: tuple[float, float, float]
 
 
 def _read_angle(table: TomlTable, key: str, default: float) -> float:
-    """An angle [rad] of a key in degrees."""
+    """Return an angle [rad] of a key in degrees."""
     value = table.number(key, None)
     if value is None:
         return default
@@ -810,9 +820,10 @@ def _read_angle(table: TomlTable, key: str, default: float) -> float:
 
 
 def find_table(urdf: Path, links: Iterable[str]) -> BodyTable | None:
-    """The table for a URDF that came without: beside it, else one of the package's that fits; None: nothing is found.
+    """Return the table for a URDF with these links: one beside it, else one of the package that fits; None: none does.
 
-    Beside it is ``<name>.toml`` that is a table, or ``model.toml`` that names the URDF.
+    Beside it is ``model.toml`` if it names the URDF, or ``<name of the URDF>.toml`` if it is a table. A table of the
+    package fits if the URDF has its links.
     """
     links = set(links)
     own_table = urdf.parent / MODEL_TABLE
@@ -840,7 +851,7 @@ def find_table(urdf: Path, links: Iterable[str]) -> BodyTable | None:
 
 
 def format_table(table: BodyTable, urdf: str) -> str:
-    """The text of a table's file, beside the URDF of that name."""
+    """Return the text of a table's file that names `urdf`, a URDF beside it."""
     lines = [f"urdf = {toml_string(urdf)}", f"kind = {toml_string(table.kind)}"]
     lines += [f"up = {toml_string(table.up)}", f"forward = {toml_string(table.forward)}"]
     if table.root:

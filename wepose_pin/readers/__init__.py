@@ -21,8 +21,8 @@ def load_session(path: str | Path, gaps: bool = False) -> Recording:
     path : str or Path
         The session file, or its folder; a file of `wepose live --record`.
     gaps : bool
-        Accept lost samples for longer than 50 ms: they are bridged, and marked in the sensor's `gap`. Of a live
-        recording they always are.
+        Accept gaps, samples lost for longer than 50 ms: they are interpolated, and marked in the sensor's `gap`. False:
+        a gap is an error. A live recording may always have them.
 
     Returns
     -------

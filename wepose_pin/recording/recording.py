@@ -38,20 +38,23 @@ class Recording:
 
     Parameters
     ----------
+    name : of the recording, for messages and titles
     time : (n,) [s], uniform at `rate_hz` to within the clock's jitter
-    sensors : segment → sensor
-    doubled : segment → its second sensor, where it has two
-    phases : name → intervals [s] on `time`; `start` is the start pose, `static` sensors on a table
+    rate_hz : samples a second
+    sensors : segment → `ImuSensor` or `OrientationSensor`, n samples each
+    phases : name → intervals [s] on `time`; in `start` the person holds the start pose, in `static` the sensors lie on
+        a table
+    start_pose : the pose in the phase `start`: "n_pose", another that the body's table names, or "configuration"
     remounted : the sensors were remounted after the subject's calibration, so that its mounts do not hold here
     start_is_guessed : `phases.start` was found in the motion and not stated by the user
     source : the file of the recording, for messages
-    truth : file with the reference; None: there is none
-    resets : samples before which a live session reset the headings, with the person in the start pose
-    start_pose : a pose of the body's table, or `CONFIGURATION`
-    joints : joint → value [rad or m] in the start pose `CONFIGURATION`; joints that are not named are at zero
-    model : the body that bears the sensors: the file of a table or a URDF, or the name of a body of the package; empty:
-        the upper body
+    truth : a file with reference poses; None: there is none
+    resets : numbers of the samples before which a live session reset the headings, with the person in the start pose
+    joints : joint → value [rad or m] in the start pose "configuration"; joints that are not named are at zero
+    model : the body that wears the sensors: the file of a table or a URDF, or the name of a body of the package;
+        empty: the upper body
     diagnostics : assumptions, bridged gaps and faults from reading
+    doubled : segment → its second sensor, where it has two
     """
 
     name: str
@@ -82,12 +85,17 @@ class Recording:
         return format_object(self, describe)
 
     def check(self) -> Recording:
-        """Check a recording that was built in code, and return it; see `check_recording`.
+        """Check a recording that was built in code, and return it.
 
         Raises
         ------
-        BadOption, BadData, BadPhase
-            As `check_recording`; specific force in another unit, which a reader of files would have detected.
+        BadOption
+            A field has a wrong type, or a name is not known.
+        BadData
+            Shapes differ, a number is not finite, time does not increase or contradicts `rate_hz`; specific force in
+            another unit, such as g.
+        BadPhase
+            A phase is empty or outside the recording.
         """
         check_recording(self)
         for segment, sensor in self.imus.items():
@@ -101,7 +109,7 @@ class Recording:
 
     @property
     def imus(self) -> dict[str, ImuSensor]:
-        """The sensors that have a gyroscope and an accelerometer."""
+        """Segment → sensor, of the sensors that have a gyroscope and an accelerometer."""
         return {segment: sensor for segment, sensor in self.sensors.items() if isinstance(sensor, ImuSensor)}
 
     def where(self) -> str:
@@ -109,18 +117,18 @@ class Recording:
         return str(self.source) if self.source else self.name
 
     def span(self, interval: tuple[float, float]) -> slice:
-        """Return the samples within the interval [s], both ends included."""
+        """Return the slice of samples within the interval [s], both ends included."""
         first, last = np.searchsorted(self.time, [interval[0] - 1e-9, interval[1] + 1e-9])
         return slice(int(first), int(last))
 
     def find_measured(self, segment: str, interval: tuple[float, float]) -> np.ndarray:
-        """Return the samples (k,) within the interval [s] that the sensor measured; samples in gaps are bridged."""
+        """Return the numbers (k,) of the samples within the interval [s] that the sensor measured: those in no gap."""
         span, gap = self.span(interval), self.sensors[segment].gap
         samples = np.arange(len(self))[span]
         return samples if gap is None else samples[~gap[span]]
 
     def cut(self, span: slice) -> Recording:
-        """Return the recording of a span of samples; its phases stay whole."""
+        """Return the recording of a span of samples; `phases` are not cut."""
         first, last, _ = span.indices(len(self))
         span = slice(first, last)
         sensors = {name: sensor.part(span) for name, sensor in self.sensors.items()}
@@ -129,7 +137,7 @@ class Recording:
         return replace(self, time=self.time[first:last], sensors=sensors, doubled=doubled, resets=resets)
 
     def chunks(self, seconds: float) -> Iterator[Recording]:
-        """Iterate over consecutive chunks of so many seconds; the last one may be half a chunk longer."""
+        """Iterate over consecutive chunks of `seconds`; the last one may be half a chunk longer or shorter."""
         size = max(1, round(seconds * self.rate_hz))
         first = 0
         while first < len(self):

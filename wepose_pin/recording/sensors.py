@@ -42,14 +42,15 @@ def find_mount_axes(quat_LS: np.ndarray) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class ImuSensor:
-    """A gyroscope and an accelerometer.
+    """The measurements of a gyroscope and an accelerometer, n samples in the sensor's frame S.
 
     Parameters
     ----------
     gyro_S : (n, 3) [rad/s], the rate over the interval that ends at the sample
-    accel_S : (n, 3) [m/s²], specific force, +g up of a static sensor
-    stated_quat_LS : (4,) xyzw, the mount in the session, sensor to segment; None: not stated
-    gap : (n,) bool, true in long gaps (longer than the silent bridge) and where the sensor was frozen; None: no gaps
+    accel_S : (n, 3) [m/s²], specific force: a static sensor measures g, upward
+    stated_quat_LS : (4,) xyzw, the mount that the session states: sensor frame S to segment frame L; None: not stated
+    gap : (n,) bool, true where samples were lost for longer than 50 ms, or repeat one value, and were interpolated;
+        None: there are none
     gyro_range : [rad/s] at which an axis of gyro saturates; infinite: not known
     """
 
@@ -64,7 +65,7 @@ class ImuSensor:
 
     @property
     def aligned(self) -> bool:
-        """False: only measured orientations can be those of the segment."""
+        """False, always: `OrientationSensor.aligned` is of measured orientations alone."""
         return False
 
     def part(self, samples: slice | np.ndarray) -> ImuSensor:
@@ -75,14 +76,14 @@ class ImuSensor:
 
 @dataclass(frozen=True)
 class OrientationSensor:
-    """A device with measured orientations: it has a filter of its own, and ours are skipped.
+    """The orientations that a device measured, n samples; they are used as they are, without a filter of this package.
 
     Parameters
     ----------
-    quat_WS : (n, 4) xyzw, sensor to a world of its own whose z points up
+    quat_WS : (n, 4) xyzw, sensor frame S to a world of the device's own: its z points up, its heading is arbitrary
     stated_quat_LS, gap : as in `ImuSensor`
-    aligned : `quat_WS` is the segment's own orientation, in a world that all aligned sensors share; the start pose
-        gives that world's heading
+    aligned : `quat_WS` is the orientation of the segment, not of the sensor, in a world that all aligned sensors
+        share; the start pose gives the heading of that world
     """
 
     quat_WS: np.ndarray

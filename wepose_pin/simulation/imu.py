@@ -13,8 +13,8 @@ from ..errors import BadOption
 from .imperfections import Imperfections
 
 GRAVITY = 9.81  # [m/s^2]
-_GYRO_DENSITY = np.deg2rad(0.007)  # [rad/s/sqrt(Hz)]
-_GYRO_BIAS_STD = np.deg2rad(0.2)  # [rad/s], turn-on, each axis
+_GYRO_DENSITY = float(np.deg2rad(0.007))  # [rad/s/sqrt(Hz)]
+_GYRO_BIAS_STD = float(np.deg2rad(0.2))  # [rad/s], turn-on, each axis
 LONGEST_RUN_S = 0.05  # of lost samples
 _MEAN_RUN_S = 0.02
 _WARM_UP_S = 900.0
@@ -35,7 +35,7 @@ class ImuNoise:
 
     gyro_density: NonNegative = _GYRO_DENSITY
     gyro_bias_std: NonNegative = _GYRO_BIAS_STD
-    gyro_bias_instability: NonNegative = np.deg2rad(10.0) / 3600.0  # [rad/s]
+    gyro_bias_instability: NonNegative = float(np.deg2rad(10.0)) / 3600.0  # [rad/s]
     accel_density: NonNegative = 120e-6 * GRAVITY  # [m/s^2/sqrt(Hz)]
     accel_bias_std: NonNegative = 3e-3 * GRAVITY  # [m/s^2], turn-on, each axis
     accel_bias_instability: NonNegative = 0.03e-3 * GRAVITY  # [m/s^2]

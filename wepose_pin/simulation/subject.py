@@ -271,46 +271,49 @@ def simulate(
     pose_deg: NonNegative = 0.0,
     session: Count = 0,
 ) -> Simulation:
-    """Simulate the paper's upper-body experiment with known truth.
+    """Simulate a person with five sensors in the upper-body experiment of Lisini Baldi et al. 2019; the truth is known.
 
     0 to 5 s static in the N-pose; 2.5 s to the clasp; `clasp_s` of free motion with the palms together while
     the torso leans and twists; 2.5 s in which the left arm returns to hang and the right hand goes to a
-    table; then `circles` circles in the air (Lisini Baldi 2019, upper-body experiment), a rest on the table
-    before and after each.
+    table; then `circles` circles in the air, a rest on the table before and after each.
 
     Parameters
     ----------
     lengths : mapping
-        Length → [m]: trunk, shoulder_width, and upper_arm, forearm, hand with ``left_`` and ``right_`` before.
+        Length → [m]: ``trunk``, ``shoulder_width``, ``left_upper_arm``, ``left_forearm``, ``left_hand`` and the same of
+        the right.
     seed : int
-        The same seed gives the same bits. Motion, mounts, noise and each imperfection draw from streams of their own:
-        noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
+        The same seed gives the same numbers. Motion, mounts, noise and each imperfection have random streams of their
+        own: noise and rate change neither motion nor mounts, and twice the density is the same noise twice as large.
     rate_hz : float
         Samples a second.
     noise : ImuNoise
-        Of gyroscope and accelerometer; `NOISE_FREE` for none.
+        Of gyroscope and accelerometer; by default that of an Xsens MTi-3, `NOISE_FREE` for none. It and the names in
+        capitals below are in `wepose_pin.simulation`.
     imperfections : Imperfections
         Of subject, mounting and sensors; `IDEAL_PRESET` for none, `MILD_PRESET` for a careful subject, `PEOPLE_PRESET`
-        for what the literature has.
+        for the sizes that the literature reports.
     clasp_s : float
-        [s] of the clasp, palms together, at least 5.
+        [s] duration of the clasp, at least 5.
     circles : int
         Number of circles, 0 or more.
     protocol : str
-        What is done in place of the clasp, one of `TASKS`, or several joined by "+"; "handle": 0.4 m between the palms;
-        "touch_left" and "touch_right": the palm on a fixed point while the trunk leans and turns; "poses": T-pose and
-        bow, no circles.
+        What the person does in place of the clasp, one of `tasks.TASKS`, or several joined by "+". "handle": 0.4 m
+        between the palms; "touch_left" and "touch_right": the palm on a fixed point while the trunk leans and turns;
+        "poses": T-pose and bow, no circles.
     pose_deg : float
-        How far T-pose and bow are off, standard deviation of each axis [deg].
+        [deg] one standard deviation about each axis by which T-pose and bow are inexact.
     session : int
-        Another session of the same person: sensors are mounted again, motion, start pose and noise are others.
+        Number of the person's session. Another number is another day: sensors are mounted again; motion, start pose and
+        noise are others.
 
     Returns
     -------
     Simulation
-        `recording()` is what a user would have, `truth()` the true pose. Before the sensor's own errors, gyro_S[k] is
-        log(R_WS[k-1]^T R_WS[k]) over the time between the two samples, so that multiplying up exp(gyro_S / rate) gives
-        `quat_WS` back exactly; accel_S[k] is R_WS[k]^T (p_ddot + g e_z), p_ddot by central differences.
+        `recording()` is the `Recording` that a user would have, `truth()` the true `Pose`. Before the sensor's own
+        errors, gyro_S[k] is log(R_WS[k-1]ᵀ R_WS[k]) over the time between the two samples, so that the product of all
+        exp(gyro_S / rate) is the true orientation exactly; accel_S[k] is R_WS[k]ᵀ (p̈ + g e_z), p̈ by central
+        differences.
 
     Raises
     ------

@@ -49,8 +49,8 @@ from .headings import (
 from .segments import Oriented
 from .start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates, cut_start_pose
 
-# What there is to observe headings by, from the recording of the start pose and its orientations; None: nothing.
-PoseProblem = Callable[[Recording, SegmentOrientations], HeadingProblem | None]
+# From the recording of the start pose and its orientations: what observes headings; None: nothing.
+MakeProblem = Callable[[Recording, SegmentOrientations], HeadingProblem | None]
 
 _MEASURED_COV = MEASURED_ORIENTATION_STD**2 * np.eye(3)  # [rad²] of a measured orientation
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
@@ -67,7 +67,7 @@ class CausalEstimator:
     ----------
     subject : lengths and mounts; None for the session's stated mounts
     start_frames : of the body; left out: the N-pose
-    pose_problem : what there is to observe headings by; None: they are not corrected
+    make_problem : called after the start pose, see `headings.make_heading_problem`; None: headings are not corrected
     """
 
     def __init__(
@@ -77,10 +77,10 @@ class CausalEstimator:
         start_frames: StartFrames = N_POSE,
         method: str = BEST,
         static_test: StaticTest | None = None,
-        pose_problem: PoseProblem | None = None,
+        make_problem: MakeProblem | None = None,
     ) -> None:
         self._subject, self._start_frames, self._method, self._static_test = subject, start_frames, method, static_test
-        self._pose_problem = pose_problem
+        self._make_problem = make_problem
         self._received: Recording | None = None  # samples up to the end of the start pose
         self._start_detector: StartPoseDetector | None = None
         self._rates: TickRates | None = None
@@ -167,7 +167,7 @@ class CausalEstimator:
             start_frames=self._start_frames,
             method=self._method,
             static_test=self._static_test,
-            pose_problem=self._pose_problem,
+            make_problem=self._make_problem,
         )
         return received.cut(slice(last, len(received)))
 
@@ -194,7 +194,7 @@ class CausalSegmentEstimator:
     start_recording : a recording that ends with its start pose, `phases.start`
     subject : lengths and mounts; None for the session's stated mounts
     start_frames : of the body; left out: the N-pose
-    pose_problem : what there is to observe headings by; None: they are not corrected
+    make_problem : called after the start pose, see `headings.make_heading_problem`; None: headings are not corrected
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ class CausalSegmentEstimator:
         start_frames: StartFrames = N_POSE,
         method: str = BEST,
         static_test: StaticTest | None = None,
-        pose_problem: PoseProblem | None = None,
+        make_problem: MakeProblem | None = None,
     ) -> None:
         check_mounts(start_recording, subject, start_frames)
         self._filters = SensorFilters(start_recording, method=method, static_test=static_test, sways=start_frames.sways)
@@ -250,7 +250,7 @@ class CausalSegmentEstimator:
             self.quat_WL,
             self.quat_WL[None].copy(),
         )
-        problem = None if pose_problem is None else pose_problem(start_recording, self.start)
+        problem = None if make_problem is None else make_problem(start_recording, self.start)
         self.headings = None if problem is None else CausalHeadings(start_recording, self.start, problem)
         self._run_var = self.heading_var()  # (k,) [rad²] of each heading by its filter alone, after the last run
         self._var_at_reset: np.ndarray | None = None  # (k,) [rad²] of heading that a reset took away

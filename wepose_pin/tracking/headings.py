@@ -1,8 +1,9 @@
-"""Correction of headings by what neighbours share: accelerations, hinges, ranges of motion, joined hands.
+"""Correction of headings by what neighbouring segments share: joint accelerations, hinges, their ranges, joined hands.
 
-The filters' tilt is good and their headings drift. `heading_filter` estimates their errors knot by knot; an error
-common to all segments is unobservable. Offline a forward pass learns where sensors sit, and a second one and a
-Rauch-Tung-Striebel pass give the errors. Causally the forward pass alone does, and a knot is corrected in the next one.
+The filters' tilt is good and their headings drift. Time is cut into intervals of equal length, the knots, and
+`heading_filter` estimates one error of each heading a knot; an error common to all segments is unobservable. Offline a
+first forward pass estimates where the sensors sit (their levers to the joints); a second one and a Rauch-Tung-Striebel
+pass backward give the errors. Causally there is one forward pass, and what a knot shows is corrected in the next one.
 """
 
 from __future__ import annotations
@@ -61,15 +62,15 @@ E_Z = np.array([0.0, 0.0, 1.0])
 class HeadingCorrection(NamedTuple):
     """The correction of headings: what was observed, residuals before and after, and the largest correction."""
 
-    gap_rms_mm: tuple[float, float] | None  # in the phases of closures
-    hinge_residual_rms_deg: Mapping[str, tuple[float, float]]  # joint → the segment below against its hinge's plane
+    gap_rms_mm: tuple[float, float] | None  # between points that coincide, before and after; None: in no phase
+    hinge_residual_rms_deg: Mapping[str, tuple[float, float]]  # joint → segment below to its hinge's plane, the same
     max_correction_deg: Mapping[str, float]  # segment → largest rotation about the vertical
-    joint_accelerations: tuple[str, ...] = ()  # segments whose joint to the one above two sensors measure
-    hinges: tuple[str, ...] = ()  # joints
-    found_clasps: tuple[tuple[float, float], ...] = ()  # [s] when the hands were found joined
-    segments: tuple[str, ...] = ()
+    joint_accelerations: tuple[str, ...] = ()  # segments whose joint to the one above has a sensor on either side
+    hinges: tuple[str, ...] = ()  # joints that were observed as hinges
+    found_clasps: tuple[tuple[float, float], ...] = ()  # [s] when the hands were found joined outside of a phase
+    segments: tuple[str, ...] = ()  # of the k rows of `covariance`
     time: np.ndarray | None = None  # (m,) [s] of the covariances
-    covariance: np.ndarray | None = None  # (m, k, k) [rad²] of the headings of the sensors' worlds
+    covariance: np.ndarray | None = None  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
 
     def relative_std(self, near: str, far: str, time: np.ndarray) -> np.ndarray:
         """Return the standard deviation (n,) [rad] of the heading between two segments at these times [s]."""
@@ -81,16 +82,17 @@ class HeadingCorrection(NamedTuple):
 
 
 def find_stride(rate_hz: float) -> int:
-    """Find the number of samples from one that is used to the next."""
+    """Return the number of samples from one that the heading filter takes to the next, at `SAMPLE_RATE_HZ`."""
     return max(1, round(rate_hz / SAMPLE_RATE_HZ))
 
 
 class KnotReader:
-    """Cuts samples into knots of equal length, by their number, and forms the sums of each.
+    """Cuts samples into knots of `size` samples and forms the observations of each.
 
     Parameters
     ----------
-    quat_LS, heading_offset : mounts (k, 4) and ψ (k,) [rad] of the problem's segments
+    quat_LS, heading_offset : mounts (k, 4) xyzw and ψ (k,) [rad] of the problem's segments
+    rate_hz : of the samples
     """
 
     def __init__(
@@ -120,13 +122,13 @@ class KnotReader:
         return self.size - self.count
 
     def push(self, time: np.ndarray, quat_VS: np.ndarray, accel_S: np.ndarray) -> None:
-        """Add at most `remaining` samples: (n,), (n, k, 4), (n, k, 3)."""
+        """Add at most `remaining` samples: (n,) [s], (n, k, 4) xyzw, (n, k, 3) [m/s²]."""
         rows = slice(self.count, self.count + len(time))
         self._time[rows], self._quat_VS[rows], self._accel_S[rows] = time, quat_VS, accel_S
         self.count += len(time)
 
     def close(self, heading_var: np.ndarray) -> Knot:
-        """Return the open knot; `heading_var` (k,) [rad²] of the filters at its last sample."""
+        """Return the open knot and open the next one; `heading_var` (k,) [rad²] is the filters' at its last sample."""
         return self.form(self.take(), heading_var)
 
     def take(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -135,7 +137,7 @@ class KnotReader:
         return self._time[:n].copy(), self._quat_VS[:n].copy(), self._accel_S[:n].copy()
 
     def form(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], heading_var: np.ndarray) -> Knot:
-        """Form the knot of samples that were taken; knots are formed in their order."""
+        """Return the knot of samples from `take`; knots must be formed in the order of time."""
         time, quat_VS, accel_S = samples
         n = len(time)
         rows = np.arange(0, n, self._stride)
@@ -147,14 +149,16 @@ class KnotReader:
         return Knot(float(time[n - 1]), time[rows].copy(), quat_WL, joints, heading_var, lost)
 
 
-def pose_problem(
+def make_heading_problem(
     recording: Recording, orientations: SegmentOrientations, subject: Subject, model: BodyModel, *, causal: bool
 ) -> HeadingProblem | None:
-    """Find what there is to observe headings by; None: nothing.
+    """Return what observes the headings of these segments, and how well they are known at the start; None: nothing.
 
     Parameters
     ----------
-    causal : as samples come: the phases of closures are marked as they begin and end
+    recording, orientations : the first chunk, or the one that ends with the start pose
+    causal : headings are corrected as samples come; the phases of closures are not read but marked as they begin and
+        end (`CausalHeadings.mark`)
     """
     names = tuple(orientations.quat_WL)
     raw = {name: orientations.quat_LS[name] for name in names if name in recording.imus}
@@ -206,7 +210,7 @@ def find_start_variances(recording: Recording, segment: str, subject: Subject, m
 def _find_hinges(
     recording: Recording, names: Sequence[str], subject: Subject, model: BodyModel
 ) -> tuple[HingeAxis, ...]:
-    """The hinges of two measured segments: calibrated, or as the table has them."""
+    """Return the hinges between two segments with sensors, their axes calibrated or as the body's table has them."""
     table = model.table
     noise = MECHANISM_NOISE if table.is_mechanism else PERSON_NOISE
     # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
@@ -242,9 +246,9 @@ def _find_hinges(
 
 
 def _find_closures(recording: Recording | None, segments: Sequence[str], model: BodyModel) -> tuple[Closure, ...]:
-    """The closures of points that coincide whose segments are all measured.
+    """Return the closures of the protocols in which points coincide and all segments between them have sensors.
 
-    They are those of the protocols; each holds in the phase of its name, which the recording may lack. None: in none.
+    Each holds in the intervals of its phase, none where the recording lacks it. `recording` None: none are read.
     """
     neutral = StartPose(orient_links(model, pin.neutral(model.pin)))
     closures, seen = [], set[tuple[str, tuple[str, ...]]]()
@@ -278,12 +282,12 @@ class HeadingCorrector:
     """Corrects the headings of a recording in two passes over its chunks.
 
     First pass: `add_observations` of every chunk, then `solve`. Second pass: `correct` every chunk. The result does not
-    depend on the chunks, because sums are formed knot by knot.
+    depend on the chunks, because observations are summed knot by knot.
 
     Parameters
     ----------
     chunk, orientations : the first chunk
-    problem : of `pose_problem`
+    problem : from `make_heading_problem`
     """
 
     def __init__(self, chunk: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
@@ -340,7 +344,7 @@ class HeadingCorrector:
         return True
 
     def correct(self, chunk: Recording, orientations: SegmentOrientations) -> SegmentOrientations:
-        """Return the chunk's orientations with corrected headings, in the second pass; adds its residuals."""
+        """Return the chunk's orientations with corrected headings, in the second pass, and add up its residuals."""
         corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
         for i, name in enumerate(self._names):
             delta = np.interp(chunk.time, self._knot_times, self._smoothed.errors[:, i])
@@ -349,9 +353,11 @@ class HeadingCorrector:
             filter_cov = _compute_filter_covariance(orientations, name)
             if filter_cov is not None:
                 with_heading, filter_var = filter_cov
+                start_var = compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
+                before = filter_var + start_var
                 variance = np.interp(chunk.time, self._knot_times, self._smoothed.segment_var[:, i])
-                before = filter_var + compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
-                variance = np.minimum(variance, before)  # the filter may have found the bias, which is a rate here
+                # The filter may have found the bias, which the knots have as an unknown rate: take the smaller one.
+                variance = np.minimum(variance, before)
                 gap = chunk.sensors[name].gap
                 if gap is not None:  # where the sensor is lost, neighbours do not tell where its segment is
                     variance = np.where(gap, np.maximum(variance, before), variance)
@@ -366,7 +372,7 @@ class HeadingCorrector:
         return result
 
     def summarize(self) -> HeadingCorrection:
-        """Return the residuals and the largest correction of the chunks so far."""
+        """Return what was observed, and residuals and the largest correction of the chunks corrected so far."""
         gaps, hinge_rms = self._gaps, self._hinge_rms
         return HeadingCorrection(
             gap_rms_mm=(1e3 * gaps["before"].value, 1e3 * gaps["after"].value) if gaps["before"].count else None,
@@ -387,7 +393,7 @@ class HeadingCorrector:
         )
 
     def _add_residuals(self, stage: str, time: np.ndarray, R_WL: np.ndarray) -> None:
-        """Add the residuals of closures and hinges before or after the correction, of orientations (k, n, 3, 3)."""
+        """Add the residuals of closures and hinges, "before" or "after" the correction, of R_WL (k, n, 3, 3)."""
         problem = self._problem
         motions = move_all_girdles(problem, R_WL) if problem.closures else {}
         for closure in problem.closures:
@@ -406,6 +412,10 @@ class CausalHeadings:
 
     When a knot is complete it is solved in parts, with samples between, so that no pose waits for long. From the sample
     `lead` of the next knot on, by which all parts are done, the correction fades in.
+
+    Parameters
+    ----------
+    recording, orientations : up to the end of the start pose
 
     Attributes
     ----------
@@ -432,12 +442,12 @@ class CausalHeadings:
 
     @property
     def phases(self) -> set[str]:
-        """The phases in which points coincide."""
+        """The names of the phases in which points coincide."""
         return {closure.phase for closure in self._problem.closures}
 
     @property
     def fade(self) -> tuple[np.ndarray, np.ndarray, int, int]:
-        """The correction (k,) [rad] from and to which it fades, the number of the next sample in that, of how many."""
+        """How the correction fades in: from (k,) [rad], to (k,) [rad], number of the next sample, number of samples."""
         count = self._reader.count
         if count < self._lead:
             return self._end, self._end, 0, 1
@@ -445,12 +455,14 @@ class CausalHeadings:
 
     @property
     def remaining(self) -> int:
-        """Number of samples that can be pushed at once, after which `fade` is another."""
+        """Number of samples that can be pushed at once: after them `fade` changes, or the knot is complete."""
         count = self._reader.count
         return (self._lead if count < self._lead else self._reader.size) - count
 
     def push(self, quat_VS: np.ndarray, accel_S: np.ndarray) -> bool:
-        """Add up to `remaining` samples, (n, k, 4), (n, k, 3), NaN where lost; return whether the knot is complete."""
+        """Add up to `remaining` samples: (n, k, 4) xyzw, (n, k, 3) [m/s²], NaN where lost; return whether the knot is
+        complete.
+        """
         time = (self._samples + np.arange(len(quat_VS))) / self._rate_hz
         self._reader.push(time, quat_VS, accel_S)
         self._samples += len(quat_VS)
@@ -462,14 +474,16 @@ class CausalHeadings:
         return not self._reader.remaining
 
     def close(self, heading_var: np.ndarray, *, record: bool = False) -> None:
-        """Close a complete knot; `heading_var` (k,) [rad²] of the filters now; `record` its covariance."""
+        """Close a complete knot; `heading_var` (k,) [rad²] is the filters' now; `record`: keep the covariance for
+        `summarize`.
+        """
         self._record = record
         self._solving = self._solve(self._reader.take(), heading_var)
         if not self._lead:
             self._apply()
 
     def mark(self, phase: str, *, begins: bool) -> None:
-        """Mark that a phase begins, or has ended, with the next sample; one that no closure has changes nothing."""
+        """Mark that a phase begins with the next sample, or has ended before it; its closures hold in between."""
         marked = self._marked.setdefault(phase, [])
         is_open = bool(marked) and marked[-1][1] is None
         if begins and not is_open:
@@ -490,6 +504,7 @@ class CausalHeadings:
         self._problem = self._filter.problem = replace(self._problem, closures=closures)
 
     def _solve(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], heading_var: np.ndarray) -> Iterator[None]:
+        """Estimate the heading errors of a knot, a part at each step of the iterator."""
         knot = self._reader.form(samples, heading_var)
         yield
         yield from self._filter.step_gradually(knot)
@@ -510,7 +525,7 @@ class CausalHeadings:
         self._var = self._find_variance()
 
     def reset(self, heading_offset: np.ndarray) -> None:
-        """Set ψ (k,) [rad] as the start pose shows it."""
+        """Correct the headings to ψ (k,) [rad] at once, as the person shows them by standing in the start pose."""
         self._apply()
         error = heading_offset - self.offset
         error = error + 2.0 * np.pi * np.round((self._end - error) / (2.0 * np.pi))
@@ -520,14 +535,14 @@ class CausalHeadings:
 
     @property
     def variance(self) -> tuple[np.ndarray, np.ndarray]:
-        """The variance (k,) [rad²] of each heading after the last knot, and that of its filter alone."""
+        """The variances (k,) [rad²] after the last knot: of each segment's heading, and of its filter's alone."""
         return self._var, self._var_at_knot
 
     def _find_variance(self) -> np.ndarray:
         return self._problem.find_segment_variance(self._filter.P)
 
     def summarize(self) -> HeadingCorrection:
-        """Return what was observed and corrected so far; residuals are not known."""
+        """Return what was observed and corrected so far, without residuals: they are not computed causally."""
         names = self._problem.names
         return HeadingCorrection(
             gap_rms_mm=None,
@@ -556,14 +571,14 @@ def _stack_samples(
 
 
 def find_specific_force(chunk: Recording, name: str) -> np.ndarray:
-    """Find `accel_S` (n, 3) [m/s²] of a sensor, NaN where it is lost; zero of a sensor that has none."""
+    """Return `accel_S` (n, 3) [m/s²] of a sensor, NaN where samples are lost; zeros of an `OrientationSensor`."""
     sensor = chunk.sensors[name]
     accel_S = sensor.accel_S if isinstance(sensor, ImuSensor) else np.zeros((len(chunk), 3))
     return accel_S if sensor.gap is None else np.where(sensor.gap[:, None], np.nan, accel_S)
 
 
 def find_heading_variance(orientation: Mapping[str, Orientation], names: Sequence[str], row: int) -> np.ndarray:
-    """Find the variance (k,) [rad²] of each filter's heading at a sample; NaN: it has none."""
+    """Return the variance (k,) [rad²] of each filter's heading at sample `row`; NaN: the filter has no covariance."""
     variance = np.full(len(names), np.nan)
     filtered = {i: orientation[name] for i, name in enumerate(names) if name in orientation}
     covs = {i: each.attitude_cov[row] for i, each in filtered.items() if each.attitude_cov is not None}
@@ -574,7 +589,7 @@ def find_heading_variance(orientation: Mapping[str, Orientation], names: Sequenc
 
 
 class _RmsAccumulator:
-    """Root mean square of added squares."""
+    """The root mean square of residuals whose squares are added chunk by chunk."""
 
     def __init__(self) -> None:
         self.count, self._sum = 0, 0.0
@@ -608,9 +623,15 @@ def compute_heading_covariance(R_VS: Rotation, attitude_cov: np.ndarray) -> np.n
 def replace_heading_variance(
     cov_W: np.ndarray, filter_W: np.ndarray, filter_var: np.ndarray, heading_var: np.ndarray
 ) -> np.ndarray:
-    """Replace the heading variance by filter and start pose in covariances (n, 3, 3) by `heading_var` (n,).
+    """Return the covariances (n, 3, 3) [rad²] with another variance of the heading from filter and start pose.
 
     Variance from other sources, such as a mount's heading, is not observed by what neighbours share: it stays.
+
+    Parameters
+    ----------
+    cov_W : (n, 3, 3) of a segment in W
+    filter_W : (n, 3) the filter's covariance of the heading with each axis of W
+    filter_var, heading_var : (n,) the variance of the heading in `cov_W`, and the one that replaces it
     """
     std_ratio = np.sqrt(heading_var / filter_var)
     removed = (1.0 - std_ratio)[:, None] * filter_W

@@ -16,7 +16,7 @@ class TrackOptions:
     Parameters
     ----------
     method : the orientation filter, a key of `wepose_pin.filters.METHODS`
-    static_test : when a sensor counts as static; None for the paper's values
+    static_test : when a sensor counts as static; None: the default values
     open_loop : do not correct heading drift, neither by joint accelerations, hinges and joined hands, nor by the resets
         of a live session: orientations are the filter's from the start pose on
     causal : begin at the end of the start pose and look at nothing ahead, as a live session does

@@ -15,7 +15,7 @@ from ..subject import Subject
 from .causal import CausalEstimator, CausalSegmentEstimator
 from .doubled import DoubledEstimator
 from .heading_filter import HeadingProblem
-from .headings import HeadingCorrector, pose_problem
+from .headings import HeadingCorrector, make_heading_problem
 from .options import TrackOptions
 from .segments import Oriented, SegmentEstimator
 from .tracked import TrackedBody, TrackedRecording, make_body
@@ -24,22 +24,24 @@ Chunks = Callable[[], Iterable[Recording]]
 
 
 class Tracker:
-    """The pose of the body of a recording that comes in chunks; the whole recording may be one.
+    """Tracks the body of a recording that comes in chunks; the whole recording may be one chunk.
 
-    `push` returns the chunks that are complete, `finish` the rest: the smoother looks one chunk ahead, and the heading
-    correction needs the whole recording. To save memory, pass over the chunks with `observe_headings` first and give
-    its result as `headings`. A causal tracker takes single samples as well, by `segment_estimator.step`.
+    `push` returns the chunks that are complete, `finish` the rest: the smoother needs the next chunk, and the heading
+    correction the whole recording. To save memory, pass over the chunks with `observe_headings` first and give its
+    result as `headings`. A causal tracker takes single samples as well, by `segment_estimator.step`.
 
     All chunks of a recording carry its phases; `start` and `static` are in the first. The result of a causal filter
     does not depend on the chunks.
 
     Parameters
     ----------
-    subject : lengths and mounts; None for the population prior and the session's stated mounts
-    model : a body, its file, or the name of one of the package's; None for that which the recording names, else the
-        upper body. It gets the subject's lengths; without a subject its own stand
-    headings, observed : what `observe_headings` returned, after a pass over all chunks; without it headings are solved
-        in `finish`, unless `options.open_loop`, where the subject allows it
+    subject : lengths and mounts; None: the population prior and the mounts that the session states
+    model : a body, its file, or the name of a body of the package, scaled to the subject's lengths; None: the one that
+        the recording names, else the upper body. Without a subject a model that is given or named keeps its own lengths
+    options : None: the default ones
+    headings : what `observe_headings` returned; None with `observed`: nothing observes the headings
+    observed : `observe_headings` has passed over all chunks. False: the tracker observes headings itself, and where
+        there is something to observe, all chunks are returned by `finish`
     """
 
     def __init__(
@@ -80,11 +82,11 @@ class Tracker:
         Raises
         ------
         WeposeError
-            What the recording, the subject or the model lacks; sensors on links that are no segments.
+            The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
         """
         if self._estimator is None:
             self._body = make_body(self._subject, self._model, chunk)
-            self._estimator = _estimator(self._subject, self._body, self.options, chunk)
+            self._estimator = _make_estimator(self._subject, self._body, self.options, chunk)
         if self.options.open_loop and chunk.resets:
             chunk = replace(chunk, resets=())
         return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented)]
@@ -103,6 +105,7 @@ class Tracker:
         return done
 
     def _process(self, oriented: Oriented) -> list[TrackedRecording]:
+        """Return a chunk with its pose, or nothing while the headings are observed."""
         assert self._body is not None  # made with the first chunk
         if self._headings is None and not self._solved:
             self._headings = make_heading_corrector(oriented, self._body.subject, self._body.model, self.options)
@@ -114,8 +117,10 @@ class Tracker:
         return [self._solve_pose(oriented)]
 
     def _solve_pose(self, oriented: Oriented) -> TrackedRecording:
+        """Return a chunk with its pose, after its headings have been corrected."""
         assert self._body is not None  # made with the first chunk
-        (recording, segments), person, body = oriented, self._body.subject, self._body.model
+        recording, segments = oriented
+        person, body = self._body.subject, self._body.model
         if self._headings is not None:
             segments = self._headings.correct(recording, segments)
         if self._kinematics is None:
@@ -141,7 +146,7 @@ def observe_headings(
     options: TrackOptions | None = None,
     model: BodyModel | str | Path | None = None,
 ) -> HeadingCorrector | None:
-    """Return the heading corrector of a recording after a pass over its chunks; None: nothing observes headings.
+    """Pass over the chunks of a recording and return its heading corrector; None: nothing observes headings.
 
     Parameters as of `Tracker`.
 
@@ -163,13 +168,13 @@ def observe_headings(
 def _estimate(
     chunks: Iterable[Recording], subject: Subject | None, model: BodyModel | str | Path | None, options: TrackOptions
 ) -> Iterator[tuple[Oriented, TrackedBody]]:
-    """Iterate over the segment orientations of all chunks, each with the body."""
+    """Iterate over all chunks with their segment orientations, each with the body."""
     body: TrackedBody | None = None
     estimator: SegmentEstimator | CausalEstimator | DoubledEstimator | None = None
     for chunk in chunks:
         if body is None or estimator is None:
             body = make_body(subject, model, chunk)
-            estimator = _estimator(subject, body, options, chunk)
+            estimator = _make_estimator(subject, body, options, chunk)
         for oriented in estimator.push(chunk):
             yield oriented, body
     if body is not None and estimator is not None:
@@ -180,11 +185,11 @@ def _estimate(
 def make_heading_corrector(
     oriented: Oriented, subject: Subject, body: BodyModel, options: TrackOptions
 ) -> HeadingCorrector | None:
-    """Return a heading corrector for a recording with this first chunk; None: its headings cannot be corrected."""
+    """Return a heading corrector for a recording whose first chunk this is; None: nothing observes its headings."""
     recording, segments = oriented
     if options.causal or options.open_loop or any(sensor.aligned for sensor in recording.sensors.values()):
         return None
-    problem = pose_problem(recording, segments, subject, body, causal=False)
+    problem = make_heading_problem(recording, segments, subject, body, causal=False)
     return None if problem is None else HeadingCorrector(recording, segments, problem)
 
 
@@ -196,9 +201,10 @@ def track_chunks(
     options: TrackOptions | None = None,
     progress: Callable[[str, Recording], None] | None = None,
 ) -> Iterator[TrackedRecording]:
-    """Track a recording too long for memory. `chunks()` iterates over its chunks; the heading correction does so twice.
+    """Iterate over the tracked chunks of a recording that is too long for memory.
 
-    `progress` is called with the task and each chunk that it has finished.
+    `chunks()` iterates over the recording's chunks; it is called twice where headings are corrected. `progress` is
+    called with the name of the task and each chunk that it has finished.
 
     Raises
     ------
@@ -207,27 +213,29 @@ def track_chunks(
     """
     options = options or TrackOptions()
 
-    def counted(task: str) -> Iterator[Recording]:
+    def report(task: str) -> Iterator[Recording]:
         for chunk in chunks():
             yield chunk
             if progress is not None:
                 progress(task, chunk)
 
     observed = not options.open_loop and not options.causal
-    headings = observe_headings(counted("observing headings"), subject, options, model) if observed else None
+    headings = observe_headings(report("observing headings"), subject, options, model) if observed else None
     tracker = Tracker(subject, model=model, options=options, headings=headings, observed=observed)
-    for chunk in counted(f"tracking by {options.method}"):
+    for chunk in report(f"tracking by {options.method}"):
         yield from tracker.push(chunk)
     yield from tracker.finish()
 
 
-def _estimator(
+def _make_estimator(
     subject: Subject | None, body: TrackedBody, options: TrackOptions, chunk: Recording
 ) -> SegmentEstimator | CausalEstimator | DoubledEstimator:
-    def observe(recording: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
+    """Return the estimator of segment orientations for a recording whose first chunk this is."""
+
+    def make_problem(recording: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
         if any(sensor.aligned for sensor in recording.sensors.values()):
             return None
-        return pose_problem(recording, segments, body.subject, body.model, causal=True)
+        return make_heading_problem(recording, segments, body.subject, body.model, causal=True)
 
     def make(person: Subject | None) -> SegmentEstimator | CausalEstimator:
         if not options.causal:
@@ -239,7 +247,7 @@ def _estimator(
             start_frames=body.start_frames,
             method=options.method,
             static_test=options.static_test,
-            pose_problem=None if options.open_loop or chunk.doubled else observe,
+            make_problem=None if options.open_loop or chunk.doubled else make_problem,
         )
 
     return DoubledEstimator(make, subject, chunk) if chunk.doubled else make(subject)

@@ -108,7 +108,7 @@ def export(
     force: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
-    """Write a motion, or the body that moves, to a file for other programs, which appears whole or not at all.
+    """Write a motion, or the body that moves, to a file for other programs. On an error no part of it is left.
 
     Parameters
     ----------
@@ -116,13 +116,13 @@ def export(
         A person's motion: what `track` or `load_result` gives, or a result folder. A robot's: what `retarget` gives, or
         a folder that `wepose retarget` wrote. Several only for "lerobot", which makes episodes of them.
     file : str or Path
-        The file to write; of "lerobot" and "rosbag" the folder, of "motion-bids" one to which a recording is added if
-        it is a dataset.
+        The file to write; of "lerobot" and "rosbag" the folder, of "motion-bids" the folder of a data set, to which the
+        recording is added where it exists.
     format : str, optional
         One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "osim", "trc", "c3d", "bvh",
         "bvh-lafan1", "bvh-nokov", "bvh-soma", "bvh-xsens", "motion-bids". Of either: "urdf", "rosbag", "mcap", "rrd".
-        Of a robot: "lerobot", "pkl", "npz", "csv-beyondmimic". None: that of the file's suffix, which otherwise has to
-        be the format's own.
+        Of a robot: "lerobot", "pkl", "npz", "csv-beyondmimic". None: by the suffix of `file`; a stated
+        format needs a file with its own suffix.
     names : str, optional
         Of a .mot's columns: only the angles of the ISB, "isb", or only the coordinates of OpenSim's model, "opensim";
         None: both, the ISB's first.
@@ -145,19 +145,20 @@ def export(
     force : bool
         Replace an existing file, or a data set of the same format.
     provenance : mapping, optional
-        Written beside the file, before it; of a format that is a folder into it.
+        What made the result (command, options, versions), written as JSON beside the file, or into it where it is a
+        folder.
 
     Returns
     -------
     Exported
-        The format, and as `diagnostics` what it cannot hold.
+        `format`, and `diagnostics`: what of the result the format cannot hold.
 
     Raises
     ------
     BadOption
-        A format that is not known, or of another kind of result; an option that it has not.
+        An unknown format, or one that is not for this kind of result; an option that the format does not take.
     MissingFile, BadData
-        No result, or nothing in it that the format could hold.
+        There is no such result, or it has nothing that the format can hold.
     ExistingOutput
         The file is there and `force` is not given, or it cannot be written.
 
