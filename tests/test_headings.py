@@ -39,7 +39,8 @@ def drifting(simulation: Simulation, deg_min: dict[str, float]) -> Recording:
     sensors = {}
     for name, quat in simulation.quat_WL.items():
         turn = np.deg2rad(deg_min.get(name, 0.0)) / 60.0 * since[:, None] * [0.0, 0.0, 1.0]
-        sensors[name] = OrientationSensor(quat_WS=(Rotation.from_rotvec(turn) * Rotation.from_quat(quat)).as_quat())
+        drifted = (Rotation.from_rotvec(turn) * Rotation.from_quat(quat)).as_quat()
+        sensors[name] = OrientationSensor(quat_WS=drifted, stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]))
     return replace(recording, sensors=sensors)
 
 

@@ -24,7 +24,6 @@ ALLOWED = {
     "angles/definitions.py": "definitions of joint angles",
     "angles/joints.py": "definitions of joint angles",
     "live/figure.py": "the figure of formats that have a person",
-    "live/mvn_frames.py": "the numbers of a format",
     "live/sources/packets.py": "the numbers of a format",
     "live/sources/slimevr.py": "the numbers of a format",
     "live/vmc_output.py": "the names of a format",
