@@ -42,7 +42,7 @@ _MIRRORED_TURN = np.array([-1.0, 1.0, -1.0])
 
 # Nearer than this to the lock [rad] an angle is flagged: there an error of the orientation is 5.8 times that in the
 # first and third angle, or more.
-NEAR_LOCK = np.radians(10.0)
+NEAR_LOCK = float(np.radians(10.0))
 MAX_NEAR_LOCK = 0.01  # of the samples: of an angle that is read as a whole
 # Nearer than this [rad] the first and third angle follow from noise, whatever the sensors.
 LEAST_NEAR_LOCK = np.radians(2.0)
