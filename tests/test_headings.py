@@ -10,14 +10,16 @@ import pytest
 from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
+import wepose_pin as wp
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate
+from wepose_pin.model import load_model
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.tracking import summarize, track
-from wepose_pin.tracking.heading_filter import ClaspDetector
+from wepose_pin.tracking.heading_filter import PERSON_NOISE, ClaspDetector, HeadingFilter, HeadingProblem, Knot
 
 # The simulated person's shoulders stay in place, against the law of the table.
 RIGID = {name: np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) for name in TABLE.girdles}
@@ -204,6 +206,30 @@ def test_the_drift_that_all_sensors_may_share_is_in_the_torsos_heading(causal: b
     assert drift[True] > 4.0
     # Five sensors share what they know of the drift that is common to them.
     assert 0.3 * drift[True] < drift[False] < 1.2 * drift[True]
+
+
+def test_a_headings_variance_is_start_pose_and_drift_until_the_filter_has_found_its_bias() -> None:
+    """Nothing is observed: the mount cancels, the rate adds up, and less of it is left once the filter's ± stands."""
+    k, knot_s, start_std, rate_std = 1, 2.0, np.deg2rad(1.0), np.deg2rad(0.5)
+    problem = HeadingProblem(
+        ("torso",), load_model(), wp.population_subject(), (), (), (), PERSON_NOISE, knot_s, 16, np.zeros(k),
+        np.full(k, rate_std), np.full(k, start_std**2), np.full(k, np.deg2rad(6.0) ** 2),
+    )  # fmt: skip
+    state = HeadingFilter(problem)
+    np.testing.assert_allclose(problem.find_segment_variance(state.P), start_std**2)
+
+    def go_on(filter_std: np.ndarray) -> np.ndarray:
+        variance = []
+        for k, std in enumerate(filter_std):
+            knot = Knot(k * knot_s, np.zeros(0), np.zeros((0, 1, 4)), (), np.array([std**2]), np.zeros(1, dtype=bool))
+            state.predict(state.find_step(knot))
+            variance.append(problem.find_segment_variance(state.P)[0])
+        return np.sqrt(variance)
+
+    growing = go_on(rate_std * knot_s * np.arange(1, 11))
+    assert growing[-1] == pytest.approx(np.hypot(start_std, 20.0 * rate_std), rel=0.05)
+    standing = go_on(np.full(20, rate_std * 20.0))
+    assert standing[-1] - standing[-6] < 1.3 * 10.0 * PERSON_NOISE.rate_std
 
 
 def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tmp_path: Path) -> None:

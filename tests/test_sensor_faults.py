@@ -21,6 +21,7 @@ from wepose_pin.readers.trials import read_broad
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.recording.clocks import build_clock
 from wepose_pin.recording.faults import SensorScan, find_faults, scan_sensor
+from wepose_pin.recording.intervals import check_phases
 from wepose_pin.recording.plausibility import check_signals
 from wepose_pin.simulation import NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.tracking import TrackOptions, track, track_session
@@ -487,6 +488,22 @@ def test_arms_that_swing_fast_are_measured_in_the_unit_that_is_stated(hertz: flo
         checked(180.0 / np.pi)
     with pytest.raises(BadData, match='"rad/s" would fit'):
         checked(np.pi / 180.0)
+
+
+def test_a_saturated_gyroscope_is_in_the_unit_that_is_stated() -> None:
+    """It turns too little for what accel shows, and 57 times its range would be more than any sensor has."""
+    time, gyro, accel = swing(1.5, 687.0)
+    narrow = np.deg2rad(125.0)
+    sensor = ImuSensor(gyro_S=np.clip(gyro, -narrow, narrow), accel_S=accel)
+    diagnostics = check_signals(Recording("swing", time, RATE, {"torso": sensor}, {"start": ((0.5, 4.5),)}))
+    assert {each.code for each in diagnostics} == {"signal-saturated"}
+
+
+def test_a_phase_may_end_one_sample_after_the_recording() -> None:
+    time = np.arange(100) / 25.0
+    check_phases("session.toml", time, {"clasp": ((1.0, time[-1] + 0.03),)})
+    with pytest.raises(BadPhase, match="outside the recording"):
+        check_phases("session.toml", time, {"clasp": ((1.0, time[-1] + 0.06),)})
 
 
 @pytest.mark.parametrize("within", [0.0, 1e-4, 2e-3])

@@ -20,15 +20,15 @@ _BARE = _OPTIONS | ({"_nrt": False} if hasattr(DefaultOptions, "_nrt") else {})
 
 
 class _CompilationNotice(Listener):  # type: ignore[misc]
-    """Prints a line when the first of our functions is compiled; unless `wanted`, on a terminal only."""
+    """Prints a line when the first of our functions is compiled; unless `always`, on a terminal only."""
 
-    printed, wanted = False, False
+    printed, always = False, False
 
     def on_start(self, event: Event) -> None:
         if self.printed or not event.data["dispatcher"].py_func.__module__.startswith("wepose_pin."):
             return
         self.printed = True
-        if self.wanted or sys.stderr.isatty():
+        if self.always or sys.stderr.isatty():
             print("compiling the filters for this machine, once: 10 to 30 seconds …", file=sys.stderr, flush=True)
 
     def on_end(self, event: Event) -> None:
@@ -41,7 +41,7 @@ register("numba:compile", _NOTICE)
 
 def announce_compilation() -> None:
     """From here on say that functions are compiled, also where nobody sits at a terminal."""
-    _NOTICE.wanted = True
+    _NOTICE.always = True
 
 
 def _compile_cached(function: Callable[..., Any], options: dict[str, Any]) -> Callable[..., Any]:

@@ -167,9 +167,9 @@ def how_to_install(*packages: str) -> str:
 
 
 def one_of(names: Iterable[str], value: str | None = None, most: int = 12) -> str:
-    """The choices for an error's end: ``a, b, c`` with the closest to `found` named first.
+    """The choices for an error's end: ``a, b, c`` with the closest to `value` named first.
 
-    Of more than `most` those are listed that are nearest to `found`, the nearest first.
+    Of more than `most` those are listed that are nearest to `value`, the nearest first.
     """
     choices = list(names)
     nearest = choices

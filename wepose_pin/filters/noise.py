@@ -87,12 +87,13 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
         raise BadPhase(
             "the static phase holds no gravity: accel is zero; the filter needs specific force, +g up when static"
         )
-    half_second_cov, bias_cov = _compute_half_second_cov(gyro_S, rate_hz), _compute_mean_cov(gyro_S, rate_hz)
-    if worn:  # what sways comes back: its mean is less than that of independent blocks
+    half_second_cov = _compute_half_second_cov(gyro_S, rate_hz)
+    if worn:  # what sways comes back: its mean is smaller than that of independent blocks
         half_second_cov = _estimate_sway_cov(gyro_S, rate_hz, half_second_cov)
         allowed = min(1.0, 2.0 / (SWAY_RATE * len(gyro_S) / rate_hz) ** 2)
-        white_cov = _apply_floor(np.cov(gyro_S.T) / len(gyro_S), BIAS_FLOOR)
-        bias_cov = white_cov + float(np.trace(half_second_cov)) / 3.0 * allowed * np.eye(3)
+        bias_cov = _compute_white_mean_cov(gyro_S) + float(np.trace(half_second_cov)) / 3.0 * allowed * np.eye(3)
+    else:
+        bias_cov = _compute_mean_cov(gyro_S, rate_hz)
     return SensorNoise(
         gyro_bias=gyro_S.mean(axis=0),
         gyro_bias_cov=bias_cov,
@@ -125,8 +126,13 @@ def _compute_mean_cov(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray:
     """Compute the covariance of the mean from the means of blocks, which average white noise out and keep sway."""
     blocks_cov = _compute_half_second_cov(gyro_S, rate_hz)
     if blocks_cov is None:  # too short for sway: the white part alone
-        return _apply_floor(np.cov(gyro_S.T) / len(gyro_S), BIAS_FLOOR)
+        return _compute_white_mean_cov(gyro_S)
     return _apply_floor(blocks_cov / (len(gyro_S) // max(1, round(BLOCK_S * rate_hz))), BIAS_FLOOR)
+
+
+def _compute_white_mean_cov(gyro_S: np.ndarray) -> np.ndarray:
+    """Compute the covariance of the mean of samples that are white noise."""
+    return _apply_floor(np.cov(gyro_S.T) / len(gyro_S), BIAS_FLOOR)
 
 
 def _compute_half_second_cov(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray | None:

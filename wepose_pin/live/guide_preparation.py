@@ -191,8 +191,8 @@ class StaticStep(Step):
         stillness, note = self._stillness, self.guide.describe_silent()
         if stillness is not None and stillness.moving:
             note = f"{stillness.moving.capitalize()} moved."
-        held = 0.0 if stillness is None else stillness.progress
-        return GuideView("Stand still for a moment.", note, progress=held, reasons=self._faults)
+        progress = 0.0 if stillness is None else stillness.progress
+        return GuideView("Stand still for a moment.", note, progress=progress, reasons=self._faults)
 
 
 class StartPoseStep(Step):
@@ -237,13 +237,13 @@ class StartPoseStep(Step):
             self._begin = self.guide.now + GET_READY_S
 
     def view(self) -> GuideView:
-        stillness, countdown, held = self._stillness, None, 0.0
+        stillness, countdown, progress = self._stillness, None, 0.0
         note = self.guide.describe_silent() or self.reason
         if self._begin is not None and self.guide.now < self._begin:
             countdown = self._begin - self.guide.now
         elif stillness is not None:
-            held = stillness.progress
-            countdown = (1.0 - held) * self._seconds
+            progress = stillness.progress
+            countdown = (1.0 - progress) * self._seconds
             if stillness.moving:
                 note = f"You moved ({stillness.moving}). Once more: {self._seconds:.0f} s still."
-        return GuideView(self._do, note, countdown, progress=held)
+        return GuideView(self._do, note, countdown, progress=progress)

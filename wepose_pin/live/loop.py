@@ -454,8 +454,11 @@ class LiveLoop:
         if self._ended:
             return "ended", "The session has ended.", 1.0
         if self._segment_estimator is not None:
-            said = [self._describe_lost(lost, frozen) or "Tracking.", *(output.describe() for output in self.outputs)]
-            return "ready", " ".join(filter(None, said)), 1.0
+            sentences = [
+                self._describe_lost(lost, frozen) or "Tracking.",
+                *(output.describe() for output in self.outputs),
+            ]
+            return "ready", " ".join(filter(None, sentences)), 1.0
         if self._start_search is None:
             missing_sensors = [name for name in self.source.sensors if self._stream.newest_times[name] == -np.inf]
             if missing_sensors:

@@ -29,7 +29,7 @@ class Decimator:
     def __init__(self, samples: int) -> None:
         self._every = max(1, samples // MOST)
         self._seen = 0
-        self._kept: list[TrackedRecording] = []
+        self._parts: list[TrackedRecording] = []
         self._signals: dict[str, list[Signal]] = {}
         self._peak_speed: dict[str, float] = {}
         self._steps = (np.inf, 0.0)
@@ -54,8 +54,8 @@ class Decimator:
         self._steps = min(self._steps[0], float(np.nanmin(steps))), max(self._steps[1], float(np.nanmax(steps)))
         self._seen, self._last = self._seen + len(recording), float(recording.time[-1])
         if len(at):
-            kept = chunk if len(at) == len(recording) else _decimate(chunk, at, recording.rate_hz / self._every)
-            self._kept.append(kept)
+            part = chunk if len(at) == len(recording) else _decimate(chunk, at, recording.rate_hz / self._every)
+            self._parts.append(part)
 
     @cached_property
     def decimated(self) -> tuple[TrackedRecording, Measures]:
@@ -65,7 +65,7 @@ class Decimator:
         """
         if self._error is not None:
             raise self._error
-        tracked = _join_recordings(self._kept)
+        tracked = _join_recordings(self._parts)
         measures = measure(tracked, {name: _join_signals(parts) for name, parts in self._signals.items()})
         return tracked, replace(
             measures,

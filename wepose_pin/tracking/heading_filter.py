@@ -32,7 +32,8 @@ from .joint_accelerations import JointPair, JointSums
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
-BIAS_FOUND_S = 10.0  # [s] over which a filter's heading variance grows slower once it has found its gyroscope's bias
+# [s] for which the growth of a filter's heading variance is remembered: the fastest of it says what bias is left.
+BIAS_FOUND_S = 10.0
 LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance within so long [s], above which it leaps
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
@@ -407,8 +408,8 @@ class HeadingFilter:
         gained = np.maximum(knot.heading_var - self._last_var, MIN_DRIFT_PSD * knot_s)
         self._last_var = knot.heading_var
         known = np.isfinite(gained)
-        left = np.maximum(np.max(self._growths, axis=0), self.problem.noise.rate_std)
-        rate_share = np.where(known, np.minimum(left / self._rate_std, 1.0), 1.0)
+        rate_std = np.maximum(np.fmax.reduce(self._growths), self.problem.noise.rate_std)
+        rate_share = np.where(known, np.minimum(rate_std / self._rate_std, 1.0), 1.0)
         self._rate_std = self._rate_std * rate_share
         leaps = known & (knot.lost | (gained > LEAP * np.maximum(self._usual_gain, self.problem.drift_psd * knot_s)))
         self._usual_gain = np.maximum(self._usual_gain * np.exp(-knot_s / USUAL_S), np.where(known, gained, 0.0))
