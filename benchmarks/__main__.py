@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `wepose` has it; a busy machine loses a multiple. Before numpy.
+
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -12,7 +15,7 @@ from wepose_pin.errors import BadOption, ExistingOutput, WeposeError
 
 from .tables import Section, document, print_table, read_document
 
-KINDS = ("filters", "calibration", "live", "batch", "long", "headings", "protocols", "robots")
+KINDS = ("filters", "calibration", "live", "batch", "long", "headings", "protocols", "robots", "bodies")
 DEFAULT = ("filters", "calibration")
 
 
@@ -35,7 +38,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "long: recordings of up to 24 hours in chunks; headings: relative headings of simulated people with and "
         "without their correction, half an hour; with --live an hour of one person who clasps the hands every ten "
         "minutes; protocols: what each calibration protocol is worth on simulated people, an hour for eight; robots: "
-        "the upper-body recording of --data on every robot, offline and live, half an hour. "
+        "the upper-body recording of --data on every robot, offline and live, half an hour; bodies: chains, other "
+        "bodies and legs by the commands, on the recordings of --data and simulated, three minutes. "
         f"Without any: {' and '.join(DEFAULT)}",
     )
     add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 12 sessions, up to one hour")
@@ -50,7 +54,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "--data",
         type=Path,
         help="real recordings (broad/, wepose_hr/) on which filters are measured, and upper_body/ "
-        "for robots; or WEPOSE_DATA",
+        "for robots, ring/, ur5/ and mvnx/ for bodies; or WEPOSE_DATA",
     )
     add("--save", type=Path, metavar="FILE", help="write the figures there with versions, machine and date, as JSON")
     add("--compare", type=Path, metavar="FILE", help="show each ratio of a file that --save wrote by that of this run")
@@ -106,6 +110,10 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
             from . import robots
 
             chosen |= robots.sections(options.quick, Path(named) if named else None, options.robot)
+        elif kind == "bodies":
+            from . import bodies
+
+            chosen |= bodies.sections(options.quick, Path(named) if named else None)
         else:
             from . import long_recordings
 

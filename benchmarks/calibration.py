@@ -23,7 +23,18 @@ from wepose_pin.calibration.least_squares import Observations, residuals
 from wepose_pin.calibration.priors import build_prior
 from wepose_pin.calibration.problem import SAMPLE_RATE_HZ, CalibrationProblem
 from wepose_pin.calibration.protocols import load_protocol
-from wepose_pin.calibration.solver import Fit, LeastSquares, solve, solve_without_bounds
+from wepose_pin.calibration.solver import (
+    DAMPING,
+    DAMPING_FACTOR,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    STEPS,
+    TOLERANCE,
+    Fit,
+    LeastSquares,
+    accept,
+    solve,
+)
 from wepose_pin.calibration.weights import FINAL_STEPS, solve_reweighted
 from wepose_pin.filters.sensors import filter_recording
 from wepose_pin.model import load_model
@@ -33,6 +44,31 @@ from wepose_pin.simulation import MILD_PRESET, Person, simulate, simulate_person
 from .tables import Column, Section, Table, time_in_turn
 
 NLPSOL, LOOP = "nlpsol", "Gauss-Newton loop"
+
+
+def solve_without_bounds(
+    problem: LeastSquares,
+    start: np.ndarray | Fit,
+    steps: int = STEPS,
+    strict: bool = True,
+    tolerance: float = TOLERANCE,
+) -> Fit:
+    """The minimiser by Gauss-Newton, damped where a step does not lower the cost; parameters and errors as `solve`."""
+    now = problem.evaluate_start(start)
+    damping = DAMPING
+    for _ in range(steps):
+        if now.remaining() < tolerance:
+            return now.fit()
+        before, H = now, now.information
+        while True:
+            now = problem.evaluate(before.x - np.linalg.solve(H + damping * np.diag(np.diag(H)), before.gradient))
+            if now.cost <= before.cost * (1.0 + 1e-12) or damping > MOST_DAMPING:
+                break
+            damping *= DAMPING_FACTOR
+        damping = max(damping / DAMPING_FACTOR, LEAST_DAMPING)
+    return accept(now, now.remaining(), strict)
+
+
 SOLVERS = {NLPSOL: solve, LOOP: solve_without_bounds}
 FINE = 3e-7  # standard deviations to go, at which solutions are compared
 _STATUS = Path("/proc/self/status")

@@ -22,7 +22,7 @@ import numpy as np
 
 from wepose_pin import rotations
 from wepose_pin.errors import how_to_install
-from wepose_pin.filters import METHODS, OFFLINE, Smekf, run_filter
+from wepose_pin.filters import METHODS, OFFLINE, FilterSettings, Smekf, run_filter
 from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.base import count_processors, run_in_parallel
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
@@ -102,7 +102,7 @@ def repeated_trial(seconds: float, rate_hz: float = 100.0, seed: int = 1) -> Sam
 
 def _batch_filters(data: Sample) -> dict[str, Callable[[], Any]]:
     """Batch runs of our methods, each with its static detector."""
-    return {name: partial(run_filter, *data, name) for name in METHODS}
+    return {name: partial(run_filter, *data, FilterSettings(name)) for name in METHODS}
 
 
 def _batch_peers(data: Sample) -> dict[str, Callable[[], Any]]:
@@ -299,7 +299,7 @@ def sensors(effort: Effort) -> Table:
         notes=[f"{count_processors()} processors."],
     )
     for count in effort.counts:
-        columns = list(zip(*[(*data, "smekf")] * count, strict=True))
+        columns = list(zip(*[(*data, FilterSettings("smekf"))] * count, strict=True))
         cases = {
             "one": partial(run_in_parallel, run_filter, *columns, threads=1),
             "all": partial(run_in_parallel, run_filter, *columns),
@@ -314,7 +314,7 @@ _FIRST_USE = """
 import sys, time
 begin = time.perf_counter()
 import numpy as np
-from wepose_pin.filters import METHODS, OFFLINE, Smekf, run_filter
+from wepose_pin.filters import METHODS, OFFLINE, FilterSettings, Smekf, run_filter
 from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.filters.static import StaticDetector
@@ -325,7 +325,7 @@ noise = estimate_noise(gyro, accel, 100.0)
 print("imports", time.perf_counter() - begin)
 for name in METHODS:
     begin = time.perf_counter()
-    run_filter(gyro, accel, 100.0, noise, name)
+    run_filter(gyro, accel, 100.0, noise, FilterSettings(name))
     print(name, time.perf_counter() - begin)
 begin = time.perf_counter()
 bank = LiveBank([Smekf(noise, 100.0, np.array([0.0, 0.0, 0.0, 1.0]))], [StaticDetector(noise, 100.0)])

@@ -39,6 +39,7 @@ napoleon_use_rtype = False
 copybutton_prompt_text = r"\$ |>>> "
 copybutton_prompt_is_regexp = True
 
+highlight_language = "text"  # of blocks that name none: folders and commands
 html_theme = "furo"
 html_title = f"wepose-pin {release}"
 html_static_path = ["static"]

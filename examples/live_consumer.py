@@ -1,14 +1,17 @@
-"""Where the right hand is, of `wepose live … --udp 9001`; ends after three seconds without a pose."""
+"""Where the right hand is, of `wepose live … --udp 9001`; waits for ever, ends by Ctrl-C."""
 
+import contextlib
 import json
 import select
 import socket
 
-with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as incoming:
+with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as incoming, contextlib.suppress(KeyboardInterrupt):
     incoming.bind(("127.0.0.1", 9001))
-    while select.select([incoming], [], [], 3.0)[0]:
+    print("waiting for poses on 127.0.0.1:9001; Ctrl-C ends", flush=True)
+    while line := incoming.recv(65535):
         while select.select([incoming], [], [], 0.0)[0]:  # whoever is slow goes on with the newest pose
             line = incoming.recv(65535)
         pose = json.loads(line)
         print(f"{pose['t']:.3f} s  right hand {pose['points'].get('right_palm')} m", flush=True)
-print("no pose for 3 s")
+        if not select.select([incoming], [], [], 3.0)[0]:
+            print("no pose for 3 s; waiting", flush=True)

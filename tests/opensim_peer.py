@@ -60,9 +60,9 @@ def arm_model() -> Any:
     vec, none = osim.Vec3, osim.Vec3(0.0)
 
     def body(name: str) -> Any:
-        found = osim.Body(name, 1.0, none, osim.Inertia(0.1))
-        model.addBody(found)
-        return found
+        segment = osim.Body(name, 1.0, none, osim.Inertia(0.1))
+        model.addBody(segment)
+        return segment
 
     def custom(name: str, parent: Any, child: Any, coordinates: list[str], signs: tuple[float, float, float]) -> None:
         turn = osim.SpatialTransform()
@@ -104,15 +104,15 @@ def bodies(values: Mapping[str, np.ndarray], names: list[str]) -> dict[str, np.n
     model = arm_model()
     state = model.initSystem()
     handles = {name: model.getCoordinateSet().get(name) for name in values}
-    found: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    by_body: dict[str, list[np.ndarray]] = {name: [] for name in names}
     for k in range(len(next(iter(values.values())))):
         for name, handle in handles.items():
             handle.setValue(state, float(values[name][k]), False)
         model.realizePosition(state)
-        for name, rows in found.items():
+        for name, rows in by_body.items():
             R = model.getBodySet().get(name).getTransformInGround(state).R().asMat33()
             rows.append(np.array([[R.get(i, j) for j in range(3)] for i in range(3)]))
-    return {name: np.array(rows) for name, rows in found.items()}
+    return {name: np.array(rows) for name, rows in by_body.items()}
 
 
 def opensense(folder: Path) -> dict[str, Any]:
@@ -140,14 +140,14 @@ def joint_centres(file: Path) -> dict[str, np.ndarray]:
     state = model.initSystem()
     model.realizePosition(state)
     joints = model.getJointSet()
-    found = {}
+    centres = {}
     for k in range(joints.getSize()):
         child = joints.get(k).getChildFrame()
-        found[child.findBaseFrame().getName()] = child.getPositionInGround(state).to_numpy()
+        centres[child.findBaseFrame().getName()] = child.getPositionInGround(state).to_numpy()
     for k in range(model.getMarkerSet().getSize()):
         marker = model.getMarkerSet().get(k)
-        found[marker.getName()] = marker.getLocationInGround(state).to_numpy()
-    return found
+        centres[marker.getName()] = marker.getLocationInGround(state).to_numpy()
+    return centres
 
 
 def zero_pose(file: Path, out: Path) -> None:
@@ -177,13 +177,13 @@ def scale(file: Path, factors: Mapping[str, tuple[float, float, float]], out: Pa
 def mass_properties(file: Path) -> dict[str, tuple[float, np.ndarray, np.ndarray]]:
     """Body → mass [kg], mass centre (3,) [m], inertia (6,) [kg m²]."""
     model = osim.Model(str(file))
-    found = {}
+    properties = {}
     for k in range(model.getBodySet().getSize()):
         body = model.getBodySet().get(k)
         inertia = body.get_inertia()
         moments = np.array([inertia.get(i) for i in range(6)])
-        found[body.getName()] = (body.getMass(), body.getMassCenter().to_numpy(), moments)
-    return found
+        properties[body.getName()] = (body.getMass(), body.getMassCenter().to_numpy(), moments)
+    return properties
 
 
 def run_setups(folder: Path, stem: str) -> dict[str, Any]:

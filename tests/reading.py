@@ -22,13 +22,13 @@ def headings(page: str) -> list[str]:
 
 def rows(page: str) -> list[list[str]]:
     """The cells of its tables."""
-    found = re.findall(r"<tr>(<td>.*?)</tr>", without_frame(page), flags=re.DOTALL)
-    return [[unescape(cell) for cell in re.findall(r"<td>(.*?)</td>", row)] for row in found]
+    cells = re.findall(r"<tr>(<td>.*?)</tr>", without_frame(page), flags=re.DOTALL)
+    return [[unescape(cell) for cell in re.findall(r"<td>(.*?)</td>", row)] for row in cells]
 
 
 def captions(page: str) -> list[tuple[str, str]]:
     """Of each chart what it is called for who cannot see it, and its caption."""
-    found = re.findall(
+    pairs = re.findall(
         r'<svg class="chart"[^>]* aria-label="([^"]+)".*?<figcaption>(.*?)</figcaption>', page, re.DOTALL
     )
-    return [(unescape(label), unescape(caption)) for label, caption in found]
+    return [(unescape(label), unescape(caption)) for label, caption in pairs]

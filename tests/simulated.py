@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.alignment import SegmentOrientations
+from wepose_pin.recording import Recording
 from wepose_pin.simulation import Simulation
+from wepose_pin.subject import Subject
+from wepose_pin.tracking.segments import SegmentEstimator
 
 G = 9.81
 SIDES = ("left", "right")
@@ -21,6 +27,13 @@ SUBJECT = {
     "right_forearm": 0.247,
     "right_hand": 0.078,
 }
+
+
+def estimate_segments(recording: Recording, subject: Subject | None = None, **options: Any) -> SegmentOrientations:
+    """Segment orientations of a whole recording from the N-pose; options and errors as of `SegmentEstimator`."""
+    estimator = SegmentEstimator(subject, **options)
+    [(_, segments)] = estimator.push(recording) + estimator.finish()
+    return segments
 
 
 def within(sim: Simulation, *phases: str) -> np.ndarray:
@@ -64,8 +77,8 @@ def check_accel(sim: Simulation, segment: str, R_WS: Rotation, start: float, sto
     t = sim.time[k]
     accel_W = R_WS[k].apply(sim.accel_S[segment][k]) - [0.0, 0.0, G]
     truth = CubicSpline(sim.time, position)
-    found = truth(t[0]) + truth(t[0], 1) * (t - t[0])[:, None] + CubicSpline(t, accel_W).antiderivative(2)(t)
-    assert np.abs(found - position[k]).max() < 1e-3
+    integrated = truth(t[0]) + truth(t[0], 1) * (t - t[0])[:, None] + CubicSpline(t, accel_W).antiderivative(2)(t)
+    assert np.abs(integrated - position[k]).max() < 1e-3
     return np.ptp(position[k], axis=0)
 
 

@@ -15,7 +15,16 @@ from scipy.spatial.transform import Rotation
 from wepose_pin import rotations
 from wepose_pin.errors import BadOption, WeposeWarning
 from wepose_pin.evaluation import attitude_error, uncertainty
-from wepose_pin.filters import TYPICAL, Amekf, AmekfParams, FilterRun, Smoother, estimate_orientation, run_filter
+from wepose_pin.filters import (
+    TYPICAL,
+    Amekf,
+    AmekfParams,
+    FilterRun,
+    FilterSettings,
+    Smoother,
+    estimate_orientation,
+    run_filter,
+)
 from wepose_pin.filters.amekf import BLOCK, ERROR, STATES, fill_transition_rows
 from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
@@ -71,13 +80,13 @@ def drawn(seed: int) -> Case:
 
 
 def run(of: Case, params: AmekfParams | None = None, kind: Any = Amekf) -> FilterRun:
-    found: FilterRun = kind(of.noise, RATE, of.start, params).run(of.gyro, of.accel, of.static)
-    return found
+    result: FilterRun = kind(of.noise, RATE, of.start, params).run(of.gyro, of.accel, of.static)
+    return result
 
 
-def cov(found: FilterRun) -> np.ndarray:
-    assert found.attitude_cov is not None
-    return found.attitude_cov
+def cov(result: FilterRun) -> np.ndarray:
+    assert result.attitude_cov is not None
+    return result.attitude_cov
 
 
 def errors(of: Case, quat_VS: np.ndarray) -> Rotation:
@@ -101,13 +110,13 @@ def columns(of: Case, quat_VS: np.ndarray) -> np.ndarray:
     return np.array([*error.roll, *error.pitch, *error.yaw])
 
 
-def nees(of: Case, found: FilterRun) -> float:
+def nees(of: Case, result: FilterRun) -> float:
     """Mean normalised squared error of the attitude in the motion; the heading is exact at the first sample."""
-    true, R_VS = Rotation.from_quat(of.true), Rotation.from_quat(found.quat_WS)
+    true, R_VS = Rotation.from_quat(of.true), Rotation.from_quat(result.quat_WS)
     psi = rotations.heading((true[0] * R_VS[0].inv()).as_quat())
     k = np.flatnonzero(of.moving)[300::25]
     error = ((Rotation.from_rotvec([0, 0, float(psi)]) * R_VS[k]).inv() * true[k]).as_rotvec()
-    return uncertainty(error, cov(found)[k]).nees
+    return uncertainty(error, cov(result)[k]).nees
 
 
 # Algebra -----------------------------------------------------------------------------------------------------------
@@ -147,17 +156,17 @@ def test_the_transition_is_the_derivative_of_the_strapdown() -> None:
         turns.append(R)
     force = np.array([turn.inv().apply([0.0, 0.0, GRAVITY]) for turn in turns])
     block = block_of(np.array([turn.as_matrix() for turn in turns[1:]]), rate, moving, dt)
-    found = np.empty((7, STATES))
-    fill_transition_rows(block[0], GRAVITY, np.eye(STATES), found)
+    rows = np.empty((7, STATES))
+    fill_transition_rows(block[0], GRAVITY, np.eye(STATES), rows)
     step, expected = 1e-6, np.empty((7, STATES))
     for j in range(STATES):
         ends = [strapdown(sign * step * np.eye(STATES)[j], rate, moving, force, dt) for sign in (1.0, -1.0)]
         turned = (Rotation.from_rotvec(ends[0][:3]) * Rotation.from_rotvec(ends[1][:3]).inv()).as_rotvec()
         expected[:, j] = np.concatenate([turned, ends[0][3:] - ends[1][3:]]) / (2.0 * step)
     # θ to a sample's turn; velocity and position to what a trapezoid over the block leaves of the gyroscope's share.
-    np.testing.assert_allclose(found[:3], expected[:3], atol=0.01 * np.abs(expected[:3]).max())
-    np.testing.assert_allclose(found[3:, :M], expected[3:, :M], atol=0.02)
-    np.testing.assert_allclose(found[3:5, F:D], expected[3:5, F:D], atol=1e-6)
+    np.testing.assert_allclose(rows[:3], expected[:3], atol=0.01 * np.abs(expected[:3]).max())
+    np.testing.assert_allclose(rows[3:, :M], expected[3:, :M], atol=0.02)
+    np.testing.assert_allclose(rows[3:5, F:D], expected[3:5, F:D], atol=1e-6)
 
 
 @pytest.mark.parametrize("still", [False, True])
@@ -175,7 +184,7 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     filter_.state.x[V : P + 2] = 0.1, -0.2, 0.05, 0.02
     x_before, P_start = filter_.state.x.copy(), filter_.state.P.copy()
     blocks = np.empty(1, BLOCK)
-    found = filter_.run_with_blocks(of.gyro[at], of.accel[at], np.full(25, still), blocks)
+    result = filter_.run_with_blocks(of.gyro[at], of.accel[at], np.full(25, still), blocks)
 
     rows, T = np.empty((7, STATES)), 0.25
     fill_transition_rows(blocks[0], of.noise.gravity, np.eye(STATES), rows)
@@ -205,10 +214,10 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
         innovation[2:] += of.gyro[at].mean(axis=0)
     d = gain @ innovation
     np.testing.assert_allclose(filter_.state.x[3:] - open_.state.x[3:], d[3:], atol=1e-12)
-    turned = (Rotation.from_quat(found.quat_WS[-1]) * Rotation.from_quat(end).inv()).as_rotvec()
+    turned = (Rotation.from_quat(result.quat_WS[-1]) * Rotation.from_quat(end).inv()).as_rotvec()
     np.testing.assert_allclose(turned, d[:3], atol=1e-12)
-    R = Rotation.from_quat(found.quat_WS[-1]).as_matrix()
-    np.testing.assert_allclose(cov(found)[-1], R.T @ filter_.state.P[:3, :3] @ R, atol=1e-15)
+    R = Rotation.from_quat(result.quat_WS[-1]).as_matrix()
+    np.testing.assert_allclose(cov(result)[-1], R.T @ filter_.state.P[:3, :3] @ R, atol=1e-15)
 
 
 def test_the_heading_is_nobody_s_to_measure() -> None:
@@ -249,10 +258,10 @@ def test_large_turns_a_sample_are_exact_too() -> None:
         rate = np.array([0.6, -0.48, 0.64]) * angle * rate_hz
         quiet = AmekfParams(block_s=1e3, gyro_matrix_std=0.0)
         noise = replace(TYPICAL, gyro_bias=np.zeros(3))
-        found = Amekf(noise, rate_hz, np.array([0.0, 0.0, 0.0, 1.0]), quiet).run(
+        result = Amekf(noise, rate_hz, np.array([0.0, 0.0, 0.0, 1.0]), quiet).run(
             np.tile(rate, (3, 1)), np.zeros((3, 3)), np.zeros(3, dtype=bool)
         )
-        apart = Rotation.from_quat(found.quat_WS[-1]).inv() * Rotation.from_rotvec(rate / rate_hz) ** 3
+        apart = Rotation.from_quat(result.quat_WS[-1]).inv() * Rotation.from_rotvec(rate / rate_hz) ** 3
         assert apart.magnitude() < 1e-14
 
 
@@ -302,8 +311,8 @@ def test_ahead_of_smekf_as_the_paper_measures() -> None:
             rows = []
             for seed in range(12):
                 of = case(seed, realistic)
-                found = run_filter(of.gyro, of.accel, RATE, of.noise, name, measured_start=True)
-                rows.append(columns(of, found.quat_WS))
+                orientation = run_filter(of.gyro, of.accel, RATE, of.noise, FilterSettings(name, measured_start=True))
+                rows.append(columns(of, orientation.quat_WS))
             mean[name] = np.mean(rows, axis=0)
             print(f"{'realistic' if realistic else 'noise and bias'} {name:9s} {np.round(mean[name], 3)}")
         assert (mean["smoother"] < mean["smekf"]).all()
@@ -337,11 +346,11 @@ def test_the_gyroscope_s_scale_is_learned_in_motion() -> None:
 # Bad data ----------------------------------------------------------------------------------------------------------
 
 
-def within(of: Case, found: FilterRun, after: int, sigmas: float = 3.0) -> bool:
+def within(of: Case, result: FilterRun, after: int, sigmas: float = 3.0) -> bool:
     """Errors in W from a sample on are within so many of the stated standard deviations."""
-    R = Rotation.from_quat(found.quat_WS).as_matrix()
-    std = np.sqrt(np.diagonal(R @ cov(found) @ R.transpose(0, 2, 1), axis1=1, axis2=2))
-    return bool((np.abs(errors(of, found.quat_WS).as_rotvec()) <= sigmas * std)[after:].all())
+    R = Rotation.from_quat(result.quat_WS).as_matrix()
+    std = np.sqrt(np.diagonal(R @ cov(result) @ R.transpose(0, 2, 1), axis1=1, axis2=2))
+    return bool((np.abs(errors(of, result.quat_WS).as_rotvec()) <= sigmas * std)[after:].all())
 
 
 @pytest.mark.parametrize("length", [1, 5, 30])
@@ -350,11 +359,11 @@ def test_lost_gyro_samples_grow_the_covariance_and_are_got_over(length: int, kin
     of = case(5)
     gyro = of.gyro.copy()
     gyro[2000 : 2000 + length] = np.nan
-    clean, found = run(of, kind=kind), run(of._replace(gyro=gyro), kind=kind)
-    assert all(part is not None and np.isfinite(part).all() for part in found)
-    assert within(of, found, 2000)
-    assert np.trace(cov(found)[2100]) > np.trace(cov(clean)[2100])
-    tilt = tilt_deg(errors(of, found.quat_WS))
+    clean, lossy = run(of, kind=kind), run(of._replace(gyro=gyro), kind=kind)
+    assert all(part is not None and np.isfinite(part).all() for part in lossy)
+    assert within(of, lossy, 2000)
+    assert np.trace(cov(lossy)[2100]) > np.trace(cov(clean)[2100])
+    tilt = tilt_deg(errors(of, lossy.quat_WS))
     assert tilt[-600:].max() < 1.0
     assert tilt[1500:1950].max() < 1.0
 
@@ -364,10 +373,10 @@ def test_lost_accel_samples_count_as_gravity_alone() -> None:
     accel = of.accel.copy()
     accel[2000:2030] = np.nan
     accel[3000::7] = np.nan
-    found = run(of._replace(accel=accel))
-    assert all(part is not None and np.isfinite(part).all() for part in found)
-    assert within(of, found, 500)
-    assert tilt_deg(errors(of, found.quat_WS))[2000:].max() < 1.0
+    result = run(of._replace(accel=accel))
+    assert all(part is not None and np.isfinite(part).all() for part in result)
+    assert within(of, result, 500)
+    assert tilt_deg(errors(of, result.quat_WS))[2000:].max() < 1.0
 
 
 def test_a_clipped_gyroscope_is_known_to_be_wrong() -> None:
@@ -384,9 +393,9 @@ def test_an_impact_does_not_tip_the_attitude() -> None:
     of = case(7)
     accel = of.accel.copy()
     accel[2500:2502] += [150.0, -100.0, 50.0]
-    clean, found = (tilt_deg(errors(of, run(c).quat_WS)) for c in (of, of._replace(accel=accel)))
-    print(f"tilt after the impact: {found[2500:].max():.2f} deg, without {clean[2500:].max():.2f} deg")
-    assert found[2500:].max() < 1.0
+    clean, struck = (tilt_deg(errors(of, run(c).quat_WS)) for c in (of, of._replace(accel=accel)))
+    print(f"tilt after the impact: {struck[2500:].max():.2f} deg, without {clean[2500:].max():.2f} deg")
+    assert struck[2500:].max() < 1.0
 
 
 def test_a_bias_that_jumps_is_taken_over_at_the_next_rest() -> None:
@@ -394,10 +403,10 @@ def test_a_bias_that_jumps_is_taken_over_at_the_next_rest() -> None:
     jump = np.deg2rad([0.3, -0.2, 0.25])
     gyro = of.gyro.copy()
     gyro[3000:] += jump
-    found = run(of._replace(gyro=gyro))
+    result = run(of._replace(gyro=gyro))
     assert of.static[-100:].all()
-    np.testing.assert_allclose(found.gyro_bias[-1] - of.noise.gyro_bias, jump, atol=2e-4)
-    assert tilt_deg(errors(of, found.quat_WS))[3000:].max() < 3.0
+    np.testing.assert_allclose(result.gyro_bias[-1] - of.noise.gyro_bias, jump, atol=2e-4)
+    assert tilt_deg(errors(of, result.quat_WS))[3000:].max() < 3.0
 
 
 def test_a_person_who_sways_at_rest_does_not_pass_for_bias() -> None:
@@ -410,8 +419,8 @@ def test_a_person_who_sways_at_rest_does_not_pass_for_bias() -> None:
     accel = [0.0, 0.0, 9.81] + 0.02 * rng.normal(size=(500, 3))
     noise = estimate_noise(gyro[:400], accel[:400], RATE)
     start = np.array([0.0, 0.0, 0.0, 1.0])
-    found = Amekf(noise, RATE, start).run(gyro, accel, np.ones(500, dtype=bool))
-    off = np.degrees(np.abs(found.gyro_bias[400:] - bias)).max()
+    result = Amekf(noise, RATE, start).run(gyro, accel, np.ones(500, dtype=bool))
+    off = np.degrees(np.abs(result.gyro_bias[400:] - bias)).max()
     white = replace(noise, gyro_half_second_cov=None)
     taken_for_bias = Amekf(white, RATE, start).run(gyro, accel, np.ones(500, dtype=bool)).gyro_bias[400:]
     assert off < 0.04 < np.degrees(np.abs(taken_for_bias - bias)).max()
@@ -425,11 +434,11 @@ def test_a_sensor_that_never_rests_converges_and_says_so(method: str) -> None:
         of = case(seed)
         gyro, accel = of.gyro[1000:5400] + np.deg2rad([0.4, -0.3, 0.2]), of.accel[1000:5400]
         with pytest.warns(WeposeWarning, match="There is no static phase"):
-            found = estimate_orientation(gyro, accel, RATE, method=method, static=None)
-        assert [each.code for each in found.diagnostics] == ["static-phase-missing"]
-        error = Rotation.from_quat(found.quat_WS) * Rotation.from_quat(of.true[1000:5400]).inv()
+            orientation = estimate_orientation(gyro, accel, RATE, method=method, static=None)
+        assert [each.code for each in orientation.diagnostics] == ["static-phase-missing"]
+        error = Rotation.from_quat(orientation.quat_WS) * Rotation.from_quat(of.true[1000:5400]).inv()
         tilts.append(tilt_deg(error))
-        assert not found.static.any()
+        assert not orientation.static.any()
     by = np.mean(tilts, axis=0)
     print(f"{method}: tilt at the start {by[0]:.1f}, after 10 s {by[1000]:.2f}, at the end {by[-500:].mean():.2f} deg")
     assert by[0] > 3.0 or method == "smoother"
@@ -441,8 +450,8 @@ def test_a_start_on_its_head_comes_round() -> None:
     """120 deg off, which no linear filter is made for."""
     of = case(9)
     start = (Rotation.from_rotvec([2.1, 0.0, 0.0]) * Rotation.from_quat(of.start)).as_quat()
-    found = run(of._replace(start=start, static=np.zeros_like(of.static)))
-    assert tilt_deg(errors(of, found.quat_WS))[-1500:].max() < 3.0
+    result = run(of._replace(start=start, static=np.zeros_like(of.static)))
+    assert tilt_deg(errors(of, result.quat_WS))[-1500:].max() < 3.0
 
 
 def test_hours_leave_the_covariance_a_covariance() -> None:
@@ -480,7 +489,7 @@ def test_broad_against_vqf(data: Path) -> None:
         scored = np.flatnonzero(trial.scored)[::3]
         true = Rotation.from_quat(np.where(seen[:, None], trial.quat_true, [0, 0, 0, 1]))
         for method in table:
-            out = run_filter(trial.gyro_S, trial.accel_S, trial.rate_hz, noise, method)
+            out = run_filter(trial.gyro_S, trial.accel_S, trial.rate_hz, noise, FilterSettings(method))
             R_VS = Rotation.from_quat(out.quat_WS)
             psi = float(rotations.heading((true[rest] * R_VS[rest].inv()).mean().as_quat()))
             error = (Rotation.from_rotvec([0, 0, psi]) * R_VS[scored]) * true[scored].inv()
@@ -510,8 +519,8 @@ def test_the_authors_trial_is_no_worse_than_with_smekf(data: Path) -> None:
     mean = {}
     for method in ("smekf", "amekf", "smoother"):
         out = estimate_orientation(trial.gyro_S, trial.accel_S, trial.rate_hz, method=method, static=(0.05, 0.9))
-        found = Rotation.from_quat(out.quat_WS[trial.scored])
-        mean[method] = float(np.degrees((true.inv() * ((true[0] * found[0].inv()) * found)).magnitude()).mean())
+        R_WS = Rotation.from_quat(out.quat_WS[trial.scored])
+        mean[method] = float(np.degrees((true.inv() * ((true[0] * R_WS[0].inv()) * R_WS)).magnitude()).mean())
     print(f"mean angle [deg]: {mean}")
     # What Vicon's own delay leaves is 1.85; where amekf's blocks begin changes its figure by 0.016.
     assert max(mean["amekf"], mean["smoother"]) <= mean["smekf"] + 0.03
@@ -524,6 +533,6 @@ def test_a_create_bank_sensors_gives_the_bits_of_each() -> None:
     runs = [run(of) for of in cases]
     for k in range(700):
         quat = bank.update(np.array([of.gyro[k] for of in cases]), np.array([of.accel[k] for of in cases]))
-        np.testing.assert_array_equal(quat, [found.quat_WS[k] for found in runs])
-    np.testing.assert_array_equal(bank.attitude_cov, [cov(found)[699] for found in runs])
-    np.testing.assert_array_equal(bank.gyro_bias, [found.gyro_bias[699] for found in runs])
+        np.testing.assert_array_equal(quat, [each.quat_WS[k] for each in runs])
+    np.testing.assert_array_equal(bank.attitude_cov, [cov(each)[699] for each in runs])
+    np.testing.assert_array_equal(bank.gyro_bias, [each.gyro_bias[699] for each in runs])

@@ -65,8 +65,8 @@ def arm_of(side: str, matrix_I: np.ndarray) -> dict[str, np.ndarray]:
     return {f"{side}_upper_arm": Rotation.from_matrix(matrix).as_quat()}
 
 
-def same_angles(found: np.ndarray, expected: np.ndarray, atol: float) -> None:
-    np.testing.assert_allclose(wrap(found - expected), 0.0, atol=atol)
+def same_angles(values: np.ndarray, expected: np.ndarray, atol: float) -> None:
+    np.testing.assert_allclose(wrap(values - expected), 0.0, atol=atol)
 
 
 # Apart and together -----------------------------------------------------------------------------------------------
@@ -75,16 +75,16 @@ def same_angles(found: np.ndarray, expected: np.ndarray, atol: float) -> None:
 @pytest.mark.parametrize("name", ALL_SEQUENCES)
 def test_every_sequence_gives_the_angles_that_scipy_gives(name: str) -> None:
     R = Rotation.random(500, random_state=1)
-    found = decompose(R.as_quat(), name)
+    decomposed = decompose(R.as_quat(), name)
     expected = R.as_euler(name)
     if name[0] == name[2]:  # SciPy's second angle of a proper sequence is positive: the other solution
         expected = np.column_stack([expected[:, 0] + np.pi, -expected[:, 1], expected[:, 2] + np.pi])
         lock = np.minimum(-expected[:, 1], np.pi + expected[:, 1])
     else:
         lock = np.pi / 2.0 - np.abs(expected[:, 1])
-    same_angles(found.values, expected, 1e-10)
-    np.testing.assert_allclose(found.gimbal, lock, atol=1e-10)
-    assert np.all(np.abs(found.values) <= np.pi + 1e-12)
+    same_angles(decomposed.values, expected, 1e-10)
+    np.testing.assert_allclose(decomposed.gimbal, lock, atol=1e-10)
+    assert np.all(np.abs(decomposed.values) <= np.pi + 1e-12)
 
 
 @pytest.mark.parametrize("name", ALL_SEQUENCES)
@@ -96,11 +96,11 @@ def test_angles_give_the_rotation_back_near_the_lock_and_in_it(name: str) -> Non
     R = Rotation.from_euler(
         name, np.column_stack([rng.uniform(-3, 3, second.size), second, rng.uniform(-3, 3, second.size)])
     )
-    for values in (found := decompose(R.as_quat(), name)).values, follow(found, name, NEAR_LOCK):
+    for values in (decomposed := decompose(R.as_quat(), name)).values, follow(decomposed, name, NEAR_LOCK):
         back = Rotation.from_quat(compose(values, name))
         assert (back.inv() * R).magnitude().max() < 1e-12
-    assert found.gimbal.min() < 1e-15
-    assert found.gimbal.max() > 0.5
+    assert decomposed.gimbal.min() < 1e-15
+    assert decomposed.gimbal.max() > 0.5
 
 
 @pytest.mark.parametrize("name", SHOULDER_SEQUENCES)
@@ -110,11 +110,11 @@ def test_in_the_lock_the_first_angle_is_held(name: str) -> None:
     third = np.radians(np.concatenate([np.zeros(11), np.linspace(0.0, 40.0, 20)]))
     second = lock - np.radians(np.concatenate([np.linspace(40.0, 10.0, 11), np.zeros(20)]))
     angles = np.column_stack([first, second, third])
-    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler(name, angles).as_matrix())), name)[
+    shoulder = joint_angles(pose_with(arm_of("right", Rotation.from_euler(name, angles).as_matrix())), name)[
         "right_shoulder"
     ]
-    np.testing.assert_allclose(found.values, angles, atol=1e-8)
-    assert np.all(found.near_lock[-20:])
+    np.testing.assert_allclose(shoulder.values, angles, atol=1e-8)
+    assert np.all(shoulder.near_lock[-20:])
     later = decompose(compose(angles[::-1], name), name).values  # begins in the lock: the first angle that there is
     same_angles(later[:20, 0], np.full(20, later[20, 0]), 1e-12)
 
@@ -132,22 +132,24 @@ def test_a_motion_straight_through_the_lock_keeps_its_angles(name: str, side: st
         np.column_stack([35.0 + 10.0 * np.sin(4.0 * t), reach[0] + (reach[1] - reach[0]) * t, -50.0 + 20.0 * t**2])
     )
     pose = pose_with(arm_of(side, Rotation.from_euler(name, angles).as_matrix()))
-    found = joint_angles(pose, name)[f"{side}_shoulder"]
-    np.testing.assert_allclose(found.values, angles, atol=1e-9)
+    shoulder = joint_angles(pose, name)[f"{side}_shoulder"]
+    np.testing.assert_allclose(shoulder.values, angles, atol=1e-9)
     lock = np.abs(angles[:, 1]) if name == "YXY" else np.abs(angles[:, 1] - np.pi / 2.0)
     expected = np.minimum(lock, np.pi / 2.0 - np.abs(lock - np.pi / 2.0) if name == "YXY" else np.pi - lock)
-    np.testing.assert_allclose(found.gimbal, expected, atol=1e-9)
+    np.testing.assert_allclose(shoulder.gimbal, expected, atol=1e-9)
     clear = np.abs(expected - NEAR_LOCK) > 1e-6
-    assert np.array_equal(found.near_lock[clear], expected[clear] < NEAR_LOCK)
-    assert found.near_lock.any()
+    assert np.array_equal(shoulder.near_lock[clear], expected[clear] < NEAR_LOCK)
+    assert shoulder.near_lock.any()
 
 
 def test_angles_do_not_stop_at_a_half_turn() -> None:
     angles = np.column_stack([np.linspace(0.0, 9.0, 500), np.full(500, -1.0), np.linspace(0.0, -7.0, 500)])
-    found = joint_angles(pose_with(arm_of("right", Rotation.from_euler("YXY", angles).as_matrix())))["right_shoulder"]
-    shift = found.values - angles
+    shoulder = joint_angles(pose_with(arm_of("right", Rotation.from_euler("YXY", angles).as_matrix())))[
+        "right_shoulder"
+    ]
+    shift = shoulder.values - angles
     np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=1e-9)
-    same_angles(found.values, angles, 1e-9)
+    same_angles(shoulder.values, angles, 1e-9)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -163,13 +165,13 @@ def test_what_a_hanging_arm_does_decides_nothing_about_the_motions_after_it(side
         for plane in (0.0, np.pi / 2.0)
     )
     R = Rotation.concatenate([hang[0], abducted, hang[1], flexed, hang[2]])
-    found = joint_angles(pose_with(arm_of(side, R.as_matrix())))[f"{side}_shoulder"]
+    shoulder = joint_angles(pose_with(arm_of(side, R.as_matrix())))[f"{side}_shoulder"]
     for middle, plane in ((400, 0.0), (900, 90.0)):
-        np.testing.assert_allclose(np.degrees(found.values[middle]), [plane, -110.0, -plane], atol=0.1)
-    jumps = np.abs(np.diff(found.values, axis=0)).max(axis=1) > np.radians(60.0)
-    assert not np.any(jumps & ~(found.near_lock[1:] & found.near_lock[:-1]))
+        np.testing.assert_allclose(np.degrees(shoulder.values[middle]), [plane, -110.0, -plane], atol=0.1)
+    jumps = np.abs(np.diff(shoulder.values, axis=0)).max(axis=1) > np.radians(60.0)
+    assert not np.any(jumps & ~(shoulder.near_lock[1:] & shoulder.near_lock[:-1]))
     assert (
-        Rotation.from_quat(compose(found.values, "YXY")).inv() * Rotation.from_quat(found.quat)
+        Rotation.from_quat(compose(shoulder.values, "YXY")).inv() * Rotation.from_quat(shoulder.quat)
     ).magnitude().max() < 1e-12
 
 
@@ -183,19 +185,19 @@ def test_full_turns_do_not_add_up_while_an_arm_hangs(raised: str) -> None:
     lift = -np.radians(90.0) * np.sin(np.linspace(0.0, np.pi, 400)) ** 2 - np.radians(2.0)
     lifted = Rotation.from_euler("YXY", np.column_stack([np.full(400, 0.5), lift, np.full(400, -0.5)]))
     parts = [lifted] * (raised in ("before", "both")) + [hang] + [lifted] * (raised in ("after", "both"))
-    found = joint_angles(pose_with(arm_of("right", Rotation.concatenate(parts).as_matrix())))["right_shoulder"]
+    shoulder = joint_angles(pose_with(arm_of("right", Rotation.concatenate(parts).as_matrix())))["right_shoulder"]
     expected = np.degrees(0.5) if len(parts) > 1 else 0.0
-    plane, _, internal = np.degrees(found.values).T
+    plane, _, internal = np.degrees(shoulder.values).T
     assert np.abs(plane - expected).max() <= 180.0 + 1e-9
     assert np.abs(internal + expected).max() <= 180.0 + np.degrees(about_length.max()) + 180.0 * (len(parts) == 1) + 5.0
     assert np.abs(np.diff(plane + internal)).max() < 5.0  # how far the arm is turned about its length
     clear = np.abs(np.diff(plane)) > 60.0
-    assert not np.any(clear & ~(found.near_lock[1:] & found.near_lock[:-1]))
-    turned_back = Rotation.from_quat(compose(found.values, "YXY")).inv() * Rotation.from_quat(found.quat)
+    assert not np.any(clear & ~(shoulder.near_lock[1:] & shoulder.near_lock[:-1]))
+    turned_back = Rotation.from_quat(compose(shoulder.values, "YXY")).inv() * Rotation.from_quat(shoulder.quat)
     assert turned_back.magnitude().max() < 1e-12
-    [hangs] = diagnose_lock(Angles(np.arange(1.0), {"right_shoulder": found}))
+    [hangs] = diagnose_lock(Angles(np.arange(1.0), {"right_shoulder": shoulder}))
     assert (hangs.code, hangs.place) == ("angles-near-lock", "right_shoulder")
-    assert hangs.value == pytest.approx(np.mean(found.near_lock))
+    assert hangs.value == pytest.approx(np.mean(shoulder.near_lock))
     assert "XZY" in render(hangs).do
 
 
@@ -268,15 +270,15 @@ def test_angles_are_scipys_on_frames_from_landmarks(side: str, name: str) -> Non
     angles = joint_angles(pose_with(quat_WL), name)
     chain = ["thorax", "shoulder", "elbow", "wrist"]
     for proximal, distal in itertools.pairwise(chain):
-        found = angles[f"{side}_{distal}"]
+        joint = angles[f"{side}_{distal}"]
         R = Rotation.from_matrix(frames[proximal].transpose(0, 2, 1) @ frames[distal])
-        np.testing.assert_allclose((R.inv() * Rotation.from_quat(found.quat)).magnitude(), 0.0, atol=1e-9)
+        np.testing.assert_allclose((R.inv() * Rotation.from_quat(joint.quat)).magnitude(), 0.0, atol=1e-9)
         sequence = name if distal == "shoulder" else "ZXY"
-        assert found.sequence == sequence
+        assert joint.sequence == sequence
         one = R.as_euler(sequence)
         offset = 0.0 if sequence == "YXY" else np.pi
         two = np.column_stack([one[:, 0] + np.pi, offset - one[:, 1], one[:, 2] + np.pi])
-        error = [np.abs(wrap(found.values - solution)).max(axis=1) for solution in (one, two)]
+        error = [np.abs(wrap(joint.values - solution)).max(axis=1) for solution in (one, two)]
         assert np.minimum(*error).max() < 1e-8
     if side == "right":
         R = Rotation.from_matrix(frames["thorax"])
@@ -349,23 +351,23 @@ def test_plain_poses_have_the_angles_of_the_isb_on_both_sides(pose: str, side: s
             quat_WL[f"{side}_{part}"] = turned(**{axis: sign[axis] * angle for axis, angle in last.items()})
     angles = joint_angles(pose_with(quat_WL))
     for joint, named in expected.items():
-        found = angles[f"{side}_{joint}"]
+        joint_angle = angles[f"{side}_{joint}"]
         for name, value in named.items():
-            assert np.degrees(found.values[0, found.names.index(name)]) == pytest.approx(value, abs=1e-9)
+            assert np.degrees(joint_angle.values[0, joint_angle.names.index(name)]) == pytest.approx(value, abs=1e-9)
 
 
 def test_the_thorax_extends_bends_right_and_turns_left_in_the_positive() -> None:
     for k, turn in enumerate((turned(y=-20.0), turned(x=20.0), turned(z=20.0))):
-        found = joint_angles(pose_with({"torso": turn}))["thorax"]
-        np.testing.assert_allclose(np.degrees(found.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
-    assert found.names == ("extension", "lateral_flexion_right", "axial_rotation_left")
+        thorax = joint_angles(pose_with({"torso": turn}))["thorax"]
+        np.testing.assert_allclose(np.degrees(thorax.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
+    assert thorax.names == ("extension", "lateral_flexion_right", "axial_rotation_left")
 
 
 def test_the_pelvis_tilts_back_drops_on_the_right_and_turns_left_in_the_positive() -> None:
     for k, turn in enumerate((turned(y=-20.0), turned(x=20.0), turned(z=20.0))):
-        found = joint_angles(pose_with({"pelvis": turn}))["pelvis_in_world"]
-        np.testing.assert_allclose(np.degrees(found.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
-    assert found.names == ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")
+        pelvis = joint_angles(pose_with({"pelvis": turn}))["pelvis_in_world"]
+        np.testing.assert_allclose(np.degrees(pelvis.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
+    assert pelvis.names == ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")
 
 
 @pytest.mark.parametrize("name", ["XZY", "ZXY"])
@@ -373,9 +375,9 @@ def test_the_other_sequences_of_the_shoulder_name_what_they_turn(name: str) -> N
     names = SHOULDER_SEQUENCES[name]
     turns = {"flexion": turned(y=-30.0), "adduction": turned(x=30.0), "internal_rotation": turned(z=30.0)}
     for angle, turn in turns.items():
-        found = joint_angles(pose_with({"right_upper_arm": turn}), name)["right_shoulder"]
-        assert found.names == names
-        np.testing.assert_allclose(np.degrees(found.values[0]), [30.0 * (n == angle) for n in names], atol=1e-9)
+        shoulder = joint_angles(pose_with({"right_upper_arm": turn}), name)["right_shoulder"]
+        assert shoulder.names == names
+        np.testing.assert_allclose(np.degrees(shoulder.values[0]), [30.0 * (n == angle) for n in names], atol=1e-9)
 
 
 @pytest.mark.parametrize("name", SHOULDER_SEQUENCES)
@@ -417,10 +419,10 @@ def test_standard_deviations_are_those_of_drawn_errors(name: str) -> None:
     cov = {s: (a @ a.T)[None] for s, a in roots.items()}
     stated = joint_angles(pose_with({s: R.as_quat() for s, R in middle.items()}, segment_cov=cov), name)
     assert set(stated.joints) == set(JOINTS)
-    for joint, found in stated.joints.items():
-        assert found.gimbal[0] > NEAR_LOCK
-        assert found.std is not None
-        np.testing.assert_allclose(spread[joint].values.std(axis=0), found.std[0], rtol=0.03)
+    for joint, joint_angle in stated.joints.items():
+        assert joint_angle.gimbal[0] > NEAR_LOCK
+        assert joint_angle.std is not None
+        np.testing.assert_allclose(spread[joint].values.std(axis=0), joint_angle.std[0], rtol=0.03)
 
 
 def test_towards_the_lock_the_deviation_grows_to_that_of_any_angle() -> None:
@@ -428,13 +430,13 @@ def test_towards_the_lock_the_deviation_grows_to_that_of_any_angle() -> None:
     angles = np.column_stack([np.full(7, 0.5), -away, np.full(7, 0.2)])
     cov = {s: np.tile(np.radians(1.0) ** 2 * np.eye(3), (7, 1, 1)) for s in SEGMENTS}
     pose = pose_with(arm_of("right", Rotation.from_euler("YXY", angles).as_matrix()), segment_cov=cov)
-    found = joint_angles(pose)["right_shoulder"]
-    assert found.std is not None
+    shoulder = joint_angles(pose)["right_shoulder"]
+    assert shoulder.std is not None
     each = np.radians(1.0) * np.sqrt(2.0)
-    np.testing.assert_allclose(found.std[:, 1], each, rtol=1e-9)
-    np.testing.assert_allclose(found.std[:5, 2], each / np.sin(away[:5]), rtol=1e-9)
-    np.testing.assert_allclose(found.std[-2:, [0, 2]], UNKNOWN, rtol=1e-12)
-    assert np.array_equal(found.near_lock, away < np.radians(10.0))
+    np.testing.assert_allclose(shoulder.std[:, 1], each, rtol=1e-9)
+    np.testing.assert_allclose(shoulder.std[:5, 2], each / np.sin(away[:5]), rtol=1e-9)
+    np.testing.assert_allclose(shoulder.std[-2:, [0, 2]], UNKNOWN, rtol=1e-12)
+    assert np.array_equal(shoulder.near_lock, away < np.radians(10.0))
 
 
 def test_without_covariances_there_are_no_deviations() -> None:
@@ -463,17 +465,17 @@ def test_gaps_and_what_is_not_known_are_flagged_and_hide_nothing_else() -> None:
     assert not angles["left_shoulder"].gap.any()
     assert np.isnan(shoulder.quat[42]).all()
     np.testing.assert_allclose(shoulder.values[~unknown], given[~unknown], atol=1e-12)
-    found = summary(angles)["right_shoulder"]
-    assert found.gap == pytest.approx(0.15)
-    assert found.range[1] == pytest.approx(1.0)
+    joint_summary = summary(angles)["right_shoulder"]
+    assert joint_summary.gap == pytest.approx(0.15)
+    assert joint_summary.range[1] == pytest.approx(1.0)
 
 
 def test_a_segment_that_is_never_known_gives_no_number() -> None:
     angles = joint_angles(pose_with({"right_upper_arm": np.full((20, 4), np.nan)}))
     assert np.isnan(angles["right_shoulder"].values).all()
     assert angles["right_shoulder"].gap.all()
-    found = summary(angles)["right_shoulder"]
-    assert np.isnan([*found.range, *found.peak_rate, found.peak_speed]).all()
+    joint_summary = summary(angles)["right_shoulder"]
+    assert np.isnan([*joint_summary.range, *joint_summary.peak_rate, joint_summary.peak_speed]).all()
 
 
 def test_only_joints_with_both_segments_are_there() -> None:
@@ -507,14 +509,16 @@ def test_range_and_peak_rate_of_a_swing_are_its_closed_form(rate_hz: float) -> N
     forearm = Rotation.from_rotvec(np.outer(flexion, [0.0, -1.0, 0.0])).as_quat()
     torso = np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
     pose = Pose(t, {"torso": torso, "right_upper_arm": torso, "right_forearm": forearm}, {})
-    found = summary(joint_angles(pose))["right_elbow"]
+    joint_summary = summary(joint_angles(pose))["right_elbow"]
     window = round(RATE_WINDOW_S * rate_hz) / rate_hz
     peak = 2.0 * np.pi * frequency * reach * np.sinc(frequency * window)
-    np.testing.assert_allclose(np.degrees(found.range), [100.0, 0.0, 0.0], atol=0.02)
-    np.testing.assert_allclose(np.degrees([found.lowest[0], found.highest[0]]), [20.0, 120.0], atol=0.02)
-    assert found.peak_rate[0] == pytest.approx(peak, rel=1e-3)
-    assert found.peak_speed == pytest.approx(peak, rel=1e-3)
-    assert (found.near_lock, found.gap) == (0.0, 0.0)
+    np.testing.assert_allclose(np.degrees(joint_summary.range), [100.0, 0.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(
+        np.degrees([joint_summary.lowest[0], joint_summary.highest[0]]), [20.0, 120.0], atol=0.02
+    )
+    assert joint_summary.peak_rate[0] == pytest.approx(peak, rel=1e-3)
+    assert joint_summary.peak_speed == pytest.approx(peak, rel=1e-3)
+    assert (joint_summary.near_lock, joint_summary.gap) == (0.0, 0.0)
 
 
 def test_near_the_lock_no_angle_makes_a_range_or_a_rate() -> None:
@@ -525,12 +529,12 @@ def test_near_the_lock_no_angle_makes_a_range_or_a_rate() -> None:
         "YXY", np.column_stack([np.full(n, 0.3), np.linspace(-0.2, -1.2, n), np.full(n, -0.3)])
     )
     angles = joint_angles(pose_with(arm_of("left", Rotation.concatenate([hanging, raised]).as_matrix())))
-    found = summary(angles)["left_shoulder"]
+    joint_summary = summary(angles)["left_shoulder"]
     assert np.ptp(angles["left_shoulder"].values[:n, 0]) > 1.0  # it spins
-    np.testing.assert_allclose(found.range[[0, 2]], 0.0, atol=1e-9)
-    np.testing.assert_allclose(found.peak_rate, [0.0, 100.0 / (n - 1), 0.0], atol=1e-6)
-    assert found.near_lock == pytest.approx(0.5)
-    assert found.highest[1] == pytest.approx(0.0, abs=0.02)
+    np.testing.assert_allclose(joint_summary.range[[0, 2]], 0.0, atol=1e-9)
+    np.testing.assert_allclose(joint_summary.peak_rate, [0.0, 100.0 / (n - 1), 0.0], atol=1e-6)
+    assert joint_summary.near_lock == pytest.approx(0.5)
+    assert joint_summary.highest[1] == pytest.approx(0.0, abs=0.02)
 
 
 def test_a_range_is_at_most_a_turn() -> None:
@@ -571,11 +575,11 @@ def test_the_axes_of_a_segment_are_right_handed() -> None:
 
 def test_of_a_tracked_person_the_angles_are_within_their_deviations(simulation: Simulation, person: Person) -> None:
     pose = wp.track(simulation.recording(), replace(population_subject(), lengths=person.lengths)).pose
-    found, true = wp.joint_angles(pose), wp.joint_angles(simulation.truth())
+    estimated, true = wp.joint_angles(pose), wp.joint_angles(simulation.truth())
     for joint in ("right_elbow", "left_elbow", "thorax"):
-        assert found[joint].std is not None
-        error = wrap(found[joint].values - true[joint].values)[~found[joint].near_lock]
-        normalised = error / found[joint].std[~found[joint].near_lock]
+        assert estimated[joint].std is not None
+        error = wrap(estimated[joint].values - true[joint].values)[~estimated[joint].near_lock]
+        normalised = error / estimated[joint].std[~estimated[joint].near_lock]
         assert np.sqrt(np.mean(np.square(normalised))) < 1.5
         assert np.degrees(np.sqrt(np.mean(np.square(error)))) < 1.5
 

@@ -21,18 +21,23 @@ import pytest
 from arms import write_arm
 
 import wepose_pin as wp
+from wepose_pin.batch.reproduction import run_reproduce
 from wepose_pin.cli import main
+from wepose_pin.errors import how_to_install
+from wepose_pin.jobs.reproduce import ReproduceJob
 from wepose_pin.jobs.retarget import RetargetJob
+from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.kinematics import PosedBody
 from wepose_pin.retargeting import LimitMargins
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import subject_toml
 from wepose_pin.writers import write_session
+from wepose_pin.writers.provenance import read_provenance
 
 ROOT = Path(__file__).resolve().parents[1]
 PUBLIC = {name: getattr(wp, name) for name in wp.__all__ if name != "__version__"}
 FUNCTIONS = [name for name, value in PUBLIC.items() if inspect.isfunction(value)]
-METHODS = [f"TrackResult.{name}" for name in ("to_dataframe", "plot", "show", "save")]
+METHODS = [f"TrackResult.{name}" for name in ("to_dataframe", "to_pandas", "plot", "show", "save")]
 
 
 @pytest.fixture(scope="module")
@@ -62,10 +67,14 @@ def workplace(simulated: Simulation, saved: Path, tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.usefixtures("workplace")
-@pytest.mark.parametrize("name", [*FUNCTIONS, *METHODS])
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "retarget")) for name in (*FUNCTIONS, *METHODS)]
+)
 def test_examples_of_the_documentation_run(name: str, simulated: Simulation, result: wp.TrackResult) -> None:
     if name == "retarget":
         pytest.importorskip("daqp")
+    if name.endswith("to_pandas"):
+        pytest.importorskip("pandas")
     if name.endswith("save"):
         Path("result").unlink()
     function: Any = wp
@@ -129,7 +138,39 @@ def test_a_saved_result_is_that_of_the_command(result: wp.TrackResult, tmp_path:
         *("pose.parquet", "subject.toml", "subject.urdf", "summary.json", "view.html", "report.html")
     }
     summary = json.loads((source / "summary.json").read_text(encoding="utf-8"))
-    assert {*result.summary, "versions", "recorded_phases"} == set(summary)
+    assert {*result.summary, "versions", "recorded_phases", "provenance"} == set(summary)
+
+
+def test_a_saved_result_says_what_made_it_as_that_of_the_command_does(workplace: Path) -> None:
+    result = wp.track(wp.load_session("session.toml"), wp.load_subject("subject.toml"), method="smekf", causal=True)
+    made = read_provenance(result.save(workplace / "mine"))
+    run_track(TrackJob(Path("session.toml"), Path("theirs"), Path("subject.toml"), method="smekf", causal=True))
+    theirs = read_provenance(workplace / "theirs")
+    same = ("format", "version", "commit", "code", "packages", "machine")
+    assert [made[name] for name in same] == [theirs[name] for name in same]
+    assert made["inputs"] == {"session": theirs["inputs"]["session"]}
+    options = made["options"]
+    assert (options["method"], options["causal"], options["subject"]) == ("smekf", True, "population")
+    with pytest.raises(wp.WeposeError, match="saved from Python"):
+        run_reproduce(ReproduceJob(workplace / "mine"))
+
+
+def test_the_table_of_pandas_is_that_of_polars(result: wp.TrackResult, saved: Path) -> None:
+    pytest.importorskip("pandas")
+    for each in (result, wp.load_result(saved)):
+        table, own = each.to_pandas(), each.to_dataframe()
+        assert list(table.columns) == own.columns
+        for name in own.columns:
+            np.testing.assert_array_equal(table[name].to_numpy(), own[name].to_numpy())
+
+
+def test_without_pandas_one_line_says_how_to_install_it(
+    result: wp.TrackResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(wp.WeposeError) as caught:
+        result.to_pandas()
+    assert str(caught.value).endswith(how_to_install("pandas"))
 
 
 @pytest.mark.parametrize("part", ['"recorded_phases": {"start": 3}', '"diagnostics": [3]', '"diagnostics": [{}]'])

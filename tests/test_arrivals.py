@@ -154,14 +154,14 @@ def test_a_sensor_that_repeats_itself_is_lost_until_it_changes(stops: int, size:
     synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
     ticks = fed(synchronizer, in_order(gyro, accel))
     measured = np.isfinite(ticks.gyro_S).all(axis=2)
-    found = stops + round(LONGEST_GAP_S * RATE)  # the first that is not taken
+    noticed = stops + round(LONGEST_GAP_S * RATE)  # the first that is not taken
     assert measured[:, :2].all()
-    assert measured[:found, 2].all()
-    assert not measured[found : stops + 100, 2].any()
+    assert measured[:noticed, 2].all()
+    assert not measured[noticed : stops + 100, 2].any()
     assert measured[stops + 101 :, 2].all()
-    assert ticks.lost[found + 2 : stops + 99, 2].all()
+    assert ticks.lost[noticed + 2 : stops + 99, 2].all()
     assert not ticks.lost[:, :2].any()
-    assert synchronizer.counts[:, FROZEN].tolist() == [0, 0, stops + 100 - found]
+    assert synchronizer.counts[:, FROZEN].tolist() == [0, 0, stops + 100 - noticed]
     assert not synchronizer.frozen.any()
     for i in (0, 1):
         assert np.array_equal(ticks.gyro_S[:, i], gyro[i])

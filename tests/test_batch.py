@@ -50,7 +50,9 @@ def test_a_file_that_was_only_touched_is_the_same(study: Path) -> None:
     assert run_items([item(study)], str(study / "items"))[0]["reused"] is True
 
 
-@pytest.mark.parametrize("change", ["recording", "truth", "options", "code", "subject"])
+@pytest.mark.parametrize(
+    "change", ["recording", pytest.param("truth", marks=pytest.mark.slow), "options", "code", "subject"]
+)
 def test_what_has_changed_is_made_again_by_force_only(
     study: Path, change: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -87,10 +89,10 @@ def test_what_changes_while_an_item_is_made_is_seen_the_next_time(study: Path, m
     run_steps = items.run_steps
 
     def meanwhile(folder: Path, one: Item) -> object:
-        found = run_steps(folder, one)
+        result = run_steps(folder, one)
         with (study / "data" / "one" / "session.toml").open("a") as file:
             file.write("# changed\n")
-        return found
+        return result
 
     monkeypatch.setattr(items, "run_steps", meanwhile)
     assert run_items([item(study)], str(study / "items"))[0]["status"] == "done"
@@ -216,9 +218,9 @@ def test_a_worker_with_another_version_is_refused(study: Path) -> None:
 def test_figures_that_stand_apart() -> None:
     rows = [{"item": f"i{k}", "status": "done", "gap_mm": 10.0 + 0.1 * (k % 7), "same": 1.0} for k in range(40)]
     rows[7]["gap_mm"], rows[9]["gap_mm"] = 30.0, float("nan")
-    found = find_outliers(build_table(rows), ["gap_mm", "same"])
-    assert [(each.item, each.column) for each in found] == [("i7", "gap_mm")]
-    assert found[0].deviations == pytest.approx((30.0 - found[0].median) / (1.4826 * 0.2), rel=0.3)
+    outliers = find_outliers(build_table(rows), ["gap_mm", "same"])
+    assert [(each.item, each.column) for each in outliers] == [("i7", "gap_mm")]
+    assert outliers[0].deviations == pytest.approx((30.0 - outliers[0].median) / (1.4826 * 0.2), rel=0.3)
 
 
 def test_the_page_escapes_what_comes_from_files(study: Path) -> None:

@@ -88,8 +88,8 @@ def test_workers_listen_on_this_machine_only() -> None:
     with connect(workers=1) as client:
         assert client.scheduler.address.startswith("tls://127.0.0.1:")
         pids = [os.getpid(), *client.run(os.getpid).values()]
-        found = listening()
-        addresses = [found[inode] for inode in mine(pids) if inode in found]
+        address_of = listening()
+        addresses = [address_of[inode] for inode in mine(pids) if inode in address_of]
     assert len(addresses) >= 2
     assert set(addresses) == {"0100007F"}
 
@@ -114,14 +114,14 @@ def test_an_item_runs_again_when_its_worker_dies(study: Path) -> None:
     with connect(workers=1) as client:
         (before,) = client.run(os.getpid).values()
         killer = killing(client)
-        found = [
+        rows = [
             row
             for some in run_on_cluster(client, [item(study), item(study, "two")], str(study / "items"))
             for row in some
         ]
         killer.join()
         (after,) = client.run(os.getpid).values()
-    assert sorted((row["item"], row["status"], row["reused"]) for row in found) == [
+    assert sorted((row["item"], row["status"], row["reused"]) for row in rows) == [
         ("one", "done", False),
         ("two", "done", False),
     ]
@@ -135,9 +135,9 @@ def test_who_lay_beside_a_worker_that_died_is_not_to_blame(study: Path, monkeypa
     some = [item(study, name) for name in ("one", "two", "three")]
     with connect(workers=1) as client:
         killer = killing(client)
-        found = [row for rows in run_on_cluster(client, some, str(study / "items")) for row in rows]
+        results = [row for rows in run_on_cluster(client, some, str(study / "items")) for row in rows]
         killer.join()
-    assert sorted((row["item"], row["status"]) for row in found) == [(n, "done") for n in ("one", "three", "two")]
+    assert sorted((row["item"], row["status"]) for row in results) == [(n, "done") for n in ("one", "three", "two")]
 
 
 def test_an_item_that_is_too_much_for_a_worker_is_given_up_by_name(
@@ -284,10 +284,10 @@ def test_a_cluster_of_ones_own_one_of_whose_workers_is_killed(study: Path) -> No
             killed.append(done)
 
     with separate_cluster(study) as (address, kill):
-        found = run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler=address), progress)
+        outcome = run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler=address), progress)
         assert killed
-        assert found.table.drop(*APART).equals(alone)
-        assert found.table["item"].n_unique() == 3
+        assert outcome.table.drop(*APART).equals(alone)
+        assert outcome.table["item"].n_unique() == 3
         assert run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler=address)).reused == 3
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, batch, calibration, filters, tables
+from benchmarks import accuracy, batch, bodies, calibration, filters, tables
 from benchmarks.__main__ import main
 from wepose_pin.filters import METHODS
 
@@ -38,6 +38,7 @@ def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WEPOSE_DATA", raising=False)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_peers")
 def test_every_method_is_measured() -> None:
     measured = {name: measure() for name, measure in filters.sections(TINY).items()}
@@ -89,9 +90,9 @@ def test_nlpsol_and_the_loop_are_compared_on_every_kind_of_calibration() -> None
 @pytest.mark.skipif(not (tables.is_installed("vqf") and tables.is_installed("imufusion")), reason="no peers installed")
 def test_the_peers_get_the_units_and_orders_they_want() -> None:
     """Wrong ones would not leave them near the truth."""
-    found = accuracy.simulated_accuracy(1)
+    errors = accuracy.simulated_accuracy(1)
     for peer, limit in (("VQF", 1.0), ("offline VQF", 1.0), ("imufusion", 8.0)):
-        assert found.rows[peer]["total_rmse"] < limit
+        assert errors.rows[peer]["total_rmse"] < limit
     table = filters.filters(TINY)
     assert table.rows["VQF"]["batch_ratio"] == table.rows["VQF"]["live_ratio"] == 1.0
     assert not table.notes[-1].startswith("No ratios")
@@ -110,10 +111,10 @@ def test_cases_take_turns_and_the_first_round_is_left_out() -> None:
         return spend
 
     slow = iter([100.0, 4.0, 8.0, 6.0])  # the first is the warm-up
-    found = tables.time_in_turn({"a": case("a", lambda: next(slow)), "b": case("b", lambda: 2.0)}, 3, "b", lambda: now)
+    times = tables.time_in_turn({"a": case("a", lambda: next(slow)), "b": case("b", lambda: 2.0)}, 3, "b", lambda: now)
     assert order == ["a", "b"] * 4
-    assert found["a"] == (6.0, 2.0, 3.0)
-    assert found["b"].ratio == 1.0
+    assert times["a"] == (6.0, 2.0, 3.0)
+    assert times["b"].ratio == 1.0
     assert np.isnan(tables.time_in_turn({"a": lambda: None}, 2, "b")["a"].ratio)
 
 
@@ -179,3 +180,17 @@ def test_nan_is_left_out_of_the_file() -> None:
     table = tables.Table("title", columns, {"row": {"a": 1.5, "b": float("nan")}})
     text = json.dumps(tables.document({"of": table}, False), allow_nan=False)
     assert json.loads(text)["sections"]["of"]["rows"] == {"row": {"a": 1.5}}
+
+
+def test_bodies_need_their_recordings_and_measure_a_simulated_arm(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("WEPOSE_DATA", raising=False)
+    assert run("bodies", "--data", tmp_path) == 2
+    assert "bodies are measured on ring/, ur5/ and mvnx" in capsys.readouterr().err
+    rows = bodies.measure_ur5_links((1,), tmp_path).rows
+    assert list(rows) == ["seed 1 upper_arm", "seed 1 forearm"]
+    for row in rows.values():
+        assert abs(row["z"]) < 3.0
+        assert row["std_mm"] < 0.1 * row["before_std_mm"]
+        assert row["calibrated_mm"] - row["true_mm"] == pytest.approx(row["z"] * row["std_mm"])

@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import rotations
-from wepose_pin.filters import GdcParams, Smekf, run_filter
+from wepose_pin.filters import FilterSettings, GdcParams, Smekf, run_filter
 from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.readers.trials import read_broad
@@ -45,7 +45,7 @@ def errors_deg(path: Path) -> dict[str, tuple[float, float, float]]:
         return inclination, heading, total
 
     def run(method: str, **options: Any) -> np.ndarray:
-        return run_filter(gyro, accel, rate_hz, noise, method, **options).quat_WS
+        return run_filter(gyro, accel, rate_hz, noise, FilterSettings(method, **options)).quat_WS
 
     # Correction only up to the motion: what the corrections in the trial are worth.
     early = StaticDetector(noise, rate_hz).run(gyro, accel)

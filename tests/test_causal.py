@@ -72,8 +72,12 @@ def test_sample_by_sample_gives_the_bits_of_a_run_through_resets_and_gaps(record
         if k in (1200, 1401, 2401, 2601):
             tracker.mark_phase("clasp", begins=k in (1200, 2401))
         stepped = tracker.step(gyro[k], accel[k])
+        covariance = tracker.covariance() if k % 7 == 0 and pose.segments.covariance_W else None
         for i, name in enumerate(tracker.names):
             assert np.array_equal(stepped[i], pose.quat_WL[name][k - begin]), (name, k)
+            if covariance is not None:
+                stated = pose.segments.covariance_W[name][k - begin]
+                np.testing.assert_allclose(covariance[i], stated, rtol=1e-9, atol=1e-12, err_msg=f"{name}, {k}")
     assert pose.time[0] == recording.time[begin]
     assert recording.phases["start"][0][1] < pose.time[0]
 
@@ -109,8 +113,8 @@ def test_measured_orientations_beside_raw_data_step_and_run_alike(recording: Rec
     assert np.isfinite(tracker.covariance()).all()
     assert np.isnan(tracker.gyro_bias[column]).all()
     quiet = {name: replace(sensor, gap=None) for name, sensor in sensors.items()}
-    found = track(replace(mixed, sensors=quiet, phases={}, resets=()), causal=True)
-    assert found.time[0] == pytest.approx(recording.time[0] + START_POSE_HOLD_S, abs=0.5)
+    tracked = track(replace(mixed, sensors=quiet, phases={}, resets=()), causal=True)
+    assert tracked.time[0] == pytest.approx(recording.time[0] + START_POSE_HOLD_S, abs=0.5)
 
 
 def test_resets_at_once_and_before_the_first_pose(recording: Recording) -> None:
@@ -236,11 +240,11 @@ def test_a_slow_steady_turn_is_no_stillness() -> None:
 
 
 def test_without_a_named_start_pose_it_is_found(recording: Recording, whole: TrackedRecording) -> None:
-    found = track(replace(recording, phases={}), causal=True)
+    tracked = track(replace(recording, phases={}), causal=True)
     named = whole
-    assert found.time[0] == pytest.approx(recording.time[0] + START_POSE_HOLD_S, abs=0.5)
+    assert tracked.time[0] == pytest.approx(recording.time[0] + START_POSE_HOLD_S, abs=0.5)
     for name, quat in named.quat_WL.items():
-        both = found.quat_WL[name][-len(quat) :]
+        both = tracked.quat_WL[name][-len(quat) :]
         assert np.degrees((Rotation.from_quat(both).inv() * Rotation.from_quat(quat)).magnitude().max()) < 3.0
 
 

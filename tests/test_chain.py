@@ -12,6 +12,7 @@ import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.ur5_arm import RUNS, UPRIGHT, UR5, write_ur5_session, write_urdf
 from wepose_pin.cli import main
 from wepose_pin.errors import BadModel, BadSession, BadSubject, WeposeError
 from wepose_pin.jobs.track import TrackJob, run_track
@@ -26,44 +27,19 @@ from wepose_pin.model.start_pose import compute_start_configuration
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.readers.live_log import read_live_log
-from wepose_pin.readers.trials import find_ur5, read_ur5
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.subject import Subject, load_subject
 from wepose_pin.tracking import Tracker, summarize, track
-from wepose_pin.validation.real import UNSCORED_S, UR5_EXCLUDED
+from wepose_pin.validation.real import UNSCORED_S
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import read_result, write_subject
 
 RATE = 100.0
-# The axes of a UR5's joints while all are at zero, the arm stretched out along x.
-UR5 = {
-    "shoulder_pan_joint": ("shoulder_link", "0 0 1", "0 0 0.089"),
-    "shoulder_lift_joint": ("upper_arm_link", "0 1 0", "0 0.136 0"),
-    "elbow_joint": ("forearm_link", "0 1 0", "0.425 -0.12 0"),
-    "wrist_1_joint": ("wrist_1_link", "0 1 0", "0.392 0 0"),
-    "wrist_2_joint": ("wrist_2_link", "0 0 -1", "0 0.093 0"),
-    "wrist_3_joint": ("wrist_3_link", "0 1 0", "0 0 -0.095"),
-}
-HOME = {"shoulder_lift_joint": -np.pi / 2.0, "wrist_1_joint": -np.pi / 2.0}
-LINKS = {"radius": "forearm_link", "carpus": "wrist_1_link"}
-RUNS = ("circle-100", "circle-250", "triangle-150", "triangle-250")
 
 
 @pytest.fixture(scope="module")
 def urdf(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An arm with a UR5's axes; 1 kg a link."""
-    text, parent = '<link name="base_link"/>', "base_link"
-    mass = '<inertial><mass value="1"/><inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0" iyz="0"/></inertial>'
-    for name, (child, axis, at) in UR5.items():
-        text += (
-            f'<link name="{child}">{mass}</link><joint name="{name}" type="revolute"><parent link="{parent}"/>'
-            f'<child link="{child}"/><origin xyz="{at}"/><axis xyz="{axis}"/>'
-            f'<limit lower="-6.3" upper="6.3" effort="100" velocity="3"/></joint>'
-        )
-        parent = child
-    file = tmp_path_factory.mktemp("ur5") / "arm.urdf"
-    file.write_text(f'<robot name="arm">{text}</robot>', encoding="utf-8")
-    return file
+    return write_urdf(tmp_path_factory.mktemp("ur5"))
 
 
 def turned(model: pin.Model, q: np.ndarray, link: str) -> Rotation:
@@ -89,7 +65,7 @@ def made(urdf: Path, links: list[str], seconds: float = 30.0) -> tuple[Recording
     body = load(urdf)
     model = body.pin
     t = np.arange(0.0, seconds, 1.0 / RATE)
-    start = compute_start_configuration(body, CONFIGURATION, HOME, "made")
+    start = compute_start_configuration(body, CONFIGURATION, UPRIGHT, "made")
     rise = np.clip((t - 4.0) / 2.0, 0.0, 1.0)[:, None] ** 2
     rng = np.random.default_rng(0)
     q = start + rise * 0.5 * (np.sin(np.outer(t, rng.uniform(0.3, 1.0, model.nq)) + rng.uniform(0.0, 6.0, model.nq)))
@@ -102,7 +78,7 @@ def made(urdf: Path, links: list[str], seconds: float = 30.0) -> tuple[Recording
         gyro[1:] = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * RATE
         sensors[link] = ImuSensor(gyro_S=gyro, accel_S=R_WS.inv().apply([0.0, 0.0, 9.81]), stated_quat_LS=mount)
     phases = {"start": ((0.5, 3.5),)}
-    return Recording("made", t, RATE, sensors, phases=phases, start_pose=CONFIGURATION, joints=HOME), q
+    return Recording("made", t, RATE, sensors, phases=phases, start_pose=CONFIGURATION, joints=UPRIGHT), q
 
 
 def rms_deg(angle: np.ndarray) -> float:
@@ -152,43 +128,13 @@ def test_the_pose_is_that_of_the_start_configuration_at_the_start(urdf: Path) ->
         assert np.degrees(off.max()) < 0.1
 
 
-def ur5_session(data: Path, run: str, folder: Path) -> dict[str, Rotation]:
-    """A run as a session, squarely mounted as the axes say, and its encoders' orientations of the links in W.
-
-    The encoders' frames equal each other at the start, where the arm stands upright; their x is W's y there. That their
-    joint angles, taken so, have the tool drawn in a plane to 0.1 mm is what says that the start is `HOME`.
-    """
-    files = [each for each in find_ur5(data) if each.recording == run and (run, each.sensor) not in UR5_EXCLUDED]
-    trials = {each.sensor: read_ur5(each) for each in files}
-    table, text, truth = {}, "", {}
-    for sensor, trial in trials.items():
-        for kind, values in (("gyr", trial.gyro_S), ("acc", trial.accel_S)):
-            table |= {f"{sensor}_{kind}_{axis}": values[:, k] for k, axis in enumerate("xyz")}
-        columns = ({kind: [f"{sensor}_{kind}_{axis}" for axis in "xyz"]} for kind in ("gyr", "acc"))
-        gyro, accel = (json.dumps(next(iter(each.values()))) for each in columns)
-        text += f'[sensors.{LINKS[sensor]}]\ngyro = {gyro}\naccel = {accel}\nmount = {{ up = "-y", forward = "-x" }}\n'
-        R_WB = Rotation.from_euler("z", np.pi / 2.0) * Rotation.from_quat(trial.quat_VB)
-        start = R_WB[trial.static].mean()
-        lift = {"radius": -np.pi / 2.0, "carpus": -np.pi}[sensor]
-        truth[LINKS[sensor]] = R_WB * start.inv() * Rotation.from_euler("y", lift)
-    trial = next(iter(trials.values()))
-    pl.DataFrame(table).write_csv(folder / "ur5.csv")
-    head = (
-        f'name = "{run}"\nstart_pose = "configuration"\n[data]\nfile = "ur5.csv"\nrate_hz = {trial.rate_hz}\n'
-        f'gyro_unit = "rad/s"\naccel_unit = "m/s^2"\n'
-        f"[phases]\nstart = [[0.0, {(trial.static.stop - 1) / trial.rate_hz}]]\n[joints]\n"
-        + "".join(f"{name} = {value}\n" for name, value in HOME.items())
-    )
-    (folder / "session.toml").write_text(head + text, encoding="utf-8")
-    return truth
-
-
-@pytest.mark.parametrize("method", [pytest.param("smekf", marks=pytest.mark.slow), "amekf"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["smekf", "amekf"])
 def test_a_ur5_beside_its_encoders(data: Path, urdf: Path, tmp_path: Path, method: str) -> None:
     """Nothing is fitted to the encoders: neither clock nor frames nor heading. Printed with -s."""
     errors: dict[str, list[float]] = {"sensor alone": [], "chain": []}
     for run in RUNS:
-        truth = ur5_session(data, run, tmp_path)
+        truth = write_ur5_session(data, run, tmp_path)
         recording = load_session(tmp_path)
         tracked = track(recording, method=method, model=urdf)
         scored = recording.time - recording.time[0] > UNSCORED_S
@@ -205,7 +151,7 @@ def test_a_ur5_beside_its_encoders(data: Path, urdf: Path, tmp_path: Path, metho
 def test_the_command_writes_joints_orientations_and_torques(
     urdf: Path, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    ur5_session(data, "circle-250", tmp_path)
+    write_ur5_session(data, "circle-250", tmp_path)
     out = tmp_path / "out"
     with pytest.raises(SystemExit) as end:
         main(["track", str(tmp_path), "--model", str(urdf), "--torques", "-o", str(out)])
@@ -249,7 +195,7 @@ def test_the_command_writes_joints_orientations_and_torques(
 def test_a_session_that_is_written_gives_the_recording_back(urdf: Path, tmp_path: Path) -> None:
     recording, _ = made(urdf, ["forearm_link", "wrist_1_link"], 6.0)
     odd = {"forearm.link": recording.sensors["forearm_link"], "wrist 1": recording.sensors["wrist_1_link"]}
-    recording = replace(recording, sensors=odd, joints={**HOME, "elbow/1": 0.1}, remounted=True, model=str(urdf))
+    recording = replace(recording, sensors=odd, joints={**UPRIGHT, "elbow/1": 0.1}, remounted=True, model=str(urdf))
     write_session(tmp_path, recording)
     again = load_session(tmp_path)
     assert (again.start_pose, again.joints, again.remounted) == (CONFIGURATION, recording.joints, True)
@@ -345,7 +291,7 @@ def test_values_of_a_joint_without_end_go_on(tmp_path: Path) -> None:
     np.testing.assert_allclose(start, [np.cos(0.3), np.sin(0.3)])
 
 
-LINKS_WITH_SENSORS = ["upper_arm_link", "forearm_link", "wrist_1_link", "wrist_3_link"]
+MARKED_WITH_SENSORS = ["upper_arm_link", "forearm_link", "wrist_1_link", "wrist_3_link"]
 TABLE = """urdf = "arm.urdf"
 kind = "mechanism"
 [segments]
@@ -375,13 +321,13 @@ def table(urdf: Path, tmp_path: Path) -> Path:
 
 def as_segments(recording: Recording) -> Recording:
     """The recording with the table's names, from its named pose."""
-    names = dict(zip(LINKS_WITH_SENSORS, ("upper", "fore", "wrist", "tool"), strict=True))
+    names = dict(zip(MARKED_WITH_SENSORS, ("upper", "fore", "wrist", "tool"), strict=True))
     sensors = {names[link]: sensor for link, sensor in recording.sensors.items()}
     return replace(recording, sensors=sensors, start_pose="home", joints={})
 
 
 def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Path) -> None:
-    recording, q = made(urdf, LINKS_WITH_SENSORS, 12.0)
+    recording, q = made(urdf, MARKED_WITH_SENSORS, 12.0)
     # Open loop: a table may name points between which sensors sit, which tell of headings.
     tracked = track(replace(as_segments(recording), model=str(table)), open_loop=True)
     bare = track(recording, model=urdf, open_loop=True)
@@ -404,7 +350,7 @@ def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Pat
 
 def test_the_covariance_of_points_is_that_of_many_fits(urdf: Path, table: Path) -> None:
     """Orientations and the length drawn from what is stated of them; two of the arm's six axes carry no sensor."""
-    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    recording, _ = made(urdf, MARKED_WITH_SENSORS, 8.0)
     subject = Subject("s", {"upper": 0.392}, ("upper",), np.array([[0.01**2]]))
     tracked = track(replace(as_segments(recording), model=str(table)), subject)
     at, rng, n = 700, np.random.default_rng(0), 600
@@ -448,7 +394,7 @@ def test_a_joint_that_slides_stays_where_it_is(urdf: Path, tmp_path: Path) -> No
     table = TABLE.replace("[lengths]", 'rod = "rod"\n[lengths]')
     table = table.replace("[poses.home]", "[poses.home]\nslider = 0.2")
     (tmp_path / "arm.toml").write_text(table, encoding="utf-8")
-    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    recording, _ = made(urdf, MARKED_WITH_SENSORS, 8.0)
     subject = Subject("s", {"upper": 0.392}, ("upper",), np.array([[0.01**2]]))
     tracked = track(replace(as_segments(recording), model=str(tmp_path / "arm.toml")), subject)
     assert tracked.find_undetermined_joints() == ["slider"]
@@ -458,7 +404,7 @@ def test_a_joint_that_slides_stays_where_it_is(urdf: Path, tmp_path: Path) -> No
 
 def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> None:
     """A mount R_LS that was found holds from any start configuration; a stated one is of the start pose."""
-    recording, _ = made(urdf, LINKS_WITH_SENSORS, 12.0)
+    recording, _ = made(urdf, MARKED_WITH_SENSORS, 12.0)
     recording = replace(as_segments(recording), model=str(table))
     stated = track(recording)
     names = list(recording.sensors)
@@ -473,7 +419,7 @@ def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> No
 
 
 def test_chunks_and_causal_tracking_give_the_joints_of_the_whole(urdf: Path) -> None:
-    recording, _ = made(urdf, LINKS_WITH_SENSORS, 20.0)
+    recording, _ = made(urdf, MARKED_WITH_SENSORS, 20.0)
     whole = track(recording, model=urdf)
     tracker = Tracker(model=urdf)
     parts = [part for chunk in recording.chunks(6.0) for part in tracker.push(chunk)] + tracker.finish()
@@ -487,10 +433,10 @@ def test_chunks_and_causal_tracking_give_the_joints_of_the_whole(urdf: Path) -> 
 
 
 def test_live_kinematics_follow_a_mechanism(urdf: Path) -> None:
-    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    recording, _ = made(urdf, MARKED_WITH_SENSORS, 8.0)
     tracked = track(recording, model=urdf, causal=True)
     body = tracked.model
-    start = compute_start_configuration(body, CONFIGURATION, HOME, "x")
+    start = compute_start_configuration(body, CONFIGURATION, UPRIGHT, "x")
     live = LiveKinematics(body, list(recording.sensors), start)
     for k in range(60):
         measured = np.array([tracked.segments.quat_WL[name][k] for name in recording.sensors])
@@ -503,7 +449,7 @@ def test_live_kinematics_follow_a_mechanism(urdf: Path) -> None:
 
 def test_a_mechanism_live(urdf: Path, tmp_path: Path, data: Path) -> None:
     """What is displayed and recorded live is what causal tracking of the recording gives."""
-    ur5_session(data, "circle-250", tmp_path)
+    write_ur5_session(data, "circle-250", tmp_path)
     recording = replace(load_session(tmp_path), model=str(urdf))
     shown: list[LivePose] = []
 
@@ -529,7 +475,7 @@ def test_a_mechanism_live(urdf: Path, tmp_path: Path, data: Path) -> None:
 
 def test_a_subject_of_a_body_without_lengths(urdf: Path, tmp_path: Path) -> None:
     """It holds mounts alone; its files give the same result again."""
-    recording, _ = made(urdf, LINKS_WITH_SENSORS, 8.0)
+    recording, _ = made(urdf, MARKED_WITH_SENSORS, 8.0)
     tracked = track(recording, model=urdf)
     person = replace(tracked.subject, mounts=dict(tracked.segments.quat_LS))
     write_subject(tmp_path, person, tracked.model)
@@ -543,7 +489,7 @@ def test_a_subject_of_a_body_without_lengths(urdf: Path, tmp_path: Path) -> None
 
 def test_a_result_on_another_body_does_not_stay(urdf: Path, data: Path, tmp_path: Path) -> None:
     """Its table and its joints would be read with the next result in the same folder."""
-    ur5_session(data, "circle-100", tmp_path)
+    write_ur5_session(data, "circle-100", tmp_path)
     out = tmp_path / "out"
     run_track(TrackJob(tmp_path, out, model=urdf, view=False, report=False))
     assert (out / "model.toml").is_file()

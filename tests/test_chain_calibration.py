@@ -2,125 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import polars as pl
 import pytest
-from scipy.spatial.transform import Rotation
 from test_chain import urdf  # noqa: F401  the arm's URDF
 
+from benchmarks.ur5_arm import MOVE_S, TRUE, Moved, move_arm, write_table
 from wepose_pin.calibration import Calibration, Protocol, assess, calibrate
 from wepose_pin.calibration.protocols import Closure
 from wepose_pin.calibration.recorded import interpolate_places
 from wepose_pin.cli import main
 from wepose_pin.errors import WeposeError
 from wepose_pin.model import BodyModel, load_model
-from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording
-from wepose_pin.simulation import MTI_3
 from wepose_pin.writers import write_session
-
-RATE, START_S, MOVE_S = 50.0, (0.5, 4.5), 5.0
-HOME = {
-    "shoulder_pan_joint": 0.0,
-    "shoulder_lift_joint": -1.2,
-    "elbow_joint": 1.6,
-    "wrist_1_joint": -1.0,
-    "wrist_2_joint": -1.57,
-    "wrist_3_joint": 0.3,
-}
-TRUE = {"upper_arm": 1.05, "forearm": 0.94}  # times the table's own, whose standard deviation is a tenth
-LINKS = ("shoulder_link", "upper_arm_link", "forearm_link", "wrist_1_link", "wrist_2_link", "wrist_3_link")
-TABLE = """urdf = "arm.urdf"
-kind = "mechanism"
-[segments]
-{segments}
-[points]
-base = "upper_arm_link"
-elbow = "forearm_link"
-wrist = "wrist_1_link"
-tip = {{ link = "wrist_3_link", at = [0.0, 0.15, 0.0] }}
-[lengths]
-upper_arm = {{ segment = "upper_arm_link", from = "base", to = "elbow", std_percent = 10 }}
-forearm = {{ segment = "forearm_link", from = "elbow", to = "wrist", std_percent = 10 }}
-"""
-START_STD = np.deg2rad(0.3)  # [rad] of each joint against the stated start pose
-SENSOR_AT = np.array([0.05, 0.03, 0.02])  # [m] in its link
-BIAS_STD, ACCEL_BIAS_STD = np.deg2rad(0.2), 0.02  # [rad/s], [m/s²]
-AWAY = np.array([0.10, -0.15, 0.08])  # [m] the second point from the first
 
 
 @pytest.fixture(scope="module")
 def arm(urdf: Path) -> BodyModel:  # noqa: F811
-    table = TABLE.format(segments="\n".join(f'{link} = "{link}"' for link in LINKS))
-    (urdf.parent / "arm.toml").write_text(table, encoding="utf-8")
-    return load_model(urdf.parent / "arm.toml")
-
-
-@dataclass(frozen=True)
-class Moved:
-    """A recording of the arm, and the truth behind it."""
-
-    recording: Recording
-    lengths: dict[str, float]  # [m]
-    tip: np.ndarray  # (n, 3) [m]
-
-
-def move_arm(body: BodyModel, seed: int, *, seconds: float = 45.0, points: int = 1, stated: bool = False) -> Moved:
-    """The arm moves with its tip on one point, on two one after the other, or free (0)."""
-    true = body.with_lengths({name: ratio * body.lengths[name] for name, ratio in TRUE.items()})
-    model, data, rng = true.pin, true.pin.createData(), np.random.default_rng(seed)
-    time, tip_frame = np.arange(0.0, seconds, 1.0 / RATE), true.pin.getFrameId("tip")
-    end = seconds - 1.0
-    change = np.clip((time - 0.5 * (MOVE_S + end)) / 2.0 + 0.5, 0.0, 1.0)[:, None] if points == 2 else 0.0
-    rise = np.clip((time - MOVE_S) / 2.0, 0.0, 1.0)
-    frequency, phase = rng.uniform(0.05, 0.25, (6, 3)), rng.uniform(0.0, 2.0 * np.pi, (6, 3))
-    amplitude = rng.uniform(0.1, 0.35, (6, 3))
-    wave = np.sin(2.0 * np.pi * frequency * (time[:, None, None] - MOVE_S) + phase)
-    wanted = 0.9 * rise[:, None] * (amplitude * wave).sum(axis=2)  # [rad/s]
-    q = np.empty((len(time), 6))
-    q[0] = [HOME[name] for name in model.names[1:]] + rng.normal(scale=START_STD, size=6)
-    pin.framesForwardKinematics(model, data, q[0])
-    target = data.oMf[tip_frame].translation + change * AWAY * np.ones((len(time), 1))
-    tip = np.empty((len(time), 3))
-    R = {link: np.empty((len(time), 3, 3)) for link in LINKS}
-    place = {link: np.empty((len(time), 3)) for link in LINKS}
-    frames = {link: model.getFrameId(link) for link in LINKS}
-    for k in range(len(time)):
-        if k:
-            pin.computeJointJacobians(model, data, q[k - 1])
-            pin.updateFramePlacements(model, data)
-            J = pin.getFrameJacobian(model, data, tip_frame, pin.LOCAL_WORLD_ALIGNED)[:3]
-            step = wanted[k] / RATE
-            if points:
-                inverse = J.T @ np.linalg.inv(J @ J.T + 1e-6 * np.eye(3))
-                step = step - inverse @ J @ step + inverse @ (target[k] - data.oMf[tip_frame].translation)
-            q[k] = q[k - 1] + step
-        pin.framesForwardKinematics(model, data, q[k])
-        tip[k] = data.oMf[tip_frame].translation
-        for link, frame in frames.items():
-            R[link][k], place[link][k] = data.oMf[frame].rotation, data.oMf[frame].act(SENSOR_AT)
-    sensors = {}
-    for link in LINKS:
-        mount = Rotation.random(random_state=rng)
-        R_WS = Rotation.from_matrix(R[link]) * mount
-        gyro = np.zeros((len(time), 3))
-        gyro[1:] = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * RATE
-        accel_W = np.gradient(np.gradient(place[link], 1.0 / RATE, axis=0), 1.0 / RATE, axis=0)
-        accel = R_WS.inv().apply(accel_W + [0.0, 0.0, 9.81])
-        gyro += rng.normal(size=3) * BIAS_STD + rng.normal(size=gyro.shape) * MTI_3.gyro_density * np.sqrt(RATE)
-        accel += rng.normal(size=3) * ACCEL_BIAS_STD
-        accel += rng.normal(size=accel.shape) * MTI_3.accel_density * np.sqrt(RATE)
-        in_start_pose = (Rotation.from_matrix(R[link][0]) * mount).as_quat() if stated else None
-        sensors[link] = ImuSensor(gyro_S=gyro, accel_S=accel, stated_quat_LS=in_start_pose)
-    phases = {"start": (START_S,), "tip": ((MOVE_S + 2.0, end),)}
-    if points == 2:
-        middle = 0.5 * (MOVE_S + end)
-        phases |= {"tip": ((MOVE_S + 2.0, middle - 1.5),), "second": ((middle + 1.5, end),)}
-    recording = Recording("arm", time, RATE, sensors, phases=phases, start_pose=CONFIGURATION, joints=HOME)
-    return Moved(recording, {name: true.lengths[name] for name in TRUE}, tip)
+    return load_model(write_table(urdf))
 
 
 def on_point(phase: str = "tip", at: np.ndarray | None = None) -> Closure:
@@ -145,7 +47,7 @@ def describe(what: str, calibration: Calibration, moved: Moved) -> None:
         print(f"{what:24} {name:10} {1e3 * value:7.1f} ± {1e3 * std:4.1f} mm, true {1e3 * true:.1f}")
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> None:
     moved = move_arm(arm, seed)
     calibration = calibrate_arm(arm, moved)
@@ -200,8 +102,8 @@ def test_places_are_interpolated_between_rows_that_have_them() -> None:
     places = np.array([0.0, 1.0, 2.0, lost, 4.0, 10.0, 11.0])[:, None] * [1.0, 2.0, -1.0]
     time = np.array([-0.05, 0.0, 0.05, 0.2, 0.25, 0.35, 0.4, 0.7, 1.05, 1.1, 1.15])
     expected = np.array([lost, 0.0, 0.5, 2.0, lost, lost, 4.0, lost, 10.5, 11.0, lost])  # 0.4 to 1.0: rows are missing
-    found = interpolate_places(time, known_time, places)
-    np.testing.assert_allclose(found, expected[:, None] * [1.0, 2.0, -1.0], atol=1e-9)
+    interpolated = interpolate_places(time, known_time, places)
+    np.testing.assert_allclose(interpolated, expected[:, None] * [1.0, 2.0, -1.0], atol=1e-9)
 
 
 def test_what_a_truth_lacks_is_said_in_one_line(arm: BodyModel, tmp_path: Path) -> None:

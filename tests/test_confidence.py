@@ -41,8 +41,8 @@ def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None
     still = {name: rotation.as_quat()[None] for name, rotation in mean.items()}
     model = body.shape(load_model())
     points = compute_pose(model, np.zeros(1), still).points
-    found = compute_point_covariances(model, still, {name: c[None] for name, c in cov.items()}, shape_cov)
-    assert set(found) == set(points)
+    point_cov = compute_point_covariances(model, still, {name: c[None] for name, c in cov.items()}, shape_cov)
+    assert set(point_cov) == set(points)
 
     drawn = {
         name: (Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), cov[name], n)) * mean[name]).as_quat()
@@ -60,7 +60,7 @@ def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None
         # What leaves the law moves the shoulder of this side in the torso.
         leaving = np.diag(np.square(TABLE.girdles[f"{name.partition('_')[0]}_shoulder"].residual_std))
         expected = turned + J @ shape_cov @ J.T + R_torso @ leaving @ R_torso.T
-        np.testing.assert_allclose(found[name][0], expected, atol=0.04 * np.trace(expected))
+        np.testing.assert_allclose(point_cov[name][0], expected, atol=0.04 * np.trace(expected))
 
 
 def test_a_shoulder_whose_law_is_not_known_is_less_certain() -> None:
@@ -83,8 +83,8 @@ def test_points_beyond_a_segment_without_covariance_have_none() -> None:
     still = {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in ("torso", *ARMS)}
     model = load_model()
     cov = {name: np.eye(3)[None] * 1e-4 for name in ("torso", "left_upper_arm", "right_forearm")}
-    found = compute_point_covariances(model, still, cov, EXACT)
-    assert set(found) == {"left_shoulder", "left_elbow", "right_shoulder"}
+    point_cov = compute_point_covariances(model, still, cov, EXACT)
+    assert set(point_cov) == {"left_shoulder", "left_elbow", "right_shoulder"}
     assert compute_point_covariances(model, still, {}, EXACT) == {}
 
 
@@ -99,8 +99,10 @@ def test_the_whole_chain_is_honest() -> None:
         person = simulate_person(200 + seed, PEOPLE_MEASURED_STD)
         simulation = simulate(person.lengths, seed=seed, imperfections=PEOPLE_PRESET)
         recording = simulation.recording()
-        found = calibrate(recording, measured=person.measured, measured_std=PEOPLE_MEASURED_STD, prior=person.prior)
-        pose = track(recording, found.subject).pose
+        calibration = calibrate(
+            recording, measured=person.measured, measured_std=PEOPLE_MEASURED_STD, prior=person.prior
+        )
+        pose = track(recording, calibration.subject).pose
         during = recording.span(simulation.phases["circles"][0])
         for name in simulation.quat_WL:
             true, tracked = (Rotation.from_quat(p.quat_WL[name][during]) for p in (simulation.truth(), pose))
@@ -120,7 +122,15 @@ def test_the_columns_of_the_result(tmp_path: Path) -> None:
     write_session(tmp_path, simulation.recording())
     for words in (["-o", "a"], ["-o", "b", "--covariance"], ["-o", "c", "--method", "ncf"]):
         with pytest.raises(SystemExit) as stop:
-            main(["track", str(tmp_path), *[str(tmp_path / w) if w in "abc" else w for w in words]])
+            main(
+                [
+                    "track",
+                    str(tmp_path),
+                    "--no-view",
+                    "--no-report",
+                    *[str(tmp_path / w) if w in "abc" else w for w in words],
+                ]
+            )
         assert not stop.value.code
     plain, full, without = (pl.read_parquet(tmp_path / name / "pose.parquet") for name in "abc")
     assert {"torso_std", "left_palm_std", "right_elbow_std"} <= set(plain.columns)
@@ -148,10 +158,10 @@ def test_the_parts_of_the_error_budget_add_up_in_variance() -> None:
     tracked = track(recording)
     budget = ErrorBudget()
     budget.add(tracked)
-    found = budget.summarize()
-    assert set(found) == set(tracked.points)
+    parts_of = budget.summarize()
+    assert set(parts_of) == set(tracked.points)
     rows = np.arange(0, len(tracked.time), round(PERIOD_S * recording.rate_hz))
-    for point, parts in found.items():
+    for point, parts in parts_of.items():
         total = np.sqrt(np.mean(np.square(compute_axis_std(tracked.pose.point_cov[point][rows]))))
         assert np.sqrt(sum(std**2 for std in parts.values())) == pytest.approx(total, rel=1e-4)
         assert list(parts.values()) == sorted(parts.values(), reverse=True)
@@ -162,7 +172,9 @@ def test_the_parts_of_the_error_budget_add_up_in_variance() -> None:
         # A segment matters for what it carries, with its sensor and with the soft tissue below that.
         carrying = ["torso", *(f"{side}_{part}" for part in ("upper_arm", "forearm"))]
         assert of == set(carrying[: {"shoulder": 1, "elbow": 2}.get(point.partition("_")[2], 3)])
-    assert found["left_palm"]["shoulder girdle"] == pytest.approx(found["left_shoulder"]["shoulder girdle"], rel=1e-9)
+    assert parts_of["left_palm"]["shoulder girdle"] == pytest.approx(
+        parts_of["left_shoulder"]["shoulder girdle"], rel=1e-9
+    )
     # A person who is known exactly has no share of lengths and girdles.
     order = (*LENGTHS, *girdle_rows(TABLE))
     exact = replace(population_subject(), order=order, covariance=np.zeros((len(order), len(order))))

@@ -112,10 +112,10 @@ def test_the_stated_gains_are_the_best_around(setting: str, request: pytest.Fixt
         folder = request.getfixturevalue("data")
         if not any((folder / "broad").glob("*.mat")):
             pytest.skip(f"no real recordings at {folder / 'broad'}")
-    found = list_trials(setting, folder)
+    trials = list_trials(setting, folder)
 
     def score(params: NcfParams | GdcParams) -> float:
-        return float(np.mean([compute_rmse(trial, params) for trial in found]))
+        return float(np.mean([compute_rmse(trial, params) for trial in trials]))
 
     def around(axis: tuple[float, ...], value: float) -> list[float]:
         at = axis.index(value)

@@ -60,9 +60,9 @@ def emitted() -> set[str]:
             codes.add(code.value)
         else:
             source = ast.parse((PACKAGE / place.rpartition(":")[0]).read_text(encoding="utf-8"))
-            found = literals(source) & set(catalogue())
-            assert found, f"{place}: the code is no string, and no string of the module is one"
-            codes |= found
+            named = literals(source) & set(catalogue())
+            assert named, f"{place}: the code is no string, and no string of the module is one"
+            codes |= named
     return codes
 
 

@@ -73,15 +73,15 @@ def known_words() -> frozenset[str]:
 
 def resolve(name: str) -> object:
     """The module or attribute of this dotted name, without ``wepose_pin.`` before it or with."""
-    found: object = wepose_pin
+    value: object = wepose_pin
     for part in name.removeprefix("wepose_pin.").split("."):
-        if isinstance(found, ModuleType) and not hasattr(found, part):
-            found = import_module(f"{found.__name__}.{part}")
-        elif isinstance(found, type) and part in getattr(found, "__annotations__", {}):
-            found = found.__annotations__[part]
+        if isinstance(value, ModuleType) and not hasattr(value, part):
+            value = import_module(f"{value.__name__}.{part}")
+        elif isinstance(value, type) and part in getattr(value, "__annotations__", {}):
+            value = value.__annotations__[part]
         else:
-            found = getattr(found, part)
-    return found
+            value = getattr(value, part)
+    return value
 
 
 @cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
@@ -12,12 +13,12 @@ import pytest
 from wepose_pin.retargeting.maps import find_example_data
 
 EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.py"))
-ARGUMENTS = {"robot_receiver.py": ("--timeout", "0.1")}
+WAITING = ("live_consumer.py", "robot_receiver.py")  # for ever
 SAYS = {
     "calibrate_subject.py": "shoulder_width",
     "estimate_orientation.py": "smekf  largest error 0.",
     "joint_angles.py": "carrying_angle",
-    "live_consumer.py": "no pose for 3 s",
+    "live_consumer.py": "waiting for poses on 127.0.0.1:9001",
     "move_robot.py": "Trajectory('panda_table'",
     "robot_receiver.py": "waiting for commands on 127.0.0.1:9002",
     "track_recording.py": "right hand from its shoulder",
@@ -38,11 +39,27 @@ def test_it_runs(path: Path, tmp_path: Path) -> None:
         pytest.importorskip("daqp")
         if find_example_data() is None:
             pytest.skip("example-robot-data is not installed")
-    words = [sys.executable, "-W", "error", str(path), *ARGUMENTS.get(path.name, ())]
+    words = [sys.executable, "-W", "error", str(path)]
+    if path.name in WAITING:
+        with subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, text=True) as waiting:
+            assert waiting.stdout is not None
+            assert SAYS[path.name] in waiting.stdout.readline()
+            waiting.terminate()
+        return
     run = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert run.returncode == 0, run.stderr
     assert SAYS.get(path.name, "") in run.stdout
     assert {file.name for file in tmp_path.iterdir()} == WRITES.get(path.name, set())
+
+
+def test_the_gallery_waits_for_no_live_session() -> None:
+    pytest.importorskip("sphinx")
+    spec = spec_from_file_location("gallery", EXAMPLES[0].parents[1] / "docs/extensions/gallery.py")
+    assert spec is not None
+    assert spec.loader is not None
+    gallery = module_from_spec(spec)
+    spec.loader.exec_module(gallery)
+    assert set(gallery.WAITING) == set(WAITING)
 
 
 @pytest.mark.slow

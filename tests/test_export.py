@@ -372,9 +372,9 @@ def test_resampling_goes_through_the_body(pose: Pose) -> None:
 def test_uneven_times_are_made_even_where_the_format_has_only_a_rate(tmp_path: Path, pose: Pose) -> None:
     late = pose.time + np.where(np.arange(301) > 150, 0.004, 0.0)
     folder = write_folder(tmp_path / "r", replace(pose, time=late))
-    found = export(folder, tmp_path / "x.bvh")
-    assert [each.code for each in found.diagnostics][:1] == ["export-resampled"]
-    assert found.diagnostics[0].facts["rate"] == pytest.approx(100.0)
+    exported = export(folder, tmp_path / "x.bvh")
+    assert [each.code for each in exported.diagnostics][:1] == ["export-resampled"]
+    assert exported.diagnostics[0].facts["rate"] == pytest.approx(100.0)
     assert codes_of(export(folder, tmp_path / "x.mot")) == {"angles-near-lock", "opensim-axes-too-few"}  # has times
 
 

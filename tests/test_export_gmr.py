@@ -107,18 +107,18 @@ def read_lafan(file: Path, toe: str) -> Frames:
             active = len(names) - 1
         elif "}" in line:
             end, active = False, active if end else parents[active]
-        elif found := re.match(r"\s*OFFSET\s+([\-\d\.e]+)\s+([\-\d\.e]+)\s+([\-\d\.e]+)", line):
+        elif match := re.match(r"\s*OFFSET\s+([\-\d\.e]+)\s+([\-\d\.e]+)\s+([\-\d\.e]+)", line):
             if not end:
-                offsets[active] = [float(number) for number in found.groups()]
-        elif found := re.match(r"\s*CHANNELS\s+(\d+)", line):
-            count = int(found[1])
+                offsets[active] = [float(number) for number in match.groups()]
+        elif match := re.match(r"\s*CHANNELS\s+(\d+)", line):
+            count = int(match[1])
             order = order or "".join(name[0] for name in line.split()[-3:])
         elif "End Site" in line:
             end = True
-        elif found := re.match(r"\s*Frames:\s+(\d+)", line):
-            expected = int(found[1])
-        elif found := re.match(r"\s*Frame Time:\s+([\d\.]+)", line):
-            frame_time = float(found[1])
+        elif match := re.match(r"\s*Frames:\s+(\d+)", line):
+            expected = int(match[1])
+        elif match := re.match(r"\s*Frame Time:\s+([\d\.]+)", line):
+            frame_time = float(match[1])
         else:
             rows.append([float(number) for number in line.strip().split(" ")])
     numbers = np.array(rows)
@@ -200,12 +200,12 @@ def read_soma(file: Path) -> Frames:
             if not end:
                 stack.pop()
             end = False
-        elif (found := re.match(r"\s*OFFSET\s+([\-\d\.eE]+)\s+([\-\d\.eE]+)\s+([\-\d\.eE]+)", line)) and not end:
-            offsets.append([float(number) for number in found.groups()])
-        elif found := re.match(r"\s*CHANNELS\s+(\d+)\s+(.+)", line):
-            channels.append(found[2].split())
-        elif found := re.match(r"\s*Frame Time:\s+([\d\.eE]+)", line):
-            frame_time = float(found[1])
+        elif (match := re.match(r"\s*OFFSET\s+([\-\d\.eE]+)\s+([\-\d\.eE]+)\s+([\-\d\.eE]+)", line)) and not end:
+            offsets.append([float(number) for number in match.groups()])
+        elif match := re.match(r"\s*CHANNELS\s+(\d+)\s+(.+)", line):
+            channels.append(match[2].split())
+        elif match := re.match(r"\s*Frame Time:\s+([\d\.eE]+)", line):
+            frame_time = float(match[1])
         elif re.match(r"-?\d", line):
             rows.append([float(number) for number in line.split()])
     numbers = np.array(rows)

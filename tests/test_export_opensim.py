@@ -71,12 +71,12 @@ def motion(n: int) -> dict[str, np.ndarray]:
         for name in MOTION
         for end in (("",) if "_" in name and name[:3] in ("pel", "lum") else ("_r", "_l"))
     ]
-    found = {}
+    values = {}
     for k, name in enumerate(names):
         middle, size = MOTION[name.removesuffix("_r").removesuffix("_l")]
         wave = smooth(n, 100 + k, 1.0)[:, 0]
-        found[name] = middle + size * wave / np.abs(wave).max()
-    return found
+        values[name] = middle + size * wave / np.abs(wave).max()
+    return values
 
 
 # Headers ----------------------------------------------------------------------------------------------------------
@@ -168,14 +168,14 @@ def test_mot_with_the_isbs_angles(result: Path, tmp_path: Path) -> None:
 
 def test_shoulders_and_thorax_are_the_isbs_of_zxy() -> None:
     pose = a_pose(tuple(name for name in SEGMENT_OF.values() if name.endswith(("torso", "upper_arm"))))
-    found, missed = coordinates(orientations(pose.quat_WL))
+    angles, missed = coordinates(orientations(pose.quat_WL))
     isb = joint_angles(pose, "ZXY")
     names = {"thorax": ("lumbar_extension", "lumbar_bending", "lumbar_rotation")}
     names |= {
         f"{side}_shoulder": tuple(f"arm_{of}_{side[0]}" for of in ("flex", "add", "rot")) for side in ("left", "right")
     }
     for joint, of in names.items():
-        np.testing.assert_allclose(np.column_stack([found[name] for name in of]), isb[joint].values, atol=1e-12)
+        np.testing.assert_allclose(np.column_stack([angles[name] for name in of]), isb[joint].values, atol=1e-12)
     assert missed == {}
 
 

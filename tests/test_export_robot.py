@@ -185,8 +185,8 @@ def test_an_earlier_data_set_goes_as_a_whole(trajectory: Path, tmp_path: Path) -
 def find_lerobot() -> str:
     """The Python that has lerobot; the test is skipped without one."""
     python = os.environ.get("WEPOSE_LEROBOT", sys.executable)
-    found = subprocess.run([python, "-c", "import importlib.util as u, sys; sys.exit(not u.find_spec('lerobot'))"])
-    if found.returncode:
+    process = subprocess.run([python, "-c", "import importlib.util as u, sys; sys.exit(not u.find_spec('lerobot'))"])
+    if process.returncode:
         pytest.skip("lerobot is not installed; WEPOSE_LEROBOT names a Python that has it")
     return python
 

@@ -13,6 +13,7 @@ from wepose_pin.errors import BadData, BadOption, BadPhase
 from wepose_pin.filters import (
     METHODS,
     OFFLINE,
+    FilterSettings,
     Gdc,
     GdcParams,
     Ncf,
@@ -215,7 +216,7 @@ def test_correction_brings_the_bias_home_and_stops_the_heading() -> None:
         noise = replace(noise, gyro_bias=wrong, gyro_bias_cov=noise.gyro_bias_cov + np.diag(wrong**2))
         row = []
         for first, test in ((200, StaticTest()), (0, StaticTest(alpha=0.0))):
-            out = run_filter(gyro, accel, RATE, noise, "smekf", static_test=test)
+            out = run_filter(gyro, accel, RATE, noise, FilterSettings("smekf", static_test=test))
             drift = heading_error_deg(out.quat_WS, true)
             row += [np.rad2deg(np.abs(out.gyro_bias[-1]).max()), np.abs(drift[first:] - drift[first]).max()]
         rows.append(row)
@@ -236,11 +237,11 @@ def test_the_exact_covariance_keeps_the_heading_through_wild_motion() -> None:
     for seed in range(8):
         gyro, accel, true, _ = measured(np.random.default_rng(seed), 120.0, tilt=1.2)
         noise = estimate_noise(gyro[:180], accel[:180], RATE)
-        for first_order, found in worst.items():
-            out = run_filter(gyro, accel, RATE, noise, "smekf", SmekfParams(first_order=first_order))
+        for first_order, errors in worst.items():
+            out = run_filter(gyro, accel, RATE, noise, FilterSettings("smekf", SmekfParams(first_order=first_order)))
             error = heading_error_deg(out.quat_WS, true)
-            found.append(float(np.abs(error - error[100]).max()))
-    mean = {first_order: float(np.mean(found)) for first_order, found in worst.items()}
+            errors.append(float(np.abs(error - error[100]).max()))
+    mean = {first_order: float(np.mean(errors)) for first_order, errors in worst.items()}
     print(f"largest heading error, mean of 8: {mean[True]:.2f} deg to first order, {mean[False]:.2f} exact")
     assert mean[False] < 0.7
     assert mean[False] < 0.6 * mean[True]
@@ -298,17 +299,17 @@ def test_where_the_papers_start_and_bias_noise_are_wrong() -> None:
     for seed in range(16):
         gyro, accel, true, _ = measured(np.random.default_rng(seed), 120.0, bias=(0.01, -0.02, 0.015), tilt=0.8)
         noise = estimate_noise(gyro[:180], accel[:180], RATE)
-        for name, found in rows.items():
+        for name, figures in rows.items():
             params = SmekfParams(first_order=True) if name == "paper" else None
             stated_noise = replace(noise, bias_step_cov=real_step) if name.endswith("bias") else noise
-            out = run_filter(gyro, accel, RATE, stated_noise, "smekf", params, measured_start=True)
+            out = run_filter(gyro, accel, RATE, stated_noise, FilterSettings("smekf", params, measured_start=True))
             heading = heading_error_deg(out.quat_WS, true)
             aligned = Rotation.from_rotvec([0, 0, np.deg2rad(heading[100])]) * Rotation.from_quat(true)
             error = (Rotation.from_quat(out.quat_WS).inv() * aligned).as_rotvec()
             assert out.attitude_cov is not None
             nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(out.attitude_cov), error)
-            found.append((nees[3000:].mean(), np.sqrt(np.mean((heading[3000:] - heading[100]) ** 2))))
-    mean = {name: np.mean(found, axis=0) for name, found in rows.items()}
+            figures.append((nees[3000:].mean(), np.sqrt(np.mean((heading[3000:] - heading[100]) ** 2))))
+    mean = {name: np.mean(figures, axis=0) for name, figures in rows.items()}
     for name, (nees, rms) in mean.items():
         print(f"{name:24s} NEES {nees:.1f}, heading {rms:.2f} deg rms")
     np.testing.assert_allclose(mean["paper"], (1.9, 0.57), rtol=0.1)
@@ -324,7 +325,9 @@ def test_the_heading_of_a_sensor_that_turns_round_and_round_is_as_uncertain_as_i
     accel = np.tile([0.0, 0.0, GRAVITY], (len(gyro), 1)) + np.random.default_rng(5).normal(
         scale=0.01, size=(500 + n, 3)
     )
-    out = run_filter(gyro, accel, RATE, estimate_noise(gyro[:500], accel[:500], RATE), "smekf", measured_start=True)
+    out = run_filter(
+        gyro, accel, RATE, estimate_noise(gyro[:500], accel[:500], RATE), FilterSettings("smekf", measured_start=True)
+    )
     assert out.attitude_cov is not None
     turned = Rotation.from_quat(out.quat_WS[-1]).as_rotvec()[2] - rate * n / RATE
     off = float(np.angle(np.exp(1j * turned)))
@@ -358,7 +361,9 @@ def test_how_the_sensors_axes_lie_changes_nothing(method: str) -> None:
     for R in (Rotation.identity(), turn):
         own_gyro, own_accel = R.apply(gyro), R.apply(accel)
         noise = estimate_noise(own_gyro[:180], own_accel[:180], RATE)
-        quat = run_filter(own_gyro, own_accel, RATE, noise, method, measured_start=True, start=slice(0, 180)).quat_WS
+        quat = run_filter(
+            own_gyro, own_accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 180))
+        ).quat_WS
         R_WS = Rotation.from_quat(quat) * R
         runs.append(R_WS[0].inv() * R_WS)  # each world has a heading of its own
     # amekf doubts each axis of a measurement by itself (three standard deviations), the others none
@@ -378,14 +383,14 @@ def test_a_recording_may_begin_in_motion(method: str) -> None:
     for seed in range(3):
         trial = simulate_paper_dynamic(seed)
         gyro, accel, true = trial.gyro_S[800:], trial.accel_S[800:], trial.quat_WS[800:]
-        found = estimate_orientation(gyro, accel, RATE, method=method, static=(47.6, 51.6))
-        tilt_deg = tilt_error_deg(found.quat_WS, true)
+        orientation = estimate_orientation(gyro, accel, RATE, method=method, static=(47.6, 51.6))
+        tilt_deg = tilt_error_deg(orientation.quat_WS, true)
         assert tilt_deg[4760:].max() < 0.5
-        assert len(found.static) == len(gyro)
-        assert found.static[4900:].mean() > 0.8
+        assert len(orientation.static) == len(gyro)
+        assert orientation.static[4900:].mean() > 0.8
         worst.append(float(tilt_deg.max()))
     print(f"{method}: tilt within {np.round(worst, 2)} deg")
-    if found.attitude_cov is not None:  # what the others keep depends on their gains
+    if orientation.attitude_cov is not None:  # what the others keep depends on their gains
         assert max(worst) < 1.0
 
 
@@ -393,10 +398,10 @@ def test_a_recording_may_begin_in_motion(method: str) -> None:
 def test_what_is_before_the_start_phase_comes_with_the_first_chunk(method: str) -> None:
     gyro, accel, _, _ = measured(np.random.default_rng(3), 60.0)
     noise = estimate_noise(gyro[1000:1180], accel[1000:1180], RATE)
-    run = SensorRun(RATE, noise, method, measured_start=True, start=slice(1003, 1180))
+    run = SensorRun(RATE, noise, FilterSettings(method, measured_start=True, start=slice(1003, 1180)))
     chunks = [run.push(gyro[a:b], accel[a:b]) for a, b in ((0, 2000), (2000, 4000), (4000, 6000))]
     chunks += [run.finish()] if method == "smoother" else []
-    whole = run_filter(gyro, accel, RATE, noise, method, measured_start=True, start=slice(1003, 1180))
+    whole = run_filter(gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(1003, 1180)))
     quat = np.concatenate([chunk.quat_WS for chunk in chunks if chunk is not None])
     assert quat.shape == whole.quat_WS.shape
     turned = np.degrees((Rotation.from_quat(quat).inv() * Rotation.from_quat(whole.quat_WS)).magnitude())
@@ -421,11 +426,13 @@ def test_the_rate_changes_little(method: str) -> None:
         accel = R[1:].inv().apply([0.0, 0.0, GRAVITY]) + rng.normal(scale=1e-3 * np.sqrt(rate), size=(n, 3))
         k = round(4.5 * rate)
         noise = estimate_noise(gyro[:k], accel[:k], rate)
-        found = run_filter(gyro, accel, rate, noise, method, measured_start=True, start=slice(0, k))
-        assert found.attitude_cov is not None
-        std.append(np.sqrt(np.trace(found.attitude_cov[round(50.0 * rate)])))
+        orientation = run_filter(
+            gyro, accel, rate, noise, FilterSettings(method, measured_start=True, start=slice(0, k))
+        )
+        assert orientation.attitude_cov is not None
+        std.append(np.sqrt(np.trace(orientation.attitude_cov[round(50.0 * rate)])))
         every = round(rate / 100.0)
-        quats.append(Rotation.from_quat(found.quat_WS[every - 1 :: every]))
+        quats.append(Rotation.from_quat(orientation.quat_WS[every - 1 :: every]))
     assert np.degrees((quats[0].inv() * quats[1]).magnitude()).max() < 2.0
     assert abs(std[1] / std[0] - 1.0) < 0.1
 
@@ -447,8 +454,33 @@ def test_gdc_is_madgwicks_equations() -> None:
         rate = np.roll(quat_product(np.roll(q, -1), np.append(gyro[k] - noise.gyro_bias, 0.0)), 1) / 2
         q = q + (rate - 0.1 * step / np.linalg.norm(step)) / RATE
         q /= np.linalg.norm(q)
-    found = np.roll(run.quat_WS[-1], 1)
-    np.testing.assert_allclose(found * np.sign(found @ q), q, atol=1e-11)
+    estimate = np.roll(run.quat_WS[-1], 1)
+    np.testing.assert_allclose(estimate * np.sign(estimate @ q), q, atol=1e-11)
+
+
+@pytest.mark.parametrize("method", ["amekf", "smekf"])
+def test_what_is_corrected_about_the_vertical_is_stated(method: str) -> None:
+    """Of an upright sensor with a wrong first bias, static and then turning about the vertical."""
+    rng, n, bias_std = np.random.default_rng(4), 2000, 0.01
+    gyro = np.array([0.002, -0.003, 0.01]) + rng.normal(scale=0.002, size=(n, 3))
+    gyro[n // 2 :, 2] += 1.0
+    accel = np.array([0.0, 0.0, GRAVITY]) + rng.normal(scale=0.02, size=(n, 3))
+    noise = replace(estimate_noise(gyro[:180], accel[:180], RATE), gyro_bias=np.zeros(3))
+    noise = replace(noise, gyro_bias_cov=bias_std**2 * np.eye(3))
+    out = run_filter(gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 180)))
+    assert out.about_vertical is not None
+    heading, rate, drift, seconds, information, rate_var = out.about_vertical.T
+    # Without its corrections the heading is the sum of the rate less the bias that the filter had at each sample.
+    bias = out.gyro_bias[:, 2] if method == "amekf" else np.append(0.0, out.gyro_bias[:-1, 2])  # smekf states the next
+    undone = np.unwrap(2.0 * np.arctan2(*out.quat_WS[:, 2:].T), period=2.0 * np.pi) - heading
+    np.testing.assert_allclose(undone, np.cumsum(gyro[:, 2] - bias) / RATE, atol=1e-4)
+    assert np.abs(heading).max() > 1e-3
+    assert rate[-1] == pytest.approx(out.gyro_bias[-1, 2], abs=1e-5)
+    assert seconds[-1] == pytest.approx(n / RATE)
+    np.testing.assert_allclose(drift, np.cumsum(np.append(0.0, rate[:-1])) / RATE, atol=1e-9)
+    assert rate[-1] == pytest.approx(0.01, abs=1e-3)
+    # The filter has not learned less than makes its variance of the first one; a bias that walks takes some away.
+    assert bias_std**-2 + information[-1] > 0.99 / rate_var[-1] > 100.0 * bias_std**-2
 
 
 # All ---------------------------------------------------------------------------------------------------------------
@@ -542,8 +574,8 @@ def sensors(
     count: int, seconds: float = 20.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[SensorNoise], list[np.ndarray]]:
     """Gyro (n, k, 3), accel (n, k, 3), true quaternions (n, k, 4), noise and start of each."""
-    found = [measured(np.random.default_rng(seed), seconds, bias=(0.01, -0.02, 0.005)) for seed in range(count)]
-    gyro, accel, true = (np.stack([sensor[i] for sensor in found], axis=1) for i in range(3))
+    drawn = [measured(np.random.default_rng(seed), seconds, bias=(0.01, -0.02, 0.005)) for seed in range(count)]
+    gyro, accel, true = (np.stack([sensor[i] for sensor in drawn], axis=1) for i in range(3))
     noises = [estimate_noise(gyro[:180, i], accel[:180, i], RATE) for i in range(count)]
     return gyro, accel, true, noises, [quat_from_gravity(accel[:50, i].mean(axis=0)) for i in range(count)]
 
@@ -598,13 +630,13 @@ def test_runs_in_threads_are_the_runs_one_after_the_other() -> None:
     gyro, accel, _, noises, _ = sensors(7)
 
     def run(i: int, noise: SensorNoise) -> Any:
-        return run_filter(gyro[:, i], accel[:, i], RATE, noise, "smekf")
+        return run_filter(gyro[:, i], accel[:, i], RATE, noise, FilterSettings("smekf"))
 
     one = run_in_parallel(run, range(7), noises, threads=1)
     for threads in (2, 5, None):
         for parallel, single in zip(run_in_parallel(run, range(7), noises, threads=threads), one, strict=True):
-            for found, expected in zip(parallel[:4], single[:4], strict=True):
-                np.testing.assert_array_equal(found, expected)
+            for actual, expected in zip(parallel[:4], single[:4], strict=True):
+                np.testing.assert_array_equal(actual, expected)
     with pytest.raises(BadOption, match="not known"):
         run_in_parallel(check_method, ["smekf", "none"])
     assert run_in_parallel(check_method, []) == []
@@ -621,7 +653,7 @@ def test_a_sample_that_is_no_number_does_not_stay(method: str, wrong: float) -> 
     gyro[[0, 500, 1050, 1051, 1052], [0, 1, 2, 0, 1]] = wrong
     accel[[0, 500, 1100, 1200, 1201], [0, 1, 2, 0, 1]] = wrong
     run = METHODS[method](noise, RATE, start).run(gyro, accel, rest & np.isfinite(accel).all(axis=1))
-    assert all(np.isfinite(found).all() for found in run if found is not None)
+    assert all(np.isfinite(part).all() for part in run if part is not None)
     turned = np.degrees((Rotation.from_quat(run.quat_WS).inv() * Rotation.from_quat(clean.quat_WS)).magnitude())
     assert turned[:500].max() < 0.3
     assert turned.max() < 3.0
@@ -662,8 +694,8 @@ def test_the_authors_own_trial_against_vicon(data: Any) -> None:
     true = Rotation.from_quat(trial.quat_true[trial.scored])
     for method, limit in (("smekf", 2.2), ("ncf", 2.5), ("gdc", 2.5)):
         out = estimate_orientation(trial.gyro_S, trial.accel_S, trial.rate_hz, method=method, static=(0.05, 0.9))
-        found = Rotation.from_quat(out.quat_WS[trial.scored])
-        aligned = (true[0] * found[0].inv()) * found
+        R_WS = Rotation.from_quat(out.quat_WS[trial.scored])
+        aligned = (true[0] * R_WS[0].inv()) * R_WS
         angle = np.degrees((true.inv() * aligned).magnitude())
         print(f"{method}: mean angle {angle.mean():.3f} deg, largest {angle.max():.2f} deg")
         assert angle.mean() < limit

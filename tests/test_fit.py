@@ -71,7 +71,7 @@ def cost(body: BodyModel, q: np.ndarray, quat_WL: dict[str, np.ndarray], weights
 @pytest.mark.parametrize("limits", [True, False])
 def test_nothing_is_nearer_by_another_minimiser(body: BodyModel, limits: bool, weights: dict[str, float]) -> None:
     quat_WL = motion(body, 40, 1, 15.0, reach=1.3)
-    found = solve_configuration(body, quat_WL, limits=limits, weights=weights)
+    solution = solve_configuration(body, quat_WL, limits=limits, weights=weights)
     model, at = body.pin, places(body.pin)
     first = model.idx_vs[body.joints["LeftUpperArm"]]
     columns = [*range(first, first + 3), *(model.idx_vs[model.getJointId(name)] for name in HINGES)]
@@ -81,14 +81,14 @@ def test_nothing_is_nearer_by_another_minimiser(body: BodyModel, limits: bool, w
         def left(step: np.ndarray, k: int = k, target: dict[str, np.ndarray] = target) -> float:
             v = np.zeros(model.nv)
             v[columns] = step
-            return cost(body, pin.integrate(model, found[k], v), target, weights)
+            return cost(body, pin.integrate(model, solution[k], v), target, weights)
 
         free = [(-3.0, 3.0)] * 7
         if limits:
-            low, high = model.lowerPositionLimit[at] - found[k, at], model.upperPositionLimit[at] - found[k, at]
+            low, high = model.lowerPositionLimit[at] - solution[k, at], model.upperPositionLimit[at] - solution[k, at]
             free[3:] = [(min(a, 0.0), max(b, 0.0)) for a, b in zip(low, high, strict=True)]
         best = minimize(left, np.zeros(7), bounds=free, options={"ftol": 1e-15, "gtol": 1e-9})
-        assert cost(body, found[k], target, weights) < best.fun + 1e-9
+        assert cost(body, solution[k], target, weights) < best.fun + 1e-9
 
 
 def test_limits_are_kept_and_the_rest_of_the_arm_takes_its_share(body: BodyModel) -> None:

@@ -117,7 +117,7 @@ def test_packets_lost_on_the_air_are_gaps(tmp_path: Path) -> None:
     recording = load(tmp_path, '[data]\nfile = "a.txt"\n[sensors.torso]')
     assert len(recording) == N
     (gap,) = recording.diagnostics
-    assert (gap.code, gap.place, gap.value, gap.facts["samples"]) == ("short-gaps-bridged", "torso", 1, 3)
+    assert (gap.code, gap.place, gap.facts["gaps"], gap.facts["samples"]) == ("short-gaps-bridged", "torso", 1, 3)
 
 
 def test_without_a_rate_the_fine_time_counts_tenths_of_milliseconds(tmp_path: Path) -> None:
@@ -686,15 +686,15 @@ def test_columns_by_their_names() -> None:
     names = (
         "Time (s),chest_gyro_x [deg/s],chest_gyro_y [deg/s],chest_gyro_z [deg/s],chest_acc_x,chest_acc_y,chest_acc_z"
     )
-    found = guess_columns([*names.split(","), "chest_mag_x", "chest_mag_y", "chest_mag_z", "left_wrist_qw"])
-    assert found.times == ["Time (s)"]
-    assert found.units == {"Time (s)": "s", "gyro": "deg/s"}
-    assert list(found.sensors) == ["torso"]
-    assert found.sensors["torso"]["accel"] == ["chest_acc_x", "chest_acc_y", "chest_acc_z"]
-    found = guess_columns(["t", "gx", "gy", "gz", "ax", "ay", "az"])
-    assert found.sensors == {"?": {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
-    found = guess_columns(["head_q0", "head_q1", "head_q2", "head_q3"])
-    assert found.sensors == {"head": {"orientation": ["head_q1", "head_q2", "head_q3", "head_q0"]}}
+    guess = guess_columns([*names.split(","), "chest_mag_x", "chest_mag_y", "chest_mag_z", "left_wrist_qw"])
+    assert guess.times == ["Time (s)"]
+    assert guess.units == {"Time (s)": "s", "gyro": "deg/s"}
+    assert list(guess.sensors) == ["torso"]
+    assert guess.sensors["torso"]["accel"] == ["chest_acc_x", "chest_acc_y", "chest_acc_z"]
+    guess = guess_columns(["t", "gx", "gy", "gz", "ax", "ay", "az"])
+    assert guess.sensors == {"?": {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"]}}
+    guess = guess_columns(["head_q0", "head_q1", "head_q2", "head_q3"])
+    assert guess.sensors == {"head": {"orientation": ["head_q1", "head_q2", "head_q3", "head_q0"]}}
     assert guess_columns(["a", "b", "velocity_x"]).sensors == {}
 
 

@@ -181,9 +181,9 @@ def test_a_fuzzer_that_sees_coverage_finds_nothing(tmp_path: Path) -> None:
         "--out",
         str(tmp_path),
     ]
-    found = subprocess.run(command, capture_output=True, text=True)
-    assert found.returncode == 0, found.stdout + found.stderr
-    tried = re.search(r"^all +(\d+) +0 +(\d+) ", found.stdout, re.MULTILINE)  # inputs, findings, edges
+    process = subprocess.run(command, capture_output=True, text=True)
+    assert process.returncode == 0, process.stdout + process.stderr
+    tried = re.search(r"^all +(\d+) +0 +(\d+) ", process.stdout, re.MULTILINE)  # inputs, findings, edges
     assert tried is not None
     assert int(tried[1]) > 100
     assert int(tried[2]) > 1000

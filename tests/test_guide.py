@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import NamedTuple, cast
 
 import numpy as np
 import pytest
@@ -19,10 +20,13 @@ from guided_person import RATE_HZ, TRACKERS, GuidedPerson, PersonSource, Tracker
 
 from wepose_pin.assets import asset
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, load_protocol
+from wepose_pin.calibration.observability import format_longest
+from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadSession
 from wepose_pin.jobs.live import LiveJob, run_live
 from wepose_pin.live.assignment import AssignedSource, ShakeDetector, read_segments, write_segments
 from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
+from wepose_pin.live.guide_motion import count_from_begin
 from wepose_pin.live.guided import make_steps
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.state import GuideView, Output, Status
@@ -153,7 +157,7 @@ def test_from_sensors_of_any_name_to_the_calibration_of_their_recording(tmp_path
     assert counted[0] == pytest.approx(8.0, abs=0.1)
 
 
-@pytest.mark.parametrize("orientations", ["sensor", "segment"])
+@pytest.mark.parametrize("orientations", [pytest.param("sensor", marks=pytest.mark.slow), "segment"])
 def test_sensors_that_measure_orientations_are_shaken_and_calibrated_too(tmp_path: Path, orientations: str) -> None:
     """Trackers in worlds of their own, and a suit that streams segments; both under any names."""
     session = Session(tmp_path, orientations=orientations)
@@ -218,6 +222,20 @@ def test_too_little_motion_asks_for_more_of_it(tmp_path: Path, monkeypatch: pyte
     assert view.quality == "fail"
     assert view.sentence == "There was too little of the motion. More of it may be enough."
     assert [action.name for action in view.actions] == ["more", "restart"]
+
+
+def test_seconds_of_a_reason_count_from_the_begin_of_the_motion() -> None:
+    """On a source's clock that began with the machine, a day before; apart from 2 to 4 s after the begin."""
+    time_s = np.arange(0.0, 40.0, 0.125)
+    gap = np.where(time_s < 10.0, np.nan, 0.01)
+    contact = np.where((time_s >= 12.0) & (time_s <= 14.0), 0.0, 1.0)
+    calibration = cast("Calibration", SimpleNamespace(time=87_200.0 + time_s, gap=gap, contact=contact))
+    apart = Diagnostic("closure-open", WARNING, "", 0.2, 0.1, {"intervals": format_longest([(87_212.0, 87_214.0)])})
+    other = Diagnostic("closure-gap-large", WARNING, "", 0.05, 0.03)
+    (shown, same) = count_from_begin([apart, other], calibration)
+    assert shown == replace(apart, facts={"intervals": format_longest([(2.0, 4.0)])})
+    assert same is other
+    assert count_from_begin([other], calibration) == [other]
 
 
 @pytest.mark.slow

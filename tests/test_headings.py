@@ -13,13 +13,21 @@ from scipy.spatial.transform import Rotation
 import wepose_pin as wp
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate
+from wepose_pin.filters import AboutVertical
 from wepose_pin.model import load_model
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
-from wepose_pin.tracking import summarize, track
-from wepose_pin.tracking.heading_filter import PERSON_NOISE, ClaspDetector, HeadingFilter, HeadingProblem, Knot
+from wepose_pin.tracking import Tracker, summarize, track
+from wepose_pin.tracking.heading_filter import (
+    PERSON_NOISE,
+    ClaspDetector,
+    FilterHeadings,
+    HeadingFilter,
+    HeadingProblem,
+    Knot,
+)
 
 # The simulated person's shoulders stay in place, against the law of the table.
 RIGID = {name: np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) for name in TABLE.girdles}
@@ -86,10 +94,10 @@ def test_without_a_clasp_the_hinges_of_each_arm_correct_it(made: tuple[Simulatio
     fewer = replace(recording, sensors={n: s for n, s in recording.sensors.items() if n != "torso"})
     alone = replace(recording, sensors={n: s for n, s in recording.sensors.items() if "forearm" not in n})
     for of, person in ((recording, replace(subject, hinges={})), (fewer, subject)):
-        found = track(of, person).correction
-        assert found is not None
-        assert found.gap_rms_mm is None
-        before, after = found.hinge_residual_rms_deg["right_elbow"]
+        correction = track(of, person).correction
+        assert correction is not None
+        assert correction.gap_rms_mm is None
+        before, after = correction.hinge_residual_rms_deg["right_elbow"]
         assert after < 0.7 * before
     assert track(alone, subject).correction is None
     assert track(recording, subject, open_loop=True).correction is None
@@ -126,14 +134,14 @@ def test_joined_hands_are_found_and_hands_apart_are_not(causal: bool) -> None:
     of_stated_mounts = track(recording, stated, causal=causal).correction
     assert of_stated_mounts is not None
     assert of_stated_mounts.found_clasps == ()
-    found = track(recording, replace(stated, mounts=simulation.quat_LS), causal=causal).correction
-    assert found is not None
+    correction = track(recording, replace(stated, mounts=simulation.quat_LS), causal=causal).correction
+    assert correction is not None
     begin, end = simulation.phases["clasp"][0]
-    assert sum(b - a for a, b in found.found_clasps) > 10.0
-    for a, b in found.found_clasps:
+    assert sum(b - a for a, b in correction.found_clasps) > 10.0
+    for a, b in correction.found_clasps:
         assert begin - 1.0 < a < b < end + 1.0
     gap = np.linalg.norm(simulation.points["left_palm"] - simulation.points["right_palm"], axis=1)
-    assert all(gap[(simulation.time > a) & (simulation.time < b)].max() < 0.05 for a, b in found.found_clasps)
+    assert all(gap[(simulation.time > a) & (simulation.time < b)].max() < 0.05 for a, b in correction.found_clasps)
 
 
 def test_a_marked_clasp_of_two_seconds_brings_a_turned_arm_back_within_one(
@@ -208,28 +216,126 @@ def test_the_drift_that_all_sensors_may_share_is_in_the_torsos_heading(causal: b
     assert 0.3 * drift[True] < drift[False] < 1.2 * drift[True]
 
 
-def test_a_headings_variance_is_start_pose_and_drift_until_the_filter_has_found_its_bias() -> None:
-    """Nothing is observed: the mount cancels, the rate adds up, and less of it is left once the filter's ± stands."""
-    k, knot_s, start_std, rate_std = 1, 2.0, np.deg2rad(1.0), np.deg2rad(0.5)
+KNOT_S, START_STD, BIAS_STD = 2.0, np.deg2rad(1.0), np.deg2rad(0.5)
+
+
+def make_filter_of_one() -> HeadingFilter:
+    """Of a torso whose heading nothing observes but its orientation filter."""
+    k = 1
     problem = HeadingProblem(
-        ("torso",), load_model(), wp.population_subject(), (), (), (), PERSON_NOISE, knot_s, 16, np.zeros(k),
-        np.full(k, rate_std), np.full(k, start_std**2), np.full(k, np.deg2rad(6.0) ** 2),
+        ("torso",), load_model(), wp.population_subject(), (), (), (), PERSON_NOISE, KNOT_S, 16, np.zeros(k),
+        np.full(k, BIAS_STD), np.full(k, START_STD**2), np.full(k, np.deg2rad(6.0) ** 2),
     )  # fmt: skip
-    state = HeadingFilter(problem)
-    np.testing.assert_allclose(problem.find_segment_variance(state.P), start_std**2)
+    return HeadingFilter(problem)
 
-    def go_on(filter_std: np.ndarray) -> np.ndarray:
-        variance = []
-        for k, std in enumerate(filter_std):
-            knot = Knot(k * knot_s, np.zeros(0), np.zeros((0, 1, 4)), (), np.array([std**2]), np.zeros(1, dtype=bool))
-            state.predict(state.find_step(knot))
-            variance.append(problem.find_segment_variance(state.P)[0])
-        return np.sqrt(variance)
 
-    growing = go_on(rate_std * knot_s * np.arange(1, 11))
-    assert growing[-1] == pytest.approx(np.hypot(start_std, 20.0 * rate_std), rel=0.05)
-    standing = go_on(np.full(20, rate_std * 20.0))
+def go_on(state: HeadingFilter, knots: int, about_vertical: tuple[float, ...], var: float = 0.0) -> np.ndarray:
+    """Step through knots at whose ends the filter says the same; return the heading's standard deviations [rad]."""
+    heading, rate, information, rate_var = np.array(about_vertical)[:, None]
+    zero = np.zeros(1)
+    filters = FilterHeadings(np.array([var]), AboutVertical(heading, rate, zero, zero, information, rate_var))
+    knot = Knot(0.0, np.zeros(0), np.zeros((0, 1, 4)), (), filters, np.zeros(1, dtype=bool))
+    variance = []
+    for _ in range(knots):
+        state.step(knot)
+        variance.append(state.problem.find_segment_variance(state.P)[0])
+    return np.sqrt(variance)
+
+
+def test_a_headings_variance_is_start_pose_and_drift_until_the_filter_has_found_its_bias() -> None:
+    """Nothing is observed: the mount cancels, the rate adds up, and less is left once the filter knows its bias."""
+    state = make_filter_of_one()
+    np.testing.assert_allclose(state.problem.find_segment_variance(state.P), START_STD**2)
+    growing = go_on(state, 10, (0.0, 0.0, 0.0, BIAS_STD**2))
+    assert growing[-1] == pytest.approx(np.hypot(START_STD, 20.0 * np.hypot(BIAS_STD, PERSON_NOISE.rate_std)), rel=0.05)
+    known_std = 0.02 * BIAS_STD
+    standing = go_on(state, 20, (0.0, 0.0, known_std**-2 - BIAS_STD**-2, known_std**2))
     assert standing[-1] - standing[-6] < 1.3 * 10.0 * PERSON_NOISE.rate_std
+
+
+KNOWN_STD = 0.02 * BIAS_STD
+LEARNED = KNOWN_STD**-2 - BIAS_STD**-2  # [s²/rad²]
+
+
+def test_what_a_filter_finds_is_believed_as_far_as_nothing_else_has_observed_it() -> None:
+    """After 20 s a filter turns its heading by −t Δb and its bias by Δb, with and without having learned it."""
+    bias, seconds = np.deg2rad(0.6), 20.0
+    for information, rate_var in ((LEARNED, KNOWN_STD**2), (0.0, BIAS_STD**2)):
+        state = make_filter_of_one()
+        go_on(state, round(seconds / KNOT_S), (0.0, 0.0, 0.0, BIAS_STD**2))
+        std = go_on(state, 1, (-seconds * bias, bias, information, rate_var))[-1]
+        heading, rate = state.x[0] + seconds * bias, state.x[1]  # against the filter's, which has turned
+        assert abs(heading) < 0.1 * seconds * bias
+        assert abs(rate) < 0.1 * bias
+        if information:
+            assert std < 2.0 * np.hypot(START_STD, seconds * PERSON_NOISE.rate_std)
+        else:
+            assert std > seconds * BIAS_STD
+    # Neighbours have observed heading and rate, and the filter learned nothing: it is the filter that is wrong now.
+    state = make_filter_of_one()
+    go_on(state, round(seconds / KNOT_S), (0.0, 0.0, 0.0, BIAS_STD**2))
+    state.P *= 1e-4
+    std = go_on(state, 1, (-seconds * bias, bias, 0.0, BIAS_STD**2))[-1]
+    np.testing.assert_allclose([state.x[0] + seconds * bias, state.x[1]], [seconds * bias, bias], rtol=0.1)
+
+
+def test_a_bias_corrected_within_a_knot_has_drifted_up_to_there_alone() -> None:
+    rng, errors = np.random.default_rng(0), []
+    for _ in range(100):
+        bias, other, start = rng.normal(scale=[BIAS_STD, PERSON_NOISE.rate_std, START_STD])
+        at = rng.uniform() * KNOT_S
+        state = make_filter_of_one()
+        go_on(state, 1, (0.0, 0.0, 0.0, BIAS_STD**2))
+        corrected = AboutVertical(
+            *np.array([bias * (KNOT_S + at), -bias, -bias * (KNOT_S - at), KNOT_S, LEARNED, KNOWN_STD**2])[:, None]
+        )
+        state.step(
+            Knot(0.0, np.zeros(0), np.zeros((0, 1, 4)), (), FilterHeadings(np.zeros(1), corrected), np.zeros(1, bool))
+        )
+        errors.append(start + bias * (KNOT_S + at) + other * 2.0 * KNOT_S - state.x[0])
+    std = np.sqrt(state.problem.find_segment_variance(state.P)[0])
+    assert 0.7 * std < np.sqrt(np.mean(np.square(errors))) < 1.3 * std
+
+
+def test_news_of_the_bias_says_nothing_of_other_drift() -> None:
+    """Neighbours know the rate to 0.1 deg/s, then the filter learns its bias; against the same with two states."""
+    state, other_var = make_filter_of_one(), PERSON_NOISE.rate_std**2
+    go_on(state, 1, (0.0, 0.0, 0.0, BIAS_STD**2))
+    P = np.diag([BIAS_STD**2, other_var])
+    for information, H in ((np.deg2rad(0.1) ** -2, np.array([1.0, 1.0])), (LEARNED, np.array([1.0, 0.0]))):
+        P -= np.outer(P @ H, P @ H) / (H @ P @ H + 1.0 / information)
+        if information != LEARNED:
+            at = state.P[:, 1].copy()
+            state.P -= np.outer(at, at) / (at[1] + 1.0 / information)
+    go_on(state, 1, (0.0, 0.0, LEARNED, KNOWN_STD**2))
+    assert np.sqrt(state.P[1, 1]) == pytest.approx(np.sqrt(P.sum()), rel=0.15)
+
+
+def test_a_rate_is_unknown_again_once_another_axis_is_vertical() -> None:
+    state = make_filter_of_one()
+    go_on(state, 2, (0.0, 0.0, 0.0, BIAS_STD**2))
+    state.P[1] *= 1e-2
+    state.P[:, 1] *= 1e-2
+    before = state.P[1, 1]
+    for angle, known in ((0.0, True), (0.7, True), (1.5, False)):
+        filters = FilterHeadings(np.zeros(1), AboutVertical(*np.array([0.0, 0.0, 0.0, 0.0, 0.0, BIAS_STD**2])[:, None]))
+        quat_WL = Rotation.from_rotvec([angle, 0.0, 0.0]).as_quat()[None, None]
+        state.predict(state.find_step(Knot(0.0, np.zeros(1), quat_WL, (), filters, np.zeros(1, dtype=bool))))
+        assert (state.P[1, 1] < 2.0 * before + 1e-6) == known
+
+
+def test_a_chunk_may_end_with_the_last_sample_of_the_start_pose(made: tuple[Simulation, Subject]) -> None:
+    """What the filters have corrected up to there is that of the next chunk's first sample, as in the whole."""
+    recording = made[0].recording()
+    begin, end = recording.phases["start"][0]
+    phases = {"start": ((begin, end + 0.4 / recording.rate_hz),)}
+    recording = replace(recording.cut(slice(0, 1500)), phases=phases)
+    tracker, last = Tracker(), recording.span(phases["start"][0]).stop
+    assert recording.time[last - 1] < phases["start"][0][1] < recording.time[last]
+    chunks = [chunk for span in ((0, last), (last, 1500)) for chunk in tracker.push(recording.cut(slice(*span)))]
+    chunks += tracker.finish()
+    for name, quat_WL in track(recording).quat_WL.items():
+        assert np.array_equal(np.concatenate([chunk.quat_WL[name] for chunk in chunks]), quat_WL)
 
 
 def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tmp_path: Path) -> None:

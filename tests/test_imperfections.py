@@ -402,8 +402,8 @@ def test_allan_deviation_gives_the_densities_back() -> None:
     for name, density in (("gyro_S", np.deg2rad(0.007)), ("accel_S", 120e-6 * G)):
         noise = np.hstack([getattr(noisy, name)[s] - getattr(clean, name)[s] for s in SEGMENTS])
         for tau in (0.05, 0.2, 1.0):
-            found = allan_deviation(noise, 100.0, round(tau * 100.0)) * np.sqrt(tau)
-            assert np.sqrt(np.mean(found**2)) == pytest.approx(density, rel=0.1)
+            deviation = allan_deviation(noise, 100.0, round(tau * 100.0)) * np.sqrt(tau)
+            assert np.sqrt(np.mean(deviation**2)) == pytest.approx(density, rel=0.1)
 
 
 # Switches --------------------------------------------------------------------------------------------------------
@@ -502,8 +502,8 @@ def test_single_sensor(make: Callable[..., SingleSensor], moving: tuple, rate_pe
             assert (multiply(one.gyro_S[1 : end + 1] / 1000.0).inv() * R_WS[0].inv() * R_WS[end]).magnitude() < 1e-6
         accel_W = R_WS.apply(one.accel_S) - [0.0, 0.0, G]
         k = slice(int(moving[0] * 1000) - 1000, int(moving[0] * 1000) + 9001)  # 10 s from before the motion
-        found = one.p_WS[k][0] + CubicSpline(one.time[k], accel_W[k]).antiderivative(2)(one.time[k])
-        assert np.abs(found - one.p_WS[k]).max() < 1e-3
+        integrated = one.p_WS[k][0] + CubicSpline(one.time[k], accel_W[k]).antiderivative(2)(one.time[k])
+        assert np.abs(integrated - one.p_WS[k]).max() < 1e-3
         for a, b in one.static:
             rest = (one.time > a + 0.01) & (one.time < b - 0.01)
             assert np.abs(one.gyro_S[rest]).max() < 1e-12

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -256,6 +257,33 @@ def test_what_can_be_done_with_the_session_is_said(
     assert ("# clasp = [[" in session) == mounts
 
 
+@pytest.mark.parametrize(("begin", "seconds"), [(0.0, 8.0), (40.0, 100.0), (1.7e9, 66.0)])
+def test_a_session_is_readable_once_the_marks_of_its_comments_are_gone(
+    begin: float, seconds: float, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Never static, sensors of names that say nothing: the examples of phases lie in the recording."""
+    time = begin + np.arange(0.0, seconds, 0.02)
+    columns = {"time": time}
+    for n, sensor in enumerate(("s1", "s2"), 1):
+        waves = np.sin(np.outer(time - begin, n + np.arange(1.0, 4.0)))
+        for k, axis in enumerate("xyz"):
+            columns |= {f"{sensor}_gyr_{axis}": waves[:, k], f"{sensor}_acc_{axis}": 9.81 * (k == 2) + waves[:, k]}
+    pl.DataFrame(columns).write_csv(tmp_path / "a.csv")
+    text = info(capsys, tmp_path / "a.csv", "--write")
+    assert ("CHECK" in text) == ("CHECK" in (tmp_path / "session.toml").read_text(encoding="utf-8"))
+    assert "take the # off" in text
+    with pytest.raises(wp.WeposeError, match="without # before its lines"):
+        wp.load_session(tmp_path)
+    session = (tmp_path / "session.toml").read_text(encoding="utf-8").replace("# # ", "# ")
+    session = re.sub(r"^# (?!mount)", "", session, flags=re.MULTILINE)
+    for segment in ("torso", "left_upper_arm"):
+        session = session.replace("sensors.SEGMENT", f"sensors.{segment}", 1)
+    (tmp_path / "session.toml").write_text(session, encoding="utf-8")
+    recording = wp.load_session(tmp_path)
+    assert set(recording.phases) == {"start", "clasp"}
+    assert set(recording.sensors) == {"torso", "left_upper_arm"}
+
+
 def test_aligned_orientations_can_be_tracked_at_once(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     text = info(capsys, mvnx(tmp_path, turning(100)), "--write")
     assert f"wepose track {tmp_path / 'session.toml'} -o result" in text
@@ -357,7 +385,7 @@ def test_sensors_without_a_segment_are_left_to_the_user(capsys: pytest.CaptureFi
     assert diagnosed(tmp_path / "a.csv")["sensor-segments-unknown"].facts == {"sensors": "seg1, seg2, seg3"}
     assert text.count("# [sensors.SEGMENT]") == 3
     assert "[sensors.torso]" not in text
-    assert "name the segment of each sensor" in info(capsys, tmp_path / "a.csv", "--write")
+    assert "write its segment in place of SEGMENT" in info(capsys, tmp_path / "a.csv", "--write")
 
 
 @pytest.mark.parametrize(("twitch", "expected"), [(20, [(0.0, 9.99)]), (80, [(0.0, 3.99), (5.0, 9.99)])])

@@ -128,15 +128,15 @@ def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving
     print(rms)
     assert rms[True][elbow] > 5.0
     assert rms[False][elbow] < 2.0
-    found = tracked.correction
-    assert found is not None
-    assert set(found.joint_accelerations) == {
+    correction = tracked.correction
+    assert correction is not None
+    assert set(correction.joint_accelerations) == {
         f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")
     }
-    assert found.max_correction_deg["right_forearm"] > 5.0
+    assert correction.max_correction_deg["right_forearm"] > 5.0
     rows = tracked.time[tracked.time > 30.0][::20]
     for near, far in pairwise(LIMB):
-        by_std = heading_errors(moving, tracked, 30.0)[near, far] / np.degrees(found.relative_std(near, far, rows))
+        by_std = heading_errors(moving, tracked, 30.0)[near, far] / np.degrees(correction.relative_std(near, far, rows))
         assert np.sqrt(np.mean(by_std**2)) < 1.6
     summary = summarize(tracked).content["heading_correction"]
     assert summary["hinges"] == ["left_elbow", "right_elbow"]

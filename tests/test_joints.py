@@ -24,7 +24,7 @@ from wepose_pin.calibration.joints import (
     estimate_couplings,
 )
 from wepose_pin.calibration.least_squares import Gaussian, Layout
-from wepose_pin.filters import run_filter
+from wepose_pin.filters import FilterSettings, run_filter
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
@@ -46,17 +46,17 @@ def exact() -> tuple[Simulation, Recording, FilteredRecording]:
     return simulation, recording, filter_recording(recording)
 
 
-def true_turn(simulation: Simulation, found: FilteredRecording, near: str, far: str) -> float:
+def true_turn(simulation: Simulation, filtered: FilteredRecording, near: str, far: str) -> float:
     psi = [
-        compute_heading_offset(found.R_VS_start[name], Rotation.from_quat(simulation.quat_LS[name]))
+        compute_heading_offset(filtered.R_VS_start[name], Rotation.from_quat(simulation.quat_LS[name]))
         for name in (near, far)
     ]
     return psi[0] - psi[1]
 
 
 def test_exact_motion_gives_the_turn_between_the_worlds(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
-    simulation, recording, found = exact
-    couplings = estimate_couplings(recording, found, PAIRS, recording.phases["clasp"])
+    simulation, recording, filtered = exact
+    couplings = estimate_couplings(recording, filtered, PAIRS, recording.phases["clasp"])
     assert [(c.near, c.far) for c in couplings] == [
         ("torso", "left_upper_arm"),
         ("left_upper_arm", "left_forearm"),
@@ -64,24 +64,24 @@ def test_exact_motion_gives_the_turn_between_the_worlds(exact: tuple[Simulation,
         ("right_upper_arm", "right_forearm"),
     ]
     for coupling in couplings:
-        off = coupling.heading - true_turn(simulation, found, coupling.near, coupling.far)
+        off = coupling.heading - true_turn(simulation, filtered, coupling.near, coupling.far)
         assert abs(np.degrees(np.angle(np.exp(1j * off)))) < 0.5, coupling
         assert SYSTEMATIC_STD < coupling.std < np.deg2rad(2.0)
-        assert coupling.elapsed_s == pytest.approx(np.mean(recording.phases["clasp"][0]) - found.start[1], abs=0.1)
+        assert coupling.elapsed_s == pytest.approx(np.mean(recording.phases["clasp"][0]) - filtered.start[1], abs=0.1)
 
 
 def test_too_little_motion_rate_or_time_tells_nothing(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
-    _, recording, found = exact
+    _, recording, filtered = exact
     clasp = recording.phases["clasp"]
-    assert estimate_couplings(recording, found, PAIRS, ((clasp[0][0], clasp[0][0] + 10.0),)) == []
-    assert estimate_couplings(replace(recording, rate_hz=10.0), found, PAIRS, clasp) == []
-    assert estimate_couplings(recording, found, PAIRS, ()) == []
+    assert estimate_couplings(recording, filtered, PAIRS, ((clasp[0][0], clasp[0][0] + 10.0),)) == []
+    assert estimate_couplings(replace(recording, rate_hz=10.0), filtered, PAIRS, clasp) == []
+    assert estimate_couplings(recording, filtered, PAIRS, ()) == []
     still = {
         name: replace(s, gyro_S=0.0 * s.gyro_S, accel_S=s.accel_S[:1] + 0.0 * s.accel_S)
         for name, s in recording.imus.items()
     }
-    R_VS = {name: Rotation.concatenate([R[0]] * len(recording)) for name, R in found.R_VS.items()}
-    assert estimate_couplings(replace(recording, sensors=still), found._replace(R_VS=R_VS), PAIRS, clasp) == []
+    R_VS = {name: Rotation.concatenate([R[0]] * len(recording)) for name, R in filtered.R_VS.items()}
+    assert estimate_couplings(replace(recording, sensors=still), filtered._replace(R_VS=R_VS), PAIRS, clasp) == []
 
 
 @pytest.mark.parametrize(("moving", "trusted"), [(1.0, True), (0.01, False)])
@@ -102,14 +102,14 @@ def test_a_heading_half_a_turn_away_that_explains_as_much_makes_it_uncertain(mov
 
 
 def test_samples_that_are_missing_are_bridged(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
-    _, recording, found = exact
+    _, recording, filtered = exact
     clasp, sensors = recording.phases["clasp"], dict(recording.sensors)
     gyro_S = np.array(sensors["torso"].gyro_S)
     gyro_S[2000:2004] = np.nan
     sensors["torso"] = replace(sensors["torso"], gyro_S=gyro_S)
-    whole = estimate_couplings(recording, found, PAIRS, clasp)
+    whole = estimate_couplings(recording, filtered, PAIRS, clasp)
     for ours, theirs in zip(
-        estimate_couplings(replace(recording, sensors=sensors), found, PAIRS, clasp), whole, strict=True
+        estimate_couplings(replace(recording, sensors=sensors), filtered, PAIRS, clasp), whole, strict=True
     ):
         assert ours.heading == pytest.approx(theirs.heading, abs=np.deg2rad(0.2))
 
@@ -140,10 +140,10 @@ def test_soft_tissue_of_the_torso_is_no_heading(seed: int, monkeypatch: pytest.M
         with monkeypatch.context() as patch:
             if not coupled:
                 patch.setattr(lengths, "estimate_couplings", lambda *_: [])
-            found = calibrate(simulation.recording(), measured=measured, prior=person.prior).subject
-        error = Rotation.from_quat(found.mounts["torso"]) * Rotation.from_quat(simulation.quat_LS["torso"]).inv()
+            subject = calibrate(simulation.recording(), measured=measured, prior=person.prior).subject
+        error = Rotation.from_quat(subject.mounts["torso"]) * Rotation.from_quat(simulation.quat_LS["torso"]).inv()
         off[coupled] = abs(float(np.degrees(error.as_rotvec()[2])))
-        assert off[coupled] < 2.0 * np.degrees(found.std("mounts.torso.z"))
+        assert off[coupled] < 2.0 * np.degrees(subject.std("mounts.torso.z"))
     print(off)
     assert off[False] > 3.0
     assert off[True] < 2.5
@@ -157,16 +157,16 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
     for mount in ("rigid", "loose"):
         R_VS, psi = {}, {}
         for segment in RING_SEGMENTS:
-            sensor, found = chain.sensors[mount, segment], registered[mount, segment]
-            noise = assume_noise(sensor.rate_hz, found.gyro_bias)
+            sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
+            noise = assume_noise(sensor.rate_hz, registration.gyro_bias)
             R_VS[segment] = Rotation.from_quat(
-                run_filter(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise, "amekf").quat_WS
+                run_filter(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise, FilterSettings("amekf")).quat_WS
             )
             clock = np.arange(len(sensor.gyro_S)) / sensor.rate_hz
-            time = sensor.time + found.offset_s
+            time = sensor.time + registration.offset_s
             seen = np.isfinite(sensor.quat_VB).all(axis=1) & (time >= 0.0) & (time < min(60.0, clock[-1]))
-            R_WS = Rotation.from_quat(found.quat_WV) * Rotation.from_quat(sensor.quat_VB[seen])
-            R_WS *= Rotation.from_quat(found.quat_BS)
+            R_WS = Rotation.from_quat(registration.quat_WV) * Rotation.from_quat(sensor.quat_VB[seen])
+            R_WS *= Rotation.from_quat(registration.quat_BS)
             headings = rotations.heading((R_WS * Slerp(clock, R_VS[segment])(time[seen]).inv()).as_quat())
             psi[segment] = float(np.angle(np.mean(np.exp(1j * headings))))
         sensors = {

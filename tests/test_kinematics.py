@@ -295,10 +295,10 @@ def test_what_two_axes_can_do_they_do_exactly(data: Path) -> None:
         q[:, body.pin.idx_qs[body.pin.getJointId(name)]] = rng.uniform(-3.0, 3.0, N)
     at = compute_link_placements(body, q, SEGMENTS)
     quat_WL = {segment: at[segment][0] for segment in SEGMENTS}
-    found = solve_configuration(body, quat_WL, limits=False)
-    assert max(missed.max() for missed in compute_orientation_residuals(body, found, quat_WL).values()) < 1e-7
+    solution = solve_configuration(body, quat_WL, limits=False)
+    assert max(missed.max() for missed in compute_orientation_residuals(body, solution, quat_WL).values()) < 1e-7
     at_hinges = [body.pin.idx_qs[body.pin.getJointId(name)] for name in names]
-    np.testing.assert_allclose(found[:, at_hinges], q[:, at_hinges], atol=1e-7)
+    np.testing.assert_allclose(solution[:, at_hinges], q[:, at_hinges], atol=1e-7)
 
 
 def test_a_spine_bends_evenly_and_does_not_twist_when_the_person_turns_round(data: Path) -> None:
@@ -402,8 +402,8 @@ def test_four_hinges_share_with_small_angles(tmp_path: Path) -> None:
     quat_WL["left_forearm"] = Rotation.from_euler("y", [-1.2]).as_quat()
     q = solve_configuration(body, quat_WL)
     # The nearest joints that make three axes: the first one rests.
-    found = [q[0, body.pin.idx_qs[body.pin.getJointId(f"left_e{k}")]] for k in range(4)]
-    np.testing.assert_allclose(found, [0.0, -1.2, 0.0, 0.0], atol=1e-9)
+    angles = [q[0, body.pin.idx_qs[body.pin.getJointId(f"left_e{k}")]] for k in range(4)]
+    np.testing.assert_allclose(angles, [0.0, -1.2, 0.0, 0.0], atol=1e-9)
 
 
 def test_one_hinge_takes_its_twist_and_a_continuous_one_has_no_end(tmp_path: Path) -> None:
@@ -428,9 +428,10 @@ def test_one_hinge_takes_its_twist_and_a_continuous_one_has_no_end(tmp_path: Pat
 def test_a_body_with_hinges_is_followed_live_as_in_a_recording(data: Path, half_minute: Recording) -> None:
     """Pose after pose, each fit from the one before."""
     body = gazebo(data, 48)
-    pose = track(half_minute, model=body, causal=True)
+    recording = replace(half_minute, phases={"start": half_minute.phases["start"]}).cut(slice(0, 1200))
+    pose = track(recording, model=body, causal=True)
     live = LiveKinematics(body, list(pose.quat_WL))
-    rows = range(2000, 2100)
+    rows = range(600, 650)
     points = np.stack([live.compute_points(np.array([quat[k] for quat in pose.quat_WL.values()])) for k in rows])
     assert live.points
     for i, name in enumerate(live.points):

@@ -226,7 +226,7 @@ def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, mo
     assert set(again.table.segments) == set(load_model("whole_body").table.segments)
 
 
-@pytest.mark.parametrize("torso", [False, True])
+@pytest.mark.parametrize("torso", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_seven_sensors_from_the_pelvis_down_are_enough(torso: bool) -> None:
     simulation = simulate_activity("walk", seed=4, seconds=10.0)
     recording = simulation.recording()

@@ -147,7 +147,7 @@ def test_status_is_json_whatever_is_not_known(person: Person) -> None:
     sent = json.loads(status_json(person.status(lost=("torso",))._replace(latency_ms=(math.nan, math.inf))))
     assert sent["latency_ms"] == [None, None]
     assert sent["sensors"][0] | {"bias_deg_s": 0} == {
-        "segment": "torso", "rate_hz": 99.8, "lost": True, "static": True, "bias_deg_s": 0, "heading_std_deg": None,
+        "segment": "torso", "rate_hz": 99.8, "lost": True, "static": True, "bias_deg_s": 0, "heading_std": "–",
         "heading_age_s": 3.0, "missing": 1, "late": 2, "duplicate": 3, "frozen": False,
         "battery": None,
     }  # fmt: skip
@@ -205,7 +205,7 @@ def listening(pid: int) -> set[str]:
             continue
         if target.startswith("socket:["):
             inodes.add(target[8:-1])
-    found = set()
+    sockets = set()
     for table in ("tcp", "tcp6", "udp", "udp6"):
         for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
             columns = line.split()
@@ -213,8 +213,8 @@ def listening(pid: int) -> set[str]:
                 address = bytes.fromhex(columns[1].split(":")[0])
                 words = [address[k : k + 4][::-1] for k in range(0, len(address), 4)]  # of this machine's byte order
                 family = socket.AF_INET6 if table.endswith("6") else socket.AF_INET
-                found.add(socket.inet_ntop(family, b"".join(words)))
-    return found
+                sockets.add(socket.inet_ntop(family, b"".join(words)))
+    return sockets
 
 
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").exists() or sys.byteorder != "little", reason="reads Linux's /proc")

@@ -101,8 +101,8 @@ class Session:
 
     def states(self, begin: float = 0.0, end: float = math.inf) -> list[str]:
         """In order, repetitions left out."""
-        found = [c.state for c in self.commands if begin <= c.clock < end]
-        return [state for k, state in enumerate(found) if k == 0 or found[k - 1] != state]
+        every = [c.state for c in self.commands if begin <= c.clock < end]
+        return [state for k, state in enumerate(every) if k == 0 or every[k - 1] != state]
 
     def hand_speed(self, begin: float, end: float) -> float:
         speed = np.linalg.norm(np.diff(self.hand, axis=0), axis=1) / DT
@@ -141,33 +141,33 @@ def keeps_its_limits(messages: Sequence[dict[str, Any]], robot: Robot) -> None:
 
 def test_it_approaches_then_follows(arm: Robot) -> None:
     pose = person(12.0)
-    found = Session(arm, stream_info(pose)).run(live_poses(pose))
-    assert found.states() == ["approach", "follow"]
-    began = next(c.clock for c in found.commands if c.state == "follow")
+    run = Session(arm, stream_info(pose)).run(live_poses(pose))
+    assert run.states() == ["approach", "follow"]
+    began = next(c.clock for c in run.commands if c.state == "follow")
     assert 0.5 < began < 5.0
-    assert found.hand_speed(0.0, 1.0) < 1.2 * (APPROACH_SPEED + 0.1)
-    error = np.array([c.error[0] for c in found.commands if c.clock > began + 1.0])
+    assert run.hand_speed(0.0, 1.0) < 1.2 * (APPROACH_SPEED + 0.1)
+    error = np.array([c.error[0] for c in run.commands if c.clock > began + 1.0])
     assert np.median(error[:, 0]) < 0.003
     assert error[:, 0].max() < 0.02
     assert np.isfinite(error).all()
-    keeps_its_limits(found.messages(), arm)
+    keeps_its_limits(run.messages(), arm)
 
 
 def test_the_aims_are_those_of_a_recording(arm: Robot) -> None:
     """Of a person who stands both ways to a target, which share little, agree; of one who moves, but for the delay."""
     still = person(3.0, swing=0.0)
     target = compute_arm_targets(still, arm).hands[0]
-    found = Session(arm, stream_info(still)).run(live_poses(still)[:5])
-    aim = found.stream._extrapolate(0, 0.0, True)
+    run = Session(arm, stream_info(still)).run(live_poses(still)[:5])
+    aim = run.stream._extrapolate(0, 0.0, True)
     assert np.allclose(aim.position, target.position[5], atol=1e-9)
     assert np.allclose(aim.rotation, target.rotation[5], atol=1e-9)
     assert np.allclose(aim.swivel, target.swivel[5], atol=1e-9)
     pose = person(8.0)
     target = compute_arm_targets(pose, arm).hands[0]
-    found = Session(arm, stream_info(pose))
-    aims = np.array([(found.run([p]), found.stream._extrapolate(0, 0.0, True).position)[1] for p in live_poses(pose)])
+    run = Session(arm, stream_info(pose))
+    aims = np.array([(run.run([p]), run.stream._extrapolate(0, 0.0, True).position)[1] for p in live_poses(pose)])
     behind = [np.linalg.norm(aims[100 + d : 700 + d] - target.position[100:700], axis=1).mean() for d in range(12)]
-    assert abs(DT * int(np.argmin(behind)) - found.stream.delay_s) < DT
+    assert abs(DT * int(np.argmin(behind)) - run.stream.delay_s) < DT
     assert min(behind) < 0.003
 
 
@@ -216,25 +216,25 @@ def test_a_jump_of_a_metre_is_gone_after_slowly(arm: Robot) -> None:
     points = dict(pose.points)
     for name in ("right_elbow", "right_wrist", "right_palm"):
         points[name] = points[name] + np.where(pose.time > 6.0, 1.0, 0.0)[:, None] * [0.0, 0.0, 1.0]
-    found = Session(arm, stream_info(pose)).run(live_poses(replace(pose, points=points)))
-    assert found.states(5.0, 6.0) == ["follow"]
-    assert found.states(6.02, 6.5) == ["approach"]
-    assert "jumped" in found.commands[610].reason
-    assert found.hand_speed(6.5, 7.5) < 0.6  # what is left of the swing dies down before
-    assert found.states(12.0) == ["follow"]
-    keeps_its_limits(found.messages(), arm)
+    run = Session(arm, stream_info(pose)).run(live_poses(replace(pose, points=points)))
+    assert run.states(5.0, 6.0) == ["follow"]
+    assert run.states(6.02, 6.5) == ["approach"]
+    assert "jumped" in run.commands[610].reason
+    assert run.hand_speed(6.5, 7.5) < 0.6  # what is left of the swing dies down before
+    assert run.states(12.0) == ["follow"]
+    keeps_its_limits(run.messages(), arm)
 
 
 def test_five_seconds_out_of_reach(arm: Robot) -> None:
     pose = far_away(person(14.0, swing=0.0), (4.0, 9.0), 1.6)
-    found = Session(arm, stream_info(pose)).run(live_poses(pose))
+    run = Session(arm, stream_info(pose)).run(live_poses(pose))
     reach = arm.arms[0].reach
-    far = np.linalg.norm(np.array(found.hand) - arm.arms[0].shoulder, axis=1)
+    far = np.linalg.norm(np.array(run.hand) - arm.arms[0].shoulder, axis=1)
     assert 0.9 * reach < far[700:890].max() <= reach
-    assert found.hand_speed(7.5, 8.9) < 0.01  # still at the reach: it does not shake
-    assert max(np.abs(c.a).max() for c in found.commands[750:890]) < 0.6
-    assert found.commands[-1].error[0, 0] < 0.01
-    keeps_its_limits(found.messages(), arm)
+    assert run.hand_speed(7.5, 8.9) < 0.01  # still at the reach: it does not shake
+    assert max(np.abs(c.a).max() for c in run.commands[750:890]) < 0.6
+    assert run.commands[-1].error[0, 0] < 0.01
+    keeps_its_limits(run.messages(), arm)
 
 
 def test_a_pose_that_is_no_number_stops_the_robot(arm: Robot) -> None:
@@ -244,10 +244,10 @@ def test_a_pose_that_is_no_number_stops_the_robot(arm: Robot) -> None:
         poses[k] = poses[k]._replace(points=np.full_like(poses[k].points, np.nan))
     poses[560] = poses[560]._replace(quat_WL=np.full_like(poses[560].quat_WL, np.nan))
     poses[570] = poses[570]._replace(quat_WL=np.zeros_like(poses[570].quat_WL))
-    found = Session(arm, stream_info(pose)).run(poses)
-    assert found.states(4.0) == ["follow", "hold", "approach", "follow"]
-    assert found.commands[515].reason == "no sound pose for 0.1 s"
-    keeps_its_limits(found.messages(), arm)
+    run = Session(arm, stream_info(pose)).run(poses)
+    assert run.states(4.0) == ["follow", "hold", "approach", "follow"]
+    assert run.commands[515].reason == "no sound pose for 0.1 s"
+    keeps_its_limits(run.messages(), arm)
 
 
 def test_a_lost_sensor_slows_it_and_its_return_is_no_jump(arm: Robot) -> None:
@@ -263,50 +263,50 @@ def test_a_lost_sensor_slows_it_and_its_return_is_no_jump(arm: Robot) -> None:
             points[at] = points[elbow] + last.points[at] - last.points[elbow]
         quat[row] = last.quat_WL[row]
         poses[k] = poses[k]._replace(points=points, quat_WL=quat, lost=np.arange(3) == row)
-    found = Session(arm, stream_info(pose)).run(poses)
+    run = Session(arm, stream_info(pose)).run(poses)
     usual = Session(arm, stream_info(pose)).run(live_poses(pose))
-    assert found.states(4.9, 5.3) == ["follow", "slow"]
-    assert found.commands[550].reason == "no samples from right forearm"
+    assert run.states(4.9, 5.3) == ["follow", "slow"]
+    assert run.commands[550].reason == "no samples from right forearm"
     assert usual.hand_speed(5.0, 7.0) > 0.8
-    assert found.hand_speed(5.5, 7.0) < 0.5
-    assert found.hand_speed(7.0, 7.5) < 0.8 * usual.hand_speed(7.0, 7.5)
-    assert found.states(11.0) == ["follow"]
-    keeps_its_limits(found.messages(), arm)
+    assert run.hand_speed(5.5, 7.0) < 0.5
+    assert run.hand_speed(7.0, 7.5) < 0.8 * usual.hand_speed(7.0, 7.5)
+    assert run.states(11.0) == ["follow"]
+    keeps_its_limits(run.messages(), arm)
 
 
 def test_an_uncertain_hand_is_slow(arm: Robot) -> None:
     pose = person(10.0, swing=45.0)
     poses = live_poses(pose)
     poses[500:800] = live_poses(pose, std=0.5)[500:800]
-    found = Session(arm, stream_info(pose)).run(poses)
-    assert found.states(4.9, 7.9) == ["follow", "slow"]
-    assert re.fullmatch(r"the right hand is uncertain by \d{3} mm", found.commands[600].reason)
-    assert found.hand_speed(6.0, 8.0) < 1.3 * APPROACH_SPEED
-    assert found.states(9.5) == ["follow"]
-    keeps_its_limits(found.messages(), arm)
+    run = Session(arm, stream_info(pose)).run(poses)
+    assert run.states(4.9, 7.9) == ["follow", "slow"]
+    assert re.fullmatch(r"the right hand is uncertain by \d{3} mm", run.commands[600].reason)
+    assert run.hand_speed(6.0, 8.0) < 1.3 * APPROACH_SPEED
+    assert run.states(9.5) == ["follow"]
+    keeps_its_limits(run.messages(), arm)
 
 
 def test_a_pause_of_half_a_second_holds_and_goes_on_by_itself(arm: Robot) -> None:
     pose = person(9.0, swing=45.0)
     poses: list[LivePose | None] = [*live_poses(pose)]
     poses[500:550] = [None] * 50
-    found = Session(arm, stream_info(pose)).run(poses)
-    assert found.states(4.9) == ["follow", "hold", "approach", "follow"]
-    first_hold = next(c.clock for c in found.commands if c.clock > 4.0 and c.state == "hold")
+    run = Session(arm, stream_info(pose)).run(poses)
+    assert run.states(4.9) == ["follow", "hold", "approach", "follow"]
+    first_hold = next(c.clock for c in run.commands if c.clock > 4.0 and c.state == "hold")
     assert abs(first_hold - 5.1) < 0.015
-    moving = np.array([np.abs(c.v).max() for c in found.commands])
+    moving = np.array([np.abs(c.v).max() for c in run.commands])
     assert moving[505] > 0.2
     assert moving[548] < 0.05
-    keeps_its_limits(found.messages(), arm)
+    keeps_its_limits(run.messages(), arm)
 
 
 def test_a_pause_of_three_seconds_stops_it_until_somebody_says_so(arm: Robot) -> None:
     pose = person(16.0, swing=45.0)
     poses: list[LivePose | None] = [*live_poses(pose)]
     poses[500:800] = [None] * 300
-    found = Session(arm, stream_info(pose)).run(poses, resume_at=1100)
-    assert found.states(4.9) == ["follow", "hold", "stopped", "approach", "follow"]
-    halted = [c for c in found.commands if c.state == "stopped"]
+    run = Session(arm, stream_info(pose)).run(poses, resume_at=1100)
+    assert run.states(4.9) == ["follow", "hold", "stopped", "approach", "follow"]
+    halted = [c for c in run.commands if c.state == "stopped"]
     assert 5.99 < halted[0].clock < 6.5
     assert halted[-1].clock == pytest.approx(10.99)
     for c in halted:
@@ -314,7 +314,7 @@ def test_a_pause_of_three_seconds_stops_it_until_somebody_says_so(arm: Robot) ->
         assert not c.a.any()
         assert np.array_equal(c.u, halted[0].u)
         assert c.reason == "no sound pose for 1 s"
-    keeps_its_limits(found.messages(), arm)
+    keeps_its_limits(run.messages(), arm)
     # Said while nothing comes it is not forgotten: the next pose goes on.
     early = Session(arm, stream_info(pose)).run(poses, resume_at=750)
     assert early.states(7.4, 8.3) == ["stopped", "hold", "approach"]
@@ -327,16 +327,16 @@ def test_braking_from_any_moment_keeps_the_limits(arm: Robot) -> None:
     poses: list[LivePose | None] = [*live_poses(pose)]
     for begin in range(150, 1900, 61):
         poses[begin : begin + 12 + begin % 37] = [None] * (12 + begin % 37)
-    found = Session(arm, stream_info(pose)).run(poses[: len(pose.time)])
-    assert found.states().count("hold") > 20
-    keeps_its_limits(found.messages(), arm)
+    run = Session(arm, stream_info(pose)).run(poses[: len(pose.time)])
+    assert run.states().count("hold") > 20
+    keeps_its_limits(run.messages(), arm)
 
 
 def test_a_turned_base_is_the_same_motion(arm: Robot, tmp_path: Path) -> None:
     turned = load_robot(find_map(str(write_arm(tmp_path, turned=(0.4, -0.7, 2.0)))))
     pose = person(6.0)
     straight, other = (Session(robot, stream_info(pose)).run(live_poses(pose)) for robot in (arm, turned))
-    u, w = (np.array([c.u for c in found.commands]) for found in (straight, other))
+    u, w = (np.array([c.u for c in each.commands]) for each in (straight, other))
     assert np.abs(u - w).max() < 1e-3
     assert np.ptp(u, axis=0).max() > 0.5
     assert other.states() == ["approach", "follow"]
@@ -598,7 +598,7 @@ def test_the_same_recording_gives_the_same_commands(
     """A session as fast as possible and what it recorded: bit-identical, without this machine's clock."""
     sent: list[bytes] = []
     monkeypatch.setattr("wepose_pin.live.robot.UdpSender.send", lambda _, data: sent.append(data))
-    recording = first(simulation.recording("bits"), 1500)
+    recording = first(simulation.recording("bits"), 1100)
 
     def commands(recording: Any, record: Path | None = None) -> list[bytes]:
         sent.clear()

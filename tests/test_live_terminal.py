@@ -12,10 +12,11 @@ import termios
 import textwrap
 import time
 
+import numpy as np
 import pytest
 from rich.console import Console
 
-from wepose_pin.live.state import SensorStatus, Status
+from wepose_pin.live.state import UNKNOWN_HEADING_STD, SensorStatus, Status, format_heading_std
 from wepose_pin.live.terminal import TerminalView, build_table
 
 
@@ -68,6 +69,17 @@ def test_a_row_a_sensor() -> None:
 def test_what_is_not_known_is_a_dash() -> None:
     row = printed(status(sensors=(sensor(heading_std=math.nan, gyro_bias=(math.nan,) * 3),))).splitlines()
     assert next(line for line in row if line.startswith("torso")).split()[4:8] == ["–"] * 4
+
+
+def test_a_heading_of_which_nothing_is_known_is_unknown() -> None:
+    """A direction that is uniform on the circle has a standard deviation of 180°/√3 = 103.9°."""
+    uniform = np.random.default_rng(0).uniform(-np.pi, np.pi, 100_000).std()
+    assert abs(uniform - UNKNOWN_HEADING_STD) < 0.01
+    assert format_heading_std(math.nan) == "–"
+    assert format_heading_std(math.radians(103.0)) == "103.0"
+    assert {format_heading_std(math.radians(degrees)) for degrees in (104.0, 230.0, 1e9)} == {"unknown"}
+    rows = printed(status(sensors=(sensor(heading_std=math.radians(230.0)),))).splitlines()
+    assert next(line for line in rows if line.startswith("torso")).split()[-3] == "unknown"
 
 
 def test_the_start_pose_has_a_bar_and_the_rest_none() -> None:

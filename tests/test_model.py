@@ -582,10 +582,10 @@ def test_a_human_with_such_textures_is_tracked(data: Path) -> None:
 
 @pytest.mark.parametrize("change", [{"left_upper_arm": 1.10}, {"trunk": 0.1}, {}])
 def test_implausible_lengths_are_warned_of(change: dict[str, float]) -> None:
-    found = load_model(lengths=change).diagnostics
-    assert {d.place: d.value for d in found} == pytest.approx(change)
-    assert {d.code for d in found} <= {"model-length-implausible"}
-    for diagnostic in found:
+    diagnostics = load_model(lengths=change).diagnostics
+    assert {d.place: d.value for d in diagnostics} == pytest.approx(change)
+    assert {d.code for d in diagnostics} <= {"model-length-implausible"}
+    for diagnostic in diagnostics:
         assert f"is {change[diagnostic.place]:g} m long; adults have " in render(diagnostic).what
 
 
@@ -623,8 +623,8 @@ def test_a_torso_that_cannot_move_is_warned_of(tmp_path: Path) -> None:
 
 def test_warnings_of_the_body_reach_the_summary(half_minute: Recording) -> None:
     body = load_model(lengths={"left_upper_arm": 1.1})
-    found = map(from_json, summarize(track(half_minute, model=body)).content["diagnostics"])
-    assert [d.place for d in found if d.code == "model-length-implausible"] == ["left_upper_arm"]
+    diagnostics = map(from_json, summarize(track(half_minute, model=body)).content["diagnostics"])
+    assert [d.place for d in diagnostics if d.code == "model-length-implausible"] == ["left_upper_arm"]
 
 
 HINGE = triple("left_upper_arm", "left_forearm", "0 0 -0.3", ("0 1 0",), ("0 0 0",))
@@ -719,12 +719,12 @@ def test_the_table_as_keywords_and_as_files(tmp_path: Path) -> None:
     by_keywords = load_model(file, segments=OTHER | {"torso": "L_torso"}, points=points)
     by_table = load_model(written(tmp_path, table_toml(more=PALMS), "any.toml"))
     written(tmp_path, table_toml(more=PALMS), "model.toml")
-    found = load_model(file)
+    model = load_model(file)
     plain = load_model(written(tmp_path, small(), "plain.urdf"))
-    for body in (by_keywords, by_table, found):
+    for body in (by_keywords, by_table, model):
         assert body.lengths == pytest.approx(plain.lengths, abs=1e-12)
         assert set(body.joints) == {OTHER.get(name, name) for name in plain.joints}
-    again = load_model(written(tmp_path, found.urdf(), "again.urdf"))  # beside a table for another file
+    again = load_model(written(tmp_path, model.urdf(), "again.urdf"))  # beside a table for another file
     assert again.lengths == pytest.approx(plain.lengths, abs=1e-12)
 
 

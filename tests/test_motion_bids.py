@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,10 @@ import polars as pl
 import pytest
 from test_export import a_pose, with_gap, write_folder
 
+import wepose_pin as wp
 from wepose_pin import cli
 from wepose_pin.angles import joint_angles
+from wepose_pin.recording import Mark
 from wepose_pin.writers.export import export
 
 # From the specification, motion: channel types and components, and the columns that come first.
@@ -97,6 +100,45 @@ def test_what_is_not_known_is_missing(tmp_path: Path) -> None:
     assert "NaN" not in file.read_text()
 
 
+def test_phases_and_marks_are_events_on_the_times_of_the_motion(tmp_path: Path) -> None:
+    pose = a_pose(n=400)  # of 4 s
+    pose = replace(pose, time=pose.time - pose.time[0] + 100.0)
+    folder = write_folder(tmp_path / "r", pose)
+    marks = [[101.25, "trial\t3"], [120.0, "after it"]]
+    about = {"recorded_phases": {"start": [[99.0, 100.5]], "reach": [[101.0, 102.5], [103.0, 103.5]]}}
+    (folder / "summary.json").write_text(json.dumps({**about, "recorded_marks": marks}), encoding="utf-8")
+
+    def read(interval: tuple[float, float] | None) -> list[tuple[object, ...]]:
+        out = tmp_path / "ds"
+        export(folder, out, "motion-bids", bids_name="sub-1_task-a", force=True, interval=interval)
+        files = {path.suffix: path for path in out.rglob("*_events.*")}
+        if not files:
+            return []
+        table = pl.read_csv(files[".tsv"], separator="\t")
+        assert set(table.columns) == set(json.loads(files[".json"].read_text()))
+        assert table.columns == ["onset", "duration", "trial_type"]
+        return table.rows()
+
+    start, first, mark, second = (-1.0, 1.5, "start"), (1.0, 1.5, "reach"), (1.25, 0.0, "trial 3"), (3.0, 0.5, "reach")
+    assert read(None) == [start, first, mark, second]
+    assert read((102.0, 102.9)) == [(-1.0, 1.5, "reach")]
+    assert read((102.6, 102.9)) == []  # and those of the recording that it replaces are gone
+    [motion] = (tmp_path / "ds").rglob("*_motion.tsv")
+    assert len(motion.read_text().splitlines()) == 31
+
+
+def test_a_mark_of_a_live_session_comes_through_the_result(tmp_path: Path) -> None:
+    simulation = wp.simulate(wp.population_subject(1.75).lengths, seed=1, clasp_s=10.0, circles=0)
+    recording = replace(simulation.recording(), marks=(Mark(6.0, "cup"),))
+    result = wp.track(recording)
+    for k, each in enumerate((result, result.source, wp.load_result(result.save(tmp_path / "r")), tmp_path / "r")):
+        out = tmp_path / f"ds{k}"
+        export(each, out, "motion-bids", bids_name="sub-1")
+        [events] = out.rglob("*_events.tsv")
+        onset = 6.0 - float(result.time[0])
+        assert (round(onset, 6), 0.0, "cup") in pl.read_csv(events, separator="\t").rows()
+
+
 def test_a_dataset_is_added_to_and_nothing_is_lost(dataset: Path, result: Path, tmp_path: Path) -> None:
     out = shutil.copytree(dataset, tmp_path / "ds")
     (out / "participants.tsv").write_text("participant_id\tage\nsub-01\t31\n")
@@ -163,16 +205,32 @@ def validate(dataset: Path) -> dict[str, Any]:
     if validator is None:
         pytest.skip("the BIDS validator is not installed")
     run = subprocess.run([validator, str(dataset), "--json"], capture_output=True, text=True, timeout=300, check=False)
-    found: dict[str, Any] = json.loads(run.stdout)
-    return found
+    report: dict[str, Any] = json.loads(run.stdout)
+    return report
+
+
+@pytest.mark.peer
+def test_the_validator_takes_the_events(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "r", a_pose(n=400))
+    begin = float(a_pose().time[0])
+    about = {"recorded_phases": {"start": [[begin, begin + 1.0]]}, "recorded_marks": [[begin + 2.0, "cup"]]}
+    (folder / "summary.json").write_text(json.dumps(about), encoding="utf-8")
+    export(folder, tmp_path / "ds", "motion-bids", bids_name="sub-01_task-reach_run-1")
+    issues = validate(tmp_path / "ds")["issues"]["issues"]
+    assert [issue for issue in issues if issue["severity"] == "error"] == []
+    left = {issue["code"] for issue in issues} - {"SIDECAR_KEY_RECOMMENDED", "JSON_KEY_RECOMMENDED"}
+    assert left == {"NO_AUTHORS", "TOO_FEW_AUTHORS"}
+    [events] = (tmp_path / "ds").rglob("*_events.tsv")
+    events.write_text(events.read_text().replace("onset", "begin"))
+    assert any(issue["severity"] == "error" for issue in validate(tmp_path / "ds")["issues"]["issues"])
 
 
 @pytest.mark.peer
 def test_the_validator_finds_no_error(dataset: Path, tmp_path: Path) -> None:
-    found = validate(dataset)
-    assert sorted(found["summary"]["tasks"]) == ["reach", "sit"]
-    assert found["summary"]["modalities"] == ["motion"]
-    issues = found["issues"]["issues"]
+    report = validate(dataset)
+    assert sorted(report["summary"]["tasks"]) == ["reach", "sit"]
+    assert report["summary"]["modalities"] == ["motion"]
+    issues = report["issues"]["issues"]
     assert [issue for issue in issues if issue["severity"] == "error"] == []
     left = {issue["code"] for issue in issues} - {"SIDECAR_KEY_RECOMMENDED", "JSON_KEY_RECOMMENDED"}
     assert left == {"EVENTS_TSV_MISSING", "NO_AUTHORS", "TOO_FEW_AUTHORS"}  # warnings: there are no events or authors

@@ -191,11 +191,11 @@ def test_the_interval_of_a_difference_is_welchs() -> None:
     rng = np.random.default_rng(7)
     first, second = rng.normal(60.0, 3.0, 8), rng.normal(63.0, 6.0, 13)
     one, two = (compute_statistics(values, np.full(len(values), 2.0)) for values in (first, second))
-    found = compare_statistics(one, two)
+    difference = compare_statistics(one, two)
     low, high = ttest_ind(second, first, equal_var=False).confidence_interval(0.95)
-    assert (found.low, found.high) == pytest.approx((low, high), rel=1e-9)
-    assert found.value == pytest.approx(second.mean() - first.mean())
-    assert found.std == pytest.approx(np.hypot(2.0, 2.0))
+    assert (difference.low, difference.high) == pytest.approx((low, high), rel=1e-9)
+    assert difference.value == pytest.approx(second.mean() - first.mean())
+    assert difference.std == pytest.approx(np.hypot(2.0, 2.0))
     few = compare_statistics(one, Statistics(1, 5.0, float("nan"), float("nan")))
     assert few.value == pytest.approx(5.0 - first.mean())
     assert np.isnan([few.low, few.high, few.std]).all()
@@ -205,10 +205,10 @@ def test_curves_are_compared_after_the_full_turns_between_them() -> None:
     pose = pose_of(1)
     curve = analyze_movement("a", pose, {}, MovementOptions()).curves["right_elbow"][0]
     higher = curve._replace(mean=curve.mean + 2.0 * np.pi + 0.1 * np.sin(np.linspace(0.0, np.pi, 101)))
-    found = compare_curves(curve, higher)
-    assert found.largest == pytest.approx(0.1)
-    assert found.percent == 50.0
-    assert found.rms == pytest.approx(0.1 / np.sqrt(2.0), rel=0.01)
+    difference = compare_curves(curve, higher)
+    assert difference.largest == pytest.approx(0.1)
+    assert difference.percent == 50.0
+    assert difference.rms == pytest.approx(0.1 / np.sqrt(2.0), rel=0.01)
     lost = curve._replace(mean=np.full(101, np.nan))
     assert np.isnan(compare_curves(curve, lost)).all()
 
@@ -286,8 +286,8 @@ def test_a_folder_of_two_results_is_made_again_from_its_provenance(
 
 def test_a_phase_marks_the_repetitions(results: tuple[Path, Path], tmp_path: Path) -> None:
     assert run(results[0], "-o", tmp_path / "a", "--repetitions", "bend", "--interval", 3, 9) == 0
-    found = pl.read_csv(tmp_path / "a" / "repetitions.csv").unique("repetition", maintain_order=True)
-    assert found.select("from_s", "to_s").rows() == [(4.0, 6.0), (6.0, 8.0)]
+    table = pl.read_csv(tmp_path / "a" / "repetitions.csv").unique("repetition", maintain_order=True)
+    assert table.select("from_s", "to_s").rows() == [(4.0, 6.0), (6.0, 8.0)]
     assert not (tmp_path / "a" / "repetitions.svg").exists()
     assert not (tmp_path / "a" / "comparison.csv").exists()
 

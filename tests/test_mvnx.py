@@ -265,7 +265,7 @@ def test_lost_frames_are_gaps(tmp_path: Path) -> None:
     recording = wp.load_session(session(tmp_path, path.name, ("torso",)))
     assert len(recording) == 60
     (gap,) = (each for each in recording.diagnostics if each.code != "arm-frames-assumed")
-    assert (gap.code, gap.place, gap.value) == ("short-gaps-bridged", "torso", 1)
+    assert (gap.code, gap.place, gap.facts["gaps"]) == ("short-gaps-bridged", "torso", 1)
     assert gap.facts["samples"] == 2
     path = mvnx(tmp_path, turning(58), index=[k + 40 * (k > 20) for k in range(58)])
     with pytest.raises(BadData, match=r"rows are missing after row 21"):

@@ -12,10 +12,11 @@ import pytest
 from reading import headings, rows, text_of
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.errors import BadData, BadOption
 from wepose_pin.evaluation import evaluate
 from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import BodyModel, load_model
-from wepose_pin.model.table import format_table
+from wepose_pin.model.table_file import format_table
 from wepose_pin.readers.describe import Wearer, describe_file
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report import render_track_report
@@ -26,7 +27,9 @@ from wepose_pin.tracking.measures import measure_hinge, measure_tips
 from wepose_pin.writers.bvh import write_bvh
 from wepose_pin.writers.export import export
 from wepose_pin.writers.motion import Motion, find_measured_points
+from wepose_pin.writers.opensim import write_mot
 from wepose_pin.writers.result import read_result, write_result
+from wepose_pin.writers.tables import table
 
 THIGH, SHANK, FOOT, HIP = 0.42, 0.40, 0.18, 0.09  # [m]
 SEGMENTS = ("pelvis", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot")
@@ -296,3 +299,37 @@ def test_a_robots_skeleton_has_its_links_and_its_tip_lies_where_it_is(robot: Bod
     assert find_floor(robot) == 0.0
     assert find_floor(load_model()) == FLOOR_Z
     assert evaluate(pose, pose, table=robot.table).position_on_limb["tip"].worst == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_robots_joints_are_in_a_mot_and_a_csv(tmp_path: Path) -> None:
+    """In degrees and m in a .mot, as `joints.parquet` has them in a CSV file."""
+    slides = ROBOT.replace('name="end" type="fixed"', 'name="end" type="prismatic"').replace(
+        "</joint></robot>", '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    (tmp_path / "arm.urdf").write_text(slides, encoding="utf-8")
+    (tmp_path / "arm.toml").write_text(ROBOT_TABLE, encoding="utf-8")
+    body, time = load_model(tmp_path / "arm.toml"), np.arange(0.0, 2.0, 0.02)
+    R_upper = Rotation.from_euler("x", 0.5) * Rotation.from_euler("z", np.sin(time)[:, None])
+    R_lower = R_upper * Rotation.from_euler("y", 0.3)
+    pose = compute_pose(body, time, {"upper": R_upper.as_quat(), "lower": R_lower.as_quat()})
+    pose = replace(pose, joints={**pose.joints, "end": np.full(len(time), 0.25)})
+    motion = Motion(pose, body, "arm", "here")
+    assert write_mot(tmp_path / "m.mot", motion) == []
+    header, rows = (tmp_path / "m.mot").read_text(encoding="utf-8").split("endheader\n")
+    assert "nColumns=4" in header
+    labels, *cells = rows.splitlines()
+    assert labels.split("\t") == ["time", "lift", "bend", "end"]
+    values = np.array([row.split("\t") for row in cells], float)
+    np.testing.assert_allclose(values[:, 1], np.degrees(np.sin(time)), atol=1e-5)
+    np.testing.assert_allclose(values[:, 2], np.degrees(0.3), atol=1e-5)
+    np.testing.assert_array_equal(values[:, 3], 0.25)
+    with pytest.raises(BadOption, match="--names isb: here is of a mechanism"):
+        write_mot(tmp_path / "m.mot", motion, "isb")
+    rows, _ = table(motion)
+    for name, each in pose.joints.items():
+        np.testing.assert_array_equal(rows[name], each)
+    odd = replace(motion, pose=replace(pose, joints={"time": pose.joints["lift"]}))
+    for write in (table, lambda named: write_mot(tmp_path / "odd.mot", named)):
+        with pytest.raises(BadData, match="here: the joint 'time' is named as a column of the file"):
+            write(odd)
+    assert not (tmp_path / "odd.mot").exists()

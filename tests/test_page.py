@@ -73,9 +73,9 @@ def test_it_plays_by_itself_and_stands_still_at_an_address(page: Path) -> None:
     def now(at: str, milliseconds: int) -> float:
         dump = browse(page, at, "--dump-dom", milliseconds=milliseconds)
         assert 'data-wepose-ready="true"' in dump
-        found = re.search(r'id="now"[^>]*>\s*([0-9.]+)', dump)
-        assert found is not None
-        return float(found[1])
+        match = re.search(r'id="now"[^>]*>\s*([0-9.]+)', dump)
+        assert match is not None
+        return float(match[1])
 
     assert now("#t=20", 4000) == pytest.approx(20.0, abs=0.03)
     assert now("#t=20&play", 6000) > 20.1

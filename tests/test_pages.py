@@ -96,8 +96,8 @@ def test_an_arm_that_hangs_throughout_is_tracked(
 @pytest.mark.parametrize(("seconds", "noise"), [(2.0, 1e-3), (1.2, 1e-3), (6.0, 1e-9)])
 def test_a_report_of_nothing_that_moves(sensors: str, seconds: float, noise: float) -> None:
     failures: list[str] = []
-    found = track(recorded({}, seconds=seconds, noise=noise, sensors=sensors))
-    page = render_track_report(summarize(found), view="<p>", failures=failures)
+    tracked = track(recorded({}, seconds=seconds, noise=noise, sensors=sensors))
+    page = render_track_report(summarize(tracked), view="<p>", failures=failures)
     assert failures == []
     assert "nan" not in page.split("<body>")[1].replace("svg", "")
 
@@ -225,8 +225,8 @@ def test_a_calibration_outlasts_its_report(
     assert run("calibrate", tmp_path, "-o", tmp_path / "anna") in (0, 3)
     assert names(tmp_path / "anna") == {"subject.toml", "subject.urdf", "calibration.json"} | left
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "ValueError" in line]
-    found = json.loads((tmp_path / "anna" / "calibration.json").read_text())["diagnostics"]
-    (saved,) = [each for each in found if each["code"] == "page-incomplete"]
+    diagnostics = json.loads((tmp_path / "anna" / "calibration.json").read_text())["diagnostics"]
+    (saved,) = [each for each in diagnostics if each["code"] == "page-incomplete"]
     assert saved["text"]["what"] in line
 
 

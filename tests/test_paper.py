@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from test_calibration import with_rigid_shoulders
 
 from wepose_pin.calibration import Calibration, assess, calibrate, load_protocol
-from wepose_pin.calibration.paper import check_paper_formulation
+from wepose_pin.calibration.paper import _Constraints, _minimise, check_paper_formulation
+from wepose_pin.calibration.solver import MIN_LENGTH
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadOption, BadSession, NoSolution
@@ -144,22 +145,32 @@ def test_the_outcome_holds_lengths_and_says_what_its_deviations_lack(estimated: 
     assert 1.0 < estimated.effective_sample_size < 12.0  # 30 s of errors that last 3 s and more
 
 
+def test_a_t_pose_beside_the_clasp_is_left_out(
+    made: tuple[Person, Simulation, Recording], estimated: Calibration
+) -> None:
+    person, _, recording = made
+    recording = replace(recording, phases={**recording.phases, "t_pose": recording.phases["start"]})
+    measured = {"shoulder_width": person.lengths["shoulder_width"]}
+    found = calibrate(recording, measured=measured, prior=person.prior, method="smekf", formulation="paper")
+    assert found.subject.lengths == estimated.subject.lengths
+
+
 def test_exact_orientations_give_the_lengths_back() -> None:
     person = simulate_person(11)
     simulation = simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=20.0, circles=0)
     sensors = {name: OrientationSensor(quat_WS=quat) for name, quat in simulation.quat_WL.items()}
     recording = replace(simulation.recording("exact"), sensors=sensors)
     measured = {name: person.lengths[name] for name in ("left_upper_arm", "left_hand", "right_forearm")}
-    found = calibrate(recording, measured=measured, formulation="paper")
+    calibration = calibrate(recording, measured=measured, formulation="paper")
     for name in ("shoulder_width", *(n for n in LENGTHS if "arm" in n or "hand" in n)):
-        assert found.subject.lengths[name] == pytest.approx(person.lengths[name], abs=1e-6), name
-    assert found.rms_gap < 1e-6
+        assert calibration.subject.lengths[name] == pytest.approx(person.lengths[name], abs=1e-6), name
+    assert calibration.rms_gap < 1e-6
 
 
 def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulation, Recording]) -> None:
     person, _, recording = made
-    found = calibrate(recording, measured={"shoulder_width": 0.6}, prior=person.prior, formulation="paper")
-    quality = assess(found)
+    calibration = calibrate(recording, measured={"shoulder_width": 0.6}, prior=person.prior, formulation="paper")
+    quality = assess(calibration)
     (contradicted,) = [each for each in quality.reasons if each.code == "measured-length-contradicted"]
     assert quality.quality == "fail"
     width = 1e3 * person.prior.lengths["shoulder_width"]
@@ -168,9 +179,9 @@ def test_a_measured_length_that_nobody_has_is_named(made: tuple[Person, Simulati
 
 def test_lengths_that_are_all_measured_stay(made: tuple[Person, Simulation, Recording]) -> None:
     person, _, recording = made
-    found = calibrate(recording, measured=person.lengths, prior=person.prior, formulation="paper").subject
-    assert found.lengths == pytest.approx(person.lengths, abs=1e-9)
-    np.testing.assert_allclose(found.covariance, 0.003**2 * np.eye(8), atol=1e-12)
+    subject = calibrate(recording, measured=person.lengths, prior=person.prior, formulation="paper").subject
+    assert subject.lengths == pytest.approx(person.lengths, abs=1e-9)
+    np.testing.assert_allclose(subject.covariance, 0.003**2 * np.eye(8), atol=1e-12)
 
 
 def test_noise_in_the_orientations_makes_arms_short() -> None:
@@ -204,9 +215,9 @@ def test_mounts_of_the_prior_are_used_and_stay(made: tuple[Person, Simulation, R
     person, simulation, recording = made
     prior = replace(person.prior, mounts=simulation.quat_LS)
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
-    found = calibrate(recording, measured=measured, prior=prior, method="smekf", formulation="paper")
-    assert found.subject.mounts == simulation.quat_LS
-    assert found.subject.lengths["left_upper_arm"] != found.prior.lengths["left_upper_arm"]
+    calibration = calibrate(recording, measured=measured, prior=prior, method="smekf", formulation="paper")
+    assert calibration.subject.mounts == simulation.quat_LS
+    assert calibration.subject.lengths["left_upper_arm"] != calibration.prior.lengths["left_upper_arm"]
 
 
 @pytest.mark.parametrize(
@@ -383,3 +394,13 @@ def test_the_validation_has_rows_of_the_papers_protocol(monkeypatch: pytest.Monk
     assert len({figures[method]["from shoulders"] for method in figures if method != WITH_TRUNK}) == 4
     assert figures["smekf"]["from shoulders"] < figures[PROTOCOL]["from shoulders"]
     assert [row[-1] for row in make_overview_table(list(rows.values())).rows] == ["smekf", "smekf"]
+
+
+def test_a_quadratic_program_without_a_solution_is_an_error_and_prints_nothing(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """A stated length below the bound of all lengths."""
+    constraints = _Constraints(np.array([[1.0, 0.0]]), np.array([0.5 * MIN_LENGTH]), np.eye(1))
+    with pytest.raises(NoSolution, match="no solution"):
+        _minimise(np.eye(2)[None], constraints, ("left_forearm", "left_hand"))
+    assert capfd.readouterr() == ("", "")

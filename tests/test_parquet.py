@@ -120,10 +120,10 @@ def test_what_polars_writes_is_taken(options: dict[str, Any], compression: Any, 
     })  # fmt: skip
     for part in (table, table.head(0), table.head(1)):
         part.write_parquet(tmp_path / "a.parquet", compression=compression, **options)
-        found = read_contents(tmp_path / "a.parquet")
-        assert found.rows == part.height
-        assert list(found.sizes) == part.columns
-        assert all(size >= 8 * part.height for size in found.sizes.values())
+        contents = read_contents(tmp_path / "a.parquet")
+        assert contents.rows == part.height
+        assert list(contents.sizes) == part.columns
+        assert all(size >= 8 * part.height for size in contents.sizes.values())
         assert tables.read_table(tmp_path / "a.parquet").equals(part)
 
 

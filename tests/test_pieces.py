@@ -18,7 +18,7 @@ from benchmarks.long_recordings import there_and_back
 from wepose_pin.calibration import calibrate
 from wepose_pin.cli import main
 from wepose_pin.errors import BadData, BadOption
-from wepose_pin.filters import METHODS, SensorRun, chunk_multiple, run_filter
+from wepose_pin.filters import METHODS, FilterSettings, SensorRun, chunk_multiple, run_filter
 from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.kinematics import build_pose_table
 from wepose_pin.model import load_model
@@ -44,9 +44,11 @@ def made(person: Person) -> Simulation:
 @pytest.fixture(scope="module")
 def subject(made: Simulation, person: Person) -> Subject:
     """Calibrated, with hinges: headings are held together by them and by the hands."""
-    found = calibrate(made.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std)
-    assert set(found.subject.hinges) == {"left_elbow", "right_elbow"}
-    return found.subject
+    calibration = calibrate(
+        made.recording(), measured=person.measured, prior=person.prior, measured_std=person.measured_std
+    )
+    assert set(calibration.subject.hinges) == {"left_elbow", "right_elbow"}
+    return calibration.subject
 
 
 @pytest.fixture
@@ -64,7 +66,10 @@ def joined(pieces: list[TrackedRecording]) -> pl.DataFrame:
     return pl.concat([build_pose_table(piece.pose, covariance=True) for piece in pieces])
 
 
-@pytest.mark.parametrize(("method", "seconds"), [("amekf", 7.31), ("smekf", 5.0), ("ncf", 2.0)])
+@pytest.mark.parametrize(
+    ("method", "seconds"),
+    [("amekf", 7.31), *(pytest.param(*case, marks=pytest.mark.slow) for case in (("smekf", 5.0), ("ncf", 2.0)))],
+)
 def test_pieces_put_together_are_the_whole(session: Path, subject: Subject, method: str, seconds: float) -> None:
     whole = track(load_session(session), subject, method=method)
     pieces = list(track_session(session, subject, options=TrackOptions(method), seconds=seconds))
@@ -98,9 +103,11 @@ def test_of_a_csv_too_and_with_lost_samples(session: Path, subject: Subject, mon
     ours, wanted = joined(pieces), build_pose_table(whole.pose, covariance=True)
     assert ours.equals(wanted)
     assert wanted["left_forearm_gap"].sum() == pytest.approx(100 * (13.0 + 14.0), abs=3)
-    found, of_whole = (of["sensors"]["torso"] for of in (summary_of(pieces), summarize(whole).content))
+    of_pieces, of_whole = (of["sensors"]["torso"] for of in (summary_of(pieces), summarize(whole).content))
     assert (
-        (found["gaps"], found["gap_s"]) == (of_whole["gaps"], of_whole["gap_s"]) == (2, pytest.approx(14.8, abs=0.03))
+        (of_pieces["gaps"], of_pieces["gap_s"])
+        == (of_whole["gaps"], of_whole["gap_s"])
+        == (2, pytest.approx(14.8, abs=0.03))
     )
     with pytest.raises(BadData, match=r"--gaps"):
         list(track_session(session, subject, seconds=6.0))
@@ -156,20 +163,20 @@ def test_filters_in_pieces(made: Simulation, method: str) -> None:
     """The last two pieces of the smoother have seen all that lies behind them."""
     gyro, accel = one_sensor(made)
     noise = estimate_noise(gyro[50:450], accel[50:450], RATE)
-    whole = run_filter(gyro, accel, RATE, noise, method)
+    whole = run_filter(gyro, accel, RATE, noise, FilterSettings(method))
     size = 40 * chunk_multiple(method, RATE)
     edges = [*range(0, len(gyro) - size, size), len(gyro)] if size > 40 else [0, 60, 1000, 1001, 3000, len(gyro)]
-    run, found = SensorRun(RATE, noise, method), []
+    run, parts = SensorRun(RATE, noise, FilterSettings(method)), []
     for first, last in pairwise(edges):
         if (of := run.push(gyro[first:last], accel[first:last])) is not None:
-            found.append(of)
+            parts.append(of)
     if method == "smoother":
-        found.append(run.finish())
-    quat = np.concatenate([of.quat_WS for of in found])
+        parts.append(run.finish())
+    quat = np.concatenate([of.quat_WS for of in parts])
     same = slice(edges[-3], None) if method == "smoother" else slice(None)
     np.testing.assert_array_equal(quat[same], whole.quat_WS[same])
-    np.testing.assert_array_equal(np.concatenate([of.gyro_bias for of in found])[same], whole.gyro_bias[same])
-    np.testing.assert_array_equal(np.concatenate([of.static for of in found]), whole.static)
+    np.testing.assert_array_equal(np.concatenate([of.gyro_bias for of in parts])[same], whole.gyro_bias[same])
+    np.testing.assert_array_equal(np.concatenate([of.static for of in parts]), whole.static)
 
 
 @pytest.mark.slow

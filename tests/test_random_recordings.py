@@ -17,7 +17,7 @@ from random_recordings.trial import try_seed
 FOLDER = Path(__file__).parent / "random_recordings"
 # Short ones that hold between them every method, most activities, clocks, faults and invariances.
 TEN = (3, 18, 175, 193, 233, 415, 1021, 1110, 1167, 1168)
-LONGEST = (3, 18, 1021, 1110)
+LONGEST = (3, 18, 193, 1021, 1110, 1168)
 FAILED_ONCE = tomllib.loads((FOLDER / "regressions.toml").read_text(encoding="utf-8")).get("seed", [])
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,9 +16,21 @@ from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 from test_model import GAZEBO, example_robot_data_human
 
-from wepose_pin.calibration.chain import point_position
+from benchmarks.ur5_arm import write_table, write_urdf
+from wepose_pin.calibration.chain import links, rotate
 from wepose_pin.errors import BadModel
-from wepose_pin.model import BodyModel, load_model, measure_reaches
+from wepose_pin.model import BodyModel, LinkVector, load_model, measure_reaches
+
+
+def point_position(lengths: Any, quat_WK: Mapping[str, Any], way: Mapping[str, LinkVector]) -> Any:
+    """The place (3,) [m] of a point in W, in CasADi, from the orientations of the links on its way."""
+    vectors = links(lengths, quat_WK, {link: part.by_length for link, part in way.items()})
+    place = ca.SX.zeros(3)
+    for link, part in way.items():
+        place += vectors[link]
+        if np.any(part.constant):
+            place += rotate(quat_WK[link], ca.DM(part.constant))
+    return place
 
 
 def cosmik(data: Path) -> BodyModel:
@@ -28,8 +43,16 @@ def cosmik(data: Path) -> BodyModel:
     return load_model(path, segments=segments, points=points, up="+y", root="pelvis")
 
 
+def arm() -> BodyModel:
+    """A robot's arm."""
+    with TemporaryDirectory() as folder:
+        return load_model(write_table(write_urdf(Path(folder))))
+
+
 BODIES: dict[str, Callable[[Path], BodyModel]] = {
     "ours": lambda _: load_model(),
+    "whole body": lambda _: load_model("whole_body"),
+    "an arm with a table": lambda _: arm(),
     **{name: lambda data, file=file: load_model(data / "human_urdf" / file) for name, file in GAZEBO.items()},
     "cosmik": cosmik,
     "example-robot-data": lambda _: load_model(example_robot_data_human()),
@@ -96,6 +119,7 @@ def test_bodies_of_others_have_links_between_the_segments(data: Path) -> None:
 def test_a_chain_that_orientations_and_lengths_do_not_give(change: str, monkeypatch: pytest.MonkeyPatch) -> None:
     body = load_model()
     if change == "slide":
+        body = replace(body, pin=body.pin.copy())  # the package's body is read once for all
         m = body.pin
         joint = m.addJoint(m.getJointId("left_forearm"), pin.JointModelPZ(), pin.SE3.Identity(), "telescope")
         m.frames[m.getFrameId("left_palm")].parentJoint = joint

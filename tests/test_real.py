@@ -67,13 +67,13 @@ def seen_from_elsewhere(sensor: SingleSensor, still: slice = slice(0, 0)) -> Ref
 
 @pytest.mark.parametrize("still", [slice(0, 0), slice(50, 450)], ids=["bias unknown", "bias known"])
 def test_registration_finds_what_lies_between(moving: SingleSensor, still: slice) -> None:
-    (found,) = register_sensors([seen_from_elsewhere(moving, still)], (6.0, 16.0))
-    assert found.offset_s == pytest.approx(OFFSET_S, abs=1e-3)
-    assert np.degrees((Rotation.from_quat(found.quat_BS) * R_BS.inv()).magnitude()) < 0.1
-    up_W = (Rotation.from_quat(found.quat_WV) * R_VW).apply([0.0, 0.0, 1.0])
+    (registration,) = register_sensors([seen_from_elsewhere(moving, still)], (6.0, 16.0))
+    assert registration.offset_s == pytest.approx(OFFSET_S, abs=1e-3)
+    assert np.degrees((Rotation.from_quat(registration.quat_BS) * R_BS.inv()).magnitude()) < 0.1
+    up_W = (Rotation.from_quat(registration.quat_WV) * R_VW).apply([0.0, 0.0, 1.0])
     assert np.degrees(np.arccos(up_W[2])) < 0.35  # 3 mg of accelerometer bias are 0.17 deg
-    assert np.degrees(np.abs(found.gyro_bias - moving.gyro_bias.mean(axis=0)).max()) < 0.02
-    assert found.residual_deg < 0.2
+    assert np.degrees(np.abs(registration.gyro_bias - moving.gyro_bias.mean(axis=0)).max()) < 0.02
+    assert registration.residual_deg < 0.2
 
 
 def test_what_cannot_be_registered_is_said(moving: SingleSensor) -> None:
@@ -147,10 +147,10 @@ def results(data: Path, experiment: str) -> tuple[Result, ...]:
 
 
 def means(data: Path, experiment: str) -> dict[str, dict[str, float]]:
-    found = {row.method: row.figures for row in summarize(results(data, experiment))}
-    for method, figures in found.items():
+    mean = {row.method: row.figures for row in summarize(results(data, experiment))}
+    for method, figures in mean.items():
         print(f"{experiment}, {method}: " + ", ".join(f"{k} {v:.2f}" for k, v in figures.items()))
-    return found
+    return mean
 
 
 def test_the_filters_on_ring(data: Path) -> None:
@@ -167,18 +167,18 @@ def test_the_filters_on_ring(data: Path) -> None:
 
 def test_link_lengths_from_orientations_and_tip(data: Path) -> None:
     for mount, limit_mm in (("rigid", 3.0), ("loose", 15.0)):
-        found = means(data, f"RING, link lengths, {mount} mounts")
+        mean = means(data, f"RING, link lengths, {mount} mounts")
         for method in ("smekf", "ncf", "gdc"):
             for link in ("seg2_and_seg3", "seg4"):
-                assert abs(found[method][f"{link}_difference_mm"]) < limit_mm
+                assert abs(mean[method][f"{link}_difference_mm"]) < limit_mm
 
 
 def test_ur5_is_read_as_it_is(data: Path) -> None:
     for recording, sensor, begins_s in (("circle-100", "carpus", 0.9), ("triangle-250", "radius", 4.2)):
-        found = read_ur5(ur5_files(data / "ur5", recording, sensor))
-        assert found.rate_hz == pytest.approx(125.0)
-        assert found.static.stop / found.rate_hz == pytest.approx(begins_s, abs=0.3)
-        at_rest = np.linalg.norm(found.accel_S[found.static], axis=1).mean()
+        trial = read_ur5(ur5_files(data / "ur5", recording, sensor))
+        assert trial.rate_hz == pytest.approx(125.0)
+        assert trial.static.stop / trial.rate_hz == pytest.approx(begins_s, abs=0.3)
+        at_rest = np.linalg.norm(trial.accel_S[trial.static], axis=1).mean()
         assert at_rest == pytest.approx(0.97 * 9.81, abs=0.2)
 
 
@@ -204,10 +204,10 @@ def test_broad_needs_no_registration(data: Path) -> None:
     sensor = Referenced(
         trial.name, trial.rate_hz, gyro, trial.accel_S[part], time, trial.quat_true[part], trial.static
     )._replace(static=slice(0, 0))
-    (found,) = register_sensors([sensor], (0.0, 12.8))
-    assert found.offset_s == pytest.approx(0.5 / trial.rate_hz, abs=1e-3)
-    assert np.degrees(Rotation.from_quat(found.quat_BS).magnitude()) < 0.3
-    assert found.tilt_deg < 0.4
+    (registration,) = register_sensors([sensor], (0.0, 12.8))
+    assert registration.offset_s == pytest.approx(0.5 / trial.rate_hz, abs=1e-3)
+    assert np.degrees(Rotation.from_quat(registration.quat_BS).magnitude()) < 0.3
+    assert registration.tilt_deg < 0.4
 
 
 def test_broken_files_are_named(tmp_path: Path) -> None:
@@ -269,9 +269,9 @@ def test_files_are_found_by_their_columns_wherever_they_lie(data: Path, tmp_path
     (run / "notes.csv").write_text("a,b\n1,2\n")
     (run / "damaged.csv").write_bytes(b"\xff\xfe\x00")
     (run / "folder.csv").mkdir()
-    found = real.list_experiments(tmp_path)
-    assert [job.trial for job in found["UR5"]] == ["monday carpus"]
-    assert [job.trial for job in found["RING, loose mounts"]] == list(RING_SEGMENTS)
+    jobs = real.list_experiments(tmp_path)
+    assert [job.trial for job in jobs["UR5"]] == ["monday carpus"]
+    assert [job.trial for job in jobs["RING, loose mounts"]] == list(RING_SEGMENTS)
     assert find_ring(tmp_path)[0].imu["loose"].name == "imu LOOSE.csv"
     assert read_ur5(find_ur5(tmp_path)[0]).static.stop > 50
 

@@ -71,7 +71,7 @@ def markers(pose: Pose) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     time, quats, points = in_laboratory(pose)
     R = {name: Rotation.from_quat(quat) for name, quat in quats.items()}
     middle = 0.5 * (points["left_shoulder"] + points["right_shoulder"])
-    found = {
+    places = {
         name: middle + R["torso"].apply(at)
         for name, at in {
             "C7": [-0.06, 0.0, 0.05],
@@ -81,27 +81,27 @@ def markers(pose: Pose) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         }.items()
     }
     for side, letter, out in (("left", "L", 0.04), ("right", "R", -0.04)):
-        found[f"{letter}SHO"] = points[f"{side}_shoulder"]
+        places[f"{letter}SHO"] = points[f"{side}_shoulder"]
         arm, forearm = R[f"{side}_upper_arm"], R[f"{side}_forearm"]
-        found[f"{letter}ELB"] = points[f"{side}_elbow"] + arm.apply([0.0, out, 0.0])
-        found[f"{letter}MELB"] = points[f"{side}_elbow"] - arm.apply([0.0, out, 0.0])
-        found[f"{letter}WRA"] = points[f"{side}_wrist"] + forearm.apply([0.03, 0.0, 0.0])
-        found[f"{letter}WRB"] = points[f"{side}_wrist"] - forearm.apply([0.03, 0.0, 0.0])
-    return time, found
+        places[f"{letter}ELB"] = points[f"{side}_elbow"] + arm.apply([0.0, out, 0.0])
+        places[f"{letter}MELB"] = points[f"{side}_elbow"] - arm.apply([0.0, out, 0.0])
+        places[f"{letter}WRA"] = points[f"{side}_wrist"] + forearm.apply([0.03, 0.0, 0.0])
+        places[f"{letter}WRB"] = points[f"{side}_wrist"] - forearm.apply([0.03, 0.0, 0.0])
+    return time, places
 
 
 def c3d(path: Path, pose: Pose, unit: str = "mm", **parameters: list[object]) -> Path:
     """As Nexus writes it, by ezc3d: names with the subject's; some markers are lost for a while."""
     ezc3d = pytest.importorskip("ezc3d")
-    _, found = markers(pose)
+    _, places = markers(pose)
     file = ezc3d.c3d()
     group = file["parameters"]["POINT"]
     group["UNITS"]["value"] = [unit]
     group["RATE"]["value"] = [LAB_HZ]
-    group["LABELS"]["value"] = [f"Anna:{name}" for name in found]
+    group["LABELS"]["value"] = [f"Anna:{name}" for name in places]
     for name, value in parameters.items():
         group[name]["value"] = value
-    p = np.stack([each.T for each in found.values()], axis=1) * {"mm": 1e3, "m": 1.0}.get(unit, 1.0)
+    p = np.stack([each.T for each in places.values()], axis=1) * {"mm": 1e3, "m": 1.0}.get(unit, 1.0)
     p[:, 5, 300:360] = np.nan
     file["data"]["points"] = np.concatenate([p, np.ones((1, *p.shape[1:]))])
     file["data"]["meta_points"]["residuals"] = np.where(np.isfinite(p).all(axis=0), 0.0, -1.0)[None]
@@ -139,16 +139,16 @@ def theia(path: Path, pose: Pose) -> Path:
 
 def trc(path: Path, pose: Pose) -> Path:
     """As OpenSim's own writer has it, by lines: y is up."""
-    time, found = markers(pose)
+    time, places = markers(pose)
     n = len(time)
     head = ["PathFileType\t4\t(X/Y/Z)\ta.trc"]
     head += ["DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"]
-    head += [f"60\t60\t{n}\t{len(found)}\tmm\t60\t1\t{n}"]
-    head += ["Frame#\tTime\t" + "\t\t\t".join(found) + "\t\t"]
-    head += ["\t\t" + "\t".join(f"{a}{k}" for k in range(1, len(found) + 1) for a in "XYZ"), ""]
+    head += [f"60\t60\t{n}\t{len(places)}\tmm\t60\t1\t{n}"]
+    head += ["Frame#\tTime\t" + "\t\t\t".join(places) + "\t\t"]
+    head += ["\t\t" + "\t".join(f"{a}{k}" for k in range(1, len(places) + 1) for a in "XYZ"), ""]
     rows = []
     for k in range(n):
-        cells = [f"{1e3 * v:.5f}" for p in found.values() for v in p[k]]
+        cells = [f"{1e3 * v:.5f}" for p in places.values() for v in p[k]]
         if 300 <= k < 360:
             cells[15:18] = ["", "", ""]
         rows.append("\t".join([str(k + 1), f"{k / LAB_HZ:.6f}", *cells]) + "\t")
@@ -483,16 +483,16 @@ def test_a_spoiled_c3d_is_one_line(
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
     """The markers of the file that was read last, name → (n, 3) [m], before joints are made of them."""
-    found: dict[str, np.ndarray] = {}
+    shown: dict[str, np.ndarray] = {}
 
     def keep(_path: Path, time: np.ndarray, markers: dict[str, np.ndarray], _table: object) -> Reference:
-        found.clear()
-        found.update(markers)
+        shown.clear()
+        shown.update(markers)
         return Reference(time, {}, {})
 
     for reader in ("c3d", "trc"):
         monkeypatch.setattr(f"wepose_pin.readers.{reader}.locate", keep)
-    return found
+    return shown
 
 
 @pytest.mark.peer
@@ -540,8 +540,11 @@ def test_icc_is_that_of_shrout_and_fleiss() -> None:
 def test_limits_of_agreement() -> None:
     true = np.linspace(-40.0, 60.0, 101)
     noise = np.where(np.arange(101) % 2, 1.0, -1.0)
-    found = compute_agreement(true + 3.0 + noise, true)
-    assert (found.bias, found.rmse) == (pytest.approx(3.0, abs=0.02), pytest.approx(np.sqrt(10.0), abs=0.02))
-    assert (found.lower, found.upper) == (pytest.approx(3.0 - 1.96, abs=0.03), pytest.approx(3.0 + 1.96, abs=0.03))
-    assert found.range == pytest.approx(100.0)
-    assert 0.99 < found.icc < 1.0
+    agreement = compute_agreement(true + 3.0 + noise, true)
+    assert (agreement.bias, agreement.rmse) == (pytest.approx(3.0, abs=0.02), pytest.approx(np.sqrt(10.0), abs=0.02))
+    assert (agreement.lower, agreement.upper) == (
+        pytest.approx(3.0 - 1.96, abs=0.03),
+        pytest.approx(3.0 + 1.96, abs=0.03),
+    )
+    assert agreement.range == pytest.approx(100.0)
+    assert 0.99 < agreement.icc < 1.0

@@ -65,20 +65,20 @@ def find(flexion_deg: np.ndarray, **options: object) -> Repetitions:
     return find_repetitions(angles_of(flexion_deg), **options)
 
 
-def check_spans(found: Repetitions, expected: np.ndarray, share: float = 0.04) -> None:
+def check_spans(repetitions: Repetitions, expected: np.ndarray, share: float = 0.04) -> None:
     """Begin and end within a share of the duration."""
-    assert found.reason == ""
-    assert len(found.spans) == len(expected)
+    assert repetitions.reason == ""
+    assert len(repetitions.spans) == len(expected)
     duration = np.diff(expected, axis=1)
-    assert np.all(np.abs(found.spans - expected) < share * duration + 0.011)
+    assert np.all(np.abs(repetitions.spans - expected) < share * duration + 0.011)
 
 
 def test_repetitions_without_a_rest_follow_each_other() -> None:
     signal, spans = chain(rest(1.0), *[reach(2.0)] * 6, rest(1.0))
-    found = find(signal)
-    check_spans(found, spans)
-    assert (found.source, found.rising, found.left_out) == (FLEXION, True, 0)
-    assert found.cmc > 0.999
+    repetitions = find(signal)
+    check_spans(repetitions, spans)
+    assert (repetitions.source, repetitions.rising, repetitions.left_out) == (FLEXION, True, 0)
+    assert repetitions.cmc > 0.999
 
 
 @pytest.mark.parametrize("noise_deg", [0.3, 2.0])
@@ -86,8 +86,8 @@ def test_rests_of_any_length_between_repetitions_do_not_count(noise_deg: float) 
     rng = np.random.default_rng(1)
     parts = [part for pause in rng.uniform(0.3, 4.0, 8) for part in (rest(pause), reach(1.5))]
     signal, spans = chain(*parts, rest(1.0))
-    found = find(signal + rng.normal(0.0, noise_deg, len(signal)))
-    check_spans(found, spans, 0.04 if noise_deg < 1.0 else 0.12)
+    repetitions = find(signal + rng.normal(0.0, noise_deg, len(signal)))
+    check_spans(repetitions, spans, 0.04 if noise_deg < 1.0 else 0.12)
 
 
 def test_two_speeds_are_one_movement() -> None:
@@ -97,10 +97,10 @@ def test_two_speeds_are_one_movement() -> None:
 
 def test_half_repetitions_at_the_ends_are_left_out() -> None:
     whole, spans = chain(*[reach(2.0)] * 6)
-    found = find(whole[100:-60])  # from the peak of the first to shortly after that of the last
-    check_spans(found, spans[1:-1] - 1.0)
-    found = find(whole[40:-40])  # both begin, or end, half way up
-    check_spans(found, spans[1:-1] - 0.4)
+    repetitions = find(whole[100:-60])  # from the peak of the first to shortly after that of the last
+    check_spans(repetitions, spans[1:-1] - 1.0)
+    repetitions = find(whole[40:-40])  # both begin, or end, half way up
+    check_spans(repetitions, spans[1:-1] - 0.4)
 
 
 def test_a_stop_on_the_way_is_part_of_a_repetition() -> None:
@@ -113,9 +113,9 @@ def test_a_stop_on_the_way_is_part_of_a_repetition() -> None:
 def test_an_angle_that_rests_high_falls_first() -> None:
     signal, spans = chain(*[part for _ in range(5) for part in (rest(1.0), reach(1.5))], rest(1.0))
     for turned in (-signal, 100.0 - signal):
-        found = find(turned)
-        assert found.rising is False
-        check_spans(found, spans)
+        repetitions = find(turned)
+        assert repetitions.rising is False
+        check_spans(repetitions, spans)
 
 
 def test_without_a_rest_the_end_nearer_to_zero_begins() -> None:
@@ -133,18 +133,18 @@ def test_other_movements_between_are_left_out() -> None:
         *(rest(1.0), *[reach(1.5)] * 4, rest(1.0), stop, rest(1.0)),
     )
     kept = [k for k in range(len(spans)) if k not in (5, 6, 11)]
-    found = find(signal)
-    check_spans(found, spans[kept])
-    assert found.left_out == 1
+    repetitions = find(signal)
+    check_spans(repetitions, spans[kept])
+    assert repetitions.left_out == 1
 
 
 def test_a_cycle_lasts_until_the_next_one_begins() -> None:
     """A knee: the swing, and the stance with a small flexion of its own."""
     cycle = np.concatenate([reach(0.4, 2.0, 65.0), reach(0.6, 2.0, 18.0)])
     signal = np.concatenate([rest(1.0, 2.0), *[cycle] * 8, rest(3.0, 2.0), *[cycle] * 3, rest(1.0, 2.0)])
-    found = find(signal, cycles=True)
-    np.testing.assert_allclose(np.diff(found.spans, axis=1), 1.0, atol=0.011)
-    assert len(found.spans) == 7 + 2
+    repetitions = find(signal, cycles=True)
+    np.testing.assert_allclose(np.diff(repetitions.spans, axis=1), 1.0, atol=0.011)
+    assert len(repetitions.spans) == 7 + 2
     np.testing.assert_allclose(np.diff(find(signal).spans, axis=1), 0.4, atol=0.05)
 
 
@@ -161,9 +161,9 @@ def test_a_cycle_lasts_until_the_next_one_begins() -> None:
     ids=["still", "noise", "once", "twice", "one way", "half"],
 )
 def test_where_nothing_repeats_it_says_so(signal: np.ndarray, said: str) -> None:
-    found = find(signal)
-    assert said in found.reason
-    assert found.spans.shape == (0, 2)
+    repetitions = find(signal)
+    assert said in repetitions.reason
+    assert repetitions.spans.shape == (0, 2)
 
 
 def test_a_motion_at_random_is_hardly_ever_taken_for_repetitions() -> None:
@@ -172,9 +172,9 @@ def test_a_motion_at_random_is_hardly_ever_taken_for_repetitions() -> None:
         rng = np.random.default_rng(seed)
         sos = butter(2, rng.uniform(0.1, 1.0), fs=RATE, output="sos")
         signal = sosfiltfilt(sos, rng.normal(size=6000))
-        found = find(40.0 * signal / signal.std())
-        taken += not found.reason
-        assert found.reason or found.cmc >= 0.85
+        repetitions = find(40.0 * signal / signal.std())
+        taken += not repetitions.reason
+        assert repetitions.reason or repetitions.cmc >= 0.85
     assert taken <= 2
 
 
@@ -183,9 +183,9 @@ def test_the_rate_of_sampling_does_not_matter() -> None:
         signal = np.concatenate(
             [rest(1.0, rate_hz=rate_hz), *[reach(2.0, rate_hz=rate_hz)] * 5, rest(1.0, rate_hz=rate_hz)]
         )
-        found = find_repetitions(angles_of(signal, rate_hz))
-        np.testing.assert_allclose(found.spans[:, 0], 1.0 + 2.0 * np.arange(5), atol=0.081)
-        np.testing.assert_allclose(found.spans[:, 1], 3.0 + 2.0 * np.arange(5), atol=0.081)
+        repetitions = find_repetitions(angles_of(signal, rate_hz))
+        np.testing.assert_allclose(repetitions.spans[:, 0], 1.0 + 2.0 * np.arange(5), atol=0.081)
+        np.testing.assert_allclose(repetitions.spans[:, 1], 3.0 + 2.0 * np.arange(5), atol=0.081)
 
 
 # The main angle ---------------------------------------------------------------------------------------------------
@@ -215,9 +215,9 @@ def test_a_repetition_in_a_gap_is_left_out() -> None:
     angles = angles_of(signal)
     angles.joints["right_elbow"].gap[450:490] = True  # 0.4 s of the second: bridged by a line, and still much alike
     angles.joints["right_elbow"].gap[700:705] = True
-    found = find_repetitions(angles)
-    check_spans(found, np.delete(spans, 1, axis=0))
-    assert found.left_out == 1
+    repetitions = find_repetitions(angles)
+    check_spans(repetitions, np.delete(spans, 1, axis=0))
+    assert repetitions.left_out == 1
 
 
 def test_an_angle_that_is_not_there_is_named() -> None:
@@ -284,22 +284,22 @@ def test_the_arm_swings_of_a_real_walk_are_found(data: Path) -> None:
     """A person works at a table, stands up and walks; the period of the swing is the raw gyroscope's."""
     recording = wp.load_session(data / "upper_body" / "session.toml")
     pose = wp.track(recording, method="amekf", open_loop=True).pose
-    found = find_repetitions(joint_angles(pose, "XZY"), "left_shoulder_flexion")
+    repetitions = find_repetitions(joint_angles(pose, "XZY"), "left_shoulder_flexion")
     walk = (recording.time > 97.0) & (recording.time < 137.0)
     sensor = recording.sensors["left_upper_arm"]
     assert isinstance(sensor, ImuSensor)
     swing = sensor.gyro_S[walk, np.argmax(sensor.gyro_S[walk].std(axis=0))]
     spectrum = np.abs(np.fft.rfft((swing - swing.mean()) * np.hanning(len(swing)), 16 * len(swing)))
     period = 1.0 / np.fft.rfftfreq(16 * len(swing), 1.0 / recording.rate_hz)[spectrum.argmax()]
-    assert np.median(np.diff(found.spans, axis=1)) == pytest.approx(period, rel=0.06)
-    assert 38 <= len(found.spans) <= 46
-    assert found.spans.min() > 95.0  # none at the table
+    assert np.median(np.diff(repetitions.spans, axis=1)) == pytest.approx(period, rel=0.06)
+    assert 38 <= len(repetitions.spans) <= 46
+    assert repetitions.spans.min() > 95.0  # none at the table
 
 
 def test_the_strides_of_a_simulated_walk_are_those_of_the_walk() -> None:
     motion = Walk(load_model("whole_body"), np.random.default_rng(2), 15.0)
     time = np.arange(0.0, 20.0, 0.01)
     knee = np.degrees(motion.leg("right", time).knee[:, 0])
-    found = find(knee, cycles=True)
-    np.testing.assert_allclose(np.diff(found.spans, axis=1), motion.stride_s, atol=0.021)
-    assert len(found.spans) >= int(15.0 / motion.stride_s) - 4
+    repetitions = find(knee, cycles=True)
+    np.testing.assert_allclose(np.diff(repetitions.spans, axis=1), motion.stride_s, atol=0.021)
+    assert len(repetitions.spans) >= int(15.0 / motion.stride_s) - 4

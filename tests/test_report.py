@@ -31,12 +31,12 @@ def made() -> Made:
     person = simulate_person(3)
     world = replace(MILD_PRESET, mount="any")
     recording = simulate(person.lengths, seed=3, imperfections=world, clasp_s=30.0, circles=0).recording("anna <3")
-    found = calibrate(recording, measured=person.measured, prior=person.prior)
-    return found, recording, track(recording, found.subject)
+    calibration = calibrate(recording, measured=person.measured, prior=person.prior)
+    return calibration, recording, track(recording, calibration.subject)
 
 
-def poor(found: Calibration) -> CalibrationQuality:
-    return replace(assess(found), quality="poor", reasons=(UNCERTAIN,))
+def poor(calibration: Calibration) -> CalibrationQuality:
+    return replace(assess(calibration), quality="poor", reasons=(UNCERTAIN,))
 
 
 @pytest.fixture(scope="module")
@@ -45,14 +45,14 @@ def page(made: Made) -> str:
 
 
 def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) -> None:
-    found = made[0]
-    for name, value in found.subject.lengths.items():
+    calibration = made[0]
+    for name, value in calibration.subject.lengths.items():
         assert f"<td>{name.replace('_', ' ')}</td>" in page
-        assert plus_minus(1e3 * value, 1e3 * found.subject.std(name), "mm") in page
-        assert plus_minus(1e3 * found.prior.lengths[name], 1e3 * found.prior.std(name), "mm") in page
-    for name in found.subject.mounts:
-        assert f"{np.degrees(found.subject.std(f'mounts.{name}.z')):.1f}°" in page
-    assert f"{1e3 * found.prior_rms_gap:.1f} mm before, {1e3 * found.rms_gap:.1f} mm after" in text_of(page)
+        assert plus_minus(1e3 * value, 1e3 * calibration.subject.std(name), "mm") in page
+        assert plus_minus(1e3 * calibration.prior.lengths[name], 1e3 * calibration.prior.std(name), "mm") in page
+    for name in calibration.subject.mounts:
+        assert f"{np.degrees(calibration.subject.std(f'mounts.{name}.z')):.1f}°" in page
+    assert f"{1e3 * calibration.prior_rms_gap:.1f} mm before, {1e3 * calibration.rms_gap:.1f} mm after" in text_of(page)
     assert headings(page) == [
         "Lengths",
         "Sensors",
@@ -117,9 +117,9 @@ def test_names_are_text(page: str) -> None:
 
 
 def test_every_figure_has_a_caption_and_the_same_text(page: str) -> None:
-    found = captions(page)
-    assert len(found) == 5
-    assert all(label == caption for label, caption in found)
+    pairs = captions(page)
+    assert len(pairs) == 5
+    assert all(label == caption for label, caption in pairs)
 
 
 def test_it_prints(page: str) -> None:
@@ -132,23 +132,23 @@ def test_equal_arguments_give_equal_text(made: Made, page: str) -> None:
 
 
 def test_hands_that_came_apart_are_shown(made: Made) -> None:
-    found = made[0]
-    kept, gap = found.contact.copy(), found.gap.copy()
+    calibration = made[0]
+    kept, gap = calibration.contact.copy(), calibration.gap.copy()
     kept[40:60], gap[40:60] = 0.01, 0.3
-    page = render_calibration_report(replace(found, contact=kept, gap=gap), made[1], tracked=made[2])
+    page = render_calibration_report(replace(calibration, contact=kept, gap=gap), made[1], tracked=made[2])
     assert "Crosses: apart." in page
-    nowhere = render_calibration_report(replace(found, contact=np.zeros_like(kept)), made[1], tracked=made[2])
+    nowhere = render_calibration_report(replace(calibration, contact=np.zeros_like(kept)), made[1], tracked=made[2])
     assert "Palm to palm over time" in headings(nowhere)
     assert "Where the motion was informative" not in headings(nowhere)
 
 
 def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
-    found = made[0]
+    calibration = made[0]
     bare = replace(
-        found,
-        subject=replace(found.subject, order=(), covariance=np.zeros((0, 0))),
-        gap=np.full_like(found.gap, np.nan),
-        prior_gap=np.full_like(found.gap, np.nan),
+        calibration,
+        subject=replace(calibration.subject, order=(), covariance=np.zeros((0, 0))),
+        gap=np.full_like(calibration.gap, np.nan),
+        prior_gap=np.full_like(calibration.gap, np.nan),
         rms_gap=float("nan"),
         measured={},
         start_pose_offset={"torso": np.array([np.nan, 0.0])},
@@ -162,19 +162,23 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
     assert "± not known" in page
     assert "nan" not in re.sub(r'"data:[^"]*"', "", without_frame(page)).split("</style>")[1]
     few = replace(
-        found, time=found.time[:1], gap=found.gap[:1], prior_gap=found.prior_gap[:1], contact=found.contact[:1]
+        calibration,
+        time=calibration.time[:1],
+        gap=calibration.gap[:1],
+        prior_gap=calibration.prior_gap[:1],
+        contact=calibration.contact[:1],
     )
     few = replace(
         few,
-        information_shares={name: share[:1] for name, share in found.information_shares.items()},
+        information_shares={name: share[:1] for name, share in calibration.information_shares.items()},
         start_pose_offset={},
     )
     assert "Palm to palm over time" not in headings(render_calibration_report(few, made[1], tracked=made[2]))
 
 
 def test_without_a_mount_it_says_why_there_is_no_motion(made: Made) -> None:
-    found = replace(made[0], subject=replace(made[0].subject, mounts={}))
-    page = render_calibration_report(found, made[1])
+    calibration = replace(made[0], subject=replace(made[0].subject, mounts={}))
+    page = render_calibration_report(calibration, made[1])
     assert "The report lacks the positions of the hands and the 3D view." in page
     assert "mount is not known" in page
     assert headings(page) == [
@@ -230,11 +234,11 @@ def test_a_line_breaks_where_time_jumps() -> None:
 
 
 def test_the_effective_sample_size_stands_as_itself_beside_its_limits(made: Made) -> None:
-    found = replace(made[0], effective_sample_size=18.2)
-    page = render_calibration_report(found, made[1], quality=assess(found), tracked=made[2])
+    calibration = replace(made[0], effective_sample_size=18.2)
+    page = render_calibration_report(calibration, made[1], quality=assess(calibration), tracked=made[2])
     text = re.sub(r"<[^>]+>", "|", without_frame(page))
     assert re.search(r"effective sample size[^|]*\|+18\|+at least 6\|+at least 2\|+pass", text)
     for size, wanted in ((6.0, "pass"), (5.9, "poor"), (2.0, "poor"), (1.9, "fail")):
-        checks = assess(replace(found, effective_sample_size=size)).checks
+        checks = assess(replace(calibration, effective_sample_size=size)).checks
         (check,) = [each for each in checks if each.diagnostic.code == "motion-too-short"]
         assert (check.value, check.quality) == (size, wanted)

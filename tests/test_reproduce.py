@@ -127,6 +127,7 @@ def test_what_another_version_has_made_is_made_again_and_said(result: Path, caps
     assert "the same, made again by wepose track" in captured.out
 
 
+@pytest.mark.slow
 def test_retarget_again(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("daqp")
     robot = tmp_path / "robot"

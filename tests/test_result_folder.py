@@ -14,7 +14,7 @@ from wepose_pin.errors import ExistingOutput
 from wepose_pin.jobs.calibrate import CalibrateJob, run_calibrate
 from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.model import load_model
-from wepose_pin.model.table import format_table, load_table
+from wepose_pin.model.table_file import format_table, load_table
 from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.subject import population_subject
 from wepose_pin.writers import write_session

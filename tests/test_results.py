@@ -39,7 +39,7 @@ def test_numbers_of_values() -> None:
         x: float
         name: str
 
-    found = values_of(
+    values = values_of(
         {
             "a": Point(1.0, "text"),
             "rows": [{"t": 1, "ok": True}, {"t": 2, "ok": False}],
@@ -49,10 +49,10 @@ def test_numbers_of_values() -> None:
             "words": ["a", "b"],
         }
     )
-    assert set(found) == {"a/x", "rows/t", "rows/ok", "uneven/0", "uneven/1", "none"}
-    assert found["rows/t"].tolist() == [1.0, 2.0]
-    assert found["rows/ok"].tolist() == [1.0, 0.0]
-    assert np.isnan(found["none"])
+    assert set(values) == {"a/x", "rows/t", "rows/ok", "uneven/0", "uneven/1", "none"}
+    assert values["rows/t"].tolist() == [1.0, 2.0]
+    assert values["rows/ok"].tolist() == [1.0, 0.0]
+    assert np.isnan(values["none"])
 
 
 def test_numbers_of_files(tmp_path: Path) -> None:
@@ -64,11 +64,11 @@ def test_numbers_of_files(tmp_path: Path) -> None:
     (tmp_path / "a.trc").write_text("PathFileType\t4\n1\t-0.5\t1e-3\tnan\t3D\n")
     (tmp_path / "a.urdf").write_text('<robot><!-- 0.1.0 of 2024 --><origin xyz="0 0 1.5"/></robot>')
     (tmp_path / "view.html").write_text("1 2 3")
-    found = folder_values(tmp_path, "track")
+    values = folder_values(tmp_path, "track")
     expected = {"track/time", "track/gap", "track/summary/rate_hz", "track/subject/lengths/trunk"}
-    assert set(found) == {*expected, "track/a.trc", "track/a.urdf"}
-    np.testing.assert_array_equal(found["track/a.trc"], [4.0, 1.0, -0.5, 1e-3, np.nan])
-    assert found["track/a.urdf"].tolist() == [0.0, 0.0, 1.5]
+    assert set(values) == {*expected, "track/a.trc", "track/a.urdf"}
+    np.testing.assert_array_equal(values["track/a.trc"], [4.0, 1.0, -0.5, 1e-3, np.nan])
+    assert values["track/a.urdf"].tolist() == [0.0, 0.0, 1.5]
     (tmp_path / "a.odd").touch()
     with pytest.raises(ValueError, match=r"a\.odd"):
         file_values(tmp_path / "a.odd", "a")

@@ -59,8 +59,8 @@ def checked(trajectory: Trajectory, changed: pl.DataFrame | None = None) -> Limi
 def is_sound(trajectory: Trajectory) -> None:
     """Limits against the URDF and the map, and no contact; none of it by the solver's code."""
     robot = trajectory.robot
-    found = checked(trajectory)
-    assert found.passed, found
+    limits = checked(trajectory)
+    assert limits.passed, limits
     assert find_self_collisions(robot, trajectory.time, trajectory.joint_position).samples == 0
     assert np.isfinite(trajectory.joint_position).all()
 
@@ -104,7 +104,7 @@ def ridden(share, dt: float, seconds: float, n: int = 60):
         yield from zip(upper - places.max(axis=0), speeds[-1], ends, strict=True)
 
 
-@pytest.mark.parametrize("dt", [0.002, 0.01, 0.05])
+@pytest.mark.parametrize("dt", [pytest.param(0.002, marks=pytest.mark.slow), 0.01, 0.05])
 def test_whoever_goes_as_fast_as_the_bounds_allow_still_keeps_every_limit(dt: float) -> None:
     def mood(time: float, rng: np.random.Generator, n: int) -> np.ndarray:
         return (np.zeros(n), np.ones(n), rng.uniform(0.0, 1.0, n), rng.integers(0, 2, n))[int(time // 15.0) % 4]
@@ -113,7 +113,7 @@ def test_whoever_goes_as_fast_as_the_bounds_allow_still_keeps_every_limit(dt: fl
     assert (nearest < 1e-3).all()  # and the bounds do not hold it off the limit
 
 
-@pytest.mark.parametrize("dt", [0.002, 0.01, 0.05])
+@pytest.mark.parametrize("dt", [pytest.param(0.002, marks=pytest.mark.slow), 0.01, 0.05])
 def test_a_joint_that_is_pushed_against_its_limit_lies_still_there(dt: float) -> None:
     """Braking at full strength up to the limit would bounce off it: a brake cannot be let go at once."""
     end = list(ridden(lambda _time, _rng, n: np.ones(n), dt, 25.0))[-round(1.0 / dt) :]
@@ -209,13 +209,13 @@ def test_a_motion_leaves_the_margins_that_are_asked_for(arm, swung: Trajectory, 
     said = urdf.with_suffix(".toml").read_text().replace("[arms.right]", stated)
     urdf.with_suffix(".toml").write_text(said)
     narrow = load_robot(find_map(str(urdf)), margins=LimitMargins(0.5, 0.1))
-    found = retarget(person(3.0), narrow)
-    is_sound(found)
+    trajectory = retarget(person(3.0), narrow)
+    is_sound(trajectory)
     elbow = JOINTS.index("elbow")
-    assert found.joint_position[:, elbow].min() >= -1.4 - 1e-8  # the bounds are searched to 1e-9
-    assert found.joint_position[:, elbow].max() <= -0.8 + 1e-8
-    assert np.abs(found.run.joint_velocity[:, elbow]).max() <= 0.4 + 1e-8
-    assert np.abs(found.run.joint_acceleration).max() <= 6.0 + 1e-8
+    assert trajectory.joint_position[:, elbow].min() >= -1.4 - 1e-8  # the bounds are searched to 1e-9
+    assert trajectory.joint_position[:, elbow].max() <= -0.8 + 1e-8
+    assert np.abs(trajectory.run.joint_velocity[:, elbow]).max() <= 0.4 + 1e-8
+    assert np.abs(trajectory.run.joint_acceleration).max() <= 6.0 + 1e-8
     table = build_table(swung)
     assert check_limits(table, arm.map).passed
     assert check_limits(table, narrow.map).position < -0.1
@@ -235,9 +235,9 @@ def test_the_check_sees_what_is_not_kept(swung: Trajectory, spoil: str) -> None:
         "ends_at_rest": ("roll_velocity", np.full(len(whole), 1e-6)),
     }[spoil]
     name, more = changed
-    found = checked(swung, whole.with_columns((pl.col(name) + pl.Series(more)).alias(name)))
-    assert not found.passed
-    value = getattr(found, spoil)
+    limits = checked(swung, whole.with_columns((pl.col(name) + pl.Series(more)).alias(name)))
+    assert not limits.passed
+    value = getattr(limits, spoil)
     assert value is False or value < 0.0
 
 
@@ -248,11 +248,11 @@ def test_the_robot_follows_hand_turn_and_elbow(swung: Trajectory) -> None:
     is_sound(swung)
     assert np.median(error(swung)) < 5e-3
     assert np.quantile(error(swung), 0.95) < 0.02
-    found = summarize(swung, checked(swung), find_self_collisions(
+    summary = summarize(swung, checked(swung), find_self_collisions(
         swung.robot, swung.time, swung.joint_position))["arms"]["right"]  # fmt: skip
-    assert found["hand_error_deg"]["median"] < 3.0
-    assert found["swivel_error_deg"]["median"] < 15.0
-    assert found["inside_reach_share"] == 1.0
+    assert summary["hand_error_deg"]["median"] < 3.0
+    assert summary["swivel_error_deg"]["median"] < 15.0
+    assert summary["inside_reach_share"] == 1.0
 
 
 def test_what_can_be_reached_is_reached(swung: Trajectory) -> None:
@@ -289,8 +289,8 @@ def test_a_link_may_have_the_name_of_its_fixed_joint(tmp_path: Path) -> None:
 def test_turned_bases_move_alike(arm, tmp_path: Path) -> None:
     straight = retarget(person(4.0), arm)
     turned = load_robot(find_map(str(write_arm(tmp_path, turned=(0.5 * np.pi, 0.2, -1.1)))))
-    found = retarget(person(4.0), turned)
-    assert np.abs(found.joint_position - straight.joint_position).max() < 1e-6
+    trajectory = retarget(person(4.0), turned)
+    assert np.abs(trajectory.joint_position - straight.joint_position).max() < 1e-6
     # Said of the root's axes in place of the base's: y of the root is where z of the base points to −z, z up is +y.
     (tmp_path / "root").mkdir()
     by_root = load_robot(find_map(str(write_arm(tmp_path / "root", turned=(0.5 * np.pi, 0.0, 0.0), base="", up="-y"))))
@@ -302,33 +302,33 @@ def test_a_joint_without_end_and_one_that_copies_another(tmp_path: Path) -> None
     (tmp_path / "c").mkdir()
     endless = load_robot(find_map(str(write_arm(tmp_path / "c", continuous="roll"))))
     assert endless.model.nq == endless.model.nv + 1
-    found = retarget(person(4.0), endless)
-    is_sound(found)
-    assert np.median(error(found)) < 5e-3
+    trajectory = retarget(person(4.0), endless)
+    is_sound(trajectory)
+    assert np.median(error(trajectory)) < 5e-3
     copied = load_robot(find_map(str(write_arm(tmp_path, mimic=True))))
     assert copied.names == JOINTS
     assert copied.model.nv == len(JOINTS) + 1
-    found = retarget(person(4.0), copied)
-    is_sound(found)
-    assert np.median(error(found)) < 5e-3
-    q = copied.configuration(found.joint_position[-1])
+    trajectory = retarget(person(4.0), copied)
+    is_sound(trajectory)
+    assert np.median(error(trajectory)) < 5e-3
+    q = copied.configuration(trajectory.joint_position[-1])
     joint = copied.model.names.tolist().index("elbow") - 1
-    assert q[joint] == q[joint + 1] == found.joint_position[-1][JOINTS.index("elbow")]
+    assert q[joint] == q[joint + 1] == trajectory.joint_position[-1][JOINTS.index("elbow")]
 
 
 @pytest.mark.parametrize("only", ["position", "orientation"])
 def test_a_task_can_be_left_out(arm, only: str) -> None:
     other = {"position": "orientation", "orientation": "position"}[only]
-    found = retarget(person(4.0), arm, params=replace(ControllerParams(), **{other: 0.0}))
-    is_sound(found)
-    target, begin = found.targets[0], found.approach_samples
+    trajectory = retarget(person(4.0), arm, params=replace(ControllerParams(), **{other: 0.0}))
+    is_sound(trajectory)
+    target, begin = trajectory.targets[0], trajectory.approach_samples
     asked = Rotation.from_matrix(target.rotation[begin:])
-    turn = (Rotation.from_matrix(found.run.rotation[0, begin:]).inv() * asked).magnitude()
+    turn = (Rotation.from_matrix(trajectory.run.rotation[0, begin:]).inv() * asked).magnitude()
     if only == "position":
-        assert np.median(error(found)) < 3e-3
+        assert np.median(error(trajectory)) < 3e-3
     else:
         assert np.median(turn) < np.radians(2.0)
-        assert np.median(error(found)) > 0.02
+        assert np.median(error(trajectory)) > 0.02
 
 
 @pytest.mark.peer
@@ -391,18 +391,18 @@ def far_away(pose: Pose, span: tuple[float, float], by: float) -> Pose:
 
 def test_five_seconds_out_of_reach(arm, swung: Trajectory) -> None:
     pose = far_away(person(11.0, swing=0.0), (3.0, 8.0), 1.6)
-    found = retarget(pose, arm, scale=swung.arm_targets.scale["right"])
-    is_sound(found)
-    target = found.targets[0]
+    trajectory = retarget(pose, arm, scale=swung.arm_targets.scale["right"])
+    is_sound(trajectory)
+    target = trajectory.targets[0]
     outside = np.linalg.norm(target.position - target.unclamped, axis=1) > 1e-3
-    assert outside[found.approach_samples :].mean() > 0.3
-    why = attribute_errors(found, 0)
-    assert why["beyond the reach"] == pytest.approx(outside[found.approach_samples :].mean(), abs=0.1)
-    settled = (found.recorded_time > 5.5) & (found.recorded_time < 7.5)
-    assert np.abs(found.run.joint_velocity[settled]).max() < 0.02  # still at the reach: it does not shake
-    assert np.abs(np.diff(found.run.joint_acceleration[settled], axis=0)).max() < 0.05 * 12.0
-    back = found.recorded_time > 9.5
-    assert np.linalg.norm(found.hand["right"] - target.position, axis=1)[back].max() < 0.02
+    assert outside[trajectory.approach_samples :].mean() > 0.3
+    why = attribute_errors(trajectory, 0)
+    assert why["beyond the reach"] == pytest.approx(outside[trajectory.approach_samples :].mean(), abs=0.1)
+    settled = (trajectory.recorded_time > 5.5) & (trajectory.recorded_time < 7.5)
+    assert np.abs(trajectory.run.joint_velocity[settled]).max() < 0.02  # still at the reach: it does not shake
+    assert np.abs(np.diff(trajectory.run.joint_acceleration[settled], axis=0)).max() < 0.05 * 12.0
+    back = trajectory.recorded_time > 9.5
+    assert np.linalg.norm(trajectory.hand["right"] - target.position, axis=1)[back].max() < 0.02
 
 
 def test_no_jerk_where_a_moving_target_passes_the_reach(arm, swung: Trajectory) -> None:
@@ -412,8 +412,8 @@ def test_no_jerk_where_a_moving_target_passes_the_reach(arm, swung: Trajectory) 
     assert drawn[across.approach_samples :].mean() > 0.1
     is_sound(across)
     jerk = [
-        np.abs(np.diff(found.run.joint_acceleration[found.approach_samples :], axis=0)).max() * 100.0
-        for found in (inside, across)
+        np.abs(np.diff(trajectory.run.joint_acceleration[trajectory.approach_samples :], axis=0)).max() * 100.0
+        for trajectory in (inside, across)
     ]
     assert jerk[1] < 3.0 * max(jerk[0], 100.0)
 
@@ -425,12 +425,12 @@ def test_a_jump_of_a_metre_is_no_jump_of_the_robot(arm) -> None:
         moved = points[name].copy()
         moved[400:] += [0.0, 0.0, 1.0]
         points[name] = moved
-    found = retarget(replace(pose, points=points), arm)
-    is_sound(found)
-    at = np.searchsorted(found.recorded_time, 4.0)
-    speed = np.linalg.norm(np.diff(found.hand["right"], axis=0), axis=1) * 100.0
+    trajectory = retarget(replace(pose, points=points), arm)
+    is_sound(trajectory)
+    at = np.searchsorted(trajectory.recorded_time, 4.0)
+    speed = np.linalg.norm(np.diff(trajectory.hand["right"], axis=0), axis=1) * 100.0
     assert speed[at - 100 : at + 100].max() < 3.0
-    assert found.targets[0].lost[found.approach_samples :].any()
+    assert trajectory.targets[0].lost[trajectory.approach_samples :].any()
 
 
 def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
@@ -442,12 +442,12 @@ def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
     lost = np.zeros(len(pose.time), dtype=bool)
     lost[300:420] = True
     gone = retarget(replace(pose, gap={"right_forearm": lost}), arm)
-    for found in (nan, gone):
-        is_sound(found)
-        during = ((found.recorded_time > 3.1) & (found.recorded_time < 4.1)).sum()
+    for trajectory in (nan, gone):
+        is_sound(trajectory)
+        during = ((trajectory.recorded_time > 3.1) & (trajectory.recorded_time < 4.1)).sum()
         usual = ((swung.recorded_time > 3.1) & (swung.recorded_time < 4.1)).sum()
         assert during > 2 * usual
-        assert np.quantile(error(found), 0.95) < 0.03
+        assert np.quantile(error(trajectory), 0.95) < 0.03
     assert attribute_errors(gone, 0)["not measured"] == pytest.approx(
         np.mean((error(gone) > 0.02) & gone.targets[0].lost[gone.approach_samples :]), abs=1e-3
     )
@@ -481,25 +481,25 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     inside = np.array([0.0, 0.0, 0.20])
     blend = np.clip((pose.time - 2.0) / 1.5, 0.0, 1.0)[:, None]
     points["right_palm"] = hand + blend * (inside - hand)
-    found = retarget(replace(pose, points=points), arm)
-    is_sound(found)
-    assert error(found)[-1] > 0.05  # it could not get there
-    assert found.counts.near_clearance > 0
-    why = attribute_errors(found, 0)
+    trajectory = retarget(replace(pose, points=points), arm)
+    is_sound(trajectory)
+    assert error(trajectory)[-1] > 0.05  # it could not get there
+    assert trajectory.counts.near_clearance > 0
+    why = attribute_errors(trajectory, 0)
     assert why["self-collision"] > 0.2
     assert why["self-collision"] > 0.9 * sum(why.values())
-    _, reached = assess_reachability(found)
-    assert reached[-1, 0] == pytest.approx(error(found)[-1], abs=0.02)  # nor could it with all the time there is
+    _, reached = assess_reachability(trajectory)
+    assert reached[-1, 0] == pytest.approx(error(trajectory)[-1], abs=0.02)  # nor could it with all the time there is
 
 
 def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
     slow = load_robot(find_map(str(write_arm(tmp_path, acceleration=2.0))))
     pose = person(4.0, swing=45.0)
-    found = retarget(pose, slow)
-    is_sound(found)
-    assert found.time[-1] - found.time[found.approach_samples] > 1.3 * 4.0
-    assert found.limiting_joint is not None
-    assert found.limiting_joint.joint in JOINTS
+    trajectory = retarget(pose, slow)
+    is_sound(trajectory)
+    assert trajectory.time[-1] - trajectory.time[trajectory.approach_samples] > 1.3 * 4.0
+    assert trajectory.limiting_joint is not None
+    assert trajectory.limiting_joint.joint in JOINTS
     with pytest.raises(NoSolution, match=r"too fast at \d.*s of the recording: \w+ would need"):
         retarget(pose, slow, strict=True)
 
@@ -664,10 +664,10 @@ def test_the_links_of_a_trajectory_are_where_the_controller_had_them(swung: Traj
 
 
 def test_the_same_motion_at_another_rate(arm) -> None:
-    found = retarget(person(), arm, rate_hz=250.0)
-    is_sound(found)
-    assert found.time[1] == pytest.approx(0.004)
-    assert np.median(error(found)) < 5e-3
+    trajectory = retarget(person(3.0), arm, rate_hz=250.0)
+    is_sound(trajectory)
+    assert trajectory.time[1] == pytest.approx(0.004)
+    assert np.median(error(trajectory)) < 5e-3
     with pytest.raises(BadOption, match="--rate-hz 5: from 10 to 2000"):
         retarget(person(), arm, rate_hz=5.0)
 
@@ -708,16 +708,16 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     made = {path.name for path in (tmp_path / "out").iterdir()}
     assert made == {"trajectory.parquet", "trajectory.csv", "joint_trajectory.json", "joint_trajectory.yaml",
                     "robot.urdf", "summary.json", "view.html", "report.html"}  # fmt: skip
-    found = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert (found["recording"], found["recorded_phases"].keys()) == ("made", set())
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["recording"], summary["recorded_phases"].keys()) == ("made", set())
     motion = read_joint_motion(tmp_path / "out")
     assert (motion.name, motion.source, motion.joints) == ("arm", "made", JOINTS)
-    assert motion.time[motion.begin] == pytest.approx(found["approach_s"], abs=1e-6)
+    assert motion.time[motion.begin] == pytest.approx(summary["approach_s"], abs=1e-6)
     assert export(tmp_path / "out", tmp_path / "data", "lerobot") == ("lerobot", [])
     frames = pl.read_parquet(tmp_path / "data" / "data" / "chunk-000" / "file-000.parquet")
     np.testing.assert_array_equal(frames["observation.state"].to_numpy(), motion.position.astype(np.float32))
-    assert found["within_limits"] is True
-    assert found["self_collisions"]["samples"] == 0
+    assert summary["within_limits"] is True
+    assert summary["self_collisions"]["samples"] == 0
     assert "Limits kept" in text
     page = (tmp_path / "out" / "view.html").read_text()
     assert '"robot 0"' in page

@@ -35,10 +35,10 @@ pytestmark = [
 ]
 
 
-def is_sound(found: Trajectory) -> None:
-    held = check_limits(build_table(found), found.robot.map)
+def is_sound(trajectory: Trajectory) -> None:
+    held = check_limits(build_table(trajectory), trajectory.robot.map)
     assert held.passed, held
-    touched = find_self_collisions(found.robot, found.time, found.joint_position)
+    touched = find_self_collisions(trajectory.robot, trajectory.time, trajectory.joint_position)
     assert touched.samples == 0, touched.first
     assert touched.pairs > 10
     assert touched.excluded[AT_REST] == []
@@ -60,10 +60,10 @@ def test_a_humanoid_stands_on_the_floor_in_exports(name: str, height: float) -> 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_every_robot_follows_and_keeps_its_limits(name: str) -> None:
     robot = load_robot(find_map(name))
-    found = retarget(both_arms(4.0), robot)
-    is_sound(found)
-    for arm, target in zip(robot.arms, found.targets, strict=True):
-        error = np.linalg.norm(found.hand[arm.side] - target.position, axis=1)[found.approach_samples :]
+    trajectory = retarget(both_arms(4.0), robot)
+    is_sound(trajectory)
+    for arm, target in zip(robot.arms, trajectory.targets, strict=True):
+        error = np.linalg.norm(trajectory.hand[arm.side] - target.position, axis=1)[trajectory.approach_samples :]
         assert np.median(error) < 0.02, arm.side
 
 
@@ -104,9 +104,9 @@ def test_what_cannot_stop_in_time_is_slowed_and_strict_refuses_it() -> None:
     rng = np.random.default_rng(6)
     motion = [rng.uniform(*of) for of in ((1.0, 2.5), (20.0, 80.0), (30.0, 100.0), (20.0, 60.0), (0.0, 6.28))]
     robot = load_robot(find_map("talos"))
-    found = retarget(violent(*motion), robot)
-    is_sound(found)
-    assert 0.0 < found.contact_times[0] < 6.0
+    trajectory = retarget(violent(*motion), robot)
+    is_sound(trajectory)
+    assert 0.0 < trajectory.contact_times[0] < 6.0
     with pytest.raises(NoSolution, match="too fast at"):
         retarget(violent(*motion), robot, strict=True)
 
@@ -124,15 +124,15 @@ def test_no_jerk_where_the_reach_ends(name: str) -> None:
     robot = load_robot(find_map(name))
     pose = both_arms(8.0, flexion=45.0, swing=40.0, abduction=40.0)
     whole = max(arm.reach / compute_target_reach(robot, arm) for arm in robot.arms)
-    found = retarget(pose, robot, scale=whole * min(compute_arm_targets(pose, robot).scale.values()))
-    is_sound(found)
-    dt, settled = 0.01, found.approach_samples + 100
-    for arm, target in zip(robot.arms, found.targets, strict=True):
+    trajectory = retarget(pose, robot, scale=whole * min(compute_arm_targets(pose, robot).scale.values()))
+    is_sound(trajectory)
+    dt, settled = 0.01, trajectory.approach_samples + 100
+    for arm, target in zip(robot.arms, trajectory.targets, strict=True):
         outside = np.linalg.norm(target.position - target.unclamped, axis=1) > 1e-3
         edges = settled + np.flatnonzero(np.diff(outside[settled:]))
         assert len(edges) >= 4
-        near = np.abs(found.time[:, None] - found.time[edges]).min(axis=1) < 0.2
-        jerk = np.abs(np.diff(found.run.joint_acceleration, axis=0))[:, arm.joints] / dt / robot.j_max[arm.joints]
+        near = np.abs(trajectory.time[:, None] - trajectory.time[edges]).min(axis=1) < 0.2
+        jerk = np.abs(np.diff(trajectory.run.joint_acceleration, axis=0))[:, arm.joints] / dt / robot.j_max[arm.joints]
         close, elsewhere = jerk[settled:][near[settled + 1 :]], jerk[settled:][~near[settled + 1 :]]
         assert close.max() < 0.5
         assert np.sqrt(np.mean(close**2)) < 1.5 * np.sqrt(np.mean(elsewhere**2))
@@ -157,6 +157,6 @@ def test_the_real_recording(tracked: Pose, name: str) -> None:
         point_cov={point: cov[keep] for point, cov in tracked.point_cov.items()},
     )
     robot = load_robot(find_map(name))
-    found = retarget(pose, robot)
-    is_sound(found)
-    assert found.counts.stopping == 0
+    trajectory = retarget(pose, robot)
+    is_sound(trajectory)
+    assert trajectory.counts.stopping == 0

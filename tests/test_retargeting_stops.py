@@ -147,10 +147,10 @@ def test_nothing_of_a_robot_on_a_table_goes_below_it(tmp_path: Path) -> None:
     pose = person(4.0, flexion=15.0)  # the hand hangs 0.6 m below the shoulder
     lowest = {}
     for name, own in (("table", robot), ("none", load_robot(replace(find_map(str(urdf)), table=None)))):
-        found = retarget(pose, own)
+        trajectory = retarget(pose, own)
         base = own.full.frames[own.full.getFrameId("base")].placement
-        height = [base.actInv(hand)[2] for hand in found.hand["right"]]
+        height = [base.actInv(hand)[2] for hand in trajectory.hand["right"]]
         lowest[name] = min(height)
-        assert find_self_collisions(own, found.time, found.joint_position).samples == 0
+        assert find_self_collisions(own, trajectory.time, trajectory.joint_position).samples == 0
     assert lowest["none"] < -0.65
     assert lowest["table"] > -0.63  # its point is 0.03 m ahead of its shape

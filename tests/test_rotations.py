@@ -112,9 +112,9 @@ def test_continuous_changes_signs_and_nothing_else() -> None:
 def test_products_of_arrays_are_scipys() -> None:
     rng = np.random.default_rng(4)
     a, b = Rotation.random(20, random_state=rng), Rotation.random(20, random_state=rng)
-    found = rotations.multiply(a.as_quat(), b.as_quat())
-    assert ((a * b).inv() * Rotation.from_quat(found)).magnitude().max() < 1e-14
-    np.testing.assert_array_equal(rotations.multiply(a.as_quat(), b.as_quat()[0])[0], found[0])
+    product = rotations.multiply(a.as_quat(), b.as_quat())
+    assert ((a * b).inv() * Rotation.from_quat(product)).magnitude().max() < 1e-14
+    np.testing.assert_array_equal(rotations.multiply(a.as_quat(), b.as_quat()[0])[0], product[0])
     back = rotations.multiply(rotations.conjugate(a.as_quat()), a.as_quat())
     np.testing.assert_allclose(back, np.tile([0.0, 0.0, 0.0, 1.0], (20, 1)), atol=1e-15)
     axis, angle = np.array([0.36, -0.48, 0.8]), np.array([-7.0, 0.0, 1e-12, 2.0])

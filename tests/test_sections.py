@@ -118,10 +118,10 @@ def test_a_line_is_where_its_numbers_are_and_breaks_at_nan() -> None:
     (d,) = re.findall(r'class="line left" d="([^"]+)"', text)
     (width,) = re.findall(r'<svg width="([\d.]+)"', text)
     assert d.count("M") == 2
-    found, known = points(d), np.isfinite(y)
-    assert len(found) == known.sum()
-    np.testing.assert_allclose(found[:, 0], float(width) * x[known], atol=0.6)
-    np.testing.assert_allclose(found[:, 1], 500.0 * (1.0 - y[known]), atol=0.6)
+    vertices, known = points(d), np.isfinite(y)
+    assert len(vertices) == known.sum()
+    np.testing.assert_allclose(vertices[:, 0], float(width) * x[known], atol=0.6)
+    np.testing.assert_allclose(vertices[:, 1], 500.0 * (1.0 - y[known]), atol=0.6)
 
 
 def test_equal_axes_flipped_ones_and_logarithmic_ones() -> None:

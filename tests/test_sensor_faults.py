@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
+from simulated import estimate_segments
 from test_bad_input import refused
 
 from wepose_pin import estimate_orientation, load_session, rotations
@@ -25,7 +26,6 @@ from wepose_pin.recording.intervals import check_phases
 from wepose_pin.recording.plausibility import check_signals
 from wepose_pin.simulation import NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.tracking import TrackOptions, track, track_session
-from wepose_pin.tracking.segments import estimate_segments
 from wepose_pin.writers import write_session
 
 BROKEN = "left_forearm"

@@ -42,7 +42,7 @@ RUN = [
 ELSEWHERE = {
     r"^(pip|make|cd|python3 -m venv) ": "sets up a machine: .ci/run does it",
     r"--source (udp|mti|lsl)|--guide": "waits for sensors: tests/test_sources_*.py, test_guide.py",
-    r"humanSubject01|arm\.(toml|urdf)": "a file of the reader's: tests/test_mvnx_models.py, test_chain_calibration.py",
+    r"humanSubject01|arm\.(toml|urdf)": "a file of the reader's: benchmarks/bodies.py",
     r"ours\.toml|session\.toml --method smekf": "a file of the reader's: tests/test_reference.py, test_chain.py",
     r"before after|session.toml --model whole_body": "two sessions, legs: tests/test_repetitions.py, test_legs.py",
     r"take_2|study|plan\.toml": "takes and plans: tests/test_live_terminal.py, test_batch_plan.py",
@@ -75,17 +75,17 @@ def blocks(page: str) -> list[tuple[str, str]]:
 
 def commands(page: str) -> list[Command]:
     """The lines of a page's shell blocks that are commands: after $, or where a program's name begins the line."""
-    found: list[Command] = []
+    shown: list[Command] = []
     for kind, body in blocks(page):
         prompt = kind == "console"
         for line in body.splitlines() if kind in SHELL else ():
             if line.startswith("$ "):
-                found.append(Command(re.sub(r"\s+#.*$", "", line[2:]), ()))
-            elif prompt and found:
-                found[-1] = found[-1]._replace(output=(*found[-1].output, line))
+                shown.append(Command(re.sub(r"\s+#.*$", "", line[2:]), ()))
+            elif prompt and shown:
+                shown[-1] = shown[-1]._replace(output=(*shown[-1].output, line))
             elif re.match(r"(wepose|python3?|pip|make|cd) ", line):
-                found.append(Command(re.sub(r"\s+#.*$", "", line), ()))
-    return found
+                shown.append(Command(re.sub(r"\s+#.*$", "", line), ()))
+    return shown
 
 
 def wepose_calls(page: str) -> list[list[str]]:

@@ -12,7 +12,9 @@ from test_amekf import RATE, Case, case, cov, errors, run, tilt_deg
 from wepose_pin import rotations
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import METHODS, OFFLINE, Amekf, AmekfParams, Smoother
-from wepose_pin.filters.amekf import BLOCK, STATES, fill_transition_rows
+from wepose_pin.filters.amekf import BLOCK, ERROR, STATES, fill_transition_rows
+
+BIASES = np.r_[ERROR.gyro_bias, ERROR.motion_bias]
 
 
 def part(of: Case, samples: slice) -> Case:
@@ -43,14 +45,21 @@ def test_the_backward_pass_is_the_textbook_s() -> None:
         correction.append(gains.T @ innovations)
     assert 0 < of.static.sum() < len(of.static)
 
-    found = Smoother(of.noise, RATE, of.start, params).run(of.gyro, of.accel, of.static)
+    result = Smoother(of.noise, RATE, of.start, params).run(of.gyro, of.accel, of.static)
     deviation, P_s = np.zeros(STATES), P[-1]
     for k in range(len(F) - 1, -1, -1):
-        R = Rotation.from_quat(found.quat_WS[25 * k + 24])
+        R = Rotation.from_quat(result.quat_WS[25 * k + 24])
         turned = (R * Rotation.from_quat(quats[k]).inv()).as_rotvec()
         np.testing.assert_allclose(turned, deviation[:3], atol=1e-8)
-        cov_W = R.as_matrix() @ cov(found)[25 * k + 24] @ R.as_matrix().T
+        cov_W = R.as_matrix() @ cov(result)[25 * k + 24] @ R.as_matrix().T
         np.testing.assert_allclose(cov_W, P_s[:3, :3], atol=1e-9, rtol=1e-6)
+        if k < len(F) - 1:  # the next sample's is that of the block before it
+            u = Rotation.from_quat(result.quat_WS[25 * k + 25]).as_matrix()[2]
+            of_bias = np.concatenate([u, u]) @ P_s[np.ix_(BIASES, BIASES)] @ np.concatenate([u, u])
+            assert result.about_vertical is not None
+            np.testing.assert_allclose(
+                result.about_vertical[25 * k + 25], (0.0, 0.0, 0.0, 0.0, 0.0, of_bias), rtol=1e-6
+            )
         G = P[k] @ F[k].T @ np.linalg.inv(P_before[k])
         deviation = G @ (correction[k] + deviation)
         P_s = P[k] + G @ (P_s - P_before[k]) @ G.T
@@ -77,11 +86,13 @@ def test_a_rest_at_the_end_tells_the_bias_of_the_beginning() -> None:
         )
         of = of._replace(noise=unknown, start=rotations.quat_from_gravity(of.accel[:50].mean(axis=0)))
         forward, smoothed = run(of), run(of, kind=Smoother)
-        wrong = [np.abs(found.gyro_bias[100] - true_bias).max() for found in (forward, smoothed)]
+        wrong = [np.abs(result.gyro_bias[100] - true_bias).max() for result in (forward, smoothed)]
         assert wrong[1] < 3e-4
         assert wrong[1] < 0.2 * wrong[0]
         true = Rotation.from_quat(of.true)
-        tilt = [tilt_deg(Rotation.from_quat(found.quat_WS) * true.inv())[:500].mean() for found in (forward, smoothed)]
+        tilt = [
+            tilt_deg(Rotation.from_quat(result.quat_WS) * true.inv())[:500].mean() for result in (forward, smoothed)
+        ]
         assert tilt[1] < 0.5 < tilt[0]
 
 
@@ -101,7 +112,7 @@ def test_a_gap_is_bridged_from_both_sides() -> None:
 def test_short_recordings_and_open_blocks(length: int) -> None:
     of = part(case(2), slice(0, length))
     forward, smoothed = run(of), run(of, kind=Smoother)
-    assert all(found is not None and len(found) == length and np.isfinite(found).all() for found in smoothed)
+    assert all(array is not None and len(array) == length and np.isfinite(array).all() for array in smoothed)
     # After the last whole block there is nothing that the filter does not know.
     np.testing.assert_allclose(smoothed.quat_WS[-1], forward.quat_WS[-1], atol=1e-12)
     np.testing.assert_allclose(cov(smoothed)[-1], cov(forward)[-1], atol=1e-12)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from bodies import LENGTHS
 
-from benchmarks.calibration import Posed, count_evaluations, pose_cases
+from benchmarks.calibration import Posed, count_evaluations, pose_cases, solve_without_bounds
 from wepose_pin.calibration import solver
 from wepose_pin.calibration.least_squares import Gaussian
-from wepose_pin.calibration.solver import MIN_LENGTH, LeastSquares, solve, solve_without_bounds
+from wepose_pin.calibration.solver import MIN_LENGTH, TOLERANCE, LeastSquares, solve
 from wepose_pin.errors import NoSolution
 
 
@@ -69,6 +69,25 @@ def test_steps_that_do_not_suffice(cases: dict[str, Posed]) -> None:
     assert count_evaluations(lambda: solve(problem, start, 3, strict=False)) <= 3 * 3
 
 
+def test_many_small_ways_to_go_are_gone(cases: dict[str, Posed], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each number of the gradient is below what `nlpsol` looks for, all together are more than may be left."""
+    problem, minimise, calls = cases["clasp"].problem, solver._minimise, 0
+    best = solve(problem, cases["clasp"].start, tolerance=1e-7)
+    z = np.full(len(best.x), 0.4 * TOLERANCE)
+    start = problem.evaluate(best.x + np.linalg.solve(np.linalg.cholesky(best.information).T, z))
+    assert start.remaining() > TOLERANCE
+
+    def counted(*arguments: object) -> object:
+        nonlocal calls
+        calls += 1
+        return minimise(*arguments)
+
+    monkeypatch.setattr(solver, "_minimise", counted)
+    fit = solve(problem, start.x)
+    assert problem.evaluate(fit.x).remaining() < TOLERANCE
+    assert calls <= 3
+
+
 def test_a_solution_is_not_evaluated_again(cases: dict[str, Posed]) -> None:
     problem, start = cases["handle"].problem, cases["handle"].start
     fit = solve(problem, start)
@@ -96,8 +115,9 @@ def test_an_interruption_passes_through_casadi(cases: dict[str, Posed], monkeypa
 
 @pytest.mark.parametrize("factor", [np.nan, 0.0, -1.0])
 def test_where_a_quadratic_program_has_no_solution_it_goes_on_from_the_last_step(
-    cases: dict[str, Posed], monkeypatch: pytest.MonkeyPatch, factor: float
+    cases: dict[str, Posed], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], factor: float
 ) -> None:
+    """CasADi writes nothing meanwhile: a program that raises would print its matrices."""
     problem, start = cases["touch_left"].problem, cases["touch_left"].start
     curvature, calls = solver._Oracle.curvature, 0
 
@@ -110,4 +130,5 @@ def test_where_a_quadratic_program_has_no_solution_it_goes_on_from_the_last_step
     monkeypatch.setattr(solver._Oracle, "curvature", broken_once)
     fit = solve(problem, start)
     assert calls > 3
+    assert capfd.readouterr() == ("", "")
     assert largest_difference(problem, fit.x, solve_without_bounds(problem, start).x) < 1e-3

@@ -76,10 +76,10 @@ def test_one_stream_a_sensor(pylsl: ModuleType, outlet: Outlet) -> None:
     rows = np.random.default_rng(1).normal(size=(50, 6)).astype(np.float32)
     stamps = pylsl.local_clock() + np.arange(50) / RATE - 0.5
     send(outlets[:2], rows, stamps)
-    found = collect(source, 50)
+    samples = collect(source, 50)
     for name in source.sensors:
-        np.testing.assert_array_equal(np.column_stack([found[name].gyro_S, found[name].accel_S]), rows)
-        np.testing.assert_array_equal(found[name].time, stamps)
+        np.testing.assert_array_equal(np.column_stack([samples[name].gyro_S, samples[name].accel_S]), rows)
+        np.testing.assert_array_equal(samples[name].time, stamps)
     assert abs(source.clock() - stamps[-1]) < 5.0
     source.close()
     source.close()
@@ -94,13 +94,13 @@ def test_one_stream_for_all_with_units_and_other_channels(pylsl: ModuleType, out
     source.open()
     rows = np.random.default_rng(2).normal(size=(20, len(labels))).astype(np.float32)
     send([out], rows, pylsl.local_clock() + np.arange(20) / RATE)
-    found = collect(source, 20)
+    samples = collect(source, 20)
     source.close()
     assert source.sensors == ("torso", "head")
     for name in source.sensors:
         columns = [rows[:, labels.index(label)].astype(float) for label in labels_of(name)]
-        np.testing.assert_allclose(found[name].gyro_S, np.deg2rad(np.column_stack(columns[:3])), rtol=1e-12)
-        np.testing.assert_allclose(found[name].accel_S, 9.80665 * np.column_stack(columns[3:]), rtol=1e-12)
+        np.testing.assert_allclose(samples[name].gyro_S, np.deg2rad(np.column_stack(columns[:3])), rtol=1e-12)
+        np.testing.assert_allclose(samples[name].accel_S, 9.80665 * np.column_stack(columns[3:]), rtol=1e-12)
 
 
 def test_samples_that_cannot_be_are_counted(pylsl: ModuleType, outlet: Outlet) -> None:
@@ -110,9 +110,9 @@ def test_samples_that_cannot_be_are_counted(pylsl: ModuleType, outlet: Outlet) -
     rows = np.ones((10, 6))
     rows[3, 2], rows[7, 4] = np.nan, 1e30
     send([out], rows, pylsl.local_clock() + np.arange(10) / RATE)
-    found = collect(source, 8)["torso"]
+    samples = collect(source, 8)["torso"]
     source.close()
-    np.testing.assert_array_equal(found.accel_S, np.ones((8, 3)))
+    np.testing.assert_array_equal(samples.accel_S, np.ones((8, 3)))
     assert source.problems == {"samples with values that no body sensor gives": 2}
 
 
@@ -124,9 +124,9 @@ def test_lost_samples_leave_the_times_of_the_others_alone(pylsl: ModuleType, out
     stamps = pylsl.local_clock() + np.arange(300) / RATE
     stamps = stamps[(np.arange(300) < 100) | (np.arange(300) >= 200)]
     send([out], np.ones((200, 6)), stamps)
-    found = collect(source, 200)["torso"]
+    samples = collect(source, 200)["torso"]
     source.close()
-    np.testing.assert_array_equal(found.time, stamps)
+    np.testing.assert_array_equal(samples.time, stamps)
 
 
 def test_a_stream_that_starts_anew_is_taken_up(pylsl: ModuleType, outlet: Outlet) -> None:
@@ -202,13 +202,13 @@ while True:
 def bound() -> set[tuple[str, str, str]]:
     """Protocol, address and inode of this process's sockets that listen (TCP) or are bound (UDP); Linux."""
     mine = {link.readlink().name for link in Path("/proc/self/fd").iterdir() if link.is_symlink()}
-    found = set()
+    sockets = set()
     for protocol in ("tcp", "tcp6", "udp", "udp6"):
         for line in Path(f"/proc/self/net/{protocol}").read_text().splitlines()[1:]:
             fields = line.split()
             if f"socket:[{fields[9]}]" in mine and (protocol[:3] == "udp" or fields[3] == "0A"):
-                found.add((protocol, fields[1].split(":")[0], fields[9]))
-    return found
+                sockets.add((protocol, fields[1].split(":")[0], fields[9]))
+    return sockets
 
 
 LOOPBACK = "{:08X}".format(int.from_bytes(socket.inet_aton("127.0.0.1"), sys.byteorder))

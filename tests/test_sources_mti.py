@@ -146,15 +146,15 @@ def test_two_sensors_configured_to_a_rate(plugged) -> None:
     assert source.sensors == ("torso", "head")
     assert source.rate_hz == 50
     source.open()
-    found = collect(source, lambda p: min(count(p, "torso"), count(p, "head")) >= 40)
+    samples = collect(source, lambda p: min(count(p, "torso"), count(p, "head")) >= 40)
     source.close()
     for device, name in ((one, "torso"), (two, "head")):
         assert [mid for mid, _ in device.asked] == [0x30, 0xC0, 0x10]
         assert device.asked[1][1] == bytes.fromhex("1020FFFF1060FFFF4020003280200032")
-        np.testing.assert_array_equal(found[name].gyro_S, np.tile(GYRO, (len(found[name].time), 1)))
-        np.testing.assert_array_equal(found[name].accel_S, np.tile(ACCEL, (len(found[name].time), 1)))
-        np.testing.assert_allclose(np.diff(found[name].time), 0.02, rtol=0.0101)
-        assert abs(found[name].time[-1] - source.clock()) < 1.0
+        np.testing.assert_array_equal(samples[name].gyro_S, np.tile(GYRO, (len(samples[name].time), 1)))
+        np.testing.assert_array_equal(samples[name].accel_S, np.tile(ACCEL, (len(samples[name].time), 1)))
+        np.testing.assert_allclose(np.diff(samples[name].time), 0.02, rtol=0.0101)
+        assert abs(samples[name].time[-1] - source.clock()) < 1.0
     assert source.problems == {}
 
 
@@ -162,10 +162,10 @@ def test_high_rates_are_asked_of_the_hr_outputs(plugged) -> None:
     device = plugged("one")
     source = open_source(f"mti:{device.link}=torso@1000", baud=921600)
     source.open()
-    found = collect(source, lambda p: count(p, "torso") >= 500)["torso"]
+    samples = collect(source, lambda p: count(p, "torso") >= 500)["torso"]
     source.close()
     assert {kind for kind, _ in device.items} == {0x4040, 0x8040}
-    assert np.diff(found.time).mean() == pytest.approx(0.001, rel=0.0101)
+    assert np.diff(samples.time).mean() == pytest.approx(0.001, rel=0.0101)
 
 
 def test_a_device_without_hr_is_asked_for_the_plain_outputs(plugged) -> None:
@@ -200,10 +200,10 @@ def test_noise_is_counted_and_no_sample_lost(plugged) -> None:
     device.noise = b"\xfa\xff\x36\x05noise\x00"
     source = open_source(f"mti:{device.link}=torso@100")
     source.open()
-    found = collect(source, lambda p: count(p, "torso") >= 60)["torso"]
+    samples = collect(source, lambda p: count(p, "torso") >= 60)["torso"]
     source.close()
-    assert len(found.time) >= 60
-    np.testing.assert_allclose(np.diff(found.time), 0.01, rtol=0.0101)
+    assert len(samples.time) >= 60
+    np.testing.assert_allclose(np.diff(samples.time), 0.01, rtol=0.0101)
     assert source.problems["bytes skipped"] >= 59 * len(device.noise)
     assert source.problems["bad checksums"] >= 59
 
@@ -220,9 +220,9 @@ def test_a_port_that_vanishes_is_taken_up_again(plugged) -> None:
     assert source.problems["connections lost to torso"] == 1
     gone.measuring, gone.ticks = False, 0
     gone.plug()
-    found = collect(source, lambda p: count(p, "torso") >= 20)["torso"]
-    assert len(found.time) >= 20
-    assert abs(found.time[-1] - source.clock()) < 0.5
+    samples = collect(source, lambda p: count(p, "torso") >= 20)["torso"]
+    assert len(samples.time) >= 20
+    assert abs(samples.time[-1] - source.clock()) < 0.5
     assert source.problems["reconnections of torso"] == 1
     assert [mid for mid, _ in gone.asked] == [0x30, 0xC0, 0x10] * 2
     source.close()
@@ -237,9 +237,9 @@ def test_a_device_that_falls_silent_is_woken(plugged, monkeypatch: pytest.Monkey
     device.measuring = False  # its supply failed, it starts in config state, the port stays
     while source.read(0.1):
         pass
-    found = collect(source, lambda p: count(p, "torso") >= 20)
+    samples = collect(source, lambda p: count(p, "torso") >= 20)
     source.close()
-    assert len(found["torso"].time) >= 20
+    assert len(samples["torso"].time) >= 20
 
 
 def test_nothing_there(tmp_path: Path, plugged, monkeypatch: pytest.MonkeyPatch) -> None:

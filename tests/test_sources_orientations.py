@@ -43,14 +43,14 @@ def sender() -> Iterator[socket.socket]:
 
 def read_all(source: DatagramSource, count: int = 1) -> dict[str, list[np.ndarray]]:
     """Quaternions by segment, as soon as there are `count`, or what came in two seconds."""
-    found: dict[str, list[np.ndarray]] = {}
+    rotations: dict[str, list[np.ndarray]] = {}
     deadline = time.monotonic() + 2.0
-    while sum(map(len, found.values())) < count and time.monotonic() < deadline:
+    while sum(map(len, rotations.values())) < count and time.monotonic() < deadline:
         for samples in source.read(0.05):
             assert isinstance(samples, Samples)
             assert abs(samples.time[-1] - source.clock()) < 1.0
-            found.setdefault(samples.sensor, []).extend(unpack_orientations(samples.gyro_S, samples.accel_S))
-    return found
+            rotations.setdefault(samples.sensor, []).extend(unpack_orientations(samples.gyro_S, samples.accel_S))
+    return rotations
 
 
 def make_tracker_source(**options: object) -> SlimeVrSource:
@@ -73,9 +73,9 @@ def test_a_tracker_is_answered_and_its_rotation_comes_on_the_segment_that_it_sit
             packet = struct.pack(">IQBB4fB", 17, number, 1, 1, *quat, 0)
             assert number != 42 or packet == ROTATION
             sender.sendto(packet, source.address)
-        found = read_all(source, 2)
-        assert list(found) == ["right_upper_arm"]
-        np.testing.assert_allclose(found["right_upper_arm"], [[0.0, 0.0, 0.0, 1.0], turn], atol=1e-7)
+        rotations = read_all(source, 2)
+        assert list(rotations) == ["right_upper_arm"]
+        np.testing.assert_allclose(rotations["right_upper_arm"], [[0.0, 0.0, 0.0, 1.0], turn], atol=1e-7)
         sender.sendto(ACCELERATION.replace(b"\x2b", b"\x50"), source.address)
         assert not read_all_for(source, 0.7)  # a heartbeat comes twice a second
         answers = [sender.recv(2000) for _ in range(4)]
@@ -113,19 +113,19 @@ def test_trackers_without_a_place_are_named_and_can_be_assigned(sender: socket.s
         # The older packets: a rotation of the first sensor, and one of sixteen bits.
         sender.sendto(struct.pack(">IQ4f", 16, 9, 0.0, 0.0, 1.0, 0.0), assigned.address)
         sender.sendto(struct.pack(">IQB4h3h", 23, 10, 1, 0, 0, 23170, 23170, 0, 0, 0), assigned.address)
-        found = read_all(assigned, 2)["head"]
-        np.testing.assert_allclose(found[0], [0.0, 0.0, 1.0, 0.0], atol=1e-7)
-        np.testing.assert_allclose(found[1], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-7)
+        rotations = read_all(assigned, 2)["head"]
+        np.testing.assert_allclose(rotations[0], [0.0, 0.0, 1.0, 0.0], atol=1e-7)
+        np.testing.assert_allclose(rotations[1], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-7)
     finally:
         assigned.close()
 
 
 def read_all_for(source: DatagramSource, seconds: float) -> list[Samples]:
     """What comes in this time."""
-    found, deadline = [], time.monotonic() + seconds
+    packets, deadline = [], time.monotonic() + seconds
     while time.monotonic() < deadline:
-        found += source.read(0.05)
-    return found
+        packets += source.read(0.05)
+    return packets
 
 
 def test_mvn_segments_are_ours_in_the_n_pose(sender: socket.socket) -> None:
@@ -148,13 +148,17 @@ def test_mvn_segments_are_ours_in_the_n_pose(sender: socket.socket) -> None:
             b"hello",
         ):
             sender.sendto(datagram, source.address)
-        found = read_all(source, 4)
-        assert set(found) == {"pelvis", "left_upper_arm", "right_forearm", "torso"}
+        rotations = read_all(source, 4)
+        assert set(rotations) == {"pelvis", "left_upper_arm", "right_forearm", "torso"}
         along = np.array([0.0, 0.0, -1.0])
-        np.testing.assert_allclose(Rotation.from_quat(found["left_upper_arm"][0]).apply(along), [0, 1, 0], atol=1e-7)
-        np.testing.assert_allclose(Rotation.from_quat(found["right_forearm"][0]).apply(along), [0, -1, 0], atol=1e-7)
-        np.testing.assert_allclose(found["pelvis"][0], [0.0, 0.0, 0.0, 1.0], atol=1e-7)
-        np.testing.assert_allclose(found["torso"][0], [0.0, 0.5, 0.0, 0.5 * np.sqrt(3.0)], atol=1e-7)
+        np.testing.assert_allclose(
+            Rotation.from_quat(rotations["left_upper_arm"][0]).apply(along), [0, 1, 0], atol=1e-7
+        )
+        np.testing.assert_allclose(
+            Rotation.from_quat(rotations["right_forearm"][0]).apply(along), [0, -1, 0], atol=1e-7
+        )
+        np.testing.assert_allclose(rotations["pelvis"][0], [0.0, 0.0, 0.0, 1.0], atol=1e-7)
+        np.testing.assert_allclose(rotations["torso"][0], [0.0, 0.5, 0.0, 0.5 * np.sqrt(3.0)], atol=1e-7)
         assert all(source.orientations.values())
         read_all_for(source, 0.1)
         assert source.problems == {

@@ -31,9 +31,9 @@ def drained(source: Source, pause_s: float = 0.0) -> dict[str, np.ndarray]:
     """Time, gyro and accel (n, 7) of each sensor, to the end."""
     rows: dict[str, list[np.ndarray]] = {}
     source.open()
-    while (found := source.read(0.05)) is not None:
+    while (came := source.read(0.05)) is not None:
         now = source.clock()
-        for samples in found:
+        for samples in came:
             assert samples.time[-1] <= now + 1e-9
             rows.setdefault(samples.sensor, []).append(np.column_stack([samples.time, samples.gyro_S, samples.accel_S]))
         time.sleep(pause_s)
@@ -44,10 +44,10 @@ def drained(source: Source, pause_s: float = 0.0) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(("speed", "pause_s"), [(math.inf, 0.0), (20.0, 0.0), (20.0, 0.03)])
 def test_every_sample_comes_once_and_in_order(speed: float, pause_s: float) -> None:
     r = recording()
-    found = drained(ReplaySource(r, speed), pause_s)
-    assert list(found) == list(r.sensors)
+    samples = drained(ReplaySource(r, speed), pause_s)
+    assert list(samples) == list(r.sensors)
     for name, sensor in r.sensors.items():
-        np.testing.assert_array_equal(found[name], np.column_stack([r.time, sensor.gyro_S, sensor.accel_S]))
+        np.testing.assert_array_equal(samples[name], np.column_stack([r.time, sensor.gyro_S, sensor.accel_S]))
 
 
 def test_the_clock_runs_at_the_speed() -> None:
@@ -63,9 +63,9 @@ def test_no_sample_in_a_marked_gap() -> None:
     r = recording()
     gap = (r.time > 21.0) & (r.time < 22.0)
     sensors = {name: replace(sensor, gap=gap if name == "torso" else None) for name, sensor in r.sensors.items()}
-    found = drained(ReplaySource(replace(r, sensors=sensors), math.inf))
-    np.testing.assert_array_equal(found["torso"][:, 0], r.time[~gap])
-    assert len(found["left_upper_arm"]) == len(r)
+    samples = drained(ReplaySource(replace(r, sensors=sensors), math.inf))
+    np.testing.assert_array_equal(samples["torso"][:, 0], r.time[~gap])
+    assert len(samples["left_upper_arm"]) == len(r)
 
 
 def test_nothing_due_is_nothing() -> None:

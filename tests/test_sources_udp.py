@@ -68,10 +68,10 @@ def test_a_json_line_may_say_the_charge_of_the_battery(source: UdpSource, sender
 def test_a_json_line_of_one_sample(source: UdpSource, sender: socket.socket) -> None:
     before = time.monotonic()
     sender.sendto(json.dumps(GOOD).encode(), source.address)
-    found = read_until(source, 1)["torso"]
-    np.testing.assert_array_equal(found.gyro_S, [GOOD["gyro"]])
-    np.testing.assert_array_equal(found.accel_S, [GOOD["accel"]])
-    assert before <= found.time[0] <= source.clock()
+    samples = read_until(source, 1)["torso"]
+    np.testing.assert_array_equal(samples.gyro_S, [GOOD["gyro"]])
+    np.testing.assert_array_equal(samples.accel_S, [GOOD["accel"]])
+    assert before <= samples.time[0] <= source.clock()
     assert source.problems == {}
 
 
@@ -81,19 +81,19 @@ def test_many_lines_and_lists_of_samples(source: UdpSource, sender: socket.socke
     many = {"sensor": "head", "t": times, "gyro": rows[:, :3].tolist(), "accel": rows[:, 3:].tolist()}
     lines = "\r\n".join([json.dumps(many), "", json.dumps({**GOOD, "t": 100.04, "extra": "passed over"})]) + "\n"
     sender.sendto(lines.encode(), source.address)
-    found = read_until(source, 6)
-    np.testing.assert_array_equal(np.column_stack([found["head"].gyro_S, found["head"].accel_S]), rows)
-    np.testing.assert_allclose(np.diff(found["head"].time), 0.01, atol=1e-9)
-    assert found["torso"].time[0] == pytest.approx(found["head"].time[4], abs=1e-9)
+    samples = read_until(source, 6)
+    np.testing.assert_array_equal(np.column_stack([samples["head"].gyro_S, samples["head"].accel_S]), rows)
+    np.testing.assert_allclose(np.diff(samples["head"].time), 0.01, atol=1e-9)
+    assert samples["torso"].time[0] == pytest.approx(samples["head"].time[4], abs=1e-9)
 
 
 def test_a_binary_packet(source: UdpSource, sender: socket.socket) -> None:
     rows = np.random.default_rng(2).normal(size=(40, 6)).astype(np.float32)
     times = [1.7e9 + k / 1000.0 for k in range(40)]
     sender.sendto(binary(3, times, rows.tolist()), source.address)
-    found = read_until(source, 40)["right_upper_arm"]
-    np.testing.assert_array_equal(np.column_stack([found.gyro_S, found.accel_S]), rows)
-    np.testing.assert_allclose(np.diff(found.time), 0.001, atol=1e-6)
+    samples = read_until(source, 40)["right_upper_arm"]
+    np.testing.assert_array_equal(np.column_stack([samples.gyro_S, samples.accel_S]), rows)
+    np.testing.assert_allclose(np.diff(samples.time), 0.001, atol=1e-6)
 
 
 def test_the_numbers_of_sensors_are_all_segments() -> None:
@@ -136,8 +136,8 @@ def test_what_is_wrong_is_counted_and_the_next_is_read(
 ) -> None:
     sender.sendto(datagram, source.address)
     sender.sendto(json.dumps(GOOD).encode(), source.address)
-    found = read_until(source, 1)
-    assert [len(samples.time) for samples in found.values()] == [1]
+    received = read_until(source, 1)
+    assert [len(samples.time) for samples in received.values()] == [1]
     assert [kind.startswith(problem) for kind in source.problems] == [True]
     assert list(source.problems.values()) == [1]
 
@@ -168,8 +168,8 @@ def test_two_senders_with_clocks_of_their_own() -> None:
             first.sendto(json.dumps({**GOOD, "t": 5000.0 + k / 100}).encode(), source.address)
             second.sendto(json.dumps({**GOOD, "t": k / 100, "sensor": "head"}).encode(), source.address)
             time.sleep(0.01)
-        found = read_until(source, 40)
-        assert np.abs(found["torso"].time - found["head"].time).max() < 0.02
+        samples = read_until(source, 40)
+        assert np.abs(samples["torso"].time - samples["head"].time).max() < 0.02
 
 
 class UdpPair:

@@ -76,8 +76,8 @@ def test_frames_of_any_length_in_any_pieces(length: int, piece: int) -> None:
     stream = whole(0x36, data) * 2 + whole(0x42, b"\x04")
     assert xbus.build_frame(0x36, data) == whole(0x36, data)
     frames = xbus.Frames()
-    found = [f for k in range(0, len(stream), piece) for f in frames.feed(stream[k : k + piece])]
-    assert found == [(0x36, data), (0x36, data), (0x42, b"\x04")]
+    read = [f for k in range(0, len(stream), piece) for f in frames.feed(stream[k : k + piece])]
+    assert read == [(0x36, data), (0x36, data), (0x42, b"\x04")]
     assert (frames.skipped, frames.bad_checksums) == (0, 0)
 
 
@@ -88,14 +88,14 @@ def test_extended_length_for_a_short_frame() -> None:
 def test_noise_between_frames_is_skipped_and_counted() -> None:
     """Noise with preambles in it, also such that announce a long frame: no whole frame is lost."""
     rng = random.Random(3)
-    frames, found, noise = xbus.Frames(), [], 0
+    frames, read, noise = xbus.Frames(), [], 0
     for k in range(200):
         between = rng.randbytes(rng.randrange(20)) + (b"\xfa\xff\x36\x40" if k % 5 == 0 else b"")
         noise += len(between)
-        found += frames.feed(between + whole(0x36, k.to_bytes(2, "big") + b"\xfa\xff\x36\x10"))
-    found += frames.feed(bytes(3000))
+        read += frames.feed(between + whole(0x36, k.to_bytes(2, "big") + b"\xfa\xff\x36\x10"))
+    read += frames.feed(bytes(3000))
     noise += 3000
-    assert [f.data[:2] for f in found] == [k.to_bytes(2, "big") for k in range(200)]
+    assert [f.data[:2] for f in read] == [k.to_bytes(2, "big") for k in range(200)]
     assert frames.skipped == noise
     assert frames.bad_checksums >= 40
 
@@ -120,10 +120,10 @@ def test_random_bytes_raise_nothing_and_end() -> None:
         if k % 3 == 0 and rng.random() < 0.5:
             piece[rng.randrange(len(piece))] = rng.randrange(256)
         came += len(piece)
-        for found in frames.feed(bytes(piece)):
-            taken += len(found.data) + (5 if len(found.data) < 255 else 7)
+        for frame in frames.feed(bytes(piece)):
+            taken += len(frame.data) + (5 if len(frame.data) < 255 else 7)
             try:
-                xbus.parse_packet(found.data)
+                xbus.parse_packet(frame.data)
                 packets += 1
             except xbus.Malformed:
                 pass
@@ -168,10 +168,10 @@ def test_a_packet_of_a_device() -> None:
         "8030103F80000037DF8801B6898000B608C000C0200CBEFBFBF23F33C485BFA0A2C108100442168000"
         "301004000186E1E0200400400003"
     )
-    found = xbus.parse_packet(data)
-    assert found.ticks == 20332454
-    assert found.accel == pytest.approx((-0.05550629, 9.81465530, 0.21842313), abs=1e-8)
-    assert found.gyro == pytest.approx((0.02131760, -0.00327826, -0.00163019), abs=1e-8)
+    packet = xbus.parse_packet(data)
+    assert packet.ticks == 20332454
+    assert packet.accel == pytest.approx((-0.05550629, 9.81465530, 0.21842313), abs=1e-8)
+    assert packet.gyro == pytest.approx((0.02131760, -0.00327826, -0.00163019), abs=1e-8)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,7 @@ class Motion(NamedTuple):
 class Draw(NamedTuple):
     """What a calibration made of one draw."""
 
-    found: Calibration
+    calibration: Calibration
     error: np.ndarray  # (k,) of lengths [m], mounts [rad] and girdles [m], in the covariance's order
 
 
@@ -130,15 +130,15 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
             R_VS_start[name] = _about_z(-psi) * tilt * mounts[name]
             R_VS[name] = Rotation.concatenate([*[R_VS_start[name]] * len(start_time), Q * R_VS_start[name]])
         filtered = FilteredRecording(R_VS, R_VS_start, {}, START, START, [])
-        found = solve_calibration(CalibrationProblem(recording, filtered, protocol, prior, measured, MODEL))
-        error = dict(zip(LENGTHS, np.array([found.subject.lengths[s] for s in LENGTHS]) - mean, strict=True))
+        calibration = solve_calibration(CalibrationProblem(recording, filtered, protocol, prior, measured, MODEL))
+        error = dict(zip(LENGTHS, np.array([calibration.subject.lengths[s] for s in LENGTHS]) - mean, strict=True))
         for name, rigid in RIGID_SHOULDERS.items():
             rows = [f"girdles.{name}.{parameter}" for parameter in PARAMETERS]
-            error |= dict(zip(rows, found.subject.girdles[name] - rigid, strict=True))
+            error |= dict(zip(rows, calibration.subject.girdles[name] - rigid, strict=True))
         for name in SENSORS:
-            off = (Rotation.from_quat(found.subject.mounts[name]) * mounts[name].inv()).as_rotvec()
+            off = (Rotation.from_quat(calibration.subject.mounts[name]) * mounts[name].inv()).as_rotvec()
             error |= dict(zip(mount_rows(name), off, strict=True))
-        yield Draw(found, np.array([error[row] for row in found.subject.order]))
+        yield Draw(calibration, np.array([error[row] for row in calibration.subject.order]))
 
 
 def _none(*parts: np.ndarray) -> np.ndarray:
@@ -184,27 +184,27 @@ def _hinged(R_WL: dict[str, Rotation], side: str, axis: np.ndarray) -> dict[str,
 def ratios(motion: Motion, count: int, seed: int = 0) -> dict[str, float]:
     """Spread of each group over what is stated of it."""
     made = list(draws(motion, count, seed))
-    order = made[0].found.subject.order
-    found = {}
+    order = made[0].calibration.subject.order
+    ratio = {}
     for group, parts in GROUPS.items():
         T = np.array([[float(row in part) for row in order] for part in parts])
         error = np.array([T @ draw.error for draw in made])
-        stated = np.array([np.diag(T @ draw.found.subject.covariance @ T.T) for draw in made])
-        found[group] = float(np.sqrt(np.mean(error**2) / np.mean(stated)))
-    return found
+        stated = np.array([np.diag(T @ draw.calibration.subject.covariance @ T.T) for draw in made])
+        ratio[group] = float(np.sqrt(np.mean(error**2) / np.mean(stated)))
+    return ratio
 
 
 @pytest.mark.monte_carlo
 def test_the_spread_is_what_is_stated(motion: Motion) -> None:
-    found = ratios(motion, DRAWS)
-    print({name: round(value, 2) for name, value in found.items()})
-    assert all(0.7 < value < 1.3 for value in found.values()), found
+    ratio_of = ratios(motion, DRAWS)
+    print({name: round(value, 2) for name, value in ratio_of.items()})
+    assert all(0.7 < value < 1.3 for value in ratio_of.values()), ratio_of
 
 
 def test_many_samples_start_from_few(motion: Motion, monkeypatch: pytest.MonkeyPatch) -> None:
-    at_once = next(draws(motion, 1)).found.subject
+    at_once = next(draws(motion, 1)).calibration.subject
     monkeypatch.setattr(weights, "MANY_SAMPLES", len(motion.time) // 2)
-    found = next(draws(motion, 1)).found.subject
+    subject = next(draws(motion, 1)).calibration.subject
     for name in LENGTHS:
-        assert found.lengths[name] == pytest.approx(at_once.lengths[name], abs=0.15 * at_once.std(name))
-        assert found.std(name) == pytest.approx(at_once.std(name), rel=0.1)
+        assert subject.lengths[name] == pytest.approx(at_once.lengths[name], abs=0.15 * at_once.std(name))
+        assert subject.std(name) == pytest.approx(at_once.std(name), rel=0.1)

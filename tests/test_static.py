@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from wepose_pin.errors import BadOption
-from wepose_pin.filters import run_filter
+from wepose_pin.filters import FilterSettings, run_filter
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import DETECTOR, StaticDetector, StaticTest
 from wepose_pin.simulation import simulate_paper_dynamic
@@ -55,9 +55,9 @@ def test_it_is_what_the_four_conditions_say(test: StaticTest) -> None:
     gyro, accel = stop_and_go(np.random.default_rng(0))
     noise = estimate_noise(gyro[:500], accel[:500], RATE)
     expected = by_the_book(gyro, accel, noise, test, RATE)
-    found = StaticDetector(noise, RATE, test).run(gyro, accel)
+    static = StaticDetector(noise, RATE, test).run(gyro, accel)
     assert 0.05 < expected.mean() < 0.95
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(static, expected)
 
 
 @pytest.mark.parametrize("condition", [1, 2, 3, 4])
@@ -162,9 +162,9 @@ def test_a_window_at_rest_is_exact_right_after_a_blow(rest_begins: int) -> None:
     first = np.array(accel[ends[0] - 49 : ends[0] + 1, 2], dtype=np.longdouble)
     variance = float(np.sum((first - first.mean()) ** 2) / 49)
     for factor, expected in ((1 + 1e-12, True), (1 - 1e-12, False)):
-        found = StaticDetector(noise, RATE, PaperTest(gamma2=variance * factor, **huge)).run(np.zeros((700, 3)), accel)
-        assert found[ends[0]] == expected
-        assert not found[: ends[0]].any()
+        static = StaticDetector(noise, RATE, PaperTest(gamma2=variance * factor, **huge)).run(np.zeros((700, 3)), accel)
+        assert static[ends[0]] == expected
+        assert not static[: ends[0]].any()
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300])
@@ -178,11 +178,11 @@ def test_a_sample_that_is_no_number_says_no_for_one_window_and_is_forgotten(
     without = StaticDetector(noise, RATE, PaperTest()).run(gyro, accel)
     assert without[300:450].any()
     (gyro if gyro_is_wrong else accel)[at, 1] = wrong
-    found = StaticDetector(noise, RATE, PaperTest()).run(gyro, accel)
-    assert not found[at : at + 50].any()
-    np.testing.assert_array_equal(np.delete(found, range(at, at + 50)), np.delete(without, range(at, at + 50)))
+    static = StaticDetector(noise, RATE, PaperTest()).run(gyro, accel)
+    assert not static[at : at + 50].any()
+    np.testing.assert_array_equal(np.delete(static, range(at, at + 50)), np.delete(without, range(at, at + 50)))
     detector = StaticDetector(noise, RATE, PaperTest())
-    assert [detector.update(g, a) for g, a in zip(gyro[:600], accel[:600], strict=True)] == list(found[:600])
+    assert [detector.update(g, a) for g, a in zip(gyro[:600], accel[:600], strict=True)] == list(static[:600])
 
 
 # (5), which the paper does not have --------------------------------------------------------------------------------
@@ -216,10 +216,10 @@ def test_an_office_chair_is_no_bias(method: str, rate: float) -> None:
     noise = estimate_noise(gyro[:500], accel[:500], RATE)
     paper = StaticDetector(noise, RATE, PaperTest()).run(gyro, accel)
     assert paper[600:1600].mean() > 0.8  # the paper's conditions see nothing in it
-    found = run_filter(gyro, accel, RATE, noise, method, measured_start=True, start=slice(0, 500))
-    assert not found.static[650:1690].any()
-    assert found.static[1900:].mean() > 0.8
-    error = Rotation.from_quat(found.quat_WS) * R.inv()
+    orientation = run_filter(gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 500)))
+    assert not orientation.static[650:1690].any()
+    assert orientation.static[1900:].mean() > 0.8
+    error = Rotation.from_quat(orientation.quat_WS) * R.inv()
     heading = np.degrees((error[1699] * error[499].inv()).as_rotvec()[2])
     assert abs(heading) < 1.0
 
@@ -231,11 +231,13 @@ def test_a_rotation_too_slow_to_tell_from_the_bias_is_in_the_standard_deviation(
     for rate in (0.0, 0.02, 0.05, 0.1, 0.2, 0.3):
         gyro, accel, R = chair(rate, 1, sway)
         noise = estimate_noise(gyro[:500], accel[:500], RATE, worn=True)
-        found = run_filter(gyro, accel, RATE, noise, method, measured_start=True, start=slice(0, 500))
-        assert found.attitude_cov is not None
-        error = Rotation.from_quat(found.quat_WS) * R.inv()
+        orientation = run_filter(
+            gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 500))
+        )
+        assert orientation.attitude_cov is not None
+        error = Rotation.from_quat(orientation.quat_WS) * R.inv()
         up = R[-1].inv().apply([0.0, 0.0, 1.0])
-        std = np.sqrt(up @ found.attitude_cov[-1] @ up)
+        std = np.sqrt(up @ orientation.attitude_cov[-1] @ up)
         worst = max(worst, abs((error[-1] * error[:500].mean().inv()).as_rotvec()[2]) / std)
     print(f"{method}, sway {sway} deg/s: heading off by up to {worst:.1f} standard deviations")
     assert worst < 6.0
@@ -263,7 +265,7 @@ def test_condition_6_is_what_it_says(sway: np.ndarray | None) -> None:
     noise = estimate_noise(gyro[:500], accel[:500], RATE)
     # Condition (5) is left out by a bias without bounds.
     unknown = replace(noise, gyro_bias_cov=1e6 * np.eye(3), gyro_half_second_cov=sway)
-    found = StaticDetector(unknown, RATE, StaticTest(bias_spread=1e3)).run(gyro, accel)
+    static = StaticDetector(unknown, RATE, StaticTest(bias_spread=1e3)).run(gyro, accel)
     paper = by_the_book(gyro, accel, noise, PaperTest(), RATE)
     inverse = np.linalg.inv(noise.gyro_cov * (1 / 5 - 1 / 50) + (0.0 if sway is None else sway))
     bound = chi2.ppf(chi2.cdf(9.0, 1), 3)
@@ -272,7 +274,7 @@ def test_condition_6_is_what_it_says(sway: np.ndarray | None) -> None:
         change = gyro[k - 4 : k + 1].mean(axis=0) - gyro[k - 49 : k + 1].mean(axis=0)
         steady[k] = change @ inverse @ change <= bound
     assert (paper & ~steady).sum() > 5
-    np.testing.assert_array_equal(found, paper & steady)
+    np.testing.assert_array_equal(static, paper & steady)
 
 
 def test_a_bias_that_warms_up_is_followed() -> None:

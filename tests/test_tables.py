@@ -8,16 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_chain import urdf  # noqa: F401
-from test_chain_calibration import HOME, LINKS, TABLE, arm  # noqa: F401
+from test_chain_calibration import arm  # noqa: F401
 from test_model import example_robot_data_human
 
+from benchmarks.ur5_arm import BENT, SENSED, TABLE
 from wepose_pin.cli import main
 from wepose_pin.errors import BadModel
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.writers import write_session
 
-GOOD = TABLE.format(segments="\n".join(f'{link} = "{link}"' for link in LINKS)).replace(
+GOOD = TABLE.format(segments="\n".join(f'{link} = "{link}"' for link in SENSED)).replace(
     "[points]", '[points]\nfoot = "base_link"'
 )
 UPPER_BODY = 'urdf = "upper_body.urdf"\nlike = "upper_body"\n'
@@ -73,6 +74,23 @@ TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
         GOOD + HINGE.replace('on = "upper_arm_link"', 'on = "uper_arm_link"'),
         ("hinges.bend.on", "uper_arm_link", "did you mean 'upper_arm_link'"),
     ),
+    "a hinge across the axis of its joint": (
+        GOOD + HINGE.replace("[0.0, 1.0, 0.0]", "[1.0, 0.0, 0.0]"),
+        ("hinges.bend.axis", "[1.0, 0.0, 0.0]", "forearm_link turns about [0, 1, 0] of upper_arm_link"),
+    ),
+    "a name that is its own counterpart": (
+        GOOD + '[pairs]\nelbow = "elbow"\n',
+        ("pairs.elbow", "'elbow' is its own counterpart"),
+    ),
+    "a counterpart that is none": (
+        GOOD + '[pairs]\nelbow = "tipp"\n',
+        ("pairs.elbow", "'tipp' is no segment", "did you mean 'tip'"),
+    ),
+    "a line of one point": (
+        GOOD + '[draw]\nlimbs = [["base"]]\n',
+        ("draw.limbs", "['base'] is no line", "two different points"),
+    ),
+    "a point in millimetres": (GOOD.replace("0.15", "150.0"), ("points.tip.at", "150.0", "10 m at most")),
     "a girdle of a point that is none": (
         GOOD + GIRDLE.replace("girdles.elbow", "girdles.elbov"),
         ("girdles.elbov", "'elbov' is no point", "did you mean 'elbow'"),
@@ -157,7 +175,7 @@ PROTOCOLS: dict[str, tuple[str, tuple[str, ...]]] = {
     "a point that is none": (PROTOCOL.replace('["tip"]', '["tipp"]'), ("'tipp'", "did you mean 'tip'")),
     "an unknown kind": (PROTOCOL.replace("fixed_point", "fixed"), ("closure 1: kind", "'fixed'", "fixed_point")),
     "two points of one": (PROTOCOL.replace('["tip"]', '["tip", "elbow"]'), ("closure 1: points", "elbow", "takes 1")),
-    "a key of another kind": (PROTOCOL + 'origin = "base"\n', ("closure 1", "'origin'", "fixed_point")),
+    "a key of another kind": (PROTOCOL + 'distance = "base"\n', ("closure 1", "'distance'", "fixed_point")),
     "a place that is none": (PROTOCOL + "at = [1.0, 2.0]\n", ("closure 1: at", "[1.0, 2.0]", "three numbers")),
     "an origin that is none": (
         PROTOCOL.replace("fixed_point", "recorded") + 'origin = "bass"\n',
@@ -183,12 +201,12 @@ def folder(arm: BodyModel, tmp_path_factory: pytest.TempPathFactory) -> Path:  #
     time = np.arange(0.0, 20.0, 0.02)
     rng = np.random.default_rng(0)
     sensors = {}
-    for link in LINKS:
+    for link in SENSED:
         accel = [0.0, 0.0, 9.81] + rng.normal(scale=0.01, size=(len(time), 3))
         gyro = rng.normal(scale=1e-3, size=(len(time), 3))
         sensors[link] = ImuSensor(gyro_S=gyro, accel_S=accel, stated_quat_LS=compute_mount("+z", "+x"))
     phases = {"start": ((0.5, 4.5),), "tip": ((5.0, 19.0),)}
-    recording = Recording("arm", time, 50.0, sensors, phases=phases, start_pose=CONFIGURATION, joints=HOME)
+    recording = Recording("arm", time, 50.0, sensors, phases=phases, start_pose=CONFIGURATION, joints=BENT)
     write_session(folder, recording)
     shutil.copyfile(Path(arm.table.where).with_name("arm.urdf"), folder / "arm.urdf")
     (folder / "arm.toml").write_text(GOOD, encoding="utf-8")
@@ -225,6 +243,14 @@ def test_a_bad_table_says_what_and_where(case: str, folder: Path, capsys: pytest
             assert part in line
         assert "bad.toml: " in line or "upper_body.urdf: " in line
     assert not (folder / "out").exists()
+
+
+def test_a_link_without_a_segment_on_the_way_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "bad.toml").write_text(GOOD.replace('shoulder_link = "shoulder_link"', 'shoulder_link = "base_link"'))
+    model = ("--model", folder / "bad.toml", "--protocol", "tip")
+    line = refuse(capsys, "calibrate", folder, *model, "-o", folder / "out")
+    for part in ("session.toml", "no segment of bad moves with 'shoulder_pan_joint'", "the place of tip"):
+        assert part in line
 
 
 @pytest.mark.parametrize("case", list(PROTOCOLS))

@@ -53,18 +53,18 @@ def swing(model: pin.Model, t: np.ndarray, seed: int) -> np.ndarray:
 def test_the_power_of_all_joints_is_the_growth_of_energy() -> None:
     model = load_model().pin
     t = np.arange(0.0, 8.0, 1.0 / RATE)
-    found = joint_torques(model, t, swing(model, t, 1), cutoff_hz=20.0)
+    torques = joint_torques(model, t, swing(model, t, 1), cutoff_hz=20.0)
     data = model.createData()
     energy = np.array(
         [
             pin.computeKineticEnergy(model, data, q, v) + pin.computePotentialEnergy(model, data, q)
-            for q, v in zip(found.q, found.v, strict=True)
+            for q, v in zip(torques.q, torques.v, strict=True)
         ]
     )
     power = np.zeros(len(t))
-    for name, tau in found.torque.items():
+    for name, tau in torques.torque.items():
         first = model.idx_vs[model.getJointId(name)]
-        power += np.einsum("ni,ni->n", tau, found.v[:, first : first + tau.shape[1]])
+        power += np.einsum("ni,ni->n", tau, torques.v[:, first : first + tau.shape[1]])
     work = np.concatenate([[0.0], np.cumsum(0.5 * (power[1:] + power[:-1])) / RATE])
     inside = slice(200, -200)
     left = (energy - work)[inside]
@@ -111,12 +111,12 @@ def test_noise_is_smoothed_away_below_the_cut_off() -> None:
 def test_a_hanging_arm_bears_nothing_and_a_raised_one_its_weight(simulation: Simulation) -> None:
     pose = track(simulation.recording())
     assert pose.q is not None
-    found = joint_torques(pose.model.pin, pose.time, pose.q)
-    table = torque_table(found)
+    torques = joint_torques(pose.model.pin, pose.time, pose.q)
+    table = torque_table(torques)
     assert {"time", "left_upper_arm_x_nm", "right_forearm_z_nm"} <= set(table.columns)
     begin, end = simulation.phases["start"][0]
     still = (pose.time > begin + 0.5) & (pose.time < end - 0.5)
-    elbow = np.linalg.norm(found.torque["left_forearm"], axis=1)
+    elbow = np.linalg.norm(torques.torque["left_forearm"], axis=1)
     assert elbow[still].max() < 0.1
     begin, end = simulation.phases["clasp"][0]
     assert 0.5 < np.median(elbow[(pose.time > begin) & (pose.time < end)]) < 10.0

@@ -87,7 +87,7 @@ def test_the_real_person_hangs_the_arms_again(data: Path) -> None:
 
 
 def test_what_reading_finds_reaches_the_result(half_minute: Recording) -> None:
-    gaps = Diagnostic("short-gaps-bridged", INFO, "torso", 2, 0.05, {"samples": 3, "longest": 0.02})
+    gaps = Diagnostic("short-gaps-bridged", INFO, "torso", 0.02, 0.05, {"samples": 3, "gaps": 2})
     tracked = track(replace(half_minute, phases={}, diagnostics=(gaps,)))
     summary = summarize(tracked)
     assert [each.code for each in summary.diagnostics] == [
@@ -107,9 +107,9 @@ def test_diagnostics_of_later_chunks_are_listed_once_and_not_without_end(half_mi
         done += tracker.push(replace(chunk, diagnostics=(cut[0], cut[min(k, 14)])))
     for tracked in [*done, *tracker.finish()]:
         accumulator.add(tracked)
-    found = accumulator.finish().diagnostics
-    assert list(found[:12]) == [cut[0], *cut[:11]]
-    assert (found[12].code, found[12].value) == ("diagnostics-omitted", 4)
+    diagnostics = accumulator.finish().diagnostics
+    assert list(diagnostics[:12]) == [cut[0], *cut[:11]]
+    assert (diagnostics[12].code, diagnostics[12].value) == ("diagnostics-omitted", 4)
 
 
 def test_joined_recordings_keep_the_diagnostics_of_both(simulation: Simulation) -> None:

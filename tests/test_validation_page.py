@@ -160,12 +160,12 @@ def test_small_gains_are_not_rounded_away() -> None:
 
 
 def test_targets_are_met_or_missed() -> None:
-    found = {(row[0], row[2]): row for row in make_targets_table(summarize(RESULTS)).rows}
-    assert len(found) == 4
-    assert found[MILD, "hand from root"][3:] == ["18.04 mm", "at most 18 mm", "**missed**"]
-    assert found[MILD, "hand from shoulders"][-1] == "met"
-    assert found[IDEAL, "hand from root"][-1] == "met"
-    assert found[IDEAL, "hand from shoulders"][-1] == "**missed**"
+    row_of = {(row[0], row[2]): row for row in make_targets_table(summarize(RESULTS)).rows}
+    assert len(row_of) == 4
+    assert row_of[MILD, "hand from root"][3:] == ["18.04 mm", "at most 18 mm", "**missed**"]
+    assert row_of[MILD, "hand from shoulders"][-1] == "met"
+    assert row_of[IDEAL, "hand from root"][-1] == "met"
+    assert row_of[IDEAL, "hand from shoulders"][-1] == "**missed**"
     assert make_targets_table(summarize(DYNAMIC)).rows == []
     mounting = Result(f"{ARBITRARY_MOUNTING}, mild", "0", "amekf", {"errors_by_std_rms": 0.6, "lengths_rms_mm": 7.0})
     assert [row[3:] for row in make_targets_table(summarize([mounting])).rows] == [
@@ -175,12 +175,12 @@ def test_targets_are_met_or_missed() -> None:
 
 
 def test_the_error_budget_adds_in_quadrature() -> None:
-    found = compute_error_budget(RESULTS)
-    assert found is not None
-    assert found.full["from root"] == 13.0
-    assert [part.name for part in found.parts] == ["soft tissue"]
-    assert found.parts[0].added["from root"] == pytest.approx(12.0)  # √(13² − 5²)
-    assert found.more[0].added["from root"] == pytest.approx(np.sqrt(20.0**2 - 13.0**2))
+    budget = compute_error_budget(RESULTS)
+    assert budget is not None
+    assert budget.full["from root"] == 13.0
+    assert [part.name for part in budget.parts] == ["soft tissue"]
+    assert budget.parts[0].added["from root"] == pytest.approx(12.0)  # √(13² − 5²)
+    assert budget.more[0].added["from root"] == pytest.approx(np.sqrt(20.0**2 - 13.0**2))
     assert compute_error_budget(DYNAMIC) is None
 
 

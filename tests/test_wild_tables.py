@@ -179,8 +179,8 @@ def test_axes_anywhere_in_a_name() -> None:
     """Numbers are those of sensors while letters are axes."""
     imus = [f"imu{s}_{k}_{a}" for s in range(3) for k in ("acc", "gyro") for a in "xyz"]
     assert list(guess_columns(imus).sensors) == ["?imu0", "?imu1", "?imu2"]
-    found = guess_columns([f"{k}[{a}]" for k in ("ACC", "GYR") for a in range(3)])
-    assert found.sensors == {"?": {"accel": [f"ACC[{a}]" for a in range(3)], "gyro": [f"GYR[{a}]" for a in range(3)]}}
+    guess = guess_columns([f"{k}[{a}]" for k in ("ACC", "GYR") for a in range(3)])
+    assert guess.sensors == {"?": {"accel": [f"ACC[{a}]" for a in range(3)], "gyro": [f"GYR[{a}]" for a in range(3)]}}
     noraxon = [f"Forearm RT {k} Sensor {a} (mG)" for k in ("Accel", "Gyro") for a in "XYZ"]
     assert list(guess_columns(noraxon).sensors) == ["right_forearm"]
     phone = ["Linear Acceleration x", "Linear Acceleration y", "Linear Acceleration z"]

@@ -476,9 +476,9 @@ def outcome(wrong: Wrong) -> str:
 @pytest.mark.parametrize("function", TABLE)
 def test_every_wrong_call_is_refused_and_says_what_is_wrong(function: str) -> None:
     pytest.importorskip("daqp")
-    found = {str(wrong): outcome(wrong) for wrong in wrong_calls() if wrong.function == function}
-    assert len(found) > 5
-    assert {call: answer for call, answer in found.items() if answer != "named"} == {}
+    outcomes = {str(wrong): outcome(wrong) for wrong in wrong_calls() if wrong.function == function}
+    assert len(outcomes) > 5
+    assert {call: answer for call, answer in outcomes.items() if answer != "named"} == {}
 
 
 def test_right_calls_go_through() -> None:

@@ -211,7 +211,7 @@ def align_sensors(
         No mount is known for a sensor, or gravity contradicts it.
     """
     start, diagnostics = filtered.start, list(filtered.diagnostics)
-    facts = {"variant": "guessed"} if _start_is_guessed(recording) else {}
+    facts: dict[str, float | str] = {"variant": "guessed"} if _start_is_guessed(recording) else {}
     nominal_mounts = collect_nominal_mounts(recording, subject, start_frames)
     mounts, heading_offsets = {}, {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
@@ -246,9 +246,12 @@ def align_sensors(
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
                 misfit = misfit - calibrated_offset.tilt
                 misfit_cov = np.diag(start_frames.repeat_std(segment)[:2] ** 2)
-            if misfit @ np.linalg.solve(misfit_cov, misfit) > MOUNT_MOVED_STDS**2:
+            squared_stds = float(misfit @ np.linalg.solve(misfit_cov, misfit))
+            if squared_stds > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
-                diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, MOUNT_MOVED_STDS, facts))
+                limit = value * MOUNT_MOVED_STDS / squared_stds**0.5  # [rad] in the direction of the misfit
+                stds = {"stds": MOUNT_MOVED_STDS}
+                diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, limit, facts | stds))
         mounts[segment], heading_offsets[segment] = start_frames.to_segment(segment, R_WS_start), psi
     R_WV = {segment: Rotation.from_rotvec([0.0, 0.0, psi]) for segment, psi in heading_offsets.items()}
     return SensorAlignment(mounts, R_WV, heading_offsets, start, filtered.static_phase, tuple(diagnostics))

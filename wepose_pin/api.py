@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,18 +18,22 @@ import polars as pl
 from . import tracking
 from .arguments import check_arguments, check_value
 from .diagnostics import WARNING, Diagnostic, from_json, lines
-from .errors import BadData
+from .errors import BadData, WeposeError, how_to_install
 from .filters import BEST
 from .filters.static import StaticTest
 from .kinematics import PosedBody, build_pose_table
 from .model import BodyModel
-from .recording import Intervals, Recording
+from .recording import Intervals, Mark, Recording
 from .subject import Subject, load_subject
 from .tracking import TrackedRecording
 from .writers import read_result, write_result
 from .writers.folder import result_folder
+from .writers.provenance import CALL, collect_provenance
+from .writers.result import read_marks
 
 if TYPE_CHECKING:
+    import pandas
+
     from .calibration import Calibration
     from .report.notebook import Figures, ViewPage
 
@@ -54,6 +58,8 @@ class TrackResult(PosedBody):
         Lengths and mounts as used.
     phases : mapping
         Name → intervals [s] of the recording.
+    marks : tuple of Mark
+        Texts that were marked in a live session, with their times [s].
     summary : mapping
         The content of ``summary.json``: inputs, options and results.
     diagnostics : tuple of Diagnostic
@@ -63,12 +69,13 @@ class TrackResult(PosedBody):
     """
 
     phases: Mapping[str, Intervals]
+    marks: tuple[Mark, ...]
     summary: Mapping[str, Any]
     diagnostics: tuple[Diagnostic, ...]
     source: TrackedRecording | Path
 
     def to_dataframe(self) -> pl.DataFrame:
-        """Return the table of ``pose.parquet``, a row a sample; ``.to_pandas()`` of it needs pandas and pyarrow.
+        """Return the table of ``pose.parquet``, a row a sample, as polars has it.
 
         Columns: ``time`` [s]; ``<segment>_qx,_qy,_qz,_qw``, segment to W, and ``<segment>_std`` [rad];
         ``<point>_x,_y,_z`` [m] in W and ``<point>_std`` [m]; ``<segment>_gap``, true where the sensor lost samples.
@@ -80,6 +87,26 @@ class TrackResult(PosedBody):
         ['time', 'torso_qx', 'torso_qy', 'torso_qz', 'torso_qw', 'torso_std']
         """
         return build_pose_table(self.pose)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the table of `to_dataframe` as pandas has it.
+
+        Raises
+        ------
+        WeposeError
+            pandas is not installed.
+
+        Examples
+        --------
+        >>> result.to_pandas()[["time", "right_palm_x", "right_palm_std"]].shape == (len(result.time), 3)
+        True
+        """
+        try:
+            import pandas
+        except ImportError:
+            raise WeposeError(f"to_pandas: needs pandas: {how_to_install('pandas')}") from None
+        table = self.to_dataframe()
+        return pandas.DataFrame({name: table[name].to_numpy() for name in table.columns})
 
     def plot(self) -> Figures:
         """Draw the report's figures: paths and reach of the hands, joint angles.
@@ -131,7 +158,8 @@ class TrackResult(PosedBody):
     def save(self, folder: str | Path, force: bool = False) -> Path:
         """Write what `wepose track -o` writes: pose, subject, summary, view and report.
 
-        Of a result that `load_result` read, its files are copied.
+        The summary says what made it: versions, options, and the file of the recording with its hash where it was read
+        from one. Of a result that `load_result` read, its files are copied.
 
         Parameters
         ----------
@@ -166,7 +194,8 @@ class TrackResult(PosedBody):
 
         with result_folder(out, force) as partial:
             summary = tracking.summarize(self.source)
-            write_result(partial, self.source, summary, phases=self.phases)
+            made = collect_provenance(CALL, _list_inputs(self.source))
+            write_result(partial, self.source, summary, phases=self.phases, provenance=made)
         write_track_pages(out, summary)
         return out
 
@@ -266,6 +295,7 @@ def track(
         model=tracked.model,
         subject=tracked.subject,
         phases=recording.phases,
+        marks=recording.marks,
         summary=summary.content,
         diagnostics=summary.diagnostics,
         source=tracked,
@@ -310,10 +340,18 @@ def load_result(folder: str | Path) -> TrackResult:
         model=model,
         subject=load_subject(folder),
         phases=phases,
+        marks=read_marks(summary),
         summary=summary,
         diagnostics=diagnostics,
         source=folder,
     )
+
+
+def _list_inputs(tracked: TrackedRecording) -> dict[str, Any]:
+    """Inputs and options of `track`, under the names that they have in `wepose track`."""
+    options = {field.name: getattr(tracked.options, field.name) for field in fields(tracked.options)}
+    about = {"subject": tracked.subject.name, "model": tracked.model.table.name}
+    return {"session": tracked.recording.source, **about, **options}
 
 
 def _parse_phases(recorded: Mapping[str, Iterable[tuple[float, float]]]) -> dict[str, Intervals]:

@@ -170,6 +170,7 @@ def _read_hints(function: Any) -> dict[str, Any]:
     return {name: hint for name, hint in hints.items() if name != "return" and not name.startswith("_")}
 
 
+@cache
 def _list_options(hint: Any) -> tuple[Any, ...]:
     return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
 

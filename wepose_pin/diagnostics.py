@@ -251,7 +251,7 @@ def document() -> str:
         "wrong or uncertain by it) and *error* (do not use the results). Results hold their diagnostics under",
         "`diagnostics` in `summary.json` and `calibration.json`, in SI units and with their text. This page lists all",
         "codes; the numbers in the texts are examples. After ± stands one standard deviation. What a word means:",
-        "[glossary.md](glossary.md).",
+        "[glossary](glossary.md).",
         "",
         "Made by `python -m wepose_pin.diagnostics > docs/diagnostics.md` from `wepose_pin/diagnostics.toml`.",
     ]

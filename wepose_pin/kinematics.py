@@ -619,7 +619,7 @@ def compute_point_covariances(
     carriers = {link: find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
     for link, carrier in carriers.items():
         if carrier is not None and carrier in segment_cov:
-            R_CK = _neutral_rotation(model, carrier).T @ _neutral_rotation(model, link)
+            R_CK = model.neutral_rotations[carrier].T @ model.neutral_rotations[link]
             R_WK[link] = Rotation.from_quat(quat_WL[carrier]).as_matrix()
             if not np.allclose(R_CK, np.eye(3), atol=1e-12):
                 R_WK[link] = R_WK[link] @ R_CK
@@ -718,13 +718,6 @@ def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str 
         own = model.table.segments.get(segment)
         segment = model.parents[segment] if own is not None and own.rigid_without_sensor else None
     return segment
-
-
-def _neutral_rotation(model: BodyModel, link: str) -> np.ndarray:
-    """Rotation (3, 3) of a link in W, all joints at zero."""
-    data = model.pin.createData()
-    pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
-    return np.array(data.oMf[model.pin.getFrameId(link)].rotation)
 
 
 def _build_skew_matrices(v: np.ndarray) -> np.ndarray:

@@ -24,13 +24,13 @@ def plan(folder: Path, data: bytes) -> object:
     _beside_a_plan(folder)
     (folder / "list.csv").write_bytes(seeds.PLAN_TABLE)
     (folder / "plan.toml").write_bytes(data)
-    found = read_plan(folder / "plan.toml", "out/items")
-    names = [item.name for item in (*found.calibrations, *found.items)]
+    read = read_plan(folder / "plan.toml", "out/items")
+    names = [item.name for item in (*read.calibrations, *read.items)]
     assert len(set(names)) == len(names)
     assert all(name and "/" not in name and name not in (".", "..") for name in names), names
-    for item in found.items:
+    for item in read.items:
         compute_key(item)
-    return found
+    return read
 
 
 def plan_table(folder: Path, data: bytes) -> object:
@@ -40,9 +40,9 @@ def plan_table(folder: Path, data: bytes) -> object:
     _beside_a_plan(folder)
     (folder / "list.csv").write_bytes(data)
     (folder / "plan.toml").write_bytes(seeds.PLAN.replace(b'files = ["*/session.toml"]', b'table = "list.csv"'))
-    found = read_plan(folder / "plan.toml", "out/items")
-    assert all(item.name and "/" not in item.name for item in found.items), [item.name for item in found.items]
-    return found
+    read = read_plan(folder / "plan.toml", "out/items")
+    assert all(item.name and "/" not in item.name for item in read.items), [item.name for item in read.items]
+    return read
 
 
 def _beside_a_plan(folder: Path) -> None:
@@ -63,9 +63,9 @@ def _validation(path: Path) -> object:
     from wepose_pin.cli.validate import print_experiments
     from wepose_pin.validation import read_document
 
-    found = read_document(path)
-    _silently(lambda: print_experiments(found))
-    return found
+    document = read_document(path)
+    _silently(lambda: print_experiments(document))
+    return document
 
 
 validation = file("validation.json", _validation)
@@ -103,9 +103,9 @@ def done(folder: Path, data: bytes) -> object:
     (folder / "item").mkdir(exist_ok=True)
     (folder / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
     (folder / "item" / "done.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
-    found = _read_done(str(folder / "item"))
+    record = _read_done(str(folder / "item"))
     item = read_item(_read_item_provenance(folder / "item"))
-    return None if found is None else _find_change(item, "", found)
+    return None if record is None else _find_change(item, "", record)
 
 
 # Recordings with a truth, for `wepose validate --data` ------------------------------------------------------------

@@ -45,8 +45,8 @@ def compiled_modules() -> list[str]:
     return [".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__") for path in files]
 
 
-def fuzz(name: str, arguments: list[str], found: str, base: Path) -> None:
-    """Fuzz one target, or all by turns, in this process; never returns. Files of findings begin with `found`.
+def fuzz(name: str, arguments: list[str], prefix: str, base: Path) -> None:
+    """Fuzz one target, or all by turns, in this process; never returns. Files of findings begin with `prefix`.
 
     `base` is an empty folder to work in, which libFuzzer leaves as it ends.
     """
@@ -81,7 +81,7 @@ def fuzz(name: str, arguments: list[str], found: str, base: Path) -> None:
             key = _where(error)
             if key not in seen:
                 seen.add(key)
-                file = Path(f"{found}{hashlib.sha256(key.encode()).hexdigest()[:12]}")
+                file = Path(f"{prefix}{hashlib.sha256(key.encode()).hexdigest()[:12]}")
                 file.write_bytes(whole)
                 print(f"FOUND {key}\n{file}", file=sys.stderr, flush=True)
             if len(seen) >= MOST_FOUND:
@@ -153,9 +153,9 @@ def _lines_of(code: CodeType) -> set[int]:
 
 def run(name: str, options: argparse.Namespace) -> int:
     """One target, begun again where an input ends the whole process, and its row of the table; how much it found."""
-    corpus, found = options.out / "corpus" / name, options.out / "found"
+    corpus, findings = options.out / "corpus" / name, options.out / "found"
     corpus.mkdir(parents=True, exist_ok=True)
-    found.mkdir(exist_ok=True)
+    findings.mkdir(exist_ok=True)
     begin = f"import sys; sys.path[:0] = {sys.path[:2]!r}; from fuzz import run"
     inputs = edges = features = died = 0
     notes: list[str] = []
@@ -168,11 +168,10 @@ def run(name: str, options: argparse.Namespace) -> int:
             f"-seed={options.seed + died if options.seed else 0}",
         ]
         limits += [f"-max_len={LONGEST}", f"-rss_limit_mb={MEMORY_MB}", f"-timeout={SECONDS_EACH}"]
-        limits += [f"-artifact_prefix={found}/{name}-", "-len_control=20"]
+        limits += [f"-artifact_prefix={findings}/{name}-", "-len_control=20"]
         with tempfile.TemporaryDirectory(prefix="wepose-fuzz-") as base:
-            code = (
-                f"{begin}; run.fuzz({name!r}, {[*limits, str(corpus)]!r}, {f'{found}/{name}-'!r}, run.Path({base!r}))"
-            )
+            arguments = [*limits, str(corpus)]
+            code = f"{begin}; run.fuzz({name!r}, {arguments!r}, {f'{findings}/{name}-'!r}, run.Path({base!r}))"
             ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, errors="replace")
         tried = re.findall(r"^#(\d+)\s.*cov: (\d+) ft: (\d+)", ended.stderr, re.MULTILINE)
         done = re.findall(r"^(?:#|Done )(\d+)", ended.stderr, re.MULTILINE)

@@ -354,19 +354,19 @@ def datagrams() -> list[bytes]:
     two = {"sensor": "head", "t": [1, 2.5], "gyro": [[0.1, 0, 0], [0, 0, 1]], "accel": [[0, 0, 9], [0, 0, 9]]}
     samples = np.zeros(2, SAMPLE)
     body = HEADER.pack(MAGIC, 1, 3, 2, 1.5) + samples.tobytes()
-    lines = "\n".join(json.dumps(found) for found in (one, two)).encode()
+    lines = "\n".join(json.dumps(message) for message in (one, two)).encode()
     return [json.dumps(one).encode(), lines, body + CRC.pack(zlib.crc32(body))]
 
 
 def serial() -> bytes:
     """Bytes of an MTi: two packets of data, an acknowledgement and noise."""
-    found = b"\x00\xfa"
+    stream = b"\x00\xfa"
     for k in range(2):
         data = struct.pack(">HBHHBI", 0x1020, 2, k, 0x1060, 4, 100 * k)
         data += struct.pack(">HB3f", xbus.RATE_OF_TURN, 12, 0.1, 0.2, 0.3)
         data += struct.pack(">HB3d", xbus.ACCELERATION | 3, 24, 0.0, 0.0, 9.8)
-        found += xbus.build_frame(xbus.DATA, data)
-    return found + xbus.build_frame(xbus.SET_OUTPUT + 1, xbus.build_output_items(100, False))
+        stream += xbus.build_frame(xbus.DATA, data)
+    return stream + xbus.build_frame(xbus.SET_OUTPUT + 1, xbus.build_output_items(100, False))
 
 
 def pose() -> bytes:

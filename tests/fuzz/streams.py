@@ -54,17 +54,17 @@ def udp(_folder: Path, data: bytes) -> object:
     source, sender = _udp()
     for part in data.split(APART)[:64]:
         sender.sendto(part[:60_000], source.address)
-    found = source.read(0.02)
-    _sound(found)
+    came = source.read(0.02)
+    _sound(came)
     if not all(problem.isprintable() for problem in source.problems):
         raise NotOneLine(repr(source.problems)[:400])
     assert len(source.problems) <= 30, source.problems
-    return found
+    return came
 
 
-def _sound(found: list[Any]) -> None:
+def _sound(came: list[Any]) -> None:
     """What sources hand on: finite, of the sensors that were asked for, shapes that fit."""
-    for samples in found:
+    for samples in came:
         n = len(samples.time)
         assert samples.sensor in TORSO_HEAD
         assert samples.gyro_S.shape == samples.accel_S.shape == (n, 3)
@@ -126,7 +126,7 @@ def mti(_folder: Path, data: bytes) -> object:
         finally:
             device.close()
     came = [queue.get() for _ in range(queue.qsize())]
-    _sound([found for found in came if hasattr(found, "gyro_S")])
+    _sound([each for each in came if hasattr(each, "gyro_S")])
     return came
 
 
@@ -151,9 +151,9 @@ def lsl_samples(_folder: Path, data: bytes) -> object:
         SensorChannels("head", [5, 4, 3, 2, 1, 0], np.full(6, 9.80665)),
     ]
     with np.errstate(all="ignore"):
-        found = source._pull(_Stream("imu", inlet, parts, 100.0))
-    _sound(found)
-    return found
+        came = source._pull(_Stream("imu", inlet, parts, 100.0))
+    _sound(came)
+    return came
 
 
 SAMPLE = np.dtype([("which", "u1"), ("time", "<f8"), ("gyro", "<f4", 3), ("accel", "<f4", 3)])

@@ -168,10 +168,10 @@ def _live(path: Path) -> object:
     from wepose_pin.subject import parse_subject
 
     path.write_bytes(_checked(path.read_bytes()))
-    found = read_live_log(path)
-    if found.header["subject"]:
-        parse_subject(found.header["subject"], path)
-    return found
+    log = read_live_log(path)
+    if log.header["subject"]:
+        parse_subject(log.header["subject"], path)
+    return log
 
 
 def _checked(data: bytes) -> bytes:
@@ -312,7 +312,7 @@ TARGETS = (
     Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML, "readers.session"),
     Target("setup", lambda: [seeds.SESSION.encode()], file("session.toml", _setup), TOML, "live.setup"),
     Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML, "subject"),
-    Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML, "model.table"),
+    Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML, "model.table_file"),
     Target("robot_map", lambda: [seeds.ARM_MAP], file("map.toml", _robot_map), TOML, "retargeting.maps"),
     Target("protocol", lambda: seeds.shipped(*_PROTOCOLS), file("own.toml", _protocol), TOML, "calibration.protocols"),
     Target("plan", lambda: [seeds.PLAN], records.plan, TOML, "batch.plan"),

@@ -307,11 +307,11 @@ def read_result(folder: Path) -> Result:
 
 def diagnosed(content: Mapping[str, Any]) -> list[Diagnosed]:
     """The diagnostics of a summary or a calibration."""
-    found = []
+    diagnostics = []
     for item in content["diagnostics"]:
         places = (item["place"], item["facts"].get("other"))  # of two sensors that are alike
-        found.append(Diagnosed(item["code"], tuple(place for place in places if place)))
-    return found
+        diagnostics.append(Diagnosed(item["code"], tuple(place for place in places if place)))
+    return diagnostics
 
 
 def _first_span(value: list) -> tuple[float, float]:

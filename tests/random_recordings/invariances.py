@@ -110,11 +110,11 @@ def _deviation(
 ) -> tuple[Deviation, str]:
     (one, at), (two, two_at) = base, other
     mirrored = of.variant.mirrored
-    found = Deviation(name, case.method, 0.0, 0.0, "")
+    largest = Deviation(name, case.method, 0.0, 0.0, "")
     over = ""
     rows, rows_two = _common(one.time - at, two.time - two_at)
     if not len(rows):
-        return found, "no common times"
+        return largest, "no common times"
     for segment, quat in one.quat.items():
         quat_two = two.quat[other_side(segment) if mirrored else segment][rows_two]
         if mirrored:
@@ -127,9 +127,9 @@ def _deviation(
             second = two.quat_std[segment][rows_two]
             ratio = np.maximum(angle - FLOOR_RAD, 0.0) / (ALL_AXES * np.maximum(std[rows] + second, 1e-9))
             z = float(ratio.max())
-        if degrees > found.degrees:
-            found.degrees, found.of = degrees, segment
-        found.z = max(found.z, z)
+        if degrees > largest.degrees:
+            largest.degrees, largest.of = degrees, segment
+        largest.z = max(largest.z, z)
         most = of.most_deg if of.most_deg is not None else UNSTATED_DEG if std is None else None
         if most is not None and std is None:
             most = max(most, of.unstated_deg)
@@ -140,7 +140,7 @@ def _deviation(
                 over
                 or f"{segment} is {degrees:.3g} deg off at {one.time[rows][k] - at:.1f} s, z = {z:.1f}, {case.method}"
             )
-    return found, over
+    return largest, over
 
 
 def _common(one: np.ndarray, two: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -38,12 +38,12 @@ class Motion:
 
     def angles(self, t: np.ndarray) -> dict[str, np.ndarray]:
         """All angles [rad] and root_x, _y, _z [m], each (n,)."""
-        found = {name: np.zeros(len(t)) for name in [*ANGLES, "heading", "root_x", "root_y", "root_z"]}
+        values = {name: np.zeros(len(t)) for name in [*ANGLES, "heading", "root_x", "root_y", "root_z"]}
         calm, free = np.zeros(len(t)), np.ones(len(t))
         for k, activity in enumerate(self.activities):
             if k == 0 or self.begins[k] < t.max():
                 for name, lasting in activity.for_good.items():
-                    found[name] += lasting(t)
+                    values[name] += lasting(t)
             weight = self._begun(k, t) - self._begun(k + 1, t)
             on = np.flatnonzero(weight)
             if not len(on):
@@ -51,14 +51,14 @@ class Motion:
             calm += weight * activity.calm
             free -= weight * activity.exact
             for name, curve in activity.angles.items():
-                found[name][on] += weight[on] * curve(t[on])
+                values[name][on] += weight[on] * curve(t[on])
         for name, curve in self.sway.items():
-            found[name] += calm * curve(t) * (free if name.startswith(SIDES) else 1.0)
+            values[name] += calm * curve(t) * (free if name.startswith(SIDES) else 1.0)
         for name, value in self.stance.items():
-            found[name] += value * (free if name.startswith(SIDES) else 1.0)
-        found["torso_yaw"] += found["heading"]
-        found["pelvis_yaw"] += found["heading"]
-        return found
+            values[name] += value * (free if name.startswith(SIDES) else 1.0)
+        values["torso_yaw"] += values["heading"]
+        values["pelvis_yaw"] += values["heading"]
+        return values
 
     def _begun(self, k: int, t: np.ndarray) -> np.ndarray:
         """How far the change to the k-th activity has come (n,), 0 to 1."""

@@ -63,15 +63,15 @@ def of_outcome(outcome: Outcome, out: object = None) -> list[Failure]:
         return [Failure("no traceback", shown, f"{last[-1]} | {_innermost(last)}")]
     if outcome.code not in adapter.codes(ours):
         return [Failure("documented exit code", shown, f"exit {outcome.code}: {outcome.err.strip()[-300:]}")]
-    found = []
+    failures = []
     if outcome.code == 2:
         if not adapter.is_one_line(outcome):
-            found.append(Failure("one line", shown, outcome.err.strip()[:500]))
+            failures.append(Failure("one line", shown, outcome.err.strip()[:500]))
         elif not adapter.names_something(outcome):
-            found.append(Failure("names the offender", shown, adapter.refusal(outcome)))
+            failures.append(Failure("names the offender", shown, adapter.refusal(outcome)))
         if out is not None and (left := adapter.left_behind(out)):  # type: ignore[arg-type]
-            found.append(Failure("nothing half-written", shown, ", ".join(left)))
-    return found
+            failures.append(Failure("nothing half-written", shown, ", ".join(left)))
+    return failures
 
 
 def _innermost(lines: list[str]) -> str:
@@ -94,7 +94,7 @@ def of_acceptance(outcome: Outcome, case: Case, extra: str = "") -> list[Failure
 
 def of_result(result: Result, shown: str) -> list[Failure]:
     """Numbers everywhere, unit quaternions, points as far apart as the lengths say."""
-    found = []
+    failures = []
     lost = {name for name, gap in result.gap.items() if gap.any()}
     for name in result.table.columns:
         values = result.table[name].to_numpy()
@@ -104,27 +104,29 @@ def of_result(result: Result, shown: str) -> list[Failure]:
         bad = ~np.isfinite(values)
         if of is not None and not (bad & ~result.gap[of]).any():
             continue
-        found.append(Failure("no undeclared NaN", shown, f"{name}: {np.count_nonzero(bad)} of {len(bad)}"))
-    if found:
-        return found[:3]
+        failures.append(Failure("no undeclared NaN", shown, f"{name}: {np.count_nonzero(bad)} of {len(bad)}"))
+    if failures:
+        return failures[:3]
     for name, quat in result.quat.items():
         off = float(np.max(np.abs(np.linalg.norm(quat, axis=1) - 1.0)))
         if off > UNIT:
-            found.append(Failure("unit quaternions", shown, f"{name}: norm is off 1 by {off:.3g}"))
+            failures.append(Failure("unit quaternions", shown, f"{name}: norm is off 1 by {off:.3g}"))
     for (one, other), length in _rigid(result).items():
         if one in result.points and other in result.points:
             apart = np.linalg.norm(result.points[one] - result.points[other], axis=1)
             off = float(np.max(np.abs(apart - length)))
             if off > RIGID:
-                found.append(Failure("lengths hold", shown, f"{one} to {other}: {1e3 * off:.3g} mm off {length:.4f} m"))
+                failures.append(
+                    Failure("lengths hold", shown, f"{one} to {other}: {1e3 * off:.3g} mm off {length:.4f} m")
+                )
     for name, wanted in _shoulders(result).items():
         off = float(np.max(np.linalg.norm(result.points[name] - wanted, axis=1)))
         if off > RIGID:
-            found.append(Failure("shoulders follow the arms", shown, f"{name}: {1e3 * off:.3g} mm off"))
+            failures.append(Failure("shoulders follow the arms", shown, f"{name}: {1e3 * off:.3g} mm off"))
     for name, std in [*result.quat_std.items(), *result.points_std.items()]:
         if (std < 0.0).any():
-            found.append(Failure("± is a number", shown, f"{name}: {std.min():.3g}"))
-    return found
+            failures.append(Failure("± is a number", shown, f"{name}: {std.min():.3g}"))
+    return failures
 
 
 def _rigid(result: Result) -> dict[tuple[str, str], float]:
@@ -165,7 +167,7 @@ def _shoulders(result: Result) -> dict[str, np.ndarray]:
 def of_errors(result: Result, case: Case, recorded: Recorded, shown: str) -> tuple[Accuracy, Truth]:
     """Errors within six stated deviations, or a diagnostic that names the cause."""
     truth = truth_at(case, result.time, recorded.origin, result.start, result.calibrated)
-    found = Accuracy()
+    accuracy = Accuracy()
     worst: list[tuple[float, str, int, str]] = []
     for name, quat in result.quat.items():
         error = (truth.R_WL[name].inv() * Rotation.from_quat(quat)).magnitude()
@@ -189,14 +191,20 @@ def of_errors(result: Result, case: Case, recorded: Recorded, shown: str) -> tup
     causes = {*case.suspects.values(), *(["gap"] if case.clock.lost else [])}
     for z_, name, k, error_ in sorted(worst, reverse=True):
         excuse = adapter.named_cause(result.diagnostics, _behind(name, case), causes) if z_ > MOST_Z else ""
-        if z_ > found.z:
-            found.z, found.of, found.at, found.error, found.excuse = z_, name, float(result.time[k]), error_, excuse
+        if z_ > accuracy.z:
+            accuracy.z, accuracy.of, accuracy.at, accuracy.error, accuracy.excuse = (
+                z_,
+                name,
+                float(result.time[k]),
+                error_,
+                excuse,
+            )
         if not excuse:
-            found.z_unexcused = max(found.z_unexcused, z_)
-        if z_ > MOST_Z and not excuse and not found.failures:
+            accuracy.z_unexcused = max(accuracy.z_unexcused, z_)
+        if z_ > MOST_Z and not excuse and not accuracy.failures:
             message = f"{name} is {error_} at {result.time[k] - recorded.origin:.1f} s: z = {z_:.1f}"
-            found.failures.append(Failure(f"error within {MOST_Z:g} ± or a warning", shown, message))
-    return found, truth
+            accuracy.failures.append(Failure(f"error within {MOST_Z:g} ± or a warning", shown, message))
+    return accuracy, truth
 
 
 def _z(over: np.ndarray, std: np.ndarray | None, fused: float | None, R: Rotation, quat: np.ndarray) -> np.ndarray:

@@ -21,15 +21,15 @@ def times(p: Quaternion, q: Quaternion) -> Quaternion:
 
 def turned(order: str, *angles: np.ndarray) -> Quaternion:
     """Turns about moving axes one after another, as in "ZYX", each by its angle (n,) [rad]."""
-    found: Quaternion | None = None
+    product: Quaternion | None = None
     for axis, angle in zip(order, angles, strict=True):
         zero = np.zeros(len(angle))
         sine = np.sin(0.5 * angle)
         x, y, z = (sine if axis == name else zero for name in "XYZ")
         turn = (x, y, z, np.cos(0.5 * angle))
-        found = turn if found is None else times(found, turn)
-    assert found is not None
-    return found
+        product = turn if product is None else times(product, turn)
+    assert product is not None
+    return product
 
 
 def rotation(q: Quaternion) -> Rotation:

@@ -94,17 +94,17 @@ def measure(
     before = np.concatenate([[2.0 * t[0] - t[1]], t])
     R, force = _in_blocks(motion, before, {name: sensor.place for name, sensor in worn.items()})
     dt = np.diff(before)
-    found = {}
+    measured = {}
     for name, sensor in worn.items():
         rng, R_WS = chance(name), R[name] * sensor.mount
         if sensor.orientation is not None:
-            found[name] = Signals(quat=_fused(R_WS[1:], sensor.orientation, t, rng))
+            measured[name] = Signals(quat=_fused(R_WS[1:], sensor.orientation, t, rng))
             continue
         rate = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / dt[:, None]
         accel = R_WS[1:].apply(force[name][1:], inverse=True)
         signals = with_errors(rate, accel, dt, sensor.errors, rng)
-        found[name] = with_fault(signals, sensor, t)
-    return found
+        measured[name] = with_fault(signals, sensor, t)
+    return measured
 
 
 def _in_blocks(

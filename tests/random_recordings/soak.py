@@ -52,15 +52,15 @@ def make_session(task: tuple[int, float, Path]) -> float:
 
 def tree(pid: int) -> list[int]:
     """The process and all that it started, of those that are there."""
-    found, at = [pid], 0
-    while at < len(found):
-        for task in Path(f"/proc/{found[at]}/task").glob("*"):
+    pids, at = [pid], 0
+    while at < len(pids):
+        for task in Path(f"/proc/{pids[at]}/task").glob("*"):
             try:
-                found += [int(child) for child in (task / "children").read_text().split()]
+                pids += [int(child) for child in (task / "children").read_text().split()]
             except OSError:
                 continue
         at += 1
-    return found
+    return pids
 
 
 def measured(pid: int) -> dict[str, Any]:

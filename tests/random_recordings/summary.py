@@ -30,11 +30,11 @@ def summary_text(reports: list[dict[str, Any]]) -> str:
         for failure in report["failures"]:
             by_oracle[failure["oracle"]].append((report["seed"], failure))
     lines += ["## Failures", ""]
-    for oracle, found in sorted(by_oracle.items(), key=lambda item: -len(item[1])):
-        lines += [f"### {oracle}: {len(found)}", ""]
+    for oracle, failures in sorted(by_oracle.items(), key=lambda item: -len(item[1])):
+        lines += [f"### {oracle}: {len(failures)}", ""]
         lines += [
             f"- seed {seed}: {' '.join(failure['message'].split())[:400]}"
-            for seed, failure in sorted(found, key=lambda f: f[0])
+            for seed, failure in sorted(failures, key=lambda f: f[0])
         ]
         lines.append("")
     return "\n".join(lines) + "\n"
@@ -43,14 +43,14 @@ def summary_text(reports: list[dict[str, Any]]) -> str:
 def _invariances(reports: list[dict[str, Any]]) -> list[str]:
     largest: dict[tuple[str, str], tuple[float, float, int, int]] = {}
     for report in reports:
-        found = report["deviation"]
-        if not found:
+        deviation = report["deviation"]
+        if not deviation:
             continue
-        key = found["invariance"], found["method"]
+        key = deviation["invariance"], deviation["method"]
         degrees, z, seed, count = largest.get(key, (0.0, 0.0, report["seed"], 0))
-        if found["degrees"] >= degrees:
-            degrees, seed = found["degrees"], report["seed"]
-        largest[key] = degrees, max(z, found["z"]), seed, count + 1
+        if deviation["degrees"] >= degrees:
+            degrees, seed = deviation["degrees"], report["seed"]
+        largest[key] = degrees, max(z, deviation["z"]), seed, count + 1
     rows = [
         [name, method, str(count), f"{degrees:.3g}", f"{z:.1f}", str(seed)]
         for (name, method), (degrees, z, seed, count) in sorted(largest.items())
@@ -64,10 +64,10 @@ def _accuracy(reports: list[dict[str, Any]]) -> list[str]:
         if report["accuracy"]:
             by_method[report["accuracy"]["method"]].append(report["accuracy"] | {"seed": report["seed"]})
     rows = []
-    for method, found in sorted(by_method.items()):
-        worst = max(found, key=lambda a: a["z_unexcused"])
-        warned = sum(bool(a["excuse"]) for a in found)
-        rows.append([method, str(len(found)), f"{worst['z_unexcused']:.1f}", str(worst["seed"]), str(warned)])
+    for method, accuracies in sorted(by_method.items()):
+        worst = max(accuracies, key=lambda a: a["z_unexcused"])
+        warned = sum(bool(a["excuse"]) for a in accuracies)
+        rows.append([method, str(len(accuracies)), f"{worst['z_unexcused']:.1f}", str(worst["seed"]), str(warned)])
     return _table(["method", "tracks", "largest z without a warning", "seed", "above 6 with a warning"], rows)
 
 

@@ -76,10 +76,10 @@ class Trial:
         """Run one, with the oracles of every command; `acceptance`: why it may be refused, None: as the case says."""
         outcome = adapter.run(argv, self.as_process)
         self._count(outcome)
-        found = of_outcome(outcome, out)
-        if not found:
-            found = of_acceptance(outcome, self.case, self.case.refusal if acceptance is None else acceptance)
-        self.report.failures += found
+        failures = of_outcome(outcome, out)
+        if not failures:
+            failures = of_acceptance(outcome, self.case, self.case.refusal if acceptance is None else acceptance)
+        self.report.failures += failures
         return outcome
 
     def _count(self, outcome: Outcome) -> None:
@@ -172,9 +172,11 @@ class Trial:
         if outcome.code or outcome.traceback:
             return
         resampled = bool(chunk and self.result) and adapter.is_resampled(self.result.diagnostics)
-        found = of_same_table(adapter.table_bytes(self.result_folder), adapter.table_bytes(out), oracle, " ".join(argv))
+        failures = of_same_table(
+            adapter.table_bytes(self.result_folder), adapter.table_bytes(out), oracle, " ".join(argv)
+        )
         if not resampled:  # then it is the same to rounding, as the documents say
-            self.report.failures += found
+            self.report.failures += failures
 
     def retarget(self) -> None:
         arms = {"right_palm", "right_elbow"}

@@ -23,7 +23,7 @@ from ..jobs.retarget import RetargetJob, run_retarget
 from ..jobs.simulate import SimulateJob, run_simulate
 from ..jobs.track import TrackJob, run_track
 from ..readers.tables import read_table
-from ..writers.provenance import code, file_hash, machine, read_provenance
+from ..writers.provenance import CALL, code, file_hash, machine, read_provenance
 from ..writers.result import versions
 from .comparison import find_differences
 from .items import COMMAND, FAILED, read_item, run_steps
@@ -86,6 +86,10 @@ def _reproduce(result: Path) -> Reproduction:
             _check_inputs(result, provenance, Path(place))
             kind, run = REPRODUCIBLE[command]
             run(_build_job(result, kind, provenance, out))
+        elif command == CALL:
+            raise BadData(
+                f"{result}: saved from Python, whose code is not known; what `wepose track` writes is made again"
+            )
         else:
             raise BadData(f"{result}: made by '{command}', which cannot be made again one by one")
         return Reproduction(command, find_differences(result, out), _diagnose_changes(provenance))

@@ -3,24 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
-
-if TYPE_CHECKING:
-    from ..model import LinkVector
-
-
-def point_position(lengths: Any, quat_WK: Mapping[str, Any], way: Mapping[str, LinkVector]) -> Any:
-    """The place (3,) [m] of a point in W, in CasADi, from the orientations of the links on its way."""
-    vectors = links(lengths, quat_WK, {link: part.by_length for link, part in way.items()})
-    place = ca.SX.zeros(3)
-    for link, part in way.items():
-        place += vectors[link]
-        if np.any(part.constant):
-            place += rotate(quat_WK[link], ca.DM(part.constant))
-    return place
 
 
 def links(lengths: Any, quat_WL: Mapping[str, Any], way: Mapping[str, np.ndarray]) -> dict[str, Any]:

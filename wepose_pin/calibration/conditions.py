@@ -231,6 +231,11 @@ def find_parts(
         carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
         if carrier is None:
             names = " and ".join(point for point, _ in points)
+            if link not in model.table.segments:
+                raise BadSession(
+                    f"no segment of {model.table.name} moves with '{link}', so that the place of {names} is not known; "
+                    f"add its link to [segments], with a sensor, or use a protocol without that point"
+                )
             raise BadSession(
                 f"sensors.{link} is missing: without it the place of {names} is not known; add it, or use a protocol "
                 f"without that point"

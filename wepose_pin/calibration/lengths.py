@@ -105,7 +105,8 @@ def calibrate(
         The body, or its file or name as for `load_model`; None: that which the recording states, else the upper body.
     protocol : str, Path or Protocol, optional
         What the person did in which phase: the name of a protocol, such as "clasp" or "free", a .toml file, or what
-        `wepose_pin.calibration.load_protocol` returned; None: "clasp", and "t_pose" if the recording has that phase.
+        `wepose_pin.calibration.load_protocol` returned; None: "clasp", and "t_pose" if the recording has that phase
+        and the formulation is not "paper".
     method : str
         The orientation filter: "amekf", "smoother", "smekf", "ncf" or "gdc", as in `estimate_orientation`.
     measured_std : float
@@ -142,7 +143,7 @@ def calibrate(
     check_arguments(calibrate, locals())
     check_method(method)
     if not isinstance(protocol, Protocol):
-        protocol = load_protocol(choose_protocol(recording.phases) if protocol is None else protocol)
+        protocol = load_protocol(choose_protocol(recording.phases, formulation) if protocol is None else protocol)
     if not isinstance(model, BodyModel):
         model = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
     table = model.table

@@ -46,7 +46,7 @@ from .priors import combine_lengths
 from .problem import CalibrationProblem
 from .protocols import Closure, Protocol
 from .result import Calibration
-from .solver import MIN_LENGTH
+from .solver import MIN_LENGTH, QUIET_QP
 from .weights import LEAST_VARIANCE, MeasuredLength, count_correlated_samples, min_correlation
 
 Formulation = Literal["full", "paper"]
@@ -237,12 +237,10 @@ def _minimise(A: np.ndarray, constraints: _Constraints, names: tuple[str, ...]) 
     x = ca.MX.sym("lengths", A.shape[-1])
     gaps = ca.mtimes(ca.DM(A.reshape(-1, A.shape[-1])), x)
     program = {"x": x, "f": 0.5 * ca.sumsqr(gaps), "g": ca.mtimes(ca.DM(constraints.E), x)}
-    options: dict[str, Any] = {"print_iter": False, "print_header": False, "print_info": False, "print_time": False}
-    solver = ca.qpsol("lengths", "qrqp", program, options)
-    try:
-        solution = solver(lbx=MIN_LENGTH, lbg=constraints.d, ubg=constraints.d)
-    except RuntimeError as error:
-        raise NoSolution("the quadratic program of the lengths has no solution") from error
+    solver = ca.qpsol("lengths", "qrqp", program, QUIET_QP)
+    solution = solver(lbx=MIN_LENGTH, lbg=constraints.d, ubg=constraints.d)
+    if not solver.stats()["success"]:
+        raise NoSolution("the quadratic program of the lengths has no solution")
     lengths = np.asarray(solution["x"]).ravel()
     if np.min(lengths) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
         shortest = int(np.argmin(lengths))

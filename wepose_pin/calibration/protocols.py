@@ -36,6 +36,7 @@ PROTOCOLS = (
     "clasp",
     "clasp_measured",
     "elbows",
+    "feet",
     "free",
     "handle",
     "poses",
@@ -207,9 +208,12 @@ class Protocol:
             raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
 
 
-def choose_protocol(phases: Collection[str]) -> str:
-    """The protocol of a recording with these phases where none is named: `DEFAULT`, with the T-pose if it was held."""
-    return "+".join([DEFAULT, *(name for name in ALSO if name in phases)])
+def choose_protocol(phases: Collection[str], formulation: str = "full") -> str:
+    """The protocol of a recording with these phases where none is named: `DEFAULT`, with the T-pose if it was held.
+
+    The paper's formulation takes no poses.
+    """
+    return "+".join([DEFAULT, *(name for name in ALSO if name in phases and formulation == "full")])
 
 
 def load_protocol(name: str | Path) -> Protocol:
@@ -315,8 +319,6 @@ def _closure(entry: dict[str, Any], place: str) -> Closure:
         more["origin"] = str(entry.get("origin", ""))
         if more["origin"] in points:
             raise BadOption(f"{place}: origin = {more['origin']!r} is the point itself; another one is needed")
-    if kind == "fixed_point" and more["origin"] and not more["on"]:
-        raise BadOption(f"{place}: 'origin' of a fixed_point needs on, the segment whose point it is; add it")
     if kind == "fixed_point" and "at" in entry:
         at = entry["at"]
         if not isinstance(at, list) or len(at) != 3 or not all(is_number(v, 100.0) for v in at):

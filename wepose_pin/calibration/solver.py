@@ -1,12 +1,13 @@
-"""The least squares of a calibration as one problem, and two solvers for it.
+"""The least squares of a calibration as one problem, and its solver.
 
 min ½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c) with bounds on the lengths. `solve` hands it to CasADi's `nlpsol`: sequential
-quadratic programming with the Gauss-Newton Hessian, JᵀWJ + Λ. `solve_without_bounds` is Gauss-Newton with Marquardt's
-damping in a few lines of NumPy, against which the tests and `python -m benchmarks calibration` hold it.
+quadratic programming with the Gauss-Newton Hessian, JᵀWJ + Λ. Tests and `python -m benchmarks calibration` hold it
+against Gauss-Newton with Marquardt's damping in a few lines of NumPy.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -28,6 +29,8 @@ HALVINGS = 30  # of a step that does not lower the cost
 DAMPING, DAMPING_FACTOR = 1e-4, 8.0
 LEAST_DAMPING, MOST_DAMPING = 1e-12, 1e8
 _QUIET = dict.fromkeys(("print_header", "print_iteration", "print_time", "print_status", "show_eval_warnings"), False)
+# A quadratic program that raises prints its matrices, which no option keeps it from: it is asked whether it succeeded.
+QUIET_QP = dict.fromkeys(("print_header", "print_iter", "print_info", "print_time", "error_on_fail"), False)
 
 
 class Fit(NamedTuple):
@@ -143,7 +146,7 @@ def solve(
     if np.any(now.x < problem.lower_bounds):
         now = problem.evaluate(np.maximum(now.x, problem.lower_bounds))
     bounded = problem.observations.layout.length
-    multipliers, damping, left = np.zeros(bounded.stop), DAMPING, steps
+    multipliers, damping, left, largest = np.zeros(bounded.stop), DAMPING, steps, tolerance / 2.0
     while True:
         gradient = now.gradient.copy()
         gradient[bounded] += multipliers
@@ -151,13 +154,18 @@ def solve(
         if not remaining >= tolerance or left <= 0:  # NaN is no way to go either
             break
         oracle = _Oracle(now, damping)
-        now, multipliers = _minimise(oracle, min(left, SAME_SCALE_STEPS), tolerance / 2.0)
+        now, multipliers = _minimise(oracle, min(left, SAME_SCALE_STEPS), largest)
+        if not oracle.steps:  # `nlpsol` looks at the largest number of the gradient, `remaining` at all m together
+            largest = tolerance / (2.0 * np.sqrt(len(now.x)))
         damping, left = oracle.damping, left - max(oracle.steps, 1)
-    return _accept(now, remaining, strict)
+    return accept(now, remaining, strict)
 
 
 def _minimise(oracle: _Oracle, steps: int, tolerance: float) -> tuple[Evaluation, np.ndarray]:
-    """The evaluation at the end, and the multipliers (k,) of the lengths' bounds there."""
+    """The evaluation at the end, and the multipliers (k,) of the lengths' bounds there.
+
+    It is done where no number of the gradient by z is above `tolerance`.
+    """
     m, K = len(oracle.start.x), oracle.bounded.stop
     unknowns, multipliers = {"x": (m, 1), "p": (0, 1)}, {"lam:f": (1, 1), "lam:g": (K, 1)}
     values, slopes = {"f": (1, 1), "g": (K, 1)}, {"f": (1, 1), "grad:f:x": (m, 1), "g": (K, 1), "jac:g:x": (K, m)}
@@ -178,14 +186,17 @@ def _minimise(oracle: _Oracle, steps: int, tolerance: float) -> tuple[Evaluation
         "beta": 0.5,
         "merit_memory": 1,  # every step lowers the cost
         "qpsol": "qrqp",
-        "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False},
+        "qpsol_options": QUIET_QP,
     }
     solver = ca.nlpsol("calibration", "sqpmethod", functions[0], options)
+    oracle.program = solver.find_function("qpsol")
     failed = False
     try:
         solution = solver(x0=np.zeros(m), lbg=np.full(K, MIN_LENGTH), ubg=np.inf)
-    except RuntimeError:  # of a quadratic program that has no solution, or of an error below
+    except RuntimeError:  # of an error below, or of bounds that contradict each other
         failed = True
+    if isinstance(oracle.error, _NoStep):
+        return oracle.accepted, np.zeros(K)
     if oracle.error is not None:
         raise oracle.error
     if not failed:
@@ -193,6 +204,10 @@ def _minimise(oracle: _Oracle, steps: int, tolerance: float) -> tuple[Evaluation
         if np.all(np.isfinite(z)):
             return oracle.evaluate(z), lam
     return oracle.accepted, np.zeros(K)
+
+
+class _NoStep(Exception):
+    """The quadratic program of a step has no solution."""
 
 
 class _Oracle:
@@ -208,14 +223,17 @@ class _Oracle:
     bounded : the lengths among the unknowns, which have bounds
     accepted, steps : the evaluation where the last step began, and how many steps there were with it
     error : raised by an evaluation
+    program : the quadratic program of the steps
     """
+
+    program: ca.Function
 
     def __init__(self, start: Evaluation, damping: float) -> None:
         self.start = self._now = self.accepted = start
         self.bounded = start.problem.observations.layout.length
         self._z = np.zeros(len(start.x))
         self._x_by_z = np.linalg.inv(np.linalg.cholesky(start.information)).T
-        self.damping, self.steps, self._tries = damping, 0, 0
+        self.damping, self.steps, self._tries, self._begins_step = damping, 0, 0, False
         self.error: BaseException | None = None
 
     def evaluate(self, z: np.ndarray) -> Evaluation:
@@ -226,7 +244,16 @@ class _Oracle:
         return self._now
 
     def values(self, z: np.ndarray) -> tuple[Any, ...]:
-        """Half the cost, and the lengths (k,) [m]."""
+        """Half the cost, and the lengths (k,) [m]; the first after `curvature` is at the end of the program's step.
+
+        Raises
+        ------
+        _NoStep
+            The program has no solution.
+        """
+        if self._begins_step and not _succeeded(self.program):
+            raise _NoStep
+        self._begins_step = False
         now = self.evaluate(z)
         return 0.5 * now.cost, now.x[self.bounded]
 
@@ -243,12 +270,21 @@ class _Oracle:
         """
         self.accepted = self.evaluate(z)
         self.steps += 1
+        self._begins_step = True
         if self._tries:
             self.damping *= DAMPING_FACTOR ** (self._tries - 2)
             self.damping = min(max(self.damping, LEAST_DAMPING), MOST_DAMPING)
         self._tries = 0
         H = self.accepted.information
         return (self._x_by_z.T @ (H + self.damping * np.diag(np.diag(H))) @ self._x_by_z,)
+
+
+def _succeeded(program: ca.Function) -> bool:
+    """Whether the quadratic program found a solution when it was solved last."""
+    for memory in (1, 0):  # which one `sqpmethod` takes differs between versions
+        with contextlib.suppress(RuntimeError):  # it was not solved in this one
+            return bool(program.stats(memory)["success"])
+    return True
 
 
 _Shapes = Mapping[str, tuple[int, int]]  # by CasADi's names of inputs or outputs
@@ -299,30 +335,7 @@ class _Function(ca.Callback):
         return 0
 
 
-def solve_without_bounds(
-    problem: LeastSquares,
-    start: np.ndarray | Fit,
-    steps: int = STEPS,
-    strict: bool = True,
-    tolerance: float = TOLERANCE,
-) -> Fit:
-    """The minimiser by Gauss-Newton, damped where a step does not lower the cost; parameters and errors as `solve`."""
-    now = problem.evaluate_start(start)
-    damping = DAMPING
-    for _ in range(steps):
-        if now.remaining() < tolerance:
-            return now.fit()
-        before, H = now, now.information
-        while True:
-            now = problem.evaluate(before.x - np.linalg.solve(H + damping * np.diag(np.diag(H)), before.gradient))
-            if now.cost <= before.cost * (1.0 + 1e-12) or damping > MOST_DAMPING:
-                break
-            damping *= DAMPING_FACTOR
-        damping = max(damping / DAMPING_FACTOR, LEAST_DAMPING)
-    return _accept(now, now.remaining(), strict)
-
-
-def _accept(now: Evaluation, remaining: float, strict: bool) -> Fit:
+def accept(now: Evaluation, remaining: float, strict: bool) -> Fit:
     """The fit at the end; `NoSolution` where too many standard deviations remain, if `strict`."""
     if remaining < LOOSE_TOLERANCE or not strict:
         return now.fit()

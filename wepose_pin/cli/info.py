@@ -20,7 +20,8 @@ def run(job: InfoJob) -> int:
         print_table("Sensors", header, description.sensors)
     if written is not None:
         then = description.then.replace("SESSION", str(written))
-        say(f"Session: {written}  (check the lines marked CHECK, then: {then})")
+        check = "check the lines marked CHECK, then: " if "CHECK" in (description.session or "") else ""
+        say(f"Session: {written}  ({check}{then})")
     elif description.session is not None:
         say(f"# A session for it; --write writes it to {job.session_file}")
         print(description.session, end="")

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
 from ..recording.faults import find_faults, scan_sensor
 from ..recording.limits import STANDARD_GRAVITY
 from .amekf import Amekf, AmekfParams
-from .base import FilterRun, OrientationFilter
+from .base import AboutVertical, FilterRun, OrientationFilter
 from .gdc import Gdc, GdcParams
 from .ncf import Ncf, NcfParams
 from .noise import SensorNoise, estimate_noise
@@ -32,9 +32,11 @@ __all__ = [
     "METHODS",
     "OFFLINE",
     "TYPICAL",
+    "AboutVertical",
     "Amekf",
     "AmekfParams",
     "FilterRun",
+    "FilterSettings",
     "Gdc",
     "GdcParams",
     "Ncf",
@@ -82,6 +84,7 @@ class Orientation(NamedTuple):
     filter: OrientationFilter | None = None  # after the last sample, to continue live; None: it cannot
     detector: StaticDetector | None = None  # after the last sample as well
     diagnostics: tuple[Diagnostic, ...] = ()
+    about_vertical: np.ndarray | None = None  # (n, 6), as `base.AboutVertical`; None where the filter has no covariance
 
     def __repr__(self) -> str:
         bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
@@ -195,7 +198,8 @@ def estimate_orientation(
         if not 0 <= first < last <= len(gyro) + 1:
             raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
         noise, start = estimate_noise(gyro[first:last], accel[first:last], rate_hz), slice(first, last)
-    run = SensorRun(rate_hz, noise, method, params, static_test, start=start, gyro_range=scan.gyro_range)
+    settings = FilterSettings(method, params, static_test or StaticTest(), start=start, gyro_range=scan.gyro_range)
+    run = SensorRun(rate_hz, noise, settings)
     return (run.push(gyro, accel) or run.finish())._replace(diagnostics=diagnostics)
 
 
@@ -213,6 +217,28 @@ def chunk_multiple(method: str, rate_hz: float) -> int:
     return max(1, round(AmekfParams().block_s * rate_hz)) if method in OFFLINE else 1
 
 
+@dataclass(frozen=True)
+class FilterSettings:
+    """How a filter runs on a sensor.
+
+    Parameters
+    ----------
+    method : a key of `METHODS`
+    params : the filter's own; None: its defaults
+    static_test : when the sensor counts as static
+    measured_start : without `params`, smekf takes P₀ from the noise in place of the paper's (`smekf.starting_params`)
+    start : samples of the start phase, in the first chunk; None: the first window of `static_test`, static or not
+    gyro_range : [rad/s] at which an axis of gyro saturates
+    """
+
+    method: str
+    params: Any = None
+    static_test: StaticTest = field(default_factory=StaticTest)
+    measured_start: bool = False
+    start: slice | None = None
+    gyro_range: float = np.inf
+
+
 class SensorRun:
     """One filter on one sensor's samples, which come in chunks; the joined results are those of the whole recording.
 
@@ -224,12 +250,6 @@ class SensorRun:
     Parameters
     ----------
     noise : of the sensor, from its static phase
-    method : a key of `METHODS`
-    params : the filter's own; None: its defaults
-    static_test : when the sensor counts as static; None: the default values
-    measured_start : without `params`, smekf takes P₀ from `noise` in place of the paper's (`smekf.starting_params`)
-    start : samples of the start phase, in the first chunk; None: the first window of `static_test`, static or not
-    gyro_range : [rad/s] at which an axis of gyro saturates
 
     Raises
     ------
@@ -237,22 +257,10 @@ class SensorRun:
         The start phase has no gravity.
     """
 
-    def __init__(
-        self,
-        rate_hz: float,
-        noise: SensorNoise,
-        method: str,
-        params: Any = None,
-        static_test: StaticTest | None = None,
-        measured_start: bool = False,
-        start: slice | None = None,
-        gyro_range: float = np.inf,
-    ) -> None:
-        self.test = static_test or StaticTest()
-        self._gyro_range = gyro_range
-        self._noise, self._rate_hz, self._method, self._params = noise, rate_hz, method, params
-        self._measured_start, self._start = measured_start, start
-        self._detector = StaticDetector(noise, rate_hz, self.test)
+    def __init__(self, rate_hz: float, noise: SensorNoise, settings: FilterSettings) -> None:
+        self._rate_hz, self._noise, self._settings = rate_hz, noise, settings
+        self._method, self._test = settings.method, settings.static_test
+        self._detector = StaticDetector(noise, rate_hz, self._test)
         self._filter: Any = None
         self._before: Orientation | None = None  # before the start phase, until it is returned
         self._static = np.zeros(0, dtype=np.bool_)  # of the smoother's chunk
@@ -274,11 +282,11 @@ class SensorRun:
 
     def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> int:
         """Create the filter, and filter the samples before the start phase; return the filter's first sample."""
-        phase = self._start or slice(0, self.test.samples(self._rate_hz))
+        phase = self._settings.start or slice(0, self._test.samples(self._rate_hz))
         first = phase.start
         start = estimate_start_tilt(gyro_S[phase], accel_S[phase], self._noise, self._rate_hz)
-        if self._start is None:  # the sensor may move there
-            static = StaticDetector(self._noise, self._rate_hz, self.test).run(gyro_S[phase], accel_S[phase])
+        if self._settings.start is None:  # the sensor may move there
+            static = StaticDetector(self._noise, self._rate_hz, self._test).run(gyro_S[phase], accel_S[phase])
             if not static[-1]:
                 start = start._replace(tilt_std=MOVING_TILT_STD)
         if first > 0:
@@ -301,26 +309,30 @@ class SensorRun:
         quat_WS = (Rotation.from_quat(start.quat_WS) * Rotation.from_rotvec(turn)).as_quat()
         noise = replace(self._noise, gyro_bias=-self._noise.gyro_bias)
         gyro, accel = -gyro_S[:0:-1], accel_S[::-1]
-        static = StaticDetector(noise, self._rate_hz, self.test).run(gyro, accel)
+        static = StaticDetector(noise, self._rate_hz, self._test).run(gyro, accel)
         method = BEST if self._method in OFFLINE else self._method
         filter_ = self._create_filter(method, noise, start._replace(quat_WS=quat_WS))
         run = filter_.run(gyro, accel, static)
         cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
-        return Orientation(run.quat_WS[::-1], -run.gyro_bias[::-1], static[::-1], cov, self._noise)
+        # What the backward run has corrected is no correction of the forward run.
+        vertical = None if run.about_vertical is None else np.zeros_like(run.about_vertical)
+        return Orientation(
+            run.quat_WS[::-1], -run.gyro_bias[::-1], static[::-1], cov, self._noise, about_vertical=vertical
+        )
 
     def _create_filter(self, method: str, noise: SensorNoise, start: StartTilt) -> Any:
-        params = self._params
-        if params is None and method in ("amekf", "smoother") and self._start is not None:
+        params = self._settings.params
+        if params is None and method in ("amekf", "smoother") and self._settings.start is not None:
             params = AmekfParams(tilt_std=start.tilt_std)
-        if params is None and method == "smekf" and self._measured_start:
+        if params is None and method == "smekf" and self._settings.measured_start:
             params = starting_params(noise, self._rate_hz, start.quat_WS, start.tilt_std)
-        if np.isfinite(self._gyro_range):
-            params = add_range(method, params, self._gyro_range)
+        if np.isfinite(self._settings.gyro_range):
+            params = add_range(method, params, self._settings.gyro_range)
         return METHODS[method](noise, self._rate_hz, start.quat_WS, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
         """Return a run as orientations, joined to those before the start phase where it is the first."""
-        live = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
+        filter_, detector = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
         before, self._before = self._before, None
         if before is not None and self._method in OFFLINE:
             # The smoother's heading is exact where the recording begins; the headings are aligned in the start phase.
@@ -331,22 +343,24 @@ class SensorRun:
                 np.concatenate([before.quat_WS, run.quat_WS]),
                 np.concatenate([before.gyro_bias, run.gyro_bias]),
                 None if run.attitude_cov is None else np.concatenate([before.attitude_cov, run.attitude_cov]),
+                None if run.about_vertical is None else np.concatenate([before.about_vertical, run.about_vertical]),
             )
             static = np.concatenate([before.static, static])
-        return Orientation(run.quat_WS, run.gyro_bias, static, run.attitude_cov, self._noise, *live)
+        return Orientation(
+            run.quat_WS,
+            run.gyro_bias,
+            static,
+            run.attitude_cov,
+            self._noise,
+            filter_,
+            detector,
+            about_vertical=run.about_vertical,
+        )
 
 
 def run_filter(
-    gyro_S: np.ndarray,
-    accel_S: np.ndarray,
-    rate_hz: float,
-    noise: SensorNoise,
-    method: str,
-    params: Any = None,
-    static_test: StaticTest | None = None,
-    measured_start: bool = False,
-    start: slice | None = None,
+    gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise, settings: FilterSettings
 ) -> Orientation:
-    """Return the orientations of one sensor, of checked arrays and known noise; parameters as of `SensorRun`."""
-    run = SensorRun(rate_hz, noise, method, params, static_test, measured_start, start)
+    """Return the orientations of one sensor, of checked arrays and known noise."""
+    run = SensorRun(rate_hz, noise, settings)
     return run.push(gyro_S, accel_S) or run.finish()

@@ -31,7 +31,16 @@ from ..compilation import inlined, kernel
 from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
-from .base import STATIC_TURN_NOISE, FilterRun, OneSample, prepare_samples
+from .base import (
+    RATE_VAR,
+    STATIC_TURN_NOISE,
+    VERTICAL_COLUMNS,
+    FilterRun,
+    OneSample,
+    add_correction,
+    age_corrections,
+    prepare_samples,
+)
 from .covariance import fill_symmetric, into_sensor
 from .noise import SensorNoise
 from .static import static_step
@@ -55,6 +64,7 @@ PROPAGATED_STATES = 7  # θ, velocity and position change over a block, the othe
 SMOOTHED_STATES = (0, 1, 2, 7, 8, 9, 22, 23, 24)  # states that the smoother corrects: θ, bias, bias in motion
 MAX_MEASUREMENTS = 5  # of a static block: velocity (2) and bias (3); of another: velocity (2) and position (2)
 VELOCITY, POSITION, GYRO_BIAS = ERROR.velocity.start, ERROR.position.start, ERROR.gyro_bias.start
+MOTION_BIAS = ERROR.motion_bias.start
 
 HELD_RATE_FADE_S = 0.1  # [s] in which the last rate before a lost sample fades
 START_HEADING_STD = 1e-5  # [rad] the start defines the heading; above zero, so that P can be inverted
@@ -110,6 +120,7 @@ STATE = np.dtype(
         ("last_rate", float, 3),  # [rad/s] without bias; it fades while samples are lost
         ("lost_s", float),  # [s] since the last good sample of gyro
         ("samples", np.int64),  # in the open block
+        ("about_vertical", float, VERTICAL_COLUMNS),  # as `base.AboutVertical`
         # work space
         ("R_WS", float, (3, 3)),
         ("FP_rows", float, (PROPAGATED_STATES, STATES)),
@@ -247,6 +258,9 @@ class Amekf:
         std[ERROR.motion_bias] = p.motion_bias_std
         np.fill_diagonal(self.state.P, std**2)
         self.state.P[ERROR.gyro_bias, ERROR.gyro_bias] = self.noise.gyro_bias_cov
+        self.state.record["about_vertical"][0, RATE_VAR] = (
+            float(np.trace(self.noise.gyro_bias_cov)) / 3.0 + p.motion_bias_std**2
+        )
 
     @property
     def bank_kernel(self) -> Callable[..., None]:
@@ -262,15 +276,17 @@ class Amekf:
     ) -> FilterRun:
         """Filter as `run`, and fill one of `blocks`, an array of `BLOCK`, at the end of each block."""
         gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
-        out = np.empty((len(gyro), 4)), np.empty((len(gyro), 3)), np.empty((len(gyro), 3, 3))
+        n = len(gyro)
+        out = FilterRun(np.empty((n, 4)), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, VERTICAL_COLUMNS)))
         _run(self.state.record, self.model, gyro, accel, is_static, blocks, *out)
-        return FilterRun(*out)
+        return out
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
         """Filter one sample (3,), (3,); return `quat_WS` (4,) xyzw after it."""
         one = self._one
         sample = one.fill(gyro_S, accel_S, static)
-        _run(self.state.record, self.model, *sample, _NO_BLOCKS, one.quat_WS, one.gyro_bias, one.attitude_cov)
+        out = one.quat_WS, one.gyro_bias, one.attitude_cov, one.about_vertical
+        _run(self.state.record, self.model, *sample, _NO_BLOCKS, *out)
         return one.quat_WS[0].copy()
 
 
@@ -488,13 +504,37 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
         else:
             at, axes, variance = POSITION, 2, model.position_var
             variance += _compute_added_variance(state, at, variance)
+        before = compute_vertical_bias_var(P, state.R_WS)
+        heading, rate = block.correction[2], compute_vertical_bias(block.correction, state.R_WS)
         for i in range(axes):
             _correct(state, at + i, sums.gyro[i] / count if axes == 3 else 0.0, variance)
+        heading, rate = block.correction[2] - heading, compute_vertical_bias(block.correction, state.R_WS) - rate
+        add_correction(state.about_vertical, heading, rate, before, compute_vertical_bias_var(P, state.R_WS))
     for i in range(VELOCITY, STATES):
         x[i] += block.correction[i]
     rotate_by_world_vector(state.quat_WS, block.correction[0], block.correction[1], block.correction[2])
     state.samples = 0
     _reset_sums(sums)
+
+
+@inlined
+def compute_vertical_bias_var(P, R_WS):  # type: ignore[no-untyped-def]
+    """Compute the variance [rad²/s²] about the vertical of the gyroscope's bias in motion."""
+    variance = 0.0
+    for i in range(3):
+        for j in range(3):
+            b, d, e, m = GYRO_BIAS + i, MOTION_BIAS + i, GYRO_BIAS + j, MOTION_BIAS + j
+            variance += R_WS[2, i] * R_WS[2, j] * (P[b, e] + P[b, m] + P[d, e] + P[d, m])
+    return variance
+
+
+@inlined
+def compute_vertical_bias(x, R_WS):  # type: ignore[no-untyped-def]
+    """Compute the gyroscope's bias in motion about the vertical [rad/s], of states (25,) or their corrections."""
+    bias = 0.0
+    for c in range(3):
+        bias += R_WS[2, c] * (x[GYRO_BIAS + c] + x[MOTION_BIAS + c])
+    return bias
 
 
 @inlined
@@ -572,6 +612,7 @@ def _compute_horizontal_acceleration(state, model, ax, ay, az):  # type: ignore[
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Filter one sample, gyro [rad/s], accel [m/s²]; records of `STATE` and `MODEL`. Return whether a block ended."""
     dt, x, sums, R = model.dt, state.x, state.sums, state.R_WS
+    age_corrections(state.about_vertical, dt)
     wx, wy, wz, ux, uy, uz = _correct_rate(state, model, gx, gy, gz, static)
     sums.rate_squared += wx * wx + wy * wy + wz * wz
     rotate_unit_by_rate(state.quat_WS, wx, wy, wz, dt)
@@ -601,7 +642,7 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
 
 
 @kernel
-def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, out_cov):  # type: ignore[no-untyped-def]
+def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
     state, model = states[0], models[0]
     row = 0
     for k in range(len(gyro_S)):
@@ -615,6 +656,8 @@ def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, ou
             row += 1
         for i in range(4):
             out_quat[k, i] = state.quat_WS[i]
+        for i in range(VERTICAL_COLUMNS):
+            out_vertical[k, i] = state.about_vertical[i]
         for i in range(3):
             out_bias[k, i] = state.gyro_bias[i]
         fill_symmetric(state.attitude_cov, out_cov[k])

@@ -71,6 +71,11 @@ class LiveBank:
         """Covariance (k, 3, 3) [rad²] of the error on the right, in S; a copy."""
         return symmetric(self._states["attitude_cov"])
 
+    @property
+    def about_vertical(self) -> np.ndarray:
+        """(k, 6) as `AboutVertical`; a view."""
+        return np.asarray(self._states["about_vertical"])
+
 
 class OneByOne:
     """As `LiveBank`, for filters without a kernel for many: each filter itself is updated, one after the other."""
@@ -91,6 +96,10 @@ class OneByOne:
 
     @property
     def attitude_cov(self) -> np.ndarray | None:
+        return None
+
+    @property
+    def about_vertical(self) -> np.ndarray | None:
         return None
 
 

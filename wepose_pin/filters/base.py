@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
+from ..compilation import inlined
 from ..errors import BadData
 from .noise import SensorNoise
 
@@ -18,12 +19,58 @@ T = TypeVar("T")
 STATIC_TURN_NOISE = 8e-4
 
 
+class AboutVertical(NamedTuple):
+    """What a filter has corrected about the vertical since its start, and what it knows there; of samples or sensors.
+
+    Parameters
+    ----------
+    heading : [rad] sum of the corrections of its heading
+    rate : [rad/s] sum of the corrections of the gyroscope's bias, each at the attitude that the sensor had then
+    drift : [rad] integral of `rate` over time
+    seconds : [s] this time
+    information : [s²/rad²] sum of what each correction adds to the inverse of `rate_var`
+    rate_var : [rad²/s²] variance of the bias now
+    """
+
+    heading: np.ndarray
+    rate: np.ndarray
+    drift: np.ndarray
+    seconds: np.ndarray
+    information: np.ndarray
+    rate_var: np.ndarray
+
+
+VERTICAL_COLUMNS = len(AboutVertical._fields)
+HEADING, RATE, DRIFT, SECONDS, INFORMATION, RATE_VAR = range(VERTICAL_COLUMNS)
+
+
+@inlined
+def add_correction(sums, heading, rate, before, after):  # type: ignore[no-untyped-def]
+    """Add a correction by `heading` [rad] and `rate` [rad/s] to `sums` (6,), a row of `AboutVertical`.
+
+    `before` and `after` [rad²/s²] are the variances of the bias.
+    """
+    sums[HEADING] += heading
+    sums[RATE] += rate
+    if before > after > 0.0:
+        sums[INFORMATION] += 1.0 / after - 1.0 / before
+    sums[RATE_VAR] = after
+
+
+@inlined
+def age_corrections(sums, dt):  # type: ignore[no-untyped-def]
+    """Integrate the corrected rate in `sums` (6,) over a sample [s]."""
+    sums[DRIFT] += sums[RATE] * dt
+    sums[SECONDS] += dt
+
+
 class FilterRun(NamedTuple):
     """Results of a run, one row a sample; W is the sensor's own world, as in `OrientationFilter`."""
 
     quat_WS: np.ndarray  # (n, 4) xyzw, orientation after the sample
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
     attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²] of the error on the right, in S; None: the filter has none
+    about_vertical: np.ndarray | None = None  # (n, 6) as `AboutVertical`; None: the filter has no covariance
 
 
 class OrientationFilter(Protocol):
@@ -65,6 +112,7 @@ class OneSample:
     def __init__(self) -> None:
         self.inputs = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1, dtype=np.bool_)
         self.quat_WS, self.gyro_bias, self.attitude_cov = np.zeros((1, 4)), np.zeros((1, 3)), np.zeros((1, 3, 3))
+        self.about_vertical = np.zeros((1, VERTICAL_COLUMNS))
 
     def fill(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The sample as arrays of one row."""

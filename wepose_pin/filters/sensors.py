@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ..diagnostics import Diagnostic
 from ..errors import WeposeError
 from ..recording import OrientationSensor, Recording
-from . import BEST, OFFLINE, Orientation, SensorRun, check_method
+from . import BEST, OFFLINE, FilterSettings, Orientation, SensorRun, check_method
 from .base import run_in_parallel
 from .noise import SensorNoise, estimate_noise
 from .phases import check_common_rotation, check_motion, find_reference_phases
@@ -72,15 +72,14 @@ class SensorFilters:
             noises[segment] = noise
         self.diagnostics += check_common_rotation(first, noises, self.static_phase)
         for segment, noise in noises.items():
-            self._runs[segment] = SensorRun(
-                first.rate_hz,
-                noise,
+            settings = FilterSettings(
                 method,
-                static_test=static_test,
+                static_test=static_test or StaticTest(),
                 measured_start=True,
                 start=first.span(self.start),
                 gyro_range=first.imus[segment].gyro_range,
             )
+            self._runs[segment] = SensorRun(first.rate_hz, noise, settings)
         self.ahead = method in OFFLINE and bool(self._runs)
 
     def push(self, chunk: Recording) -> tuple[Recording, dict[str, Orientation]] | None:

@@ -22,7 +22,16 @@ from ..compilation import inlined, kernel
 from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, rotation_terms, up_in_sensor
-from .base import STATIC_TURN_NOISE, FilterRun, OneSample, prepare_samples
+from .base import (
+    RATE_VAR,
+    STATIC_TURN_NOISE,
+    VERTICAL_COLUMNS,
+    FilterRun,
+    OneSample,
+    add_correction,
+    age_corrections,
+    prepare_samples,
+)
 from .covariance import fill_symmetric, symmetric
 from .noise import SWAY_CORRELATION_S, SensorNoise
 from .start import ACCEL_BIAS_STD
@@ -99,6 +108,7 @@ STATE = np.dtype(
         ("P_bb", float, 6),  # [rad²/s²] upper triangle
         ("held_rate", float, 3),  # [rad/s] the last that was measured
         ("unseen_s", float),  # [s] since then
+        ("about_vertical", float, VERTICAL_COLUMNS),  # as `base.AboutVertical`
     ],
     align=True,
 )
@@ -155,6 +165,7 @@ class Smekf:
         record["quat_WS"], record["gyro_bias"] = quat_WS, noise.gyro_bias
         record["P_aa"] = record["attitude_cov"] = _matrix(self.params.attitude_cov0)[_UPPER]
         record["P_bb"] = _matrix(self.params.bias_cov0)[_UPPER]
+        record["about_vertical"][0, RATE_VAR] = float(np.trace(_matrix(self.params.bias_cov0))) / 3.0
         self.state = SmekfState(record)
         self._one = OneSample()
 
@@ -165,14 +176,16 @@ class Smekf:
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
         gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
-        out = FilterRun(np.empty((len(gyro), 4)), np.empty((len(gyro), 3)), np.empty((len(gyro), 3, 3)))
+        n = len(gyro)
+        out = FilterRun(np.empty((n, 4)), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, VERTICAL_COLUMNS)))
         _run(self.state.record, self.model, gyro, accel, is_static, *out)
         return out
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
         one = self._one
         sample = one.fill(gyro_S, accel_S, static)
-        _run(self.state.record, self.model, *sample, one.quat_WS, one.gyro_bias, one.attitude_cov)
+        out = one.quat_WS, one.gyro_bias, one.attitude_cov, one.about_vertical
+        _run(self.state.record, self.model, *sample, *out)
         return one.quat_WS[0].copy()
 
 
@@ -207,6 +220,7 @@ def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Take one sample of one sensor: records of `STATE` and `MODEL`, gyro [rad/s], accel [m/s²]."""
     dt, bias, held = model.dt, state.gyro_bias, state.held_rate
+    age_corrections(state.about_vertical, dt)
     seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
     unseen_cov = 0.0
     if seen:
@@ -245,6 +259,7 @@ def update_attitude_cov(state, model, wx, wy, wz):  # type: ignore[no-untyped-de
     cov[3] = P_aa[3] + heading_var * uy * uy
     cov[4] = P_aa[4] + heading_var * uy * uz
     cov[5] = P_aa[5] + heading_var * uz * uz
+    state.about_vertical[RATE_VAR] = compute_variance_along(state.P_bb, ux, uy, uz)
 
 
 @inlined
@@ -356,6 +371,7 @@ def correct(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-de
     """
     bias, P_aa, P_bb = state.gyro_bias, state.P_aa, state.P_bb
     ux, uy, uz = up_in_sensor(state.quat_WS)
+    before = compute_variance_along(P_bb, ux, uy, uz)
     # gyro: H P = [P_ba, P_bb], S = P_bb + Σ_ω
     R = model.static_gyro_cov
     b, c = nine(state.P_ab), full(P_bb)
@@ -395,6 +411,11 @@ def correct(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-de
         propagate(state, turn[0], turn[1], turn[2], 0.0, False)
     for i in range(3):
         bias[i] += d[3 + i] + e[3 + i]
+    heading, rate = (
+        ux * turn[0] + uy * turn[1] + uz * turn[2],
+        ux * (d[3] + e[3]) + uy * (d[4] + e[4]) + uz * (d[5] + e[5]),
+    )
+    add_correction(state.about_vertical, heading, rate, before, compute_variance_along(P_bb, ux, uy, uz))
     tx, ty, tz = model.static_turn * ux, model.static_turn * uy, model.static_turn * uz
     P_aa[0] += tx * ux
     P_aa[1] += tx * uy
@@ -402,6 +423,13 @@ def correct(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-de
     P_aa[3] += ty * uy
     P_aa[4] += ty * uz
     P_aa[5] += tz * uz
+
+
+@inlined
+def compute_variance_along(P, ux, uy, uz):  # type: ignore[no-untyped-def]
+    """Compute uᵀ P u of an upper triangle (6,)."""
+    x, y, z = P[0] * ux + P[1] * uy + P[2] * uz, P[1] * ux + P[3] * uy + P[4] * uz, P[2] * ux + P[4] * uy + P[5] * uz
+    return x * ux + y * uy + z * uz
 
 
 @inlined
@@ -472,13 +500,15 @@ def fuse(state, rows, S, innovation):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov):  # type: ignore[no-untyped-def]
+def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, out_vertical):  # type: ignore[no-untyped-def]
     state, model = states[0], models[0]
     for k in range(len(gyro_S)):
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         step(state, model, gx, gy, gz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2], static[k])
         for i in range(4):
             out_quat[k, i] = state.quat_WS[i]
+        for i in range(VERTICAL_COLUMNS):
+            out_vertical[k, i] = state.about_vertical[i]
         for i in range(3):
             out_bias[k, i] = state.gyro_bias[i]
         fill_symmetric(state.attitude_cov, out_cov[k])

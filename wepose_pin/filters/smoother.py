@@ -8,7 +8,7 @@ on. The backward pass is that of Rauch, Tung and Striebel 1965 (AIAA Journal 3(8
 
 for each block, which inverts nothing. It goes from block to block of the filter; the samples in between take the
 corrections of both ends in proportion. Time is linear in the samples; the blocks between the passes take
-3.5 kB a block, that is 140 bytes a sample at 100 Hz, 14 at 1 kHz, beside the output's 128.
+3.5 kB a block, that is 140 bytes a sample at 100 Hz, 14 at 1 kHz, beside the output's 160.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..compilation import compiled, inlined
 from ..errors import BadData, BadOption
 from ..rotations import fill_matrix, rotate_by_world_vector
 from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, Amekf, AmekfParams
-from .base import FilterRun
+from .base import RATE_VAR, VERTICAL_COLUMNS, FilterRun
 from .covariance import fill_symmetric, into_sensor
 from .noise import SensorNoise
 
@@ -93,10 +93,10 @@ class Smoother:
     def _smooth(self, chunk: _Forward, after: np.ndarray) -> FilterRun:
         """A chunk in the light of itself and of the blocks `after` it."""
         blocks, P_rows = chunk.blocks, chunk.P_rows
-        deviation, cov = _backward(np.concatenate([blocks, after]), P_rows, self.noise.gravity)
-        deviation, cov = deviation[: len(blocks) + 1], cov[: len(blocks) + 1]
+        ends = slice(len(blocks) + 1)
+        smoothed = [values[ends] for values in _backward(np.concatenate([blocks, after]), P_rows, self.noise.gravity)]
         trace = float(np.trace(P_rows[:3, :3]))
-        _interpolate(blocks, deviation, cov, trace, self._filter.block_samples, chunk.static, *chunk.out)
+        _interpolate(blocks, *smoothed, trace, self._filter.block_samples, chunk.static, *chunk.out)
         return chunk.out
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:  # noqa: ARG002
@@ -136,10 +136,10 @@ def _transpose_transition(block, gravity, L):  # type: ignore[no-untyped-def]
 @compiled
 def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
     """Compute deviations (blocks + 1, 9) of the smoothed from the filtered states `SMOOTHED_STATES` after each block,
-    and the smoothed covariance (blocks + 1, 3, 3) of θ; the first of both is that of the start, whose rows of P are
-    `start_rows`."""
+    and the smoothed covariances (blocks + 1, 3, 3) of θ and of the bias in motion; the first of each is that of the
+    start, whose rows of P are `start_rows`."""
     deviation = np.empty((len(blocks) + 1, COUNT))
-    cov = np.empty((len(blocks) + 1, 3, 3))
+    covs = np.empty((2, len(blocks) + 1, 3, 3))
     lam = np.zeros((STATES, 1))
     Lam = np.zeros((STATES, STATES))
     swapped = np.empty((STATES, STATES))
@@ -152,19 +152,26 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
                 rows[n, j] = start_rows[n, j] if k == 0 else blocks[k - 1].P_smoothed_rows[n, j]
                 s -= rows[n, j] * lam[j, 0]
             deviation[k, n] = s
-        for i in range(3):
+        for n in range(3):  # rows of the bias in motion: bias and what is added in motion
             for j in range(STATES):
-                u[j] = 0.0
-            for m in range(STATES):
-                p = rows[i, m]
+                rows[3 + n, j] += rows[6 + n, j]
+        for part in range(2):
+            first, columns = 3 * part, ERROR.gyro_bias.start * part
+            for i in range(3):
                 for j in range(STATES):
-                    u[j] += p * Lam[m, j]
-            for j in range(i, 3):
-                s = rows[i, j]
+                    u[j] = 0.0
                 for m in range(STATES):
-                    s -= u[m] * rows[j, m]
-                cov[k, i, j] = s
-                cov[k, j, i] = s
+                    p = rows[first + i, m]
+                    for j in range(STATES):
+                        u[j] += p * Lam[m, j]
+                for j in range(i, 3):
+                    s = rows[first + i, columns + j]
+                    if part:
+                        s += rows[first + i, ERROR.motion_bias.start + j]
+                    for m in range(STATES):
+                        s -= u[m] * rows[first + j, m]
+                    covs[part, k, i, j] = s
+                    covs[part, k, j, i] = s
         if k == 0:
             break
         block = blocks[k - 1]
@@ -187,7 +194,7 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
         for i in range(STATES):
             for j in range(STATES):
                 Lam[i, j] = 0.5 * (swapped[i, j] + swapped[j, i])
-    return deviation, cov
+    return deviation, covs[0], covs[1]
 
 
 @inlined
@@ -212,7 +219,7 @@ def _uncorrect(lam, Lam, at, root, innovation, gain, u):  # type: ignore[no-unty
 
 
 @compiled
-def _interpolate(blocks, deviation, cov, start_trace, size, static, quat, bias, attitude_cov):  # type: ignore[no-untyped-def]
+def _interpolate(blocks, deviation, cov, bias_cov, start_trace, size, static, quat, bias, attitude_cov, about_vertical):  # type: ignore[no-untyped-def]
     """Correct the filter's run in place, sample by sample, between the corrections of its block's ends.
 
     They are taken in proportion to the time, or, where gyro was lost, to the variance of the turn that was lost up to
@@ -261,3 +268,10 @@ def _interpolate(blocks, deviation, cov, start_trace, size, static, quat, bias, 
         fill_matrix(quat[k], R)
         into_sensor(R, P, bridge, upper)
         fill_symmetric(upper, attitude_cov[k])
+        # Smoothed headings and biases know the whole recording from the first sample on: nothing is corrected later.
+        for i in range(VERTICAL_COLUMNS):
+            about_vertical[k, i] = 0.0
+        at = min(row, len(blocks))
+        for i in range(3):
+            for j in range(3):
+                about_vertical[k, RATE_VAR] += R[2, i] * R[2, j] * bias_cov[at, i, j]

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..calibration import Calibration, CalibrationQuality
-from ..calibration.quality import ENOUGH_SAMPLES
-from ..diagnostics import render, render_all
+from ..calibration.observability import format_longest
+from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals
+from ..diagnostics import Diagnostic, render, render_all
 from ..errors import WeposeError
 from ..recording.arrivals import Ticks
 from .guide import GET_READY_S, RESTART, Calibrated, Guide, Step
@@ -242,7 +244,7 @@ class CalibrationStep(Step):
             sentence = "The proportions are good. One measured length gives the scale too."
         if quality.quality == "fail" and self._lacks_motion:
             sentence = "There was too little of the motion. More of it may be enough."
-        reasons = [text.line() for _, text in render_all(quality.reasons)]
+        reasons = [text.line() for _, text in render_all(count_from_begin(quality.reasons, calibration))]
         if self._moved:  # all other reasons follow from this one
             sentence, reasons = (
                 "Some sensors sit on other segments than assigned. The same motion will do.",
@@ -257,6 +259,18 @@ class CalibrationStep(Step):
             reasons=tuple(reasons),
             measurable=self._measurable,
         )
+
+
+def count_from_begin(reasons: Sequence[Diagnostic], calibration: Calibration) -> list[Diagnostic]:
+    """The reasons with intervals counted from the begin of the motion: the person knows no clock of the source."""
+    if not any("intervals" in reason.facts for reason in reasons):
+        return list(reasons)
+    begin = calibration.time[np.isfinite(calibration.gap)][0]
+    intervals = format_longest([(first - begin, last - begin) for first, last in find_open_intervals(calibration)])
+    return [
+        replace(reason, facts={**reason.facts, "intervals": intervals}) if "intervals" in reason.facts else reason
+        for reason in reasons
+    ]
 
 
 def _list_lengths(calibration: Calibration) -> tuple[LengthEstimate, ...]:

@@ -19,7 +19,7 @@ from typing import Any
 from ..errors import BadOption
 from .addresses import name_host
 from .encoder import PoseEncoder
-from .state import GuideView, Status, round_finite
+from .state import GuideView, Status, format_heading_std, round_finite
 
 FRAME_S = 1.0 / 60.0
 MAX_ACTION = 120  # letters of an action
@@ -306,7 +306,7 @@ def status_json(status: Status) -> str:
                     "lost": bool(sensor.lost),
                     "static": bool(sensor.static),
                     "bias_deg_s": [round_finite(math.degrees(axis), 5) for axis in sensor.gyro_bias],
-                    "heading_std_deg": round_finite(math.degrees(sensor.heading_std), 2),
+                    "heading_std": format_heading_std(sensor.heading_std),
                     "heading_age_s": round_finite(sensor.heading_age, 1),
                     "missing": sensor.missing,
                     "late": sensor.late,

@@ -7,6 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+# [rad] standard deviation of a direction that is uniform on the circle: with more, nothing is known of a heading.
+UNKNOWN_HEADING_STD = math.pi / math.sqrt(3.0)
+
 
 class StreamInfo(NamedTuple):
     """What stays the same from the start of tracking on."""
@@ -136,6 +139,13 @@ class Output:
 def round_finite(value: float, digits: int) -> float | None:
     """A number for JSON; None for NaN and infinity."""
     return round(float(value), digits) if math.isfinite(value) else None
+
+
+def format_heading_std(std: float) -> str:
+    """A heading's standard deviation [rad] in degrees, as text; "–" where there is none, "unknown" above the limit."""
+    if not math.isfinite(std):
+        return "–"
+    return f"{math.degrees(std):.1f}" if std < UNKNOWN_HEADING_STD else "unknown"
 
 
 def join_names(segments: list[str]) -> str:

@@ -10,7 +10,7 @@ import select
 import sys
 from typing import Any, TextIO
 
-from .state import GuideView, Output, SensorStatus, Status
+from .state import GuideView, Output, SensorStatus, Status, format_heading_std
 
 REFRESH_HZ = 4
 KEYS = {"r": "r", "q": "q", "t": "take", "m": "mark mark"}  # key → what it asks for
@@ -190,7 +190,7 @@ def _sensor_cells(sensor: SensorStatus, tracking: bool) -> tuple[str, ...]:
     if math.isfinite(sensor.battery):
         state += f" {100.0 * sensor.battery:.0f} %"
     bias = " ".join(f"{_format(math.degrees(axis) if tracking else math.nan, 2):>6}" for axis in sensor.gyro_bias)
-    heading = _format(math.degrees(sensor.heading_std), 1)
+    heading = format_heading_std(sensor.heading_std)
     age = _format(sensor.heading_age if tracking else math.nan, 0)
     missing = str(sensor.missing + sensor.late + sensor.duplicate)
     return sensor.segment.replace("_", " "), state, _format(sensor.rate_hz, 0), bias, heading, age, missing

@@ -19,7 +19,8 @@ from .body import BodyModel, load_model, read_urdf
 from .chains import Chain
 from .girdle import Girdle, GirdleMotion, move_girdles
 from .reaches import LinkVector, measure_reaches
-from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, Segment, find_table, load_table, read_table
+from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, Segment
+from .table_file import find_table, load_table, read_table
 from .tree import AxisLimits
 from .visuals import Visual
 

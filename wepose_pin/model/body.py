@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -23,7 +23,8 @@ from .chains import Chain, find_chains, find_parents
 from .girdle import PARAMETERS
 from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
-from .table import DEFAULT_BODY, BodyTable, Segment, find_table, load_table, parse_table, read_table
+from .table import DEFAULT_BODY, BodyTable, HingeJoint, Segment
+from .table_file import find_table, load_table, parse_table, read_table
 from .tree import AxisLimits, build, find_bounds, find_impossible_inertia, parse_tree
 from .urdf_library import import_yourdfpy
 from .visuals import Visual
@@ -33,6 +34,7 @@ FAR_OFF = 5.0
 # So is a mass [kg] beyond ten standard deviations above the mean of men, 85.5 ± 14.2 kg (ANSUR II), or below an upper
 # body's share (head, arms and trunk: 68 %, Winter 2009, table 4.1) of five below the mean of women, 67.8 ± 11.0 kg.
 HEAVIEST, LIGHTEST = 230.0, 8.0
+MIN_HINGE_COSINE = 0.5  # of the angle between a hinge's axis and that of the joint, below which it is another axis
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,13 @@ class BodyModel:
     def reaches(self) -> dict[str, dict[str, LinkVector]]:
         """Point → link → its part of the way from the root, the same for all lengths."""
         return measure_reaches(self) if self.loaded is None else self.loaded.reaches
+
+    @cached_property
+    def neutral_rotations(self) -> dict[str, np.ndarray]:
+        """Link → its rotation (3, 3) in W, all joints at zero."""
+        data = self.pin.createData()
+        pin.framesForwardKinematics(self.pin, data, pin.neutral(self.pin))
+        return {frame.name: np.array(M_WK.rotation) for frame, M_WK in zip(self.pin.frames, data.oMf, strict=True)}
 
     @cached_property
     def point_frames(self) -> dict[str, str]:
@@ -201,7 +210,8 @@ def load_model(
     Returns
     -------
     BodyModel
-        Its `pin` is the Pinocchio model, its `table` names segments, points, lengths and joints.
+        Its `pin` is the Pinocchio model, its `table` names segments, points, lengths and joints. A body of the package
+        is read once and shared: what is to be changed in it, such as `pin`, is copied first.
 
     Raises
     ------
@@ -221,15 +231,31 @@ def load_model(
     """
     check_arguments(load_model, locals())
     path = _find_body(path)
+    if segments is not None:
+        entries = {"like": like, "segments": segments, "points": points or {}, "up": up, "forward": forward}
+        body = _load_body(path, {**entries, "root": root or ()})
+    elif points is not None or root is not None or (up, forward) != ("+z", "+x"):
+        raise BadModel(f"{path}: points, up, forward and root are part of a table; give segments with them")
+    else:
+        packaged = path.parent == asset("urdf", f"{DEFAULT_BODY}.urdf").parent
+        body = _load_packaged_body(path) if packaged else _load_body(path)
+    return body.with_lengths(lengths) if lengths else body
+
+
+@lru_cache
+def _load_packaged_body(path: Path) -> BodyModel:
+    """Return a body of the package, read once; a `BodyModel` does not change."""
+    return _load_body(path)
+
+
+def _load_body(path: Path, entries: Mapping[str, Any] | None = None) -> BodyModel:
+    """Return the body of a URDF or of a table that names one; `entries` of a table that is given go before."""
     table: BodyTable | None = None
     if path.suffix.lower() == ".toml":
         table, urdf = read_table(path, needs_urdf=True)
         path = urdf or path
-    if segments is not None:
-        entries = {"like": like, "segments": segments, "points": points or {}, "up": up, "forward": forward}
-        table = parse_table({**entries, "root": root or ()}, str(path), path.stem)
-    elif points is not None or root is not None or (up, forward) != ("+z", "+x"):
-        raise BadModel(f"{path}: points, up, forward and root are part of a table; give segments with them")
+    if entries is not None:
+        table = parse_table(dict(entries), str(path), path.stem)
     robot = read_urdf(path)
     tree, own = parse_tree(robot, str(path)), table is not None
     table = table or find_table(path, tree.below)
@@ -238,7 +264,8 @@ def load_model(
         lacking = [name for name in default.needed if default.segments[name].link not in tree.below]
         raise BadModel(
             f"{path}: no link {format_closest_links(lacking, tree.below, default)}; name the segments' links in a "
-            f"table, as docs/models.md shows; {one_of(tree.below, most=MOST_LINKS)}"
+            f'table, as docs/models.md shows (of a robot with kind = "mechanism"); '
+            f"{one_of(tree.below, most=MOST_LINKS)}"
         )
     joints = {joint.name for joint in robot.joints}
     girdles = {name: girdle for name, girdle in table.girdles.items() if joints.issuperset(girdle.joints)}
@@ -253,7 +280,7 @@ def load_model(
     _check_segments_move(body, str(path))
     if own:
         _lengths.check_lengths_scale(robot, table)
-    return body.with_lengths(lengths) if lengths else body
+    return body
 
 
 def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: str) -> BodyModel:
@@ -345,6 +372,8 @@ def read_urdf(path: Path) -> Any:
         robot = import_yourdfpy().URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
     except Exception as error:  # yourdfpy and lxml raise many kinds
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        if isinstance(error, KeyError):
+            reason = f"an element lacks the attribute {reason}"
         raise BadModel(f"{path}: cannot be read as a URDF: {reason}") from error
     materials = [visual.material for link in robot.links for visual in link.visuals if visual.material is not None]
     for material in [*robot.materials, *materials]:
@@ -373,6 +402,29 @@ def _check_segments_move(body: BodyModel, where: str) -> None:
                 f"{table.where}: hinges.{name} is none: {hinge.moves} hangs on "
                 f"{body.parents[hinge.moves] or 'the root'}, not on {hinge.on}"
             )
+        own = _find_single_axis(body, hinge)
+        if own is not None and abs(own @ hinge.axis) < MIN_HINGE_COSINE:
+            axis = ", ".join(f"{v:.2g}" for v in own + 0.0)
+            raise BadModel(
+                f"{table.where}: hinges.{name}.axis = {[*hinge.axis]} is none: {hinge.moves} turns about [{axis}] of "
+                f"{hinge.on}"
+            )
+
+
+def _find_single_axis(body: BodyModel, hinge: HingeJoint) -> np.ndarray | None:
+    """The axis (3,) of the one revolute joint that moves a hinge's segment, in the frame of the other; None: no one.
+
+    With all joints at zero.
+    """
+    joints = body.chains[hinge.moves].joints
+    if len(joints) != 1 or body.pin.nvs[joints[0]] != 1:
+        return None
+    data = body.pin.createData()
+    pin.computeJointJacobians(body.pin, data, pin.neutral(body.pin))
+    pin.updateFramePlacements(body.pin, data)
+    axis_W = pin.getJointJacobian(body.pin, data, joints[0], pin.WORLD)[3:, body.pin.idx_vs[joints[0]]]
+    R_WL = data.oMf[body.pin.getFrameId(hinge.on)].rotation
+    return np.asarray(R_WL.T @ axis_W) if np.linalg.norm(axis_W) > 0.5 else None  # a joint that slides has none
 
 
 def _check_xml(path: Path) -> None:

@@ -253,7 +253,9 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal, wearer: Wear
         return Description(what, tuple(proposal.facts), (), text, "mend what cannot be read", diagnostics)
     static = find_static_intervals(recording)
     comments = {segment: _mount_comment(recording, segment, static) for segment in proposal.tables}
-    text = _session_text(title, head, phases or _start_lines(static), proposal.tables, comments, wearer.table)
+    ends = float(recording.time[0]), float(recording.time[-1])
+    phases = phases or _start_lines(static, ends[0])
+    text = _session_text(title, head, phases, proposal.tables, comments, wearer.table, ends)
     facts, rows = (*proposal.facts, *_facts(recording)), _rows(recording, proposal.labels)
     # A sensor on an unknown segment has its name in the file.
     read = (replace(each, place=each.place.removeprefix("?")) for each in recording.diagnostics)
@@ -264,7 +266,7 @@ def _advise(recording: Recording, table: BodyTable) -> str:
     """Advise on the use of a session with these sensors, once its lines marked CHECK are right."""
     worn = {segment: sensor for segment, sensor in recording.sensors.items() if segment in table.segments}
     if not worn:
-        return "name the segment of each sensor in place of SEGMENT"
+        return "take the # off each sensor's lines and write its segment in place of SEGMENT"
     without = [segment for segment, sensor in worn.items() if not sensor.aligned and sensor.stated_quat_LS is None]
     if not without:
         return "wepose track SESSION -o result"
@@ -276,11 +278,13 @@ def _advise(recording: Recording, table: BodyTable) -> str:
     return f"state the mounts of {', '.join(without)}, then wepose track SESSION -o result"
 
 
-def _start_lines(static: list[tuple[float, float]]) -> list[str]:
+def _start_lines(static: list[tuple[float, float]], begin: float) -> list[str]:
+    """Propose the start pose: the first static interval, else an example after the recording's `begin` [s]."""
     if static and static[0][1] - static[0][0] >= SHORTEST_STATIC_S:
         first, last = static[0]
         return [f"start = [[{first:.2f}, {last:.2f}]]{CHECK}all sensors are static there; is it the start pose?"]
-    return ["# start = [[0.5, 4.5]]   # name the seconds in which the person stands still in the start pose"]
+    example = _write_example(begin + 0.5, begin + 4.5)
+    return [f"# start = {example}   # name the seconds in which the person stands still in the start pose"]
 
 
 def _session_text(
@@ -290,7 +294,9 @@ def _session_text(
     tables: Mapping[str, list[str]],
     comments: Mapping[str, list[str]],
     body: BodyTable,
+    ends: tuple[float, float] = (0.0, 80.0),
 ) -> str:
+    """The text of a session; examples of phases lie between the `ends` [s] of the recording."""
     lines = [
         *title,
         'start_pose = "n_pose"',
@@ -306,9 +312,9 @@ def _session_text(
     clasped = any(line.startswith("clasp = ") for line in phases) or (lacking and known)
     if not clasped and body.paths and all(body.counterpart(tip) in body.paths for tip in body.paths):
         tips = " and ".join(dict.fromkeys(f"{body.shared_name(tip).replace('_', ' ')}s" for tip in body.paths))
-        lines.append(
-            f"# clasp = [[10.0, 70.0]]   # for wepose calibrate: the seconds in which the {tips} are held together"
-        )
+        begin, end = ends
+        example = _write_example(begin + min(10.0, (end - begin) / 4.0), begin + min(70.0, 0.75 * (end - begin)))
+        lines.append(f"# clasp = {example}   # for wepose calibrate: the seconds in which the {tips} are held together")
     if lacking and known:
         lines += ["", f"# without a sensor here, and not known without one: {', '.join(lacking)}"]
     segments = list(body.segments)
@@ -395,7 +401,7 @@ def _describe_live(path: Path) -> tuple[list[str], list[str]]:
     marked = {name: spans for name, spans in recording.phases.items() if name != "start"}
     for name, spans in marked.items():
         facts.append(f"phase {name} [s]: {', '.join(f'{begin:.2f} to {end:.2f}' for begin, end in spans)}")
-    facts += [f"marked at {marker.time:.2f} s: {marker.text}" for marker in log.texts]
+    facts += [f"marked at {mark.time:.2f} s: {mark.text}" for mark in recording.marks]
     if len(log.quat_WL):
         facts.append(f"track it as it was: wepose track {path} -o result")
     facts.append("to change its phases: --write")
@@ -408,6 +414,11 @@ def _describe_live(path: Path) -> tuple[list[str], list[str]]:
 def _write_spans(spans: Intervals) -> str:
     """Intervals [s] in TOML, to the millisecond within them."""
     return f"[{', '.join(f'[{np.ceil(1e3 * a) / 1e3:.3f}, {np.floor(1e3 * b) / 1e3:.3f}]' for a, b in spans)}]"
+
+
+def _write_example(begin: float, end: float) -> str:
+    """An interval [s] in TOML that is to be replaced, to a tenth of a second within it."""
+    return f"[[{np.ceil(10.0 * begin) / 10.0:.1f}, {np.floor(10.0 * end) / 10.0:.1f}]]"
 
 
 def _siblings(path: Path, format: str) -> list[Path]:
@@ -583,7 +594,8 @@ def _mount_comment(recording: Recording, segment: str, static: list[tuple[float,
             sensor.accel_S[recording.span(static[0])] if static else sensor.accel_S[: max(1, round(recording.rate_hz))]
         )
         up = max(AXES, key=lambda axis: float(AXES[axis] @ force.mean(axis=0)))
-    hint = f"up as gravity says {'where it is static' if static else 'in the first second'}; ? is the axis ahead"
+    where = "where it is static" if static else "in the first second"
+    hint = f"up as gravity says {where}; write the axis ahead for ?, without the #"
     if isinstance(sensor, OrientationSensor):
         hint = "which sensor axis is up, which forward, in the start pose? none: the segment's own orientation"
     return [f'# mount = {{ up = "{up}", forward = "?" }}   # {hint}']

@@ -29,7 +29,7 @@ import numpy as np
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable, is_number
 from ..errors import BadData, MissingFile
-from ..recording import ImuSensor, Intervals, OrientationSensor, Recording, Sensor, check_recording
+from ..recording import ImuSensor, Intervals, Mark, OrientationSensor, Recording, Sensor, check_recording
 from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks, unpack_orientations
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge, bridge_quat
@@ -58,13 +58,6 @@ _EVENTS = {
 }
 
 
-class Marker(NamedTuple):
-    """A text that was marked at a time."""
-
-    time: float  # [s]
-    text: str
-
-
 class Markers:
     """Phases and texts that were marked in a live session, and the segments of its sensors.
 
@@ -75,7 +68,7 @@ class Markers:
     """
 
     def __init__(self) -> None:
-        self.texts: list[Marker] = []
+        self.texts: list[Mark] = []
         self.segments: dict[str, str] = {}
         self._spans: dict[str, list[tuple[float, float]]] = {}
         self._open: dict[str, float] = {}
@@ -90,7 +83,7 @@ class Markers:
             self._spans.pop(event["phase"], None)
             self._open.pop(event["phase"], None)
         elif kind == "mark":
-            self.texts.append(Marker(event["time"], event["text"]))
+            self.texts.append(Mark(event["time"], event["text"]))
         elif kind == "assign":
             self.segments = dict(event["segments"])
 
@@ -107,11 +100,10 @@ class Markers:
 class LiveRecording(NamedTuple):
     """The contents of a live session's recording."""
 
-    recording: Recording  # on its ticks, with its start pose, marked phases and resets
+    recording: Recording  # on its ticks, with its start pose, marked phases and texts, and resets
     header: dict[str, Any]  # as `HEAD`
     first: int  # tick of the first pose
     quat_WL: np.ndarray  # (n, k, 4) xyzw, the live poses, in the order of the header's sensors
-    texts: tuple[Marker, ...]  # marked in the session
 
 
 def is_live_log(path: Path) -> bool:
@@ -188,12 +180,13 @@ def read_live_log(path: Path) -> LiveRecording:
     if start is None and not any(end <= ends[1] for _, end in header["phases"].get("start", ())):
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     recording = check_recording(build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets)))
+    recording = replace(recording, marks=tuple(markers.texts))
     if broken_off:
         killed = Diagnostic("live-recording-incomplete", WARNING, path.name, facts={"variant": "killed"})
         recording = replace(recording, diagnostics=(killed,))
     quat_WL = np.concatenate([quat for _, quat in poses]) if poses else np.empty((0, len(header["sensors"]), 4))
     first = poses[0][0] if poses else start[1] + 1 if start is not None else 0
-    return LiveRecording(recording, header, first, quat_WL, tuple(markers.texts))
+    return LiveRecording(recording, header, first, quat_WL)
 
 
 def _assign_segments(path: Path, sensors: Sequence[str], segments: Mapping[str, str]) -> list[str]:

@@ -25,7 +25,7 @@ from ..recording import (
     check_recording,
     format_span,
 )
-from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time
+from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time, measure_rate
 from ..recording.faults import ROWS, Scan
 from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples
 from ..recording.limits import LARGEST_NUMBER
@@ -161,7 +161,7 @@ class SessionReader:
         # Whether the names are segments, and the start pose one of theirs, is checked where the body is known.
         tables = {name: sensors.table(name) for name in sensors.values}
         if not tables:
-            raise BadSession(f"{self.path}: no sensors; one [sensors.<segment>] table each")
+            raise BadSession(f"{self.path}: no sensors; one [sensors.<segment>] table each, without # before its lines")
         self._head = Recording(
             name=printable(top.text("name", None) or self.path.absolute().parent.name or self.path.stem),
             time=np.empty(0),
@@ -208,7 +208,7 @@ class SessionReader:
             *(each for device in self.devices.values() for each in device.diagnostics),
             *(Diagnostic("packet-times-spread", INFO, path.name, packet) for path, packet in packets.items()),
         )
-        self.rate_hz = (len(self.time) - 1) / float(self.time[-1] - self.time[0])
+        self.rate_hz = measure_rate(self.time)
         check_phases(str(self.path), self.time, self._head.phases)
         self.phases, self.start_pose, self.remounted = self._head.phases, start_pose, self._head.remounted
         self._refuse_shared_columns()
@@ -588,5 +588,5 @@ def _report_bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterat
     for mark, code, severity in ((LONG, "long-gaps-bridged", WARNING), (BRIDGED, "short-gaps-bridged", INFO)):
         spans = [last - first for first, last in find_runs(marks == mark)]
         if spans:
-            facts = {"samples": sum(spans), "longest": max(spans) * step}
-            yield Diagnostic(code, severity, segment, len(spans), max(LONGEST_GAP_S, step), facts)
+            facts = {"samples": sum(spans), "gaps": len(spans)}
+            yield Diagnostic(code, severity, segment, max(spans) * step, max(LONGEST_GAP_S, step), facts)

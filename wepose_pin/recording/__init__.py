@@ -14,7 +14,7 @@ from .intervals import (
     format_time,
     select_interval,
 )
-from .recording import CONFIGURATION, EACH_TIME, DoubledSensor, Recording, check_recording, join_recordings
+from .recording import CONFIGURATION, EACH_TIME, DoubledSensor, Mark, Recording, check_recording, join_recordings
 from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, compute_mount, find_mount_axes
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "DoubledSensor",
     "ImuSensor",
     "Intervals",
+    "Mark",
     "OrientationSensor",
     "Recording",
     "Sensor",

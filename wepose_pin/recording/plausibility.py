@@ -102,8 +102,8 @@ def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place:
         raise _make_gravity_error(f"{place}.accel: {text}, where gravity's {STANDARD_GRAVITY:.3g} is expected", norm)
     if abs(share) <= GRAVITY_ERROR_NOTED:
         return []
-    facts = {"share": share, "start": first, "end": last}
-    return [Diagnostic("accel-scale", WARNING, segment, norm, GRAVITY_ERROR_NOTED, facts)]
+    facts = {"norm": norm, "start": first, "end": last}
+    return [Diagnostic("accel-scale", WARNING, segment, share, GRAVITY_ERROR_NOTED, facts)]
 
 
 def _make_gravity_error(text: str, norm: float) -> BadData:

@@ -25,6 +25,13 @@ LONGEST_STEP = 2.5  # allowed step between two times, in steps of the rate; read
 EACH_TIME = ", a row for each time"  # part of an error's text on an array's shape
 
 
+class Mark(NamedTuple):
+    """A text that was marked at a time."""
+
+    time: float  # [s]
+    text: str
+
+
 class DoubledSensor(NamedTuple):
     """A second sensor on a segment, and its name."""
 
@@ -50,6 +57,7 @@ class Recording:
     source : the file of the recording, for messages
     truth : a file with reference poses; None: there is none
     resets : numbers of the samples before which a live session reset the headings, with the person in the start pose
+    marks : texts that were marked in a live session, with their times [s]
     joints : joint → value [rad or m] in the start pose "configuration"; joints that are not named are at zero
     model : the body that wears the sensors: the file of a table or a URDF, or the name of a body of the package;
         empty: the upper body
@@ -68,6 +76,7 @@ class Recording:
     source: Path | None = None
     truth: Path | None = None
     resets: tuple[int, ...] = ()
+    marks: tuple[Mark, ...] = ()
     joints: Mapping[str, float] = field(default_factory=dict)
     model: str = ""
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -128,7 +137,7 @@ class Recording:
         return samples if gap is None else samples[~gap[span]]
 
     def cut(self, span: slice) -> Recording:
-        """Return the recording of a span of samples; `phases` are not cut."""
+        """Return the recording of a span of samples; `phases` and `marks` are not cut."""
         first, last, _ = span.indices(len(self))
         span = slice(first, last)
         sensors = {name: sensor.part(span) for name, sensor in self.sensors.items()}

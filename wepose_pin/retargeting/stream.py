@@ -149,9 +149,9 @@ class _Reference:
         self.reached = self.reached or (_norm(away) < REACHED_M and _norm(turn) < REACHED_RAD)
         if self.reached:
             trust = (target.weight - WEIGHT_POOR) / (1.0 - WEIGHT_POOR)
-            wanted = APPROACH_SPEED * (FREE_SPEED / APPROACH_SPEED) ** trust
+            target_speed = APPROACH_SPEED * (FREE_SPEED / APPROACH_SPEED) ** trust
             up, down = np.exp(dt / SPEED_UP_S), np.exp(-dt / SPEED_DOWN_S)
-            self.speed = float(min(max(wanted, down * self.speed), up * self.speed))
+            self.speed = float(min(max(target_speed, down * self.speed), up * self.speed))
         else:
             self.speed += APPROACH_GROWTH * dt * target.weight
         speed, limit = self.speed, self.max_acceleration
@@ -414,9 +414,9 @@ class CommandStream:
         if self._references is None:
             self._references = self._start_references()
         for i, observation in enumerate(self._observed):
-            wanted = _compute_trust(observation)
-            time_constant = TRUST_UP_S if wanted > self._trust[i] else TRUST_DOWN_S
-            self._trust[i] += (wanted - self._trust[i]) * -math.expm1(-dt / time_constant)
+            trust = _compute_trust(observation)
+            time_constant = TRUST_UP_S if trust > self._trust[i] else TRUST_DOWN_S
+            self._trust[i] += (trust - self._trust[i]) * -math.expm1(-dt / time_constant)
         ahead = min(max(now - self._time, -dt), EXTRAPOLATE_S)
         moving = now - self._time <= EXTRAPOLATE_S
         targets = [self._extrapolate(i, ahead, moving) for i in range(len(self._observed))]

@@ -15,13 +15,23 @@ from .imperfections import IDEAL_PRESET, MILD_PRESET, PEOPLE_PRESET, PRESETS, Im
 from .imu import GRAVITY, MTI_3, NOISE_FREE, Device, ImuNoise
 from .motion import CIRCLING_POINT, SEGMENTS, SIDES
 from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
-from .subject import MEASURED_STD, MOUNT, PEOPLE_MEASURED_STD, Person, Simulation, simulate, simulate_person
+from .subject import (
+    MEASURED_LENGTHS,
+    MEASURED_STD,
+    MOUNT,
+    PEOPLE_MEASURED_STD,
+    Person,
+    Simulation,
+    simulate,
+    simulate_person,
+)
 
 __all__ = [
     "ACTIVITIES",
     "CIRCLING_POINT",
     "GRAVITY",
     "IDEAL_PRESET",
+    "MEASURED_LENGTHS",
     "MEASURED_STD",
     "MILD_PRESET",
     "MOUNT",

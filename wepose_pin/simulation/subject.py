@@ -29,7 +29,8 @@ from .tasks import find_task
 
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
-MEASURED_STD = 0.003  # [m] of shoulder width and trunk
+MEASURED_LENGTHS = ("shoulder_width", "trunk")  # of a simulated person
+MEASURED_STD = 0.003  # [m] of each
 # [m] Shoulder width as 0.83 ± 0.03 of the biacromial breadth (`breadths` in calibration/anthropometry.toml): 12 mm of
 # 400 mm.
 PEOPLE_MEASURED_STD = 0.012
@@ -462,5 +463,5 @@ def simulate_person(seed: int, measured_std: float = MEASURED_STD, body: str = D
     table = load_table(body)
     prior = population_subject(round(stature, 2), sex, table)
     lengths = dict(population_subject(stature, sex, table).sample(rng).lengths)
-    measured = {name: lengths[name] + float(rng.normal(0.0, measured_std)) for name in ("shoulder_width", "trunk")}
+    measured = {name: lengths[name] + float(rng.normal(0.0, measured_std)) for name in MEASURED_LENGTHS}
     return Person(lengths, stature, sex, measured, measured_std, prior)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,7 +31,7 @@ from ..alignment import (
 )
 from ..compilation import kernel
 from ..errors import BadPhase
-from ..filters import BEST, Orientation
+from ..filters import BEST, AboutVertical, Orientation
 from ..filters.bank import LiveBank, OneByOne, create_bank
 from ..filters.sensors import SensorFilters, combine_chunk
 from ..filters.static import StaticTest
@@ -38,13 +39,14 @@ from ..recording import ImuSensor, OrientationSensor, Recording, join_recordings
 from ..recording.arrivals import list_numbers, unpack_orientations
 from ..rotations import product
 from ..subject import Subject
-from .heading_filter import HeadingProblem
+from .heading_filter import FilterHeadings, HeadingProblem, undo_corrections
 from .headings import (
     CausalHeadings,
     compute_heading_covariance,
-    find_heading_variance,
     find_specific_force,
+    read_filter_headings,
     replace_heading_variance,
+    stack_heading_corrections,
 )
 from .segments import Oriented
 from .start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates, cut_start_pose
@@ -242,6 +244,7 @@ class CausalSegmentEstimator:
         self._oldest = 0  # row of `_recent` with the oldest sample
         self.quat_WL = np.zeros((len(self.names), 4))
         self._uncorrected = np.zeros(len(self.names))
+        self._filter_corrections = np.zeros((1, len(self.names)))  # [rad] of the last step, contiguous as in `_run`
         _place_segments(
             self._quat_WV,
             (self._uncorrected, self._uncorrected, 0, 1),
@@ -252,6 +255,8 @@ class CausalSegmentEstimator:
         )
         problem = None if make_problem is None else make_problem(start_recording, self.start)
         self.headings = None if problem is None else CausalHeadings(start_recording, self.start, problem)
+        unknown = np.full(len(self.names), np.nan)
+        self._variance = (unknown,) * 3 if self.headings is None else self.headings.variance  # of the last step
         self._run_var = self.heading_var()  # (k,) [rad²] of each heading by its filter alone, after the last run
         self._var_at_reset: np.ndarray | None = None  # (k,) [rad²] of heading that a reset took away
 
@@ -295,11 +300,15 @@ class CausalSegmentEstimator:
         elif self._bank is not None:
             self._recent[self._oldest] = self._bank.update(gyro_S, accel_S)
         newest = self._recent[self._oldest : self._oldest + 1]
+        if self.headings is not None and self._bank is not None and self._bank.about_vertical is not None:
+            self._filter_corrections[0, ~self._measured] = self._bank.about_vertical[:, 0]
+            undo_corrections(newest, self._filter_corrections, self.headings.at_start)
         _place_segments(self._quat_WV, self._correction(), newest, self._quat_LS, self.quat_WL, self.quat_WL[None])
         self._oldest = (self._oldest + 1) % len(self._recent)
-        if self.headings is not None and self.headings.push(newest, accel_S[None]):
-            var = self.heading_var()
-            self.headings.close(np.full(len(self.names), np.nan) if var is None else var)
+        if self.headings is not None:
+            self._variance = self.headings.variance  # of this sample, as in `_place`
+            if self.headings.push(newest, accel_S[None]):
+                self.headings.close(self._read_filter_headings())
         return self.quat_WL
 
     def _take_measured(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
@@ -352,6 +361,9 @@ class CausalSegmentEstimator:
         """Return the segment orientations of a chunk without resets."""
         _, orientation = self._filters.push(chunk) or self._filters.finish()
         quat_VS = self._stack_orientations(chunk, orientation)
+        if self.headings is not None:
+            corrections = stack_heading_corrections(orientation, self.names, len(chunk))
+            undo_corrections(quat_VS, corrections, self.headings.at_start)
         quat_WL = np.empty(quat_VS.shape)
         variance = self._place(chunk, orientation, quat_VS, quat_WL)
         self._recent = np.concatenate([self._order_recent(), quat_VS])[-len(self._recent) :].copy()
@@ -359,7 +371,7 @@ class CausalSegmentEstimator:
         covariance_W = {}
         covs = {name: o.attitude_cov for name, o in orientation.items() if o.attitude_cov is not None}
         if covs:
-            self._run_var = find_heading_variance(orientation, self.names, len(chunk) - 1)
+            self._run_var = read_filter_headings(orientation, self.names, len(chunk) - 1).var
         for i in np.flatnonzero(self._measured):
             covs[self.names[i]] = np.tile(_MEASURED_COV, (len(chunk), 1, 1))
         if covs:
@@ -383,12 +395,12 @@ class CausalSegmentEstimator:
     def _place(
         self, chunk: Recording, orientation: Mapping[str, Orientation], quat_VS: np.ndarray, quat_WL: np.ndarray
     ) -> np.ndarray:
-        """Fill `quat_WL` (n, k, 4), knot by knot; return `CausalHeadings.variance` (n, 2, k) [rad²] of each sample.
+        """Fill `quat_WL` (n, k, 4), knot by knot; return `CausalHeadings.variance` (n, 3, k) [rad²] of each sample.
 
         It is NaN where headings are not corrected.
         """
         n = len(chunk)
-        variance = np.full((n, 2, len(self.names)), np.nan)
+        variance = np.full((n, 3, len(self.names)), np.nan)
         if self.headings is None:
             _place_segments(self._quat_WV, self._correction(), quat_VS, self._quat_LS, self.quat_WL, quat_WL)
             return variance
@@ -402,7 +414,7 @@ class CausalSegmentEstimator:
             )
             variance[rows] = self.headings.variance
             if self.headings.push(quat_VS[rows], accel_S[rows]):
-                self.headings.close(find_heading_variance(orientation, self.names, end - 1), record=True)
+                self.headings.close(read_filter_headings(orientation, self.names, end - 1), record=True)
             begin = end
         return variance
 
@@ -425,6 +437,7 @@ class CausalSegmentEstimator:
         if self.headings is not None:
             self._quat_WV = _quat_about_z(self.headings.offset)
             self.headings.reset(offset)
+            self._variance = self.headings.variance
             return
         self._quat_WV = _quat_about_z(offset)
         self._var_at_reset = heading_var if heading_var is not None else self.heading_var()
@@ -435,14 +448,21 @@ class CausalSegmentEstimator:
         None: no filter has a covariance.
         """
         cov = None if self._bank is None else self._bank.attitude_cov
-        if cov is None:
+        if self._bank is None or cov is None:
             return None
-        newest = self._recent[self._oldest - 1]
-        if not self._any_measured:
-            return compute_heading_variance(newest, cov)
         variance = np.full(len(self.names), np.nan)
-        variance[~self._measured] = compute_heading_variance(newest[~self._measured], cov)
+        variance[~self._measured] = compute_heading_variance(self._bank.quat_WS, cov)
         return variance
+
+    def _read_filter_headings(self) -> FilterHeadings:
+        """Read what the filters say of their headings after a step."""
+        var, about_vertical = self.heading_var(), np.full((len(self.names), len(AboutVertical._fields)), np.nan)
+        filtered = None if self._bank is None else self._bank.about_vertical
+        if filtered is not None:
+            about_vertical[~self._measured] = filtered
+        return FilterHeadings(
+            np.full(len(self.names), np.nan) if var is None else var, AboutVertical(*about_vertical.T)
+        )
 
     def covariance(self) -> np.ndarray:
         """Return the covariances (k, 3, 3) [rad²] of the segments in W after the last step, mounts included.
@@ -465,7 +485,7 @@ class CausalSegmentEstimator:
             cov[~self._measured] = filtered
         if np.isfinite(cov).any():
             newest = self._recent[self._oldest - 1].copy()
-            variance = np.full((2, len(cov)), np.nan) if self.headings is None else np.array(self.headings.variance)
+            variance = np.array(self._variance)
             soft = compute_soft_tissue_covariances(
                 self._start_frames.table, {name: self.quat_WL[i : i + 1] for i, name in enumerate(self.names)}
             )
@@ -479,7 +499,7 @@ class CausalSegmentEstimator:
     def _covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment, error on the left of `quat_WL`, in W.
 
-        `variance` (n, 2) [rad²] is that of the corrected heading after a knot, and that of its filter then.
+        `variance` (n, 3) [rad²] is `CausalHeadings.variance` of the sensor.
 
         As `alignment.compute_segment_covariance`; after a reset the heading's error is that of the start pose and the
         drift since.
@@ -498,7 +518,8 @@ class CausalSegmentEstimator:
             start = compute_start_heading_var(self._start_recording, self.names[i], self._subject, self._start_frames)
             var = with_heading[:, 2]
             grown = np.maximum(var - variance[:, 1], 0.0)
-            corrected = np.minimum(variance[:, 0] + grown, var + start)  # the filter may have found the bias
+            # The filter alone may know the heading better; to it a correction is an error of that size.
+            corrected = np.minimum(variance[:, 0] + grown, var + start + variance[:, 2])
             cov = replace_heading_variance(cov, R_WV.apply(with_heading), var + start, corrected)
         if self._var_at_reset is not None and np.isfinite(self._var_at_reset[i]):
             var = compute_heading_variance(quat_VS, attitude_cov)
@@ -520,14 +541,11 @@ def _join_segments(chunk: Recording, parts: list[SegmentOrientations]) -> Segmen
 
     def join_orientation(name: str) -> Orientation:
         results = [part.orientation[name] for part in parts]
-        covs = [result.attitude_cov for result in results if result.attitude_cov is not None]
-        quat_WS, gyro_bias, static = (
-            np.concatenate([getattr(result, field) for result in results])
-            for field in ("quat_WS", "gyro_bias", "static")
-        )
-        return results[-1]._replace(
-            quat_WS=quat_WS, gyro_bias=gyro_bias, static=static, attitude_cov=np.concatenate(covs) if covs else None
-        )
+        joined: dict[str, Any] = {}
+        for field in ("quat_WS", "gyro_bias", "static", "attitude_cov", "about_vertical"):
+            values = [getattr(result, field) for result in results]
+            joined[field] = None if values[0] is None else np.concatenate(values)
+        return results[-1]._replace(**joined)
 
     last = parts[-1]
     return replace(

@@ -15,7 +15,7 @@ from .measures import Measures, Signal, measure, measure_signal, measure_tips
 from .tracked import TrackedRecording
 
 MOST = 20_000  # samples that are kept
-_OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov")  # in `Orientation`
+_OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov", "about_vertical")  # in `Orientation`
 
 
 class Decimator:

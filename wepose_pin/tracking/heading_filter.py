@@ -2,7 +2,9 @@
 
 δ_i is the heading error of segment i, on the left in W: R_WL,true = Rz(δ) R_WL. It is a random walk whose step variance
 is the growth of the orientation filter's heading variance, and a rate that changes slowly, by a bias that the
-orientation filter has not found. Observed are differences of two or more:
+orientation filter has not found. The heading is that of the filter without its own corrections of the heading
+(`undo_corrections`), so that it does not jump. Where the filter corrects its bias by Δb the rate changes by Δb, and
+what it learned by that is an observation of the rate. Observed are differences of two or more as well:
 
 - the acceleration of a joint, which two sensors measure (`joint_accelerations`), with their levers as unknowns;
 - a hinge: the segment below stays in the plane across its axis, n · R_Oᵀ R_M e = 0, with e its long axis;
@@ -25,6 +27,7 @@ import numpy as np
 from ..alignment import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
 from ..calibration.conditions import Part, StartPose
 from ..compilation import kernel
+from ..filters import AboutVertical
 from ..model import BodyModel, GirdleMotion, move_girdles
 from ..model.girdle import PARAMETERS
 from ..subject import Subject
@@ -32,8 +35,8 @@ from .joint_accelerations import JointPair, JointSums
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
-# [s] for which the growth of a filter's heading variance is remembered: the fastest of it says what bias is left.
-BIAS_FOUND_S = 10.0
+MIN_RATE_VAR = 1e-18  # [rad²/s²] so that it can be inverted
+LEAST_INFORMATION = 1e-6  # relative to what a filter knew of its bias, below which a correction tells nothing
 LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance within so long [s], above which it leaps
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
@@ -81,7 +84,7 @@ class HeadingNoise:
     Parameters
     ----------
     drift_psd : [rad²/s] of a heading in motion, beside a rate that changes slowly: scale errors, tissue's wobble
-    rate_std : [rad/s] drift of a heading, at the start; more after a short start phase
+    rate_std : [rad/s] drift of a heading by other causes than its gyroscope's bias
     rate_change_psd : [rad²/s³] of its random walk: a sensor warms up under its strap
     joint_std, girdle_std : [rad] by which the acceleration of a joint is off in heading, as tissue and a travelling
         shoulder follow the motion; it changes within `joint_correlation_s`
@@ -200,6 +203,19 @@ class Closure(NamedTuple):
         return closed
 
 
+class FilterHeadings(NamedTuple):
+    """What the orientation filters of k sensors say of their headings after a sample.
+
+    Parameters
+    ----------
+    var : (k,) [rad²]; NaN: the filter has no covariance
+    about_vertical : of (k,) each
+    """
+
+    var: np.ndarray
+    about_vertical: AboutVertical
+
+
 class Knot(NamedTuple):
     """The observations of a knot, before headings are corrected."""
 
@@ -207,15 +223,35 @@ class Knot(NamedTuple):
     time: np.ndarray  # (m,) [s] of the samples
     quat_WL: np.ndarray  # (m, k, 4) xyzw
     joints: tuple[JointSums | None, ...]
-    heading_var: np.ndarray  # (k,) [rad²] of each orientation filter at the end; NaN: it has none
+    filters: FilterHeadings  # at the end
     lost: np.ndarray  # (k,) bool, whether a sensor has lost a sample
 
 
 class Step(NamedTuple):
-    """A prediction: the variance (k,) [rad²] that headings gain beside their rates, and what share of these is left."""
+    """A prediction; (k,) each.
 
+    Parameters
+    ----------
+    drift : [rad] by which headings change as the orientation filters correct their biases within the knot
+    heading_var : [rad²] that headings gain beside their rates
+    rate : [rad/s] by which the orientation filters have corrected their biases about the vertical
+    rate_var : [rad²/s²] that rates gain as their sensors turn another axis to the vertical
+    information : [s²/rad²] that the filters' corrections brought about their biases
+    prior_var : [rad²/s²] of these biases without them
+    heading : [rad] by which the filters have corrected their headings
+    unobserved, unobserved_rate : share of the variance of a heading and of its rate, as a filter alone would have them,
+        that is left
+    """
+
+    drift: np.ndarray
     heading_var: np.ndarray
-    rate_share: np.ndarray  # (k,)
+    rate: np.ndarray
+    rate_var: np.ndarray
+    information: np.ndarray
+    prior_var: np.ndarray
+    heading: np.ndarray
+    unobserved: np.ndarray
+    unobserved_rate: np.ndarray
 
 
 class Rows(NamedTuple):
@@ -235,8 +271,9 @@ class HeadingProblem:
     ----------
     names : segments, in the order of δ
     drift_psd : (k,) [rad²/s] most that a heading gains by what is not a rate that changes slowly
-    rate_std : (k,) [rad/s] of the headings' drift at the start
+    rate_std : (k,) [rad/s] of the gyroscopes' biases at the start
     start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
+    start : what the filters say at the end of the start pose; None: as at the end of the first knot
     levers_at : (pairs, 6) [m] where levers are known; None: they are unknowns
     causal : headings are corrected as samples come; a short clasp then counts as one observation
     """
@@ -254,6 +291,7 @@ class HeadingProblem:
     rate_std: np.ndarray
     start_var: np.ndarray
     mount_var: np.ndarray
+    start: FilterHeadings | None = None
     levers_at: np.ndarray | None = None
     causal: bool = False
 
@@ -336,7 +374,11 @@ class HeadingFilter:
         self.problem = problem
         noise, k = problem.noise, len(problem.names)
         self.x, std = np.zeros(problem.size), np.zeros(problem.size)
-        std[k : 2 * k] = problem.rate_std
+        bias_std = problem.rate_std
+        if problem.start is not None:
+            known = np.sqrt(problem.start.about_vertical.rate_var)
+            bias_std = np.where(np.isfinite(known), known, bias_std)
+        std[k : 2 * k] = np.hypot(noise.rate_std, bias_std)
         decay = np.ones(problem.size)
         for i, pair in enumerate(problem.pairs):
             column = problem.column("joint", i)
@@ -352,10 +394,9 @@ class HeadingFilter:
         self._set_start_covariance()
         self._decay, self._steady = decay, (1.0 - decay**2) * std**2
         self._misfit = np.full(len(problem.pairs), noise.acceleration_std**2)  # [m²/s⁴] recent mean of each axis
-        self._last_var: np.ndarray | None = None
+        self._last = problem.start
+        self._last_up: np.ndarray | None = None  # (k, 3) the axis of each segment that was turned to the vertical
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
-        self._rate_std = problem.rate_std.copy()  # [rad/s] that the orientation filters have left
-        self._growths: list[np.ndarray] = []  # [rad/s] of the orientation filters' heading std, of late
         self._usual_gain = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, largest of late
         self._clasps = ClaspDetector(problem)
         self._closed_before = set[tuple[str, ...]]()  # points that coincided in the last knot
@@ -381,13 +422,16 @@ class HeadingFilter:
         """Predict to a knot and update by it; return what the prediction was."""
         step = self.find_step(knot)
         self.predict(step)
+        self._learn_from_filters(step)
         for _ in self.update(knot):
             pass
         return step
 
     def step_gradually(self, knot: Knot) -> Iterator[None]:
         """Do as `step`, in parts of a millisecond or two; the state is valid after the last one."""
-        self.predict(self.find_step(knot))
+        step = self.find_step(knot)
+        self.predict(step)
+        self._learn_from_filters(step)
         yield
         yield from self.update(knot)
 
@@ -395,42 +439,102 @@ class HeadingFilter:
         """Find what the headings have gained in a knot beside their rates, and what is left of these.
 
         The variance of the orientation filter includes its gyroscope's bias, which is a rate here: it counts up to
-        `drift_psd`, and as a whole where samples were lost or the rate was cut off, which make it leap. Where its
-        standard deviation grows slower than the rate's would let it, the filter has found the bias.
+        `drift_psd`, and as a whole where samples were lost or the rate was cut off, which make it leap.
         """
         knot_s, k = self.problem.knot_s, len(self.problem.names)
-        if self._last_var is None:
-            self._last_var = knot.heading_var
-            self._growths.append(np.where(np.isfinite(knot.heading_var), np.inf, np.nan))
-        else:
-            self._growths.append((np.sqrt(knot.heading_var) - np.sqrt(self._last_var)) / knot_s)
-        self._growths = self._growths[-max(1, round(BIAS_FOUND_S / knot_s)) :]
-        gained = np.maximum(knot.heading_var - self._last_var, MIN_DRIFT_PSD * knot_s)
-        self._last_var = knot.heading_var
+        now, last = knot.filters, self._last or knot.filters
+        self._last = now
+        gained = np.maximum(now.var - last.var, MIN_DRIFT_PSD * knot_s)
         known = np.isfinite(gained)
-        rate_std = np.maximum(np.fmax.reduce(self._growths), self.problem.noise.rate_std)
-        rate_share = np.where(known, np.minimum(rate_std / self._rate_std, 1.0), 1.0)
-        self._rate_std = self._rate_std * rate_share
         leaps = known & (knot.lost | (gained > LEAP * np.maximum(self._usual_gain, self.problem.drift_psd * knot_s)))
         self._usual_gain = np.maximum(self._usual_gain * np.exp(-knot_s / USUAL_S), np.where(known, gained, 0.0))
         limited = np.where(leaps, gained, np.minimum(gained, self.problem.drift_psd * knot_s))
-        return Step(np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k)), rate_share)
+        drift_var = np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k))
+        changes = [np.nan_to_num(a - b) for a, b in zip(now.about_vertical, last.about_vertical, strict=True)]
+        change = AboutVertical(*changes)
+        # The rate of the knot's begin is in the prediction; what was corrected since has added up from then on.
+        drift = change.drift - np.nan_to_num(last.about_vertical.rate) * change.seconds
+        unobserved = np.diag(self.P)[:k] / (np.nan_to_num(last.var) + self.problem.start_var + self.problem.mount_var)
+        prior_var = self._find_prior_bias_var(now.about_vertical, last.about_vertical, change)
+        rates, alone = np.diag(self.P)[k : 2 * k], prior_var + self.problem.noise.rate_std**2
+        rate_var = self._find_turn(knot) * np.maximum(alone - rates, 0.0)
+        shares = np.minimum(unobserved, 1.0), np.minimum(rates / alone, 1.0)
+        learned = change.information, prior_var, change.heading, *shares
+        return Step(drift, drift_var, change.rate, rate_var, *learned)
 
-    def transition(self, step: Step) -> np.ndarray:
+    def _find_prior_bias_var(self, now: AboutVertical, last: AboutVertical, change: AboutVertical) -> np.ndarray:
+        """Find the variances (k,) [rad²/s²] of the biases about the present vertical without a knot's corrections.
+
+        A sum of information that says less than the start, the knot before and the correction itself is rounding, or
+        what aged in between.
+        """
+        most_var = np.fmax.reduce([now.rate_var, last.rate_var, self.problem.rate_std**2, 4.0 * change.rate**2])
+        most_var = np.maximum(most_var, MIN_RATE_VAR)
+        rate_var = np.maximum(now.rate_var, MIN_RATE_VAR)
+        return np.nan_to_num(1.0 / np.maximum(1.0 / rate_var - change.information, 1.0 / most_var))
+
+    def _find_bias_share(self, bias_var: np.ndarray) -> np.ndarray:
+        """Find the share (k,) of the rates' variances that is the biases'; the rest are other causes of drift."""
+        return bias_var / (bias_var + self.problem.noise.rate_std**2)
+
+    def _find_turn(self, knot: Knot) -> np.ndarray:
+        """Find the squared sines (k,) of the angles by which segments have turned another axis to the vertical.
+
+        Zero up to 45°. It is the share of the bias about the new vertical that the one about the last does not tell.
+        """
+        k = len(self.problem.names)
+        if not len(knot.quat_WL):
+            return np.zeros(k)
+        x, y, z, w = knot.quat_WL[-1].T
+        up = np.stack([2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)], axis=1)
+        last_up = up if self._last_up is None else self._last_up
+        cosine = np.einsum("ki,ki->k", up, last_up)
+        is_turned = np.abs(cosine) < np.sqrt(0.5)
+        self._last_up = np.where(is_turned[:, None], up, last_up)
+        return np.where(is_turned, 1.0 - cosine**2, 0.0)
+
+    def transition(self) -> np.ndarray:
         """Return F (n, n) of one knot."""
         k = len(self.problem.names)
         F = np.diag(self._decay)
         F[:k, k : 2 * k] = self.problem.knot_s * np.eye(k)
-        F[np.arange(k, 2 * k), np.arange(k, 2 * k)] = step.rate_share
         return F
 
     def predict(self, step: Step) -> None:
-        k, F = len(self.problem.names), self.transition(step)
+        k, F = len(self.problem.names), self.transition()
         self.x = F @ self.x
+        self.x[:k] += step.drift
+        self.x[k : 2 * k] += step.rate
         self.P = F @ self.P @ F.T + np.diag(self._steady)
         self.P[np.arange(k), np.arange(k)] += step.heading_var
         rates = np.arange(k, 2 * k)
-        self.P[rates, rates] += self.problem.noise.rate_change_psd * self.problem.knot_s
+        self.P[rates, rates] += self.problem.noise.rate_change_psd * self.problem.knot_s + step.rate_var
+
+    def _learn_from_filters(self, step: Step) -> None:
+        """Update the rates by what the orientation filters have learned of their biases in a knot.
+
+        A filter that knew its bias to the variance p and has corrected it by Δb with the information i has measured,
+        with the variance 1/i, that the rate is now −Δb/(p i). A rate has other parts than the bias (`noise.rate_std`),
+        of which that says nothing.
+
+        The filter's correction of its heading, which was undone, follows from that as far as the heading was wrong by
+        the bias about the present vertical. The rest is by a bias about an axis that was vertical before, or by the
+        gyroscope's scale; it is believed as far as nothing else has observed the heading, and so with the rate.
+        """
+        k, shares = len(step.rate), self._find_bias_share(step.prior_var)
+        before = self.x[: 2 * k]
+        for i in np.flatnonzero(step.information * step.prior_var > LEAST_INFORMATION):
+            at, share, prior_var, correction = k + i, shares[i], step.prior_var[i], step.rate[i]
+            measured = -correction / (prior_var * step.information[i])
+            innovation = measured - correction - share * (self.x[at] - correction)
+            gain = share * self.P[:, at]
+            bias_var = share**2 * self.P[at, at] + (1.0 - share) * prior_var
+            gain /= bias_var + 1.0 / step.information[i]
+            self.P = _symmetric(self.P - np.outer(gain, share * self.P[:, at]))
+            self.x = self.x + gain * innovation
+        rest = np.concatenate([step.heading - step.drift, -step.rate]) - (self.x[: 2 * k] - before)
+        self.x = self.x.copy()
+        self.x[: 2 * k] += np.concatenate([step.unobserved, step.unobserved_rate]) * rest
 
     def update(self, knot: Knot) -> Iterator[None]:
         """Update by a knot's observations, then by the points that are found to coincide in it; yield between parts."""
@@ -537,6 +641,18 @@ class HeadingFilter:
                 weight = rows.weight / self._find_correlation(closure.points, knot)
                 information[:k, :k] += rows.H.T @ (weight[:, None] * rows.H)
                 vector[:k] += rows.H.T @ (weight * rows.r)
+
+
+@kernel
+def undo_corrections(quat_VS, corrections, at_start):  # type: ignore[no-untyped-def]
+    """Turn orientations (n, k, 4) xyzw in place by Rz(−c), c [rad] the corrections (n, k) since the start (k,)."""
+    for n in range(len(quat_VS)):
+        for k in range(quat_VS.shape[1]):
+            angle = at_start[k] - corrections[n, k]
+            s, c = np.sin(0.5 * angle), np.cos(0.5 * angle)
+            x, y, z, w = quat_VS[n, k, 0], quat_VS[n, k, 1], quat_VS[n, k, 2], quat_VS[n, k, 3]
+            quat_VS[n, k, 0], quat_VS[n, k, 1] = c * x - s * y, c * y + s * x
+            quat_VS[n, k, 2], quat_VS[n, k, 3] = c * z + s * w, c * w - s * z
 
 
 def correct_headings(quat_WL: np.ndarray, headings: np.ndarray) -> np.ndarray:
@@ -771,7 +887,7 @@ def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> SmoothedHeadings:
     for i in range(len(knots) - 2, -1, -1):
         forward.x, forward.P = filtered[i]
         forward.predict(steps[i + 1])
-        gain = np.linalg.solve(forward.P, forward.transition(steps[i + 1]) @ filtered[i][1]).T
+        gain = np.linalg.solve(forward.P, forward.transition() @ filtered[i][1]).T
         x = filtered[i][0] + gain @ (x - forward.x)
         P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)
         means.append(x[:k])

@@ -27,7 +27,7 @@ from ..alignment import (
 from ..calibration import PROTOCOLS, load_protocol
 from ..calibration.conditions import StartPose, find_girdle_signs, find_parts
 from ..errors import BadSession
-from ..filters import Orientation
+from ..filters import AboutVertical, Orientation
 from ..model import BodyModel
 from ..model.start_pose import orient_links
 from ..recording import ImuSensor, OrientationSensor, Recording
@@ -36,6 +36,7 @@ from .heading_filter import (
     MECHANISM_NOISE,
     PERSON_NOISE,
     Closure,
+    FilterHeadings,
     HeadingFilter,
     HeadingProblem,
     HingeAxis,
@@ -45,6 +46,7 @@ from .heading_filter import (
     linearize_hinge,
     move_all_girdles,
     smooth,
+    undo_corrections,
 )
 from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, find_pairs
 
@@ -127,16 +129,16 @@ class KnotReader:
         self._time[rows], self._quat_VS[rows], self._accel_S[rows] = time, quat_VS, accel_S
         self.count += len(time)
 
-    def close(self, heading_var: np.ndarray) -> Knot:
-        """Return the open knot and open the next one; `heading_var` (k,) [rad²] is the filters' at its last sample."""
-        return self.form(self.take(), heading_var)
+    def close(self, filters: FilterHeadings) -> Knot:
+        """Return the open knot and open the next one; `filters` is at its last sample."""
+        return self.form(self.take(), filters)
 
     def take(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the samples of the open knot, time, `quat_VS` and `accel_S`, and open the next one."""
         n, self.count = self.count, 0
         return self._time[:n].copy(), self._quat_VS[:n].copy(), self._accel_S[:n].copy()
 
-    def form(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], heading_var: np.ndarray) -> Knot:
+    def form(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], filters: FilterHeadings) -> Knot:
         """Return the knot of samples from `take`; knots must be formed in the order of time."""
         time, quat_VS, accel_S = samples
         n = len(time)
@@ -146,7 +148,7 @@ class KnotReader:
         quat_WS = rotations.multiply(rotations.rotation_about(E_Z, self._heading_offset), quat_VS[rows])
         quat_WL = rotations.multiply(quat_WS, self._quat_SL)
         lost = np.asarray(~np.isfinite(accel_S).all(axis=(0, 2)))
-        return Knot(float(time[n - 1]), time[rows].copy(), quat_WL, joints, heading_var, lost)
+        return Knot(float(time[n - 1]), time[rows].copy(), quat_WL, joints, filters, lost)
 
 
 def make_heading_problem(
@@ -172,12 +174,12 @@ def make_heading_problem(
     stride = find_stride(recording.rate_hz)
     samples = max(1, round((CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S) * recording.rate_hz / stride))
     knot_s = samples * stride / recording.rate_hz
-    drift_psd, rate_std = np.full(len(names), noise.drift_psd), np.full(len(names), noise.rate_std)
+    drift_psd, rate_std = np.full(len(names), noise.drift_psd), np.zeros(len(names))
     for i, name in enumerate(names):
-        if name in orientations.orientation:  # a gyroscope's white noise may be more, and a short start tells less
+        if name in orientations.orientation:  # a gyroscope's white noise may be more
             of_sensor = orientations.orientation[name].noise
             drift_psd[i] = max(noise.drift_psd, float(np.trace(of_sensor.gyro_cov)) / (3.0 * recording.rate_hz))
-            rate_std[i] = max(noise.rate_std, np.sqrt(float(np.trace(of_sensor.gyro_bias_cov)) / 3.0))
+            rate_std[i] = np.sqrt(float(np.trace(of_sensor.gyro_bias_cov)) / 3.0)
     start_var, mount_var = np.array([find_start_variances(recording, name, subject, model) for name in names]).T
     return HeadingProblem(
         names,
@@ -298,7 +300,7 @@ class HeadingCorrector:
         offsets = np.array([orientations.heading_offset[name] for name in self._names])
         self._reader = KnotReader(mounts, offsets, chunk.rate_hz, problem)
         self._knots: list[Knot] = []
-        self._last_var = np.full(len(self._names), np.nan)
+        self._at_start = np.zeros(len(self._names))  # [rad] corrections of the filters' headings up to the start pose
         self._corrected_samples = 0  # of the second pass so far
         self._gaps = {stage: _RmsAccumulator() for stage in ("before", "after")}
         self._hinge_rms = {
@@ -312,19 +314,25 @@ class HeadingCorrector:
         if first == len(chunk):
             return
         quat_VS, accel_S = _stack_samples(chunk, orientations, self._names)
+        sums = stack_heading_corrections(orientations.orientation, self._names, len(chunk))
+        if not (self._knots or self._reader.count):
+            self._at_start = sums[first]
+            start = read_filter_headings(orientations.orientation, self._names, first)
+            self._problem = replace(self._problem, start=start)
+        undo_corrections(quat_VS, sums, self._at_start)
         begin = first
         while begin < len(chunk):
             end = min(len(chunk), begin + self._reader.remaining)
             self._reader.push(chunk.time[begin:end], quat_VS[begin:end], accel_S[begin:end])
-            self._last_var = find_heading_variance(orientations.orientation, self._names, end - 1)
+            self._last_filters = read_filter_headings(orientations.orientation, self._names, end - 1)
             if not self._reader.remaining:
-                self._knots.append(self._reader.close(self._last_var))
+                self._knots.append(self._reader.close(self._last_filters))
             begin = end
 
     def solve(self) -> bool:
         """Estimate the heading errors; return False where nothing observes them."""
         if self._reader.count:
-            self._knots.append(self._reader.close(self._last_var))
+            self._knots.append(self._reader.close(self._last_filters))
         if not self._knots:
             return False
         problem = self._problem
@@ -338,16 +346,16 @@ class HeadingCorrector:
         ends = np.array([knot.end for knot in self._knots])
         begins = np.array([knot.time[0] for knot in self._knots])
         self._knot_times = 0.5 * (begins + ends)  # the errors are constant before the first and after the last
-        for knot in self._knots:
-            self._add_residuals("before", knot.time, correct_headings(knot.quat_WL, np.zeros(len(self._names))))
         self._knots = []
         return True
 
     def correct(self, chunk: Recording, orientations: SegmentOrientations) -> SegmentOrientations:
         """Return the chunk's orientations with corrected headings, in the second pass, and add up its residuals."""
         corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
+        sums = stack_heading_corrections(orientations.orientation, self._names, len(chunk)) - self._at_start
+        sums[chunk.time < self._start_end] = 0.0
         for i, name in enumerate(self._names):
-            delta = np.interp(chunk.time, self._knot_times, self._smoothed.errors[:, i])
+            delta = np.interp(chunk.time, self._knot_times, self._smoothed.errors[:, i]) - sums[:, i]
             corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
             self._max_correction_deg[name] = max(self._max_correction_deg[name], float(np.degrees(np.abs(delta).max())))
             filter_cov = _compute_filter_covariance(orientations, name)
@@ -356,8 +364,8 @@ class HeadingCorrector:
                 start_var = compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
                 before = filter_var + start_var
                 variance = np.interp(chunk.time, self._knot_times, self._smoothed.segment_var[:, i])
-                # The filter may have found the bias, which the knots have as an unknown rate: take the smaller one.
-                variance = np.minimum(variance, before)
+                # The filter alone may know the heading better; to it a correction is an error of that size.
+                variance = np.minimum(variance, before + delta**2)
                 gap = chunk.sensors[name].gap
                 if gap is not None:  # where the sensor is lost, neighbours do not tell where its segment is
                     variance = np.where(gap, np.maximum(variance, before), variance)
@@ -367,8 +375,9 @@ class HeadingCorrector:
         rows = np.arange(-self._corrected_samples % stride, len(chunk), stride)
         rows = rows[chunk.time[rows] >= self._start_end]
         self._corrected_samples += len(chunk)
-        quat_WL = np.stack([corrected[name][rows] for name in self._names], axis=1)
-        self._add_residuals("after", chunk.time[rows], correct_headings(quat_WL, np.zeros(len(self._names))))
+        for stage, quats in (("before", orientations.quat_WL), ("after", corrected)):
+            quat_WL = np.stack([quats[name][rows] for name in self._names], axis=1)
+            self._add_residuals(stage, chunk.time[rows], correct_headings(quat_WL, np.zeros(len(self._names))))
         return result
 
     def summarize(self) -> HeadingCorrection:
@@ -420,10 +429,15 @@ class CausalHeadings:
     Attributes
     ----------
     offset : (k,) ψ [rad] to which corrections are added
+    variance : (k,) [rad²] each after the last knot: variances of each segment's heading and of its filter's alone, and
+        the squared correction of the filters' headings since the start or the last reset
+    at_start : (k,) [rad] what the filters have corrected of their headings up to the end of the start pose; what they
+        correct later is undone before samples are pushed (`undo_corrections`)
     """
 
     def __init__(self, recording: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
-        self._problem = problem
+        start = read_filter_headings(orientations.orientation, problem.names, len(recording) - 1)
+        self._problem = problem = replace(problem, start=start)
         mounts = np.array([orientations.quat_LS[name] for name in problem.names])
         self.offset = np.array([orientations.heading_offset[name] for name in problem.names])
         self._reader = KnotReader(mounts, self.offset, recording.rate_hz, problem)
@@ -433,9 +447,12 @@ class CausalHeadings:
         self._lead = min(round(SOLVE_SHARE * self._reader.size), self._reader.size - 1)
         self._solving: Iterator[None] | None = None  # the last knot, until its correction is applied
         self._record = False
-        self._begin, self._end = np.zeros(len(problem.names)), np.zeros(len(problem.names))
-        self._var_at_knot = np.zeros(len(problem.names))  # [rad²] of the filters
-        self._var = self._find_variance()  # [rad²] of the segments' headings then
+        self._begin, self._end, self._at_reset = np.zeros((3, len(problem.names)))
+        self.at_start = np.nan_to_num(start.about_vertical.heading)
+        self._undone = np.zeros(len(problem.names))  # [rad] what the filters have corrected since, at the last knot
+        self._knot_filters: FilterHeadings | None = None  # of the last complete knot
+        self._var_at_knot = np.zeros(len(problem.names))  # [rad²] of the filters, at the last knot that is applied
+        self.variance = self._find_variances()
         self._max_correction = np.zeros(len(problem.names))
         self._marked: dict[str, list[tuple[int, int | None]]] = {}  # phase → first sample, and the one after the last
         self._history: list[tuple[float, np.ndarray]] = []
@@ -473,12 +490,10 @@ class CausalHeadings:
                 next(self._solving, None)
         return not self._reader.remaining
 
-    def close(self, heading_var: np.ndarray, *, record: bool = False) -> None:
-        """Close a complete knot; `heading_var` (k,) [rad²] is the filters' now; `record`: keep the covariance for
-        `summarize`.
-        """
-        self._record = record
-        self._solving = self._solve(self._reader.take(), heading_var)
+    def close(self, filters: FilterHeadings, *, record: bool = False) -> None:
+        """Close a complete knot; `filters` is after its last sample; `record`: keep the covariance for `summarize`."""
+        self._record, self._knot_filters = record, filters
+        self._solving = self._solve(self._reader.take(), filters)
         if not self._lead:
             self._apply()
 
@@ -503,26 +518,27 @@ class CausalHeadings:
         )
         self._problem = self._filter.problem = replace(self._problem, closures=closures)
 
-    def _solve(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], heading_var: np.ndarray) -> Iterator[None]:
+    def _solve(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], filters: FilterHeadings) -> Iterator[None]:
         """Estimate the heading errors of a knot, a part at each step of the iterator."""
-        knot = self._reader.form(samples, heading_var)
+        knot = self._reader.form(samples, filters)
         yield
         yield from self._filter.step_gradually(knot)
-        k = len(heading_var)
-        self._var_at_knot = np.nan_to_num(heading_var)
+        k = len(filters.var)
         if self._record:
             self._history.append((self._start_end + knot.end, self._filter.P[:k, :k].copy()))
 
     def _apply(self) -> None:
         """Finish the last knot; its correction fades in from the next sample on."""
-        if self._solving is None:
+        if self._solving is None or self._knot_filters is None:
             return
         for _ in self._solving:
             pass
         self._solving = None
+        self._var_at_knot = np.nan_to_num(self._knot_filters.var)
+        self._undone = np.nan_to_num(self._knot_filters.about_vertical.heading - self.at_start)
         self._begin, self._end = self._end, self._filter.x[: len(self._end)].copy()
-        self._max_correction = np.maximum(self._max_correction, np.abs(self._end))
-        self._var = self._find_variance()
+        self._max_correction = np.maximum(self._max_correction, np.abs(self._end - self._undone))
+        self.variance = self._find_variances()
 
     def reset(self, heading_offset: np.ndarray) -> None:
         """Correct the headings to ψ (k,) [rad] at once, as the person shows them by standing in the start pose."""
@@ -531,15 +547,13 @@ class CausalHeadings:
         error = error + 2.0 * np.pi * np.round((self._end - error) / (2.0 * np.pi))
         self._filter.reset(error)
         self._begin = self._end = error
-        self._var = self._find_variance()
+        self._at_reset = error - self._undone
+        self.variance = self._find_variances()
 
-    @property
-    def variance(self) -> tuple[np.ndarray, np.ndarray]:
-        """The variances (k,) [rad²] after the last knot: of each segment's heading, and of its filter's alone."""
-        return self._var, self._var_at_knot
-
-    def _find_variance(self) -> np.ndarray:
-        return self._problem.find_segment_variance(self._filter.P)
+    def _find_variances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what `variance` is now."""
+        of_segments = self._problem.find_segment_variance(self._filter.P)
+        return of_segments, self._var_at_knot, (self._end - self._undone - self._at_reset) ** 2
 
     def summarize(self) -> HeadingCorrection:
         """Return what was observed and corrected so far, without residuals: they are not computed causally."""
@@ -570,6 +584,16 @@ def _stack_samples(
     return np.stack(quats, axis=1), np.stack(accels, axis=1)
 
 
+def stack_heading_corrections(orientation: Mapping[str, Orientation], names: Sequence[str], samples: int) -> np.ndarray:
+    """Stack the sums (n, k) [rad] of what each filter has corrected of its heading; zero: it does not say."""
+    sums = np.zeros((samples, len(names)))
+    for i, name in enumerate(names):
+        about_vertical = orientation[name].about_vertical if name in orientation else None
+        if about_vertical is not None:
+            sums[:, i] = about_vertical[:, 0]
+    return sums
+
+
 def find_specific_force(chunk: Recording, name: str) -> np.ndarray:
     """Return `accel_S` (n, 3) [m/s²] of a sensor, NaN where samples are lost; zeros of an `OrientationSensor`."""
     sensor = chunk.sensors[name]
@@ -577,15 +601,18 @@ def find_specific_force(chunk: Recording, name: str) -> np.ndarray:
     return accel_S if sensor.gap is None else np.where(sensor.gap[:, None], np.nan, accel_S)
 
 
-def find_heading_variance(orientation: Mapping[str, Orientation], names: Sequence[str], row: int) -> np.ndarray:
-    """Return the variance (k,) [rad²] of each filter's heading at sample `row`; NaN: the filter has no covariance."""
-    variance = np.full(len(names), np.nan)
+def read_filter_headings(orientation: Mapping[str, Orientation], names: Sequence[str], row: int) -> FilterHeadings:
+    """Read what the filters say of their headings at sample `row`."""
+    variance, about_vertical = np.full(len(names), np.nan), np.full((len(names), len(AboutVertical._fields)), np.nan)
     filtered = {i: orientation[name] for i, name in enumerate(names) if name in orientation}
     covs = {i: each.attitude_cov[row] for i, each in filtered.items() if each.attitude_cov is not None}
     if covs:
         quat_VS = np.stack([filtered[i].quat_WS[row] for i in covs])
         variance[list(covs)] = compute_heading_variance(quat_VS, np.stack(list(covs.values())))
-    return variance
+    for i, each in filtered.items():
+        if each.about_vertical is not None:
+            about_vertical[i] = each.about_vertical[row]
+    return FilterHeadings(variance, AboutVertical(*about_vertical.T))
 
 
 class _RmsAccumulator:

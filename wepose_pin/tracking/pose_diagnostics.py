@@ -72,8 +72,8 @@ def _diagnose_signals(tracked: TrackedRecording, signals: Mapping[str, Signal]) 
     for name, signal in signals.items():
         share = signal.gravity / STANDARD_GRAVITY - 1.0
         if abs(share) > GRAVITY_OFF:
-            at_rest = {"share": share, "start": start, "end": end}
-            yield Diagnostic("accel-scale", INFO, name, signal.gravity, GRAVITY_OFF, at_rest)
+            at_rest = {"norm": signal.gravity, "start": start, "end": end}
+            yield Diagnostic("accel-scale", INFO, name, share, GRAVITY_OFF, at_rest)
     biases = {name: signal.bias for name, signal in signals.items() if signal.bias is not None}
     for name, bias in biases.items():
         largest_bias = float(np.linalg.norm(bias, axis=1).max())

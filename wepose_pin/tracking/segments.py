@@ -71,16 +71,3 @@ class SegmentEstimator:
             filtered = combine_chunk(filters, chunk, orientation)
             self._alignment = align_sensors(chunk, self._subject, filtered, self._start_frames)
         return chunk, orient_segments(chunk, self._alignment, orientation, self._subject, self._start_frames)
-
-
-def estimate_segments(
-    recording: Recording,
-    subject: Subject | None = None,
-    *,
-    method: str = BEST,
-    static_test: StaticTest | None = None,
-) -> SegmentOrientations:
-    """Segment orientations of a whole recording from the N-pose; parameters and errors as `SegmentEstimator`."""
-    estimator = SegmentEstimator(subject, method=method, static_test=static_test)
-    [(_, segments)] = estimator.push(recording) + estimator.finish()
-    return segments

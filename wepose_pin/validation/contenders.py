@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import rotations
-from ..filters import METHODS, GdcParams, NcfParams, SmekfParams, run_filter
+from ..filters import METHODS, FilterSettings, GdcParams, NcfParams, SmekfParams, run_filter
 from ..filters.noise import SensorNoise
 from ..filters.static import StaticTest
 from .gains import make_gains
@@ -57,7 +57,7 @@ def list_contenders(setting: str, trial: str = "") -> list[Contender]:
 
 def _make_ours(method: str) -> Contender:
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-        return run_filter(gyro_S, accel_S, rate_hz, noise, method, measured_start=True).quat_WS
+        return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(method, measured_start=True)).quat_WS
 
     return Contender(method, orient, method)
 
@@ -65,12 +65,12 @@ def _make_ours(method: str) -> Contender:
 def _run_as_published(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
     """Run the paper's own form: transition to the first order, initial covariance and static test of the paper's."""
     params, test = SmekfParams(first_order=True), StaticTest(rate_stds=np.inf)
-    return run_filter(gyro_S, accel_S, rate_hz, noise, OURS, params, test).quat_WS
+    return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(OURS, params, test)).quat_WS
 
 
 def _make_tuned(method: str, params: Any) -> Contender:
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-        return run_filter(gyro_S, accel_S, rate_hz, noise, method, params).quat_WS
+        return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(method, params)).quat_WS
 
     return Contender(method, orient)
 
@@ -80,7 +80,7 @@ def _make_default(method: str, params: Any) -> Contender:
 
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
         unknown = replace(noise, gyro_bias=np.zeros(3))
-        return run_filter(gyro_S, accel_S, rate_hz, unknown, method, params).quat_WS
+        return run_filter(gyro_S, accel_S, rate_hz, unknown, FilterSettings(method, params)).quat_WS
 
     return Contender(f"{method}, default gains", orient)
 

@@ -23,6 +23,7 @@ from ..recording import OrientationSensor, Recording
 from ..simulation import (
     CIRCLING_POINT,
     IDEAL_PRESET,
+    MEASURED_LENGTHS,
     Imperfections,
     Person,
     Simulation,
@@ -50,8 +51,7 @@ from .tables import (
 )
 
 RATES = {"100 Hz": 100.0, "1 kHz": 1000.0}
-MEASURED = ("shoulder_width",)  # lengths that are measured beforehand
-MEASURED_WITH_TRUNK = ("shoulder_width", "trunk")
+MEASURED, MEASURED_WITH_TRUNK = MEASURED_LENGTHS[:1], MEASURED_LENGTHS  # lengths that are measured beforehand
 KNOWN_MOUNT_STD = np.deg2rad(0.5)  # stated standard deviation of exact mounts
 TRIALS = {"dynamic": 12, "drift": 10, UPPER_BODY: 10, ERROR_BUDGET: 10}  # the paper's numbers; the budget's is ours
 # Parts of the error budget: parts of the chain known exactly, or not as well; then groups of imperfections switched

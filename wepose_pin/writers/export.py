@@ -37,7 +37,7 @@ from .motion_bids import parse_bids_name, write_motion_bids
 from .opensim import OpenSenseFiles, write_mot, write_placement, write_setups, write_sto, write_trc
 from .osim import write_osim
 from .provenance import provenance_file, provenance_text, write_provenance
-from .result import SUBJECT_URDF, format_urdf, read_result
+from .result import SUBJECT_URDF, format_urdf, read_marks, read_phases, read_result
 from .ros import write_mcap, write_rosbag
 from .rrd import write_rrd
 from .tables import write_csv, write_parquet
@@ -313,15 +313,17 @@ def _read_motion(
             f"of that there is: {', '.join(FORMATS[len(OF_PERSONS) :])}"
         )
     if isinstance(result, PosedBody):
-        phases = result.recording.phases if isinstance(result, TrackedRecording) else getattr(result, "phases", {})
+        recorded = result.recording if isinstance(result, TrackedRecording) else result
+        phases, marks = getattr(recorded, "phases", {}), getattr(recorded, "marks", ())
         selected = select_interval(result.time, phases, interval, phase)
         pose = result.pose if selected is None else cut_pose(result.pose, selected)
-        motion = Motion(pose, result.model, result.name, result.name, _name_person(result.subject))
+        motion = Motion(pose, result.model, result.name, result.name, _name_person(result.subject), phases, marks)
     else:
         folder = Path(str(result))
         pose, model, summary = read_result(folder, interval, phase)
         subject = load_subject(folder) if (folder / "subject.toml").is_file() else None
-        motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder), _name_person(subject))
+        name, phases, marks = summary.get("recording") or folder.name, read_phases(summary), read_marks(summary)
+        motion = Motion(pose, model, str(name), str(folder), _name_person(subject), phases, marks)
     if len(motion.pose.time) < 2:
         raise BadData(f"{motion.where}: a pose of {len(motion.pose.time)} samples; a motion has at least 2")
     return motion if rate_hz is None else resampled(motion, rate_hz)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..documents import whole_folder
 from ..errors import ExistingOutput, WeposeError
-from ..model.table import MODEL_TABLE, format_table, read_table
+from ..model.table_file import MODEL_TABLE, format_table, read_table
 from ..readers.tables import read_table as read_columns
 from .provenance import INSIDE, list_files
 from .result import JOINTS, SUBJECT_URDF

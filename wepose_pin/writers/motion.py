@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -11,7 +12,7 @@ from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, WrongOption
 from ..kinematics import Pose, compute_pose
 from ..model import BodyModel
-from ..recording import format_span
+from ..recording import Intervals, Mark, format_span
 
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
@@ -29,6 +30,7 @@ class Motion:
     name : of the recording
     where : the result's folder, for error texts
     subject : name of the person; empty where none is known
+    phases, marks : of the recording, all of them also where `pose` is a part
     """
 
     pose: Pose
@@ -36,6 +38,8 @@ class Motion:
     name: str
     where: str
     subject: str = ""
+    phases: Mapping[str, Intervals] = field(default_factory=dict)
+    marks: tuple[Mark, ...] = ()
 
     @property
     def rate_hz(self) -> float:
@@ -147,3 +151,16 @@ def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:
         lost = [pose.gap[link] for link in motion.model.reaches[point] if link in pose.gap]
         points[point] = np.where(np.any(lost, axis=0)[:, None], np.nan, p_W) if lost else p_W
     return points
+
+
+def check_joint_names(motion: Motion, columns: Collection[str]) -> None:
+    """Check that no joint of a mechanism is named as one of the table's own columns.
+
+    Raises
+    ------
+    BadData
+        One is: it would replace that column.
+    """
+    for name in motion.pose.joints:
+        if name in columns:
+            raise BadData(f"{motion.where}: the joint '{name}' is named as a column of the file; rename it in the URDF")

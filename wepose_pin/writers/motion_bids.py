@@ -22,6 +22,7 @@ from ..angles import Angles, diagnose_lock, joint_angles
 from ..diagnostics import Diagnostic
 from ..documents import whole_folder
 from ..errors import BadData, BadOption, ExistingOutput
+from ..recording import format_time
 from .motion import Motion, diagnose_gaps
 
 BIDS_VERSION = "1.10.0"
@@ -39,6 +40,11 @@ _HEADER = ("name", "component", "type", "tracked_point", "units", "sampling_freq
 # That motion.json counts.
 _TYPES = ("ACCEL", "ANGACCEL", "GYRO", "JNTANG", "LATENCY", "MAGN", "MISC", "ORNT", "POS", "VEL")
 _FRAME = "W"
+_EVENTS = {
+    "onset": {"Description": "Time from the first sample of motion.tsv", "Units": "s"},
+    "duration": {"Description": "Duration of a phase; 0 of what was marked at a moment", "Units": "s"},
+    "trial_type": {"Description": "Name of a phase of the recording, or a text that was marked while it ran"},
+}
 
 
 class BidsName(NamedTuple):
@@ -66,6 +72,14 @@ class Channel(NamedTuple):
     tracked_point: str
     units: str
     values: np.ndarray  # (n,)
+
+
+class Event(NamedTuple):
+    """A row of the events.tsv."""
+
+    onset: float  # [s] from the first sample; negative where a phase began before the part that is written
+    duration: float  # [s]; 0 of a marked text
+    trial_type: str  # name of the phase, or the text
 
 
 def parse_bids_name(text: str | None, subject: str, task: str) -> BidsName:
@@ -118,7 +132,7 @@ def write_motion_bids(
         )
     participants = _add_participant(out / _PARTICIPANTS, f"sub-{name.entities['sub']}")
     angles = joint_angles(motion.pose)
-    channels = list(_list_channels(motion, angles))
+    channels, events = list(_list_channels(motion, angles)), list_events(motion)
     with whole_folder(out, force or exists) as partial:
         files = partial / folder
         files.mkdir(parents=True)
@@ -130,11 +144,34 @@ def write_motion_bids(
         rows = ["\t".join(_HEADER), *("\t".join(_channel_row(channel, motion.rate_hz)) for channel in channels)]
         (files / f"{stem}_channels.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
         _write_json(files / f"{stem}_channels.json", _describe_channels())
+        if events:
+            _write_events(files / f"{stem}_events.tsv", events)
+            _write_json(files / f"{stem}_events.json", _EVENTS)
         (partial / _PARTICIPANTS).write_text(participants, encoding="utf-8")
         if not exists:
             _write_json(partial / _DESCRIPTION, _describe_dataset(motion))
             (partial / "README.md").write_text(_README.format(version=__version__), encoding="utf-8")
+    if not events:  # those of a recording that is replaced
+        for ending in ("tsv", "json"):
+            (out / folder / f"{stem}_events.{ending}").unlink(missing_ok=True)
     return diagnose_gaps(motion) + diagnose_lock(angles)
+
+
+def list_events(motion: Motion) -> list[Event]:
+    """The phases and marked texts of a recording that lie in the motion, at least in part, in the order of time."""
+    begin, end = float(motion.pose.time[0]), float(motion.pose.time[-1])
+    spans = [(span, name) for name, intervals in motion.phases.items() for span in intervals]
+    spans += [((mark.time, mark.time), mark.text) for mark in motion.marks]
+    return [
+        Event(first - begin, last - first, " ".join(text.split()) or _MISSING)
+        for (first, last), text in sorted(spans)
+        if first <= end and last >= begin
+    ]
+
+
+def _write_events(path: Path, events: list[Event]) -> None:
+    rows = ["\t".join((*(format_time(seconds, 6) for seconds in event[:2]), event.trial_type)) for event in events]
+    path.write_text("\n".join(["\t".join(Event._fields), *rows]) + "\n", encoding="utf-8")
 
 
 def _list_channels(motion: Motion, angles: Angles) -> Iterator[Channel]:

@@ -27,9 +27,9 @@ from scipy.spatial.transform import Rotation
 
 from ..angles import diagnose_lock, joint_angles
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadData
+from ..errors import BadData, BadOption
 from ..readers.opensim import OWN
-from .motion import Motion, check_complete, diagnose_gaps, find_measured_points, resample_evenly
+from .motion import Motion, check_complete, check_joint_names, diagnose_gaps, find_measured_points, resample_evenly
 from .rajagopal import compute_bodies, coordinates, find_first_values, in_ground, orientations
 
 _TRC_KEYS = (
@@ -42,7 +42,8 @@ MOST_MISSED = np.deg2rad(1.0)  # [rad] rms of a body of the model, whose elbows 
 def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
     """Joint angles in degrees: first the ISB's, of `wepose_pin.angles`, then the coordinates of Rajagopal's model.
 
-    Beside the three angles of a joint ``<joint>_near_lock`` is 1 where the first and the third are not to be read.
+    Beside the three angles of a joint ``<joint>_near_lock`` is 1 where the first and the third are not to be read. Of a
+    mechanism it has the joints of its URDF by their names, in degrees, and in m those that slide.
 
     Parameters
     ----------
@@ -52,9 +53,17 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
     ------
     BadData
         No joint has both of its segments, or a sample has no orientation.
+    BadOption
+        `names` of a mechanism, whose joints have their own.
     """
     check_complete(motion, "a .mot")
     diagnostics = diagnose_gaps(motion)
+    if motion.pose.joints:
+        if names is not None:
+            raise BadOption(f"--names {names}: {motion.where} is of a mechanism, whose joints have their own names")
+        check_joint_names(motion, ("time",))
+        _write_coordinates(path, motion, _convert_joints(motion))
+        return diagnostics
     columns, marks = dict[str, np.ndarray](), dict[str, np.ndarray]()
     if names != "opensim":
         angles = joint_angles(motion.pose)
@@ -74,12 +83,21 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
         raise BadData(
             f"{motion.where}: no joint has both of its segments in pose.parquet; there are no angles to write"
         )
-    degrees = {name: np.degrees(angle) for name, angle in columns.items()}
-    rows = pl.DataFrame({"time": motion.pose.time, **degrees, **marks})
+    _write_coordinates(path, motion, {name: np.degrees(angle) for name, angle in columns.items()} | marks)
+    return diagnostics
+
+
+def _convert_joints(motion: Motion) -> dict[str, np.ndarray]:
+    """The joints of a mechanism, in degrees and m."""
+    slides = {joint.name for joint in motion.model.robot.joints if joint.type == "prismatic"}
+    return {name: each if name in slides else np.degrees(each) for name, each in motion.pose.joints.items()}
+
+
+def _write_coordinates(path: Path, motion: Motion, columns: Mapping[str, np.ndarray]) -> None:
+    rows = pl.DataFrame({"time": motion.pose.time, **columns})
     header = {"version": 1, "nRows": rows.height, "nColumns": rows.width, "inDegrees": "yes"}
     name = " ".join(motion.name.split()).replace("=", "-") or "motion"  # a line that is no key and no other's
     _write(path, [name, *(f"{key}={value}" for key, value in header.items()), "endheader"], rows)
-    return diagnostics
 
 
 @dataclass(frozen=True)

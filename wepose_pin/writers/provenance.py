@@ -19,6 +19,7 @@ from ..errors import BadData, MissingFile
 from .result import versions
 
 FORMAT = 1
+CALL = "wepose_pin.track"  # in place of a command, of a result that `TrackResult.save` wrote
 ALONE = "provenance.json"  # beside results that have no JSON of their own
 INSIDE = ("summary.json", "calibration.json")
 # Of a result folder, what others are made from; pages and what was exported into it are not.
@@ -69,7 +70,7 @@ def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any
 
     Parameters
     ----------
-    command : as on the command line
+    command : as on the command line, or `CALL`
     values : the fields of its job; those that name existing files are inputs, the others options, seeds among them
 
     Raises

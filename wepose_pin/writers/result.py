@@ -24,9 +24,9 @@ from ..angles.torques import Torques, torque_table
 from ..errors import BadData, ExistingOutput, MissingFile
 from ..kinematics import Pose, build_pose_table, cut_pose, parse_pose_table
 from ..model import BodyModel, BodyTable, load_model, load_table
-from ..model.table import MODEL_TABLE, format_table
+from ..model.table_file import MODEL_TABLE, format_table
 from ..readers.tables import read_table
-from ..recording import Intervals, select_interval
+from ..recording import Intervals, Mark, select_interval
 from ..subject import Subject, load_subject, subject_toml
 from ..tracking import TrackedRecording, TrackSummary
 
@@ -69,6 +69,8 @@ def write_about(
     write_subject(folder, tracked.subject, tracked.model)
     spans = {name: [[float(a), float(b)] for a, b in intervals] for name, intervals in (phases or {}).items()}
     about = {**summary, "recorded_phases": spans, "versions": versions()}
+    if tracked.recording.marks:
+        about["recorded_marks"] = [[mark.time, mark.text] for mark in tracked.recording.marks]
     if provenance is not None:
         about["provenance"] = dict(provenance)
     (folder / "summary.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
@@ -161,6 +163,16 @@ def read_phases(summary: Mapping[str, Any]) -> dict[str, Intervals]:
         with contextlib.suppress(TypeError, ValueError):
             phases[name] = tuple((float(begin), float(end)) for begin, end in spans)
     return phases
+
+
+def read_marks(summary: Mapping[str, Any]) -> tuple[Mark, ...]:
+    """Read the marked texts of the recording from a result's summary; what is none is left out."""
+    marks, recorded = [], summary.get("recorded_marks")
+    for mark in recorded if isinstance(recorded, list) else ():
+        with contextlib.suppress(TypeError, ValueError):
+            time, text = mark
+            marks.append(Mark(float(time), str(text)))
+    return tuple(marks)
 
 
 def _read_joints(file: Path, samples: int) -> dict[str, np.ndarray]:

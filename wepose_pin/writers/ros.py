@@ -51,7 +51,7 @@ def write_rosbag(folder: Path, motion: JointMotion) -> None:
 
 
 def write_mcap(path: Path, motion: JointMotion) -> None:
-    """Write the messages of a bag as one MCAP file.
+    """Write the messages of a bag as one MCAP file, its chunks compressed by zstd.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def write_mcap(path: Path, motion: JointMotion) -> None:
 def _write_bag(folder: Path, motion: JointMotion, storage: str) -> None:
     try:
         from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
-        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise BadOption(f"--format rosbag, mcap: needs rosbags: {how_to_install('rosbags')}") from None
@@ -76,7 +76,10 @@ def _write_bag(folder: Path, motion: JointMotion, storage: str) -> None:
         QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, never, never,
         QosLiveliness.AUTOMATIC, never, False,
     )  # fmt: skip
-    with Writer(folder, version=BAG_VERSION, storage_plugin=StoragePlugin[storage]) as writer:
+    bag = Writer(folder, version=BAG_VERSION, storage_plugin=StoragePlugin[storage])
+    if storage == "MCAP":  # of a bag with SQLite only whole files or messages could be, which not every reader takes
+        bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with bag as writer:
         connections = {
             topic: writer.add_connection(
                 topic, kind, typestore=store, offered_qos_profiles=[latched] if topic in LATCHED else []

@@ -10,13 +10,15 @@ from ..angles import angle_table, diagnose_lock, joint_angles
 from ..diagnostics import Diagnostic
 from ..errors import BadData
 from ..kinematics import build_pose_table
-from .motion import Motion
+from .motion import Motion, check_joint_names
 from .result import write_table
 
 
 def table(motion: Motion) -> tuple[pl.DataFrame, list[Diagnostic]]:
-    """`build_pose_table`, and beside it `angle_table` where a joint has both of its segments."""
+    """`build_pose_table`, and beside it `angle_table` where a joint has both of its segments; a mechanism's joints."""
     pose = build_pose_table(motion.pose)
+    check_joint_names(motion, pose.columns)
+    pose = pose.with_columns(**motion.pose.joints)
     try:
         angles = joint_angles(motion.pose)
     except BadData:

@@ -199,7 +199,7 @@ function show(status) {
     if (sensor.battery !== null) text(place, "small", ` ${Math.round(100 * sensor.battery)} %`, "charge of its battery").className = sensor.battery < .15 ? "low" : "";
     text(row, "td", known(sensor.rate_hz, 0));
     text(row, "td", sensor.bias_deg_s.map((axis) => known(begun ? axis : null, 2).padStart(5, "\u2007")).join(" "));
-    text(row, "td", sensor.heading_std_deg > 90 ? "> 90" : known(sensor.heading_std_deg, 1));
+    text(row, "td", sensor.heading_std);
     text(row, "td", duration(begun ? sensor.heading_age_s : null));
     text(row, "td", sensor.missing + sensor.late + sensor.duplicate,
          `never came: ${sensor.missing}, too late: ${sensor.late}, twice: ${sensor.duplicate}`);

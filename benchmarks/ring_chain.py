@@ -19,8 +19,9 @@ MOTION_S = (real.UNSCORED_S, 66.0)  # that on which the validation's own script 
 LINK = 0.2  # [m] of each link in arm.xml
 END = np.array([LINK, 0.0, 0.0])  # [m] a point on seg5 from its marker; the marker is too near to the joint
 
-# arm.xml: seg1 free, seg2 on a ball joint, then hinges about x, y and z. What is free to turn is three hinges here.
-JOINTS = {"seg1": "zyx", "seg2": "zyx", "seg3": "x", "seg4": "y", "seg5": "z"}
+# arm.xml: seg1 free, seg2 on a ball joint, then hinges about x, y and z. What is free to turn is three hinges here, and
+# so is the first hinge: by the optical system seg3 leaves the axis that fits best by 2.9 deg rms, seg4 and seg5 by 0.3.
+JOINTS = {"seg1": "zyx", "seg2": "zyx", "seg3": "zyx", "seg4": "y", "seg5": "z"}
 AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 
 

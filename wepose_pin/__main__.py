@@ -1,0 +1,5 @@
+"""`python -m wepose_pin`: the command ``wepose``."""
+
+from .cli import main
+
+main()
