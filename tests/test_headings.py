@@ -219,22 +219,30 @@ def test_the_drift_that_all_sensors_may_share_is_in_the_torsos_heading(causal: b
 KNOT_S, START_STD, BIAS_STD = 2.0, np.deg2rad(1.0), np.deg2rad(0.5)
 
 
-def make_filter_of_one() -> HeadingFilter:
-    """Of a torso whose heading nothing observes but its orientation filter."""
-    k = 1
+def make_filter_of(*names: str, start: FilterHeadings | None = None) -> HeadingFilter:
+    """Of segments whose headings nothing observes but their orientation filters."""
+    k = len(names)
     problem = HeadingProblem(
-        ("torso",), load_model(), wp.population_subject(), (), (), (), PERSON_NOISE, KNOT_S, 16, np.zeros(k),
-        np.full(k, BIAS_STD), np.full(k, START_STD**2), np.full(k, np.deg2rad(6.0) ** 2),
+        names, load_model(), wp.population_subject(), (), (), (), PERSON_NOISE, KNOT_S, 16, np.zeros(k),
+        np.full(k, BIAS_STD), np.full(k, START_STD**2), np.full(k, np.deg2rad(6.0) ** 2), start,
     )  # fmt: skip
     return HeadingFilter(problem)
 
 
+def make_filter_of_one() -> HeadingFilter:
+    return make_filter_of("torso")
+
+
+def say(k: int, about_vertical: tuple[float, ...], var: float = 0.0) -> FilterHeadings:
+    """What k filters say alike: correction of the heading and of the rate, information, variance of the rate."""
+    heading, rate, information, rate_var = np.repeat(np.array(about_vertical)[:, None], k, axis=1)
+    return FilterHeadings(np.full(k, var), AboutVertical(heading, rate, *np.zeros((2, k)), information, rate_var))
+
+
 def go_on(state: HeadingFilter, knots: int, about_vertical: tuple[float, ...], var: float = 0.0) -> np.ndarray:
-    """Step through knots at whose ends the filter says the same; return the heading's standard deviations [rad]."""
-    heading, rate, information, rate_var = np.array(about_vertical)[:, None]
-    zero = np.zeros(1)
-    filters = FilterHeadings(np.array([var]), AboutVertical(heading, rate, zero, zero, information, rate_var))
-    knot = Knot(0.0, np.zeros(0), np.zeros((0, 1, 4)), (), filters, np.zeros(1, dtype=bool))
+    """Step through knots at whose ends the filters say the same; return the first heading's stds [rad]."""
+    k = len(state.problem.names)
+    knot = Knot(0.0, np.zeros(0), np.zeros((0, k, 4)), (), say(k, about_vertical, var), np.zeros(k, dtype=bool))
     variance = []
     for _ in range(knots):
         state.step(knot)
@@ -295,6 +303,30 @@ def test_a_bias_corrected_within_a_knot_has_drifted_up_to_there_alone() -> None:
         errors.append(start + bias * (KNOT_S + at) + other * 2.0 * KNOT_S - state.x[0])
     std = np.sqrt(state.problem.find_segment_variance(state.P)[0])
     assert 0.7 * std < np.sqrt(np.mean(np.square(errors))) < 1.3 * std
+
+
+def test_together_filters_know_no_more_of_how_the_person_turns_than_one() -> None:
+    """A slow turn on a chair is taken for a bias by all of them."""
+    information, gained = BIAS_STD**-2, []
+    for names in (("torso",), ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")):
+        k, state = len(names), make_filter_of(*names)
+        rates, known = slice(k, 2 * k), []
+        for heard in ((0.0, 0.0, 0.0, BIAS_STD**2), (0.0, np.deg2rad(0.3), information, BIAS_STD**2 / 2.0)):
+            go_on(state, 1, heard)
+            known.append(1.0 / np.mean(state.P[rates, rates]))  # of the mean rate
+        gained.append(known[1] - known[0])
+    assert gained[1] == pytest.approx(gained[0], rel=0.15)
+    of_each = state.P[rates, rates]
+    assert of_each[0, 0] + of_each[1, 1] - 2.0 * of_each[0, 1] < 1.1 * BIAS_STD**2
+
+
+def test_what_a_filter_finds_in_the_first_knot_is_since_the_start_pose() -> None:
+    bias = np.deg2rad(0.6)
+    for start, turned in ((say(1, (0.0, 0.0, 0.0, BIAS_STD**2)), -KNOT_S * bias), (None, 0.0)):
+        state = make_filter_of("torso", start=start)
+        std = go_on(state, 1, (-KNOT_S * bias, bias, LEARNED, KNOWN_STD**2))[0]
+        np.testing.assert_allclose(state.x[:2], [turned, 0.0], atol=1e-3 * bias)
+        assert (std < np.hypot(START_STD, KNOT_S * 2.0 * PERSON_NOISE.rate_std)) == (start is not None)
 
 
 def test_news_of_the_bias_says_nothing_of_other_drift() -> None:

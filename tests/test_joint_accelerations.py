@@ -9,12 +9,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.filters import AboutVertical
 from wepose_pin.model import load_model
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
+from wepose_pin.subject import population_subject
 from wepose_pin.tracking import TrackedRecording, summarize, track
-from wepose_pin.tracking.heading_filter import HingeAxis, linearize_hinge
+from wepose_pin.tracking.heading_filter import (
+    PERSON_NOISE,
+    FilterHeadings,
+    HeadingFilter,
+    HeadingProblem,
+    HingeAxis,
+    Knot,
+    linearize_hinge,
+)
 from wepose_pin.tracking.joint_accelerations import JointAccelerationFilter, JointPair, _sum_products, find_pairs
 
 LIMB = ("torso", "right_upper_arm", "right_forearm")
@@ -54,17 +64,17 @@ def heading_errors(
 
 def test_sums_give_the_misfit_and_its_slopes() -> None:
     rng = np.random.default_rng(0)
-    near, far = rng.normal(size=(2, 50, 3, 4))
+    near, far = rng.normal(size=(2, 50, 3, 7))
     sums = _sum_products(near, far)
 
     def misfit(values: np.ndarray) -> np.ndarray:
         R = Rotation.from_rotvec([0.0, 0.0, values[0]]).as_matrix()
-        a, b = np.concatenate(([1.0], values[1:4])), np.concatenate(([1.0], values[4:]))
+        a, b = np.concatenate(([1.0], values[1:7])), np.concatenate(([1.0], values[7:]))
         return (far @ b - (near @ a) @ R.T).ravel()
 
-    at = rng.normal(size=7)
-    J = np.stack([(misfit(at + d) - misfit(at - d)) / 2e-6 for d in 1e-6 * np.eye(7)], axis=1)
-    information, gradient, cost = sums.linearize(at[0], at[1:])
+    at = rng.normal(size=13)
+    J = np.stack([(misfit(at + d) - misfit(at - d)) / 2e-6 for d in 1e-6 * np.eye(13)], axis=1)
+    information, gradient, cost = sums.linearize(at[0], at[1:7], at[7:])
     np.testing.assert_allclose(information, J.T @ J, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(gradient, J.T @ misfit(at), rtol=1e-6, atol=1e-6)
     assert cost == pytest.approx(np.sum(misfit(at) ** 2))
@@ -77,8 +87,9 @@ def test_exact_motion_fits_with_the_true_levers() -> None:
     levers_L = [simulation.p_LS["left_upper_arm"] + [0.0, 0.0, upper], simulation.p_LS["left_forearm"]]
     names = ("left_upper_arm", "left_forearm")
     R_LS = [Rotation.from_quat(simulation.quat_LS[name]) for name in names]
-    levers = np.concatenate([R.inv().apply(lever) for R, lever in zip(R_LS, levers_L, strict=True)])
-    pair = JointPair(*names, levers, 0.1, False)
+    levers = [R.inv().apply(lever) for R, lever in zip(R_LS, levers_L, strict=True)]
+    sides = [np.concatenate((lever, np.zeros(3))) for lever in levers]
+    pair = JointPair(*names, np.concatenate(levers), 0.1, False)
     R_WS = np.stack([Rotation.from_quat(simulation.quat_WS[name]).as_matrix() for name in names], axis=1)
     accel_S = np.stack([simulation.accel_S[name] for name in names], axis=1)
     n = len(simulation.time)
@@ -87,7 +98,7 @@ def test_exact_motion_fits_with_the_true_levers() -> None:
     assert sums is not None
     signal = np.sqrt(np.trace(sums.far[:1, :1]) / sums.samples)
     for angle, least, most in ((0.0, 0.0, 0.02), (0.2, 0.05, 1.0)):
-        misfit = np.sqrt(sums.linearize(angle, levers)[2] / sums.samples)
+        misfit = np.sqrt(sums.linearize(angle, *sides)[2] / sums.samples)
         assert least * signal <= misfit < most * signal
     # Cut into pieces it is the same, and a piece with a lost sample has no sums.
     pieces = JointAccelerationFilter(names, [pair], simulation.rate_hz)
@@ -95,10 +106,40 @@ def test_exact_motion_fits_with_the_true_levers() -> None:
     for begin in range(0, n - n % 12, 12):
         [part] = pieces.push(R_WS[begin : begin + 12], accel_S[begin : begin + 12], np.array([0]))
         assert part is not None
-        cost += part.linearize(0.2, levers)[2]
-    assert cost == pytest.approx(sums.linearize(0.2, levers)[2], rel=1e-2)
+        cost += part.linearize(0.2, *sides)[2]
+    assert cost == pytest.approx(sums.linearize(0.2, *sides)[2], rel=1e-2)
     accel_S[5, 1] = np.nan
     assert JointAccelerationFilter(names, [pair], simulation.rate_hz).push(R_WS, accel_S, np.arange(9)) == (None,)
+
+
+def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_joint() -> None:
+    """Two sensors on an office chair, each with a tilt of a degree wrong; their joint is on the axis."""
+    rng, rate_hz, knot_s = np.random.default_rng(5), 50.0, 2.0
+    samples = round(knot_s * rate_hz)
+    turned = np.deg2rad(90.0) / rate_hz * np.arange(25 * samples)
+    spin = Rotation.from_rotvec(np.outer(turned, [0.0, 0.0, 1.0])).as_matrix()
+    names = ("torso", "head")
+    pair = JointPair(*names, np.zeros(6), 0.1, False)
+    zeros = np.zeros(2)
+    same = AboutVertical(*np.zeros((6, 2)))
+    problem = HeadingProblem(
+        names, load_model(), population_subject(), (pair,), (), (), PERSON_NOISE, knot_s, samples, zeros,
+        np.full(2, 1e-4), np.deg2rad([0.1, 20.0]) ** 2, zeros, levers_at=np.zeros((1, 6)),
+    )  # fmt: skip
+    z = []
+    for _ in range(20):
+        tilt = Rotation.from_rotvec(np.deg2rad(1.0) * rng.normal(size=(2, 3)) * [1.0, 1.0, 0.0]).as_matrix()
+        off = rng.normal(scale=np.deg2rad(20.0))
+        R_WS = np.stack([spin @ tilt[0], Rotation.from_rotvec([0.0, 0.0, -off]).as_matrix() @ spin @ tilt[1]], axis=1)
+        accel_S = np.broadcast_to([0.0, 0.0, 9.81], (len(spin), 2, 3)) + rng.normal(scale=0.02, size=(len(spin), 2, 3))
+        accelerations, state = JointAccelerationFilter(names, [pair], rate_hz), HeadingFilter(problem)
+        for begin in range(0, len(spin), samples):
+            rows = slice(begin, begin + samples)
+            joints = accelerations.push(R_WS[rows], accel_S[rows], np.arange(0, samples, 5))
+            quats = np.tile([0.0, 0.0, 0.0, 1.0], (1, 2, 1))
+            state.step(Knot(0.0, np.zeros(1), quats, joints, FilterHeadings(zeros, same), np.zeros(2, dtype=bool)))
+        z.append((off - state.x[1] + state.x[0]) / np.sqrt(state.P[1, 1] + state.P[0, 0] - 2.0 * state.P[0, 1]))
+    assert np.sqrt(np.mean(np.square(z))) < 1.5
 
 
 def test_pairs_are_neighbours_with_nothing_between_that_moves() -> None:

@@ -41,9 +41,10 @@ LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance with
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 _DIFFERENCE = np.array([[1.0, -1.0], [-1.0, 1.0]])
-# Of the angle and the levers of a joint by their columns.
-_BY_ANGLE_AND_LEVERS = np.zeros((7, 9))
-_BY_ANGLE_AND_LEVERS[0, :3], _BY_ANGLE_AND_LEVERS[1:, 3:] = (1.0, -1.0, 1.0), np.eye(6)
+# Of the angle, levers and forces of a joint by their columns, and those columns that are no lever.
+_BY_JOINT = np.zeros((13, 15))
+_BY_JOINT[0, :3], _BY_JOINT[1:, 3:] = (1.0, -1.0, 1.0), np.eye(12)
+_NO_LEVERS = np.array([0, 1, 2, 6, 7, 8, 12, 13, 14])
 ITERATIONS = 2  # linearizations of an update
 
 
@@ -90,6 +91,8 @@ class HeadingNoise:
         shoulder follow the motion; it changes within `joint_correlation_s`
     acceleration_std : [m/s²] least misfit of two sides of a joint; the recent misfit where that is larger
     acceleration_correlation_s : [s] of the misfit
+    force_std, force_correlation_s : [m/s²], [s] of a force that turns with a sensor: the tilt that an orientation
+        filter has wrong in motion, a degree, times gravity
     twist_std, twist_correlation_s : [rad], [s] by which tissue turns a sensor about its segment's long axis
     hinge_std, hinge_correlation_s : [rad], [s] by which the segment below leaves the plane of a hinge otherwise
     axis_std, tilt_std : [rad] of a calibrated hinge's axis about the long axis of its segment, and across
@@ -106,6 +109,8 @@ class HeadingNoise:
     joint_correlation_s: float = 60.0
     acceleration_std: float = 0.07
     acceleration_correlation_s: float = 0.4
+    force_std: float = float(np.deg2rad(1.0) * 9.81)
+    force_correlation_s: float = 20.0
     twist_std: float = float(np.deg2rad(7.0))
     twist_correlation_s: float = 4.0
     hinge_std: float = float(np.deg2rad(4.0))
@@ -308,7 +313,7 @@ class HeadingProblem:
     @property
     def kept(self) -> int:
         """Number of states without levers."""
-        return 3 * len(self.names) + len(self.pairs) + 3 * len(self.hinges)
+        return self.column("force", 3 * len(self.names))
 
     def find_segment_variance(self, P: np.ndarray) -> np.ndarray:
         """Find the variance (k,) [rad²] of the segments' headings near the start pose, in the covariance of the state.
@@ -331,6 +336,7 @@ class HeadingProblem:
             "twist": 2 * k + j + h,
             "tilt": 2 * k + j + 2 * h,
             "mount": 2 * k + j + 3 * h,
+            "force": 3 * k + j + 3 * h,
         }
         return first[part] + index
 
@@ -344,22 +350,27 @@ class HeadingProblem:
 
     @cached_property
     def pair_columns(self) -> list[np.ndarray]:
-        """The columns of each joint: headings of the near and the far segment, the joint, its levers."""
-        return [
-            np.array(
-                [
-                    self.names.index(pair.near),
-                    self.names.index(pair.far),
-                    self.column("joint", i),
-                    *range(self.size)[self.lever_columns(i)],
-                ]
+        """The columns of each joint: headings of its segments, joint, near lever and force, far lever and force.
+
+        Where levers are known, theirs are beyond the state.
+        """
+        columns = []
+        for i, pair in enumerate(self.pairs):
+            near, far = self.names.index(pair.near), self.names.index(pair.far)
+            levers, forces = (
+                np.arange(self.kept + 6 * i, self.kept + 6 * i + 6),
+                (self.force_columns(near), self.force_columns(far)),
             )
-            for i, pair in enumerate(self.pairs)
-        ]
+            sides = (levers[:3], forces[0], levers[3:], forces[1])
+            columns.append(np.concatenate(([near, far, self.column("joint", i)], *sides)))
+        return columns
 
     def lever_columns(self, pair: int) -> slice:
         first = self.kept + 6 * pair
         return slice(first, first + 6)
+
+    def force_columns(self, segment: int) -> np.ndarray:
+        return self.column("force", 3 * segment) + np.arange(3)
 
 
 class HeadingFilter:
@@ -386,6 +397,8 @@ class HeadingFilter:
             decay[column] = np.exp(-problem.knot_s / noise.joint_correlation_s)
             if problem.levers_at is None:
                 self.x[problem.lever_columns(i)], std[problem.lever_columns(i)] = pair.levers, pair.lever_std
+        forces = slice(problem.column("force", 0), problem.column("force", 3 * k))
+        std[forces], decay[forces] = noise.force_std, np.exp(-problem.knot_s / noise.force_correlation_s)
         for i, hinge in enumerate(problem.hinges):
             std[problem.column("axis", i)], std[problem.column("tilt", i)] = hinge.axis_std, hinge.tilt_std
             std[problem.column("twist", i)] = noise.twist_std
@@ -515,7 +528,8 @@ class HeadingFilter:
 
         A filter that knew its bias to the variance p and has corrected it by Δb with the information i has measured,
         with the variance 1/i, that the rate is now −Δb/(p i). A rate has other parts than the bias (`noise.rate_std`),
-        of which that says nothing.
+        of which that says nothing. What sets the filters' information is how the person moves where they take it for
+        rest; that is common to the sensors, and all of them together know no more of it than one.
 
         The filter's correction of its heading, which was undone, follows from that as far as the heading was wrong by
         the bias about the present vertical. The rest is by a bias about an axis that was vertical before, or by the
@@ -523,15 +537,17 @@ class HeadingFilter:
         """
         k, shares = len(step.rate), self._find_bias_share(step.prior_var)
         before = self.x[: 2 * k]
-        for i in np.flatnonzero(step.information * step.prior_var > LEAST_INFORMATION):
-            at, share, prior_var, correction = k + i, shares[i], step.prior_var[i], step.rate[i]
-            measured = -correction / (prior_var * step.information[i])
-            innovation = measured - correction - share * (self.x[at] - correction)
-            gain = share * self.P[:, at]
-            bias_var = share**2 * self.P[at, at] + (1.0 - share) * prior_var
-            gain /= bias_var + 1.0 / step.information[i]
-            self.P = _symmetric(self.P - np.outer(gain, share * self.P[:, at]))
-            self.x = self.x + gain * innovation
+        at = np.flatnonzero(step.information * step.prior_var > LEAST_INFORMATION)
+        if len(at):
+            rates, share, prior_var = k + at, shares[at], step.prior_var[at]
+            correction, var = step.rate[at], 1.0 / step.information[at]
+            innovation = -correction * var / prior_var - correction - share * (self.x[rates] - correction)
+            by_state = share * self.P[:, rates]
+            covariance = share[:, None] * by_state[rates] + np.diag((1.0 - share) * prior_var + var)
+            covariance += (1.0 - 1.0 / len(at)) * np.sqrt(np.outer(var, var))
+            gain = np.linalg.solve(covariance, by_state.T).T
+            self.P = _symmetric(self.P - gain @ by_state.T)
+            self.x = self.x + gain @ innovation
         rest = np.concatenate([step.heading - step.drift, -step.rate]) - (self.x[: 2 * k] - before)
         self.x = self.x.copy()
         self.x[: 2 * k] += np.concatenate([step.unobserved, step.unobserved_rate]) * rest
@@ -600,12 +616,14 @@ class HeadingFilter:
                 continue
             near, far, joint = problem.pair_columns[i][:3]
             levers = problem.levers_at[i] if problem.levers_at is not None else x[problem.lever_columns(i)]
-            JJ, Je, cost = sums.linearize(x[near] - x[far] + x[joint], levers)
+            near_force, far_force = x[problem.force_columns(near)], x[problem.force_columns(far)]
+            near_side, far_side = np.concatenate((levers[:3], near_force)), np.concatenate((levers[3:], far_force))
+            JJ, Je, cost = sums.linearize(x[near] - x[far] + x[joint], near_side, far_side)
             misfit = max(cost / (3.0 * sums.samples), self._misfit[i], problem.noise.acceleration_std**2)
             weight = 1.0 / (misfit * max(1.0, problem.noise.acceleration_correlation_s * rate))
-            columns, G = problem.pair_columns[i], _BY_ANGLE_AND_LEVERS
+            columns, G = problem.pair_columns[i], _BY_JOINT
             if problem.levers_at is not None:
-                columns, G, JJ, Je = columns[:3], G[:1, :3], JJ[:1, :1], Je[:1]
+                columns, G = columns[_NO_LEVERS], G[:, _NO_LEVERS]
             information[columns[:, None], columns] += weight * G.T @ JJ @ G
             vector[columns] += weight * G.T @ Je
             if last:

@@ -6,7 +6,9 @@ A sensor at r from a joint measures the joint's specific force and its own about
 
 and both neighbours give the same, rotated about the vertical by the difference of their heading errors (Weygers and Kok
 2020, IEEE Sensors Journal 20). A linear filter keeps that: it takes gravity's constant and what tissue shakes off both
-sides. With a = (1, r) each side is B a, so that the misfit of any heading and levers follows from a few 4 × 4 sums.
+sides. A force ε that is fixed in the sensor's frame is none of the joint's: gravity times a tilt that the orientation
+filter has wrong, or the accelerometer's bias. In an even spin it turns with the sensor, as the joint's force does. With
+a = (1, r, ε) each side is B a, so that the misfit of any heading, levers and ε follows from a few 7 × 7 sums.
 """
 
 from __future__ import annotations
@@ -48,10 +50,10 @@ class JointPair(NamedTuple):
 
 
 class JointSums(NamedTuple):
-    """Sums over samples of two sensors at a joint; x, y, z are rows of B (3, 4), n and f the near and the far one."""
+    """Sums over samples of two sensors at a joint; x, y, z are rows of B (3, 7), n and f the near and the far one."""
 
     samples: int
-    near_xy: np.ndarray  # (4, 4) Σ nx nxᵀ + ny nyᵀ
+    near_xy: np.ndarray  # (7, 7) Σ nx nxᵀ + ny nyᵀ
     near_z: np.ndarray  # Σ nz nzᵀ
     near_turn: np.ndarray  # Σ nx nyᵀ − ny nxᵀ
     far: np.ndarray  # Σ fᵀ f
@@ -59,22 +61,27 @@ class JointSums(NamedTuple):
     sin: np.ndarray  # Σ fy nxᵀ − fx nyᵀ
     up: np.ndarray  # Σ fz nzᵀ
 
-    def linearize(self, angle: float, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return JᵀJ (7, 7), Jᵀe (7,) and eᵀe of the misfit e, by the angle [rad] and the levers (6,) [m].
+    def linearize(self, angle: float, near: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return JᵀJ (13, 13), Jᵀe (13,) and eᵀe of the misfit e, by the angle [rad], near and far side.
 
-        The angle turns the near side about the vertical into the far one.
+        Parameters
+        ----------
+        angle : turns the near side about the vertical into the far one
+        near, far : (6,) lever r [m] and force ε [m/s²] of each sensor
         """
-        near, far = np.concatenate(([1.0], levers[:3])), np.concatenate(([1.0], levers[3:]))
+        near, far = np.concatenate(([1.0], near)), np.concatenate(([1.0], far))
+        side = len(near) - 1
         c, s = np.cos(angle), np.sin(angle)
         cross, slope = c * self.cos + s * self.sin + self.up, c * self.sin - s * self.cos
         all_near = self.near_xy + self.near_z
-        information = np.empty((7, 7))
+        information = np.empty((1 + 2 * side, 1 + 2 * side))
+        nears, fars = slice(1, 1 + side), slice(1 + side, None)
         information[0, 0] = near @ self.near_xy @ near
-        information[0, 1:4] = information[1:4, 0] = (near @ self.near_turn)[1:]
-        information[0, 4:] = information[4:, 0] = -(slope @ near)[1:]
-        information[1:4, 1:4], information[4:, 4:] = all_near[1:, 1:], self.far[1:, 1:]
-        information[4:, 1:4] = -cross[1:, 1:]
-        information[1:4, 4:] = information[4:, 1:4].T
+        information[0, nears] = information[nears, 0] = (near @ self.near_turn)[1:]
+        information[0, fars] = information[fars, 0] = -(slope @ near)[1:]
+        information[nears, nears], information[fars, fars] = all_near[1:, 1:], self.far[1:, 1:]
+        information[fars, nears] = -cross[1:, 1:]
+        information[nears, fars] = information[fars, nears].T
         gradient = np.concatenate(
             (
                 [-far @ slope @ near],
@@ -173,12 +180,12 @@ class JointAccelerationFilter:
         signal = np.concatenate([force[..., None], R_WS[:, used]], axis=3)  # (n, used, 3, 4)
         if self._last is None or self._band is None:
             self._last = np.repeat(signal[:1], 2, axis=0)
-            steady = np.concatenate([signal[0, ..., :1], np.zeros((len(used), 3, 3))], axis=2)
+            steady = np.concatenate([signal[0, ..., :1], np.zeros((len(used), 3, 3)), signal[0, ..., 1:]], axis=2)
             self._band = BandPass(BAND_HZ, self._rate_hz, steady.ravel())
         long = np.concatenate([self._last, signal])
         self._last = long[-2:]
         second = self._rate_hz**2 * (long[2:, ..., 1:] - 2.0 * long[1:-1, ..., 1:] + long[:-2, ..., 1:])
-        sides = np.concatenate([long[1:-1, ..., :1], -second], axis=3)  # B, one sample late
+        sides = np.concatenate([long[1:-1, ..., :1], -second, long[1:-1, ..., 1:]], axis=3)  # B, one sample late
         B = self._band.push(sides.reshape(len(sides), -1)).reshape(sides.shape)[rows]
         return tuple(
             None
@@ -189,7 +196,7 @@ class JointAccelerationFilter:
 
 
 def _sum_products(near: np.ndarray, far: np.ndarray) -> JointSums:
-    """The sums of the sides (n, 3, 4) of a joint."""
+    """The sums of the sides (n, 3, 7) of a joint."""
     (nx, ny, nz), (fx, fy, fz) = np.moveaxis(near, 1, 0), np.moveaxis(far, 1, 0)
     turn = nx.T @ ny
     return JointSums(
