@@ -506,19 +506,19 @@ class HeadingFilter:
         self._last_up = np.where(is_turned[:, None], up, last_up)
         return np.where(is_turned, 1.0 - cosine**2, 0.0)
 
-    def transition(self) -> np.ndarray:
-        """Return F (n, n) of one knot."""
+    def advance(self, values: np.ndarray) -> np.ndarray:
+        """Return F v of one knot for v (n,) or (n, m): what lasts decays, and headings turn at their rates."""
         k = len(self.problem.names)
-        F = np.diag(self._decay)
-        F[:k, k : 2 * k] = self.problem.knot_s * np.eye(k)
-        return F
+        advanced = np.asarray((self._decay * values.T).T)
+        advanced[:k] += self.problem.knot_s * values[k : 2 * k]
+        return advanced
 
     def predict(self, step: Step) -> None:
-        k, F = len(self.problem.names), self.transition()
-        self.x = F @ self.x
+        k = len(self.problem.names)
+        self.x = self.advance(self.x)
         self.x[:k] += step.drift
         self.x[k : 2 * k] += step.rate
-        self.P = F @ self.P @ F.T + np.diag(self._steady)
+        self.P = self.advance(self.advance(self.P).T).T + np.diag(self._steady)
         self.P[np.arange(k), np.arange(k)] += step.heading_var
         rates = np.arange(k, 2 * k)
         self.P[rates, rates] += self.problem.noise.rate_change_psd * self.problem.knot_s + step.rate_var
@@ -905,7 +905,7 @@ def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> SmoothedHeadings:
     for i in range(len(knots) - 2, -1, -1):
         forward.x, forward.P = filtered[i]
         forward.predict(steps[i + 1])
-        gain = np.linalg.solve(forward.P, forward.transition() @ filtered[i][1]).T
+        gain = np.linalg.solve(forward.P, forward.advance(filtered[i][1])).T
         x = filtered[i][0] + gain @ (x - forward.x)
         P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)
         means.append(x[:k])
