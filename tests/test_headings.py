@@ -20,14 +20,9 @@ from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.tracking import Tracker, summarize, track
-from wepose_pin.tracking.heading_filter import (
-    PERSON_NOISE,
-    ClaspDetector,
-    FilterHeadings,
-    HeadingFilter,
-    HeadingProblem,
-    Knot,
-)
+from wepose_pin.tracking.heading_filter import HeadingFilter
+from wepose_pin.tracking.heading_observations import ClaspDetector
+from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, Knot
 
 # The simulated person's shoulders stay in place, against the law of the table.
 RIGID = {name: np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) for name in TABLE.girdles}

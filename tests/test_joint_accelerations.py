@@ -16,15 +16,9 @@ from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.subject import population_subject
 from wepose_pin.tracking import TrackedRecording, summarize, track
-from wepose_pin.tracking.heading_filter import (
-    PERSON_NOISE,
-    FilterHeadings,
-    HeadingFilter,
-    HeadingProblem,
-    HingeAxis,
-    Knot,
-    linearize_hinge,
-)
+from wepose_pin.tracking.heading_filter import HeadingFilter
+from wepose_pin.tracking.heading_observations import linearize_hinge
+from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, HingeAxis, Knot
 from wepose_pin.tracking.joint_accelerations import JointAccelerationFilter, JointPair, _sum_products, find_pairs
 
 LIMB = ("torso", "right_upper_arm", "right_forearm")

@@ -39,7 +39,8 @@ from ..recording import ImuSensor, OrientationSensor, Recording, join_recordings
 from ..recording.arrivals import list_numbers, unpack_orientations
 from ..rotations import product
 from ..subject import Subject
-from .heading_filter import FilterHeadings, HeadingProblem, undo_corrections
+from .heading_observations import undo_corrections
+from .heading_problem import FilterHeadings, HeadingProblem
 from .headings import (
     CausalHeadings,
     compute_heading_covariance,

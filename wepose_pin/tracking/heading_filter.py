@@ -17,219 +17,27 @@ state, so that a long recording does not average it away.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from ..alignment import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
-from ..calibration.conditions import Part, StartPose
-from ..compilation import kernel
 from ..filters import AboutVertical
-from ..model import BodyModel, GirdleMotion, move_girdles
-from ..model.girdle import PARAMETERS
-from ..subject import Subject
-from .joint_accelerations import JointPair, JointSums
+from .heading_observations import OUTLIER_STDS, ClaspDetector, build_gap_rows, correct_headings, linearize_hinge
+from .heading_problem import HeadingProblem, Knot
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
 MIN_RATE_VAR = 1e-18  # [rad²/s²] so that it can be inverted
 LEAST_INFORMATION = 1e-6  # relative to what a filter knew of its bias, below which a correction tells nothing
 LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance within so long [s], above which it leaps
-OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
+ITERATIONS = 2  # linearizations of an update
 _DIFFERENCE = np.array([[1.0, -1.0], [-1.0, 1.0]])
 # Of the angle, levers and forces of a joint by their columns, and those columns that are no lever.
 _BY_JOINT = np.zeros((13, 15))
 _BY_JOINT[0, :3], _BY_JOINT[1:, 3:] = (1.0, -1.0, 1.0), np.eye(12)
 _NO_LEVERS = np.array([0, 1, 2, 6, 7, 8, 12, 13, 14])
-ITERATIONS = 2  # linearizations of an update
-
-
-@dataclass(frozen=True)
-class ClaspTest:
-    """When points of a closure are found to coincide; lengths are rms over the time.
-
-    With the lengths of the population or stated mounts the joined hands of simulated people seem up to 25 cm apart, and
-    hands apart seem joined: clasps are found where all mounts between the points are calibrated.
-
-    Parameters
-    ----------
-    seconds : [s] for which they do
-    gap : [m] most between them, once the headings have closed it as far as their uncertainty lets them
-    change : [m] most around the mean of that gap
-    height : [m] most of the gap's vertical part
-    speed : [m/s] least of each of them in the frame of the reference segment
-    speed_ratio : most of the gap's rate against that
-    """
-
-    seconds: float = 2.0
-    gap: float = 0.06
-    change: float = 0.03
-    height: float = 0.12
-    speed: float = 0.08
-    speed_ratio: float = 0.3
-
-
-OFFLINE_CLASP = ClaspTest()
-# Over the shorter time of a clasp of two seconds tissue moves the gap by more of the hands' speed.
-CAUSAL_CLASP = ClaspTest(change=0.04, gap=0.08, speed_ratio=0.8)
-
-
-@dataclass(frozen=True)
-class HeadingNoise:
-    """What disturbs headings and their observations; standard deviations, of a person unless said otherwise.
-
-    Parameters
-    ----------
-    drift_psd : [rad²/s] of a heading in motion, beside a rate that changes slowly: scale errors, tissue's wobble
-    rate_std : [rad/s] drift of a heading by other causes than its gyroscope's bias
-    rate_change_psd : [rad²/s³] of its random walk: a sensor warms up under its strap
-    joint_std, girdle_std : [rad] by which the acceleration of a joint is off in heading, as tissue and a travelling
-        shoulder follow the motion; it changes within `joint_correlation_s`
-    acceleration_std : [m/s²] least misfit of two sides of a joint; the recent misfit where that is larger
-    acceleration_correlation_s : [s] of the misfit
-    force_std, force_correlation_s : [m/s²], [s] of a force that turns with a sensor: the tilt that an orientation
-        filter has wrong in motion, a degree, times gravity
-    twist_std, twist_correlation_s : [rad], [s] by which tissue turns a sensor about its segment's long axis
-    hinge_std, hinge_correlation_s : [rad], [s] by which the segment below leaves the plane of a hinge otherwise
-    axis_std, tilt_std : [rad] of a calibrated hinge's axis about the long axis of its segment, and across
-    range_std : [rad] of a hinge's range
-    slip_std : [m] between palms of a clasp that was found: a cup may be between them
-    closure_correlation_s : [s] of residuals of a closure
-    """
-
-    drift_psd: float = float(np.deg2rad(0.12) ** 2)
-    rate_std: float = float(np.deg2rad(0.1))
-    rate_change_psd: float = float(np.deg2rad(0.1) ** 2 / 900.0)
-    joint_std: float = float(np.deg2rad(0.5))
-    girdle_std: float = float(np.deg2rad(0.9))
-    joint_correlation_s: float = 60.0
-    acceleration_std: float = 0.07
-    acceleration_correlation_s: float = 0.4
-    force_std: float = float(np.deg2rad(1.0) * 9.81)
-    force_correlation_s: float = 20.0
-    twist_std: float = float(np.deg2rad(7.0))
-    twist_correlation_s: float = 4.0
-    hinge_std: float = float(np.deg2rad(4.0))
-    hinge_correlation_s: float = 5.0
-    axis_std: float = float(np.deg2rad(5.0))
-    tilt_std: float = float(np.deg2rad(2.0))
-    range_std: float = float(np.deg2rad(10.0))
-    slip_std: float = 0.03
-    closure_correlation_s: float = 20.0
-
-
-PERSON_NOISE = HeadingNoise()
-MECHANISM_NOISE = HeadingNoise(
-    joint_std=float(np.deg2rad(0.5)),
-    girdle_std=float(np.deg2rad(0.5)),
-    twist_std=float(np.deg2rad(0.5)),
-    hinge_std=float(np.deg2rad(0.5)),
-)
-
-
-class HingeAxis(NamedTuple):
-    """A hinge of two measured segments; vectors in the frame of `on`, `along` in that of `moves`; stds in [rad]."""
-
-    joint: str
-    on: int
-    moves: int
-    axis: np.ndarray
-    on_along: np.ndarray
-    along: np.ndarray
-    range: tuple[float, float]  # [rad] of the angle from the long axis of `on` about the axis
-    axis_std: float
-    tilt_std: float
-    std: float
-
-
-class Way(NamedTuple):
-    """Vectors that turn with segments; their sum is the way from the root to a point, or from one point to another.
-
-    Parameters
-    ----------
-    segments : (p,) index of each vector's segment
-    vectors : (p, 3) [m] in the frames L of their segments
-    by_length : (p, 3, lengths) their derivatives by the lengths of the model
-    girdles : that move the ends: name, sign, index of the vector on whose segment the girdle is
-    """
-
-    segments: np.ndarray
-    vectors: np.ndarray
-    by_length: np.ndarray
-    girdles: tuple[tuple[str, float, int], ...]
-
-    @classmethod
-    def of(
-        cls,
-        model: BodyModel,
-        names: Sequence[str],
-        parts: Sequence[Part],
-        neutral: StartPose,
-        girdles: Sequence[tuple[str, float]],
-    ) -> Way:
-        """Return the way of `parts`, which are in frames that equal W in `neutral`; `names` are the segments."""
-        parts = [part for part in parts if part.sensor in names]  # what does not turn is left out
-        lengths = np.array(list(model.lengths.values()))
-        R_LK = [neutral.R_WK[part.sensor].T for part in parts]
-        carriers = [part.sensor for part in parts]
-        return cls(
-            np.array([names.index(carrier) for carrier in carriers], dtype=int),
-            np.array([R @ part.vector(lengths) for R, part in zip(R_LK, parts, strict=True)]).reshape(-1, 3),
-            np.array([R @ np.array(part.by_length) for R, part in zip(R_LK, parts, strict=True)]),
-            tuple((name, sign, carriers.index(model.table.girdles[name].on)) for name, sign in girdles),
-        )
-
-    def turn(self, R_WL: np.ndarray, motions: Mapping[str, GirdleMotion]) -> np.ndarray:
-        """Return the vectors (p, n, 3) [m] in W, for orientations (k, n, 3, 3) and the motions of the girdles."""
-        turned = np.asarray((R_WL[self.segments] @ self.vectors[:, None, :, None])[..., 0])
-        for name, sign, i in self.girdles:
-            turned[i] += sign * (R_WL[self.segments[i]] @ motions[name].displacement[:, :, None])[..., 0]
-        return turned
-
-
-class Closure(NamedTuple):
-    """Two points that coincide in some intervals [s], those of a phase."""
-
-    phase: str
-    points: tuple[str, ...]
-    intervals: tuple[tuple[float, float], ...]
-    gap: Way  # from the second point to the first one
-    ways: tuple[Way, ...]  # from the root to each of the points
-
-    def holds(self, time: np.ndarray) -> np.ndarray:
-        """(n,) bool: which times [s] lie in an interval."""
-        closed = np.zeros(len(time), dtype=bool)
-        for begin, end in self.intervals:
-            closed |= (time >= begin) & (time <= end)
-        return closed
-
-
-class FilterHeadings(NamedTuple):
-    """What the orientation filters of k sensors say of their headings after a sample.
-
-    Parameters
-    ----------
-    var : (k,) [rad²]; NaN: the filter has no covariance
-    about_vertical : of (k,) each
-    """
-
-    var: np.ndarray
-    about_vertical: AboutVertical
-
-
-class Knot(NamedTuple):
-    """The observations of a knot, before headings are corrected."""
-
-    end: float  # [s]
-    time: np.ndarray  # (m,) [s] of the samples
-    quat_WL: np.ndarray  # (m, k, 4) xyzw
-    joints: tuple[JointSums | None, ...]
-    filters: FilterHeadings  # at the end
-    lost: np.ndarray  # (k,) bool, whether a sensor has lost a sample
 
 
 class Step(NamedTuple):
@@ -257,120 +65,6 @@ class Step(NamedTuple):
     heading: np.ndarray
     unobserved: np.ndarray
     unobserved_rate: np.ndarray
-
-
-class Rows(NamedTuple):
-    """Scalar measurements 0 = r + H δ + e."""
-
-    sample: np.ndarray  # (m,) its index
-    r: np.ndarray  # (m,)
-    H: np.ndarray  # (m, k), δ of the segments in their order
-    weight: np.ndarray  # (m,) 1 / variance of e
-
-
-@dataclass(frozen=True)
-class HeadingProblem:
-    """What there is to observe headings by.
-
-    Parameters
-    ----------
-    names : segments, in the order of δ
-    drift_psd : (k,) [rad²/s] most that a heading gains by what is not a rate that changes slowly
-    rate_std : (k,) [rad/s] of the gyroscopes' biases at the start
-    start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
-    start : what the filters say at the end of the start pose; None: as at the end of the first knot
-    levers_at : (pairs, 6) [m] where levers are known; None: they are unknowns
-    causal : headings are corrected as samples come; a short clasp then counts as one observation
-    """
-
-    names: tuple[str, ...]
-    model: BodyModel
-    subject: Subject
-    pairs: tuple[JointPair, ...]
-    hinges: tuple[HingeAxis, ...]
-    closures: tuple[Closure, ...]
-    noise: HeadingNoise
-    knot_s: float
-    samples_per_knot: int
-    drift_psd: np.ndarray
-    rate_std: np.ndarray
-    start_var: np.ndarray
-    mount_var: np.ndarray
-    start: FilterHeadings | None = None
-    levers_at: np.ndarray | None = None
-    causal: bool = False
-
-    @cached_property
-    def shape_cov(self) -> np.ndarray:
-        """The covariance of the lengths and of the girdles' parameters, as `Subject.shape_covariance`."""
-        return self.subject.shape_covariance(self.model.table)
-
-    @property
-    def size(self) -> int:
-        levers = 0 if self.levers_at is not None else 6 * len(self.pairs)
-        return self.kept + levers
-
-    @property
-    def kept(self) -> int:
-        """Number of states without levers."""
-        return self.column("force", 3 * len(self.names))
-
-    def find_segment_variance(self, P: np.ndarray) -> np.ndarray:
-        """Find the variance (k,) [rad²] of the segments' headings near the start pose, in the covariance of the state.
-
-        δ begins at s − ε_z, by errors s of the start pose and ε_z of the mount, and grows by the drift; a segment that
-        hangs is off by δ + ε_z.
-        """
-        k, first = len(self.names), self.column("mount", 0)
-        mounts = slice(first, first + k)
-        return np.asarray(np.diag(P)[:k] + np.diag(P)[mounts] + 2.0 * np.diag(P[:k, mounts]))
-
-    def column(self, part: str, index: int) -> int:
-        """Return the column of a state."""
-        k, j, h = len(self.names), len(self.pairs), len(self.hinges)
-        first = {
-            "heading": 0,
-            "rate": k,
-            "joint": 2 * k,
-            "axis": 2 * k + j,
-            "twist": 2 * k + j + h,
-            "tilt": 2 * k + j + 2 * h,
-            "mount": 2 * k + j + 3 * h,
-            "force": 3 * k + j + 3 * h,
-        }
-        return first[part] + index
-
-    @cached_property
-    def hinge_columns(self) -> list[np.ndarray]:
-        """The columns of each hinge, in the order of `HingeRows.H`."""
-        return [
-            np.array([hinge.moves, hinge.on, *(self.column(part, i) for part in ("axis", "twist", "tilt"))])
-            for i, hinge in enumerate(self.hinges)
-        ]
-
-    @cached_property
-    def pair_columns(self) -> list[np.ndarray]:
-        """The columns of each joint: headings of its segments, joint, near lever and force, far lever and force.
-
-        Where levers are known, theirs are beyond the state.
-        """
-        columns = []
-        for i, pair in enumerate(self.pairs):
-            near, far = self.names.index(pair.near), self.names.index(pair.far)
-            levers, forces = (
-                np.arange(self.kept + 6 * i, self.kept + 6 * i + 6),
-                (self.force_columns(near), self.force_columns(far)),
-            )
-            sides = (levers[:3], forces[0], levers[3:], forces[1])
-            columns.append(np.concatenate(([near, far, self.column("joint", i)], *sides)))
-        return columns
-
-    def lever_columns(self, pair: int) -> slice:
-        first = self.kept + 6 * pair
-        return slice(first, first + 6)
-
-    def force_columns(self, segment: int) -> np.ndarray:
-        return self.column("force", 3 * segment) + np.arange(3)
 
 
 class HeadingFilter:
@@ -566,14 +260,14 @@ class HeadingFilter:
         self.x = x
         self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + P @ information, P))
         yield
-        found = self._clasps.find(knot, self)
+        k = len(self.problem.names)
+        found = self._clasps.find(knot, self.x[:k], self.P[:k, :k])
         yield
         unsure = self._find_unsure(knot)
         self._lost_before = knot.lost
         closed = {closure.points for closure in self.problem.closures if closure.holds(knot.time).any()}
         for points, rows in () if unsure.any() else found:
             closed.add(points)
-            k = len(self.problem.names)
             information, vector = np.zeros_like(P), np.zeros(len(x))
             weight = rows.weight / self._find_correlation(points, knot)
             information[:k, :k] = rows.H.T @ (weight[:, None] * rows.H)
@@ -661,219 +355,8 @@ class HeadingFilter:
                 vector[:k] += rows.H.T @ (weight * rows.r)
 
 
-@kernel
-def undo_corrections(quat_VS, corrections, at_start):  # type: ignore[no-untyped-def]
-    """Turn orientations (n, k, 4) xyzw in place by Rz(−c), c [rad] the corrections (n, k) since the start (k,)."""
-    for n in range(len(quat_VS)):
-        for k in range(quat_VS.shape[1]):
-            angle = at_start[k] - corrections[n, k]
-            s, c = np.sin(0.5 * angle), np.cos(0.5 * angle)
-            x, y, z, w = quat_VS[n, k, 0], quat_VS[n, k, 1], quat_VS[n, k, 2], quat_VS[n, k, 3]
-            quat_VS[n, k, 0], quat_VS[n, k, 1] = c * x - s * y, c * y + s * x
-            quat_VS[n, k, 2], quat_VS[n, k, 3] = c * z + s * w, c * w - s * z
-
-
-def correct_headings(quat_WL: np.ndarray, headings: np.ndarray) -> np.ndarray:
-    """Return Rz(δ) R_WL (k, n, 3, 3) for orientations (n, k, 4) xyzw and headings δ (k,) or more [rad]."""
-    R = np.empty((quat_WL.shape[1], len(quat_WL), 3, 3))
-    _turn_about_vertical(quat_WL, headings, R)
-    return R
-
-
-@kernel
-def _turn_about_vertical(quat_WL, headings, R):  # type: ignore[no-untyped-def]
-    for k in range(len(R)):
-        s, c = np.sin(headings[k]), np.cos(headings[k])
-        for n in range(len(quat_WL)):
-            x, y, z, w = quat_WL[n, k, 0], quat_WL[n, k, 1], quat_WL[n, k, 2], quat_WL[n, k, 3]
-            xx, xy, xz = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
-            yx, yy, yz = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
-            R[k, n, 0, 0], R[k, n, 0, 1], R[k, n, 0, 2] = c * xx - s * yx, c * xy - s * yy, c * xz - s * yz
-            R[k, n, 1, 0], R[k, n, 1, 1], R[k, n, 1, 2] = s * xx + c * yx, s * xy + c * yy, s * xz + c * yz
-            R[k, n, 2, 0], R[k, n, 2, 1] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w)
-            R[k, n, 2, 2] = 1.0 - 2.0 * (x * x + y * y)
-
-
-def _cross_vertical(v: np.ndarray) -> np.ndarray:
-    """Return ``[0, 0, 1] × v`` of vectors (..., 3): how they change as they turn about the vertical."""
-    turned = np.zeros(v.shape)
-    turned[..., 0], turned[..., 1] = -v[..., 1], v[..., 0]
-    return turned
-
-
-class HingeRows(NamedTuple):
-    """What n samples of two orientations tell of a hinge.
-
-    Parameters
-    ----------
-    r : (n,) [rad] out of the hinge's plane
-    H : (n, 5) its slope by the headings of `moves` and `on`, the axis about the long axis of `on`, tissue there, and
-        the axis across
-    excess : (n,) [rad] beyond the hinge's range, signed
-    slope : (n,) of that by the heading of `moves`; by the heading of `on` it is the negative
-    """
-
-    r: np.ndarray
-    H: np.ndarray
-    excess: np.ndarray
-    slope: np.ndarray
-
-
-def linearize_hinge(R_on: np.ndarray, R_moves: np.ndarray, hinge: HingeAxis) -> HingeRows:
-    """Linearize a hinge of orientations (n, 3, 3)."""
-    n = len(R_on)
-    rows = HingeRows(np.empty(n), np.empty((n, 5)), np.empty(n), np.empty(n))
-    _linearize_hinge(R_on, R_moves, hinge.axis, hinge.on_along, hinge.along, hinge.range, *rows)
-    return rows
-
-
-@kernel
-def _linearize_hinge(R_on, R_moves, axis, on_along, along, limits, r, H, excess, slope):  # type: ignore[no-untyped-def]
-    nx, ny, nz = axis[0], axis[1], axis[2]
-    ax, ay, az = on_along[0], on_along[1], on_along[2]
-    bx, by, bz = ny * az - nz * ay, nz * ax - nx * az, nx * ay - ny * ax  # axis × long axis
-    tx, ty, tz = by * nz - bz * ny, bz * nx - bx * nz, bx * ny - by * nx  # that × axis
-    middle, half = 0.5 * (limits[0] + limits[1]), 0.5 * (limits[1] - limits[0])
-    for i in range(len(R_on)):
-        A, B = R_on[i], R_moves[i]
-        # The long axis of `moves` in W, in the frame of `on`, and its slope there by the heading of `moves`.
-        ux = B[0, 0] * along[0] + B[0, 1] * along[1] + B[0, 2] * along[2]
-        uy = B[1, 0] * along[0] + B[1, 1] * along[1] + B[1, 2] * along[2]
-        uz = B[2, 0] * along[0] + B[2, 1] * along[1] + B[2, 2] * along[2]
-        vx = A[0, 0] * ux + A[1, 0] * uy + A[2, 0] * uz
-        vy = A[0, 1] * ux + A[1, 1] * uy + A[2, 1] * uz
-        vz = A[0, 2] * ux + A[1, 2] * uy + A[2, 2] * uz
-        dx, dy, dz = A[1, 0] * ux - A[0, 0] * uy, A[1, 1] * ux - A[0, 1] * uy, A[1, 2] * ux - A[0, 2] * uy
-        r[i] = vx * nx + vy * ny + vz * nz
-        by_heading = dx * nx + dy * ny + dz * nz
-        sine, cosine = vx * bx + vy * by + vz * bz, vx * ax + vy * ay + vz * az
-        H[i, 0], H[i, 1], H[i, 2], H[i, 3] = by_heading, -by_heading, -sine, -sine
-        H[i, 4] = -(vx * tx + vy * ty + vz * tz)
-        off = np.arctan2(sine, cosine) - middle
-        off -= 2.0 * np.pi * np.round(off / (2.0 * np.pi))
-        excess[i] = np.sign(off) * max(abs(off) - half, 0.0)
-        by_sine, by_cosine = dx * bx + dy * by + dz * bz, dx * ax + dy * ay + dz * az
-        slope[i] = (by_sine * cosine - by_cosine * sine) / max(sine * sine + cosine * cosine, 0.1)
-
-
-class ClaspDetector:
-    """Finds the knots in which two points of a closure stay together while both move.
-
-    The gap between them, once the headings have closed it as far as their uncertainty lets them, is short and constant,
-    and its rate is small beside those of the points in the frame of the reference segment.
-    """
-
-    def __init__(self, problem: HeadingProblem) -> None:
-        # Of a clasp of that many seconds so many knots are whole, whenever it begins.
-        self._test = CAUSAL_CLASP if problem.causal else OFFLINE_CLASP
-        self._knots = max(2, int(self._test.seconds / problem.knot_s) - 1)
-        self._recent: list[Knot] = []
-
-    @staticmethod
-    def _is_calibrated(closure: Closure, problem: HeadingProblem) -> bool:
-        return all(problem.names[i] in problem.subject.mounts for i in closure.gap.segments)
-
-    def find(self, knot: Knot, state: HeadingFilter) -> list[tuple[tuple[str, ...], Rows]]:
-        """Return the points that coincide and the rows of the gap between them in the last knot."""
-        problem, test = state.problem, self._test
-        names, reference = problem.names, problem.model.table.reference
-        if reference not in names or not any(self._is_calibrated(closure, problem) for closure in problem.closures):
-            return []
-        self._recent = [*self._recent, knot][-self._knots :]
-        if len(self._recent) < self._knots and len(self._recent) * problem.knot_s < 0.8 * test.seconds:
-            return []
-        k, rate = len(names), problem.samples_per_knot / problem.knot_s
-        quats = np.concatenate([each.quat_WL for each in self._recent])
-        time = np.concatenate([each.time for each in self._recent])
-        if len(time) < 2:
-            return []
-        R = correct_headings(quats, state.x)
-        motions = move_all_girdles(problem, R)
-        R_reference = R[names.index(reference)]
-        found = []
-        seen = set[tuple[str, ...]]()
-        for closure in problem.closures:
-            if closure.points in seen or closure.holds(knot.time).any() or not self._is_calibrated(closure, problem):
-                continue
-            seen.add(closure.points)
-            paths = [(way.turn(R, motions).sum(axis=0)[:, None] @ R_reference)[:, 0] for way in closure.ways]
-            speed = min(_find_rms(np.gradient(path, time, axis=0)) for path in paths)
-            v = closure.gap.turn(R, motions)
-            gap = v.sum(axis=0)
-            if speed < test.speed or np.abs(gap[:, 2]).max() > test.height:
-                continue
-            H = np.zeros((len(time), 3, k))
-            for i, link in zip(closure.gap.segments, v, strict=True):
-                H[:, :, i] += _cross_vertical(link)
-            # The headings that close the gap best, within their covariance.
-            P, flat, r = state.P[:k, :k], H.reshape(-1, k), gap.ravel()
-            weight = 1.0 / (problem.noise.slip_std**2 * max(1.0, test.seconds * rate))
-            turn = -np.linalg.solve(np.eye(k) + P @ (weight * flat.T @ flat), P @ (weight * flat.T @ r))
-            closed = gap + H @ turn
-            change, length = _find_rms(closed - closed.mean(axis=0)), _find_rms(closed)
-            drift = _find_rms(np.gradient(closed, time, axis=0))
-            if length > test.gap or change > test.change or drift > test.speed_ratio * speed:
-                continue
-            joined = np.ones(len(knot.time), dtype=bool)
-            rows = build_gap_rows(R[:, -len(knot.time) :], problem, closure, joined, problem.noise.slip_std)
-            found.append((closure.points, rows))
-        return found
-
-
 def _symmetric(P: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * (P + P.T))
-
-
-def _find_rms(v: np.ndarray) -> float:
-    """Return the rms length of vectors (n, 3)."""
-    return float(np.sqrt(np.mean(np.sum(v**2, axis=1))))
-
-
-def move_all_girdles(problem: HeadingProblem, R_WL: np.ndarray) -> dict[str, GirdleMotion]:
-    """Return the motions of the girdles for orientations (k, n, 3, 3) of the problem's segments."""
-    return move_girdles(problem.model, dict(zip(problem.names, R_WL, strict=True)))
-
-
-def build_gap_rows(
-    R_WL: np.ndarray,
-    problem: HeadingProblem,
-    closure: Closure,
-    closed: np.ndarray,
-    slip_std: float = PALM_SLIP_STD,
-) -> Rows:
-    """Build three whitened rows for each sample at which the points coincide, without outliers.
-
-    Parameters
-    ----------
-    R_WL : (k, n, 3, 3) of the problem's segments
-    closed : (n,) bool
-    """
-    model, gap, R = problem.model, closure.gap, R_WL[:, closed]
-    motions = move_all_girdles(problem, R)
-    v = gap.turn(R, motions)
-    n, lengths = v.shape[1], len(model.lengths)
-    squares = np.sum(v**2, axis=(0, 2))
-    covariance = (slip_std**2 + SEGMENT_ATTITUDE_STD**2 * squares)[:, None, None] * np.eye(3)
-    links = v.transpose(1, 2, 0)
-    covariance -= SEGMENT_ATTITUDE_STD**2 * (links @ links.swapaxes(1, 2))
-    shape_cov = problem.shape_cov
-    J = np.zeros((n, 3, len(shape_cov)))
-    J[:, :, :lengths] = (R[gap.segments] @ gap.by_length[:, None]).sum(axis=0)
-    for name, sign, i in gap.girdles:
-        girdle, motion, R_on = model.table.girdles[name], motions[name], R[gap.segments[i]]
-        first = lengths + len(PARAMETERS) * list(model.table.girdles).index(name)
-        J[:, :, first : first + len(PARAMETERS)] += sign * R_on @ motion.jacobian
-        covariance += (R_on * motion.residual_covariance(girdle)[:, None, :]) @ R_on.swapaxes(1, 2)
-    covariance += J @ shape_cov @ J.swapaxes(1, 2)
-    H = np.zeros((n, 3, len(problem.names)))
-    for i, link in zip(gap.segments, v, strict=True):
-        H[:, :, i] += _cross_vertical(link)
-    r = v.sum(axis=0)
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance)) if n else covariance
-    r, H = (whiten @ r[:, :, None])[..., 0], whiten @ H
-    is_inlier = np.sum(r**2, axis=1) < OUTLIER_STDS**2 * 3.0  # three axes
-    sample = np.repeat(np.flatnonzero(closed)[is_inlier], 3)
-    return Rows(sample, r[is_inlier].ravel(), H[is_inlier].reshape(-1, len(problem.names)), np.ones(len(sample)))
 
 
 class SmoothedHeadings(NamedTuple):

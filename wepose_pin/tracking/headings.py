@@ -32,21 +32,17 @@ from ..model import BodyModel
 from ..model.start_pose import orient_links
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..subject import Subject
-from .heading_filter import (
+from .heading_filter import HeadingFilter, smooth
+from .heading_observations import correct_headings, linearize_hinge, move_all_girdles, undo_corrections
+from .heading_problem import (
     MECHANISM_NOISE,
     PERSON_NOISE,
     Closure,
     FilterHeadings,
-    HeadingFilter,
     HeadingProblem,
     HingeAxis,
     Knot,
     Way,
-    correct_headings,
-    linearize_hinge,
-    move_all_girdles,
-    smooth,
-    undo_corrections,
 )
 from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, find_pairs
 

@@ -14,7 +14,7 @@ from ..recording import Recording
 from ..subject import Subject
 from .causal import CausalEstimator, CausalSegmentEstimator
 from .doubled import DoubledEstimator
-from .heading_filter import HeadingProblem
+from .heading_problem import HeadingProblem
 from .headings import HeadingCorrector, make_heading_problem
 from .options import TrackOptions
 from .segments import Oriented, SegmentEstimator
