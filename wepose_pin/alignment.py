@@ -10,7 +10,7 @@ equal W in the N-pose; in another start pose R_LS = R_WL(start)ᵀ R_L'S.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from . import rotations
 from .diagnostics import WARNING, Diagnostic
 from .errors import BadSession
-from .filters import Orientation
+from .filters import Orientation, join_orientations
 from .filters.sensors import FilteredRecording, collect_rotations
 from .filters.start import ACCEL_BIAS_STD
 from .model import BodyModel, BodyTable, load_table
@@ -123,6 +123,18 @@ class SegmentOrientations:
     start: tuple[float, float]
     static_phase: tuple[float, float]
     diagnostics: tuple[Diagnostic, ...]
+
+
+def join_segments(parts: Sequence[SegmentOrientations]) -> SegmentOrientations:
+    """Join the samples of chunks; what is not of each sample is that of the last one."""
+    last = parts[-1]
+    return replace(
+        last,
+        time=np.concatenate([part.time for part in parts]),
+        quat_WL={name: np.concatenate([part.quat_WL[name] for part in parts]) for name in last.quat_WL},
+        orientation={name: join_orientations([part.orientation[name] for part in parts]) for name in last.orientation},
+        covariance_W={name: np.concatenate([part.covariance_W[name] for part in parts]) for name in last.covariance_W},
+    )
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -50,6 +51,7 @@ __all__ = [
     "check_method",
     "chunk_multiple",
     "estimate_orientation",
+    "join_orientations",
     "run_filter",
 ]
 
@@ -86,10 +88,28 @@ class Orientation(NamedTuple):
     diagnostics: tuple[Diagnostic, ...] = ()
     about_vertical: np.ndarray | None = None  # (n, 6), as `base.AboutVertical`; None where the filter has no covariance
 
+    def take(self, rows: np.ndarray) -> Orientation:
+        """Take the samples `rows`."""
+        values: dict[str, Any] = {name: getattr(self, name) for name in _OF_EACH_SAMPLE}
+        taken: dict[str, Any] = {name: None if each is None else each[rows] for name, each in values.items()}
+        return self._replace(**taken)
+
     def __repr__(self) -> str:
         bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
         share = 100.0 * float(np.mean(self.static)) if len(self.static) else float("nan")
         return f"Orientation({len(self.quat_WS)} samples, {share:.0f} % static, gyro bias {bias:.2f} deg/s)"
+
+
+_OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov", "about_vertical")
+
+
+def join_orientations(parts: Sequence[Orientation]) -> Orientation:
+    """Join the samples of one sensor's orientations; what is not of each sample is that of the last part."""
+    joined: dict[str, Any] = {}
+    for name in _OF_EACH_SAMPLE:
+        values = [getattr(part, name) for part in parts]
+        joined[name] = None if any(value is None for value in values) else np.concatenate(values)
+    return parts[-1]._replace(**joined)
 
 
 def check_method(method: str) -> str:
@@ -332,21 +352,12 @@ class SensorRun:
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
         """Return a run as orientations, joined to those before the start phase where it is the first."""
-        filter_, detector = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
         before, self._before = self._before, None
-        if before is not None and self._method in OFFLINE:
+        filter_, detector = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
+        if before is not None and self._method in OFFLINE and run.attitude_cov is not None:
             # The smoother's heading is exact where the recording begins; the headings are aligned in the start phase.
-            if run.attitude_cov is not None:
-                run.attitude_cov[: len(before.static)] = before.attitude_cov
-        elif before is not None:
-            run = FilterRun(
-                np.concatenate([before.quat_WS, run.quat_WS]),
-                np.concatenate([before.gyro_bias, run.gyro_bias]),
-                None if run.attitude_cov is None else np.concatenate([before.attitude_cov, run.attitude_cov]),
-                None if run.about_vertical is None else np.concatenate([before.about_vertical, run.about_vertical]),
-            )
-            static = np.concatenate([before.static, static])
-        return Orientation(
+            run.attitude_cov[: len(before.static)] = before.attitude_cov
+        orientation = Orientation(
             run.quat_WS,
             run.gyro_bias,
             static,
@@ -356,6 +367,7 @@ class SensorRun:
             detector,
             about_vertical=run.about_vertical,
         )
+        return orientation if before is None or self._method in OFFLINE else join_orientations([before, orientation])
 
 
 def run_filter(

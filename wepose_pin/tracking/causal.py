@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,6 +26,7 @@ from ..alignment import (
     compute_segment_covariance,
     compute_soft_tissue_covariances,
     compute_start_heading_var,
+    join_segments,
     orient_segments,
 )
 from ..compilation import kernel
@@ -340,7 +340,7 @@ class CausalSegmentEstimator:
             for phase, begins in marks.get(begin, ()):
                 self.mark_phase(phase, begins=begins)
             parts.append(self._run(chunk.cut(slice(begin, end))))
-        return parts[0] if len(parts) == 1 else _join_segments(chunk, parts)
+        return parts[0] if len(parts) == 1 else join_segments(parts)
 
     def _find_marks(self, chunk: Recording) -> dict[int, list[tuple[str, bool]]]:
         """Find sample → phases that begin (True) or have ended with it, of those that headings are corrected by."""
@@ -535,27 +535,6 @@ class CausalSegmentEstimator:
 
     def _order_recent(self) -> np.ndarray:
         return np.concatenate([self._recent[self._oldest :], self._recent[: self._oldest]])
-
-
-def _join_segments(chunk: Recording, parts: list[SegmentOrientations]) -> SegmentOrientations:
-    """Join the segment orientations of a chunk's parts; heading offsets are those of the last part."""
-
-    def join_orientation(name: str) -> Orientation:
-        results = [part.orientation[name] for part in parts]
-        joined: dict[str, Any] = {}
-        for field in ("quat_WS", "gyro_bias", "static", "attitude_cov", "about_vertical"):
-            values = [getattr(result, field) for result in results]
-            joined[field] = None if values[0] is None else np.concatenate(values)
-        return results[-1]._replace(**joined)
-
-    last = parts[-1]
-    return replace(
-        last,
-        time=chunk.time,
-        quat_WL={name: np.concatenate([part.quat_WL[name] for part in parts]) for name in last.quat_WL},
-        orientation={name: join_orientation(name) for name in last.orientation},
-        covariance_W={name: np.concatenate([part.covariance_W[name] for part in parts]) for name in last.covariance_W},
-    )
 
 
 def _quat_about_z(angle: np.ndarray) -> np.ndarray:

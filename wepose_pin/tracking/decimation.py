@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from ..alignment import join_segments
 from ..kinematics import Pose
 from ..recording import join_recordings
 from .measures import Measures, Signal, measure, measure_signal, measure_tips
 from .tracked import TrackedRecording
 
 MOST = 20_000  # samples that are kept
-_OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov", "about_vertical")  # in `Orientation`
 
 
 class Decimator:
@@ -120,10 +120,6 @@ def _decimate(tracked: TrackedRecording, at: np.ndarray, rate_hz: float) -> Trac
     """The samples `at` of a recording, as if it had been recorded so slowly."""
     pose, recording, segments = tracked.pose, tracked.recording, tracked.segments
     sensors = {name: sensor.part(at) for name, sensor in recording.sensors.items()}
-    orientation = {
-        name: orientation._replace(**{field: _rows(getattr(orientation, field), at) for field in _OF_EACH_SAMPLE})
-        for name, orientation in segments.orientation.items()
-    }
     return replace(
         tracked,
         pose=Pose(*(_rows(getattr(pose, entry.name), at) for entry in fields(Pose))),
@@ -133,7 +129,7 @@ def _decimate(tracked: TrackedRecording, at: np.ndarray, rate_hz: float) -> Trac
             time=segments.time[at],
             quat_WL=_rows(segments.quat_WL, at),
             covariance_W=_rows(segments.covariance_W, at),
-            orientation=orientation,
+            orientation={name: orientation.take(at) for name, orientation in segments.orientation.items()},
         ),
     )
 
@@ -149,28 +145,11 @@ def _join_recordings(parts: list[TrackedRecording]) -> TrackedRecording:
     """One of many; what is one number comes from the last."""
     if len(parts) == 1:
         return parts[0]
-    last = parts[-1]
-    segments = [part.segments for part in parts]
-    orientation = {
-        name: orientation._replace(
-            **{
-                field: _concatenate([getattr(s.orientation[name], field) for s in segments])
-                for field in _OF_EACH_SAMPLE
-            }
-        )
-        for name, orientation in segments[-1].orientation.items()
-    }
     return replace(
-        last,
+        parts[-1],
         pose=Pose(*(_concatenate([getattr(part.pose, entry.name) for part in parts]) for entry in fields(Pose))),
         recording=reduce(join_recordings, [part.recording for part in parts]),
-        segments=replace(
-            segments[-1],
-            time=np.concatenate([part.time for part in segments]),
-            quat_WL=_concatenate([part.quat_WL for part in segments]),
-            covariance_W=_concatenate([part.covariance_W for part in segments]),
-            orientation=orientation,
-        ),
+        segments=join_segments([part.segments for part in parts]),
     )
 
 
