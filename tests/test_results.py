@@ -146,7 +146,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(saving, "tasks", lambda: chosen)
     monkeypatch.setattr(inputs, "makers", lambda: {"chain": makers["chain"]})
     monkeypatch.setattr(
-        saving, "_run", lambda todo, out, data, _jobs: [saving.run_task(task.name, out, data) for task in todo]
+        saving, "_run", lambda todo, out, data, *_: [saving.run_task(task.name, out, data) for task in todo]
     )
 
 

@@ -203,6 +203,13 @@ class Outcome:
     error: str
 
 
+def solve_by_loop() -> None:
+    """Solve calibrations by the Gauss-Newton loop from now on, in this process."""
+    from ..calibration import exchange_solver, solve_without_bounds
+
+    exchange_solver(solve_without_bounds)
+
+
 def run(argv: list[str]) -> Outcome:
     """Run a command in this process."""
     from wepose_pin.cli import main
@@ -236,7 +243,7 @@ def track(
 ) -> list[str]:
     """`options`: of causal, chunks, gaps, covariance, torques, no-limits."""
     argv = ["track", str(session), "-o", str(out), "--method", method, "--no-report"]
-    argv += ["--subject", str(subject)] if subject else []
+    argv += ["--subject", str(subject), "--accept-failed"] if subject else []
     argv += ["--model", str(model)] if model else []
     words = {"chunks": ["--chunk-seconds", "10"]}
     return argv + [word for name in options for word in words.get(name, [f"--{name}"])]
