@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,26 +126,43 @@ class Moved:
     tip: np.ndarray  # (n, 3) [m]
 
 
-def move_arm(body: BodyModel, seed: int, *, seconds: float = 45.0, points: int = 1, stated: bool = False) -> Moved:
-    """Move the arm, its tip on one point, on two one after the other, or free (0)."""
-    true = body.with_lengths({name: ratio * body.lengths[name] for name, ratio in TRUE.items()})
+def move_arm(
+    body: BodyModel,
+    seed: int,
+    *,
+    seconds: float = 45.0,
+    points: int = 1,
+    stated: bool = False,
+    start: Mapping[str, float] = BENT,
+    ratios: Mapping[str, float] = TRUE,
+) -> Moved:
+    """Move the arm, or another chain, its tip on one point, on two one after the other, or free (0).
+
+    Parameters
+    ----------
+    stated : the session states the mounts
+    start : joint → [rad] in the start pose, but for `START_STD`
+    ratios : length → the true one over that of the body
+    """
+    true = body.with_lengths({name: ratio * body.lengths[name] for name, ratio in ratios.items()})
     model, data, rng = true.pin, true.pin.createData(), np.random.default_rng(seed)
+    joints, links = true.pin.nv, tuple(body.table.segments)
     time, tip_frame = np.arange(0.0, seconds, 1.0 / RATE), true.pin.getFrameId("tip")
     end = seconds - 1.0
     change = np.clip((time - 0.5 * (MOVE_S + end)) / 2.0 + 0.5, 0.0, 1.0)[:, None] if points == 2 else 0.0
     rise = np.clip((time - MOVE_S) / 2.0, 0.0, 1.0)
-    frequency, phase = rng.uniform(0.05, 0.25, (6, 3)), rng.uniform(0.0, 2.0 * np.pi, (6, 3))
-    amplitude = rng.uniform(0.1, 0.35, (6, 3))
+    frequency, phase = rng.uniform(0.05, 0.25, (joints, 3)), rng.uniform(0.0, 2.0 * np.pi, (joints, 3))
+    amplitude = rng.uniform(0.1, 0.35, (joints, 3))
     wave = np.sin(2.0 * np.pi * frequency * (time[:, None, None] - MOVE_S) + phase)
     rate = 0.9 * rise[:, None] * (amplitude * wave).sum(axis=2)  # [rad/s]
-    q = np.empty((len(time), 6))
-    q[0] = [BENT[name] for name in model.names[1:]] + rng.normal(scale=START_STD, size=6)
+    q = np.empty((len(time), joints))
+    q[0] = [start[name] for name in model.names[1:]] + rng.normal(scale=START_STD, size=joints)
     pin.framesForwardKinematics(model, data, q[0])
     target = data.oMf[tip_frame].translation + change * AWAY * np.ones((len(time), 1))
     tip = np.empty((len(time), 3))
-    R = {link: np.empty((len(time), 3, 3)) for link in SENSED}
-    place = {link: np.empty((len(time), 3)) for link in SENSED}
-    frames = {link: model.getFrameId(link) for link in SENSED}
+    R = {link: np.empty((len(time), 3, 3)) for link in links}
+    place = {link: np.empty((len(time), 3)) for link in links}
+    frames = {link: model.getFrameId(link) for link in links}
     for k in range(len(time)):
         if k:
             pin.computeJointJacobians(model, data, q[k - 1])
@@ -160,7 +178,7 @@ def move_arm(body: BodyModel, seed: int, *, seconds: float = 45.0, points: int =
         for link, frame in frames.items():
             R[link][k], place[link][k] = data.oMf[frame].rotation, data.oMf[frame].act(SENSOR_AT)
     sensors = {}
-    for link in SENSED:
+    for link in links:
         mount = Rotation.random(random_state=rng)
         R_WS = Rotation.from_matrix(R[link]) * mount
         gyro = np.zeros((len(time), 3))
@@ -176,5 +194,5 @@ def move_arm(body: BodyModel, seed: int, *, seconds: float = 45.0, points: int =
     if points == 2:
         middle = 0.5 * (MOVE_S + end)
         phases |= {"tip": ((MOVE_S + 2.0, middle - 1.5),), "second": ((middle + 1.5, end),)}
-    recording = Recording("arm", time, RATE, sensors, phases=phases, start_pose=CONFIGURATION, joints=BENT)
-    return Moved(recording, {name: true.lengths[name] for name in TRUE}, tip)
+    recording = Recording("arm", time, RATE, sensors, phases=phases, start_pose=CONFIGURATION, joints=start)
+    return Moved(recording, {name: true.lengths[name] for name in ratios}, tip)

@@ -19,6 +19,35 @@ from wepose_pin.errors import WeposeError
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.writers import write_session
 
+# A crank-rocker in a vertical plane, as an open chain whose tip is the second pivot on the ground.
+FOUR_BAR = {"crank": 0.2, "coupler": 0.5, "rocker": 0.4}  # [m]
+FOUR_BAR_START = {"crank_joint": -1.2, "coupler_joint": 0.775, "rocker_joint": 2.19}  # [rad]
+FOUR_BAR_RATIOS = {"crank": 1.05, "coupler": 0.94, "rocker": 1.03}  # true lengths over the table's
+
+
+@pytest.fixture(scope="module")
+def four_bar(tmp_path_factory: pytest.TempPathFactory) -> BodyModel:
+    folder = tmp_path_factory.mktemp("four_bar")
+    text, parent, at = '<link name="ground"/>', "ground", 0.0
+    lengths, points = "", ""
+    ends = [*(f"{name}_joint" for name in list(FOUR_BAR)[1:]), "tip"]
+    for (name, length), end in zip(FOUR_BAR.items(), ends, strict=True):
+        text += (
+            f'<link name="{name}"/><joint name="{name}_joint" type="revolute"><parent link="{parent}"/>'
+            f'<child link="{name}"/><origin xyz="{at} 0 0"/><axis xyz="0 1 0"/>'
+            f'<limit lower="-9" upper="9" effort="1" velocity="9"/></joint>'
+        )
+        points += f'{name}_joint = "{name}"\n'
+        lengths += f'{name} = {{ segment = "{name}", from = "{name}_joint", to = "{end}", std_percent = 10 }}\n'
+        parent, at = name, length
+    points += f'tip = {{ link = "{parent}", at = [{at}, 0.0, 0.0] }}\n'
+    (folder / "four_bar.urdf").write_text(f'<robot name="four_bar">{text}</robot>', encoding="utf-8")
+    segments = "".join(f'{name} = "{name}"\n' for name in FOUR_BAR)
+    file = folder / "four_bar.toml"
+    head = 'urdf = "four_bar.urdf"\nkind = "mechanism"\n'
+    file.write_text(f"{head}[segments]\n{segments}[points]\n{points}[lengths]\n{lengths}", encoding="utf-8")
+    return load_model(file)
+
 
 @pytest.fixture(scope="module")
 def arm(urdf: Path) -> BodyModel:  # noqa: F811
@@ -56,6 +85,20 @@ def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> 
     assert calibration.rms_gap < 0.2 * calibration.prior_rms_gap
     for name in TRUE:  # a tenth before the motion
         assert calibration.subject.std(name) < 0.01 * moved.lengths[name]
+
+
+def calibrate_four_bar(body: BodyModel, seed: int) -> tuple[Calibration, Moved]:
+    moved = move_arm(body, seed, start=FOUR_BAR_START, ratios=FOUR_BAR_RATIOS)
+    return calibrate_arm(body, moved, on_point(at=moved.tip[0])), moved
+
+
+def test_a_loop_closed_with_the_world(four_bar: BodyModel) -> None:
+    """A four-bar linkage: both its ends are at known places of the ground, so all three lengths are shown."""
+    calibration, moved = calibrate_four_bar(four_bar, 0)
+    describe("four-bar linkage", calibration, moved)
+    assert np.abs(deviations(calibration, moved)).max() < 3.0
+    for name in FOUR_BAR:  # a tenth before the motion
+        assert calibration.subject.std(name) < 0.02 * moved.lengths[name]
 
 
 @pytest.mark.slow
@@ -138,11 +181,13 @@ def test_a_lost_sensor_is_named_in_one_line(arm: BodyModel, tmp_path: Path, caps
 
 
 @pytest.mark.monte_carlo
-def test_stated_deviations_are_right_over_seeds(arm: BodyModel) -> None:
-    z = []
+def test_stated_deviations_are_right_over_seeds(arm: BodyModel, four_bar: BodyModel) -> None:
+    z: dict[str, list[np.ndarray]] = {"arm": [], "four-bar": []}
     for seed in range(10, 20):
         moved = move_arm(arm, seed)
-        z.append(deviations(calibrate_arm(arm, moved), moved))
-    rms = np.sqrt(np.mean(np.square(z)))
-    print(f"rms of z over {len(z)} seeds: {rms:.2f}")
-    assert 0.4 < rms < 1.6
+        z["arm"].append(deviations(calibrate_arm(arm, moved), moved))
+        z["four-bar"].append(deviations(*calibrate_four_bar(four_bar, seed)))
+    for name, each in z.items():
+        rms = np.sqrt(np.mean(np.square(each)))
+        print(f"{name}: rms of z over {len(each)} seeds: {rms:.2f}")
+        assert 0.4 < rms < 1.6, name
