@@ -114,7 +114,7 @@ def measure_ring_links(data: Path, mounts: Sequence[str], folder: Path) -> Table
     for mount in mounts:
         ring = calibrate_ring(data, mount, folder)
         subject = load_subject(folder / "cal")
-        by_script = [each for each in real._compare_links("", "", find_ring(data)[0], mount) if each.method == "amekf"]
+        by_script = [each for each in real.compare_links("", "", find_ring(data)[0], mount) if each.method == "amekf"]
         for name, true in ring.true_lengths.items():
             links = 2.0 if name == "seg2_and_seg3" else 1.0
             table.rows[f"{mount} {name}"] = {
@@ -145,14 +145,14 @@ def measure_ring_orientations(data: Path, mounts: Sequence[str], folder: Path) -
         inside = ring.known & (ring.time >= time[0]) & (ring.time <= time[-1])
         scored_time = ring.time[inside]
         early = scored_time <= real.UNSCORED_S
-        chain, registered = real._register_ring(find_ring(data)[0].folder)
+        chain, registered = real.register_ring(find_ring(data)[0].folder)
         for segment in RING_SEGMENTS:
             quat = pose.select([f"{segment}_{c}" for c in ("qx", "qy", "qz", "qw")]).to_numpy()
             tracked, true = Slerp(time, Rotation.from_quat(quat))(scored_time), ring.true[segment][inside]
             tracked = align_rotation(tracked, true, early)
             sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
             noise = real.assume_noise(sensor.rate_hz, registration.gyro_bias)
-            alone = dict(real._run_orientations(sensor, registration, noise))["amekf"]
+            alone = dict(real.run_orientations(sensor, registration, noise))["amekf"]
             scored = alone.scored
             by_script = attitude_error(alone.estimated[scored], alone.true[scored], sensor.time[scored])
             table.rows[f"{mount} {segment}"] = {

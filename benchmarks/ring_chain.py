@@ -99,7 +99,7 @@ class RingSession(NamedTuple):
 
 def write_ring_session(files: RingFiles, mount: str, folder: Path) -> RingSession:
     """Write the trial as a session with a table and a protocol, the optical system's places as its truth."""
-    chain, registered = real._register_ring(files.folder)
+    chain, registered = real.register_ring(files.folder)
     links = real.fit_optical_links(chain)
     registration = registered[mount, "seg1"]
     known = np.isfinite(chain.quat_VB["seg1"]).all(axis=1)

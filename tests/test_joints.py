@@ -28,7 +28,7 @@ from wepose_pin.filters import FilterSettings, run_filter
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
-from wepose_pin.validation.real import RING_SEGMENTS, _register_ring, assume_noise
+from wepose_pin.validation.real import RING_SEGMENTS, assume_noise, register_ring
 
 NAMES = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 PAIRS = [
@@ -153,7 +153,7 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
     """RING: between neighbours of a chain of five, screwed on and on foam; errors of 0.2 to 1.6 deg were seen."""
     if not (data / "ring" / "trial1").is_dir():
         pytest.skip("no RING trial among the real recordings")
-    chain, registered = _register_ring(data / "ring" / "trial1")
+    chain, registered = register_ring(data / "ring" / "trial1")
     for mount in ("rigid", "loose"):
         R_VS, psi = {}, {}
         for segment in RING_SEGMENTS:

@@ -125,7 +125,7 @@ def test_optical_orientations_give_the_optical_lengths(data: Path) -> None:
 
 def test_ring_registration_is_consistent(data: Path) -> None:
     """Ten sensors, one clock and one world: each rigid one alone finds the same."""
-    chain, registered = real._register_ring(data / "ring" / "trial1")
+    chain, registered = real.register_ring(data / "ring" / "trial1")
     one = registered["rigid", "seg3"]
     assert one.offset_s == pytest.approx(-0.0285, abs=2e-3)
     assert one.tilt_deg == pytest.approx(0.9, abs=0.3)

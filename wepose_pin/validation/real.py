@@ -88,7 +88,7 @@ def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
     for mount in RING_MOUNTS:
         name = f"RING, link lengths, {mount} mounts"
         experiments[name] = [
-            Job(name, ring.folder.name, _compare_links, (ring, mount)) for ring in rings if mount in ring.imu
+            Job(name, ring.folder.name, compare_links, (ring, mount)) for ring in rings if mount in ring.imu
         ]
     ur5 = [files for files in find_ur5(data) if (files.recording, files.sensor) not in UR5_EXCLUDED]
     experiments["UR5"] = [
@@ -163,7 +163,7 @@ def _make_errors(
 
 def _ring(experiment: str, name: str, files: RingFiles, segment: str, mount: str, bias_known: bool) -> list[Result]:
     """Compute errors of one segment from 10 s on."""
-    chain, registered = _register_ring(files.folder)
+    chain, registered = register_ring(files.folder)
     sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
     noise = assume_noise(sensor.rate_hz, registration.gyro_bias if bias_known else None)
     return _score_reference(experiment, name, sensor, registration, noise, segment == RING_SEGMENTS[0])
@@ -181,16 +181,16 @@ def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result
     return _score_reference(experiment, name, trial, registration, noise, keep)
 
 
-def _compare_links(experiment: str, name: str, files: RingFiles, mount: str) -> list[Result]:
+def compare_links(experiment: str, name: str, files: RingFiles, mount: str) -> list[Result]:
     """Compare lengths of the chain's links, from contenders' orientations and the optical tip, with optical ones."""
-    chain, registered = _register_ring(files.folder)
+    chain, registered = register_ring(files.folder)
     links = fit_optical_links(chain)
     optical = (links.lengths["seg2"] + links.lengths["seg3"], links.lengths["seg4"])
     orientations = []
     for segment in ("seg2", "seg3", "seg4"):
         sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
         noise = assume_noise(sensor.rate_hz, registration.gyro_bias)
-        orientations.append(dict(_run_orientations(sensor, registration, noise)))
+        orientations.append(dict(run_orientations(sensor, registration, noise)))
     tip_W = Rotation.from_quat(registered[mount, "seg2"].quat_WV).apply(links.tip_V)
     results = []
     for contender in list_contenders("real"):
@@ -248,7 +248,7 @@ def fit_links(tip_W: np.ndarray, R_W2: Rotation, R_W3: Rotation, R_W4: Rotation)
 
 
 @lru_cache(maxsize=1)
-def _register_ring(folder: Path) -> tuple[Chain, dict[tuple[str, str], Registration]]:
+def register_ring(folder: Path) -> tuple[Chain, dict[tuple[str, str], Registration]]:
     """Register all ten sensors of the chain together: one clock, one optical world."""
     (files,) = [files for files in find_ring(folder) if files.folder == folder]
     chain = read_ring(files)
@@ -275,7 +275,7 @@ class Compared(NamedTuple):
     scored: np.ndarray  # (m,) bool
 
 
-def _run_orientations(
+def run_orientations(
     sensor: Referenced, registration: Registration, noise: SensorNoise, intervals: Intervals = AFTER_TEN_SECONDS
 ) -> Iterator[tuple[str, Compared]]:
     """Run each contender; iterates over label and orientations."""
@@ -319,7 +319,7 @@ def _score_reference(
     intervals: Intervals = AFTER_TEN_SECONDS,
 ) -> list[Result]:
     results = []
-    for label, run in _run_orientations(sensor, registration, noise, intervals):
+    for label, run in run_orientations(sensor, registration, noise, intervals):
         figures, series = _make_errors(run.estimated[run.scored], run.true[run.scored], sensor.time[run.scored], keep)
         results.append(Result(experiment, name, label, figures | registration.figures(), series))
     return results
