@@ -18,6 +18,7 @@ from wepose_pin.recording import DoubledSensor, ImuSensor, Recording
 from wepose_pin.simulation import Person, Simulation, simulate, simulate_person
 from wepose_pin.subject import parse_subject, subject_toml
 from wepose_pin.tracking import summarize, track, track_chunks
+from wepose_pin.tracking.doubled import FOLLOW_S
 from wepose_pin.writers import write_session
 
 TURN = Rotation.from_euler("xyz", [90, 0, 30], degrees=True)  # the second sensor against the first
@@ -60,6 +61,26 @@ def test_both_are_used_and_their_difference_is_said(made: tuple[Person, Simulati
     assert diagnostic.value == pytest.approx(np.deg2rad(worse.mean()), rel=0.5)
     chunks = list(track_chunks(lambda: recording.chunks(10.0)))
     np.testing.assert_array_equal(np.concatenate([c.quat_WL["torso"] for c in chunks]), both.quat_WL["torso"])
+
+
+def test_the_drift_of_the_second_sensor_is_not_in_corrected_headings() -> None:
+    simulation = simulate(simulate_person(3).lengths, seed=3, clasp_s=60.0, circles=1)
+    recording = simulation.recording()
+    first = recording.imus["left_forearm"]
+    rate = np.deg2rad(0.06) * (recording.time > recording.phases["start"][0][1])  # [rad/s] about the vertical
+    R_WS = Rotation.from_quat(simulation.quat_WS["left_forearm"])
+    drifting = replace(first, gyro_S=first.gyro_S + R_WS.inv().apply(rate[:, None] * [0.0, 0.0, 1.0]))
+    both = replace(recording, doubled={"left_forearm": DoubledSensor("left_forearm_2", drifting)})
+    off = {}
+    for how in ("open_loop", "causal", ""):
+        options = {how: True} if how else {}
+        one, two = (track(each, **options).quat_WL["left_forearm"] for each in (recording, both))
+        off[how] = np.degrees((Rotation.from_quat(one).inv() * Rotation.from_quat(two)).magnitude())[-100:].mean()
+    drift = np.degrees(rate.sum() / recording.rate_hz)
+    assert drift > 4.0
+    assert off["open_loop"] == pytest.approx(0.5 * drift, rel=0.1)
+    # The mean of `FOLLOW_S` is behind by what it drifts in that time.
+    assert max(off["causal"], off[""]) < 0.55 * 0.06 * FOLLOW_S
 
 
 def test_the_mounts_of_both_are_calibrated(made: tuple[Person, Simulation, Recording]) -> None:

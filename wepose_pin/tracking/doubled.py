@@ -3,17 +3,22 @@
 The segment's orientation lies between the two, nearer to the one with the smaller covariance. Their errors by soft
 tissue are partly alike, so that two sensors are not taken as more certain than one: the covariance is the mean of both,
 with their difference added. How far they differ is a diagnostic.
+
+Headings are corrected by what neighbours share with the first sensor. So the second one's heading follows the first
+one's, by their mean difference of the last `FOLLOW_S`, and its own drift is not in the result.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from .. import rotations
 from ..alignment import SegmentOrientations
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..recording import Recording
@@ -21,7 +26,12 @@ from ..subject import Subject, mount_rows
 from .segments import Oriented
 
 MOST_DIFFERENCE = float(np.deg2rad(8.0))  # [rad] rms by which soft tissue lets two sensors differ; assumption
+# [s] over which the difference of headings is averaged: long beside soft tissue, short beside a gyroscope's drift
+FOLLOW_S = 30.0
 ALIKE_STD = float(np.deg2rad(1.0))  # [rad] of a sensor whose filter states no covariance
+E_Z = np.array([0.0, 0.0, 1.0])
+
+Known = tuple[np.ndarray, np.ndarray | None]  # (n, 4) xyzw, and its covariance (n, 3, 3) in W, None: not known
 
 
 class Estimator(Protocol):
@@ -37,23 +47,25 @@ class DoubledEstimator:
 
     Parameters
     ----------
-    make : subject → the estimator of a recording with one sensor a segment
+    first, second : the estimators of recordings with one sensor a segment
+    names : segment → name of its second sensor
+    follow : the second sensor's heading follows the first one's, which is corrected
     """
 
-    def __init__(self, make: Callable[[Subject | None], Estimator], subject: Subject | None, chunk: Recording) -> None:
-        self._names = {segment: doubled.name for segment, doubled in chunk.doubled.items()}
-        self._first, self._second = make(subject), make(_rename_mounts(subject, self._names))
-        self._squares = dict.fromkeys(self._names, 0.0)  # [rad²] sums of the differences
+    def __init__(self, first: Estimator, second: Estimator, names: Mapping[str, str], *, follow: bool) -> None:
+        self.first, self._second, self._names, self._follow = first, second, names, follow
+        self._heading = dict.fromkeys(names, 0.0)  # [rad] mean difference at the last sample
+        self._squares = dict.fromkeys(names, 0.0)  # [rad²] sums of the differences
         self._samples = 0
 
     def push(self, chunk: Recording) -> list[Oriented]:
         """Take a chunk; as `SegmentEstimator.push`."""
         second = replace(chunk, sensors={segment: doubled.sensor for segment, doubled in chunk.doubled.items()})
-        return self._fuse(self._first.push(chunk), self._second.push(second))
+        return self._fuse(self.first.push(chunk), self._second.push(second))
 
     def finish(self) -> list[Oriented]:
         """What is left when the last chunk has been pushed."""
-        return self._fuse(self._first.finish(), self._second.finish())
+        return self._fuse(self.first.finish(), self._second.finish())
 
     def _fuse(self, first: list[Oriented], second: list[Oriented]) -> list[Oriented]:
         fused = []
@@ -62,9 +74,11 @@ class DoubledEstimator:
             diagnostics = []
             self._samples += len(chunk)
             for segment, name in self._names.items():
-                quat_WL[segment], cov, angle = fuse_orientations(
-                    (a.quat_WL[segment], a.covariance_W.get(segment)), (b.quat_WL[segment], b.covariance_W.get(segment))
-                )
+                of_a = (a.quat_WL[segment], a.covariance_W.get(segment))
+                of_b = (b.quat_WL[segment], b.covariance_W.get(segment))
+                if self._follow:
+                    of_b = self._follow_heading(segment, of_a, of_b, chunk.rate_hz)
+                quat_WL[segment], cov, angle = fuse_orientations(of_a, of_b)
                 if cov is not None:
                     covariance[segment] = cov
                 self._squares[segment] += float(np.sum(angle**2))
@@ -78,15 +92,28 @@ class DoubledEstimator:
             fused.append((chunk, both))
         return fused
 
+    def _follow_heading(self, segment: str, a: Known, b: Known, rate_hz: float) -> Known:
+        """Return b with the mean heading of a, and with the covariances of a's heading."""
+        (quat_a, cov_a), (quat_b, cov_b) = a, b
+        share = 1.0 - np.exp(-1.0 / (FOLLOW_S * rate_hz))
+        difference = rotations.heading(rotations.multiply(quat_b, rotations.conjugate(quat_a)))
+        before = [(1.0 - share) * self._heading[segment]]
+        mean, _ = lfilter([share], [1.0, share - 1.0], difference, zi=before)
+        self._heading[segment] = float(mean[-1])
+        quat = rotations.multiply(rotations.rotation_about(E_Z, -mean), quat_b)
+        if cov_a is None or cov_b is None:
+            return quat, cov_b
+        covariance = cov_b.copy()
+        covariance[:, 2, :], covariance[:, :, 2] = cov_a[:, 2, :], cov_a[:, :, 2]
+        return quat, covariance
 
-def fuse_orientations(
-    a: tuple[np.ndarray, np.ndarray | None], b: tuple[np.ndarray, np.ndarray | None]
-) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+
+def fuse_orientations(a: Known, b: Known) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     """The orientation (n, 4) xyzw between two, its covariance (n, 3, 3) in W, and the angle (n,) [rad] between them.
 
     Parameters
     ----------
-    a, b : (n, 4) xyzw, and covariance (n, 3, 3) [rad²] in W, None where it is not known
+    a, b : with covariance in rad²
     """
     (quat_a, cov_a), (quat_b, cov_b) = a, b
     R_a = Rotation.from_quat(quat_a)
@@ -105,7 +132,7 @@ def fuse_orientations(
     return quat, covariance, np.linalg.norm(difference, axis=1)
 
 
-def _rename_mounts(subject: Subject | None, names: Mapping[str, str]) -> Subject | None:
+def rename_mounts(subject: Subject | None, names: Mapping[str, str]) -> Subject | None:
     """The subject with the mounts of the second sensors, by segment."""
     if subject is None:
         return None

@@ -13,7 +13,7 @@ from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject
 from .causal import CausalEstimator, CausalSegmentEstimator
-from .doubled import DoubledEstimator
+from .doubled import DoubledEstimator, rename_mounts
 from .heading_problem import HeadingProblem
 from .headings import HeadingCorrector, make_heading_problem
 from .options import TrackOptions
@@ -135,7 +135,8 @@ class Tracker:
             point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, shape_cov, pose.q),
             gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         )
-        headings = self._headings if not isinstance(self._estimator, CausalEstimator) else self._estimator.headings
+        first = self._estimator.first if isinstance(self._estimator, DoubledEstimator) else self._estimator
+        headings = first.headings if isinstance(first, CausalEstimator) else self._headings
         correction = None if headings is None else headings.summarize()
         return TrackedRecording(recording.name, pose, body, person, recording, segments, self.options, correction)
 
@@ -237,7 +238,7 @@ def _make_estimator(
             return None
         return make_heading_problem(recording, segments, body.subject, body.model, causal=True)
 
-    def make(person: Subject | None) -> SegmentEstimator | CausalEstimator:
+    def make(person: Subject | None, *, corrects: bool) -> SegmentEstimator | CausalEstimator:
         if not options.causal:
             return SegmentEstimator(
                 person, start_frames=body.start_frames, method=options.method, static_test=options.static_test
@@ -247,7 +248,13 @@ def _make_estimator(
             start_frames=body.start_frames,
             method=options.method,
             static_test=options.static_test,
-            make_problem=None if options.open_loop or chunk.doubled else make_problem,
+            make_problem=make_problem if corrects else None,
         )
 
-    return DoubledEstimator(make, subject, chunk) if chunk.doubled else make(subject)
+    corrects = not options.open_loop
+    first = make(subject, corrects=corrects)
+    if not chunk.doubled:
+        return first
+    names = {segment: doubled.name for segment, doubled in chunk.doubled.items()}
+    second = make(rename_mounts(subject, names), corrects=False)
+    return DoubledEstimator(first, second, names, follow=corrects)
