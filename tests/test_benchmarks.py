@@ -63,7 +63,7 @@ def test_scipy_solves_the_same_calibration() -> None:
     rows = calibration.calibration(10.0, (10.0,), 1).rows
     names = [name.partition(": ")[2] for name in rows]
     solvers = ["nlpsol", "Gauss-Newton loop", "least_squares, our Jacobian", "least_squares, 2-point"]
-    assert names == ["building", *solvers, "whole"]
+    assert names == ["building", *solvers, *(f"whole, {name}" for name in solvers[:2])]
     for name, row in rows.items():
         assert "cost" not in row or row["cost"] == pytest.approx(1.0, abs=1e-3), name
     assert len({name.partition(":")[0] for name in rows}) == 1
