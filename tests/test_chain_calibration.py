@@ -98,7 +98,7 @@ def test_a_loop_closed_with_the_world(four_bar: BodyModel) -> None:
     describe("four-bar linkage", calibration, moved)
     assert np.abs(deviations(calibration, moved)).max() < 3.0
     for name in FOUR_BAR:  # a tenth before the motion
-        assert calibration.subject.std(name) < 0.02 * moved.lengths[name]
+        assert calibration.subject.std(name) < 0.04 * moved.lengths[name]
 
 
 @pytest.mark.slow
