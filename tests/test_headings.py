@@ -315,6 +315,21 @@ def test_together_filters_know_no_more_of_how_the_person_turns_than_one() -> Non
     assert of_each[0, 0] + of_each[1, 1] - 2.0 * of_each[0, 1] < 1.1 * BIAS_STD**2
 
 
+def test_a_correction_by_far_more_than_was_learned_is_no_news_for_the_other_filters() -> None:
+    """One has turned another axis to the vertical, whose bias it knew."""
+    names = ("torso", "left_upper_arm", "left_forearm")
+    state, k = make_filter_of(*names), len(names)
+    go_on(state, 1, (0.0, 0.0, 0.0, BIAS_STD**2))
+    state.P *= 0.25  # neighbours have observed the headings
+    headings, about_vertical = say(k, (0.0, 0.0, (0.3 * BIAS_STD) ** -2, BIAS_STD**2 / 12.0))
+    about_vertical.rate[1], about_vertical.rate_var[1] = np.deg2rad(0.5), KNOWN_STD**2
+    state.step(
+        Knot(0.0, np.zeros(0), np.zeros((0, k, 4)), (), FilterHeadings(headings, about_vertical), np.zeros(k, bool))
+    )
+    assert np.abs(state.x[[0, 2]]).max() < 0.1 * KNOT_S * BIAS_STD
+    assert np.abs(state.x[[k, k + 2]]).max() < 0.1 * BIAS_STD
+
+
 def test_what_a_filter_finds_in_the_first_knot_is_since_the_start_pose() -> None:
     bias = np.deg2rad(0.6)
     for start, turned in ((say(1, (0.0, 0.0, 0.0, BIAS_STD**2)), -KNOT_S * bias), (None, 0.0)):

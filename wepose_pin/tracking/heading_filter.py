@@ -231,7 +231,10 @@ class HeadingFilter:
         """
         k, shares = len(step.rate), self._find_bias_share(step.prior_var)
         before = self.x[: 2 * k]
-        at = np.flatnonzero(step.information * step.prior_var > LEAST_INFORMATION)
+        # What was learned corrects by some √(p² i / (1 + p i)); more is by another axis that is vertical now.
+        known = step.information * step.prior_var
+        is_learned = step.rate**2 * (1.0 + known) < OUTLIER_STDS**2 * step.prior_var * known
+        at = np.flatnonzero(is_learned & (known > LEAST_INFORMATION))
         if len(at):
             rates, share, prior_var = k + at, shares[at], step.prior_var[at]
             correction, var = step.rate[at], 1.0 / step.information[at]
