@@ -18,7 +18,7 @@ from scipy import optimize
 
 from wepose_pin.calibration import alternatives, least_squares, solver, weights
 from wepose_pin.calibration.blocks import evaluate, make_program
-from wepose_pin.calibration.contact import find_contact_start
+from wepose_pin.calibration.contact import find_initial_guess
 from wepose_pin.calibration.least_squares import Observations, residuals
 from wepose_pin.calibration.priors import build_prior
 from wepose_pin.calibration.problem import SAMPLE_RATE_HZ, CalibrationProblem
@@ -195,9 +195,9 @@ def pose(problem: CalibrationProblem, rate_hz: float) -> Posed:
     """The last least squares of a calibration."""
     observations, _ = problem.observe(rate_hz)
     prior = build_prior(problem, observations)
-    start, contact = find_contact_start(observations, prior.mean, lambda some: build_prior(problem, some).mean)
-    weights = solve_reweighted(observations, prior, start, contact).weights
-    return Posed(LeastSquares(observations, prior, weights), start)
+    guess, contact = find_initial_guess(observations, prior.mean, lambda some: build_prior(problem, some).mean)
+    weights = solve_reweighted(observations, prior, guess, contact).weights
+    return Posed(LeastSquares(observations, prior, weights), guess)
 
 
 def calibration(clasp_s: float, rates_hz: tuple[float, ...], rounds: int) -> Table:

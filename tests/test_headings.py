@@ -362,7 +362,7 @@ def test_a_rate_is_unknown_again_once_another_axis_is_vertical() -> None:
     for angle, known in ((0.0, True), (0.7, True), (1.5, False)):
         filters = FilterHeadings(np.zeros(1), AboutVertical(*np.array([0.0, 0.0, 0.0, 0.0, 0.0, BIAS_STD**2])[:, None]))
         quat_WL = Rotation.from_rotvec([angle, 0.0, 0.0]).as_quat()[None, None]
-        state.predict(state.find_step(Knot(0.0, np.zeros(1), quat_WL, (), filters, np.zeros(1, dtype=bool))))
+        state.predict(state.find_change(Knot(0.0, np.zeros(1), quat_WL, (), filters, np.zeros(1, dtype=bool))))
         assert (state.P[1, 1] < 2.0 * before + 1e-6) == known
 
 

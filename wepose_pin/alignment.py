@@ -1,10 +1,10 @@
 """Sensor-to-segment alignment: mounts R_LS and heading offsets ψ from the start pose, then segment orientations.
 
 A filter observes the vertical and not the heading: its world V differs from W by a rotation about the vertical,
-R_WV = Rz(ψ). Alignment works in frames L' that equal W in the start pose: there the mount is R_L'S = R_WS =
-Rz(ψ) R_VS(start). Gravity gives its tilt; ψ is the angle that makes it nearest to the stated or calibrated mount. A
-calibrated mount is fused with the start pose, whose standard deviation is `StartFrames.std`. A person's segment frames
-equal W in the N-pose; in another start pose R_LS = R_WL(start)ᵀ R_L'S.
+R_WV = Rz(ψ). Alignment works with the frame L' of each segment that equals W in the start pose: the mount in it is
+R_L'S = R_WS(start) = Rz(ψ) R_VS(start). Gravity gives its tilt; ψ is the angle that makes it nearest to the stated or
+calibrated mount. A calibrated mount is fused with the start pose, whose standard deviation is `StartFrames.std`. A
+person's segment frames L equal W in the N-pose; in another start pose R_LS = R_WL(start)ᵀ R_L'S.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from .subject import Subject
 MAX_MOUNT_ERROR_DEG = 60.0
 MOUNT_WARNING_DEG = 35.0
 
-# Standard deviations per axis; assumptions. Those of start poses and soft tissue are the body's, in its table.
-# [rad] of a device's own orientation about each axis: segments against optical motion capture, walking and turning,
-# have 1.1 to 5.5 deg rms in all (Lebel et al. 2017, BioMed Eng OnLine 16:56), soft tissue included.
+# Standard deviations per axis; assumptions. Those of start poses and soft tissue stand in the table of the body.
+# [rad] of a device's own orientation about each axis: segments differ from optical motion capture, in walking and
+# turning, by 1.1 to 5.5 deg rms in all (Lebel et al. 2017, BioMed Eng OnLine 16:56), soft tissue included.
 MEASURED_ORIENTATION_STD = np.deg2rad(2.0)
 SEGMENT_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation in motion, mostly by soft tissue
 PALM_SLIP_STD = 0.005  # [m] by which joined palms slip
@@ -64,7 +64,7 @@ class StartFrames:
         return np.array(self.table.segments[segment].start_std)
 
     def repeat_std(self, segment: str) -> np.ndarray:
-        """Return (3,) [rad], the same of the rotation between two start poses of one person."""
+        """Return (3,) [rad], one standard deviation about each axis between two start poses of one person."""
         return np.array(self.table.segments[segment].repeat_std)
 
     def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
@@ -72,7 +72,7 @@ class StartFrames:
         return self.R_WL[segment] * R_LS if segment in self.R_WL else R_LS
 
     def to_segment(self, segment: str, R_WS: Rotation) -> Rotation:
-        """Return the mount R_LS of the sensor's orientation in W in the start pose."""
+        """Return the mount R_LS of a sensor whose orientation in the start pose is R_WS."""
         return self.R_WL[segment].inv() * R_WS if segment in self.R_WL else R_WS
 
 
@@ -126,7 +126,7 @@ class SegmentOrientations:
 
 
 def join_segments(parts: Sequence[SegmentOrientations]) -> SegmentOrientations:
-    """Join the samples of chunks; what is not of each sample is that of the last one."""
+    """Join the samples of chunks; fields that are not a value a sample are those of the last chunk."""
     last = parts[-1]
     return replace(
         last,
@@ -158,15 +158,15 @@ class SensorAlignment:
     diagnostics: tuple[Diagnostic, ...]
 
 
-def check_mounts(recording: Recording, subject: Subject | None, start_frames: StartFrames = N_POSE) -> None:
+def check_mounts(recording: Recording, subject: Subject | None, start_frames: StartFrames) -> None:
     """Raise `BadSession` where neither the subject nor the session has the mount of a sensor."""
     collect_nominal_mounts(recording, subject, start_frames)
 
 
 def collect_nominal_mounts(
-    recording: Recording, subject: Subject | None, start_frames: StartFrames = N_POSE
+    recording: Recording, subject: Subject | None, start_frames: StartFrames
 ) -> dict[str, np.ndarray]:
-    """Collect segment → nominal mount `quat_LS` (4,) xyzw of every sensor.
+    """Return segment → nominal mount `quat_LS` (4,) xyzw of every sensor.
 
     Raises
     ------
@@ -197,9 +197,7 @@ def suggest_mounts(segments: Sequence[str], table: BodyTable) -> str:
     others = [segment for segment in segments if segment not in measured]
     if calibrated:
         target = f"that of {', '.join(calibrated)}" if others else "it" if len(calibrated) == 1 else "them"
-        remedy += (
-            f"; or find {target} by `wepose calibrate` (--protocol free without joined hands), and track with its "
-        )
+        remedy += f"; or find {target} by `wepose calibrate` (without joined hands --protocol free), then track with "
         remedy += "--subject"
     if others:
         remedy += f"; no calibration finds that of {', '.join(others)}"
@@ -213,8 +211,8 @@ def align_sensors(
 
     Parameters
     ----------
-    recording : that of `filtered`, or its chunk that contains the start pose
-    subject : its mounts go before those that the session states; None: the stated ones alone
+    recording : the one that was filtered, or its chunk that contains the start pose
+    subject : its mounts are used in place of those that the session states; None: the stated ones are used
     start_frames : `find_start_frames` of the body; left out: the N-pose
 
     Raises
@@ -297,7 +295,7 @@ def orient_segments(
     alignment: SensorAlignment,
     orientation: Mapping[str, Orientation],
     subject: Subject | None,
-    start_frames: StartFrames = N_POSE,
+    start_frames: StartFrames,
 ) -> SegmentOrientations:
     """Return the segment orientations of a recording or a chunk of it, from the results of its sensors' filters."""
     quat_WL, covariance_W = {}, {}
@@ -333,30 +331,34 @@ def orient_segments(
 
 
 def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:
-    """ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
+    """Return ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
     return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
 
 
 def find_nominal_mount(
     recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames = N_POSE
 ) -> np.ndarray | None:
-    """Find the mount `quat_LS` (4,) xyzw: calibrated, else stated, else that of a measured segment; None: unknown.
+    """Find the mount `quat_LS` (4,) xyzw: the calibrated one, else the stated one; None: unknown.
 
-    A stated mount names the sensor's axes that point up and forward in the start pose.
+    A stated mount names the sensor's axes that point up and forward in the start pose. Where a device measures the
+    orientation of the segment itself, and no mount is stated, it is the identity.
     """
     if subject is not None and segment in subject.mounts and not recording.remounted:
         return subject.mounts[segment]
     stated = recording.sensors[segment].stated_quat_LS
     sensor = recording.sensors[segment]
     if stated is None and isinstance(sensor, OrientationSensor) and (sensor.aligned or not recording.remounted):
-        return np.array([0.0, 0.0, 0.0, 1.0])  # a device's own orientations of segments; a tracker is strapped on
+        return np.array([0.0, 0.0, 0.0, 1.0])
     if stated is None or segment not in start_frames.R_WL:
         return stated
     return start_frames.to_segment(segment, Rotation.from_quat(stated)).as_quat()
 
 
 def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
-    """Compute the variance (n,) [rad²] of the heading from that (n, 3, 3) of the attitude error, in S on the right."""
+    """Compute the variance (n,) [rad²] of the heading from the covariance (n, 3, 3) [rad²] of the attitude error.
+
+    `quat_VS` is (n, 4) xyzw; the attitude error is in S, on the right.
+    """
     up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
     return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
 
@@ -368,7 +370,7 @@ def compute_segment_covariance(
     quat_WS: np.ndarray,
     R_LS: Rotation,
     attitude_cov: np.ndarray,
-    start_frames: StartFrames = N_POSE,
+    start_frames: StartFrames,
 ) -> np.ndarray:
     """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
 
@@ -433,13 +435,13 @@ def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.n
 
 
 def compute_start_heading_var(
-    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames = N_POSE
+    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames
 ) -> float:
     """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset.
 
-    It is zero for the segment whose heading defines x. With a calibrated mount it is that between two start poses of
-    one person: the mount contains the heading error of the calibration's start pose. With a stated one it is that
-    between a person and the stated pose.
+    It is zero for the segment whose heading defines x. With a calibrated mount it is the variance between two start
+    poses of one person: the mount contains the heading error of the calibration's start pose. With a stated mount it is
+    the variance of people off the stated pose.
     """
     if segment == start_frames.table.reference:
         return 0.0

@@ -2,11 +2,11 @@
 
 `lengths` is the calibration from a recording to a subject. `protocols` describes what a person does, `problem` collects
 inputs and samples, `chain` is the model's chains in CasADi, `least_squares` unknowns and residuals, `solver` the
-problem and its solution by `nlpsol`, `priors` what is known before. `initial_headings` and `contact` give the start,
-`joints` adds what accelerations show of headings, `losses` what lost samples change, `weights` weighs the samples,
-`alternatives` searches other minima, `anatomy` checks sensors and mounts. `paper` is the published calibration of the
-lengths alone. `series` calibrates several sessions of one person. `result` is what comes of it, `observability` and
-`quality` assess it.
+problem and its solution by `nlpsol`, `priors` what is known before. `initial_headings` and `contact` give the initial
+guess, `joints` adds what accelerations observe of headings, `sample_losses` what lost samples change, `weights` weighs
+the samples, `alternatives` searches other minima, `anatomy` checks sensors and mounts. `paper` is the published
+calibration of the lengths alone. `series` calibrates several sessions of one person. `result` is what comes of it,
+`observability` and `quality` assess it.
 """
 
 from __future__ import annotations

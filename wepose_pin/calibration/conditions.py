@@ -1,8 +1,8 @@
-"""A protocol's conditions on a body: the sensors' parts of each closure, in frames that equal W in the start pose.
+"""A protocol's conditions on a body: which vectors, fixed to segments with sensors, make up each closure.
 
 A point is the sum of the vectors of the links between it and the root (`wepose_pin.model.reaches`). Each link rotates
-with a segment that has a sensor, its own or the one above it with which it is rigid. Here S' is the frame of such a
-segment that equals W in the start pose: of a person in the N-pose the segment's own frame.
+with a segment that has a sensor, its own or the one above it with which it is rigid. As in `wepose_pin.alignment`, L'
+is the frame of such a segment that equals W in the start pose: of a person in the N-pose the segment's own frame L.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ Vector = tuple[float, float, float]
 
 
 class Part(NamedTuple):
-    """A sensor's part of the way between points: ``by_length @ lengths + constant`` [m] in S'."""
+    """One segment's part of the way between points: the vector ``by_length @ lengths + constant`` [m] in L'."""
 
-    sensor: str  # its segment; `UNIVERSE` of what does not move
+    sensor: str  # of the segment, named by it; `UNIVERSE`: the vector does not rotate
     by_length: tuple[Vector | tuple[float, ...], ...]  # (3, k), lengths in the order of the table
     constant: Vector
 
@@ -37,12 +37,12 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Loop:
-    """A closure on a body.
+    """A closure of a protocol, resolved on a body.
 
     Parameters
     ----------
     ways : parts from the root to a point, or from one point to another where the closure is between two
-    girdles : of each way, the girdles that move its points, each with its sign
+    girdles : of each way, the girdles that move its points, each with the sign of its displacement
     """
 
     closure: Closure
@@ -98,13 +98,13 @@ Constraint = Loop | Pointing | Level | Moving
 
 
 class HingeUnknown(NamedTuple):
-    """A hinge with an axis ``axis + x across + z tilted`` (3,) that is estimated; vectors in S' of `on`.
+    """A hinge whose axis ``axis + x across + z tilted`` is estimated by x and z; vectors (3,) in L' of `on`.
 
     Parameters
     ----------
-    on, moves : sensors
-    along : (3,) the long axis of `moves`, in its S'
-    side : (3,) to which it bends
+    on, moves : the segments above and below, both with a sensor
+    along : the long axis of `moves`, in its own L'
+    side : the direction to which it bends
     """
 
     name: str
@@ -122,8 +122,8 @@ class GirdleTerm(NamedTuple):
 
     Parameters
     ----------
-    along : (3,) of the limb, in S' of `law.moves`
-    R_on : (3, 3), row by row: the frame of `law.on` in its S'
+    along : (3,) of the limb, in L' of `law.moves`
+    R_on : (3, 3), row by row: maps the frame L of `law.on` to its L'
     scale : of the law
     """
 
@@ -141,7 +141,7 @@ class StartPose:
     R_WK: Mapping[str, np.ndarray]
 
     def turn(self, link: str, vector: Collection[float]) -> Vector:
-        """A vector (3,) of a link's frame in S'."""
+        """A vector (3,) of a link's frame, in L'."""
         R = self.R_WK.get(link)
         x, y, z = vector if R is None else R @ np.array(vector)
         return float(x), float(y), float(z)
@@ -294,13 +294,14 @@ def find_measured_lengths(protocol: Protocol, model: BodyModel) -> tuple[str, ..
             for link, part in model.reaches.get(point, {}).items():
                 total[link] = total.get(link, 0.0) + sign * part.by_length
                 if closure.kind == "plane":
-                    names |= dict.fromkeys(_moved(model, part.by_length))
+                    names |= dict.fromkeys(_find_lengths_in(model, part.by_length))
         for by_length in total.values():
-            names |= dict.fromkeys(_moved(model, by_length))
+            names |= dict.fromkeys(_find_lengths_in(model, by_length))
     return tuple(name for name in model.lengths if name in names)
 
 
-def _moved(model: BodyModel, by_length: np.ndarray) -> list[str]:
+def _find_lengths_in(model: BodyModel, by_length: np.ndarray) -> list[str]:
+    """The lengths on which a vector with these derivatives (3, lengths) depends."""
     return [name for name, column in zip(model.lengths, by_length.T, strict=True) if np.abs(column).max() > 1e-12]
 
 
@@ -319,8 +320,8 @@ def find_segments(protocol: Protocol, model: BodyModel) -> frozenset[str]:
     return frozenset(used & set(model.table.segments))
 
 
-def fix_scale(constraints: Collection[Constraint]) -> bool:
-    """Whether the closures have a scale of their own: a recorded or known place, or a link of known size."""
+def is_scale_observed(constraints: Collection[Constraint]) -> bool:
+    """Whether the closures determine the scale: by a recorded or known place, or by a link of known size."""
     loops = [constraint for constraint in constraints if isinstance(constraint, Loop)]
     return any(
         loop.kind == "recorded"
@@ -331,7 +332,7 @@ def fix_scale(constraints: Collection[Constraint]) -> bool:
 
 
 def group_lengths(constraints: Collection[Constraint], lengths: Collection[str]) -> dict[str, tuple[str, ...]]:
-    """Sensor → the lengths that rotate with it in some closure; a closure shows the sum of those in one direction."""
+    """Sensor → the lengths that rotate with it in some closure, which observes the sum of those in one direction."""
     groups: dict[str, dict[str, None]] = {}
     for loop in constraints:
         for part in loop.parts if isinstance(loop, Loop) else ():

@@ -1,7 +1,8 @@
-"""Initial headings from samples at which the palms touch.
+"""An initial guess of the least squares by the samples at which the palms touch.
 
-The linear start weighs all samples alike: where the hands are apart for a good part of the phase, its headings are
-wrong. Then it is computed from subsets of short windows, and the subset that closes most of the samples is taken.
+The linear guess of the headings (`initial_headings`) weighs all samples alike: where the hands are apart for a good
+part of the phase, it is wrong. Then it is computed from subsets of short windows, and that which closes most of the
+samples is taken.
 """
 
 from __future__ import annotations
@@ -15,24 +16,25 @@ from .least_squares import Observations, residuals
 
 WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
 MANY_WIDE = 0.05  # share of samples with such gaps, above which subsets are tried
-# Windows of a subset, their length [s], and subsets: with half of the phase apart one in 16 has none of it.
+# Windows of a subset, their length [s], and subsets: with the palms apart in half of the phase, in one of 16 subsets
+# they touch in all windows.
 WINDOWS, WINDOW_S, SUBSETS = 4, 2.5, 60
-SCORED = 120  # samples by which a start is scored
+SCORED = 120  # samples by which a guess is scored
 
 
-def find_contact_start(
-    observations: Observations, start: np.ndarray, start_from: Callable[[Observations], np.ndarray]
+def find_initial_guess(
+    observations: Observations, linear: np.ndarray, guess_from: Callable[[Observations], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A start x (m,) and the weight (n,) of each sample's gap in it, near 0 where the palms are apart.
+    """The initial guess x (m,) of the unknowns, and the weight (n,) of each sample in it: 0 where palms are far apart.
 
     Parameters
     ----------
-    start : x (m,) from all observations
-    start_from : observations → x (m,), the prior's mean with headings from the closure of these observations
+    linear : x (m,) from all observations
+    guess_from : observations → x (m,), the prior's mean with headings from the closure of these observations
     """
     n, spans = len(observations), [span for _, span in observations.spans()]
     window = max(5, round(WINDOW_S / max(float(np.median(np.diff(observations.data[-1]))), 1e-3)))
-    # Where points of the body are joined, those show whether they touch; places elsewhere may be hardly known.
+    # Where points of the body coincide, these samples tell whether they touch; fixed points may be hardly known.
     joined = np.array([isinstance(c, Loop) and c.kind == "coincide" for c in observations.conditions])
     scored = np.flatnonzero(joined[observations.condition_index]) if joined.any() else np.arange(n)
     few = observations.take(scored[np.linspace(0, len(scored) - 1, min(len(scored), SCORED)).astype(int)])
@@ -43,9 +45,9 @@ def find_contact_start(
     def score(x: np.ndarray) -> float:
         return float(np.mean(np.minimum(gap_ratios(x, few), 1.0)))
 
-    best = start
+    best = linear
     lowest = score(best)
-    # Recorded places are those of the point at any time: no contact is lost.
+    # A recorded place is the point's at any time: there is no contact that could be lost.
     touching = observations.closed.all() and any(
         c.kind != "recorded" for c in observations.conditions if isinstance(c, Loop)
     )
@@ -54,7 +56,7 @@ def find_contact_start(
         windows = [np.array_split(np.arange(n)[span], (span.stop - span.start) // window or 1) for span in spans]
         for _ in range(SUBSETS):
             chosen = [own[k] for own in windows for k in np.sort(rng.choice(len(own), min(WINDOWS, len(own)), False))]
-            x = start_from(observations.take(np.concatenate(chosen)))
+            x = guess_from(observations.take(np.concatenate(chosen)))
             cost = score(x)
             if cost < lowest:
                 best, lowest = x, cost

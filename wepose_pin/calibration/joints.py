@@ -21,7 +21,7 @@ from ..filters.sensors import FilteredRecording
 from ..recording import Recording
 from .initial_headings import Coupling
 from .least_squares import Gaussian, Layout
-from .losses import find_losses, mask_connected
+from .sample_losses import find_sample_losses, mask_connected
 from .weights import LEAST_CORRELATION_S
 
 # What people move in, without gravity's constant and without what tissue shakes; of the rate, before it is derived.
@@ -63,7 +63,7 @@ def estimate_couplings(
             inside &= ~gap
     samples = np.flatnonzero(inside)
     # Beyond a loss the headings are others.
-    samples = samples[mask_connected(find_losses(recording, filtered.start, raw), samples)]
+    samples = samples[mask_connected(find_sample_losses(recording, filtered.start, raw), samples)]
     if len(samples) < LEAST_S * recording.rate_hz:
         return []
     samples = samples[:: max(1, round(recording.rate_hz / SAMPLES_HZ))]

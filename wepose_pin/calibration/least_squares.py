@@ -1,12 +1,12 @@
 """The unknowns of a calibration and the residuals of its samples, with their Jacobian; `solver` minimises them.
 
 For each sensor i the filter gives R_VS(t) in a world V of its own heading, and Q(t) = R_VS(t) R_VS(start)ᵀ. Here L is
-the frame of its segment that equals W in the start pose (S' in `conditions`). With a start pose that is ε off the
+the frame of its segment that equals W in the start pose (L' in `conditions`). With a start pose that is ε off the
 stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
 
     R_WL(t) = Rz(ψ + d τ + s) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
 
-with ψ the heading, d its drift since the start, s its steps where samples were lost since (`losses`), and A the
+with ψ the heading, d its drift since the start, s its steps where samples were lost since (`sample_losses`), and A the
 soft-tissue artefact: soft tissue rotates a sensor as the direction of gravity in the segment changes. A segment's
 points may move, as the shoulders do by collarbones and shoulder blades while the arms are raised (`model.girdle`). d,
 s, A and the hinges are nuisance parameters: the covariance of lengths and mounts includes their effect.

@@ -44,8 +44,8 @@ from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
 from .anatomy import BETTER, LabelCheck, check_labels
-from .conditions import Level, Pointing, find_hinges, find_measured_lengths, fix_scale, group_lengths
-from .contact import find_contact_start
+from .conditions import Level, Pointing, find_hinges, find_measured_lengths, group_lengths, is_scale_observed
+from .contact import find_initial_guess
 from .doubled import add_second_mounts
 from .initial_headings import Coupling, estimate_joint_headings
 from .joints import add_couplings, estimate_couplings
@@ -281,9 +281,9 @@ def _solve(problem: CalibrationProblem) -> _Solution:
     layout = observations.layout
     prior, couplings = build_prior(problem, observations), _estimate_couplings(problem, layout.sensors)
     prior = _start_without_closure(problem, observations, prior, couplings)
-    start, contact = find_contact_start(observations, prior.mean, lambda some: build_prior(problem, some).mean)
-    coupled = add_couplings(prior, layout, couplings, start)
-    result = solve_reweighted(observations, coupled, start, contact)
+    guess, contact = find_initial_guess(observations, prior.mean, lambda some: build_prior(problem, some).mean)
+    coupled = add_couplings(prior, layout, couplings, guess)
+    result = solve_reweighted(observations, coupled, guess, contact)
 
     headings = problem.stated_headings(layout.sensors)
     free = layout.heading.start + np.flatnonzero([name not in headings for name in layout.sensors])
@@ -380,7 +380,7 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
     hinges = _hinges(fit.hinge[bending], fit.x[layout.hinge], problem) if bending.any() else {}
     offsets = Rotation.from_rotvec(np.pad(fit.x[layout.tilt].reshape(-1, 2), ((0, 0), (0, 1)))).as_rotvec()[:, :2]
     subject = _make_subject(problem, solution, {joint: hinge for joint, (hinge, _) in hinges.items()}, offsets)
-    scale_observed = fix_scale(problem.conditions)
+    scale_observed = is_scale_observed(problem.conditions)
     scale = "of the population prior" if prior.is_population else f"of {prior.name}"
     if scale_lengths or scale_observed:
         scale = f"measured: {', '.join(scale_lengths)}" if scale_lengths else "of the closure"

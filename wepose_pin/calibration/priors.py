@@ -19,8 +19,8 @@ from ..subject import Subject
 from .conditions import Loop
 from .initial_headings import estimate_headings
 from .least_squares import Gaussian, Layout, Observations, place_points
-from .losses import FREE_STD, HEADING_STD
 from .problem import CalibrationProblem
+from .sample_losses import FREE_STD, HEADING_STD
 
 # Priors, one standard deviation. A stated mount names sensor axes, estimated by eye.
 STATED_STD = np.deg2rad(10.0)  # [rad] of a stated mount's heading

@@ -31,9 +31,9 @@ from .conditions import (
 )
 from .initial_headings import find_linear
 from .least_squares import Layout, Observations
-from .losses import check_start_pose, find_losses, find_unknown_tilt, group_steps, mask_connected
 from .protocols import Closure, Condition, FreeMotion, Protocol
 from .recorded import read_recorded_places
+from .sample_losses import check_start_pose, find_sample_losses, find_unknown_tilt, group_steps, mask_connected
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
@@ -239,7 +239,7 @@ class CalibrationProblem:
             rigid=tuple(name for name in sensors if self.model.table.segments[name].soft_tissue_std == 0.0),
             attitude_std=tuple(_estimate_attitude_std(self.model.table.segments[name]) for name in sensors),
         )
-        losses = find_losses(recording, filtered.start, layout.sensors)
+        losses = find_sample_losses(recording, filtered.start, layout.sensors)
         # Only the linear start can estimate a heading step of any size.
         linear, free = find_linear(self.conditions), [loss for loss in losses if loss.free]
         parts, places = [], []
@@ -295,7 +295,7 @@ class CalibrationProblem:
         observations, samples = self.observe()
         sensors = observations.layout.sensors
         unknown = [name for name in sensors if self.mount(name) is None]
-        losses = find_losses(self.recording, self.filtered.start, sensors)
+        losses = find_sample_losses(self.recording, self.filtered.start, sensors)
         check_start_pose(self.recording, losses, samples, unknown, self.model.table.reference, MIN_SAMPLES)
 
 

@@ -19,7 +19,7 @@ from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
 from ..errors import BadSession
 from ..model.table import ROOT
 from ..subject import Quality
-from .conditions import find_parts, fix_scale, group_lengths
+from .conditions import find_parts, group_lengths, is_scale_observed
 from .observability import MOST_OPEN, find_intervals, format_longest
 from .result import Calibration
 from .weights import CONTRADICTED, MIN_CONTACT
@@ -228,7 +228,7 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
     lengths = np.array([subject.lengths[name] for name in names])
     covariance = subject.lengths_covariance(names)
     # Errors of the scale change all lengths together; they have their own check.
-    shape, scale_observed = covariance, fix_scale(calibration.conditions)
+    shape, scale_observed = covariance, is_scale_observed(calibration.conditions)
     if len(names) > 1 and not scale_observed:
         common = 1.0 / float(lengths @ np.linalg.solve(covariance, lengths))
         shape = covariance - common * np.outer(lengths, lengths)

@@ -68,7 +68,7 @@ def run(job: EvaluateJob) -> int:
         on_limb = errors.position_on_limb
         print_table(
             "Position error [mm], mean ± std",
-            ("point", "from the root", "from where its limb hangs"),
+            ("point", "from the root", "from where its limb begins"),
             [
                 (name, mean_std(error), mean_std(on_limb[name]) if name in on_limb else "")
                 for name, error in errors.position.items()

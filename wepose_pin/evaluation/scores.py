@@ -72,7 +72,7 @@ class Evaluation:
     attitude: dict[str, AttitudeError]
     joints: dict[str, dict[str, AngleError]]  # joint → angle → its error
     position: dict[str, PositionError]  # relative to the root
-    position_on_limb: dict[str, PositionError]  # relative to where its limb hangs, the middle of the shoulders say
+    position_on_limb: dict[str, PositionError]  # relative to where its limb begins, such as the middle of the shoulders
     attitude_uncertainty: dict[str, Uncertainty]  # where the pose has covariances
     position_uncertainty: dict[str, Uncertainty]
     interval: tuple[float, float]

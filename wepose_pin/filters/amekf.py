@@ -38,7 +38,7 @@ from .base import (
     FilterRun,
     OneSample,
     add_correction,
-    age_corrections,
+    integrate_corrections,
     prepare_samples,
 )
 from .covariance import fill_symmetric, into_sensor
@@ -612,7 +612,7 @@ def _compute_horizontal_acceleration(state, model, ax, ay, az):  # type: ignore[
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Filter one sample, gyro [rad/s], accel [m/s²]; records of `STATE` and `MODEL`. Return whether a block ended."""
     dt, x, sums, R = model.dt, state.x, state.sums, state.R_WS
-    age_corrections(state.about_vertical, dt)
+    integrate_corrections(state.about_vertical, dt)
     wx, wy, wz, ux, uy, uz = _correct_rate(state, model, gx, gy, gz, static)
     sums.rate_squared += wx * wx + wy * wy + wz * wz
     rotate_unit_by_rate(state.quat_WS, wx, wy, wz, dt)

@@ -32,7 +32,7 @@ class LiveBank:
     Raises
     ------
     BadOption
-        Filters of several kinds, or of one that cannot run live; windows of several lengths; not as many each.
+        Filters of several kinds, or of one that cannot run live; windows of several lengths; numbers that differ.
     """
 
     def __init__(self, filters: Sequence[Any], detectors: Sequence[StaticDetector]) -> None:

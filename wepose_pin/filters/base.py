@@ -1,4 +1,4 @@
-"""The protocol of orientation filters: frozen parameters, a state apart from them, one compiled step for all uses."""
+"""The interface of orientation filters: frozen parameters, a state apart from them, one compiled step for all uses."""
 
 from __future__ import annotations
 
@@ -20,14 +20,16 @@ STATIC_TURN_NOISE = 8e-4
 
 
 class AboutVertical(NamedTuple):
-    """What a filter has corrected about the vertical since its start, and what it knows there; of samples or sensors.
+    """A filter's corrections about the vertical since its start, and what it knows of the bias there.
+
+    The fields are arrays over samples or over sensors.
 
     Parameters
     ----------
     heading : [rad] sum of the corrections of its heading
     rate : [rad/s] sum of the corrections of the gyroscope's bias, each at the attitude that the sensor had then
     drift : [rad] integral of `rate` over time
-    seconds : [s] this time
+    seconds : [s] this time, since the start
     information : [s²/rad²] sum of what each correction adds to the inverse of `rate_var`
     rate_var : [rad²/s²] variance of the bias now
     """
@@ -58,8 +60,8 @@ def add_correction(sums, heading, rate, before, after):  # type: ignore[no-untyp
 
 
 @inlined
-def age_corrections(sums, dt):  # type: ignore[no-untyped-def]
-    """Integrate the corrected rate in `sums` (6,) over a sample [s]."""
+def integrate_corrections(sums, dt):  # type: ignore[no-untyped-def]
+    """Integrate the correction of the rate in `sums` (6,), a row of `AboutVertical`, over a sample of `dt` [s]."""
     sums[DRIFT] += sums[RATE] * dt
     sums[SECONDS] += dt
 
@@ -95,13 +97,13 @@ class OrientationFilter(Protocol):
 def prepare_samples(
     gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One sample or many as the contiguous arrays that the compiled steps take: (n, 3), (n, 3), (n,)."""
+    """Return one sample or many as the contiguous arrays that the compiled steps take: (n, 3), (n, 3), (n,)."""
     gyro = np.ascontiguousarray(np.reshape(gyro_S, (-1, 3)), dtype=float)
     accel = np.ascontiguousarray(np.reshape(accel_S, (-1, 3)), dtype=float)
     is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
     if not len(gyro) == len(accel) == len(is_static):  # the compiled steps would read beyond an array's end
         raise BadData(
-            f"{len(gyro)} rows of gyro_S, {len(accel)} of accel_S, {len(is_static)} of static: not as many each"
+            f"{len(gyro)} rows of gyro_S, {len(accel)} of accel_S, {len(is_static)} of static: they must be as many"
         )
     return gyro, accel, is_static
 
@@ -115,17 +117,17 @@ class OneSample:
         self.about_vertical = np.zeros((1, VERTICAL_COLUMNS))
 
     def fill(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The sample as arrays of one row."""
+        """Return the sample as arrays of one row, which the next call overwrites."""
         gyro, accel, is_static = self.inputs
         gyro[0], accel[0], is_static[0] = gyro_S, accel_S, static
         return self.inputs
 
 
 def run_in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads: int | None = None) -> list[T]:
-    """``[function(*row) for row in zip(*columns)]`` in threads: the compiled runs of several sensors at a time.
+    """Return ``[function(*row) for row in zip(*columns)]``, computed in threads: one for each sensor's compiled run.
 
-    The runs release the interpreter's lock, so that as many go on at once as there are processors (`threads` to say
-    otherwise). The order is that of the columns; the first error that one raises is raised here.
+    The runs release the interpreter's lock, so that `threads` of them run at once, by default as many as there are
+    processors. The order is that of the columns; the first error of a run is raised here.
     """
     rows = list(zip(*columns, strict=True))
     workers = min(threads or count_processors(), len(rows))
@@ -136,7 +138,7 @@ def run_in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads
 
 
 def count_processors() -> int:
-    """Processors that this process may use; WEPOSE_THREADS says fewer, as where processes share the machine."""
+    """Return the number of processors that this process may use, or WEPOSE_THREADS where that is set."""
     if (stated := os.environ.get("WEPOSE_THREADS", "")).isdecimal():
         return max(1, int(stated))
     if hasattr(os, "sched_getaffinity"):  # Linux: a container or taskset may have fewer than the machine

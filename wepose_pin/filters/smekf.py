@@ -29,7 +29,7 @@ from .base import (
     FilterRun,
     OneSample,
     add_correction,
-    age_corrections,
+    integrate_corrections,
     prepare_samples,
 )
 from .covariance import fill_symmetric, symmetric
@@ -220,7 +220,7 @@ def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Take one sample of one sensor: records of `STATE` and `MODEL`, gyro [rad/s], accel [m/s²]."""
     dt, bias, held = model.dt, state.gyro_bias, state.held_rate
-    age_corrections(state.about_vertical, dt)
+    integrate_corrections(state.about_vertical, dt)
     seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
     unseen_cov = 0.0
     if seen:

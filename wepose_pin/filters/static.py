@@ -149,7 +149,7 @@ class StaticDetector:
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """`static` (n,) bool for `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²]."""
         if len(gyro_S) != len(accel_S):  # the compiled step would read beyond an array's end
-            raise BadData(f"{len(gyro_S)} rows of gyro_S and {len(accel_S)} of accel_S: not as many each")
+            raise BadData(f"{len(gyro_S)} rows of gyro_S and {len(accel_S)} of accel_S: they must be as many")
         gyro, accel = np.ascontiguousarray(gyro_S, dtype=float), np.ascontiguousarray(accel_S, dtype=float)
         static = np.empty(len(gyro), dtype=np.bool_)
         _run(*self.state, gyro, accel, static)

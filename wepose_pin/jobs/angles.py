@@ -24,7 +24,7 @@ class AnglesJob:
 
     Angles are those of the International Society of Biomechanics (docs/angles.md). Repetitions of the movement are
     found by the angle of the largest range, or taken from a phase of the recording, and normalised in time, 0 to 100 %.
-    Several results are compared with the first one: the same person before and after a treatment, say.
+    Several results are compared with the first one, for example of the same person before and after a treatment.
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ class AnglesJob:
     further : RESULT…
         Further results, each compared with the first one.
     out : DIR
-        Write to this folder: repetitions.csv (least, most, range, peak rate of each angle in each repetition),
-        phases.csv (the same of all of the time and of each phase), summary.csv (mean and standard deviation over
+        Write to this folder: repetitions.csv (minimum, maximum, range, peak rate of each angle in each repetition),
+        phases.csv (the same in the whole time and in each phase), summary.csv (mean and standard deviation over
         repetitions), curves.csv (0 to 100 %), comparison.csv (of several results), sessions.csv, definitions.csv
         (sequences and signs), the figures as .svg, and angles.html, which shows all of it.
     interval : FROM TO
@@ -52,7 +52,7 @@ class AnglesJob:
         amplitude at HZ). Without it they are not filtered.
     shoulder
         Use this sequence for the shoulder: YXY (plane of elevation, elevation, internal rotation), XZY or ZXY (flexion
-        and adduction: not locked where the arm hangs).
+        and adduction: no gimbal lock where the arm hangs).
     force
         Replace the files of an earlier run in DIR.
     """

@@ -12,8 +12,8 @@ from ..errors import BadOption
 class BatchJob:
     """Run the same steps on many recordings, on all processors of this machine or on a Dask cluster.
 
-    An item is one session of the plan with its steps. If it fails, its error stands in the table, and the others
-    continue. The same command continues a run that was stopped and repeats nothing that is done. Sessions and DIR may
+    An item is one session of the plan with its steps. If it fails, the table has its error, and the others continue.
+    The same command continues a run that was stopped and repeats nothing that is done. Sessions and DIR may
     lie on s3:// (docs/batch.md).
 
     Parameters
@@ -28,7 +28,7 @@ class BatchJob:
         Start this number of workers here. Without it one per processor.
     force
         Run those items again whose inputs, options or package version have changed. Without it they are kept, with the
-        status changed.
+        status "changed".
     """
 
     plan: Path

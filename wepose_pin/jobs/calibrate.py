@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 class CalibrateJob:
     """Calibrate lengths and sensor mounts from a recording of a protocol, such as joined hands.
 
-    Joined hands determine the proportions of the arms and not their scale. Measure one length, such as the shoulder
-    width, and give it by --measured. Without one the scale is that of the population prior, and the output says how
-    uncertain it is.
+    Joined hands determine the proportions of the arms and not their scale. Measure one length, such as the breadth of
+    the shoulders, and give it with --measured. Without one the scale is that of the population prior, and the output
+    says how uncertain it is.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ class CalibrateJob:
         Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     protocol : NAME|FILE.toml
         Calibrate by this protocol. Without it clasp, and t_pose as well where the session has that phase (not with
-        --formulation paper). Known are
+        --formulation paper). Protocols:
         clasp (hands together), clasp_measured (the same with a measured length), handle (hands on a bar of known
         length), touch_left or touch_right (one palm on a fixed point), table (both palms on a table), tip (of a robot's
         arm or another chain: its point "tip" on a fixed point), feet (of a body with legs: both on the floor),
@@ -48,20 +48,21 @@ class CalibrateJob:
         Several in one session are joined by +, as in clasp+t_pose.
     model : NAME|FILE
         Calibrate this body: a name (upper_body, whole_body), a table of a body (.toml), or a URDF beside its table
-        (docs/models.md). Without it that which the session states, else upper_body.
+        (docs/models.md). Without it the body that the session names, else upper_body.
     measured : NAME=METRES
         Use this measured length; may be given several times. biacromial=0.41 is the breadth over the acromions, the
-        bony edges on top of the shoulders, which a tape reaches: the shoulder joints are 0.83 ± 0.03 of it apart. A
-        name of [lengths] is from joint centre to joint centre, as shoulder_width or left_forearm. With --protocol
-        handle also handle=0.42, the distance of the palms on the bar.
+        bony edges on top of the shoulders, which a tape reaches: the distance of the shoulder joints is 0.83 ± 0.03 of
+        it. The other names are those of [lengths] in subject.toml, such as left_forearm: from joint centre to joint
+        centre. With --protocol handle also handle=0.42, the distance of the palms on the bar.
     formulation
         Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
         priors) or paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the
         palms, with the mounts as the session states them and a measured length that fixes the scale).
     prior : SUBJECT
-        Begin with this subject.toml, or the one in this folder, of an earlier calibration of the same person: lengths
-        and shoulders with their covariance, so that each session adds to what is known. Its mounts hold as long as the
-        sensors were not taken off; a session with remounted = true takes none of them. Of an Xsens .mvnx the lengths.
+        Use as the prior this subject.toml, or the one in this folder, of an earlier calibration of the same person:
+        lengths and shoulders with their covariance, so that each session adds to what is known. Its mounts are used
+        too, unless the sensors were taken off: a session with remounted = true uses none of them. Of an Xsens .mvnx
+        only the lengths are used.
     stature : METRES
         Narrow the population prior to people of this body height.
     sex
@@ -73,7 +74,8 @@ class CalibrateJob:
     gaps
         Accept gaps of more than 50 ms and bridge them. Without it such a gap is an error.
     report
-        Write report.html, which shows the quality with what to do, lengths, mounts and the gap between the palms.
+        Write report.html, which shows the quality and what to do about it, lengths, mounts and the gap between the
+        palms.
     force
         Replace the files of an earlier run in DIR.
     """

@@ -24,8 +24,8 @@ class DemoJob:
 
     A person of random size wears five Xsens MTi-3, stands in the N-pose (upright, arms hanging, palms to the thighs),
     moves the joined hands and holds the T-pose, a minute in all, then draws six circles in the air with the right hand
-    and rests it on a table in between. All of it is simulated, so the truth is known. Printed are lengths and errors of
-    each filter beside the truth.
+    and rests it on a table in between. All of it is simulated, so the truth is known. Prints lengths and errors of each
+    filter, with the true lengths.
 
     Parameters
     ----------

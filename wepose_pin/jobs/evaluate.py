@@ -20,12 +20,13 @@ class EvaluateJob:
 
     Prints for each segment the attitude error (roll, pitch, yaw about the axes of W), inclination, heading and total
     RMSE [deg] and the drift of the heading [deg/min]; for each joint the error of its angles [deg]; for each point the
-    position error [mm], relative to the root and to where its limb hangs, as the middle of the shoulders; and whether
-    the stated standard deviations are consistent with the errors. Nothing is written.
+    position error [mm], relative to the root and to the place where its limb begins, such as the middle of the
+    shoulders; and whether the stated standard deviations are consistent with the errors. Writes nothing.
 
     A table with the columns of pose.parquet is compared as it is, without alignment. A file of another system (.c3d,
     .trc, .mvnx) is brought to the clock and the heading of the result first, by the first third of the result, which
-    is then not scored; both are printed, and the agreement of joint angles (Bland-Altman, ICC) with them.
+    is then not scored. Prints the clock offset and the heading too, and the agreement of joint angles (Bland-Altman,
+    ICC).
 
     Parameters
     ----------
@@ -41,12 +42,12 @@ class EvaluateJob:
     align
         Bring a file of another system to the clock and the world of the result.
     fit : world|segments
-        Fit this to the result, of a table too. world: clock, heading and place; segments: besides a constant rotation
-        of each segment's frame, where frames are not those of docs/glossary.md.
+        Fit this to the result, also of a table. world: clock, heading and place; segments: in addition a constant
+        rotation of each segment's frame, for frames that are not those of docs/glossary.md.
     time_offset : SECONDS
-        Add this to the times of the reference, in place of an offset that is fitted.
+        Add this to the times of the reference, instead of fitting the offset.
     markers : TOML
-        Table of markers, which goes before the shipped one (docs/formats/evaluate.md).
+        Use this table of markers before the one of the package (docs/formats/evaluate.md).
     """
 
     result: Path

@@ -31,7 +31,7 @@ class ExportJob:
     format : FORMAT
         Write this format instead of that of the suffix: csv, parquet (pose and joint angles), mot (joint angles for
         OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU Placer),
-        osim (OpenSim's model of the subject), trc (points, as of markers), c3d (points and rotations of segments), bvh
+        osim (OpenSim's model of the subject), trc (points, as markers), c3d (points and rotations of segments), bvh
         (skeleton and motion, for animation), bvh-lafan1, bvh-nokov, bvh-soma, bvh-xsens (a whole person, for GMR),
         motion-bids (a dataset, of which FILE is the folder); of persons and robots rosbag (for ROS 2, in a folder),
         mcap, rrd (for rerun), urdf; of robots lerobot (a data set of episodes, in a folder; joints in rad, not in units
@@ -49,13 +49,14 @@ class ExportJob:
         Only for lerobot: make each interval of this phase of the recording an episode, or, by the word
         repetitions, each repetition of the movement. Without it each result is an episode.
     instruction : TEXT
-        Only for lerobot: the text that says what the robot does, in all episodes. Without it "follow NAME".
+        Only for lerobot: the text that says what the robot does, in all episodes. Without it "follow", and the name of
+        the recording.
     osim_model : FILE
         Only for .osim and .sto: scale this generic model of OpenSim to the subject. With .sto the model and the set-up
         files of OpenSim's IMU Placer and IMU Inverse Kinematics are written beside it.
     bids_name : NAME
-        Only for motion-bids: call the recording so in the dataset, such as sub-01_task-reach_run-2. What it lacks is
-        taken from the names of subject and recording.
+        Only for motion-bids: the name of the recording in the dataset, such as sub-01_task-reach_run-2. What it lacks
+        is taken from the names of subject and recording.
     force
         Replace an existing file.
     """

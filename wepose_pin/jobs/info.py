@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 class InfoJob:
     """Describe a file, its sensors, rates and gaps, and propose a session file for it.
 
-    Prints both, and writes nothing without --write or -o. Reads CSV, Parquet, HDF5 and MATLAB; Xsens MVNX and MT
-    Manager's text, Movella DOT, x-IMU3, APDM, Shimmer, Delsys, Noraxon, phones (Sensor Logger, phyphox), ROS bags, XDF
-    and OpenSim .sto of orientations (docs/formats/); recordings of `wepose live`, sessions, subjects and results.
-    Entries of the proposed session that are guesses are marked CHECK.
+    Prints the description and the proposal; writes nothing without --write or -o. Reads CSV, Parquet, HDF5 and MATLAB;
+    Xsens MVNX and text files of MT Manager, Movella DOT, x-IMU3, APDM, Shimmer, Delsys, Noraxon, phones (Sensor Logger,
+    phyphox), ROS bags, XDF and OpenSim's orientations, .sto (docs/formats/); recordings of `wepose live`, sessions,
+    subjects and results. Entries of the proposed session that are guesses are marked CHECK.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ class LiveJob:
         Take the mounts of the sensors from this session file; its data are not read.
     record : FILE
         Write all that is received and the poses to this file; `wepose track FILE` gives the same poses again. Without
-        it the first take (T) begins such a file, which holds what came before too.
+        it the first take (key T) begins such a file, which also holds what came before the take.
     method
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smekf (Kalman filter of
         Lisini Baldi et al. 2019, corrected in static phases), ncf (complementary filter, Mahony et al. 2008), gdc
@@ -66,29 +66,30 @@ class LiveJob:
         Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package
         (docs/models.md). Without it the body that the session names, else the upper body.
     speed : FACTOR
-        With --source replay: replay at this speed; 1 that of the recording, 4 four times that, max as fast as possible.
+        With --source replay: replay at this speed; 1 is that of the recording, 4 is four times that, max is as fast as
+        possible.
     page
         Serve the page that shows the pose (which only this machine can open).
     open
         Open the page in the browser.
     host : ADDRESS
-        Serve the page on this address of this machine, as 0.0.0.0 for all, to open it on a phone. Its URL then holds a
-        token, without which nobody gets it. Without it this machine alone can open the page.
+        Serve the page on this address of this machine, such as 0.0.0.0 for all, to open it on a phone. Its URL then
+        holds a token, without which nobody can open it. Without --host this machine alone can open the page.
     port : PORT
         Serve the page at this port; 0 takes any that is free.
     udp : [HOST:]PORT
         Send each pose as JSON to this UDP port (docs/live-page.md). Without HOST to this machine.
     mvn : [HOST:]PORT
-        Send each pose to this UDP port as the Xsens MVN network streamer does (port 9763 by habit): the whole figure,
+        Send each pose to this UDP port as the Xsens MVN network streamer does (usually 9763): the whole figure,
         its legs standing where no sensor measures them.
     vmc : [HOST:]PORT
-        Send each pose to this UDP port by the VMC protocol (OSC; 39539 by habit), for Unity, VSeeFace or Blender.
+        Send each pose to this UDP port by the VMC protocol (OSC; usually 39539), for Unity, VSeeFace or Blender.
     lsl : NAME
         Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
     robot : NAME|FILE
         Send joint commands that let this robot follow the person (docs/live-robot.md): one of the names of `wepose
-        retarget --robot`, a URDF with a robot map beside it (ARM.urdf, ARM.toml), or the robot map. Bring the robot
-        into the rest posture of its robot map before.
+        retarget --robot`, a URDF with a robot map beside it (ARM.urdf, ARM.toml), or the robot map. First bring the
+        robot into the rest posture of its robot map.
     arm
         Move only this arm of the robot, or both. Without it all arms that it has. Needs --robot.
     to : [HOST:]PORT
@@ -98,7 +99,8 @@ class LiveJob:
     speed_scale : SHARE
         Use this share of the robot's limits of velocity, acceleration and jerk, above 0, up to 1.
     limit_margin : RAD
-        Keep this distance from the robot's position limits, in radians; of a joint that slides a tenth of it in metres.
+        Keep this distance from the robot's position limits, in radians; from those of a prismatic joint a tenth of it,
+        in metres.
     hold_after : SECONDS
         Brake the robot after this time without a pose. It continues by itself, slowly at first, when poses come again.
     stop_after : SECONDS

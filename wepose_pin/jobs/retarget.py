@@ -49,7 +49,8 @@ class RetargetJob:
     speed_scale : SHARE
         Use this share of the robot's limits of velocity, acceleration and jerk, above 0, up to 1.
     limit_margin : RAD
-        Keep this distance from the position limits, in radians; of a joint that slides a tenth of it in metres.
+        Keep this distance from the position limits, in radians; from those of a prismatic joint a tenth of it,
+        in metres.
     interval : FROM TO
         Follow only this time of the recording, in seconds.
     phase : NAME
@@ -85,12 +86,12 @@ class RetargetJob:
         """Raise `WeposeError` where there is no such robot, or a number is out of its range."""
         from ..recording import check_selection
         from ..retargeting import LimitMargins, find_map
-        from ..retargeting.targets import check_mapping
+        from ..retargeting.targets import check_scale_and_smoothing
         from ..retargeting.trajectory import check_rate
 
         check_selection(self.interval, self.phase)
         check_rate(self.rate_hz)
-        check_mapping(self.scale, self.smoothing_hz)
+        check_scale_and_smoothing(self.scale, self.smoothing_hz)
         LimitMargins(self.speed_scale, self.limit_margin).check()
         find_map(self.robot)
 

@@ -24,7 +24,7 @@ CIRCLES = 6  # drawn by the right hand after the protocol
 
 @dataclass(frozen=True)
 class SimulateJob:
-    """Simulate a person with five sensors, or fifteen in an activity, and a known truth.
+    """Simulate the recording of a person with five sensors, or fifteen on the whole body, and its known truth.
 
     The person stands in the start pose, does the motion of the protocol, then draws circles with the right hand (not
     after poses). The sensors have the noise and bias of an Xsens MTi-3. Continue with `wepose calibrate DIR --measured
@@ -46,28 +46,32 @@ class SimulateJob:
     activity
         Simulate an activity in place of a protocol. Of the whole body, with sensors on pelvis, head, hands and legs
         too: walking on the spot (walk), or sitting down and standing up (sit). Of the upper body: reaches, rests and
-        typing of both arms, hands apart (tasks). Of the body's imperfections of `mild` it has soft-tissue artefacts.
+        typing of both arms, hands apart (tasks). Of the imperfections of the body in --preset mild, an activity has
+        only the soft-tissue artefacts.
     seconds
-        Simulate the activity (40) or the protocol's motion (60) for so long; at least 5.
+        Simulate this many seconds of the activity (without it 40) or of the protocol's motion (without it 60); at least
+        5.
     preset
         Simulate only the sensors' noise and bias (ideal), or also small soft-tissue artefacts, slip, sway and sensor
-        errors (mild), or all of them and more as the literature has them (people): soft tissue that follows the joints,
-        shoulders that move with the arms, start poses as people hold them, wrists that bend. Their sizes and sources
-        are in wepose_pin/simulation/imperfections.py.
+        errors (mild), or all of these and more at the sizes of people in the literature (people): soft tissue that
+        follows the joints, shoulders that move with the arms, start poses as people hold them, wrists that bend. Sizes
+        and sources are in wepose_pin/simulation/imperfections.py.
     imperfection : NAME=VALUE
         Simulate one imperfection at this size; may be given several times. mount=any: arbitrary sensor mounting, which
-        the session does not state. All others are numbers; 0 is off, for the two ranges inf. Of the body, rms:
+        the session does not state. All others are numbers; 0 is off, inf for the two full scales. Of the body, rms:
         soft_tissue_deg, palm_slip [m] in the clasp, sway_deg_s, start_segment_deg (arm segments off the start pose);
         mean: start_elbow_deg (flexion in the start pose), shoulder_wander [m] (translation at 90 deg of elevation). Of
         the sensors, standard deviation: gyro_scale, accel_scale (of the scale factors, 0.01 is 1 %), misalignment_deg,
         g_sensitivity_deg_s (per g), clock_jitter [s], clock_offset [s]; full scale: gyro_range_deg_s, accel_range_g;
-        bits: of a sample over the full scale; dropped: fraction of samples lost, at most 0.2. Of people, times the
-        literature's size: tissue_gain (soft tissue that follows the joints), tissue_random, girdle (shoulders that
-        follow the arms), girdle_person, girdle_wander, girdle_rest, carrying_angle, start_pose; others: breath_deg,
-        creep_deg (a strap in 10 min), strap_slip_deg, wobble_deg (per g), upper_arm_place and forearm_place (of the
-        sensor, share of the length), girdle_hysteresis (share of elevation), elbow_abduction_deg, start_heading_deg
-        (torso against W), sway_tilt_deg, wrist_flexion_deg, wrist_deviation_deg, handle_slip [m], gyro_warm_up_deg_s
-        (of the bias, in 15 min), clock_drift_ppm.
+        bits: of a sample over the full scale; dropped: fraction of samples lost, at most 0.2. Of people, as a multiple
+        of the size in the literature: tissue_gain (soft tissue that follows the joints), tissue_random (its random
+        part), girdle (shoulders that follow the arms), girdle_person (how people differ in that), girdle_wander
+        (shrugs and reaching), girdle_rest (place of the shoulders at rest), carrying_angle (of the elbow), start_pose
+        (offsets of the start pose); others: breath_deg (pitch of the torso's sensor), creep_deg (a strap in 10 min),
+        strap_slip_deg, wobble_deg (per g), upper_arm_place and forearm_place (of the sensor, share of the length),
+        girdle_hysteresis (share of elevation), elbow_abduction_deg, start_heading_deg (torso against W), sway_tilt_deg,
+        wrist_flexion_deg, wrist_deviation_deg, handle_slip [m], gyro_warm_up_deg_s (of the bias, in 15 min),
+        clock_drift_ppm.
     force
         Replace the files of an earlier run in DIR.
     """

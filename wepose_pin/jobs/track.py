@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 class TrackJob:
     """Estimate the pose of a person from a recording: segment orientations and joint centres, with their uncertainty.
 
-    Joint angles of a person are made of the result by `wepose angles` and `wepose export`.
+    `wepose angles` and `wepose export` compute the joint angles of a person from the result.
 
     A recording of `wepose live` is tracked causally, with the subject and the method of that session, and gives the
     displayed poses again, bit-identical. With --subject or --method it is tracked as any other recording.
 
-    The protocol of Lisini Baldi et al. 2019 is --method smekf --open-loop with a subject of `wepose calibrate
+    To track as Lisini Baldi et al. 2019 do, give --method smekf --open-loop and a subject of `wepose calibrate
     --formulation paper`, which holds lengths and no mounts.
 
     Parameters
@@ -44,8 +44,8 @@ class TrackJob:
         Use a subject whose calibration failed (quality = "fail" in subject.toml), which is refused otherwise.
     model : URDF|TOML|NAME
         Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package, such as
-        whole_body (docs/models.md). A URDF without a table, a robot's say, is a mechanism whose links bear the
-        sensors. Without it the body that the session names, else the upper body.
+        whole_body (docs/models.md). A URDF without such a TOML, as a robot's, is a mechanism: its sensors are named by
+        its links. Without it the body that the session names, else the upper body.
     method : METHOD
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
         and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases), ncf
@@ -54,16 +54,17 @@ class TrackJob:
     causal
         Use only past samples, as `wepose live` does. Poses begin at the end of the start pose.
     open_loop
-        Correct no headings: neither by accelerations of joints, elbows and joined hands, nor by the resets of a live
-        session. Orientations are those of the filter from the start pose on.
+        Correct no headings: neither by joint accelerations, by elbows as hinges and by joined hands, nor by the resets
+        of a live session. Orientations are those of the filter from the start pose on.
     gaps
         Accept gaps of more than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap). Without it such a gap
         is an error.
     covariance
         Write the covariance of each orientation and point too, not only the standard deviations.
     error_budget
-        Print what each part is worth in the standard deviation of each point: soft tissue, sensors with their mounts
-        and start poses, lengths, the shoulder girdle. summary.json and report.html have it in any case.
+        Print the contribution of each source of error to the standard deviation of each point: soft tissue, sensors
+        with their mounts and start poses, lengths, the shoulder girdle. summary.json and report.html have it in any
+        case.
     limits
         Keep joints with one or two axes within the limits of the model.
     torques
@@ -72,7 +73,7 @@ class TrackJob:
     view
         Write view.html, the animation of the motion.
     report
-        Write report.html, which shows diagnostics with what to do, noise, drift, hands and joint angles.
+        Write report.html, which shows diagnostics and what to do about them, noise, drift, hands and joint angles.
     chunk_seconds : SECONDS
         Track in chunks of this length, so that the memory does not grow with the recording (docs/long-recordings.md).
         Without it recordings of 500 MB and more are tracked in chunks of 120 s (smoother: 600 s), others as a whole; 0
@@ -125,7 +126,7 @@ def run_track(
 
     Parameters
     ----------
-    provenance : what the result says made it; None: this job
+    provenance : of the result; None: this job
 
     Raises
     ------
@@ -184,7 +185,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
             from ..angles.torques import pose_torques
 
             torques = pose_torques(tracked)
-        stated = _provenance_of(job, provenance)
+        stated = _collect_provenance(job, provenance)
         write_result(folder, tracked, summary, job.covariance, recording.phases, torques, stated)
     failures: list[Diagnostic] = []
     if job.view or job.report:
@@ -194,7 +195,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
 
 
 def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
-    """In a memory that does not grow with the recording."""
+    """Track in chunks: the memory does not grow with the recording."""
     from ..filters import BEST
     from ..readers.session import SessionReader
     from ..report import write_track_pages
@@ -214,7 +215,7 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
         ):
             writer.add(chunk)
         progress("writing the result", 1.0)
-        summary = writer.finish(reader.phases, _provenance_of(job, provenance))
+        summary = writer.finish(reader.phases, _collect_provenance(job, provenance))
     view_rate_hz = min(30.0, MOST_FRAMES / max(summary.content["duration_s"], 1e-3))
     failures: list[Diagnostic] = []
     if job.view or job.report:
@@ -234,8 +235,8 @@ def _load_subject(job: TrackJob) -> Subject | None:
     return subject
 
 
-def _provenance_of(job: TrackJob, stated: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    """What the result says made it. Collected last: what is wrong with an input is said by what reads it."""
+def _collect_provenance(job: TrackJob, stated: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """The provenance of the result. Collected last, so that an input that is wrong is reported by its reader."""
     from ..writers.provenance import collect_provenance
 
     return collect_provenance("track", field_values(job)) if stated is None else stated

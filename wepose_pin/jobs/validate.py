@@ -37,7 +37,7 @@ class ValidateJob:
         Run at most this many trials of each experiment of simulated people or sensors, instead of ten or twelve. The
         page says so.
     experiment : NAME
-        Run only the experiments whose names begin so, such as "upper body, mild" or BROAD.
+        Run only the experiments whose names begin with this, such as "upper body, mild" or BROAD.
     keep : FILE
         Take the experiments that are not run from the validation.json of an earlier run.
     from_ : FILE

@@ -1,7 +1,7 @@
 """The guided session: from sensors that send to a calibrated subject, as a state machine.
 
-It knows nothing of pages or terminals: `Guide.push` takes samples, `Guide.act` what the person asks for, `Guide.view`
-says what to tell the person. Each step is a class, before the motion in `guide_preparation`, from then on in
+It is independent of pages and terminals: `Guide.push` takes samples, `Guide.act` an action of the person, `Guide.view`
+returns what to tell the person. Each step is a class, before the motion in `guide_preparation`, from then on in
 `guide_motion`; steps can be repeated, and all but the start pose skipped. Times are those of the source's clock.
 """
 
@@ -25,7 +25,7 @@ from .sources.base import Source
 from .state import GuideAction, GuideStep, GuideView, join_names
 
 SILENCE_S = 1.0  # [s] without a sample after which a sensor counts as silent
-GET_READY_S = 8.0  # [s] to let go of the keyboard
+GET_READY_S = 8.0  # [s] to leave the keyboard and stand ready
 
 NEXT = GuideAction("next", "Continue", "n")
 AGAIN = GuideAction("again", "Once more", "a")
@@ -53,6 +53,7 @@ class GuideOptions:
     calibrate : calibrates a recorded file, with lengths [m] that the person measured
     estimate : calibrates the recording so far
     method : of the filter, for the recording's header
+    known : sensor → segment, as in an earlier session
     """
 
     folder: Path
@@ -63,7 +64,7 @@ class GuideOptions:
     calibrate: Callable[[Path, Mapping[str, float]], Calibrated]
     estimate: Callable[[Recording], tuple[Calibration, CalibrationQuality]]
     method: str
-    known: Mapping[str, str] = field(default_factory=dict)  # sensor → segment, of an earlier session
+    known: Mapping[str, str] = field(default_factory=dict)
 
 
 class Guide:
@@ -129,13 +130,13 @@ class Guide:
             for each in postponed:
                 for ticks in self.attempt.push(each):
                     self.step.push_ticks(ticks)
-            self.attempt.log.due()
+            self.attempt.log.flush_if_due()
         elif self.attempt is None:
             self._postponed.clear()
         self.step.update()
 
     def act(self, action: str) -> None:
-        """Do what the person asks for; what the step does not offer is ignored."""
+        """Do what the person asks for; an action that the step does not offer is ignored."""
         if action.startswith("go "):
             name = action.removeprefix("go ")
             index = next((k for k, step in enumerate(self.steps) if step.name == name), self._index)
@@ -216,7 +217,7 @@ class Step:
     records = True  # the attempt goes on recording; else its samples wait for the next step
 
     def __init__(self, guide: Guide) -> None:
-        self.guide, self.reason = guide, ""  # why it is needed once more
+        self.guide, self.reason = guide, ""  # why the person must repeat it
 
     def enter(self) -> None:
         """Begin this step."""

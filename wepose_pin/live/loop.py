@@ -220,7 +220,7 @@ class LiveLoop:
                     break
                 self._process_samples(samples)
                 if self.log is not None:
-                    self.log.due()
+                    self.log.flush_if_due()
                 if not self._handle_keys():
                     break
                 if time.monotonic() >= next_status:

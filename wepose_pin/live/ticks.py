@@ -73,7 +73,7 @@ class TickStream:
                 for ticks in self.synchronizer.iterate_ticks(each):
                     yield ticks
                     if self.log is not None:
-                        self.log.due()
+                        self.log.flush_if_due()
 
     def _begin_ticks(self) -> None:
         sensor, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])

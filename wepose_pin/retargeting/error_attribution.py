@@ -16,7 +16,7 @@ CLAMPED = 1e-3  # [m] by which a target was moved: it was outside the reach
 AT_LIMIT = 0.01  # [rad or m] from a position limit: there an active joint is at its position limit
 CATCH_UP_S = 0.3  # [s] after a joint was too slow in which its error is attributed to that
 CAUSES = ("not measured", "beyond the reach", "self-collision", "joint limit", "too fast", "conflicting tasks")
-_FRAMES, _STARTS, _STEPS = 40, 3, 25
+_SAMPLES, _RANDOM_POSTURES, _STEPS = 40, 3, 25  # of the reachability: samples, start postures of each, steps from each
 _PENETRATION = 4e-3  # [m] into the clearance, above which a posture does not count as reached
 
 
@@ -29,9 +29,9 @@ def attribute_errors(trajectory: Trajectory, arm: int) -> dict[str, float]:
 def find_error_causes(trajectory: Trajectory, arm: int) -> np.ndarray:
     """Return the cause (n,) of the error of a hand, its place in `CAUSES`; -1 where the hand is less than `FAR` off.
 
-    The first that applies: a sensor was lost; the target is beyond the reach; near shapes stop the arm; a joint is at
-    its position limit; a joint is at a limit of velocity, acceleration or jerk, or was so shortly before; none of
-    these: position, orientation and swivel cannot be met together.
+    The first that applies: a sensor was lost; the target is beyond the reach; links close to each other stop the arm; a
+    joint is at its position limit; a joint is at a limit of velocity, acceleration or jerk, or was so shortly before;
+    none of these: position, orientation and swivel cannot be met together.
     """
     robot, run = trajectory.robot, trajectory.run
     joints, target = robot.arms[arm].joints, trajectory.targets[arm]
@@ -53,10 +53,11 @@ def find_error_causes(trajectory: Trajectory, arm: int) -> np.ndarray:
 
 
 def assess_reachability(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Samples (m,), and the distance (m, arms) [m] of each hand from its target that unlimited time would leave.
+    """Return samples (m,), and the distance (m, arms) [m] of each hand from its target that unlimited time would leave.
 
-    The same tasks, joint limits and clearances, without limits of velocity, acceleration and jerk, are solved to rest
-    from several postures: the robot's own, the rest posture, random ones. The search is local: it is an upper bound.
+    The same tasks, joint limits and clearances, without limits of velocity, acceleration and jerk, are solved until the
+    robot rests, from several postures: its own at the sample, the rest posture, random ones. The search is local: the
+    distance is an upper bound.
     """
     robot = trajectory.robot
     n, rng = len(robot.names), np.random.default_rng(0)
@@ -69,15 +70,15 @@ def assess_reachability(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]
         joint_velocity=1e-4,
     )
     controller = QpController(robot, trajectory.collision, 0.01, params, limit_factor=1e4, guarded=False)
-    frames = np.linspace(trajectory.approach_samples, len(trajectory.time) - 1, _FRAMES).astype(int)
-    distance = np.full((len(frames), len(robot.arms)), np.inf)
-    for k, frame in enumerate(frames.tolist()):
+    samples = np.linspace(trajectory.approach_samples, len(trajectory.time) - 1, _SAMPLES).astype(int)
+    distance = np.full((len(samples), len(robot.arms)), np.inf)
+    for k, sample in enumerate(samples.tolist()):
         targets = tuple(
-            HandTarget(path.position[frame], np.zeros(3), path.rotation[frame], np.zeros(3), path.swivel[frame], 1.0)
+            HandTarget(path.position[sample], np.zeros(3), path.rotation[sample], np.zeros(3), path.swivel[sample], 1.0)
             for path in trajectory.targets
         )
         best = np.full(len(robot.arms), np.inf)
-        for u in (trajectory.joint_position[frame], robot.rest, *rng.uniform(*robot.bounds, (_STARTS, n))):
+        for u in (trajectory.joint_position[sample], robot.rest, *rng.uniform(*robot.bounds, (_RANDOM_POSTURES, n))):
             state = JointState.at_rest(u)
             for _ in range(_STEPS):
                 state = controller.step(state, targets)
@@ -92,4 +93,4 @@ def assess_reachability(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]
                 cost = params.position * far**2 + params.orientation * angle**2
                 if cost < best[i]:
                     best[i], distance[k, i] = cost, far
-    return frames, distance
+    return samples, distance

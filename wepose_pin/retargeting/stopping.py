@@ -1,4 +1,4 @@
-"""The stop that every step leaves open: its path, and whether the robot's hulls stay apart along it.
+"""The stop that every step leaves possible: its path, and whether the hulls of the robot's links stay apart on it.
 
 A step is taken only if from the state behind it the robot can stop within its limits, and without self-contact. By
 induction there is always such a stop: that of the step before (as braking trajectories in "provably safe" motion:
@@ -17,9 +17,9 @@ from .collision import CollisionModel
 from .limits import _bound_acceleration, _keeps_bound
 from .robot import Robot
 
-STOP_S = 0.06  # [s] time constant of the last of a velocity; above, joints brake at their limits
-STOP_RISES = 1.5  # of it at least, in times that a joint needs to reach its full acceleration
-STOP_SHARE = 0.02  # of what one step can brake: below it the velocity goes to zero at once
+STOP_S = 0.06  # [s] time constant with which a low velocity decays; at a higher one joints brake at their limits
+STOP_RISES = 1.5  # least time constant, in times that a joint needs to reach its full acceleration
+STOP_SHARE = 0.02  # of the velocity that one step can brake: below it the velocity goes to zero at once
 STATIC_SPEED = 1e-9  # [rad/s or m/s] below it a joint is at rest
 MIN_BRAKING_SHARE = 0.05  # of the acceleration limit, with which a joint brakes that comes to rest with the others
 MAX_STOP_S = 5.0  # [s]; a stop that takes longer counts as none
@@ -41,11 +41,12 @@ class Stop(NamedTuple):
 
 @compiled
 def compute_stop(u, v, a, lower, upper, v_max, a_max, j_max, braking, dt):  # type: ignore[no-untyped-def]
-    """Return positions, velocities, accelerations, largest travel of each step (m, n): joints brake one by one to rest.
+    """Return positions, velocities, accelerations, largest travel of each step (m, n): each joint brakes to rest.
 
-    Each brakes at `braking` (n,), up to `a_max`, and harder where its position limit asks for it. They keep the limits
-    if the present state does, as `compute_acceleration_bounds` has it. Without rows: at rest. The last state is not at
-    rest where that takes longer than `MAX_STOP_S`.
+    `u`, `v`, `a` (n,) are joint position, velocity and acceleration [rad or m, s]; `dt` [s] is a step.
+    Each joint brakes at `braking` (n,), up to `a_max`, and harder where its position limit requires it. They keep the
+    limits if the present state does, in the sense of `compute_acceleration_bounds`. No rows: the robot is at rest. The
+    last state is not at rest where that takes longer than `MAX_STOP_S`.
     """
     n = len(u)
     steps = int(MAX_STOP_S / dt)
@@ -102,7 +103,7 @@ class StopCheck:
         self._data: Any = robot.model.createData()
 
     def find_shortfall(self, distance: np.ndarray, path: np.ndarray, travel: np.ndarray) -> np.ndarray | None:
-        """Return how far (pairs,) [m] pairs come below their least distance at a point of the way; None: nowhere.
+        """Return how far (pairs,) [m] pairs are below their least distance, at one point of the way; None: nowhere.
 
         Parameters
         ----------
@@ -117,7 +118,7 @@ class StopCheck:
         critical = np.flatnonzero(approach[-1] >= distance - collision.least_distance)
         if not len(critical):
             return None
-        # Along the way a pair has come nearer by `approach` at most: its room at both ends of a part covers the part.
+        # Along the way a pair comes nearer by `approach` at most: enough room at both ends of a part covers the part.
         approach = np.vstack([np.zeros(len(critical)), approach[:, critical]])
         room = {0: (distance - collision.least_distance)[critical]}
         parts = [(0, len(path))]

@@ -19,7 +19,7 @@ from .robot import Arm, Robot
 
 REACH_SHARE = 0.95  # of the robot's reach for a straight arm: its elbow stays flexed, far from the singularity
 CLAMP_FROM, CLAMP_TO = 0.95, 0.99  # of the reach: between them a target is clamped smoothly
-SMOOTHING_HZ = 6.0  # voluntary motion of an arm is slower (Winter 2009, 2.2.3)
+SMOOTHING_HZ = 6.0  # [Hz] voluntary motion of an arm is slower (Winter 2009, 2.2.3)
 # [m] of the hand: full speed up to the first, slowest from the second. With mounts stated in the N-pose it is uncertain
 # by some 0.09 m, with calibrated ones by 0.04; beyond that headings drift or sensors are lost.
 STD_GOOD, STD_POOR = 0.10, 0.25
@@ -37,7 +37,7 @@ class HandPath(NamedTuple):
     velocity: np.ndarray  # (n, 3) [m/s]
     rotation: np.ndarray  # (n, 3, 3)
     angular_velocity: np.ndarray  # (n, 3) [rad/s]
-    swivel: np.ndarray  # (n, 3) [m] elbow swivel direction, from the line shoulder-hand to the elbow
+    swivel: np.ndarray  # (n, 3) [m] elbow swivel direction: perpendicular from the line shoulder-hand to the elbow
     unclamped: np.ndarray  # (n, 3) [m] position before it was clamped to the reach
     weight: np.ndarray  # (n,) 0 to 1, from the uncertainty of the hand
     lost: np.ndarray  # (n,) bool: not measured, bridged
@@ -62,7 +62,7 @@ class ArmTargets:
 
 
 def find_person_arm(table: BodyTable, side: str) -> Limb:
-    """The limb of a person that the robot's arm of this side ("left" or "right") follows: the first one there.
+    """The limb of a person that the robot's arm of this side ("left" or "right") follows: the first one of that side.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def compute_arm_targets(
     WrongOption
         A scale or cut-off out of range.
     """
-    check_mapping(scale, smoothing_hz)
+    check_scale_and_smoothing(scale, smoothing_hz)
     time = np.asarray(pose.time, dtype=float)
     if len(time) < 10:
         raise BadData(f"{len(time)} samples in the pose; a motion has at least 10")
@@ -133,7 +133,7 @@ def compute_arm_targets(
     return ArmTargets(time, tuple(hands), slowdown, scales)
 
 
-def check_mapping(scale: float | None, smoothing_hz: float) -> None:
+def check_scale_and_smoothing(scale: float | None, smoothing_hz: float) -> None:
     """Raise `WrongOption` for a scale or cut-off out of range."""
     if scale is not None and not 0.0 < scale < np.inf:
         raise WrongOption("scale", f"{scale:g}", "a number above 0 is needed")
@@ -142,7 +142,7 @@ def check_mapping(scale: float | None, smoothing_hz: float) -> None:
 
 
 def compute_target_reach(robot: Robot, arm: Arm) -> float:
-    """[m] what a straight arm of the person becomes."""
+    """The distance [m] from the robot's shoulder to its hand that a straight arm of the person becomes."""
     reach = robot.map.arms[arm.side].reach
     return REACH_SHARE * arm.reach if reach is None else min(reach, REACH_SHARE * arm.reach)
 
@@ -157,13 +157,16 @@ def clamp_to_reach(offset: np.ndarray, reach: float) -> np.ndarray:
 
 
 def compute_swivel(upper: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Elbow swivel direction (…, 3) [m]: from the line along `offset`, shoulder to hand, to the elbow at `upper`."""
+    """Elbow swivel direction (…, 3) [m]: perpendicular from the line along `offset`, shoulder to hand, to the elbow.
+
+    `upper` is the vector from shoulder to elbow.
+    """
     axis = offset / np.maximum(np.linalg.norm(offset, axis=-1, keepdims=True), 1e-9)
     return upper - axis * np.sum(upper * axis, axis=-1, keepdims=True)
 
 
 def resample_targets(targets: ArmTargets, moments: np.ndarray, clock: np.ndarray) -> ArmTargets:
-    """The targets at `moments` [s] of their own time, which the robot passes at `clock` [s] of its own."""
+    """The targets at the times `moments` [s] of the recording, with velocities on the robot's time `clock` [s]."""
     time, inside = targets.time, np.clip(moments, targets.time[0], targets.time[-1])
     hands = []
     for hand in targets.hands:

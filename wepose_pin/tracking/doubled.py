@@ -28,14 +28,14 @@ from .segments import Oriented
 MOST_DIFFERENCE = float(np.deg2rad(8.0))  # [rad] rms by which soft tissue lets two sensors differ; assumption
 # [s] over which the difference of headings is averaged: long beside soft tissue, short beside a gyroscope's drift
 FOLLOW_S = 30.0
-ALIKE_STD = float(np.deg2rad(1.0))  # [rad] of a sensor whose filter states no covariance
+UNSTATED_STD = float(np.deg2rad(1.0))  # [rad] of a sensor whose filter has no covariance
 E_Z = np.array([0.0, 0.0, 1.0])
 
 Known = tuple[np.ndarray, np.ndarray | None]  # (n, 4) xyzw, and its covariance (n, 3, 3) in W, None: not known
 
 
 class Estimator(Protocol):
-    """What `SegmentEstimator` and `CausalEstimator` are."""
+    """Estimates the segment orientations of one sensor a segment: `SegmentEstimator` or `CausalEstimator`."""
 
     def push(self, chunk: Recording) -> list[Oriented]: ...
 
@@ -64,7 +64,7 @@ class DoubledEstimator:
         return self._fuse(self.first.push(chunk), self._second.push(second))
 
     def finish(self) -> list[Oriented]:
-        """What is left when the last chunk has been pushed."""
+        """Return the samples that are left after the last chunk; as `SegmentEstimator.finish`."""
         return self._fuse(self.first.finish(), self._second.finish())
 
     def _fuse(self, first: list[Oriented], second: list[Oriented]) -> list[Oriented]:
@@ -93,7 +93,7 @@ class DoubledEstimator:
         return fused
 
     def _follow_heading(self, segment: str, a: Known, b: Known, rate_hz: float) -> Known:
-        """Return b with the mean heading of a, and with the covariances of a's heading."""
+        """Return b with the mean heading of a, and with the variance of a's heading."""
         (quat_a, cov_a), (quat_b, cov_b) = a, b
         share = 1.0 - np.exp(-1.0 / (FOLLOW_S * rate_hz))
         difference = rotations.heading(rotations.multiply(quat_b, rotations.conjugate(quat_a)))
@@ -103,23 +103,23 @@ class DoubledEstimator:
         quat = rotations.multiply(rotations.rotation_about(E_Z, -mean), quat_b)
         if cov_a is None or cov_b is None:
             return quat, cov_b
-        covariance = cov_b.copy()
-        covariance[:, 2, :], covariance[:, :, 2] = cov_a[:, 2, :], cov_a[:, :, 2]
-        return quat, covariance
+        to_heading_of_a = np.ones((len(cov_b), 3))
+        to_heading_of_a[:, 2] = np.sqrt(cov_a[:, 2, 2] / cov_b[:, 2, 2])
+        return quat, to_heading_of_a[:, :, None] * cov_b * to_heading_of_a[:, None, :]
 
 
 def fuse_orientations(a: Known, b: Known) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-    """The orientation (n, 4) xyzw between two, its covariance (n, 3, 3) in W, and the angle (n,) [rad] between them.
+    """Return the orientation (n, 4) xyzw between two, its covariance (n, 3, 3), and the angle (n,) [rad] between them.
 
     Parameters
     ----------
-    a, b : with covariance in rad²
+    a, b : `quat_WL` (n, 4) xyzw, and its covariance (n, 3, 3) [rad²] in W, None where it is not known
     """
     (quat_a, cov_a), (quat_b, cov_b) = a, b
     R_a = Rotation.from_quat(quat_a)
     difference = (Rotation.from_quat(quat_b) * R_a.inv()).as_rotvec()  # in W, from a to b
     var_a, var_b = (
-        np.full(len(quat_a), ALIKE_STD**2) if cov is None else np.trace(cov, axis1=1, axis2=2) / 3.0
+        np.full(len(quat_a), UNSTATED_STD**2) if cov is None else np.trace(cov, axis1=1, axis2=2) / 3.0
         for cov in (cov_a, cov_b)
     )
     share = var_a / np.maximum(var_a + var_b, 1e-12)  # of b
@@ -133,7 +133,7 @@ def fuse_orientations(a: Known, b: Known) -> tuple[np.ndarray, np.ndarray | None
 
 
 def rename_mounts(subject: Subject | None, names: Mapping[str, str]) -> Subject | None:
-    """The subject with the mounts of the second sensors, by segment."""
+    """Return the subject with the mounts of the second sensors in place of the first ones, under their segments."""
     if subject is None:
         return None
     new = {

@@ -1,18 +1,19 @@
 """A Kalman filter of heading errors over knots of a recording, and what observes them.
 
-δ_i is the heading error of segment i, on the left in W: R_WL,true = Rz(δ) R_WL. It is a random walk whose step variance
-is the growth of the orientation filter's heading variance, and a rate that changes slowly, by a bias that the
-orientation filter has not found. The heading is that of the filter without its own corrections of the heading
-(`undo_corrections`), so that it does not jump. Where the filter corrects its bias by Δb the rate changes by Δb, and
-what it learned by that is an observation of the rate. Observed are differences of two or more as well:
+δ_i is the heading error of segment i, on the left in W: R_WL,true = Rz(δ_i) R_WL. It changes by a random walk, whose
+step variance is the growth of the orientation filter's heading variance, and by a rate that changes slowly: the bias
+that the orientation filter has not found. The heading is that of the filter without its own corrections of the heading
+(`heading_observations.undo_corrections`), so that it does not jump. Where the filter corrects its bias by Δb the rate
+changes by Δb, and what it learned by that is an observation of the rate. Differences of two or more δ are observed by:
 
 - the acceleration of a joint, which two sensors measure (`joint_accelerations`), with their levers as unknowns;
-- a hinge: the segment below stays in the plane across its axis, n · R_Oᵀ R_M e = 0, with e its long axis;
+- a hinge with the axis n on the segment O: the long axis e of the segment M below stays in the plane across n, so that
+  n · R_WOᵀ R_WM e = 0;
 - ranges of motion: the hinge bends within its range;
 - two points that coincide (`Closure`): palms in a phase `clasp`, or in a clasp that was found.
 
-What tissue, tilted axes and travelling joints add is correlated over seconds to the whole recording. It is part of the
-state, so that a long recording does not average it away.
+Errors by soft tissue, tilted hinge axes and travelling joints are correlated over seconds or over the whole recording.
+They are states, so that a long recording does not average them away.
 """
 
 from __future__ import annotations
@@ -30,30 +31,33 @@ UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has 
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
 MIN_RATE_VAR = 1e-18  # [rad²/s²] so that it can be inverted
 LEAST_INFORMATION = 1e-6  # relative to what a filter knew of its bias, below which a correction tells nothing
-LEAP, USUAL_S = 10.0, 60.0  # times the largest gain of a filter's variance within so long [s], above which it leaps
+# The heading variance of an orientation filter leaps where a knot adds more than this many times the largest recent
+# growth; that is forgotten with a time constant [s].
+LEAP_RATIO, GROWTH_MEMORY_S = 10.0, 60.0
+MISFIT_MEMORY_S = 20.0  # time constant of the mean misfit of a joint's accelerations
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
 _DIFFERENCE = np.array([[1.0, -1.0], [-1.0, 1.0]])
-# Of the angle, levers and forces of a joint by their columns, and those columns that are no lever.
-_BY_JOINT = np.zeros((13, 15))
-_BY_JOINT[0, :3], _BY_JOINT[1:, 3:] = (1.0, -1.0, 1.0), np.eye(12)
-_NO_LEVERS = np.array([0, 1, 2, 6, 7, 8, 12, 13, 14])
+# Jacobian of the angle, levers and forces of a joint by its columns (`HeadingProblem.pair_columns`), and those columns
+# that are no levers.
+_JOINT_JACOBIAN = np.zeros((13, 15))
+_JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(12)
+_WITHOUT_LEVERS = np.array([0, 1, 2, 6, 7, 8, 12, 13, 14])
 
 
-class Step(NamedTuple):
-    """A prediction; (k,) each.
+class KnotChange(NamedTuple):
+    """How headings and their rates change within a knot, by what the orientation filters did; (k,) each.
 
     Parameters
     ----------
-    drift : [rad] by which headings change as the orientation filters correct their biases within the knot
-    heading_var : [rad²] that headings gain beside their rates
-    rate : [rad/s] by which the orientation filters have corrected their biases about the vertical
-    rate_var : [rad²/s²] that rates gain as their sensors turn another axis to the vertical
-    information : [s²/rad²] that the filters' corrections brought about their biases
-    prior_var : [rad²/s²] of these biases without them
-    heading : [rad] by which the filters have corrected their headings
-    unobserved, unobserved_rate : share of the variance of a heading and of its rate, as a filter alone would have them,
-        that is left
+    drift : [rad] change of a heading as its filter corrects the bias within the knot
+    heading_var : [rad²] growth of a heading's variance apart from that by its rate
+    rate : [rad/s] correction of the filter's bias about the vertical
+    rate_var : [rad²/s²] growth of a rate's variance as the sensor turns another axis to the vertical
+    information : [s²/rad²] of the filter's corrections about its bias
+    prior_var : [rad²/s²] of this bias without these corrections
+    heading : [rad] correction of the filter's heading
+    unobserved, unobserved_rate : variance of a heading and of its rate, as a share of that by the filter alone
     """
 
     drift: np.ndarray
@@ -86,25 +90,25 @@ class HeadingFilter:
         std[k : 2 * k] = np.hypot(noise.rate_std, bias_std)
         decay = np.ones(problem.size)
         for i, pair in enumerate(problem.pairs):
-            column = problem.column("joint", i)
+            column = problem.find_column("joint", i)
             std[column] = noise.girdle_std if pair.travels else noise.joint_std
             decay[column] = np.exp(-problem.knot_s / noise.joint_correlation_s)
             if problem.levers_at is None:
-                self.x[problem.lever_columns(i)], std[problem.lever_columns(i)] = pair.levers, pair.lever_std
-        forces = slice(problem.column("force", 0), problem.column("force", 3 * k))
+                self.x[problem.find_lever_columns(i)], std[problem.find_lever_columns(i)] = pair.levers, pair.lever_std
+        forces = slice(problem.find_column("force", 0), problem.find_column("force", 3 * k))
         std[forces], decay[forces] = noise.force_std, np.exp(-problem.knot_s / noise.force_correlation_s)
         for i, hinge in enumerate(problem.hinges):
-            std[problem.column("axis", i)], std[problem.column("tilt", i)] = hinge.axis_std, hinge.tilt_std
-            std[problem.column("twist", i)] = noise.twist_std
-            decay[problem.column("twist", i)] = np.exp(-problem.knot_s / noise.twist_correlation_s)
+            std[problem.find_column("axis", i)], std[problem.find_column("tilt", i)] = hinge.axis_std, hinge.tilt_std
+            std[problem.find_column("twist", i)] = noise.twist_std
+            decay[problem.find_column("twist", i)] = np.exp(-problem.knot_s / noise.twist_correlation_s)
         self.P = np.diag(std**2)
         self._set_start_covariance()
-        self._decay, self._steady = decay, (1.0 - decay**2) * std**2
+        self._decay, self._process_var = decay, (1.0 - decay**2) * std**2
         self._misfit = np.full(len(problem.pairs), noise.acceleration_std**2)  # [m²/s⁴] recent mean of each axis
         self._last = problem.start
         self._last_up: np.ndarray | None = None  # (k, 3) the axis of each segment that was turned to the vertical
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
-        self._usual_gain = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, largest of late
+        self._recent_growth = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, the largest
         self._clasps = ClaspDetector(problem)
         self._closed_before = set[tuple[str, ...]]()  # points that coincided in the last knot
         self.clasps: list[tuple[float, float]] = []  # [s] when points were found to coincide
@@ -118,76 +122,82 @@ class HeadingFilter:
         """Set the covariance of δ = s − ε_z and of the mounts' ε_z after a start pose."""
         k, problem = len(self.problem.names), self.problem
         headings = np.arange(k)
-        mounts = problem.column("mount", 0) + headings
+        mounts = problem.find_column("mount", 0) + headings
         both = np.concatenate([headings, mounts])
         self.P[both, :], self.P[:, both] = 0.0, 0.0
         self.P[headings, headings] = problem.start_var + problem.mount_var
         self.P[mounts, mounts] = problem.mount_var
         self.P[headings, mounts] = self.P[mounts, headings] = -problem.mount_var
 
-    def step(self, knot: Knot) -> Step:
-        """Predict to a knot and update by it; return what the prediction was."""
-        step = self.find_step(knot)
-        self.predict(step)
-        self._learn_from_filters(step)
+    def step(self, knot: Knot) -> KnotChange:
+        """Predict to the end of a knot and update by its observations; return the change of the prediction."""
+        change = self.find_change(knot)
+        self.predict(change)
+        self._learn_from_filters(change)
         for _ in self.update(knot):
             pass
-        return step
+        return change
 
     def step_gradually(self, knot: Knot) -> Iterator[None]:
         """Do as `step`, in parts of a millisecond or two; the state is valid after the last one."""
-        step = self.find_step(knot)
-        self.predict(step)
-        self._learn_from_filters(step)
+        change = self.find_change(knot)
+        self.predict(change)
+        self._learn_from_filters(change)
         yield
         yield from self.update(knot)
 
-    def find_step(self, knot: Knot) -> Step:
-        """Find what the headings have gained in a knot beside their rates, and what is left of these.
+    def find_change(self, knot: Knot) -> KnotChange:
+        """Find how headings and their rates change within a knot.
 
-        The variance of the orientation filter includes its gyroscope's bias, which is a rate here: it counts up to
-        `drift_psd`, and as a whole where samples were lost or the rate was cut off, which make it leap.
+        The heading variance of an orientation filter grows by the bias too, which is a rate here. So its growth counts
+        up to `drift_psd`. As a whole it counts where it leaps: samples were lost, or the gyroscope was saturated.
         """
         knot_s, k = self.problem.knot_s, len(self.problem.names)
         now, last = knot.filters, self._last or knot.filters
         self._last = now
         gained = np.maximum(now.var - last.var, MIN_DRIFT_PSD * knot_s)
         known = np.isfinite(gained)
-        leaps = known & (knot.lost | (gained > LEAP * np.maximum(self._usual_gain, self.problem.drift_psd * knot_s)))
-        self._usual_gain = np.maximum(self._usual_gain * np.exp(-knot_s / USUAL_S), np.where(known, gained, 0.0))
+        usual = np.maximum(self._recent_growth, self.problem.drift_psd * knot_s)
+        leaps = known & (knot.lost | (gained > LEAP_RATIO * usual))
+        remembered = self._recent_growth * np.exp(-knot_s / GROWTH_MEMORY_S)
+        self._recent_growth = np.maximum(remembered, np.where(known, gained, 0.0))
         limited = np.where(leaps, gained, np.minimum(gained, self.problem.drift_psd * knot_s))
         drift_var = np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k))
-        changes = [np.nan_to_num(a - b) for a, b in zip(now.about_vertical, last.about_vertical, strict=True)]
-        change = AboutVertical(*changes)
-        # The rate of the knot's begin is in the prediction; what was corrected since has added up from then on.
-        drift = change.drift - np.nan_to_num(last.about_vertical.rate) * change.seconds
+        differences = [np.nan_to_num(a - b) for a, b in zip(now.about_vertical, last.about_vertical, strict=True)]
+        added = AboutVertical(*differences)
+        # The prediction integrates the rate of the knot's begin; corrections within the knot come on top of it.
+        drift = added.drift - np.nan_to_num(last.about_vertical.rate) * added.seconds
         unobserved = np.diag(self.P)[:k] / (np.nan_to_num(last.var) + self.problem.start_var + self.problem.mount_var)
-        prior_var = self._find_prior_bias_var(now.about_vertical, last.about_vertical, change)
+        prior_var = self._find_prior_bias_var(now.about_vertical, last.about_vertical, added)
         rates, alone = np.diag(self.P)[k : 2 * k], prior_var + self.problem.noise.rate_std**2
-        rate_var = self._find_turn(knot) * np.maximum(alone - rates, 0.0)
-        shares = np.minimum(unobserved, 1.0), np.minimum(rates / alone, 1.0)
-        learned = change.information, prior_var, change.heading, *shares
-        return Step(drift, drift_var, change.rate, rate_var, *learned)
+        return KnotChange(
+            drift=drift,
+            heading_var=drift_var,
+            rate=added.rate,
+            rate_var=self._find_new_axis_share(knot) * np.maximum(alone - rates, 0.0),
+            information=added.information,
+            prior_var=prior_var,
+            heading=added.heading,
+            unobserved=np.minimum(unobserved, 1.0),
+            unobserved_rate=np.minimum(rates / alone, 1.0),
+        )
 
-    def _find_prior_bias_var(self, now: AboutVertical, last: AboutVertical, change: AboutVertical) -> np.ndarray:
+    def _find_prior_bias_var(self, now: AboutVertical, last: AboutVertical, added: AboutVertical) -> np.ndarray:
         """Find the variances (k,) [rad²/s²] of the biases about the present vertical without a knot's corrections.
 
-        A sum of information that says less than the start, the knot before and the correction itself is rounding, or
-        what aged in between.
+        They are at most the largest of those at the start and after the knot before, and the correction's own size:
+        more would be rounding of the sum of information, or the growth of the variance between corrections.
         """
-        most_var = np.fmax.reduce([now.rate_var, last.rate_var, self.problem.rate_std**2, 4.0 * change.rate**2])
+        most_var = np.fmax.reduce([now.rate_var, last.rate_var, self.problem.rate_std**2, 4.0 * added.rate**2])
         most_var = np.maximum(most_var, MIN_RATE_VAR)
         rate_var = np.maximum(now.rate_var, MIN_RATE_VAR)
-        return np.nan_to_num(1.0 / np.maximum(1.0 / rate_var - change.information, 1.0 / most_var))
+        return np.nan_to_num(1.0 / np.maximum(1.0 / rate_var - added.information, 1.0 / most_var))
 
-    def _find_bias_share(self, bias_var: np.ndarray) -> np.ndarray:
-        """Find the share (k,) of the rates' variances that is the biases'; the rest are other causes of drift."""
-        return bias_var / (bias_var + self.problem.noise.rate_std**2)
+    def _find_new_axis_share(self, knot: Knot) -> np.ndarray:
+        """Find the share (k,) of the variance of the bias about the vertical that the bias about the last one leaves.
 
-    def _find_turn(self, knot: Knot) -> np.ndarray:
-        """Find the squared sines (k,) of the angles by which segments have turned another axis to the vertical.
-
-        Zero up to 45°. It is the share of the bias about the new vertical that the one about the last does not tell.
+        It is the squared sine of the angle by which a segment has turned since another of its axes was vertical; zero
+        up to 45°.
         """
         k = len(self.problem.names)
         if not len(knot.quat_WL):
@@ -201,43 +211,46 @@ class HeadingFilter:
         return np.where(is_turned, 1.0 - cosine**2, 0.0)
 
     def advance(self, values: np.ndarray) -> np.ndarray:
-        """Return F v of one knot for v (n,) or (n, m): what lasts decays, and headings turn at their rates."""
+        """Return F v of one knot for v (n,) or (n, m): correlated states decay, headings change by their rates."""
         k = len(self.problem.names)
         advanced = np.asarray((self._decay * values.T).T)
         advanced[:k] += self.problem.knot_s * values[k : 2 * k]
         return advanced
 
-    def predict(self, step: Step) -> None:
+    def predict(self, change: KnotChange) -> None:
+        """Predict state and covariance at the end of the next knot."""
         k = len(self.problem.names)
         self.x = self.advance(self.x)
-        self.x[:k] += step.drift
-        self.x[k : 2 * k] += step.rate
-        self.P = self.advance(self.advance(self.P).T).T + np.diag(self._steady)
-        self.P[np.arange(k), np.arange(k)] += step.heading_var
+        self.x[:k] += change.drift
+        self.x[k : 2 * k] += change.rate
+        self.P = self.advance(self.advance(self.P).T).T + np.diag(self._process_var)
+        self.P[np.arange(k), np.arange(k)] += change.heading_var
         rates = np.arange(k, 2 * k)
-        self.P[rates, rates] += self.problem.noise.rate_change_psd * self.problem.knot_s + step.rate_var
+        self.P[rates, rates] += self.problem.noise.rate_change_psd * self.problem.knot_s + change.rate_var
 
-    def _learn_from_filters(self, step: Step) -> None:
+    def _learn_from_filters(self, change: KnotChange) -> None:
         """Update the rates by what the orientation filters have learned of their biases in a knot.
 
         A filter that knew its bias to the variance p and has corrected it by Δb with the information i has measured,
-        with the variance 1/i, that the rate is now −Δb/(p i). A rate has other parts than the bias (`noise.rate_std`),
-        of which that says nothing. What sets the filters' information is how the person moves where they take it for
-        rest; that is common to the sensors, and all of them together know no more of it than one.
+        with the variance 1/i, that the rate is now −Δb/(p i). A rate has other parts than the bias (`noise.rate_std`);
+        this observes nothing of them. The filters' information has one common limit: how much the person moves while
+        they take it for static. So all of them together know no more than one.
 
         The filter's correction of its heading, which was undone, follows from that as far as the heading was wrong by
-        the bias about the present vertical. The rest is by a bias about an axis that was vertical before, or by the
-        gyroscope's scale; it is believed as far as nothing else has observed the heading, and so with the rate.
+        the bias about the present vertical. The rest comes from a bias about an axis that was vertical before, or from
+        the gyroscope's scale. It is applied as far as nothing else has observed the heading; the same holds for the
+        rate.
         """
-        k, shares = len(step.rate), self._find_bias_share(step.prior_var)
+        k = len(change.rate)
         before = self.x[: 2 * k]
         # What was learned corrects by some √(p² i / (1 + p i)); more is by another axis that is vertical now.
-        known = step.information * step.prior_var
-        is_learned = step.rate**2 * (1.0 + known) < OUTLIER_STDS**2 * step.prior_var * known
+        known = change.information * change.prior_var
+        is_learned = change.rate**2 * (1.0 + known) < OUTLIER_STDS**2 * change.prior_var * known
         at = np.flatnonzero(is_learned & (known > LEAST_INFORMATION))
         if len(at):
-            rates, share, prior_var = k + at, shares[at], step.prior_var[at]
-            correction, var = step.rate[at], 1.0 / step.information[at]
+            rates, prior_var = k + at, change.prior_var[at]
+            share = prior_var / (prior_var + self.problem.noise.rate_std**2)  # of a rate's variance: the bias's
+            correction, var = change.rate[at], 1.0 / change.information[at]
             innovation = -correction * var / prior_var - correction - share * (self.x[rates] - correction)
             by_state = share * self.P[:, rates]
             covariance = share[:, None] * by_state[rates] + np.diag((1.0 - share) * prior_var + var)
@@ -245,9 +258,9 @@ class HeadingFilter:
             gain = np.linalg.solve(covariance, by_state.T).T
             self.P = _symmetric(self.P - gain @ by_state.T)
             self.x = self.x + gain @ innovation
-        rest = np.concatenate([step.heading - step.drift, -step.rate]) - (self.x[: 2 * k] - before)
+        rest = np.concatenate([change.heading - change.drift, -change.rate]) - (self.x[: 2 * k] - before)
         self.x = self.x.copy()
-        self.x[: 2 * k] += np.concatenate([step.unobserved, step.unobserved_rate]) * rest
+        self.x[: 2 * k] += np.concatenate([change.unobserved, change.unobserved_rate]) * rest
 
     def update(self, knot: Knot) -> Iterator[None]:
         """Update by a knot's observations, then by the points that are found to coincide in it; yield between parts."""
@@ -266,13 +279,15 @@ class HeadingFilter:
         k = len(self.problem.names)
         found = self._clasps.find(knot, self.x[:k], self.P[:k, :k])
         yield
-        unsure = self._find_unsure(knot)
+        unreliable = self._find_unreliable(knot)
         self._lost_before = knot.lost
+        if unreliable.any():
+            found = []
         closed = {closure.points for closure in self.problem.closures if closure.holds(knot.time).any()}
-        for points, rows in () if unsure.any() else found:
+        for points, rows in found:
             closed.add(points)
             information, vector = np.zeros_like(P), np.zeros(len(x))
-            weight = rows.weight / self._find_correlation(points, knot)
+            weight = rows.weight / self._count_correlated(points, knot)
             information[:k, :k] = rows.H.T @ (weight[:, None] * rows.H)
             vector[:k] = rows.H.T @ (weight * rows.r)
             self.x = self._fuse(self.x, information, vector)
@@ -284,8 +299,8 @@ class HeadingFilter:
             yield
         self._closed_before = closed
 
-    def _find_correlation(self, points: tuple[str, ...], knot: Knot) -> float:
-        """Find the number of samples of a closure that count as one observation.
+    def _count_correlated(self, points: tuple[str, ...], knot: Knot) -> float:
+        """Count the samples of a closure that are one observation, as their residuals are correlated.
 
         Causally all of a clasp's first knot: a clasp may be shorter than its residuals are correlated.
         """
@@ -294,8 +309,8 @@ class HeadingFilter:
             return float(len(knot.time))
         return max(1.0, self.problem.noise.closure_correlation_s * rate)
 
-    def _find_unsure(self, knot: Knot) -> np.ndarray:
-        """Find (k,) bool the sensors that are lost or were in the last knot."""
+    def _find_unreliable(self, knot: Knot) -> np.ndarray:
+        """Find the sensors (k,) bool that lost samples in this knot or in the last one: their tilt may be wrong."""
         return knot.lost | self._lost_before
 
     def _fuse(self, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -312,19 +327,19 @@ class HeadingFilter:
             if sums is None or not sums.samples:
                 continue
             near, far, joint = problem.pair_columns[i][:3]
-            levers = problem.levers_at[i] if problem.levers_at is not None else x[problem.lever_columns(i)]
-            near_force, far_force = x[problem.force_columns(near)], x[problem.force_columns(far)]
+            levers = problem.levers_at[i] if problem.levers_at is not None else x[problem.find_lever_columns(i)]
+            near_force, far_force = x[problem.find_force_columns(near)], x[problem.find_force_columns(far)]
             near_side, far_side = np.concatenate((levers[:3], near_force)), np.concatenate((levers[3:], far_force))
             JJ, Je, cost = sums.linearize(x[near] - x[far] + x[joint], near_side, far_side)
             misfit = max(cost / (3.0 * sums.samples), self._misfit[i], problem.noise.acceleration_std**2)
             weight = 1.0 / (misfit * max(1.0, problem.noise.acceleration_correlation_s * rate))
-            columns, G = problem.pair_columns[i], _BY_JOINT
+            columns, G = problem.pair_columns[i], _JOINT_JACOBIAN
             if problem.levers_at is not None:
-                columns, G = columns[_NO_LEVERS], G[:, _NO_LEVERS]
+                columns, G = columns[_WITHOUT_LEVERS], G[:, _WITHOUT_LEVERS]
             information[columns[:, None], columns] += weight * G.T @ JJ @ G
             vector[columns] += weight * G.T @ Je
             if last:
-                share = 1.0 - np.exp(-problem.knot_s / 20.0)
+                share = 1.0 - np.exp(-problem.knot_s / MISFIT_MEMORY_S)
                 self._misfit[i] += share * (cost / (3.0 * sums.samples) - self._misfit[i])
 
     def _add_rows(self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Iterator[None]:
@@ -333,10 +348,9 @@ class HeadingFilter:
         k, noise = len(problem.names), problem.noise
         rate = problem.samples_per_knot / problem.knot_s
         R = correct_headings(knot.quat_WL, x)
-        # While a sensor is lost, and while its tilt comes back, its segment is where nobody knows.
-        unsure = self._find_unsure(knot)
+        unreliable = self._find_unreliable(knot)
         for i, hinge in enumerate(problem.hinges):
-            if unsure[hinge.on] or unsure[hinge.moves]:
+            if unreliable[hinge.on] or unreliable[hinge.moves]:
                 continue
             yield
             columns, samples = problem.hinge_columns[i], max(1.0, noise.hinge_correlation_s * rate)
@@ -350,10 +364,10 @@ class HeadingFilter:
             vector[columns[:2]] += beyond @ excess * _DIFFERENCE[0]
         for closure in problem.closures:
             closed = closure.holds(knot.time)
-            if closed.any() and not unsure[closure.gap.segments].any():
+            if closed.any() and not unreliable[closure.gap.segments].any():
                 yield
                 rows = build_gap_rows(R, problem, closure, closed)
-                weight = rows.weight / self._find_correlation(closure.points, knot)
+                weight = rows.weight / self._count_correlated(closure.points, knot)
                 information[:k, :k] += rows.H.T @ (weight[:, None] * rows.H)
                 vector[:k] += rows.H.T @ (weight * rows.r)
 
@@ -369,7 +383,7 @@ class SmoothedHeadings(NamedTuple):
     ----------
     errors, covariance : (m, k) [rad] and (m, k, k) [rad²] of δ
     segment_var : (m, k) [rad²] of the segments' headings, see `HeadingProblem.find_segment_variance`
-    clasps : [s] when points were found to coincide
+    clasps : [s] intervals in which points were found to coincide
     """
 
     errors: np.ndarray
@@ -382,15 +396,15 @@ def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> SmoothedHeadings:
     """Filter and smooth the knots (Rauch, Tung, Striebel 1965)."""
     k = len(problem.names)
     forward = HeadingFilter(problem)
-    filtered, steps = [], []
+    filtered, changes = [], []
     for knot in knots:
-        steps.append(forward.step(knot))
+        changes.append(forward.step(knot))
         filtered.append((forward.x, forward.P))
     x, P = filtered[-1]
     means, covs, segment_vars = [x[:k]], [P[:k, :k]], [problem.find_segment_variance(P)]
     for i in range(len(knots) - 2, -1, -1):
         forward.x, forward.P = filtered[i]
-        forward.predict(steps[i + 1])
+        forward.predict(changes[i + 1])
         gain = np.linalg.solve(forward.P, forward.advance(filtered[i][1])).T
         x = filtered[i][0] + gain @ (x - forward.x)
         P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)

@@ -1,4 +1,8 @@
-"""What there is to observe headings by: joints, hinges, closures, what disturbs them, and the states of the filter."""
+"""The problem of the heading filter: what observes the headings, the noise of that, and the states.
+
+δ (k,) [rad] are the heading errors of the k segments with sensors, on the left in W. Time is cut into intervals of
+equal length, the knots. Headings are observed by joints between two sensors, by hinges and by closures.
+"""
 
 from __future__ import annotations
 
@@ -18,25 +22,31 @@ from .joint_accelerations import JointPair, JointSums
 
 @dataclass(frozen=True)
 class HeadingNoise:
-    """What disturbs headings and their observations; standard deviations, of a person unless said otherwise.
+    """Standard deviations, power spectral densities and correlation times of the heading filter.
+
+    The defaults are those of a person.
 
     Parameters
     ----------
-    drift_psd : [rad²/s] of a heading in motion, beside a rate that changes slowly: scale errors, tissue's wobble
-    rate_std : [rad/s] drift of a heading by other causes than its gyroscope's bias
-    rate_change_psd : [rad²/s³] of its random walk: a sensor warms up under its strap
-    joint_std, girdle_std : [rad] by which the acceleration of a joint is off in heading, as tissue and a travelling
-        shoulder follow the motion; it changes within `joint_correlation_s`
-    acceleration_std : [m/s²] least misfit of two sides of a joint; the recent misfit where that is larger
+    drift_psd : [rad²/s] of the random walk of a heading in motion, in addition to its rate: scale errors, soft tissue
+    rate_std : [rad/s] of the rate at which a heading drifts, by other causes than its gyroscope's bias
+    rate_change_psd : [rad²/s³] of the random walk of that rate: a sensor warms up under its strap
+    joint_std, girdle_std : [rad] of the heading error of a joint's acceleration, and of that of a joint on a girdle:
+        soft tissue and a travelling shoulder follow the motion
+    joint_correlation_s : [s] of these two
+    acceleration_std : [m/s²] least misfit between the accelerations of a joint by its two sensors; the recent misfit
+        where that is larger
     acceleration_correlation_s : [s] of the misfit
-    force_std, force_correlation_s : [m/s²], [s] of a force that turns with a sensor: the tilt that an orientation
-        filter has wrong in motion, a degree, times gravity
-    twist_std, twist_correlation_s : [rad], [s] by which tissue turns a sensor about its segment's long axis
-    hinge_std, hinge_correlation_s : [rad], [s] by which the segment below leaves the plane of a hinge otherwise
-    axis_std, tilt_std : [rad] of a calibrated hinge's axis about the long axis of its segment, and across
-    range_std : [rad] of a hinge's range
-    slip_std : [m] between palms of a clasp that was found: a cup may be between them
-    closure_correlation_s : [s] of residuals of a closure
+    force_std, force_correlation_s : [m/s²], [s] of an error of specific force that is fixed in the sensor's frame: the
+        tilt error of an orientation filter in motion, a degree, times gravity
+    twist_std, twist_correlation_s : [rad], [s] of the rotation of a sensor about its segment's long axis by soft tissue
+    hinge_std, hinge_correlation_s : [rad], [s] of the other errors of the angle between a hinge's plane and the segment
+        below
+    axis_std, tilt_std : [rad] of a calibrated hinge's axis: its rotation about the long axis of the segment above, and
+        about the direction across both
+    range_std : [rad] of the limits of a hinge's range
+    slip_std : [m] of the gap between palms in a clasp that was found: a cup may be between them
+    closure_correlation_s : [s] of the residuals of a closure
     """
 
     drift_psd: float = float(np.deg2rad(0.12) ** 2)
@@ -70,7 +80,17 @@ MECHANISM_NOISE = HeadingNoise(
 
 
 class HingeAxis(NamedTuple):
-    """A hinge of two measured segments; vectors in the frame of `on`, `along` in that of `moves`; stds in [rad]."""
+    """A hinge between two segments with sensors.
+
+    Parameters
+    ----------
+    on, moves : indices of the segment above and of the one below
+    axis, on_along : (3,) unit, the axis and the long axis of `on`, in the frame of `on`
+    along : (3,) unit, the long axis of `moves`, in the frame of `moves`
+    range : [rad] of the angle about the axis from the long axis of `on` to that of `moves`
+    axis_std, tilt_std : [rad] as in `HeadingNoise`
+    std : [rad] of the angle between the hinge's plane and the long axis of `moves`
+    """
 
     joint: str
     on: int
@@ -78,7 +98,7 @@ class HingeAxis(NamedTuple):
     axis: np.ndarray
     on_along: np.ndarray
     along: np.ndarray
-    range: tuple[float, float]  # [rad] of the angle from the long axis of `on` about the axis
+    range: tuple[float, float]
     axis_std: float
     tilt_std: float
     std: float
@@ -92,7 +112,7 @@ class Way(NamedTuple):
     segments : (p,) index of each vector's segment
     vectors : (p, 3) [m] in the frames L of their segments
     by_length : (p, 3, lengths) their derivatives by the lengths of the model
-    girdles : that move the ends: name, sign, index of the vector on whose segment the girdle is
+    girdles : those that move the ends; of each the name, the sign, and the index of the vector on whose segment it is
     """
 
     segments: np.ndarray
@@ -101,7 +121,7 @@ class Way(NamedTuple):
     girdles: tuple[tuple[str, float, int], ...]
 
     @classmethod
-    def of(
+    def from_parts(
         cls,
         model: BodyModel,
         names: Sequence[str],
@@ -109,15 +129,15 @@ class Way(NamedTuple):
         neutral: StartPose,
         girdles: Sequence[tuple[str, float]],
     ) -> Way:
-        """Return the way of `parts`, which are in frames that equal W in `neutral`; `names` are the segments."""
-        parts = [part for part in parts if part.sensor in names]  # what does not turn is left out
+        """Return the way of `parts`, whose frames equal W in the pose `neutral`; `names` are the segments."""
+        parts = [part for part in parts if part.sensor in names]  # the others do not rotate
         lengths = np.array(list(model.lengths.values()))
-        R_LK = [neutral.R_WK[part.sensor].T for part in parts]
+        R_LW = [neutral.R_WK[part.sensor].T for part in parts]
         carriers = [part.sensor for part in parts]
         return cls(
             np.array([names.index(carrier) for carrier in carriers], dtype=int),
-            np.array([R @ part.vector(lengths) for R, part in zip(R_LK, parts, strict=True)]).reshape(-1, 3),
-            np.array([R @ np.array(part.by_length) for R, part in zip(R_LK, parts, strict=True)]),
+            np.array([R @ part.vector(lengths) for R, part in zip(R_LW, parts, strict=True)]).reshape(-1, 3),
+            np.array([R @ np.array(part.by_length) for R, part in zip(R_LW, parts, strict=True)]),
             tuple((name, sign, carriers.index(model.table.girdles[name].on)) for name, sign in girdles),
         )
 
@@ -147,12 +167,12 @@ class Closure(NamedTuple):
 
 
 class FilterHeadings(NamedTuple):
-    """What the orientation filters of k sensors say of their headings after a sample.
+    """What the orientation filters of k sensors know of their headings after a sample.
 
     Parameters
     ----------
-    var : (k,) [rad²]; NaN: the filter has no covariance
-    about_vertical : of (k,) each
+    var : (k,) [rad²] of the heading; NaN: the filter has no covariance
+    about_vertical : (k,) each
     """
 
     var: np.ndarray
@@ -160,28 +180,29 @@ class FilterHeadings(NamedTuple):
 
 
 class Knot(NamedTuple):
-    """The observations of a knot, before headings are corrected."""
+    """The observations of a knot, with uncorrected headings."""
 
     end: float  # [s]
     time: np.ndarray  # (m,) [s] of the samples
     quat_WL: np.ndarray  # (m, k, 4) xyzw
-    joints: tuple[JointSums | None, ...]
+    joints: tuple[JointSums | None, ...]  # of each pair
     filters: FilterHeadings  # at the end
-    lost: np.ndarray  # (k,) bool, whether a sensor has lost a sample
+    lost: np.ndarray  # (k,) bool: the sensor has lost a sample
 
 
 @dataclass(frozen=True)
 class HeadingProblem:
-    """What there is to observe headings by.
+    """What observes the headings of a recording, and how well they are known at the start.
 
     Parameters
     ----------
     names : segments, in the order of δ
-    drift_psd : (k,) [rad²/s] most that a heading gains by what is not a rate that changes slowly
+    knot_s : [s] length of a knot
+    drift_psd : (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate
     rate_std : (k,) [rad/s] of the gyroscopes' biases at the start
     start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
-    start : what the filters say at the end of the start pose; None: as at the end of the first knot
-    levers_at : (pairs, 6) [m] where levers are known; None: they are unknowns
+    start : what the filters know at the end of the start pose; None: as at the end of the first knot
+    levers_at : (pairs, 6) [m] known levers, as `JointPair.levers`; None: they are states
     causal : headings are corrected as samples come; a short clasp then counts as one observation
     """
 
@@ -209,13 +230,13 @@ class HeadingProblem:
 
     @property
     def size(self) -> int:
+        """Number of states."""
         levers = 0 if self.levers_at is not None else 6 * len(self.pairs)
-        return self.kept + levers
+        return self.size_without_levers + levers
 
     @property
-    def kept(self) -> int:
-        """Number of states without levers."""
-        return self.column("force", 3 * len(self.names))
+    def size_without_levers(self) -> int:
+        return self.find_column("force", 3 * len(self.names))
 
     def find_segment_variance(self, P: np.ndarray) -> np.ndarray:
         """Find the variance (k,) [rad²] of the segments' headings near the start pose, in the covariance of the state.
@@ -223,12 +244,12 @@ class HeadingProblem:
         δ begins at s − ε_z, by errors s of the start pose and ε_z of the mount, and grows by the drift; a segment that
         hangs is off by δ + ε_z.
         """
-        k, first = len(self.names), self.column("mount", 0)
+        k, first = len(self.names), self.find_column("mount", 0)
         mounts = slice(first, first + k)
         return np.asarray(np.diag(P)[:k] + np.diag(P)[mounts] + 2.0 * np.diag(P[:k, mounts]))
 
-    def column(self, part: str, index: int) -> int:
-        """Return the column of a state."""
+    def find_column(self, state: str, index: int) -> int:
+        """Find the column of a state; `index` is that of its segment, joint or hinge, of a force 3 times that."""
         k, j, h = len(self.names), len(self.pairs), len(self.hinges)
         first = {
             "heading": 0,
@@ -240,36 +261,36 @@ class HeadingProblem:
             "mount": 2 * k + j + 3 * h,
             "force": 3 * k + j + 3 * h,
         }
-        return first[part] + index
+        return first[state] + index
 
     @cached_property
     def hinge_columns(self) -> list[np.ndarray]:
-        """The columns of each hinge, in the order of `HingeRows.H`."""
+        """The columns of each hinge, in the order of `heading_observations.HingeRows.H`."""
         return [
-            np.array([hinge.moves, hinge.on, *(self.column(part, i) for part in ("axis", "twist", "tilt"))])
+            np.array([hinge.moves, hinge.on, *(self.find_column(state, i) for state in ("axis", "twist", "tilt"))])
             for i, hinge in enumerate(self.hinges)
         ]
 
     @cached_property
     def pair_columns(self) -> list[np.ndarray]:
-        """The columns of each joint: headings of its segments, joint, near lever and force, far lever and force.
+        """The columns (15,) of each joint: headings of its segments, joint, near lever and force, far lever and force.
 
-        Where levers are known, theirs are beyond the state.
+        Where levers are known, the columns of theirs lie beyond the state and are not used.
         """
         columns = []
         for i, pair in enumerate(self.pairs):
             near, far = self.names.index(pair.near), self.names.index(pair.far)
             levers, forces = (
-                np.arange(self.kept + 6 * i, self.kept + 6 * i + 6),
-                (self.force_columns(near), self.force_columns(far)),
+                np.arange(self.size_without_levers + 6 * i, self.size_without_levers + 6 * i + 6),
+                (self.find_force_columns(near), self.find_force_columns(far)),
             )
             sides = (levers[:3], forces[0], levers[3:], forces[1])
-            columns.append(np.concatenate(([near, far, self.column("joint", i)], *sides)))
+            columns.append(np.concatenate(([near, far, self.find_column("joint", i)], *sides)))
         return columns
 
-    def lever_columns(self, pair: int) -> slice:
-        first = self.kept + 6 * pair
+    def find_lever_columns(self, pair: int) -> slice:
+        first = self.size_without_levers + 6 * pair
         return slice(first, first + 6)
 
-    def force_columns(self, segment: int) -> np.ndarray:
-        return self.column("force", 3 * segment) + np.arange(3)
+    def find_force_columns(self, segment: int) -> np.ndarray:
+        return self.find_column("force", 3 * segment) + np.arange(3)

@@ -260,7 +260,7 @@ def _find_closures(recording: Recording | None, segments: Sequence[str], model: 
             first, last = closure.points
             try:
                 gap, *ways = (
-                    Way.of(
+                    Way.from_parts(
                         model,
                         segments,
                         find_parts(model, neutral, segments, ends),
@@ -336,7 +336,7 @@ class HeadingCorrector:
             learn = HeadingFilter(problem)
             for knot in self._knots:
                 learn.step(knot)
-            levers = np.array([learn.x[problem.lever_columns(i)] for i in range(len(problem.pairs))])
+            levers = np.array([learn.x[problem.find_lever_columns(i)] for i in range(len(problem.pairs))])
             problem = replace(problem, levers_at=levers)
         self._smoothed = smooth(problem, self._knots)
         ends = np.array([knot.end for knot in self._knots])

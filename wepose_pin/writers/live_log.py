@@ -74,8 +74,8 @@ class LiveLog:
         self._put_samples()
         self._block(EVENT, json.dumps({"kind": kind, **values}).encode())
 
-    def due(self) -> None:
-        """Write what waits, if it has waited for long."""
+    def flush_if_due(self) -> None:
+        """Write what waits, if it is much or has waited for long."""
         if (
             self._waiting >= FLUSH_SAMPLES
             or len(self._poses) >= FLUSH_SAMPLES

@@ -1,8 +1,8 @@
 """Heading steps where a sensor lost samples between the start pose and the motion.
 
-After a loss a filter recovers the tilt from gravity, but never the heading. So each loss between the start pose and a
-sample is an unknown heading step, which a closure shows. A sensor that is measured only beyond a long loss shows
-nothing of its mount.
+After lost samples a filter recovers the tilt from gravity, but never the heading. So each loss between the start pose
+and a sample is an unknown heading step, which a closure observes. A sensor that is measured only beyond a long loss
+observes nothing of its mount.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from ..recording import OrientationSensor, Recording, format_span
 from ..recording.gaps import find_runs
 
 HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of an unknown heading: the whole circle
-FREE_STD = np.deg2rad(15.0)  # [rad] of a step, above which the heading after it may be any
+FREE_STD = np.deg2rad(15.0)  # [rad] of a step, above which the heading after it is unknown
 TILT_STD = np.deg2rad(5.0)  # [rad] above which the filter has not recovered the tilt
 
 
-class Loss(NamedTuple):
-    """Samples `first` to `last` that one sensor lost, after the start pose or before it."""
+class SampleLoss(NamedTuple):
+    """Samples `first` to `last` that one sensor lost."""
 
     sensor: str
     first: int
     last: int
-    after: bool
+    after: bool  # the start pose; False: before it
     std: float  # [rad] of the heading step
 
     @property
     def free(self) -> bool:
-        """Whether the heading beyond it may be any."""
+        """Whether the heading beyond it is unknown."""
         return self.std > FREE_STD
 
     def beyond(self, samples: np.ndarray) -> np.ndarray:
@@ -43,8 +43,8 @@ class Loss(NamedTuple):
         return samples > self.last if self.after else samples < self.first
 
 
-def find_losses(recording: Recording, start: tuple[float, float], sensors: Collection[str]) -> list[Loss]:
-    """The losses of these sensors except measured orientations; `start` [s] is the start pose."""
+def find_sample_losses(recording: Recording, start: tuple[float, float], sensors: Collection[str]) -> list[SampleLoss]:
+    """The losses of these sensors, without those of measured orientations; `start` [s] is the start pose."""
     begin, losses = recording.span(start).start, []
     for name in sensors:
         sensor = recording.sensors[name]
@@ -53,7 +53,7 @@ def find_losses(recording: Recording, start: tuple[float, float], sensors: Colle
         for first, end in find_runs(sensor.gap):
             seconds = (end - first + 1) / recording.rate_hz
             std = min(HEADING_STD, UNSEEN_RATE_STD * seconds**2 / (seconds + HOLD_S))
-            losses.append(Loss(name, first, end - 1, first >= begin, std))
+            losses.append(SampleLoss(name, first, end - 1, first >= begin, std))
     return losses
 
 
@@ -66,7 +66,7 @@ def find_unknown_tilt(orientation: Orientation, samples: np.ndarray) -> np.ndarr
     return np.trace(cov, axis1=1, axis2=2) - heading_var > 2.0 * TILT_STD**2
 
 
-def mask_connected(losses: Sequence[Loss], samples: np.ndarray) -> np.ndarray:
+def mask_connected(losses: Sequence[SampleLoss], samples: np.ndarray) -> np.ndarray:
     """(n,) bool: none of the losses lies between the start pose and these samples (n,)."""
     apart = np.zeros(len(samples), dtype=bool)
     for loss in losses:
@@ -74,7 +74,7 @@ def mask_connected(losses: Sequence[Loss], samples: np.ndarray) -> np.ndarray:
     return ~apart
 
 
-def group_steps(losses: Sequence[Loss], samples: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+def group_steps(losses: Sequence[SampleLoss], samples: np.ndarray) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
     """Heading steps before samples (n,): the sensor of each, its standard deviation (m,) [rad], beyond (m, n).
 
     Losses of a sensor without a sample between them are one step.
@@ -92,20 +92,20 @@ def group_steps(losses: Sequence[Loss], samples: np.ndarray) -> tuple[tuple[str,
 
 def check_start_pose(
     recording: Recording,
-    losses: Sequence[Loss],
+    losses: Sequence[SampleLoss],
     samples: np.ndarray,
     unknown: Collection[str],
     reference: str,
     min_samples: int,
 ) -> None:
-    """Raises `BadPhase` where the motion does not show a mount, since the sensor or the reference lost samples before.
+    """Raise `BadPhase` where lost samples of its sensor or the reference keep the motion from determining a mount.
 
     Parameters
     ----------
     samples : (n,) of the motion
     unknown : sensors of the chain whose mount is not known
     reference : the sensor that faces x of W in the start pose
-    min_samples : at which the sensor and the reference must be connected with the start pose
+    min_samples : least number of samples before which neither the sensor nor the reference lost its heading
     """
     for name in unknown:
         between = [loss for loss in losses if loss.sensor in (name, reference) and loss.free]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import calibrate
 from wepose_pin.calibration.lengths import Calibration
-from wepose_pin.calibration.losses import Loss, find_losses, group_steps, mask_connected
+from wepose_pin.calibration.sample_losses import SampleLoss, find_sample_losses, group_steps, mask_connected
 from wepose_pin.errors import BadPhase
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import NOISE_FREE, Simulation, simulate, simulate_person
@@ -81,7 +81,7 @@ def test_what_lies_beyond_a_loss() -> None:
     for first, last in ((2, 9), (start.stop + 100, start.stop + 399), (start.stop + 420, start.stop + 425)):
         gap[first : last + 1] = True
     sensors = {**recording.sensors, "torso": replace(sensor, gap=gap)}
-    early, long, short = losses = find_losses(
+    early, long, short = losses = find_sample_losses(
         replace(recording, sensors=sensors), recording.phases["start"][0], ("torso", "left_forearm")
     )
     assert [loss.after for loss in losses] == [False, True, True]
@@ -101,7 +101,7 @@ def test_what_lies_beyond_a_loss() -> None:
 
 def test_nothing_lost_is_no_step() -> None:
     assert (
-        find_losses(
+        find_sample_losses(
             Recording("none", np.arange(3.0), 1.0, {"torso": ImuSensor(np.zeros((3, 3)), np.zeros((3, 3)))}),
             (0.0, 1.0),
             ("torso",),
@@ -111,4 +111,4 @@ def test_nothing_lost_is_no_step() -> None:
     names, std, beyond = group_steps([], np.arange(4))
     assert (names, len(std), beyond.shape) == ((), 0, (0, 4))
     assert mask_connected([], np.arange(2)).all()
-    assert not mask_connected([Loss("torso", 1, 2, True, 1.0)], np.array([3])).any()
+    assert not mask_connected([SampleLoss("torso", 1, 2, True, 1.0)], np.array([3])).any()
