@@ -35,7 +35,7 @@ from wepose_pin.simulation import (
 )
 from wepose_pin.simulation.girdle import Girdle, compute_girdle
 from wepose_pin.simulation.motion import SIDES, Flaws
-from wepose_pin.simulation.people import START_POSE, Elbow, StartPose
+from wepose_pin.simulation.people import START_POSE, Elbow, StartPoseOffsets
 from wepose_pin.simulation.signals import Process, RandomWalk, integrate_pulse, integrate_step, make_pulse, make_step
 from wepose_pin.simulation.soft_tissue import GAINS, RANDOM_DEG, JointRotations, SoftTissue, lost_twist
 from wepose_pin.simulation.subject import spawn_streams
@@ -311,7 +311,7 @@ def test_wrists_bend(body: Simulation) -> None:
 
 
 def test_start_poses() -> None:
-    poses = [StartPose(PEOPLE_PRESET, spawn_streams(seed), SIDES) for seed in range(500)]
+    poses = [StartPoseOffsets(PEOPLE_PRESET, spawn_streams(seed), SIDES) for seed in range(500)]
     arms = np.array([pose.upper_arm["left"] for pose in poses])
     np.testing.assert_allclose(np.rad2deg(arms.mean(axis=0)), (8.0, 0.0, -5.0), atol=1.2)
     np.testing.assert_allclose(np.rad2deg(arms.std(axis=0)), (4.0, 5.0, 12.0), rtol=0.1)

@@ -19,7 +19,7 @@ from ..errors import BadOption
 from ..rotations import compose, log, quat_from_matrix, turn_about
 from .girdle import Girdle
 from .imperfections import IDEAL_PRESET, Imperfections
-from .people import Elbow, StartPose, Wrists
+from .people import Elbow, StartPoseOffsets, Wrists
 from .signals import Process, Sway, Wander, integrate_pulse, make_pulse, make_step
 
 SIDES = {"left": 1.0, "right": -1.0}  # y of the side in W
@@ -102,7 +102,7 @@ class Flaws:
         self.girdle = Girdle(sizes, rngs, shoulder_width)
         self.elbow_joint = Elbow(sizes, rngs)
         self.wrists = Wrists(sizes, rngs)
-        self.start_pose = StartPose(sizes, rngs, SIDES)
+        self.start_pose = StartPoseOffsets(sizes, rngs, SIDES)
         self.tilt = Process(rngs["sway_tilt"], _TILT_S, 2)
         self.slip = [Wander(rngs["palm_slip"]) for _ in range(3)]
         self.shoulder = {}  # side -> (3,) [m] in T at 90 deg of elevation

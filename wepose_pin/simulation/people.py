@@ -46,8 +46,8 @@ _WRIST_SHARE = (0.8, 0.6)  # of the hands' distance from the chest, and of a wan
 _WRIST_S = 2.0  # correlation time of the wandering, assumption
 
 
-class StartPose:
-    """One person's offsets in the start pose; rotation vectors [rad] of torso and upper arms, angles of the elbows."""
+class StartPoseOffsets:
+    """One person's offsets from the start pose: rotation vectors [rad] of torso and upper arms, angles of elbows."""
 
     def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], sides: Mapping[str, float]):
         trunk = [name for name in START_POSE if name.startswith(("torso", "head"))]

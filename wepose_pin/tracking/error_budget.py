@@ -1,7 +1,7 @@
-"""The error budget: what each part is worth in the standard deviation of each point.
+"""The error budget: the contribution of each source of error to the standard deviation of each point.
 
-The parts add up in variance. They are independent of one another but for lengths and girdles, whose correlation goes to
-the lengths.
+The contributions add up in variance. They are independent of one another but for lengths and girdles, whose
+correlation goes to the lengths.
 """
 
 from __future__ import annotations
