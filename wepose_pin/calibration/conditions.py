@@ -21,6 +21,7 @@ from ..model.reaches import UNIVERSE
 from .protocols import Axis, Closure, Direction, Protocol
 
 Vector = tuple[float, float, float]
+ZERO_LENGTH = 1e-12  # [m] below which a vector is zero; its derivatives by the lengths alike
 
 
 class Part(NamedTuple):
@@ -226,7 +227,7 @@ def find_parts(
             B, c = links.get(link, (np.zeros((3, lengths)), np.zeros(3)))
             links[link] = B + sign * by_length, c + sign * constant
     for link, (by_length, constant) in links.items():
-        if not (np.any(np.abs(by_length) > 1e-12) or np.any(np.abs(constant) > 1e-12)):
+        if not (np.any(np.abs(by_length) > ZERO_LENGTH) or np.any(np.abs(constant) > ZERO_LENGTH)):
             continue
         carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
         if carrier is None:
@@ -247,7 +248,7 @@ def find_parts(
     parts = []
     for carrier in sorted(sums, key=order.index):
         B, c = sums[carrier]
-        if np.any(np.abs(B) > 1e-12) or np.any(np.abs(c) > 1e-12):
+        if np.any(np.abs(B) > ZERO_LENGTH) or np.any(np.abs(c) > ZERO_LENGTH):
             x, y, z = (float(v) for v in c)
             parts.append(Part(carrier, tuple(tuple(row) for row in B.tolist()), (x, y, z)))
     return tuple(parts)
@@ -302,7 +303,7 @@ def find_measured_lengths(protocol: Protocol, model: BodyModel) -> tuple[str, ..
 
 def _find_lengths_in(model: BodyModel, by_length: np.ndarray) -> list[str]:
     """The lengths on which a vector with these derivatives (3, lengths) depends."""
-    return [name for name, column in zip(model.lengths, by_length.T, strict=True) if np.abs(column).max() > 1e-12]
+    return [name for name, column in zip(model.lengths, by_length.T, strict=True) if np.abs(column).max() > ZERO_LENGTH]
 
 
 def find_segments(protocol: Protocol, model: BodyModel) -> frozenset[str]:
@@ -336,7 +337,7 @@ def group_lengths(constraints: Collection[Constraint], lengths: Collection[str])
     groups: dict[str, dict[str, None]] = {}
     for loop in constraints:
         for part in loop.parts if isinstance(loop, Loop) else ():
-            moved = np.abs(np.array(part.by_length)).max(axis=0) > 1e-12
+            moved = np.abs(np.array(part.by_length)).max(axis=0) > ZERO_LENGTH
             names = [name for name, moves in zip(lengths, moved, strict=True) if moves]
             groups.setdefault(part.sensor, {}).update(dict.fromkeys(names))
     return {sensor: tuple(names) for sensor, names in groups.items() if names}

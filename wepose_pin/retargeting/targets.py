@@ -108,7 +108,7 @@ def compute_arm_targets(
         raise BadData(f"{len(time)} samples in the pose; a motion has at least 10")
     table = table or load_table()
     _check_arms(pose, robot, table)
-    R_BT = Rotation.from_matrix(robot.R_BT)
+    R_BT = Rotation.from_matrix(robot.R_BT)  # T: the segment that carries the arms
     hands, scales, slowdown = [], {}, np.ones(len(time))
     for arm in robot.arms:
         side, limb = arm.side, find_person_arm(table, arm.side)
@@ -176,7 +176,7 @@ def resample_targets(targets: ArmTargets, moments: np.ndarray, clock: np.ndarray
         rotation = Slerp(time, Rotation.from_matrix(hand.rotation))(inside).as_matrix()
         weight = np.interp(moments, time, hand.weight)
         lost = np.interp(moments, time, hand.lost.astype(float)) > 0.5
-        path = HandPath(position, position, rotation, position, swivel, unclamped, weight, lost)
+        path = HandPath(position, position, rotation, position, swivel, unclamped, weight, lost)  # without velocities
         hands.append(differentiate(path, clock))
     return replace(targets, time=moments, hands=tuple(hands), slowdown=np.interp(moments, time, targets.slowdown))
 
@@ -222,7 +222,7 @@ def _smooth(measured: _MeasuredArm, arm: Arm, smoothing_hz: float) -> HandPath:
     position, unclamped = arm.shoulder + clamp_to_reach(offset, arm.reach), arm.shoulder + offset
     swivel = compute_swivel(upper, offset)
     path = HandPath(position, position, rotation.as_matrix(), position, swivel, unclamped, weight, ~known)
-    return differentiate(path, time)
+    return differentiate(path, time)  # fills in the velocities
 
 
 def _nearest_rotations(matrices: np.ndarray) -> np.ndarray:
