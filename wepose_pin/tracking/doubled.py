@@ -15,11 +15,11 @@ from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..alignment import SegmentOrientations
+from ..compilation import kernel
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..recording import Recording
 from ..subject import Subject, mount_rows
@@ -97,15 +97,24 @@ class DoubledEstimator:
         (quat_a, cov_a), (quat_b, cov_b) = a, b
         share = 1.0 - np.exp(-1.0 / (FOLLOW_S * rate_hz))
         difference = rotations.heading(rotations.multiply(quat_b, rotations.conjugate(quat_a)))
-        before = [(1.0 - share) * self._heading[segment]]
-        mean, _ = lfilter([share], [1.0, share - 1.0], difference, zi=before)
-        self._heading[segment] = float(mean[-1])
+        mean = np.empty(len(difference))
+        self._heading[segment] = _average_angle(difference, share, self._heading[segment], mean)
         quat = rotations.multiply(rotations.rotation_about(E_Z, -mean), quat_b)
         if cov_a is None or cov_b is None:
             return quat, cov_b
         to_heading_of_a = np.ones((len(cov_b), 3))
         to_heading_of_a[:, 2] = np.sqrt(cov_a[:, 2, 2] / cov_b[:, 2, 2])
         return quat, to_heading_of_a[:, :, None] * cov_b * to_heading_of_a[:, None, :]
+
+
+@kernel
+def _average_angle(angle, share, mean, means):  # type: ignore[no-untyped-def]
+    """Fill `means` (n,) with the exponential mean of angles (n,) [rad] since `mean`; return the last one."""
+    for n in range(len(angle)):
+        off = angle[n] - mean
+        mean += share * (off - 2.0 * np.pi * np.round(off / (2.0 * np.pi)))
+        means[n] = mean
+    return mean
 
 
 def fuse_orientations(a: Known, b: Known) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
