@@ -42,8 +42,10 @@ product = inlined(_product)
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Products of quaternions (..., 4) xyzw; on 60 000 ten times as fast as SciPy's."""
-    parts = [quat[..., k] for quat in (a, b) for k in range(4)]  # `np.moveaxis` takes half of the time of a few
-    return np.stack(_product(*parts), axis=-1)  # type: ignore[no-untyped-call]
+    parts = _product(*(quat[..., k] for quat in (a, b) for k in range(4)))  # type: ignore[no-untyped-call]
+    out = np.empty((*parts[0].shape, 4))  # `np.stack` takes half of the time of a few
+    out[..., 0], out[..., 1], out[..., 2], out[..., 3] = parts
+    return out
 
 
 def conjugate(quat: np.ndarray) -> np.ndarray:

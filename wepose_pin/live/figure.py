@@ -64,11 +64,28 @@ class Figure(NamedTuple):
     quat_WB: np.ndarray  # (23, 4) xyzw; B equals W in the T-pose
 
 
+class _Completed(NamedTuple):
+    info: StreamInfo
+    pose: LivePose
+    figure: Figure
+
+
+_newest: _Completed | None = None  # two outputs at the same rate ask for the figure of the same pose
+
+
 def complete_figure(info: StreamInfo, pose: LivePose) -> Figure:
-    """Return the whole figure of a pose."""
+    """Return the whole figure of a pose; that of the newest pose is made once for all outputs."""
+    global _newest
+    if _newest is None or _newest.pose is not pose or _newest.info is not info:
+        _newest = _Completed(info, pose, _complete_figure(info, pose))
+    return _newest.figure
+
+
+def _complete_figure(info: StreamInfo, pose: LivePose) -> Figure:
     quat_WL = _orient_segments(dict(zip(info.segments, pose.quat_WL, strict=True)))
     R_WL = dict(zip(SEGMENTS, Rotation.from_quat(quat_WL).as_matrix(), strict=True))
-    points = {name: pose.points[k] for k, name in enumerate(info.points) if np.isfinite(pose.points[k]).all()}
+    known = np.isfinite(pose.points).all(axis=1)
+    points = {name: pose.points[k] for k, name in enumerate(info.points) if known[k]}
     soles = [points[name][2] for name in _SOLES if name in points]
     root = np.array([0.0, 0.0, -min(soles) if len(soles) == len(_SOLES) else HIP_Z])
     shoulders = {

@@ -84,7 +84,7 @@ class Server:
         self.port = int(self._socket.getsockname()[1])
         self.url = f"http://{name_host(host)}:{self.port}/" + (f"?token={self.token}" if self.token else "")
         self._loop = asyncio.new_event_loop()
-        self._end = asyncio.Event()
+        self._closing = False
         self._thread = threading.Thread(target=self._run, name="live page", daemon=True)
 
     def set_page(self, options: ServerOptions, encoder: PoseEncoder) -> None:
@@ -100,7 +100,7 @@ class Server:
 
     def close(self) -> None:
         if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._end.set)
+            self._closing = True
             self._thread.join()
 
     def _run(self) -> None:
@@ -118,13 +118,10 @@ class Server:
         server = HTTPServer(_build_application(self), max_header_size=16384)
         server.add_socket(self._socket)
         due = self._loop.time()
-        while not self._end.is_set():
+        while not self._closing:
             self._send_newest()
             due = max(due + FRAME_S, self._loop.time())
-            try:
-                await asyncio.wait_for(self._end.wait(), max(due - self._loop.time(), 0.001))
-            except TimeoutError:
-                continue
+            await asyncio.sleep(max(due - self._loop.time(), 0.001))
         server.stop()
         for client in list(self._clients):
             client.say_goodbye(self.status)

@@ -75,14 +75,14 @@ def encode_bundles(figure: Figure, time_s: float) -> list[bytes]:
 def _list_messages(figure: Figure, time_s: float) -> Iterator[bytes]:
     yield encode_message("/VMC/Ext/OK", 1)
     yield encode_message("/VMC/Ext/T", float(time_s))
-    yield encode_message("/VMC/Ext/Root/Pos", "root", *(0.0,) * 6, 1.0)
+    yield _ROOT
     R_WB = Rotation.from_quat(figure.quat_WB)
     R_above = R_WB[_ABOVE].inv()
     position = R_above.apply(figure.position[_AT] - figure.position[_ABOVE])
     quat = (R_above * R_WB[_AT]).as_quat()
     position[0], quat[0] = figure.position[_AT[0]], figure.quat_WB[_AT[0]]  # of the hips, in W
-    for bone, numbers in zip(BONES, to_unity(position, quat).tolist(), strict=True):
-        yield encode_message("/VMC/Ext/Bone/Pos", bone, *numbers)
+    for head, numbers in zip(_BONE_HEADS, to_unity(position, quat).tolist(), strict=True):
+        yield head + _BONE_NUMBERS.pack(*numbers)
 
 
 def to_unity(position: np.ndarray, quat: np.ndarray) -> np.ndarray:
@@ -109,3 +109,9 @@ def _pad(text: str) -> bytes:
     """Return a text with its closing zeros, a multiple of four bytes."""
     data = text.encode("utf-8") + b"\0"
     return data + b"\0" * (-len(data) % 4)
+
+
+_BONE_NUMBERS = struct.Struct(">7f")  # position x, y, z [m], quaternion x, y, z, w
+# What stays the same in the messages of the bones, and that of the root.
+_BONE_HEADS = [encode_message("/VMC/Ext/Bone/Pos", bone, *(0.0,) * 7)[: -_BONE_NUMBERS.size] for bone in BONES]
+_ROOT = encode_message("/VMC/Ext/Root/Pos", "root", *(0.0,) * 6, 1.0)

@@ -93,9 +93,10 @@ def list_numbers(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
 
 def order_arrivals(samples: Sequence[Samples], sensors: Sequence[str]) -> Arrivals:
     """Merge the samples of one read in order of time; the order in which sensors were read has no meaning."""
-    which = np.repeat([sensors.index(s.sensor) for s in samples], [len(s.time) for s in samples]).astype(np.uint8)
+    sensor = np.array([sensors.index(s.sensor) for s in samples], dtype=np.uint8)
+    which = sensor.repeat([len(s.time) for s in samples])
     time, gyro_S, accel_S = (np.concatenate(column, dtype=float) for column in tuple(zip(*samples, strict=True))[1:])
-    if len(samples) > 1:
+    if len(samples) > 1 and not (time[1:] >= time[:-1]).all():
         order = np.argsort(time, kind="stable")
         return Arrivals(which[order], time[order], gyro_S[order], accel_S[order])
     return Arrivals(which, time, gyro_S, accel_S)

@@ -65,32 +65,30 @@ class CollisionModel:
             self.clearance > 0.0, LEAST_SHARE * self.clearance, self.clearance - OVERLAP
         )  # (pairs,) [m]
         self.levers = self._compute_levers(self._centre, radius)
+        self._none = NearPairs(np.empty(0, dtype=int), np.empty(0), np.empty((0, robot.model.nv)), np.empty(0))
         self._viewed: Any = None
         self._rotations: list[np.ndarray] = []
         self._translations: list[np.ndarray] = []
 
     def find_near_pairs(self, data: Any) -> NearPairs:
         """Pairs within `NEAR`; `data` of the model holds joint placements and Jacobians."""
-        none = NearPairs(np.empty(0, dtype=int), np.empty(0), np.empty((0, self.robot.model.nv)), np.empty(0))
         if not len(self.pairs):
-            return none
+            return self._none
         if data is not self._viewed:  # views into Pinocchio's memory: to create them costs more than all the rest
             self._viewed = data
             self._rotations = [placement.rotation for placement in data.oMi]
             self._translations = [placement.translation for placement in data.oMi]
         R, p = np.array(self._rotations), np.array(self._translations)
-        centre = np.einsum("kij,kj->ki", R[self._joint], self._centre) + p[self._joint]
-        gap = centre[self._first] - centre[self._second]
-        close = np.einsum("ki,ki->k", gap, gap) < self._range**2
+        close = _find_close(R, p, self._joint, self._centre, self._first, self._second, self._range)
         if not close.any():
-            return none
+            return self._none
         self._activate(close)
         pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
         pin.computeDistances(self.hulls, self.data)
         results = self.data.distanceResults
         near = [(k, result) for k in np.flatnonzero(close).tolist() if (result := results[k]).min_distance < NEAR]
         if not near:
-            return none
+            return self._none
         indices = np.array([k for k, _ in near])
         distance = np.array([result.min_distance for _, result in near])
         a = np.concatenate([result.getNearestPoint1() for _, result in near]).reshape(-1, 3)
@@ -143,6 +141,28 @@ class CollisionModel:
                     joint = model.parents[joint]
         common = (levers[0] > 0.0) & (levers[1] > 0.0)  # carries both shapes
         return np.where(common, 0.0, levers.sum(axis=0)) @ moves
+
+
+@compiled
+def _find_close(R, p, joint, centre, first, second, reach):  # type: ignore[no-untyped-def]
+    """(pairs,) bool: the spheres around two shapes overlap; `reach` (pairs,) [m] is the sum of both radii.
+
+    `R` (njoints, 3, 3) and `p` (njoints, 3) place the joints, `centre` (shapes, 3) is that of a sphere in its `joint`'s
+    frame.
+    """
+    placed = np.empty(centre.shape)
+    for k in range(len(centre)):
+        for i in range(3):
+            placed[k, i] = p[joint[k], i]
+            for j in range(3):
+                placed[k, i] += R[joint[k], i, j] * centre[k, j]
+    close = np.empty(len(first), dtype=np.bool_)
+    for k in range(len(first)):
+        square = 0.0
+        for i in range(3):
+            square += (placed[first[k], i] - placed[second[k], i]) ** 2
+        close[k] = square < reach[k] ** 2
+    return close
 
 
 @compiled

@@ -197,7 +197,7 @@ class QpController:
         for arm, target in zip(self._arms, targets, strict=True):
             self.counts.singular += arm.add_to_objective(H, f, target, self._kernel_params, dt, state.velocity)
         velocity_mid = _predict_mid_velocity(state, dt)
-        H[np.diag_indices(n)] += params.posture + params.joint_velocity + params.joint_velocity_change
+        H.flat[:: n + 1] += params.posture + params.joint_velocity + params.joint_velocity_change
         reference = self.posture_reference or PostureReference(robot.rest, 0.0)
         f += params.posture * (params.posture_gain * (reference.position - state.position) + reference.velocity)
         f += params.joint_velocity_change * (velocity_mid + dt * state.acceleration)

@@ -231,15 +231,13 @@ class ArmObserver:
         self, quat_WL: np.ndarray, points: np.ndarray, std: np.ndarray, lost: np.ndarray
     ) -> list[ArmObservation] | None:
         """The arms at one moment; None where a value of them is NaN."""
-        for rows, own in zip(self._rows, self._points, strict=True):
-            quat = quat_WL[rows]
-            if not (np.isfinite(points[own]).all() and np.isfinite(quat).all() and quat.any(axis=1).all()):
+        arms = [(quat_WL[rows], points[own]) for rows, own in zip(self._rows, self._points, strict=True)]
+        for quat, p in arms:
+            if not (np.isfinite(p).all() and np.isfinite(quat).all() and quat.any(axis=1).all()):
                 return None
         if not self.scales:
-            self.scales = [self._compute_scale(arm, points[self._points[i]]) for i, arm in enumerate(self._robot.arms)]
-        return [
-            self._observe_arm(i, quat_WL[rows], points[self._points[i]], std, lost) for i, rows in enumerate(self._rows)
-        ]
+            self.scales = [self._compute_scale(arm, p) for arm, (_, p) in zip(self._robot.arms, arms, strict=True)]
+        return [self._observe_arm(i, quat, p, std, lost) for i, (quat, p) in enumerate(arms)]
 
     def _observe_arm(
         self, i: int, quat: np.ndarray, p: np.ndarray, std: np.ndarray, lost: np.ndarray
@@ -263,7 +261,7 @@ class ArmObserver:
         the trunk. The covariance of a segment is known here only as its mean over the axes.
         """
         base, upper, fore, hand = self._rows[i]
-        links = np.diff(p, axis=0)
+        links = p[1:] - p[:-1]
         levers = {base: p[3] - p[0], upper: links[0], fore: links[1] if hand != fore else p[3] - p[1]}
         levers |= {} if hand == fore else {hand: links[2]}
         variance = sum(2.0 * std[row] ** 2 * (lever @ lever) for row, lever in levers.items())
