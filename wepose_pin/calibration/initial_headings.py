@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from ..model.reaches import UNIVERSE
 from .conditions import Constraint, Level, Loop, Part, Pointing
 from .least_squares import Observations
+from .sobol import list_sobol_points
 
 STARTS, NEARER = 256, 24  # starts, and how many of the best continue after some rounds
 MINIMA, MOST_DISTINCT = 64, 12  # as `NEARER` for a search of all minima, and how many of these at most
@@ -208,8 +209,6 @@ def _find_minima(
     observations: Observations, known_x: np.ndarray, known: Mapping[str, float], nearer: int
 ) -> np.ndarray:
     """Headings and log sizes (`nearer`, 2 m) at the minima that the best of many starts reach, the lowest first."""
-    from scipy.stats import qmc  # takes half a second to load, and is seldom needed
-
     sensors, layout = observations.layout.sensors, observations.layout
     m = len(sensors)
     # Of each way of a closure: it, Q (m, n, 3, 3), u (m, 3) each sensor's part, what does not move (3,), or less the
@@ -238,7 +237,7 @@ def _find_minima(
     is_known = np.array([name in known for name in sensors])
     center = np.array([known.get(name, 0.0) for name in sensors] + [0.0] * m)
     prior = np.array([KNOWN_STD**-2 if k else 0.0 for k in is_known] + [SIZE_STD**-2] * m)
-    starts = 2.0 * np.pi * qmc.Sobol(m, scramble=False).random(STARTS)
+    starts = 2.0 * np.pi * list_sobol_points(m, STARTS)
     x = np.column_stack([np.where(is_known, center[:m], starts), np.zeros((STARTS, m))])
     x, cost = _descend(x, center, prior, closure_residuals, FIRST_ROUNDS)
     x = x[np.argsort(cost)[:nearer]]

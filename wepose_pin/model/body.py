@@ -137,7 +137,7 @@ class BodyModel:
             diagnostics.append(Diagnostic("model-torso-fixed", WARNING, name, facts=facts))
         return tuple(diagnostics)
 
-    @property
+    @cached_property
     def visuals(self) -> list[Visual]:
         """The visuals of all links."""
         return _visuals.visuals(self.robot)
