@@ -85,6 +85,18 @@ def test_the_way_to_rest_is_as_clear_as_a_dense_search_finds(arm: Robot) -> None
     assert 5 < refused < 50
 
 
+def test_near_pairs_are_all_that_are_near(arm: Robot) -> None:
+    collision, data = CollisionModel(arm), arm.model.createData()
+    rng, count = np.random.default_rng(2), 0
+    for _ in range(200):
+        pin.computeJointJacobians(arm.model, data, arm.configuration(rng.uniform(*arm.bounds)))
+        near = collision.find_near_pairs(data)
+        distances = collision.compute_distances(data, np.arange(len(collision.pairs)))
+        np.testing.assert_array_equal(near.pairs, np.flatnonzero(distances < NEAR))
+        count += len(near.pairs)
+    assert 100 < count < 500
+
+
 def pushed(seconds: float, hz: float) -> Pose:
     """A hand that goes through the torso and out again, faster than any robot can follow."""
     pose = person(seconds, flexion=80.0, swing=10.0)
