@@ -208,7 +208,7 @@ def test_the_result_is_there_when_the_page_is_stopped(
     ("broken", "left"),
     [
         ("wepose_pin.report.calibration.draw_lengths", {"report.html"}),
-        ("wepose_pin.report.calibration.track", {"report.html"}),
+        ("wepose_pin.report.calibration.Tracker", {"report.html"}),
         ("wepose_pin.report.calibration.render_calibration_report", set()),
     ],
 )

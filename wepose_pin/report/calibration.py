@@ -24,7 +24,7 @@ from ..kinematics import Pose
 from ..model import ROOT, BodyTable
 from ..recording import Recording, compute_mount, find_mount_axes
 from ..subject import Subject, mount_rows
-from ..tracking import TrackedRecording, track
+from ..tracking import TrackedRecording, Tracker, TrackOptions
 from .calibration_figures import (
     Length,
     Places,
@@ -92,7 +92,8 @@ def render_calibration_report(
     untracked: list[Diagnostic] = []
     if tracked is None:
         try:
-            tracked = track(recording, calibration.subject, method=method)
+            tracker = Tracker(calibration.subject, options=TrackOptions(method), with_point_cov=False)
+            [tracked] = tracker.push(recording) + tracker.finish()
         except Exception as error:
             untracked = [Diagnostic("motion-not-shown", WARNING, facts={"reason": str(error)})]
             if not isinstance(error, WeposeError) and failures is not None:

@@ -42,6 +42,7 @@ class Tracker:
     headings : what `observe_headings` returned; None with `observed`: nothing observes the headings
     observed : `observe_headings` has passed over all chunks. False: the tracker observes headings itself, and where
         there is something to observe, all chunks are returned by `finish`
+    with_point_cov : compute the covariances of the points; a page that shows none does without
     """
 
     def __init__(
@@ -52,8 +53,10 @@ class Tracker:
         options: TrackOptions | None = None,
         headings: HeadingCorrector | None = None,
         observed: bool = False,
+        with_point_cov: bool = True,
     ) -> None:
         self.options = options or TrackOptions()
+        self._with_point_cov = with_point_cov
         self._subject, self._model = subject, model
         self._headings, self._solved = headings, observed
         self._estimator: SegmentEstimator | CausalEstimator | DoubledEstimator | None = None  # made at the first chunk
@@ -132,7 +135,9 @@ class Tracker:
         pose = replace(
             pose,
             segment_cov=segments.covariance_W,
-            point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, shape_cov, pose.q),
+            point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, shape_cov, pose.q)
+            if self._with_point_cov
+            else {},
             gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         )
         first = self._estimator.first if isinstance(self._estimator, DoubledEstimator) else self._estimator
