@@ -24,7 +24,6 @@ from scipy.spatial.transform import Rotation
 from ..model.reaches import UNIVERSE
 from .conditions import Constraint, Level, Loop, Part, Pointing
 from .least_squares import Observations
-from .sobol import list_sobol_points
 
 STARTS, NEARER = 256, 24  # starts, and how many of the best continue after some rounds
 MINIMA, MOST_DISTINCT = 64, 12  # as `NEARER` for a search of all minima, and how many of these at most
@@ -237,7 +236,9 @@ def _find_minima(
     is_known = np.array([name in known for name in sensors])
     center = np.array([known.get(name, 0.0) for name in sensors] + [0.0] * m)
     prior = np.array([KNOWN_STD**-2 if k else 0.0 for k in is_known] + [SIZE_STD**-2] * m)
-    starts = 2.0 * np.pi * list_sobol_points(m, STARTS)
+    # A Latin hypercube: each angle of each sensor once, in any order.
+    order = np.random.default_rng(0).permuted(np.tile(np.arange(STARTS), (m, 1)), axis=1).T
+    starts = 2.0 * np.pi / STARTS * order
     x = np.column_stack([np.where(is_known, center[:m], starts), np.zeros((STARTS, m))])
     x, cost = _descend(x, center, prior, closure_residuals, FIRST_ROUNDS)
     x = x[np.argsort(cost)[:nearer]]
