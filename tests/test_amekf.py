@@ -304,7 +304,8 @@ def test_the_covariance_is_right(kind: Any) -> None:
 @pytest.mark.monte_carlo
 def test_ahead_of_smekf_as_the_paper_measures() -> None:
     """12 trials at 100 Hz. With noise and biases alone smekf's error hardly changes, so its std over time is small;
-    amekf's starts from the same accelerometer bias, which it then finds: the std has that change in it."""
+    amekf's starts from the same accelerometer bias, which it then finds: the std has that change in it. Of the heading,
+    which nothing observes, the smoother's std is as large as smekf's."""
     for realistic in (False, True):
         mean = {}
         for name in ("smekf", "amekf", "smoother"):
@@ -315,11 +316,12 @@ def test_ahead_of_smekf_as_the_paper_measures() -> None:
                 rows.append(columns(of, orientation.quat_WS))
             mean[name] = np.mean(rows, axis=0)
             print(f"{'realistic' if realistic else 'noise and bias'} {name:9s} {np.round(mean[name], 3)}")
-        assert (mean["smoother"] < mean["smekf"]).all()
+        assert (mean["smoother"][:5] < mean["smekf"][:5]).all()
         means = slice(None) if realistic else slice(0, None, 2)
         assert (mean["amekf"][means] < mean["smekf"][means]).all()
         rms = {name: np.hypot(values[0::2], values[1::2]) for name, values in mean.items()}
         assert (rms["amekf"] < rms["smekf"]).all()
+        assert (rms["smoother"] < rms["smekf"]).all()
         assert rms["smoother"].sum() < rms["amekf"].sum()
 
 
