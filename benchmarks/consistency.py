@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.calibration import assess, calibrate
 from wepose_pin.errors import WeposeError
 from wepose_pin.kinematics import compute_axis_std
-from wepose_pin.rotations import heading
 from wepose_pin.simulation import (
     MEASURED_STD,
     PEOPLE_MEASURED_STD,
@@ -28,6 +27,7 @@ from wepose_pin.simulation import (
 )
 from wepose_pin.subject import Subject, mount_rows
 from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.validation.mounting import compute_mount_errors
 
 FIRST_SEED = 5000  # of persons that no other measurement or test draws
 CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand")
@@ -84,24 +84,11 @@ def compare_subject(subject: Subject, person: Person, simulation: Simulation) ->
         error = sum(subject.lengths[name] - person.lengths[name] for name in names)
         arms.append((error, float(np.sqrt(subject.lengths_covariance(names).sum()))))
     tilts, headings = [], []
-    start, turn = _face_forward(simulation)
-    for name, quat in simulation.quat_LS.items():
-        R_LS = Rotation.from_quat(subject.mounts[name])
-        tilt = (R_LS * Rotation.from_quat(quat).inv()).as_rotvec()[:2]
-        # A mount's heading is relative to the start pose, however the person turned the segment in it.
-        R_WS_start = turn * Rotation.from_quat(simulation.quat_WS[name][start]).mean()
-        off = (R_LS * R_WS_start.inv()).as_rotvec()[2]
+    for name, error in zip(simulation.quat_LS, compute_mount_errors(subject, simulation), strict=True):
         std = [subject.std(row) for row in mount_rows(name)]
-        tilts += list(zip(tilt, std[:2], strict=True))
-        headings.append((off, std[2]))
+        tilts += list(zip(error[:2], std[:2], strict=True))
+        headings.append((error[2], std[2]))
     return {"lengths": lengths, "whole arms": arms, "mounts, tilt": tilts, "mounts, heading": headings}
-
-
-def _face_forward(simulation: Simulation) -> tuple[np.ndarray, Rotation]:
-    """The samples of the start pose (n,) bool, and the turn of the simulation's W to where the torso faces in it."""
-    start = simulation.time <= simulation.phases["start"][0][1]
-    facing = float(heading(Rotation.from_quat(simulation.quat_WL["torso"][start]).mean().as_quat()))
-    return start, Rotation.from_rotvec([0.0, 0.0, -facing])
 
 
 def _compare_pose(tracked: TrackedRecording, simulation: Simulation) -> dict[str, Any]:

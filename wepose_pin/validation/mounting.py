@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ..evaluation import evaluate
 from ..model import load_table
+from ..rotations import heading
 from ..simulation import IDEAL_PRESET, Person, Simulation, simulate
 from ..subject import Subject, mount_rows
 from ..tracking import track
@@ -52,12 +53,7 @@ def _compute_calibration_errors(subject: Subject, person: Person, simulation: Si
     names = list_closed_lengths(table)
     lengths = np.array([subject.lengths[name] - person.lengths[name] for name in names])
     order = list(simulation.quat_LS)
-    mounts = np.array(
-        [
-            (Rotation.from_quat(subject.mounts[name]) * Rotation.from_quat(quat).inv()).as_rotvec()
-            for name, quat in simulation.quat_LS.items()
-        ]
-    )
+    mounts = compute_mount_errors(subject, simulation)
     stated = np.array([[subject.std(row) for row in mount_rows(name)] for name in order])
     by_std = [*(lengths / [subject.std(name) for name in names]), *(mounts / stated).ravel()]
     return {
@@ -67,6 +63,24 @@ def _compute_calibration_errors(subject: Subject, person: Person, simulation: Si
         "tilts_rms_deg": float(np.degrees(_rms(mounts[:, :2]))),
         "errors_by_std_rms": _rms(np.array(by_std)),
     }
+
+
+def compute_mount_errors(subject: Subject, simulation: Simulation) -> np.ndarray:
+    """Compute the errors (sensors, 3) [rad] of the mounts in L, the heading last.
+
+    A mount's heading is relative to the start pose, however the person turned the segment in it: no closure shows that
+    turn, and it is in the ± of what is tracked.
+    """
+    start = simulation.time <= simulation.phases["start"][0][1]
+    facing = float(heading(Rotation.from_quat(simulation.quat_WL[load_table().reference][start]).mean().as_quat()))
+    turn = Rotation.from_rotvec([0.0, 0.0, -facing])
+    errors = []
+    for name, quat_LS in simulation.quat_LS.items():
+        R_LS = Rotation.from_quat(subject.mounts[name])
+        error = (R_LS * Rotation.from_quat(quat_LS).inv()).as_rotvec()
+        R_WS_start = turn * Rotation.from_quat(simulation.quat_WS[name][start]).mean()
+        errors.append([*error[:2], (R_LS * R_WS_start.inv()).as_rotvec()[2]])
+    return np.array(errors)
 
 
 def _rms(values: np.ndarray) -> float:
