@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import re
-import sys
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
+from opensim_process import start_opensim
 from scipy.spatial.transform import Rotation
 from test_export import LENGTHS, POINTS, a_pose, smooth, with_gap, write_folder
 
@@ -46,17 +42,8 @@ MOTION = {
 
 @pytest.fixture(scope="module")
 def peer() -> Iterator[Callable[..., Any]]:
-    """Calls a function of `opensim_peer` in a process of its own."""
-    if importlib.util.find_spec("opensim") is None:
-        pytest.skip("OpenSim's Python package is not installed")
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        yield lambda name, *args: pool.submit(ask_opensim, name, *args).result()
-    assert "opensim" not in sys.modules
-
-
-def ask_opensim(name: str, *args: Any) -> Any:
-    """In that process."""
-    return getattr(importlib.import_module("opensim_peer"), name)(*args)
+    with start_opensim() as call:
+        yield call
 
 
 @pytest.fixture(scope="module")
