@@ -18,6 +18,7 @@ from wepose_pin.calibration.priors import (
     DRIFT_STD,
 )
 from wepose_pin.calibration.problem import CalibrationProblem
+from wepose_pin.calibration.quality import GAP
 from wepose_pin.calibration.weights import LEAST_CORRELATION_S
 from wepose_pin.filters.sensors import FilteredRecording
 from wepose_pin.model import load_model
@@ -182,8 +183,9 @@ def _hinged(R_WL: dict[str, Rotation], side: str, axis: np.ndarray) -> dict[str,
 
 
 def ratios(motion: Motion, count: int, seed: int = 0) -> dict[str, float]:
-    """Spread of each group over what is stated of it."""
-    made = list(draws(motion, count, seed))
+    """Spread of each group over what is stated of it, but for calibrations that failed, as their palms do not meet."""
+    made = [draw for draw in draws(motion, count, seed) if draw.calibration.rms_gap < GAP.poor]
+    assert len(made) >= 0.98 * count
     order = made[0].calibration.subject.order
     ratio = {}
     for group, parts in GROUPS.items():
