@@ -18,7 +18,7 @@ from wepose_pin.recording import DoubledSensor, ImuSensor, Recording
 from wepose_pin.simulation import Person, Simulation, simulate, simulate_person
 from wepose_pin.subject import parse_subject, subject_toml
 from wepose_pin.tracking import summarize, track, track_chunks
-from wepose_pin.tracking.doubled import FOLLOW_S
+from wepose_pin.tracking.doubled import FOLLOW_S, _average_angle
 from wepose_pin.writers import write_session
 
 TURN = Rotation.from_euler("xyz", [90, 0, 30], degrees=True)  # the second sensor against the first
@@ -134,3 +134,14 @@ def test_a_session_names_the_segment_of_both(made: tuple[Person, Simulation, Rec
     session.write_text(f"{text}\n{second}\n{second.replace('sensors.back', 'sensors.third')}", encoding="utf-8")
     with pytest.raises(BadSession, match="a segment bears two sensors at most"):
         load_session(session)
+
+
+def test_the_mean_difference_goes_on_beyond_half_a_turn_and_after_lost_samples() -> None:
+    angle = np.linspace(0.0, 4.0 * np.pi, 4000)
+    wrapped = np.angle(np.exp(1j * angle))
+    wrapped[1000:1020] = np.nan
+    means = np.empty(len(angle))
+    last = _average_angle(wrapped, 0.1, 0.0, means)
+    assert last == means[-1]
+    np.testing.assert_allclose(means[-1], angle[-1], atol=0.05)
+    assert np.isfinite(means).all()

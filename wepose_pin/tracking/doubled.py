@@ -103,16 +103,17 @@ class DoubledEstimator:
         if cov_a is None or cov_b is None:
             return quat, cov_b
         to_heading_of_a = np.ones((len(cov_b), 3))
-        to_heading_of_a[:, 2] = np.sqrt(cov_a[:, 2, 2] / cov_b[:, 2, 2])
+        to_heading_of_a[:, 2] = np.sqrt(cov_a[:, 2, 2] / np.maximum(cov_b[:, 2, 2], 1e-12))
         return quat, to_heading_of_a[:, :, None] * cov_b * to_heading_of_a[:, None, :]
 
 
 @kernel
 def _average_angle(angle, share, mean, means):  # type: ignore[no-untyped-def]
-    """Fill `means` (n,) with the exponential mean of angles (n,) [rad] since `mean`; return the last one."""
+    """Fill `means` (n,) with the exponential mean of angles (n,) [rad] since `mean` without NaN; return the last."""
     for n in range(len(angle)):
         off = angle[n] - mean
-        mean += share * (off - 2.0 * np.pi * np.round(off / (2.0 * np.pi)))
+        if np.isfinite(off):
+            mean += share * (off - 2.0 * np.pi * np.round(off / (2.0 * np.pi)))
         means[n] = mean
     return mean
 
