@@ -152,22 +152,23 @@ S0, S1, S2, S3, S4, S5, S6, S7 = (0.5 * (-1) ** k / factorial(2 * k + 1) for k i
 C0, C1, C2, C3, C4, C5, C6, C7 = ((-1) ** k / factorial(2 * k) for k in range(8))  # cos(h) in h²
 
 
-@kernel
-def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
-    """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised. `quat` (4,) or more, its first four xyzw; vector [rad].
-
-    Sine and cosine of a sample's turn are power series in the square of the half angle: no call, no square root.
-    """
-    h1 = 0.25 * (x * x + y * y + z * z)
+@inlined
+def half_angle_terms(h1):  # type: ignore[no-untyped-def]
+    """½ sin(h)/h and cos(h) of h² = `h1`. A sample's are power series: no call, no square root, no division."""
     if h1 < SERIES_HALF_ANGLE * SERIES_HALF_ANGLE:
         h2 = h1 * h1
         h4 = h2 * h2
         s = (S0 + S1 * h1 + h2 * (S2 + S3 * h1)) + h4 * (S4 + S5 * h1 + h2 * (S6 + S7 * h1))
         c = (C0 + C1 * h1 + h2 * (C2 + C3 * h1)) + h4 * (C4 + C5 * h1 + h2 * (C6 + C7 * h1))
-    else:
-        half = np.sqrt(h1)
-        s = 0.5 * np.sin(half) / half
-        c = np.cos(half)
+        return s, c
+    half = np.sqrt(h1)
+    return 0.5 * np.sin(half) / half, np.cos(half)
+
+
+@kernel
+def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
+    """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised. `quat` (4,) or more, its first four xyzw; vector [rad]."""
+    s, c = half_angle_terms(0.25 * (x * x + y * y + z * z))
     ex, ey, ez = s * x, s * y, s * z
     qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]
     rx, ry, rz, rw = product(qx, qy, qz, qw, ex, ey, ez, c)
@@ -178,21 +179,10 @@ def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def half_angle_terms(h2):  # type: ignore[no-untyped-def]
-    """sin(h)/h and cos(h) of h² = `h2`; below 0.02 (0.28 rad a sample) by series, to the last bit or two."""
-    if h2 < 0.02:
-        s = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * (1.0 - h2 / 42.0 * (1.0 - h2 / 72.0)))
-        c = 1.0 - h2 / 2.0 * (1.0 - h2 / 12.0 * (1.0 - h2 / 30.0 * (1.0 - h2 / 56.0 * (1.0 - h2 / 90.0))))
-        return s, c
-    h = np.sqrt(h2)
-    return np.sin(h) / h, np.cos(h)
-
-
-@inlined
 def rotate_unit_by_rate(quat, wx, wy, wz, dt):  # type: ignore[no-untyped-def]
     """In place: ``quat ← quat ⊗ exp([wx, wy, wz] dt)``, renormalised to first order: but for rounding it is unit."""
     s, ew = half_angle_terms(0.25 * dt * dt * (wx * wx + wy * wy + wz * wz))
-    s *= 0.5 * dt
+    s *= dt
     rx, ry, rz, rw = product(quat[0], quat[1], quat[2], quat[3], s * wx, s * wy, s * wz, ew)
     norm = 1.5 - 0.5 * (rx * rx + ry * ry + rz * rz + rw * rw)  # 1/√, to first order
     quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
@@ -202,9 +192,14 @@ def rotate_unit_by_rate(quat, wx, wy, wz, dt):  # type: ignore[no-untyped-def]
 def rotate_by_world_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     """In place: ``quat ← exp([x, y, z]) ⊗ quat``, renormalised; the vector is in W [rad]."""
     s, ew = half_angle_terms(0.25 * (x * x + y * y + z * z))
-    rx, ry, rz, rw = product(0.5 * s * x, 0.5 * s * y, 0.5 * s * z, ew, quat[0], quat[1], quat[2], quat[3])
+    rx, ry, rz, rw = product(s * x, s * y, s * z, ew, quat[0], quat[1], quat[2], quat[3])
     norm = 1.0 / np.sqrt(rx * rx + ry * ry + rz * rz + rw * rw)
     quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
+
+
+# Power series in θ² of the terms below; the first terms left out are under 1e-17 of them for θ² < 0.02.
+T0, T1, T2, T3, T4, T5 = ((-1) ** k / factorial(2 * k + 1) for k in range(6))  # sin θ/θ
+U0, U1, U2, U3, U4 = ((-1) ** k / factorial(2 * k + 2) for k in range(5))  # (1 − cos θ)/θ²
 
 
 @inlined
@@ -215,10 +210,10 @@ def rotation_terms(t):  # type: ignore[no-untyped-def]
     1 has the second to fourth term in their place.
     """
     if t < 0.02:
-        s = 1.0 - t / 6.0 * (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0)))
-        c = 0.5 * (1.0 - t / 12.0 * (1.0 - t / 30.0 * (1.0 - t / 56.0 * (1.0 - t / 90.0))))
-        d = (1.0 - t / 20.0 * (1.0 - t / 42.0 * (1.0 - t / 72.0 * (1.0 - t / 110.0)))) / 6.0
-        return 1.0 - t * c, s, c, d
+        t2 = t * t
+        d = -(T1 + T2 * t + t2 * (T3 + T4 * t + t2 * T5))
+        c = U0 + U1 * t + t2 * (U2 + U3 * t + t2 * U4)
+        return 1.0 - t * c, T0 - t * d, c, d
     angle = np.sqrt(t)
     cosine, s = np.cos(angle), np.sin(angle) / angle
     return cosine, s, (1.0 - cosine) / t, (1.0 - s) / t

@@ -60,6 +60,7 @@ class ErrorStates(NamedTuple):
 
 ERROR = ErrorStates()
 STATES = 25
+COLUMNS = 32  # of matrices in the record: rows of whole processor vectors; beyond the 25 states they are zero
 PROPAGATED_STATES = 7  # θ, velocity and position change over a block, the other states stay
 SMOOTHED_STATES = (0, 1, 2, 7, 8, 9, 22, 23, 24)  # states that the smoother corrects: θ, bias, bias in motion
 MAX_MEASUREMENTS = 5  # of a static block: velocity (2) and bias (3); of another: velocity (2) and position (2)
@@ -115,7 +116,7 @@ STATE = np.dtype(
         ("gyro_bias", float, 3),  # [rad/s] as returned: with the motion bias where the sample is not static
         ("attitude_cov", float, 6),  # [rad²] upper triangle, error on the right, in S
         ("x", float, STATES),  # as `ErrorStates`; the attitude's error is always zero
-        ("P", float, (STATES, STATES)),
+        ("P", float, (STATES, COLUMNS)),
         ("sums", SUMS),
         ("last_rate", float, 3),  # [rad/s] without bias; it fades while samples are lost
         ("lost_s", float),  # [s] since the last good sample of gyro
@@ -123,9 +124,11 @@ STATE = np.dtype(
         ("about_vertical", float, VERTICAL_COLUMNS),  # as `base.AboutVertical`
         # work space
         ("R_WS", float, (3, 3)),
-        ("FP_rows", float, (PROPAGATED_STATES, STATES)),
-        ("FP_columns", float, (STATES, PROPAGATED_STATES)),
-        ("FPF_corner", float, (PROPAGATED_STATES, PROPAGATED_STATES)),
+        ("FP_rows", float, (PROPAGATED_STATES, COLUMNS)),
+        ("FP_columns", float, (STATES, 8)),  # the last column is zero
+        ("FPF_corner", float, (PROPAGATED_STATES, 8)),
+        ("gains", float, (3, COLUMNS)),  # P h/√s of the measurements that are taken together
+        ("measured", float, 3),
         ("block", BLOCK),
     ],
     align=True,
@@ -215,7 +218,7 @@ class AmekfState:
         self.quat_WS = record["quat_WS"][0]  # (4,) xyzw
         self.gyro_bias = record["gyro_bias"][0]  # (3,) [rad/s]
         self.x = record["x"][0]  # (25,) as `ErrorStates`
-        self.P = record["P"][0]  # (25, 25)
+        self.P = record["P"][0, :, :STATES]  # (25, 25)
 
 
 class Amekf:
@@ -401,23 +404,42 @@ def _add_variance(P, states, variance):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _correct(state, at, measured, variance):  # type: ignore[no-untyped-def]
-    """Correct by a measurement of state `at`: P ← P − P h hᵀ P/s; the correction of the states is summed up."""
-    P, block = state.P, state.block
-    m, correction = block.measurements, block.correction
-    gain = block.normalized_gain[m]
-    inv_std = 1.0 / np.sqrt(P[at, at] + variance)
-    innovation = (measured - state.x[at] - correction[at]) * inv_std
-    for j in range(STATES):
-        gain[j] = P[at, j] * inv_std
-    for j in range(STATES):
-        correction[j] += gain[j] * innovation
-    for i in range(STATES):
-        gain_i = gain[i]
+def _correct(state, at, axes, measured, variance):  # type: ignore[no-untyped-def]
+    """Correct by measurements of two or three states from `at` on: P ← P − P h hᵀ P/s for one after the other.
+
+    The correction of the states is summed up. The gains come first, so that P is gone through once.
+    """
+    P, block, gains = state.P, state.block, state.gains
+    correction = block.correction
+    for m in range(axes):
+        gain, measured_state = gains[m], at + m
+        for j in range(COLUMNS):
+            gain[j] = P[measured_state, j]
+        for before in range(m):
+            share = gains[before, measured_state]
+            for j in range(COLUMNS):
+                gain[j] -= share * gains[before, j]
+        inv_std = 1.0 / np.sqrt(gain[measured_state] + variance)
+        innovation = (measured[m] - state.x[measured_state] - correction[measured_state]) * inv_std
+        for j in range(COLUMNS):
+            gain[j] *= inv_std
         for j in range(STATES):
-            P[i, j] -= gain_i * gain[j]
-    block.state_index[m], block.inv_innovation_std[m], block.normalized_innovation[m] = at, inv_std, innovation
-    block.measurements = m + 1
+            correction[j] += gain[j] * innovation
+        row = block.measurements + m
+        block.state_index[row], block.inv_innovation_std[row] = measured_state, inv_std
+        block.normalized_innovation[row] = innovation
+        for j in range(STATES):
+            block.normalized_gain[row, j] = gain[j]
+    block.measurements += axes
+    for i in range(STATES):
+        first, second = gains[0, i], gains[1, i]
+        for j in range(COLUMNS):
+            P[i, j] = P[i, j] - first * gains[0, j] - second * gains[1, j]
+    if axes == 3:
+        for i in range(STATES):
+            third = gains[2, i]
+            for j in range(COLUMNS):
+                P[i, j] -= third * gains[2, j]
 
 
 @inlined
@@ -507,7 +529,8 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
         before = compute_vertical_bias_var(P, state.R_WS)
         heading, rate = block.correction[2], compute_vertical_bias(block.correction, state.R_WS)
         for i in range(axes):
-            _correct(state, at + i, sums.gyro[i] / count if axes == 3 else 0.0, variance)
+            state.measured[i] = sums.gyro[i] / count if axes == 3 else 0.0
+        _correct(state, at, axes, state.measured, variance)
         heading, rate = block.correction[2] - heading, compute_vertical_bias(block.correction, state.R_WS) - rate
         add_correction(state.about_vertical, heading, rate, before, compute_vertical_bias_var(P, state.R_WS))
     for i in range(VELOCITY, STATES):

@@ -204,28 +204,28 @@ def _bound_rate_change(noise: SensorNoise, newest: int, n: int, rate_stds: float
 
 
 @inlined
-def _add(sums, block, at, anchor):  # type: ignore[no-untyped-def]
-    """Take sample `at` of the block into the sums."""
+def _add(sums, before, block, at, anchor):  # type: ignore[no-untyped-def]
+    """Fill `sums` with `before` and sample `at` of the block; both may be one."""
     gx, gy, gz = block[at, 0] - anchor[0], block[at, 1] - anchor[1], block[at, 2] - anchor[2]
     ax, ay, az = block[at, 3] - anchor[3], block[at, 4] - anchor[4], block[at, 5] - anchor[5]
     norm = block[at, 6] - anchor[6]
-    _add_vector(sums.gyro, sums.gyro_products, gx, gy, gz)
-    _add_vector(sums.accel, sums.accel_products, ax, ay, az)
-    sums.norm += norm
-    sums.norm_square += norm * norm
+    _add_vector(sums.gyro, before.gyro, gx, gy, gz)
+    _add_vector(sums.accel, before.accel, ax, ay, az)
+    _add_products(sums.gyro_products, before.gyro_products, gx, gy, gz)
+    _add_products(sums.accel_products, before.accel_products, ax, ay, az)
+    sums.norm = before.norm + norm
+    sums.norm_square = before.norm_square + norm * norm
 
 
 @inlined
-def _add_vector(mean, products, x, y, z):  # type: ignore[no-untyped-def]
-    mean[0] += x
-    mean[1] += y
-    mean[2] += z
-    products[0] += x * x
-    products[1] += x * y
-    products[2] += x * z
-    products[3] += y * y
-    products[4] += y * z
-    products[5] += z * z
+def _add_vector(sums, before, x, y, z):  # type: ignore[no-untyped-def]
+    sums[0], sums[1], sums[2] = before[0] + x, before[1] + y, before[2] + z
+
+
+@inlined
+def _add_products(sums, before, x, y, z):  # type: ignore[no-untyped-def]
+    sums[0], sums[1], sums[2] = before[0] + x * x, before[1] + x * y, before[2] + x * z
+    sums[3], sums[4], sums[5] = before[3] + y * y, before[4] + y * z, before[5] + z * z
 
 
 @inlined
@@ -239,13 +239,12 @@ def _clear(sums):  # type: ignore[no-untyped-def]
 
 @inlined
 def _sum_up(tail, block, anchor):  # type: ignore[no-untyped-def]
-    """The sums from each sample of the block to its end."""
-    n = len(block)
-    _clear(tail[n - 1])
-    for at in range(n - 1, -1, -1):
-        if at < n - 1:
-            tail[at] = tail[at + 1]
-        _add(tail[at], block, at, anchor)
+    """Fill `tail` with the sums from each sample of the block to its end."""
+    last = len(block) - 1
+    _clear(tail[last])
+    _add(tail[last], tail[last], block, last, anchor)
+    for at in range(last - 1, -1, -1):
+        _add(tail[at], tail[at + 1], block, at, anchor)
 
 
 @inlined
@@ -328,7 +327,7 @@ def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[
     first = at + 1  # where the window begins in the block before
     if first < n:
         detector.samples = first
-        _add(head, block, at, anchor)
+        _add(head, head, block, at, anchor)
         if not detector.has_block:
             detector.bias_var += detector.walk_var
             return False
