@@ -642,7 +642,8 @@ def test_stopped_amid_a_motion_the_robot_stands(session: Path, tmp_path: Path, r
     out, err = process.communicate(timeout=60)
     messages = receiver.messages
     assert process.returncode == 0, err
-    assert all("commands were skipped" in line for line in err.splitlines())  # on a busy machine
+    # Skipped on a busy machine; compiled where no test has used the filters before.
+    assert all("commands were skipped" in line or "compiling the filters" in line for line in err.splitlines())
     assert ended(messages)
     assert messages[-1]["reason"] == "the session has ended"
     assert "arm: " in out

@@ -167,7 +167,7 @@ def half_angle_terms(h1):  # type: ignore[no-untyped-def]
 
 @kernel
 def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
-    """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised. `quat` (4,) or more, its first four xyzw; vector [rad]."""
+    """In place: ``quat ← quat ⊗ exp([x, y, z])``, renormalised. `quat` (4,) or more: its first four, xyzw; [rad]."""
     s, c = half_angle_terms(0.25 * (x * x + y * y + z * z))
     ex, ey, ez = s * x, s * y, s * z
     qx, qy, qz, qw = quat[0], quat[1], quat[2], quat[3]

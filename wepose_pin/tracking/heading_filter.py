@@ -10,7 +10,7 @@ changes by Δb, and what it learned by that is an observation of the rate. Diffe
 - a hinge with the axis n on the segment O: the long axis e of the segment M below stays in the plane across n, so that
   n · R_WOᵀ R_WM e = 0;
 - ranges of motion: the hinge bends within its range;
-- two points that coincide (`Closure`): palms in a phase `clasp`, or in a clasp that was found.
+- two points that coincide (`CoincidentPoints`): palms in a phase `clasp`, or in a clasp that was found.
 
 Errors by soft tissue, tilted hinge axes and travelling joints are correlated over seconds or over the whole recording.
 They are states, so that a long recording does not average them away.

@@ -11,7 +11,7 @@ from ..alignment import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
 from ..compilation import kernel
 from ..model import GirdleMotion, move_girdles
 from ..model.girdle import PARAMETERS
-from .heading_problem import Closure, HeadingProblem, HingeAxis, Knot
+from .heading_problem import CoincidentPoints, HeadingProblem, HingeAxis, Knot
 
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 
@@ -128,7 +128,7 @@ def move_all_girdles(problem: HeadingProblem, R_WL: np.ndarray) -> dict[str, Gir
 def build_gap_rows(
     R_WL: np.ndarray,
     problem: HeadingProblem,
-    closure: Closure,
+    closure: CoincidentPoints,
     closed: np.ndarray,
     slip_std: float = PALM_SLIP_STD,
 ) -> Rows:
@@ -211,7 +211,7 @@ class ClaspDetector:
         self._knots = max(2, int(self._test.seconds / problem.knot_s) - 1)
         self._recent: list[Knot] = []
 
-    def _is_calibrated(self, closure: Closure) -> bool:
+    def _is_calibrated(self, closure: CoincidentPoints) -> bool:
         problem = self._problem
         return all(problem.names[i] in problem.subject.mounts for i in closure.gap.segments)
 

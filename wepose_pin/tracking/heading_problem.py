@@ -149,7 +149,7 @@ class Way(NamedTuple):
         return turned
 
 
-class Closure(NamedTuple):
+class CoincidentPoints(NamedTuple):
     """Two points that coincide in some intervals [s], those of a phase."""
 
     phase: str
@@ -211,7 +211,7 @@ class HeadingProblem:
     subject: Subject
     pairs: tuple[JointPair, ...]
     hinges: tuple[HingeAxis, ...]
-    closures: tuple[Closure, ...]
+    closures: tuple[CoincidentPoints, ...]
     noise: HeadingNoise
     knot_s: float
     samples_per_knot: int

@@ -37,7 +37,7 @@ from .heading_observations import correct_headings, linearize_hinge, move_all_gi
 from .heading_problem import (
     MECHANISM_NOISE,
     PERSON_NOISE,
-    Closure,
+    CoincidentPoints,
     FilterHeadings,
     HeadingProblem,
     HingeAxis,
@@ -243,7 +243,9 @@ def _find_hinges(
     return tuple(hinges)
 
 
-def _find_closures(recording: Recording | None, segments: Sequence[str], model: BodyModel) -> tuple[Closure, ...]:
+def _find_closures(
+    recording: Recording | None, segments: Sequence[str], model: BodyModel
+) -> tuple[CoincidentPoints, ...]:
     """Return the closures of the protocols in which points coincide and all segments between them have sensors.
 
     Each holds in the intervals of its phase, none where the recording lacks it. `recording` None: none are read.
@@ -272,7 +274,7 @@ def _find_closures(recording: Recording | None, segments: Sequence[str], model: 
             except BadSession:
                 continue
             intervals = () if recording is None else tuple(recording.phases.get(closure.phase, ()))
-            closures.append(Closure(closure.phase, closure.points, intervals, gap, tuple(ways)))
+            closures.append(CoincidentPoints(closure.phase, closure.points, intervals, gap, tuple(ways)))
     return tuple(closures)
 
 
