@@ -389,9 +389,8 @@ def compute_segment_covariance(
         start_frames.std(segment) ** 2,
     )
     vertical = np.array([0.0, 0.0, 1.0])
-    if mount_cov is not None:
+    if mount_cov is not None and subject is not None:  # whose mount it is
         error_jacobian = R_WL - np.outer(vertical, vertical)
-        assert subject is not None  # it has the mount
         if segment not in subject.start_pose_offset:
             # What is left after the start pose has corrected the tilt, as in `align_sensors`. A person repeats the
             # offset of the calibration's own start pose: then the start pose tells nothing new.

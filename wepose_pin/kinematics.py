@@ -616,9 +616,10 @@ def compute_point_covariances(
     known = {name: Rotation.from_quat(quat_WL[name]).as_matrix() for name in _girdle_segments(model) if name in quat_WL}
     motions = move_girdles(model, known)
     R_WK: dict[str, np.ndarray] = {}
-    carriers = {link: find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
+    found = {link: find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
+    carriers = {link: carrier for link, carrier in found.items() if carrier is not None}
     for link, carrier in carriers.items():
-        if carrier is not None and carrier in segment_cov:
+        if carrier in segment_cov:
             R_CK = model.neutral_rotations[carrier].T @ model.neutral_rotations[link]
             R_WK[link] = Rotation.from_quat(quat_WL[carrier]).as_matrix()
             if not np.allclose(R_CK, np.eye(3), atol=1e-12):
@@ -635,7 +636,6 @@ def compute_point_covariances(
                 shape_jacobian[:, :, : len(lengths)] += part.by_length
                 continue
             carrier = carriers[link]
-            assert carrier is not None  # it has a rotation
             vectors[carrier] = vectors.get(carrier, 0.0) + R_WK[link] @ (part.by_length @ lengths + part.constant)
             shape_jacobian[:, :, : len(lengths)] += R_WK[link] @ part.by_length
         residual = np.zeros((n, 3, 3))

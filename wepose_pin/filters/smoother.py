@@ -85,8 +85,15 @@ class Smoother:
         return done
 
     def finish(self) -> FilterRun:
-        """The last chunk."""
-        assert self._pending is not None, "nothing was pushed"
+        """The last chunk.
+
+        Raises
+        ------
+        BadData
+            Nothing was pushed.
+        """
+        if self._pending is None:
+            raise BadData("the smoother has no samples: nothing was pushed")
         last, self._pending = self._pending, None
         return self._smooth(last, last.blocks[:0])
 

@@ -190,7 +190,9 @@ def run_live(
     from ..subject import load_subject
 
     job.check()
-    following = None if job.robot is None else _load_robot(job)  # a wrong one is found before the person does anything
+    following = (
+        None if job.robot is None else _load_robot(job, job.robot)
+    )  # a wrong one is found before the person does anything
     if job.subject is not None and not job.accept_failed:
         load_subject(job.subject).check_quality()
     setup: SensorSetup
@@ -288,7 +290,7 @@ def _open_page(
     return page
 
 
-def _load_robot(job: LiveJob) -> RobotOptions:
+def _load_robot(job: LiveJob, name: str) -> RobotOptions:
     """The robot, and how it is to follow."""
     from ..calibration import load_protocol
     from ..live.robot import PORT, RobotOptions
@@ -296,10 +298,9 @@ def _load_robot(job: LiveJob) -> RobotOptions:
     from ..retargeting.maps import list_sides
     from ..retargeting.stream import StreamOptions, check_segments
 
-    assert job.robot is not None
     timing = StreamOptions(job.robot_hz, job.hold_after, job.stop_after)
     margins = LimitMargins(job.speed_scale, job.limit_margin)
-    robot = load_robot(find_map(job.robot), list_sides(job.arm), margins)
+    robot = load_robot(find_map(name), list_sides(job.arm), margins)
     if job.guide:
         check_segments(robot, load_protocol(job.protocol).needs)
     return RobotOptions(robot, job.to or str(PORT), timing)

@@ -185,7 +185,7 @@ class LiveLoop:
         self.model = build_subject_model(setup, model, source.sensors)
         self.model.table.check_segments(source.sensors, f"{setup.name}: sensors.", BadSession)
         with suppress(BadModel):  # measured before samples come; the parts of the way to a point
-            assert self.model.reaches is not None
+            _ = self.model.reaches
         start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
         self.kinematics = LiveKinematics(self.model, source.sensors, start)
         self._instruction = START_POSES.get(setup.start_pose, f"Hold still in the start pose, {setup.start_pose}")
@@ -244,18 +244,17 @@ class LiveLoop:
         """Record the samples of one read, track the ticks that they complete, and show the last pose."""
         pose = None
         for ticks in self._stream.push(samples):
-            pose = self._track_ticks(ticks, self._begin_search()) or pose
-        if self._stream.synchronizer is not None:
-            self._begin_search()
+            if (search := self._begin_search()) is not None:
+                pose = self._track_ticks(ticks, search) or pose
+        self._begin_search()
         if pose is not None:
             for output in self.outputs:
                 output.show(pose)
 
-    def _begin_search(self) -> StartPoseSearch:
-        """The search of the start pose, which begins with the ticks."""
+    def _begin_search(self) -> StartPoseSearch | None:
+        """The search of the start pose, which begins with the ticks; None before them."""
         synchronizer = self._stream.synchronizer
-        if self._start_search is None:
-            assert synchronizer is not None
+        if self._start_search is None and synchronizer is not None:
             stated = next(iter(self.setup.phases.get("start", ())), None)
             self._start_search = StartPoseSearch(synchronizer, self.source.orientations, stated)
             self._covariance_ticks = max(1, round(STATUS_PERIOD_S * synchronizer.rate_hz))

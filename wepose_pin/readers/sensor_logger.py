@@ -63,11 +63,11 @@ def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None
             about = _read_metadata(files)
     place = path.name
     total, diagnostics = _add_gravity(path, signals), list[Diagnostic]()
-    raw = "Gyroscope" in signals and total is not None
-    if use == "raw" and not raw:
+    if "Gyroscope" not in signals:
+        total = None  # it is of no use alone
+    if use == "raw" and total is None:
         raise BadData(f"{path}: no Gyroscope and no TotalAcceleration in it; record both, or leave out data.use")
-    if raw and use != "orientation":
-        assert total is not None
+    if total is not None and use != "orientation":
         standard = (about.get("standardisation") or about.get("standardization") or "false").lower() == "true"
         if not about.get("platform"):
             diagnostics.append(Diagnostic("accel-sign-assumed", WARNING, place))

@@ -24,6 +24,7 @@ from ..model import BodyModel, load_model
 from ..model.girdle import PARAMETERS
 from ..rotations import compose, turn_about
 from .arm_tasks import ArmTasks
+from .girdle import Girdle
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
 from .motion import ARM, E_Z, MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, Flaws, place_arm, place_sensors
@@ -108,15 +109,14 @@ class Activity(BodyMotion):
         origins = {segment: p_W[:, k] for k, segment in enumerate(R_WL)}
         points = {point: p_W[:, len(R_WL) + k] for k, point in enumerate(frames)}
         if self.flaws and self.flaws.girdle.moves:
-            points |= self._move_shoulders(t, R_WL, origins)
+            points |= self._move_shoulders(self.flaws.girdle, t, R_WL, origins)
         return BodyPose(R_WL, points, origins)
 
     def _move_shoulders(
-        self, t: np.ndarray, R_WL: dict[str, Rotation], origins: dict[str, np.ndarray]
+        self, girdle: Girdle, t: np.ndarray, R_WL: dict[str, Rotation], origins: dict[str, np.ndarray]
     ) -> dict[str, np.ndarray]:
         """Place the arms' points (n, 3) [m] on shoulders that move, and correct the arms' `origins`."""
-        assert self.flaws is not None
-        girdle, R_WT = self.flaws.girdle, R_WL["torso"]
+        R_WT = R_WL["torso"]
         points: dict[str, np.ndarray] = {}
         for side, y in SIDES.items():
             along_T = compose(R_WT.inv(), R_WL[f"{side}_upper_arm"]).apply(-E_Z)

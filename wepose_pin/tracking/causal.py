@@ -470,9 +470,7 @@ class CausalSegmentEstimator:
 
         NaN where the filter has none.
         """
-        *_, covariance = self.covariance_gradually()
-        assert covariance is not None
-        return covariance
+        return [covariance for covariance in self.covariance_gradually() if covariance is not None][-1]
 
     def covariance_gradually(self) -> Iterator[np.ndarray | None]:
         """Do as `covariance`, in parts of less than half a millisecond; only the last one is not None.

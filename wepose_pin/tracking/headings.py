@@ -67,13 +67,11 @@ class HeadingCorrection(NamedTuple):
     hinges: tuple[str, ...] = ()  # joints that were observed as hinges
     found_clasps: tuple[tuple[float, float], ...] = ()  # [s] when the hands were found joined outside of a phase
     segments: tuple[str, ...] = ()  # of the k rows of `covariance`
-    time: np.ndarray | None = None  # (m,) [s] of the covariances
-    covariance: np.ndarray | None = None  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
+    time: np.ndarray = np.zeros(0)  # (m,) [s] of the covariances
+    covariance: np.ndarray = np.zeros((0, 0, 0))  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
 
     def relative_std(self, near: str, far: str, time: np.ndarray) -> np.ndarray:
         """Return the standard deviation (n,) [rad] of the heading between two segments at these times [s]."""
-        assert self.time is not None
-        assert self.covariance is not None
         i, j = self.segments.index(near), self.segments.index(far)
         variance = self.covariance[:, i, i] + self.covariance[:, j, j] - 2.0 * self.covariance[:, i, j]
         return np.asarray(np.sqrt(np.interp(time, self.time, variance)))

@@ -116,8 +116,7 @@ def compute_heading_uncertainties(tracked: TrackedRecording) -> dict[str, Budget
         minutes = float(np.count_nonzero(~orientation.static)) / tracked.recording.rate_hz / 60.0
         growth = max(last - first, 0.0) / minutes if minutes > 0.0 else float("nan")
         correction = tracked.correction
-        if correction is not None and correction.covariance is not None and name in correction.segments:
-            assert correction.time is not None  # it is that of the covariances
+        if correction is not None and len(correction.time) and name in correction.segments:
             i = correction.segments.index(name)
             drift = np.minimum(drift, np.sqrt(np.interp(tracked.time, correction.time, correction.covariance[:, i, i])))
         budgets[name] = Budget(np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), drift, last, growth)

@@ -87,48 +87,46 @@ class Tracker:
         WeposeError
             The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
         """
-        if self._estimator is None:
+        if self._estimator is None or self._body is None:
             self._body = make_body(self._subject, self._model, chunk)
             self._estimator = _make_estimator(self._subject, self._body, self.options, chunk)
         if self.options.open_loop and chunk.resets:
             chunk = replace(chunk, resets=())
-        return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented)]
+        return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented, self._body)]
 
     def finish(self) -> list[TrackedRecording]:
         """Return the remaining chunks, after the last one has been pushed."""
-        if self._estimator is None:
+        if self._estimator is None or self._body is None:
             return []
-        done = [tracked for oriented in self._estimator.finish() for tracked in self._process(oriented)]
+        done = [tracked for oriented in self._estimator.finish() for tracked in self._process(oriented, self._body)]
         if self._headings is not None and not self._solved:
             self._solved = True
             if not self._headings.solve():
                 self._headings = None
             waiting, self._waiting = self._waiting, []
-            done += [self._solve_pose(oriented) for oriented in waiting]
+            done += [self._solve_pose(oriented, self._body) for oriented in waiting]
         return done
 
-    def _process(self, oriented: Oriented) -> list[TrackedRecording]:
+    def _process(self, oriented: Oriented, body: TrackedBody) -> list[TrackedRecording]:
         """Return a chunk with its pose, or nothing while the headings are observed."""
-        assert self._body is not None  # made with the first chunk
         if self._headings is None and not self._solved:
-            self._headings = make_heading_corrector(oriented, self._body.subject, self._body.model, self.options)
+            self._headings = make_heading_corrector(oriented, body.subject, body.model, self.options)
             self._solved = self._headings is None
         if self._headings is not None and not self._solved:
             self._headings.add_observations(*oriented)
             self._waiting.append(oriented)
             return []
-        return [self._solve_pose(oriented)]
+        return [self._solve_pose(oriented, body)]
 
-    def _solve_pose(self, oriented: Oriented) -> TrackedRecording:
+    def _solve_pose(self, oriented: Oriented, tracked_body: TrackedBody) -> TrackedRecording:
         """Return a chunk with its pose, after its headings have been corrected."""
-        assert self._body is not None  # made with the first chunk
         recording, segments = oriented
-        person, body = self._body.subject, self._body.model
+        person, body = tracked_body.subject, tracked_body.model
         if self._headings is not None:
             segments = self._headings.correct(recording, segments)
         if self._kinematics is None:
             self._kinematics = KinematicsSolver(
-                body, segments.quat_WL, limits=self.options.limits, start=self._body.start
+                body, segments.quat_WL, limits=self.options.limits, start=tracked_body.start
             )
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
         shape_cov = person.shape_covariance(body.table)
