@@ -63,7 +63,7 @@ def find_alternatives(
 
     best = solve_from(fit.x[rows])
     std = np.sqrt(np.diag(np.linalg.inv(fit.information))[rows])
-    found: list[Alternative] = []
+    alternatives: list[Alternative] = []
     closed = observations.take(observations.closed).apply_steps(fit.x)
     for psi in find_distinct_headings(closed, fit.x, stated):
         other = solve_from(psi)
@@ -74,9 +74,9 @@ def find_alternatives(
         new = Alternative(offset, float((1.0 + max(other.cost - best.cost, 0.0) / degrees) ** (-0.5 * degrees)))
         if np.abs(offset[rows] / std).max() < NEAR or new.weight < LEAST_WEIGHT:
             continue
-        if all(np.abs((offset - each.offset)[rows] / std).max() > NEAR for each in found):
-            found.append(new)
-    return sorted(found, key=lambda each: -each.weight)
+        if all(np.abs((offset - each.offset)[rows] / std).max() > NEAR for each in alternatives):
+            alternatives.append(new)
+    return sorted(alternatives, key=lambda each: -each.weight)
 
 
 def widen_covariance(covariance: np.ndarray, others: list[Alternative], layout: Layout) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from ..alignment import compute_heading_variance
 from ..errors import BadPhase
 from ..filters import Orientation
-from ..filters.smekf import HOLD_S, UNSEEN_RATE_STD
+from ..filters.smekf import HOLD_S, LOST_RATE_STD
 from ..recording import OrientationSensor, Recording, format_span
 from ..recording.gaps import find_runs
 
@@ -52,7 +52,7 @@ def find_sample_losses(recording: Recording, start: tuple[float, float], sensors
             continue
         for first, end in find_runs(sensor.gap):
             seconds = (end - first + 1) / recording.rate_hz
-            std = min(HEADING_STD, UNSEEN_RATE_STD * seconds**2 / (seconds + HOLD_S))
+            std = min(HEADING_STD, LOST_RATE_STD * seconds**2 / (seconds + HOLD_S))
             losses.append(SampleLoss(name, first, end - 1, first >= begin, std))
     return losses
 

@@ -218,11 +218,11 @@ def _joint_errors(
     gap = {segment: gap[inside] for segment, gap in pose.gap.items() if segment in true_WL}
     estimated = Pose(time, {segment: pose.quat_WL[segment][inside] for segment in true_WL}, {}, gap=gap)
     try:
-        found, true = joint_angles(estimated), joint_angles(Pose(time, true_WL, {}))
+        angles, true = joint_angles(estimated), joint_angles(Pose(time, true_WL, {}))
     except BadData:  # no joint has both of its segments
         return {}, {}
     errors, agreement = {}, {}
-    for name, joint in found.joints.items():
+    for name, joint in angles.joints.items():
         sound = ~(joint.gap | joint.near_lock | true[name].gap | true[name].near_lock)
         if not sound.any():
             continue

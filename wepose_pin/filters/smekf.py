@@ -61,7 +61,7 @@ class SmekfParams:
     bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the static phase's first differences
     static_gyro_cov: np.ndarray | None = None  # (3, 3) [rad²/s²] of static gyro about the bias; None: Σ_ω
     static_accel_cov: np.ndarray | None = None  # (3, 3) of static accel/g about the vertical; None: Σ_g
-    static_turn_noise: float = 0.0  # [rad/√s] by which a static sensor may turn about the vertical unseen; the paper: 0
+    static_turn_noise: float = 0.0  # [rad/√s] of undetected rotation about the vertical in a static phase; the paper: 0
     first_order: bool = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
     gyro_scale_std: float = 0.0  # of the gyroscope's scale, which no static phase shows; the paper: 0
     gyro_range: float = np.inf  # [rad/s]; a sample at it is used, and the covariance grows by what may be beyond
@@ -91,10 +91,10 @@ def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, til
 
 
 # At a missing sample (NaN, or beyond `recording.limits`) the last rate is held and fades with the time constant HOLD_S,
-# no correction is made, and the attitude's standard deviation grows by the motion that may have gone unseen: after T
-# seconds by UNSEEN_RATE_STD T²/(T + HOLD_S), up to π.
+# no correction is made, and the attitude's standard deviation grows by the motion that may have been missed: after T
+# seconds by LOST_RATE_STD T²/(T + HOLD_S), up to π.
 HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
-UNSEEN_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
+LOST_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
 
 # The state of a sensor is one record, its constants (the model) are another. Upper triangles are xx xy xz yy yz zz.
 STATE = np.dtype(
@@ -107,7 +107,7 @@ STATE = np.dtype(
         ("P_ab", float, (3, 3)),  # [rad²/s]
         ("P_bb", float, 6),  # [rad²/s²] upper triangle
         ("held_rate", float, 3),  # [rad/s] the last that was measured
-        ("unseen_s", float),  # [s] since then
+        ("lost_s", float),  # [s] since then
         ("about_vertical", float, VERTICAL_COLUMNS),  # as `base.AboutVertical`
     ],
     align=True,
@@ -122,7 +122,7 @@ MODEL = np.dtype(
         ("static_accel_cov", float, 6),  # of accel/g
         ("fade", float),  # factor on a held rate at each missing sample
         ("first_order", np.bool_),
-        ("static_turn", float),  # [rad²] variance of an unseen turn in a static sample
+        ("static_turn", float),  # [rad²] variance of an undetected turn in a static sample
         ("scale_var", float),  # of the gyroscope's scale
         ("gyro_range", float),  # [rad/s]
     ],
@@ -150,8 +150,8 @@ class SmekfState:
 class Smekf:
     """sMEKF of one sensor. Σ_ω, Σ_g, Σ_b, the first bias and the size of gravity come from `noise`.
 
-    Missing samples are NaN: the last rate is held and fades, and `attitude_cov` grows by the motion that may have gone
-    unseen (HOLD_S, UNSEEN_RATE_STD). `run` and `update` are those of `base.OrientationFilter`.
+    Missing samples are NaN: the last rate is held and fades, and `attitude_cov` grows by the motion that may have been
+    missed (HOLD_S, LOST_RATE_STD). `run` and `update` are those of `base.OrientationFilter`.
     """
 
     def __init__(
@@ -221,23 +221,23 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
     """Take one sample of one sensor: records of `STATE` and `MODEL`, gyro [rad/s], accel [m/s²]."""
     dt, bias, held = model.dt, state.gyro_bias, state.held_rate
     integrate_corrections(state.about_vertical, dt)
-    seen = gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
-    unseen_cov = 0.0
-    if seen:
+    is_measured = gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
+    lost_var = 0.0
+    if is_measured:
         wx, wy, wz = gx - bias[0], gy - bias[1], gz - bias[2]
     else:
         wx, wy, wz = model.fade * held[0], model.fade * held[1], model.fade * held[2]
-    if seen and max(abs(gx), abs(gy), abs(gz)) < model.gyro_range:
-        state.unseen_s = 0.0
+    if is_measured and max(abs(gx), abs(gy), abs(gz)) < model.gyro_range:
+        state.lost_s = 0.0
     else:
-        before, after = state.unseen_s, state.unseen_s + dt
-        std_before = min(np.pi, UNSEEN_RATE_STD * before * before / (before + HOLD_S))
-        std_after = min(np.pi, UNSEEN_RATE_STD * after * after / (after + HOLD_S))
-        unseen_cov = std_after * std_after - std_before * std_before
-        state.unseen_s = after
+        before, after = state.lost_s, state.lost_s + dt
+        std_before = min(np.pi, LOST_RATE_STD * before * before / (before + HOLD_S))
+        std_after = min(np.pi, LOST_RATE_STD * after * after / (after + HOLD_S))
+        lost_var = std_after * std_after - std_before * std_before
+        state.lost_s = after
     held[0], held[1], held[2] = wx, wy, wz
-    predict(state, model, wx * dt, wy * dt, wz * dt, unseen_cov)
-    if static and seen and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
+    predict(state, model, wx * dt, wy * dt, wz * dt, lost_var)
+    if static and is_measured and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
         correct(state, model, gx, gy, gz, ax, ay, az)
     update_attitude_cov(state, model, wx * dt, wy * dt, wz * dt)
 
@@ -263,17 +263,17 @@ def update_attitude_cov(state, model, wx, wy, wz):  # type: ignore[no-untyped-de
 
 
 @inlined
-def predict(state, model, wx, wy, wz, unseen_cov):  # type: ignore[no-untyped-def]
+def predict(state, model, wx, wy, wz, lost_var):  # type: ignore[no-untyped-def]
     """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w), P ← F P Fᵀ + G Q Gᵀ.
 
-    G Q Gᵀ = δt² diag(Σ_ω, Σ_b). `unseen_cov` [rad²] is added on top.
+    G Q Gᵀ = δt² diag(Σ_ω, Σ_b). `lost_var` [rad²] is added on top.
     """
     rotate_by_vector(state.quat_WS, wx, wy, wz)
     propagate(state, wx, wy, wz, model.dt, model.first_order)
     P_aa, P_bb = state.P_aa, state.P_bb
     for i in range(6):
         diagonal = i == 0 or i == 3 or i == 5
-        P_aa[i] += model.attitude_step[i] + unseen_cov if diagonal else model.attitude_step[i]
+        P_aa[i] += model.attitude_step[i] + lost_var if diagonal else model.attitude_step[i]
         P_bb[i] += model.bias_step[i]
 
 

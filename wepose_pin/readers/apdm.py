@@ -61,13 +61,13 @@ def read_apdm(path: Path, use: str | None = None, rate_hz: float | None = None) 
     names = [str(k) for k in range(len(rows[1] if newer else rows[2]))]
     body = path.read_bytes().split(b"\n", lines)[lines:]
     text = Text(path, {}, parse_rows(path, body[0] if body else b"", names, ",", lines, "CSV of APDM"))
-    wanted = {"raw": ("gyro", "accel"), "orientation": ("orientation",)}
-    kinds = [use] if use else list(wanted)
+    needed = {"raw": ("gyro", "accel"), "orientation": ("orientation",)}
+    kinds = [use] if use else list(needed)
     signals = {
         kind: {
             label: its
             for label, its in places.items()
-            if all(signal in its and [str(k) for k in its[signal]] in text for signal in wanted[kind])
+            if all(signal in its and [str(k) for k in its[signal]] in text for signal in needed[kind])
         }
         for kind in kinds
     }
@@ -75,17 +75,17 @@ def read_apdm(path: Path, use: str | None = None, rate_hz: float | None = None) 
     if kind is None:
         instead = "; leave out data.use" if use else ""
         raise BadData(
-            f"{path}: no sensor in it has {' or '.join(' and '.join(wanted[kind]) for kind in kinds)}{instead}"
+            f"{path}: no sensor in it has {' or '.join(' and '.join(needed[kind]) for kind in kinds)}{instead}"
         )
     values = {}
     for label, its in signals[kind].items():
         values[label] = {
-            signal: scale.get(signal, 1.0) * text.numbers([str(k) for k in its[signal]]) for signal in wanted[kind]
+            signal: scale.get(signal, 1.0) * text.numbers([str(k) for k in its[signal]]) for signal in needed[kind]
         }
         if kind == "orientation":
             values[label] = {"orientation": values[label]["orientation"][:, [1, 2, 3, 0]]}
     left_out = [label for label in places if label not in values]
-    facts = {"devices": ", ".join(left_out), "signals": " and ".join(wanted[kind])}
+    facts = {"devices": ", ".join(left_out), "signals": " and ".join(needed[kind])}
     missing = (Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts),) if left_out else ()
     time = np.arange(text.cells.height) / rate_hz if rate_hz else (US if newer else 1.0) * text.numbers(["0"])[:, 0]
     labels = {label: load_table().guess_segment(label) for label in values}

@@ -54,29 +54,29 @@ def read_apdm_hdf5(path: Path, use: str | None = None, rate_hz: float | None = N
     BadData
         No HDF5 of APDM; damaged; not what `use` asks for; h5py is not installed.
     """
-    wanted = {"raw": ("gyro", "accel"), "orientation": ("orientation",)}
+    needed = {"raw": ("gyro", "accel"), "orientation": ("orientation",)}
     with open_hdf5(path) as file:
         sensors = _list_sensors(file)
     if not sensors:
         raise BadData(f"{path}: is no HDF5 of APDM: neither CaseIdList nor Sensors with a Configuration is in it")
     arrays = ArrayFile(path)
     kind = use or ("raw" if any({"gyro", "accel"} <= set(each.arrays) for each in sensors) else "orientation")
-    complete = [each for each in sensors if {*wanted[kind]} <= set(each.arrays) and each.time in arrays.shapes]
+    complete = [each for each in sensors if {*needed[kind]} <= set(each.arrays) and each.time in arrays.shapes]
     if not complete:
         instead = "; leave out data.use" if use else ""
-        raise BadData(f"{path}: no sensor in it has {' and '.join(wanted[kind])}, and times{instead}")
+        raise BadData(f"{path}: no sensor in it has {' and '.join(needed[kind])}, and times{instead}")
     clocks, values = {}, {}
     for each in complete:
         time = _read(arrays, each.time)
         clocks[each.label] = np.arange(len(time)) / rate_hz if rate_hz else US * time[:, 0]
-        values[each.label] = {name: _read(arrays, each.arrays[name], WIDTHS[name]) for name in wanted[kind]}
+        values[each.label] = {name: _read(arrays, each.arrays[name], WIDTHS[name]) for name in needed[kind]}
         lengths = {len(time), *map(len, values[each.label].values())}
         if len(lengths) > 1:
             raise BadData(f"{path}: the arrays of '{each.label}' differ in length: {sorted(lengths)}; export it again")
         if kind == "orientation":
             values[each.label] = {kind: values[each.label][kind][:, [1, 2, 3, 0]]}
     left_out = [each.label for each in sensors if each not in complete]
-    facts = {"devices": ", ".join(left_out), "signals": " and ".join(wanted[kind])}
+    facts = {"devices": ", ".join(left_out), "signals": " and ".join(needed[kind])}
     missing = (Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts),) if left_out else ()
     labels = {label: load_table().guess_segment(label) for label in values}
     return make_device("apdm_hdf5", kind, clocks, values, labels, missing)

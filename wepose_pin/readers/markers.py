@@ -89,16 +89,14 @@ def _check(top: TomlTable, key: str, name: str, value: Any) -> None:
         return isinstance(each, list) and bool(each) and all(isinstance(text, str) for text in each)
 
     if key == "points":
-        good, wanted = (
+        good, form = (
             isinstance(value, list) and all(map(is_names, value)),
             '[["A", "B"], ["C"]], ways, each of markers',
         )
     elif key == "rotations":
-        good, wanted = isinstance(value, str), "the name of a rotation"
+        good, form = isinstance(value, str), "the name of a rotation"
     else:
-        wanted = (
-            '[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions from markers to markers'
-        )
+        form = '[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions from markers to markers'
         good = isinstance(value, list) and all(
             isinstance(way, dict)
             and len(way) == 2
@@ -107,7 +105,7 @@ def _check(top: TomlTable, key: str, name: str, value: Any) -> None:
             for way in value
         )
     if not good:
-        raise BadData(f"{top.at(key)}.{name} = {str(value)[:60]}; {wanted} is needed")
+        raise BadData(f"{top.at(key)}.{name} = {str(value)[:60]}; {form} is needed")
 
 
 def locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], table: MarkerTable) -> Reference:
@@ -132,10 +130,10 @@ def locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], tabl
                 quats[segment] = _orient(segment, frame, known)
                 break
     if not points and not quats:
-        wanted = sorted({each for ways in table.points.values() for way in ways for each in way} - set(table.points))
+        expected = sorted({each for ways in table.points.values() for way in ways for each in way} - set(table.points))
         raise BadData(
             f"{path}: no joint follows from its markers ({', '.join(list(markers)[:8]) or 'none'}, …); "
-            f"{one_of(wanted, most=12)}. Name yours in a table of markers (--markers)"
+            f"{one_of(expected, most=12)}. Name yours in a table of markers (--markers)"
         )
     return Reference(time, quats, points)
 

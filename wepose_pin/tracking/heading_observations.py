@@ -237,12 +237,12 @@ class ClaspDetector:
         R = correct_headings(quats, headings)
         motions = move_all_girdles(problem, R)
         R_reference = R[names.index(reference)]
-        found = []
-        seen = set[tuple[str, ...]]()
+        clasps = []
+        tested = set[tuple[str, ...]]()
         for closure in problem.closures:
-            if closure.points in seen or closure.holds(knot.time).any() or not self._is_calibrated(closure):
+            if closure.points in tested or closure.holds(knot.time).any() or not self._is_calibrated(closure):
                 continue
-            seen.add(closure.points)
+            tested.add(closure.points)
             paths = [(way.turn(R, motions).sum(axis=0)[:, None] @ R_reference)[:, 0] for way in closure.ways]
             speed = min(_find_rms(np.gradient(path, time, axis=0)) for path in paths)
             v = closure.gap.turn(R, motions)
@@ -263,8 +263,8 @@ class ClaspDetector:
                 continue
             joined = np.ones(len(knot.time), dtype=bool)
             rows = build_gap_rows(R[:, -len(knot.time) :], problem, closure, joined, problem.noise.slip_std)
-            found.append((closure.points, rows))
-        return found
+            clasps.append((closure.points, rows))
+        return clasps
 
 
 def _find_rms(v: np.ndarray) -> float:

@@ -249,14 +249,14 @@ def _find_closures(
     Each holds in the intervals of its phase, none where the recording lacks it. `recording` None: none are read.
     """
     neutral = StartPose(orient_links(model, pin.neutral(model.pin)))
-    closures, seen = [], set[tuple[str, tuple[str, ...]]]()
+    closures, taken = [], set[tuple[str, tuple[str, ...]]]()
     for name in PROTOCOLS:
         for closure in load_protocol(name).closures:
             if closure.kind != "coincide" or not set(closure.points) <= set(model.table.points):
                 continue
-            if (closure.phase, closure.points) in seen:
+            if (closure.phase, closure.points) in taken:
                 continue
-            seen.add((closure.phase, closure.points))
+            taken.add((closure.phase, closure.points))
             first, last = closure.points
             try:
                 gap, *ways = (
