@@ -346,7 +346,7 @@ def describe_known(experiment: str, presets: Mapping[str, Mapping[str, Any]]) ->
     still = (
         "noise, gyroscope bias and tilt, from {} (default gains: their bias starts at zero); the heading, aligned there"
     )
-    lengths = f"the shoulder width{off_text}; stature to 1 cm, and sex"
+    lengths = f"the shoulder width between the joint centres{off_text}; stature to 1 cm, and sex"
     bias = (
         "noise, gyroscope bias and tilt of each sensor, from the start pose (default gains: their bias starts at zero)"
     )
@@ -386,7 +386,7 @@ def describe_table(rows: Sequence[Row]) -> str:
     if set(SHORT.values()) & set(keys):
         notes.append(
             "nees: normalised squared error of the hand from the root, right are 3; in 1σ, in 2σ: share of its errors "
-            "within one and two stated standard deviations, right are 0.68 and 0.95"
+            "of one axis within one and two stated standard deviations, right are 0.68 and 0.95"
         )
     if any(key in ERRORS for key in keys) and len(rows) > 1 and not rows[0].experiment.startswith(ERROR_BUDGET):
         notes.append("bold: the smallest of a column")
