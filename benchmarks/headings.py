@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.recording import Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, PEOPLE_PRESET, Imperfections, Simulation, simulate, simulate_person
 from wepose_pin.simulation.tasks import TASKS
@@ -60,7 +61,7 @@ def measure_headings(name: str, preset: Imperfections, persons: int, seconds: fl
     for seed in range(1, persons + 1):
         simulation = simulate_free_motion(seed, preset, seconds)
         hours += seconds / 3600.0
-        tracked = track_in_all_ways(simulation)
+        tracked = track_in_all_ways(simulation.recording())
         for kind, of in tracked.items():
             for row, figures in compare_headings(simulation, of).items():
                 for key, value in figures.items():
@@ -84,9 +85,8 @@ def simulate_free_motion(seed: int, preset: Imperfections, seconds: float) -> Si
     )
 
 
-def track_in_all_ways(simulation: Simulation) -> dict[str, TrackedRecording]:
-    """Track a simulation in open loop, and with headings corrected offline and causally."""
-    recording = simulation.recording()
+def track_in_all_ways(recording: Recording) -> dict[str, TrackedRecording]:
+    """Track a recording with its start phase alone: in open loop, and with headings corrected offline and causally."""
     recording = replace(recording, phases={"start": recording.phases["start"]})
     return {
         "open": track(recording, open_loop=True),
