@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -24,12 +24,14 @@ from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.mvnx import SEGMENT_OF, read_frames
 from wepose_pin.readers.trials import RING_SEGMENTS, find_ring
+from wepose_pin.simulation import NOISE_FREE
 from wepose_pin.subject import load_subject, population_subject, subject_toml
 from wepose_pin.tracking import track
 from wepose_pin.validation import real
 from wepose_pin.validation.series import align_rotation
 from wepose_pin.writers import write_session
 
+from .four_bar import PROTOCOL, STD_PERCENT, move_four_bar, write_four_bar
 from .ring_chain import RingSession, write_ring_session
 from .tables import Column, Section, Table
 from .ur5_arm import RUNS, move_arm, write_table, write_ur5_session, write_urdf
@@ -55,6 +57,7 @@ def sections(quick: bool, data: Path | None) -> dict[str, Section]:
         "ring links": partial(measure_ring_links, data, MOUNTS[: 1 if quick else None]),
         "ring orientations": partial(measure_ring_orientations, data, MOUNTS[: 1 if quick else None]),
         "ur5 links": partial(measure_ur5_links, (0,) if quick else (0, 1, 2)),
+        "four-bar linkage": partial(measure_four_bar, range(3 if quick else 12)),
         "ur5 encoders": partial(measure_ur5, data, ("amekf",) if quick else ("smekf", "amekf")),
         "mvnx": partial(measure_mvnx, data),
         "legs": partial(measure_legs, ("walk",) if quick else ("walk", "sit")),
@@ -200,6 +203,55 @@ def measure_ur5_links(seeds: Sequence[int], folder: Path) -> Table:
                 "std_mm": 1e3 * std,
                 "true_mm": 1e3 * true,
                 "z": (value - true) / std,
+            }
+    return table
+
+
+def measure_four_bar(seeds: Sequence[int], folder: Path) -> Table:
+    """Measure the lengths of a simulated four-bar linkage by `wepose calibrate`, and what their errors come from."""
+    table = Table(
+        "Four-bar linkage, simulated, the tip on its pivot on the ground: three lengths by wepose calibrate",
+        (
+            Column("mean_mm", "mean error [mm]", 1),
+            Column("spread_mm", "its spread [mm]", 1),
+            Column("std_mm", "± [mm]", 1),
+            Column("z", "error / ±, rms", 2),
+        ),
+        notes=[f"{len(seeds)} seeds. Lengths are known to {STD_PERCENT:g} % before."],
+    )
+    exact: dict[str, Any] = {"start_std": 0.0}
+    noise_free: dict[str, Any] = {"noise": NOISE_FREE}
+    cases: dict[str, tuple[float, dict[str, Any]]] = {
+        "all errors": (STD_PERCENT, {}),
+        "lengths unknown before": (10.0 * STD_PERCENT, {}),
+        "exact start pose": (STD_PERCENT, exact),
+        "sensors without noise": (STD_PERCENT, noise_free),
+        "neither of these": (STD_PERCENT, exact | noise_free),
+    }
+    for case, (std_percent, options) in cases.items():
+        model = write_four_bar(folder, std_percent)
+        body = load_model(model)
+        errors: dict[str, list[tuple[float, float]]] = {name: [] for name in body.lengths}
+        for seed in seeds:
+            moved, session = move_four_bar(body, seed, **options), folder / f"{len(table.rows)}-{seed}"
+            session.mkdir()
+            write_session(session, moved.recording)
+            (folder / "pivot.toml").write_text(PROTOCOL.format(at=moved.tip[0].tolist()), encoding="utf-8")
+            run(
+                *("calibrate", session, "--model", model, "--protocol", folder / "pivot.toml"),
+                *("-o", folder / "cal", "--no-report", "--force"),
+                codes=(0, 3, 4),
+            )
+            subject = load_subject(folder / "cal")
+            for name, true in moved.lengths.items():
+                errors[name].append((subject.lengths[name] - true, subject.std(name)))
+        for name, pairs in errors.items():
+            error, std = np.transpose(pairs)
+            table.rows[f"{case}: {name}"] = {
+                "mean_mm": 1e3 * float(error.mean()),
+                "spread_mm": 1e3 * float(error.std()),
+                "std_mm": 1e3 * float(std.mean()),
+                "z": float(np.sqrt(np.mean((error / std) ** 2))),
             }
     return table
 

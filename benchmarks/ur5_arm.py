@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.model import BodyModel
 from wepose_pin.readers.trials import find_ur5, read_ur5
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording
-from wepose_pin.simulation import MTI_3
+from wepose_pin.simulation import MTI_3, ImuNoise
 from wepose_pin.validation.real import UR5_EXCLUDED
 
 # The axes of a UR5's joints while all are at zero, the arm stretched out along x.
@@ -135,14 +135,17 @@ def move_arm(
     stated: bool = False,
     start: Mapping[str, float] = BENT,
     ratios: Mapping[str, float] = TRUE,
+    start_std: float = START_STD,
+    noise: ImuNoise = MTI_3,
 ) -> Moved:
     """Move the arm, or another chain, its tip on one point, on two one after the other, or free (0).
 
     Parameters
     ----------
     stated : the session states the mounts
-    start : joint → [rad] in the start pose, but for `START_STD`
+    start : joint → [rad] in the start pose, but for `start_std` [rad]
     ratios : length → the true one over that of the body
+    noise : densities of the sensors' white noise
     """
     true = body.with_lengths({name: ratio * body.lengths[name] for name, ratio in ratios.items()})
     model, data, rng = true.pin, true.pin.createData(), np.random.default_rng(seed)
@@ -156,7 +159,7 @@ def move_arm(
     wave = np.sin(2.0 * np.pi * frequency * (time[:, None, None] - MOVE_S) + phase)
     rate = 0.9 * rise[:, None] * (amplitude * wave).sum(axis=2)  # [rad/s]
     q = np.empty((len(time), joints))
-    q[0] = [start[name] for name in model.names[1:]] + rng.normal(scale=START_STD, size=joints)
+    q[0] = [start[name] for name in model.names[1:]] + rng.normal(scale=start_std, size=joints)
     pin.framesForwardKinematics(model, data, q[0])
     target = data.oMf[tip_frame].translation + change * AWAY * np.ones((len(time), 1))
     tip = np.empty((len(time), 3))
@@ -185,9 +188,9 @@ def move_arm(
         gyro[1:] = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * RATE
         accel_W = np.gradient(np.gradient(place[link], 1.0 / RATE, axis=0), 1.0 / RATE, axis=0)
         accel = R_WS.inv().apply(accel_W + [0.0, 0.0, 9.81])
-        gyro += rng.normal(size=3) * BIAS_STD + rng.normal(size=gyro.shape) * MTI_3.gyro_density * np.sqrt(RATE)
+        gyro += rng.normal(size=3) * BIAS_STD + rng.normal(size=gyro.shape) * noise.gyro_density * np.sqrt(RATE)
         accel += rng.normal(size=3) * ACCEL_BIAS_STD
-        accel += rng.normal(size=accel.shape) * MTI_3.accel_density * np.sqrt(RATE)
+        accel += rng.normal(size=accel.shape) * noise.accel_density * np.sqrt(RATE)
         in_start_pose = (Rotation.from_matrix(R[link][0]) * mount).as_quat() if stated else None
         sensors[link] = ImuSensor(gyro_S=gyro, accel_S=accel, stated_quat_LS=in_start_pose)
     phases = {"start": (START_S,), "tip": ((MOVE_S + 2.0, end),)}
