@@ -29,11 +29,7 @@ def main() -> int:
     saving.add_argument("--inputs", type=Path, help="recordings of another run (its inputs/) in place of new ones")
     saving.add_argument("--only", default="*", metavar="PATTERN", help="only tasks of such names, as 'mild/*'")
     saving.add_argument("--jobs", type=int, default=2, help="processes (2)")
-    saving.add_argument(
-        "--loop",
-        action="store_true",
-        help="solve calibrations by the Gauss-Newton loop, but those of batch and validate",
-    )
+    saving.add_argument("--loop", action="store_true", help="solve calibrations by the Gauss-Newton loop")
     comparing = commands.add_parser("compare", help="hold two folders of `save` against each other, bit for bit")
     comparing.add_argument("old", type=Path)
     comparing.add_argument("new", type=Path)

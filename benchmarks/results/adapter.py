@@ -204,10 +204,18 @@ class Outcome:
 
 
 def solve_by_loop() -> None:
-    """Solve calibrations by the Gauss-Newton loop from now on, in this process."""
+    """Solve calibrations by the Gauss-Newton loop from now on: here, in the workers of `batch`, and in `validate`."""
+    from functools import partial
+
+    from wepose_pin import validation
+    from wepose_pin.batch import cluster
+
     from ..calibration import exchange_solver, solve_without_bounds
 
     exchange_solver(solve_without_bounds)
+    preload = "from benchmarks.calibration import exchange_solver, solve_without_bounds as loop; exchange_solver(loop)"
+    cluster.SETTINGS["distributed.worker.preload"].append(preload)
+    validation.run_jobs = partial(validation.run_jobs, workers=1)  # in this process
 
 
 def run(argv: list[str]) -> Outcome:
