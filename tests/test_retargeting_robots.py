@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from arms import FORE, HAND, UPPER, person
 from scipy.spatial.transform import Rotation
@@ -24,6 +25,7 @@ from wepose_pin.retargeting import (
     retarget,
 )
 from wepose_pin.retargeting.checks import AT_REST
+from wepose_pin.retargeting.collision import CollisionModel
 from wepose_pin.retargeting.files import place_root
 from wepose_pin.retargeting.maps import find_example_data
 from wepose_pin.retargeting.targets import compute_target_reach
@@ -55,6 +57,21 @@ def test_a_humanoid_stands_on_the_floor_in_exports(name: str, height: float) -> 
     *at, qx, qy, qz, qw = place_root(robot)
     np.testing.assert_allclose(at, [0.0, 0.0, height], atol=1e-3)
     np.testing.assert_allclose(Rotation.from_quat([qx, qy, qz, qw]).as_matrix(), robot.R_BT.T, atol=1e-12)
+
+
+def test_distances_do_not_jump_between_neighbouring_postures() -> None:
+    """Baxter's arms are cylinders, whose distances are found by iteration."""
+    robot = load_robot(find_map("baxter"))
+    collision, data, rng = CollisionModel(robot), robot.model.createData(), np.random.default_rng(0)
+    for _ in range(10):
+        position = robot.rest + 0.1 * rng.standard_normal(len(robot.rest))
+        near = []
+        for step in (0.0, 1e-12 * rng.standard_normal(len(position))):
+            pin.computeJointJacobians(robot.model, data, robot.configuration(position + step))
+            near.append(collision.find_near_pairs(data))
+        np.testing.assert_array_equal(near[0].pairs, near[1].pairs)
+        np.testing.assert_allclose(near[0].distance, near[1].distance, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(near[0].jacobian, near[1].jacobian, rtol=0.0, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
