@@ -20,6 +20,8 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, MissingFile
+from ..model import load_table
+from ..model.table import ROOT
 from .device import Device, check_measured, make_table
 from .markers import Reference
 
@@ -49,6 +51,7 @@ JOINT_OF = {
     for side in ("Left", "Right")
     for part, joint in (("UpperArm", "shoulder"), ("ForeArm", "elbow"), ("Hand", "wrist"), ("UpperLeg", "hip"))
 }
+HIPS = ("left_hip", "right_hip")  # the root is midway between them
 # MVN draws its joints on the axis, to 0.03 deg: what is off by more than this is of another convention.
 ALONG_DEG = 5.0
 
@@ -141,19 +144,16 @@ def read_mvnx_lengths(path: Path) -> dict[str, float]:
         As `read_mvnx`; no positions of the arms in it.
     """
     joints = _find_joints(read_frames(path))
+    root = tuple(joint for joint in joints if joint in HIPS)
 
-    def measure(*ends: tuple[str, ...]) -> float | None:
-        if not {name for end in ends for name in end} <= set(joints):
-            return None
-        first, last = (np.mean([joints[name] for name in end], axis=0) for end in ends)
-        return float(np.nanmedian(np.linalg.norm(last - first, axis=1)))
+    def locate(points: tuple[str, ...]) -> np.ndarray:
+        return np.mean([joints[name] for point in points for name in (root if point == ROOT else (point,))], axis=0)
 
-    shoulders, hips = ("left_shoulder", "right_shoulder"), ("left_hip", "right_hip")
-    lengths = {"shoulder_width": measure(*((name,) for name in shoulders)), "trunk": measure(hips, shoulders)}
-    for side in ("left", "right"):
-        lengths[f"{side}_upper_arm"] = measure((f"{side}_shoulder",), (f"{side}_elbow",))
-        lengths[f"{side}_forearm"] = measure((f"{side}_elbow",), (f"{side}_wrist",))
-    known = {name: length for name, length in lengths.items() if length is not None}
+    known = {}
+    for name, length in load_table().lengths.items():
+        (start, end), *others = ((part.start, part.end) for part in length.stretches)
+        if not others and {*start, *end} <= {*joints, *([ROOT] if len(root) == len(HIPS) else [])}:
+            known[name] = float(np.nanmedian(np.linalg.norm(locate(end) - locate(start), axis=1)))
     if not known:
         raise BadData(f"{path}: no positions of the arms' segments in it; export it with <position>")
     return known
