@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,43 +11,21 @@ import polars as pl
 import pytest
 from test_chain import urdf  # noqa: F401  the arm's URDF
 
+from benchmarks.four_bar import LENGTHS, PROTOCOL, move_four_bar, write_four_bar
 from benchmarks.ur5_arm import MOVE_S, TRUE, Moved, move_arm, write_table
 from wepose_pin.calibration import Calibration, Protocol, assess, calibrate
 from wepose_pin.calibration.protocols import Closure
 from wepose_pin.calibration.recorded import interpolate_places
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import render_all
 from wepose_pin.errors import WeposeError
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.writers import write_session
 
-# A crank-rocker in a vertical plane, as an open chain whose tip is the second pivot on the ground.
-FOUR_BAR = {"crank": 0.2, "coupler": 0.5, "rocker": 0.4}  # [m]
-FOUR_BAR_START = {"crank_joint": -1.2, "coupler_joint": 0.775, "rocker_joint": 2.19}  # [rad]
-FOUR_BAR_RATIOS = {"crank": 1.05, "coupler": 0.94, "rocker": 1.03}  # true lengths over the table's
-
 
 @pytest.fixture(scope="module")
 def four_bar(tmp_path_factory: pytest.TempPathFactory) -> BodyModel:
-    folder = tmp_path_factory.mktemp("four_bar")
-    text, parent, at = '<link name="ground"/>', "ground", 0.0
-    lengths, points = "", ""
-    ends = [*(f"{name}_joint" for name in list(FOUR_BAR)[1:]), "tip"]
-    for (name, length), end in zip(FOUR_BAR.items(), ends, strict=True):
-        text += (
-            f'<link name="{name}"/><joint name="{name}_joint" type="revolute"><parent link="{parent}"/>'
-            f'<child link="{name}"/><origin xyz="{at} 0 0"/><axis xyz="0 1 0"/>'
-            f'<limit lower="-9" upper="9" effort="1" velocity="9"/></joint>'
-        )
-        points += f'{name}_joint = "{name}"\n'
-        lengths += f'{name} = {{ segment = "{name}", from = "{name}_joint", to = "{end}", std_percent = 10 }}\n'
-        parent, at = name, length
-    points += f'tip = {{ link = "{parent}", at = [{at}, 0.0, 0.0] }}\n'
-    (folder / "four_bar.urdf").write_text(f'<robot name="four_bar">{text}</robot>', encoding="utf-8")
-    segments = "".join(f'{name} = "{name}"\n' for name in FOUR_BAR)
-    file = folder / "four_bar.toml"
-    head = 'urdf = "four_bar.urdf"\nkind = "mechanism"\n'
-    file.write_text(f"{head}[segments]\n{segments}[points]\n{points}[lengths]\n{lengths}", encoding="utf-8")
-    return load_model(file)
+    return load_model(write_four_bar(tmp_path_factory.mktemp("four_bar")))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +67,7 @@ def test_lengths_are_found_within_their_deviation(arm: BodyModel, seed: int) -> 
 
 
 def calibrate_four_bar(body: BodyModel, seed: int) -> tuple[Calibration, Moved]:
-    moved = move_arm(body, seed, start=FOUR_BAR_START, ratios=FOUR_BAR_RATIOS)
+    moved = move_four_bar(body, seed)
     return calibrate_arm(body, moved, on_point(at=moved.tip[0])), moved
 
 
@@ -97,7 +76,7 @@ def test_a_loop_closed_with_the_world(four_bar: BodyModel) -> None:
     calibration, moved = calibrate_four_bar(four_bar, 0)
     describe("four-bar linkage", calibration, moved)
     assert np.abs(deviations(calibration, moved)).max() < 3.0
-    for name in FOUR_BAR:  # a tenth before the motion
+    for name in LENGTHS:  # a tenth before the motion
         assert calibration.subject.std(name) < 0.04 * moved.lengths[name]
 
 
@@ -149,6 +128,27 @@ def test_places_are_interpolated_between_rows_that_have_them() -> None:
     np.testing.assert_allclose(interpolated, expected[:, None] * [1.0, 2.0, -1.0], atol=1e-9)
 
 
+def test_a_chain_whose_limb_is_drawn_is_assessed(urdf: Path) -> None:  # noqa: F811
+    table = write_table(urdf)
+    text = table.read_text(encoding="utf-8")
+    table.write_text(f'{text}[draw]\nlimbs = [["base", "elbow", "wrist", "tip"]]\n', encoding="utf-8")
+    arm = load_model(table)
+    short = calibrate_arm(arm, move_arm(arm, 0, seconds=12.0))
+    reasons = assess(short).reasons
+    assert "motion-too-short" in {diagnostic.code for diagnostic in reasons}
+    words = " ".join(text.line() for _, text in render_all(reasons))
+    assert not re.search("hand|palm|anatom|person", words)
+
+
+def test_a_closure_between_points_of_one_segment_is_refused(arm: BodyModel) -> None:
+    moved = move_arm(arm, 0, seconds=12.0)
+    for kind in ("coincide", "distance"):
+        rigid = Closure("tip", kind, ("base", "elbow"), distance="d", metres=0.4, metres_std=0.01)
+        with pytest.raises(WeposeError, match="base and elbow both move with the sensor on upper_arm_link") as raised:
+            calibrate_arm(arm, moved, rigid)
+        assert "\n" not in str(raised.value)
+
+
 def test_what_a_truth_lacks_is_said_in_one_line(arm: BodyModel, tmp_path: Path) -> None:
     recording = replace(move_arm(arm, 0, seconds=12.0).recording, truth=tmp_path / "optical.parquet")
     time = np.arange(0.0, 12.0, 0.1)
@@ -178,6 +178,33 @@ def test_a_lost_sensor_is_named_in_one_line(arm: BodyModel, tmp_path: Path, caps
     [line] = capsys.readouterr().err.strip().splitlines()
     assert "forearm_link" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_a_chain_by_option_has_its_report_and_its_live_recording(
+    four_bar: BodyModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`--model` is the body of the report's motion too, and of what a live recording is tracked with."""
+    moved, model = move_four_bar(four_bar, 5, seconds=20.0), four_bar.table.where
+    (tmp_path / "session").mkdir()
+    write_session(tmp_path / "session", moved.recording)
+    (tmp_path / "pivot.toml").write_text(PROTOCOL.format(at=moved.tip[0].tolist()), encoding="utf-8")
+
+    def run(*words: object) -> None:
+        with pytest.raises(SystemExit) as stopped:
+            main([str(word) for word in words])
+        assert stopped.value.code in (None, 0, 3, 4), capsys.readouterr().err
+
+    session, cal, log = tmp_path / "session", tmp_path / "cal", tmp_path / "a.wepose"
+    run("calibrate", session, "--model", model, "--protocol", tmp_path / "pivot.toml", "-o", cal)
+    page = re.sub(
+        "<script.*?</script>|<[^>]+>", " ", (cal / "report.html").read_text(encoding="utf-8"), flags=re.DOTALL
+    )
+    assert "The motion in 3D" in page
+    assert not re.search("cannot be tracked|[Pp]alm|hands|anatom|population", page)
+    replay = ("live", "--source", f"replay:{session}", "--speed", "max", "--no-page", "--record", log)
+    run(*replay, "--model", model, "--subject", cal, "--accept-failed")
+    run("track", log, "-o", tmp_path / "result", "--no-report", "--no-view")
+    assert (tmp_path / "result" / "joints.parquet").exists()
 
 
 @pytest.mark.monte_carlo

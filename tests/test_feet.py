@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +11,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.calibration import Calibration, calibrate
+from wepose_pin.calibration import Calibration, assess, calibrate
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import render_all
 from wepose_pin.model import load_table
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import MTI_3
@@ -98,6 +101,18 @@ def test_stated_deviations_of_legs_are_right_over_seeds() -> None:
     rms = np.sqrt(np.mean(np.square(z)))
     print(f"rms of z over {len(z)} people: {rms:.2f}")
     assert 0.5 < rms < 1.5
+
+
+def test_advice_is_of_feet() -> None:
+    """Nine seconds are too few: what to do is not said in the words of hands."""
+    recording, lengths, _ = stand_and_squat(1)
+    ((begin, _),) = recording.phases["feet"]
+    short = replace(recording, phases={**recording.phases, "feet": ((begin, begin + 9.0),)})
+    measured = {"hip_width": lengths["hip_width"]}
+    quality = assess(calibrate(short, model="whole_body", protocol="feet", measured=measured))
+    assert "motion-too-short" in {diagnostic.code for diagnostic in quality.reasons}
+    words = " ".join(text.line() for _, text in render_all(quality.reasons))
+    assert not re.search("hand|palm|arm", words)
 
 
 def test_feet_by_the_command_and_on_a_body_without_legs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -179,7 +179,7 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
 def test_without_a_mount_it_says_why_there_is_no_motion(made: Made) -> None:
     calibration = replace(made[0], subject=replace(made[0].subject, mounts={}))
     page = render_calibration_report(calibration, made[1])
-    assert "The report lacks the positions of the hands and the 3D view." in page
+    assert "The report lacks the motion in 3D." in page
     assert "mount is not known" in page
     assert headings(page) == [
         "Lengths",
@@ -194,7 +194,7 @@ def test_one_hand_at_a_point(made: Made) -> None:
     page = render_calibration_report(made[0], made[1], tracked=made[2], protocol="touch_left")
     assert "Palm to its point over time" in headings(page)
     assert "The left palm went from" in text_of(page)
-    assert "Not in the chain, known by the population prior's proportions" in text_of(page)
+    assert "Not in the chain, known by the prior's proportions" in text_of(page)
     assert "joined" not in without_frame(page)
 
 

@@ -84,6 +84,12 @@ class LabelCheck:
     places: tuple[str, ...] = ()
     pairs: Mapping[str, str] = field(default_factory=dict)
 
+    @classmethod
+    def from_motion(cls, limbs: LimbMotion, table: BodyTable) -> LabelCheck:
+        """The check of labels by how the limbs moved; a mechanism has no limits of anatomy."""
+        doubt = 0.0 if table.is_mechanism else limbs.doubt()
+        return cls(doubt, limbs.contradiction() if doubt > 1.0 else None)
+
     def diagnostic(self, severity: Severity = ERROR) -> Diagnostic:
         """The sensors that sit on other segments, or the movement that a person cannot make."""
         if not self.moved:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..errors import BadOption, BadSession
 from ..kinematics import find_carrier
-from ..model import BodyModel, Girdle
+from ..model import BodyModel, BodyTable, Girdle
 from ..model.girdle import find_girdle_scale
 from ..model.reaches import UNIVERSE
 from .protocols import Axis, Closure, Direction, Protocol
@@ -63,6 +63,12 @@ class Loop:
     def parts(self) -> tuple[Part, ...]:
         """Of all ways."""
         return tuple(part for way in self.ways for part in way)
+
+
+def choose_variant(closure: Closure, table: BodyTable) -> str:
+    """The variant of texts about a closure: its kind, "general" where it is not one of a person's hands."""
+    of_hands = closure.kind == "recorded" or set(closure.points) <= set(table.paths)
+    return closure.kind if of_hands and not table.is_mechanism else "general"
 
 
 @dataclass(frozen=True)
@@ -191,6 +197,12 @@ def _resolve_closure(
     if not any(part.sensor != UNIVERSE for way in ways for part in way):
         raise BadSession(
             f"protocol '{protocol.name}': no sensor moves {' and '.join(closure.points)}; a point that moves is needed"
+        )
+    between = {part.sensor for way in ways for part in way}
+    if closure.kind in ("coincide", "distance") and len(between) == 1:
+        raise BadSession(
+            f"protocol '{protocol.name}': {' and '.join(closure.points)} both move with the sensor on {between.pop()}, "
+            f"so that their distance cannot change; points on two segments with sensors are needed"
         )
     girdles = tuple(find_girdle_signs(model, points) for points in closure.ways)
     if closure.on and closure.on not in sensors:

@@ -233,9 +233,7 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
         best = solve_calibration(problem)
     except NoSolution as error:
         raise NoSolution(f"{problem.recording.where()}: {error}") from error
-    limbs = best.limbs()
-    labels = LabelCheck(limbs.doubt(), limbs.contradiction() if limbs.doubt() > 1.0 else None)
-    return replace(best, labels=labels, unused_mounts=tuple(unused))
+    return replace(best, labels=LabelCheck.from_motion(best.limbs(), problem.model.table), unused_mounts=tuple(unused))
 
 
 def _diagnose_unused_mount(segment: str, angle_deg: float, limit_deg: float, contradiction: str = "") -> Diagnostic:

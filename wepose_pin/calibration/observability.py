@@ -9,7 +9,7 @@ import numpy as np
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..model import BodyModel
 from ..recording import format_span
-from .conditions import Loop, find_segments
+from .conditions import Loop, choose_variant, find_segments
 from .least_squares import Observations
 from .problem import CalibrationProblem
 from .protocols import PROTOCOLS, load_protocol
@@ -106,11 +106,14 @@ def diagnose_closures(
     time: np.ndarray, contact: np.ndarray, observations: Observations, model: BodyModel
 ) -> list[Diagnostic]:
     """The share and the intervals in which each closure was open."""
-    diagnostics, variant = [], "mechanism" if model.table.is_mechanism else ""
+    diagnostics = []
     for closure, span in observations.spans():
         apart = contact[span] < MIN_CONTACT
         if isinstance(closure, Loop) and apart.any():
-            facts = {"intervals": format_longest(find_intervals(time[span], apart)), "variant": variant or closure.kind}
+            facts = {
+                "intervals": format_longest(find_intervals(time[span], apart)),
+                "variant": choose_variant(closure.closure, model.table),
+            }
             share = float(apart.mean())
             diagnostics.append(Diagnostic("closure-open", INFO, closure.closure.phase, share, MOST_OPEN, facts))
     return diagnostics

@@ -157,10 +157,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         start_pose=problem.start_pose,
         conditions=problem.conditions,
     )  # fmt: skip
-    limbs = calibration.limbs()
-    return replace(
-        calibration, labels=LabelCheck(limbs.doubt(), limbs.contradiction() if limbs.doubt() > 1.0 else None)
-    )
+    return replace(calibration, labels=LabelCheck.from_motion(calibration.limbs(), problem.model.table))
 
 
 def compute_gap_matrices(observations: Observations, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
 from ..errors import BadSession
-from ..model.table import ROOT
+from ..model.table import MECHANISM, ROOT
 from ..subject import Quality
 from .conditions import find_parts, group_lengths, is_scale_observed
 from .observability import MOST_OPEN, find_intervals, format_longest
@@ -213,7 +213,9 @@ def _check(
 def _check_sensors(calibration: Calibration) -> list[Check]:
     """Checks of labels and mounts."""
     labels = calibration.labels
-    checks = [_check(labels.diagnostic(), DOUBT, labels.contradiction)]
+    checks = []
+    if not calibration.model.table.is_mechanism:
+        checks.append(_check(labels.diagnostic(), DOUBT, labels.contradiction))
     for mount in calibration.unused_mounts:
         checks.append(_check(mount, Limits(float(mount.limit or 0.0), np.pi), quality="poor"))
     return checks
@@ -280,7 +282,7 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
             INFO,
             segment,
             subject.std(f"mounts.{segment}.z"),
-            facts={"variant": calibration.variant or "poses"},
+            facts={"variant": MECHANISM if table.is_mechanism else calibration.variant or "poses"},
         )
         checks.append(_check(uncertain, limits, cause))
     if scale_observed:
@@ -360,8 +362,10 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
     if not z:
         return checks
     name = max(z, key=lambda n: z[n])
-    metres = {"metres": float(subject.lengths[name])}
-    return [*checks, _check(Diagnostic("length-unusual", INFO, name, z[name], facts=metres), UNUSUAL)]
+    unusual: dict[str, float | str] = {"metres": float(subject.lengths[name])}
+    if calibration.model.table.is_mechanism:
+        unusual["variant"] = MECHANISM
+    return [*checks, _check(Diagnostic("length-unusual", INFO, name, z[name], facts=unusual), UNUSUAL)]
 
 
 def _measure_motion(calibration: Calibration) -> Motion:
@@ -374,7 +378,7 @@ def _measure_motion(calibration: Calibration) -> Motion:
     hinges = {hinge.on: joint for joint, hinge in table.hinges.items()}
     elevation, sideways, bend = {}, {}, {}
     flexion = calibration.limbs().flexion
-    for limb in table.limbs:
+    for limb in () if table.is_mechanism else table.limbs:  # its links hang in no common pose
         key, first = table.side(limb[0]) or limb[-1], table.points[limb[0]].link
         above = model.parents.get(first)
         joint = hinges.get(first, "")

@@ -14,7 +14,7 @@ from ..diagnostics import Diagnostic, lines, render
 from ..model import BodyModel
 from ..subject import Subject
 from .anatomy import LabelCheck, LimbMotion, measure_limbs
-from .conditions import Constraint, StartPose
+from .conditions import Constraint, Loop, StartPose, choose_variant
 from .weights import MIN_CONTACT, MeasuredLength
 
 if TYPE_CHECKING:
@@ -125,8 +125,10 @@ class Calibration:
 
     @property
     def variant(self) -> str:
-        """The variant of texts about it: "mechanism", else the kind of its closure; empty without a closure."""
-        return "mechanism" if self.model.table.is_mechanism else self.closure
+        """The variant of texts about it: the kind of its closure, or "general"; empty without a closure."""
+        table = self.model.table
+        variants = {choose_variant(each.closure, table) for each in self.conditions if isinstance(each, Loop)}
+        return "general" if table.is_mechanism or "general" in variants else self.closure
 
     @property
     def body(self) -> BodyModel:

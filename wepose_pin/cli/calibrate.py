@@ -32,12 +32,20 @@ def run(job: CalibrateJob) -> int:
     print_diagnostics([*quality.further, *outcome.page_failures])
     for path, each in outcome.others:
         say(f"{path}: quality {each.quality}")
-    print_lengths(f"Lengths, by {protocol.title}", calibration.subject, outcome.prior, calibration.measured)
+    of_people = outcome.prior.is_population and not calibration.model.table.is_mechanism
+    prior_name = "population prior" if of_people else "prior"
+    print_lengths(
+        f"Lengths, by {protocol.title}",
+        calibration.subject,
+        outcome.prior,
+        calibration.measured,
+        prior_name=prior_name,
+    )
     _print_mounts(calibration)
     if protocol.closures:
         points = " and ".join(point.replace("_", " ") for point in protocol.closures[0].points)
         gap = GAPS[calibration.closure].format(points)
-        prior_mm = f"{1e3 * calibration.prior_rms_gap:.1f} mm with the lengths of the population prior"
+        prior_mm = f"{1e3 * calibration.prior_rms_gap:.1f} mm with the lengths of the {prior_name}"
         say(f"{gap}: {1e3 * calibration.rms_gap:.1f} mm rms, {prior_mm}")
         say(f"Effective sample size of the motion: {calibration.effective_sample_size:.0f}")
     if job.report:

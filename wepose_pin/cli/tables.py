@@ -13,9 +13,14 @@ if TYPE_CHECKING:
 
 
 def print_lengths(
-    title: str, subject: Subject, prior: Subject, measured: Collection[str], truth: Mapping[str, float] | None = None
+    title: str,
+    subject: Subject,
+    prior: Subject,
+    measured: Collection[str],
+    truth: Mapping[str, float] | None = None,
+    prior_name: str = "population prior",
 ) -> None:
-    """Each length with its standard deviation beside the population prior's, and the truth where it is known."""
+    """Each length with its standard deviation beside the prior's, and the truth where it is known."""
     rows = []
     for name, value in subject.lengths.items():
         true = [] if truth is None else [f"{1e3 * truth[name]:.1f}"]
@@ -23,7 +28,7 @@ def print_lengths(
         cells = f"{1e3 * value:.1f}", f"± {1e3 * subject.std(name):.1f}", before
         rows.append((name, *true, *cells, "measured" if name in measured else ""))
     columns = [] if truth is None else ["true"]
-    print_table(title, ("length [mm]", *columns, "estimated", "std", "population prior", ""), rows)
+    print_table(title, ("length [mm]", *columns, "estimated", "std", prior_name, ""), rows)
 
 
 def mean_std(error: PositionError) -> str:

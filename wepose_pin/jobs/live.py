@@ -237,7 +237,7 @@ def run_live(
                 robot.open()
             summary = run_session(
                 source,
-                setup,
+                setup.with_model(job.model),
                 method=job.method,
                 model=model,
                 record=record,

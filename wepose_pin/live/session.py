@@ -59,7 +59,7 @@ def run_session(
     WeposeError
         No such source; a sensor whose mount is not known; an existing file.
     """
-    setup, record = setup.as_recorded(), None if record is None else Path(record)
+    setup, record = setup.as_recorded().with_model(model), None if record is None else Path(record)
     if record is not None and record.exists() and not force:
         raise ExistingOutput(f"{record}: exists; --force replaces it, --record names another file")
     _check_mounts(source, setup)

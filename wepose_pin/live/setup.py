@@ -55,6 +55,12 @@ class SensorSetup:
             recording.model,
         )
 
+    def with_model(self, model: object) -> SensorSetup:
+        """With the file or the name of a body in place of its own; as it is where `model` is neither."""
+        if not isinstance(model, str | Path):
+            return self
+        return replace(self, model=str(Path(model).absolute() if Path(model).is_file() else model))
+
     def as_recorded(self) -> SensorSetup:
         """With the subject as a reader of the recording gets it: rounded to the decimals of its text."""
         if self.subject is None or self.subject_text:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..calibration import Calibration, CalibrationQuality
-from ..calibration.conditions import find_measured_lengths, group_lengths
+from ..calibration.conditions import find_measured_lengths, group_lengths, is_scale_observed
 from ..calibration.observability import find_intervals
 from ..calibration.priors import DRIFT_STD
 from ..calibration.protocols import Protocol, load_protocol
@@ -92,7 +92,8 @@ def render_calibration_report(
     untracked: list[Diagnostic] = []
     if tracked is None:
         try:
-            tracker = Tracker(calibration.subject, options=TrackOptions(method), with_point_cov=False)
+            options = TrackOptions(method)
+            tracker = Tracker(calibration.subject, model=calibration.model, options=options, with_point_cov=False)
             [tracked] = tracker.push(recording) + tracker.finish()
         except Exception as error:
             untracked = [Diagnostic("motion-not-shown", WARNING, facts={"reason": str(error)})]
@@ -170,6 +171,7 @@ def _build_summary_section(calibration: Calibration, contact: _Contact) -> dict[
     worst = [max(known, key=lambda name, k=k: known[name][k]) for k in (0, 1)] if known else []  # type: ignore[misc]
     return {
         "chain": bool(contact.chain),
+        "closed": is_scale_observed(calibration.conditions),
         "scaling": [plain(name) for name in scaling],
         "scale_percent": 100 * calibration.scale_std,
         "gap": contact.gap if np.isfinite(calibration.rms_gap) else None,
@@ -199,7 +201,7 @@ def _build_lengths_section(calibration: Calibration, contact: _Contact) -> dict[
                 f"{100 * float(np.sum(learned)):.0f} %" if learned is not None else "",
             ]
         )
-    header = ["length", "estimated", "population prior", "measured", "learned from the motion"]
+    header = ["length", "estimated", "prior", "measured", "learned from the motion"]
     return {
         "rigid": [
             [plain(table.shared_name(part)) for part in reversed(parts)]
@@ -419,7 +421,7 @@ def _build_run_section(
         ("protocol", f"{contact.protocol}, {len(calibration.time)} samples of it"),
         ("filter", method),
         ("measured lengths", ", ".join(measured) or "none"),
-        ("population prior", calibration.prior.note or calibration.prior.name),
+        ("prior", calibration.prior.note or calibration.prior.name),
         ("sensors mounted again", "yes" if recording.remounted else "no"),
         ("made with", versions()),
     ]
@@ -525,7 +527,7 @@ def _describe_check(check: Check, contact: _Contact) -> tuple[str, str]:
         "closure-open": ("share of the time apart", "percent"),
         "start-pose-off": (f"segment farthest off the start pose: {place}", "deg"),
         "measured-length-contradicted": (f"standard deviations of the measured {place} from all else", "number"),
-        "length-unusual": (f"standard deviations from the population, {place}", "number"),
+        "length-unusual": (f"standard deviations from the prior, {place}", "number"),
     }[check.diagnostic.code]
 
 

@@ -56,8 +56,8 @@ class Places(NamedTuple):
 
 
 def draw_lengths(rows: Sequence[Length]) -> Picture:
-    """Each length beside the population prior, with intervals."""
-    panel = Panel(x_label="longer than the population prior [mm]", right=110.0)
+    """Each length beside the prior, with intervals."""
+    panel = Panel(x_label="longer than the prior [mm]", right=110.0)
     for at, row in zip(category_rows(panel, [row.label for row in rows]), rows, strict=True):
         off, std, before = (1e3 * v for v in (row.value - row.prior, row.std, row.prior_std))
         if np.isfinite(before):
@@ -72,13 +72,13 @@ def draw_lengths(rows: Sequence[Length]) -> Picture:
         panel.text(np.inf, at, plus_minus(1e3 * row.value, 1e3 * row.std, "mm", 0), dx=8.0)
     keys = [
         Key("estimated, ± 1 and 2 standard deviations", "accent", "circle"),
-        Key("population prior, ± 1", "band", "box"),
+        Key("prior, ± 1", "band", "box"),
     ]
     if any(np.isfinite(row.measured) for row in rows):
         keys.append(Key("measured", "ink hollow", "triangle"))
     return Picture(
         "lengths",
-        "Lengths against the population prior's; to the right the estimates.",
+        "Lengths against the prior's; to the right the estimates.",
         Chart([[panel]], [26.0 * len(rows) + 6.0], keys),
     )
 
@@ -136,7 +136,7 @@ def draw_gap(
     top.spans(apart, "hatched")
     top.line(*broken(time, 1e3 * prior_gap), "before dashed")
     top.line(*broken(time, 1e3 * gap), "accent")
-    keys = [Key("with the population prior's lengths", "before dashed"), Key("with the estimated lengths", "accent")]
+    keys = [Key("with the prior's lengths", "before dashed"), Key("with the estimated lengths", "accent")]
     panels = [top]
     if learned:
         most = max(float(np.nanmax(values)) for values in learned.values())
