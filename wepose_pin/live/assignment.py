@@ -124,10 +124,9 @@ class AssignedSource(Source):
         """Segment → share of its sensor's charge, 0 to 1, where it is known."""
         return {self.segments[name]: charge for name, charge in self.source.batteries.items() if name in self.segments}
 
-    @property
-    def awaited(self) -> str:
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
         """As of the source."""
-        return self.source.awaited
+        return self.source.describe_awaited([name for name, own in self.segments.items() if own in sensors])
 
     def clock(self) -> float:
         return self.source.clock()

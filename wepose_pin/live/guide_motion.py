@@ -28,6 +28,11 @@ MOST_ADVICE = 2  # sentences at a time
 APART_S, APART = 3.0, 0.10  # [s] newest motion, and its median gap [m] above which the closure seems open
 # Codes of reasons that more motion takes away, or begin so.
 TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain", "closure-open")
+# Code → what to do, of those whose remedy is an option of a command: here it is asked for.
+MEASURE = "Measure one length and enter it here."
+REMEDIES = dict.fromkeys(("scale-from-prior", "scale-uncertain", "limb-scale-from-prior"), MEASURE) | {
+    "length-uncertain": "Move further and faster, through the whole reach.",
+}
 MOST_LOSS_S = 2.0  # [s] of a lost sensor after which its heading has to be found anew
 
 FINISH = GuideAction("next", "Finish", "n")
@@ -214,10 +219,14 @@ class CalibrationStep(Step):
 
     @property
     def _measurable(self) -> str:
-        """The length that would fix the scale best, where none was measured."""
-        if not isinstance(self._result, Calibrated) or self._result.calibration.scale_lengths:
+        """The length that would fix the scale best, where none was measured or the scale is uncertain."""
+        if not isinstance(self._result, Calibrated):
             return ""
-        return self._result.calibration.measured_example.partition("=")[0]
+        calibration, quality, _ = self._result
+        uncertain = any(REMEDIES.get(reason.code) == MEASURE for reason in quality.reasons)
+        if calibration.scale_lengths and not uncertain:
+            return ""
+        return calibration.measured_example.partition("=")[0]
 
     def _exchange(self, moved: Mapping[str, str]) -> None:
         """Assign the sensors as the calibration found them, and calibrate again."""
@@ -244,7 +253,7 @@ class CalibrationStep(Step):
             sentence = "The proportions are good. One measured length gives the scale too."
         if quality.quality == "fail" and self._lacks_motion:
             sentence = "There was too little of the motion. More of it may be enough."
-        reasons = [text.line() for _, text in render_all(count_from_begin(quality.reasons, calibration))]
+        reasons = [text.line() for _, text in render_all(count_from_begin(quality.reasons, calibration), REMEDIES)]
         if self._moved:  # all other reasons follow from this one
             sentence, reasons = (
                 "Some sensors sit on other segments than assigned. The same motion will do.",
@@ -282,5 +291,5 @@ def _advise(quality: CalibrationQuality) -> tuple[str, ...]:
     """What to do while the person moves: about the parts of the motion that are too small, else the worst reason."""
     reasons = [reason for reason in quality.reasons if not reason.code.startswith("scale-")]
     motion = [reason for reason in reasons if reason.code.startswith("motion-")]
-    advice = [render(reason).do for reason in motion or reasons[:1]]
+    advice = [REMEDIES.get(reason.code, render(reason).do) for reason in motion or reasons[:1]]
     return tuple(dict.fromkeys(advice))[:MOST_ADVICE]

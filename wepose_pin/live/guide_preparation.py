@@ -36,8 +36,9 @@ class SensorStep(Step):
     def view(self) -> GuideView:
         count, needed = len(self.guide.newest_times) - len(self.guide.silent), len(self.guide.needs)
         sentence, note = "Strap the sensors on and switch them on", self.guide.describe_silent()
-        awaited = "" if self.guide.newest_times else self.guide.source.awaited
-        sentence = f"{sentence}. Waiting for {awaited}." if awaited else f"{sentence}: {count} of {needed} send."
+        absent = [name for name in self.guide.source.sensors if name not in self.guide.newest_times]
+        awaited = self.guide.source.describe_awaited(absent)
+        sentence = f"{sentence}: {count} of {needed} send." + (f" Waiting for {awaited}." if awaited else "")
         if count >= needed:
             sentence = f"{count} sensors send. Are all strapped on tightly?"
         return GuideView(sentence, note, progress=min(1.0, count / max(needed, 1)), reasons=self._warn_of_trackers())

@@ -30,7 +30,6 @@ from ..recording.arrivals import (
     CUT_OFF,
     DUPLICATE,
     LATE,
-    MISSING,
     TAKEN,
     WAIT_S,
     Samples,
@@ -44,6 +43,7 @@ from ..tracking.causal import CausalSegmentEstimator
 from ..tracking.headings import CAUSAL_KNOT_S
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates
 from ..writers.live_log import LiveLog
+from .losses import SampleLosses
 from .setup import SensorSetup
 from .sources.base import Source
 from .state import LivePose, Output, SensorStatus, Status, StreamInfo, join_names
@@ -86,7 +86,7 @@ class SessionSummary(NamedTuple):
 
     poses: int
     seconds: float  # [s] from the first pose to the last, on the source's clock
-    counts: Mapping[str, Mapping[str, int]]  # segment → each of `arrivals.COUNTS`
+    counts: Mapping[str, Mapping[str, int]]  # segment → each of `arrivals.COUNTS`, and "lost" samples
     latency: Latencies  # of every tick with a sample: [s] from its time to its pose
     diagnostics: tuple[Diagnostic, ...]
     problem: str  # of the recording; empty where it is complete
@@ -192,6 +192,7 @@ class LiveLoop:
         if self.model.table.is_mechanism:
             self._instruction = f"{self.model.table.name} must stand still in its start configuration"
         self._stream = TickStream(source.sensors, source.rate_hz, begin, wait_s, log, source.orientations)
+        self._losses = SampleLosses()
         self._phase_edges = PhaseEdges(self.setup.phases)
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
         self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
@@ -243,6 +244,7 @@ class LiveLoop:
     def _process_samples(self, samples: list[Samples]) -> None:
         """Record the samples of one read, track the ticks that they complete, and show the last pose."""
         pose = None
+        self._losses.push(samples)
         for ticks in self._stream.push(samples):
             if (search := self._begin_search()) is not None:
                 pose = self._track_ticks(ticks, search) or pose
@@ -359,7 +361,7 @@ class LiveLoop:
     def _mark(self, key: str) -> None:
         """Mark in the recording what a key asks for: "mark TEXT", "begin PHASE", "end PHASE", or "take"."""
         synchronizer = self._stream.synchronizer
-        if key == "take" and self.log is None:
+        if (key == "take" or key.startswith("begin ")) and self.log is None:
             self._begin_recording()
         if self.log is None or synchronizer is None or not synchronizer.next_tick:
             return
@@ -424,7 +426,7 @@ class LiveLoop:
                     (float(bias[i, 0]), float(bias[i, 1]), float(bias[i, 2])),
                     float(self._heading_std[i]),
                     heading_age,
-                    int(counts[i, MISSING]),
+                    self._losses.count(name, now),
                     int(counts[i, LATE]),
                     int(counts[i, DUPLICATE]),
                     bool(frozen[i]),
@@ -461,8 +463,8 @@ class LiveLoop:
         if self._start_search is None:
             missing_sensors = [name for name in self.source.sensors if self._stream.newest_times[name] == -np.inf]
             if missing_sensors:
-                nothing, awaited = len(missing_sensors) == len(self.source.sensors), self.source.awaited
-                where = f" Waiting for {awaited}." if nothing and awaited else ""
+                awaited = self.source.describe_awaited(missing_sensors)
+                where = f" Waiting for {awaited}." if awaited else ""
                 return "waiting", f"Nothing has come yet from {join_names(missing_sensors)}.{where}", 0.0
             return "waiting", "Measuring the sampling rate.", 0.0
         search, detector = self._start_search, self._start_search.detector
@@ -504,7 +506,10 @@ class LiveLoop:
         return SessionSummary(
             self._poses,
             self._last_pose - self._first_pose if self._poses else 0.0,
-            {name: dict(zip(COUNTS, row.tolist(), strict=True)) for name, row in zip(sensors, counts, strict=True)},
+            {
+                name: dict(zip(COUNTS, row.tolist(), strict=True)) | {"lost": self._losses.count(name, -math.inf)}
+                for name, row in zip(sensors, counts, strict=True)
+            },
             self._latency,
             () if self._segment_estimator is None else self._segment_estimator.start.diagnostics,
             "" if self.log is None else self.log.problem,
