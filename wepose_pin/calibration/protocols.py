@@ -224,7 +224,7 @@ def load_protocol(name: str | Path) -> Protocol:
     BadOption
         There is no such protocol, or its file has a key or value that is none.
     """
-    names = [str(name)] if Path(name).is_file() else str(name).split("+")  # a path may have a +
+    names = split_protocol(name)
     if len(names) > 1:
         return _join_protocols(str(name), [load_protocol(each) for each in names])
     own = str(name).endswith(".toml")
@@ -234,6 +234,11 @@ def load_protocol(name: str | Path) -> Protocol:
         )
     path = Path(name) if own else asset("calibration", f"{name}.toml")
     return _protocol(read_toml(path, "a protocol", BadOption), path)
+
+
+def split_protocol(name: str | Path) -> list[str]:
+    """The names of protocols that are joined by "+"; a path may have a +."""
+    return [str(name)] if Path(name).is_file() else str(name).split("+")
 
 
 def _join_protocols(name: str, protocols: list[Protocol]) -> Protocol:

@@ -29,6 +29,8 @@ GET_READY_S = 8.0  # [s] to leave the keyboard and stand ready
 
 NEXT = GuideAction("next", "Continue", "n")
 AGAIN = GuideAction("again", "Once more", "a")
+SKIP = GuideAction("skip", "Skip", "s")
+KEEP = GuideAction("skip", "Keep as it was", "s")
 RESTART = GuideAction("restart", "All again from the start pose", "a")
 
 
@@ -54,6 +56,7 @@ class GuideOptions:
     estimate : calibrates the recording so far
     method : of the filter, for the recording's header
     known : sensor → segment, as in an earlier session
+    optional : phases of the protocol that may be skipped
     """
 
     folder: Path
@@ -65,6 +68,7 @@ class GuideOptions:
     estimate: Callable[[Recording], tuple[Calibration, CalibrationQuality]]
     method: str
     known: Mapping[str, str] = field(default_factory=dict)
+    optional: frozenset[str] = frozenset()
 
 
 class Guide:
@@ -165,7 +169,9 @@ class Guide:
             self.step.enter()
 
     def restart(self, reason: str = "") -> None:
-        """Go to the start pose, and say why."""
+        """Go to the start pose; where there is a reason, what was recorded cannot go on."""
+        if reason:
+            self.discard_phases()
         self.go(next(k for k, step in enumerate(self.steps) if step.name == "start"))
         self.step.reason = reason
 
@@ -183,6 +189,12 @@ class Guide:
             header = self.options.setup.header(source.sensors, source.orientations) | {"method": self.options.method}
             self.attempt = Attempt(path, source, header)
         return self.attempt
+
+    def discard_phases(self) -> None:
+        """Take back what was recorded of the protocol."""
+        if self.attempt is not None:
+            for phase in ("start", *(step.phase for step in self.options.protocol.steps)):
+                self.attempt.mark("discard", phase=phase)
 
     def close(self) -> None:
         """End the recording; may be called twice."""

@@ -14,7 +14,7 @@ from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals
 from ..diagnostics import Diagnostic, render, render_all
 from ..errors import WeposeError
 from ..recording.arrivals import Ticks
-from .guide import GET_READY_S, RESTART, Calibrated, Guide, Step
+from .guide import GET_READY_S, RESTART, SKIP, Calibrated, Guide, Step
 from .state import GuideAction, GuideView, LengthEstimate
 from .worker import Worker
 
@@ -53,10 +53,28 @@ class ExerciseStep(Step):
         self._estimate: tuple[Calibration, CalibrationQuality] | None = None
 
     def enter(self) -> None:
-        measured_s = 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)
-        if measured_s == 0.0:
+        if self._measured_s >= self._seconds:  # the person came back to an earlier step, and kept it
+            self.guide.go_on()
+        else:
+            self._start(self._seconds)
+
+    def repeat(self) -> None:
+        self._start(max(self._seconds, self._measured_s + min(MORE_S, self._seconds)))
+
+    @property
+    def seconds(self) -> float:
+        """Duration that the protocol asks for."""
+        return self._seconds
+
+    @property
+    def _measured_s(self) -> float:
+        return 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)
+
+    def _start(self, target_s: float) -> None:
+        """Begin, or go on until so many seconds of the motion are recorded."""
+        if self._measured_s == 0.0:
             self._estimate = None
-        self._target_s = self._seconds if measured_s == 0.0 else measured_s + MORE_S
+        self._target_s = target_s
         self._begin = self.guide.now + GET_READY_S
         self._running = False
         self._estimated_s = 0.0
@@ -118,17 +136,21 @@ class ExerciseStep(Step):
         return self.guide.join_sensors([name for name in self.guide.order if name in self._lost_segments])
 
     def actions(self) -> list[GuideAction]:
-        measured_s = 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)
-        return [FINISH, RESTART] if measured_s > min(FINISH_AFTER_S, self._seconds) else [RESTART]
+        finish = [FINISH] if self._measured_s > min(FINISH_AFTER_S, self._seconds) else []
+        return [*finish, RESTART, *([SKIP] if self.name in self.guide.options.optional else [])]
 
     def act(self, action: str) -> None:
         if action == "next":
+            self.guide.go_on()
+        elif action == "skip" and self.guide.attempt is not None:
+            self._pause(self.guide.attempt.newest)
+            self.guide.attempt.mark("discard", phase=self.name)
             self.guide.go_on()
         else:
             self.guide.restart()
 
     def view(self) -> GuideView:
-        measured_s = 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)
+        measured_s = self._measured_s
         countdown = None if self._running else max(0.0, self._begin - self.guide.now)
         further = self._sentences[1:] or self._sentences
         turn = int(measured_s / SENTENCE_S)
@@ -205,7 +227,9 @@ class CalibrationStep(Step):
         if action == "accept" and isinstance(self._result, Calibrated):
             self.guide.accepted = self._result
         elif action == "more":
-            self.guide.go(self.guide.steps.index(self) - 1)
+            exercises = [step for step in self.guide.steps if isinstance(step, ExerciseStep)]
+            longest = max(exercises, key=lambda step: step.seconds)
+            self.guide.go(self.guide.steps.index(longest), again=True)
         elif action == "exchange":
             self._exchange(self._moved)
         else:
