@@ -292,7 +292,9 @@ def test_who_goes_back_by_mistake_keeps_what_was_done(tmp_path: Path) -> None:
     guide.act("skip")
     begin(session, "clasp", 8.0)
     assert guide.attempts == 1
-    assert [name for name, spans in guide.attempt.recording().phases.items() for _ in spans] == ["start"] + 2 * ["clasp"]
+    assert [name for name, spans in guide.attempt.recording().phases.items() for _ in spans] == ["start"] + 2 * [
+        "clasp"
+    ]
     guide.act("go assignment")
     assert guide.segments == {}
     guide.act("skip")

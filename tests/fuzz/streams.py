@@ -168,7 +168,7 @@ class _Wild:
     orientations: ClassVar[dict[str, bool]] = {}
     batteries: ClassVar[dict[str, float]] = {}
 
-    def describe_awaited(self, sensors: object = ()) -> str:
+    def describe_awaited(self, sensors: object = ()) -> str:  # noqa: ARG002
         return ""
 
     def __init__(self, data: bytes) -> None:

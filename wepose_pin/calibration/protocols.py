@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -232,7 +233,15 @@ def load_protocol(name: str | Path) -> Protocol:
         raise BadOption(
             f"protocol '{name}' is not known; {one_of(PROTOCOLS, str(name))}; or the path of a .toml of one's own"
         )
-    path = Path(name) if own else asset("calibration", f"{name}.toml")
+    return _read_protocol(Path(name)) if own else _load_packaged(str(name))
+
+
+@lru_cache
+def _load_packaged(name: str) -> Protocol:
+    return _read_protocol(asset("calibration", f"{name}.toml"))
+
+
+def _read_protocol(path: Path) -> Protocol:
     return _protocol(read_toml(path, "a protocol", BadOption), path)
 
 

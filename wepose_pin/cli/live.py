@@ -51,7 +51,13 @@ def _print_session(session: SessionSummary) -> None:
         title,
         ("sensor", "samples", "lost", "ticks without", "late", "twice", "unsound", "frozen", "cut off"),
         [
-            (name, *(str(counts[key]) for key in ("taken", "lost", "missing", "late", "duplicate", "bad", "frozen", "cut_off")))
+            (
+                name,
+                *(
+                    str(counts[key])
+                    for key in ("taken", "lost", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
+                ),
+            )
             for name, counts in session.counts.items()
         ],
     )

@@ -157,7 +157,9 @@ def choose_parts(protocol: str, phases: Collection[str]) -> str:
     from ..calibration import load_protocol
     from ..calibration.protocols import split_protocol
 
-    there = [part for part in split_protocol(protocol) if all(step.phase in phases for step in load_protocol(part).steps)]
+    there = [
+        part for part in split_protocol(protocol) if all(step.phase in phases for step in load_protocol(part).steps)
+    ]
     return "+".join(there) or protocol
 
 

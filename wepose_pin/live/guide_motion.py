@@ -31,6 +31,7 @@ TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain"
 # Code → what to do, of those whose remedy is an option of a command: here it is asked for.
 MEASURE = "Measure one length and enter it here."
 REMEDIES = dict.fromkeys(("scale-from-prior", "scale-uncertain", "limb-scale-from-prior"), MEASURE) | {
+    "sensors-exchanged": "Exchange them here.",
     "length-uncertain": "Move further and faster, through the whole reach.",
 }
 MOST_LOSS_S = 2.0  # [s] of a lost sensor after which its heading has to be found anew

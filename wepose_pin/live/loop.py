@@ -55,6 +55,7 @@ READ_TIMEOUT_S = 0.05  # [s]; keys and the status wait for a read
 MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
 MAX_LATENCIES = 1000  # newest latencies in the status
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
+BEGUN_S = 0.5  # [s] of standing still after which who moves is told so
 START_POSES = {NEUTRAL_POSE: "Stand upright and still, arms hanging, palms to the thighs"}  # what to tell a person
 
 
@@ -193,6 +194,7 @@ class LiveLoop:
             self._instruction = f"{self.model.table.name} must stand still in its start configuration"
         self._stream = TickStream(source.sensors, source.rate_hz, begin, wait_s, log, source.orientations)
         self._losses = SampleLosses()
+        self._stood_s = 0.0  # [s] longest time that the person stood still before tracking
         self._phase_edges = PhaseEdges(self.setup.phases)
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
         self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
@@ -474,6 +476,9 @@ class LiveLoop:
             missing = np.isin(np.arange(len(lost)), detector.missing)
             text = self._describe_lost(missing & frozen, frozen) or f"Waiting for {self._join_sensors(missing)}."
             return "waiting", text, 0.0
+        self._stood_s = max(self._stood_s, detector.held_s)
+        if detector.state == "moved" and self._stood_s < BEGUN_S:  # the person walks to the place, or joins the pose
+            return "start_pose", f"{self._instruction}.", 0.0
         if detector.state == "moved":
             moved = join_names([self.source.sensors[i] for i in detector.moving])
             again = self._instruction[0].lower() + self._instruction[1:]

@@ -91,7 +91,7 @@ class _EvenTimes:
 
 
 def measure_step(time_s: np.ndarray) -> float:
-    """Measure the step [s] between times (n,) in order of arrival, some of which are missing; 0: none can be measured."""
+    """Measure the step [s] between times (n,) of which some are missing; 0: none can be measured."""
     time_s = np.unique(time_s)
     if len(time_s) < 3:
         return 0.0

@@ -55,7 +55,7 @@ class MTiSource(Source):
         Raises
         ------
         BadSource
-            An MTi that cannot send at the rate; without `waiting` also a port that cannot be opened, or no answer there.
+            An MTi cannot send at the rate; without `waiting` also: a port cannot be opened, or no MTi answers there.
         """
         try:
             for device in self._devices:
@@ -90,7 +90,9 @@ class MTiSource(Source):
             device.close()
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        places = [f"{join_names([name])} at {port}" for name, port in self._ports.items() if name in sensors or not sensors]
+        places = [
+            f"{join_names([name])} at {port}" for name, port in self._ports.items() if name in sensors or not sensors
+        ]
         return f"MTi sensors: {', '.join(places)}"
 
     def _dispatch(self, entry: Samples | tuple[str, int], samples: list[Samples]) -> None:

@@ -88,7 +88,9 @@ class Ximu3Source(Source):
         return self.describe_awaited([segment for segment in self._devices if segment not in self._connections])
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        places = [f"{join_names([name])} at {at}" for name, at in self._devices.items() if name in sensors or not sensors]
+        places = [
+            f"{join_names([name])} at {at}" for name, at in self._devices.items() if name in sensors or not sensors
+        ]
         return f"x-IMU3 sensors: {', '.join(places)}"
 
     def _take(self, segment: str, message: Any) -> None:
