@@ -235,6 +235,20 @@ def test_too_little_motion_asks_for_more_of_it(tmp_path: Path, monkeypatch: pyte
     assert [action.name for action in view.actions] == ["more", "restart"]
 
 
+def test_a_length_that_cannot_be_is_refused_and_the_result_stays(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    guide = session.guide
+    before = session.run(lambda m: m.view.quality == "pass")[-1].view
+    guide.act("measure shoulder_width=wide")
+    assert guide.view() == before
+    guide.act("measure shoulder_width=-0.3")
+    assert guide.view().quality == ""
+    after = session.run(lambda m: bool(m.view.quality))[-1].view
+    assert "shoulder_width" in after.note
+    assert after._replace(note="") == before
+    guide.close()
+
+
 def test_seconds_of_a_reason_count_from_the_begin_of_the_motion() -> None:
     """On a source's clock that began with the machine, a day before; apart from 2 to 4 s after the begin."""
     time_s = np.arange(0.0, 40.0, 0.125)

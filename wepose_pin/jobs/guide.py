@@ -104,6 +104,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
     from ..calibration.protocols import split_protocol
     from ..live.assignment import read_segments
     from ..live.guide import Calibrated, GuideOptions
+    from ..live.guide_motion import STATURE
     from ..readers import load_session
     from ..readers.subject import read_subject
     from ..subject import population_subject
@@ -113,13 +114,14 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
     order = tuple(model.table.segments)
 
     def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
-        out = path.with_suffix("")
+        out, lengths = path.with_suffix(""), {**job.measured, **measured}
+        stature = lengths.pop(STATURE, job.stature)
         calibration = CalibrateJob(
             path,
             out,
             protocol=choose_parts(job.protocol, load_session(path).phases),
-            measured={**job.measured, **measured},
-            stature=job.stature,
+            measured=lengths,
+            stature=stature,
             prior=job.subject,
             method=job.method,
             force=True,
@@ -149,6 +151,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
         job.method,
         {} if job.setup is None else read_segments(job.setup, order),
         frozenset(step.phase for part in parts[1:] for step in load_protocol(part).steps if step.phase != "start"),
+        frozenset({*job.measured, *([STATURE] if job.stature is not None or job.subject is not None else [])}),
     )
 
 

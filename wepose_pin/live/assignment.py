@@ -103,8 +103,11 @@ class AssignedSource(Source):
         return {self.segments[name]: own for name, own in self.source.orientations.items() if name in self.segments}
 
     def open(self, waiting: Waiting | None = None) -> None:
-        """Open the source, unless it is open already."""
-        if not self._is_open:
+        """Open the source; of one that is open already, leave out what has come so far."""
+        if self._is_open:
+            while self.source.read(0.0):
+                pass
+        else:
             self.source.open(waiting)
             self._is_open = True
 

@@ -52,11 +52,12 @@ class GuideOptions:
     setup : name, start pose and body of the session; its mounts, where known
     table : of the body
     depth : segment → number of segments between it and the root
-    calibrate : calibrates a recorded file, with lengths [m] that the person measured
+    calibrate : calibrates a recorded file, with lengths [m] that the person measured, or "stature"
     estimate : calibrates the recording so far
     method : of the filter, for the recording's header
     known : sensor → segment, as in an earlier session
     optional : phases of the protocol that may be skipped
+    measured : names of the lengths that are given already, "stature" among them where it is
     """
 
     folder: Path
@@ -69,6 +70,7 @@ class GuideOptions:
     method: str
     known: Mapping[str, str] = field(default_factory=dict)
     optional: frozenset[str] = frozenset()
+    measured: frozenset[str] = frozenset()
 
 
 class Guide:

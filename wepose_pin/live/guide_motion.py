@@ -23,13 +23,14 @@ SENTENCE_S = 9.0  # [s] for which each sentence of an instruction stands
 ESTIMATE_PERIOD_S = 4.0  # [s] of motion between two estimates
 FIRST_ESTIMATE_S = 12.0  # [s] of motion before the first estimate
 FINISH_AFTER_S = 15.0  # [s] of a phase after which it may be finished
+STATURE = "stature"  # that a person may enter in place of a length
 MORE_S = 30.0  # [s] of motion that "more" adds
 MOST_ADVICE = 2  # sentences at a time
 APART_S, APART = 3.0, 0.10  # [s] newest motion, and its median gap [m] above which the closure seems open
 # Codes of reasons that more motion takes away, or begin so.
 TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain", "closure-open")
 # Code → what to do, of those whose remedy is an option of a command: here it is asked for.
-MEASURE = "Measure one length and enter it here."
+MEASURE = "Measure what is asked for and enter it here."
 REMEDIES = dict.fromkeys(("scale-from-prior", "scale-uncertain", "limb-scale-from-prior"), MEASURE) | {
     "sensors-exchanged": "Exchange them here.",
     "length-uncertain": "Move further and faster, through the whole reach.",
@@ -189,9 +190,13 @@ class CalibrationStep(Step):
     def __init__(self, guide: Guide) -> None:
         super().__init__(guide)
         self._worker: Worker[Calibrated] = Worker()
-        self._measured: dict[str, float] = {}
+        self._measured: dict[str, float] = {}  # lengths [m] that the person entered
 
     def enter(self) -> None:
+        self._entered, self._before, self._refused = "", None, ""
+        self._calibrate()
+
+    def _calibrate(self) -> None:
         self._result: Calibrated | WeposeError | None = None
         assert self.guide.attempt is not None
         self.guide.attempt.log.flush()
@@ -203,6 +208,9 @@ class CalibrationStep(Step):
 
     def update(self) -> None:
         self._result = self._worker.take() or self._result
+        if self._entered and isinstance(self._result, WeposeError):  # the result before it stays
+            del self._measured[self._entered]
+            self._result, self._refused, self._entered = self._before, str(self._result), ""
 
     @property
     def _moved(self) -> Mapping[str, str]:
@@ -240,18 +248,20 @@ class CalibrationStep(Step):
         name, _, metres = stated.partition("=")
         with contextlib.suppress(ValueError):
             self._measured[name] = float(metres)
-            self.enter()
+            self._entered, self._before, self._refused = name, self._result, ""
+            self._calibrate()
 
     @property
     def _measurable(self) -> str:
-        """The length that would fix the scale best, where none was measured or the scale is uncertain."""
+        """What to measure next for the scale, where it is uncertain; empty: nothing."""
         if not isinstance(self._result, Calibrated):
             return ""
         calibration, quality, _ = self._result
-        uncertain = any(REMEDIES.get(reason.code) == MEASURE for reason in quality.reasons)
-        if calibration.scale_lengths and not uncertain:
+        if not any(REMEDIES.get(reason.code) == MEASURE for reason in quality.reasons):
             return ""
-        return calibration.measured_example.partition("=")[0]
+        known = {*self.guide.options.measured, *self._measured}
+        choices = (calibration.measured_example.partition("=")[0], STATURE)
+        return next((name for name in choices if name not in known), "")
 
     def _exchange(self, moved: Mapping[str, str]) -> None:
         """Assign the sensors as the calibration found them, and calibrate again."""
@@ -276,6 +286,8 @@ class CalibrationStep(Step):
         }[quality.quality]
         if quality.quality == "poor" and all(reason.code.startswith("scale-") for reason in quality.reasons):
             sentence = "The proportions are good. One measured length gives the scale too."
+            if calibration.scale_lengths:
+                sentence = "The proportions are good. The scale is still uncertain."
         if quality.quality == "fail" and self._lacks_motion:
             sentence = "There was too little of the motion. More of it may be enough."
         reasons = [text.line() for _, text in render_all(count_from_begin(quality.reasons, calibration), REMEDIES)]
@@ -286,6 +298,7 @@ class CalibrationStep(Step):
             )
         return GuideView(
             sentence,
+            self._refused,
             progress=1.0,
             lengths=_list_lengths(calibration),
             sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES),

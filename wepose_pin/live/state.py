@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-LENGTH_NAMES = {"biacromial": "breadth of the shoulders, from acromion to acromion"}  # as a person measures them
+LENGTH_NAMES = {"biacromial": "breadth of the shoulders, from acromion to acromion", "stature": "body height"}
 # [rad] standard deviation of a direction that is uniform on the circle: with more, nothing is known of a heading.
 UNKNOWN_HEADING_STD = math.pi / math.sqrt(3.0)
 
