@@ -260,7 +260,8 @@ class CalibrationStep(Step):
         if not any(REMEDIES.get(reason.code) == MEASURE for reason in quality.reasons):
             return ""
         known = {*self.guide.options.measured, *self._measured}
-        choices = (calibration.measured_example.partition("=")[0], STATURE)
+        best = calibration.measured_example.partition("=")[0]
+        choices = (STATURE, best) if calibration.scale_lengths else (best, STATURE)
         return next((name for name in choices if name not in known), "")
 
     def _exchange(self, moved: Mapping[str, str]) -> None:

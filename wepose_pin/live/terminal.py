@@ -145,7 +145,7 @@ class TerminalView(Output):
         view = build_table(self._newest, keys=self._keyboard is not None, width=self._console.width)
         if self._entry is None:
             return view
-        return Group(view, Text(f"{self._entry.title}: {self._entry.text}▏  (Return, or Escape)", style="bold yellow"))
+        return Group(Text(f"{self._entry.title}: {self._entry.text}▏  (Return, or Escape)", style="bold yellow"), view)
 
 
 MEASURE_KEY = "l"
@@ -215,6 +215,14 @@ def build_guide(status: Status, guide: GuideView, *, keys: bool = False) -> Any:
     done = round(30 * min(max(guide.progress, 0.0), 1.0))
     remaining = "" if guide.remaining is None else f"  {guide.remaining:.0f} s"
     parts.append(Text("█" * done + "░" * (30 - done) + remaining))
+    if keys:
+        offered = [f"{action.key} {action.label}" for action in guide.actions]
+        offered += [f"{MEASURE_KEY} enter the {name_length(guide.measurable)}"] if guide.measurable else []
+        back = [f"{k + 1} {step.title}" for k, step in enumerate(guide.steps) if step.state == "done"]
+        parts.append(Text("   ".join([*offered, "q end"]), style="dim"))
+        if back:
+            parts.append(Text("   ".join(["again:", *back]), style="dim"))
+    parts.append(Text("   ".join(map(_describe_sensor, status.sensors)), style="dim"))
     if guide.lengths:
         table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
         for length in guide.lengths:
@@ -224,14 +232,6 @@ def build_guide(status: Status, guide: GuideView, *, keys: bool = False) -> Any:
     if guide.sample_size is not None:
         parts.append(Text(f"effective sample size {guide.sample_size[0]:.1f}; {guide.sample_size[1]:.0f} are enough"))
     parts += [Text(reason) for reason in ([guide.quality] if guide.quality else []) + list(guide.reasons)]
-    parts.append(Text("   ".join(map(_describe_sensor, status.sensors)), style="dim"))
-    if keys:
-        offered = [f"{action.key} {action.label}" for action in guide.actions]
-        offered += [f"{MEASURE_KEY} enter the {name_length(guide.measurable)}"] if guide.measurable else []
-        back = [f"{k + 1} {step.title}" for k, step in enumerate(guide.steps) if step.state == "done"]
-        parts.append(Text("   ".join([*offered, "q end"]), style="dim"))
-        if back:
-            parts.append(Text("   ".join(["again:", *back]), style="dim"))
     return Group(*parts)
 
 

@@ -284,6 +284,7 @@ function drawCurves() {
   });
 }
 $("joint").addEventListener("change", drawCurves);
+addEventListener("resize", drawCurves);
 
 // ---- the line: nothing more comes until what came is drawn
 let socket, tries = 0, owed = 0, newestStatus = null, newestFrame = null, drawnAt = performance.now();
@@ -335,6 +336,7 @@ $("phase").addEventListener("click", togglePhase);
 $("measure").addEventListener("submit", (event) => {
   event.preventDefault();
   ask(`measure ${$("measure").dataset.name}=${(Number($("measured").value) / 100).toFixed(4)}`);
+  $("measured").value = "";
 });
 $("take").addEventListener("click", () => ask("take"));
 $("markers").addEventListener("submit", (event) => { event.preventDefault(); mark(); });
