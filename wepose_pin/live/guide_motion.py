@@ -191,6 +191,8 @@ class CalibrationStep(Step):
         super().__init__(guide)
         self._worker: Worker[Calibrated] = Worker()
         self._measured: dict[str, float] = {}  # lengths [m] that the person entered
+        self._before: Calibrated | WeposeError | None = None  # the result before the newest of them
+        self._entered, self._refused = "", ""  # its name, and why it cannot be
 
     def enter(self) -> None:
         self._entered, self._before, self._refused = "", None, ""
