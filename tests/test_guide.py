@@ -23,6 +23,7 @@ from wepose_pin.calibration import Calibration, CalibrationQuality, assess, cali
 from wepose_pin.calibration.observability import format_longest
 from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadSession
+from wepose_pin.jobs.guide import choose_parts
 from wepose_pin.jobs.live import LiveJob, run_live
 from wepose_pin.live.assignment import AssignedSource, ShakeDetector, read_segments, write_segments
 from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
@@ -58,10 +59,13 @@ def calibrate_recording(recording: Recording, measured: Mapping[str, float]) -> 
 
 
 def make_options(
-    folder: Path, known: Mapping[str, str] | None = None, mounts: Mapping[str, np.ndarray] | None = None
+    folder: Path,
+    known: Mapping[str, str] | None = None,
+    mounts: Mapping[str, np.ndarray] | None = None,
+    protocol_name: str = "clasp",
 ) -> GuideOptions:
     """A guide whose clasp is short, and which estimates nothing on the way."""
-    protocol, model = load_protocol("clasp"), load_model()
+    protocol, model = load_protocol(protocol_name), load_model()
     steps = tuple(replace(step, seconds=CLASP_S) if step.phase == "clasp" else step for step in protocol.steps)
 
     def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
@@ -81,18 +85,25 @@ def make_options(
         estimate,
         "amekf",
         known or {},
+        frozenset(step.phase for step in protocol.steps) - {"start", "clasp"},
     )
 
 
 class Session:
     """A person in front of a guide; presses what is offered first."""
 
-    def __init__(self, folder: Path, known: Mapping[str, str] | None = None, orientations: str = "") -> None:
+    def __init__(
+        self,
+        folder: Path,
+        known: Mapping[str, str] | None = None,
+        orientations: str = "",
+        protocol: str = "clasp",
+    ) -> None:
         self.person = GuidedPerson(perform(*PERSON), orientations=orientations)
         self.source = PersonSource(self.person)
         # The closure does not show how a tracker on the torso is turned, and it has no accelerometer to tell.
         mounts = {"torso": perform(*PERSON).quat_LS["torso"]} if orientations == "sensor" else {}
-        self.guide = Guide(self.source, make_options(folder, known, mounts), make_steps)
+        self.guide = Guide(self.source, make_options(folder, known, mounts, protocol), make_steps)
         self.clicks: list[str] = []
         self.obeys: Callable[[str, GuideView], str] = lambda _step, view: view.highlight
 
@@ -224,6 +235,20 @@ def test_too_little_motion_asks_for_more_of_it(tmp_path: Path, monkeypatch: pyte
     assert [action.name for action in view.actions] == ["more", "restart"]
 
 
+def test_a_length_that_cannot_be_is_refused_and_the_result_stays(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    guide = session.guide
+    before = session.run(lambda m: m.view.quality == "pass")[-1].view
+    guide.act("measure shoulder_width=wide")
+    assert guide.view() == before
+    guide.act("measure shoulder_width=-0.3")
+    assert guide.view().quality == ""
+    after = session.run(lambda m: bool(m.view.quality))[-1].view
+    assert "shoulder_width" in after.note
+    assert after._replace(note="") == before
+    guide.close()
+
+
 def test_seconds_of_a_reason_count_from_the_begin_of_the_motion() -> None:
     """On a source's clock that began with the machine, a day before; apart from 2 to 4 s after the begin."""
     time_s = np.arange(0.0, 40.0, 0.125)
@@ -269,6 +294,45 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     assert session.guide.segments == worn
     assert session.guide.attempts == 2  # of other sensors: another file
     session.guide.close()
+
+
+def test_who_goes_back_by_mistake_keeps_what_was_done(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    guide = session.guide
+    begin(session, "clasp", 5.0)
+    guide.act("go static")
+    guide.act("skip")
+    assert [action.name for action in guide.view().actions] == ["next", "skip"]
+    guide.act("skip")
+    begin(session, "clasp", 8.0)
+    assert guide.attempts == 1
+    assert [name for name, spans in guide.attempt.recording().phases.items() for _ in spans] == ["start"] + 2 * [
+        "clasp"
+    ]
+    guide.act("go assignment")
+    assert guide.segments == {}
+    guide.act("skip")
+    assert (guide.step.name, guide.segments) == ("static", session.person.worn)
+    guide.close()
+
+
+def test_a_part_of_a_joined_protocol_is_skipped_and_more_motion_is_of_the_longest(tmp_path: Path) -> None:
+    session = Session(tmp_path, protocol="clasp+t_pose")
+    guide = session.guide
+    session.run(lambda m: m.step == "t_pose")
+    assert [action.name for action in guide.view().actions] == ["restart", "skip"]
+    guide.act("skip")
+    session.run(lambda m: bool(m.view.quality))
+    assert set(guide.attempt.recording().phases) == {"start", "clasp"}
+    guide.act("more")
+    assert guide.step.name == "clasp"
+    guide.close()
+
+
+def test_the_parts_of_a_protocol_whose_phases_are_there() -> None:
+    assert choose_parts("clasp+t_pose+elbows", {"start", "clasp", "elbows"}) == "clasp+elbows"
+    assert choose_parts("clasp+t_pose", {"start"}) == "clasp+t_pose"
+    assert choose_parts("clasp", {"start", "clasp"}) == "clasp"
 
 
 def test_a_setup_with_a_wrong_segment_is_refused(tmp_path: Path) -> None:

@@ -144,7 +144,16 @@ def test_a_live_recording_is_described_and_gets_its_phases_by_a_session(
 def test_unknown_mounts_are_said_before_anybody_stands_still(capsys: pytest.CaptureFixture[str]) -> None:
     run("live", "--source", "mti:/dev/null=torso", "--no-page", code=2)
     err = capsys.readouterr().err.strip()
-    assert "how the sensor of torso is mounted is not known: give --subject" in err
+    assert "how the sensor of torso is mounted is not known: find it out with --guide" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_raw_sensors_without_any_mount_are_refused_before_they_are_waited_for(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run("live", "--source", "udp:9000", "--no-page", code=2)
+    err = capsys.readouterr().err.strip()
+    assert "how the sensors are mounted is not known: find it out with --guide" in err
     assert len(err.splitlines()) == 1
 
 
@@ -152,7 +161,7 @@ def test_ctrl_c_stops_the_wait_for_senders_at_once(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-    command = [sys.executable, "-c", _WAITING, f"udp:{port}"]
+    command = [sys.executable, "-c", _WAITING, f"mvn:127.0.0.1:{port}"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     assert process.stdout is not None
     assert process.stdout.readline() == "open\n"
@@ -166,12 +175,12 @@ def test_ctrl_c_stops_the_wait_for_senders_at_once(tmp_path: Path) -> None:
 _WAITING = """
 import sys
 from wepose_pin import cli
-from wepose_pin.live.sources.udp import UdpSource
-find = UdpSource._find_sensors
+from wepose_pin.live.sources.datagrams import DatagramSource
+find = DatagramSource._find_sensors
 def say(self, waiting):
     print("open", flush=True)
     find(self, waiting)
-UdpSource._find_sensors = say
+DatagramSource._find_sensors = say
 sys.argv[1:] = ["live", "--source", sys.argv[1], "--no-page"]
 cli.main()
 """

@@ -11,12 +11,21 @@ import sys
 import termios
 import textwrap
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from wepose_pin.live.state import UNKNOWN_HEADING_STD, SensorStatus, Status, format_heading_std
+from wepose_pin.live.state import (
+    UNKNOWN_HEADING_STD,
+    GuideAction,
+    GuideStep,
+    GuideView,
+    SensorStatus,
+    Status,
+    format_heading_std,
+)
 from wepose_pin.live.terminal import TerminalView, build_table
 
 
@@ -39,9 +48,9 @@ def status(state: str = "ready", message: str = "Tracking.", sensors: tuple = ()
     return Status(**(usual | other))  # type: ignore[arg-type]
 
 
-def printed(one: Status) -> str:
+def printed(one: Status, keys: bool = False) -> str:
     console = Console(file=io.StringIO(), width=120)
-    console.print(build_table(one))
+    console.print(build_table(one, keys=keys))
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -151,6 +160,39 @@ finally:
     view.close()
 print("keys", "".join(keys))
 """
+
+
+def press(view: TerminalView, keys: str, now: Status) -> list[str]:
+    """What keys ask for, one after the other."""
+    view.status(now)
+    requests = []
+    for key in keys:
+        view._keyboard = SimpleNamespace(take=lambda key=key: [key], open=lambda: None, close=lambda: None)  # type: ignore
+        requests += view.take_keys()
+    return requests
+
+
+def test_keys_while_tracking_mark_phases_and_texts() -> None:
+    view, live = TerminalView(io.StringIO()), status()
+    assert press(view, "tMr", live) == ["take", "mark mark", "r"]
+    assert press(view, "nTrialx\x7f 3\r", live) == ["mark Trial 3"]
+    assert press(view, "n\r", live) == ["mark mark"]
+    assert press(view, "nq\x1bq", live) == ["q"]
+    assert press(view, "p\rpbox\n", live) == ["begin clasp", "begin box"]
+    assert press(view, "p", status(open_phases=("take_1", "clasp"))) == ["end clasp"]
+    assert press(view, "pn", status("start_pose", "Stand still.")) == []
+
+
+def test_keys_of_the_guide_go_back_and_enter_a_length() -> None:
+    steps = tuple(GuideStep(name, name.title(), state) for name, state in (("a", "done"), ("b", "done"), ("c", "now")))
+    guide = GuideView("Result.", steps=steps, actions=(GuideAction("accept", "Accept", "y"),), measurable="biacromial")
+    view, shown = TerminalView(io.StringIO()), status("guide", "Result.", guide=guide)
+    assert press(view, "y2q", shown) == ["accept", "go b", "q"]
+    assert press(view, "3", shown) == []
+    assert press(view, "l40.5\rl40,5\rlwide\r", shown) == 2 * ["measure biacromial=0.4050"]
+    text = printed(shown._replace(sensors=(sensor(battery=0.4, missing=7),)), keys=True)
+    for said in ("again: 1 A 2 B", "l enter the breadth of the shoulders", "torso 100 Hz 40 % 7 lost"):
+        assert said in " ".join(text.split())
 
 
 def read_until(master: int, wanted: bytes, seconds: float = 60.0) -> bytes:

@@ -265,13 +265,34 @@ def test_a_port_is_waited_for(tmp_path: Path, plugged) -> None:
 
     source.open(wait)
     try:
-        assert said[0].startswith(f"Waiting for the MTi of torso: mti:{tmp_path / 'two'}: cannot open the port")
+        place = tmp_path / "two"
+        assert said[0] == f"Waiting for the MTi of torso at {place}: cannot open the port (No such file or directory)."
         assert collect(source, lambda p: count(p, "torso") >= 5)
     finally:
         source.close()
     gone = open_source(f"mti:{tmp_path / 'three'}=torso@100")
     gone.open(lambda _text: False)  # the user has had enough
     assert gone.sensors == ()
+
+
+def test_a_device_that_is_switched_off_is_waited_for(plugged, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mti, "ANSWER_S", 0.05)
+    device, said = plugged("one"), []
+    device.deaf = True
+
+    def wait(text: str) -> bool:
+        said.append(text)
+        device.deaf = False
+        return len(said) < 20
+
+    source = open_source(f"mti:{device.link}=torso@100")
+    source.open(wait)
+    try:
+        assert said == [f"Waiting for the MTi of torso at {device.link}: no MTi answers at 115200 baud."]
+        assert collect(source, lambda p: count(p, "torso") >= 5)
+        assert source.describe_awaited(["torso"]) == f"MTi sensors: torso at {device.link}"
+    finally:
+        source.close()
 
 
 def test_close_frees_the_ports_and_may_be_repeated(plugged) -> None:

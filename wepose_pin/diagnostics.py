@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 
@@ -91,11 +92,17 @@ def render(diagnostic: Diagnostic) -> Text:
     return Text(*(_fill(part, known) for part in template))
 
 
-def render_all(diagnostics: Iterable[Diagnostic]) -> list[tuple[Severity, Text]]:
-    """The diagnostics in words, the gravest first; those with the same reason and remedy are one text."""
+def render_all(
+    diagnostics: Iterable[Diagnostic], remedies: Mapping[str, str] = MappingProxyType({})
+) -> list[tuple[Severity, Text]]:
+    """The diagnostics in words, the gravest first; those with the same reason and remedy are one text.
+
+    `remedies` : code → what to do, in place of the catalogue's
+    """
     alike: dict[tuple[str, Severity, Text], dict[str, str]] = {}  # code, severity, text without `what` → `what` → place
     for diagnostic in gravest_first(diagnostics):
         text = render(diagnostic)
+        text = text._replace(do=remedies.get(diagnostic.code, text.do))
         key = text._replace(what="") if text.do else text
         alike.setdefault((diagnostic.code, diagnostic.severity, key), {}).setdefault(text.what, diagnostic.place)
     texts = []

@@ -310,7 +310,10 @@ def population_subject(
     >>> round(prior.lengths["left_forearm"], 2), round(prior.std("left_forearm"), 2)  # [m]
     (0.26, 0.01)
     """
-    check_arguments(population_subject, locals())
+    arguments: dict[str, Any] = {"stature": stature, "sex": sex}
+    if not isinstance(body, BodyModel | BodyTable):  # which were checked when they were made
+        arguments["body"] = body
+    check_arguments(population_subject, arguments)
     table = load_table() if body is None else body if isinstance(body, BodyTable) else body.table
     people = compute_population_lengths(table, stature, sex)
     lengths, variances = dict(zip(people.names, people.mean.tolist(), strict=True)), {}

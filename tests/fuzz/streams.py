@@ -167,7 +167,9 @@ class _Wild:
     rate_hz: float | None = 100.0
     orientations: ClassVar[dict[str, bool]] = {}
     batteries: ClassVar[dict[str, float]] = {}
-    awaited = ""
+
+    def describe_awaited(self, sensors: object = ()) -> str:  # noqa: ARG002
+        return ""
 
     def __init__(self, data: bytes) -> None:
         self.problems: dict[str, int] = {}

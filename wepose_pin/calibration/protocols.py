@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -224,7 +225,7 @@ def load_protocol(name: str | Path) -> Protocol:
     BadOption
         There is no such protocol, or its file has a key or value that is none.
     """
-    names = [str(name)] if Path(name).is_file() else str(name).split("+")  # a path may have a +
+    names = split_protocol(name)
     if len(names) > 1:
         return _join_protocols(str(name), [load_protocol(each) for each in names])
     own = str(name).endswith(".toml")
@@ -232,8 +233,21 @@ def load_protocol(name: str | Path) -> Protocol:
         raise BadOption(
             f"protocol '{name}' is not known; {one_of(PROTOCOLS, str(name))}; or the path of a .toml of one's own"
         )
-    path = Path(name) if own else asset("calibration", f"{name}.toml")
+    return _read_protocol(Path(name)) if own else _load_packaged(str(name))
+
+
+@lru_cache
+def _load_packaged(name: str) -> Protocol:
+    return _read_protocol(asset("calibration", f"{name}.toml"))
+
+
+def _read_protocol(path: Path) -> Protocol:
     return _protocol(read_toml(path, "a protocol", BadOption), path)
+
+
+def split_protocol(name: str | Path) -> list[str]:
+    """The names of protocols that are joined by "+"; a path may have a +."""
+    return [str(name)] if Path(name).is_file() else str(name).split("+")
 
 
 def _join_protocols(name: str, protocols: list[Protocol]) -> Protocol:

@@ -49,9 +49,15 @@ def _print_session(session: SessionSummary) -> None:
         )
     print_table(
         title,
-        ("sensor", "samples", "ticks without", "late", "twice", "unsound", "frozen", "cut off"),
+        ("sensor", "samples", "lost", "ticks without", "late", "twice", "unsound", "frozen", "cut off"),
         [
-            (name, *(str(counts[key]) for key in ("taken", "missing", "late", "duplicate", "bad", "frozen", "cut_off")))
+            (
+                name,
+                *(
+                    str(counts[key])
+                    for key in ("taken", "lost", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
+                ),
+            )
             for name, counts in session.counts.items()
         ],
     )

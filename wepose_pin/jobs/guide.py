@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -101,23 +101,27 @@ def _with_subject(setup: SensorSetup, folder: Path) -> SensorSetup:
 def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyModel) -> GuideOptions:
     """What the guide does, by the functions that `wepose calibrate` calls too."""
     from ..calibration import assess, calibrate, load_protocol
+    from ..calibration.protocols import split_protocol
     from ..live.assignment import read_segments
     from ..live.guide import Calibrated, GuideOptions
+    from ..live.guide_motion import STATURE
+    from ..readers import load_session
     from ..readers.subject import read_subject
     from ..subject import population_subject
 
-    protocol = load_protocol(job.protocol)
+    protocol, parts = load_protocol(job.protocol), split_protocol(job.protocol)
     prior = read_subject(job.subject) if job.subject else population_subject(job.stature, None, model)
     order = tuple(model.table.segments)
 
     def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
-        out = path.with_suffix("")
+        out, lengths = path.with_suffix(""), {**job.measured, **measured}
+        stature = lengths.pop(STATURE, job.stature)
         calibration = CalibrateJob(
             path,
             out,
-            protocol=job.protocol,
-            measured={**job.measured, **measured},
-            stature=job.stature,
+            protocol=choose_parts(job.protocol, load_session(path).phases),
+            measured=lengths,
+            stature=stature,
             prior=job.subject,
             method=job.method,
             force=True,
@@ -131,7 +135,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
             measured=dict(job.measured),
             prior=prior,
             model=model,
-            protocol=protocol,
+            protocol=load_protocol(choose_parts(job.protocol, recording.phases)),
             method=job.method,
         )
         return calibration, assess(calibration)
@@ -146,7 +150,20 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
         estimate,
         job.method,
         {} if job.setup is None else read_segments(job.setup, order),
+        frozenset(step.phase for part in parts[1:] for step in load_protocol(part).steps if step.phase != "start"),
+        frozenset({*job.measured, *([STATURE] if job.stature is not None or job.subject is not None else [])}),
     )
+
+
+def choose_parts(protocol: str, phases: Collection[str]) -> str:
+    """Choose the parts of a joined protocol whose phases are there, all where none is: a part may be skipped."""
+    from ..calibration import load_protocol
+    from ..calibration.protocols import split_protocol
+
+    there = [
+        part for part in split_protocol(protocol) if all(step.phase in phases for step in load_protocol(part).steps)
+    ]
+    return "+".join(there) or protocol
 
 
 def _depth(model: BodyModel, segment: str) -> int:

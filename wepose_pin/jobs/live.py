@@ -187,6 +187,7 @@ def run_live(
     """
     from ..live import find_setup, open_source, run_session
     from ..live.loop import build_subject_model, warm_up
+    from ..live.session import check_mounts
     from ..subject import load_subject
 
     job.check()
@@ -205,6 +206,8 @@ def run_live(
         setup = stated or find_setup(None, job.subject, None)
         model = build_subject_model(setup, job.model)
         source = _open_stream(job, setup, model)
+    if not job.guide:
+        check_mounts(source, setup)  # before the page opens
     tell(model.diagnostics)
     outputs: list[Output] = list(views)
     robot: RobotOutput | None = None

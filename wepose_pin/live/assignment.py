@@ -103,8 +103,11 @@ class AssignedSource(Source):
         return {self.segments[name]: own for name, own in self.source.orientations.items() if name in self.segments}
 
     def open(self, waiting: Waiting | None = None) -> None:
-        """Open the source, unless it is open already."""
-        if not self._is_open:
+        """Open the source; of one that is open already, leave out what has come so far."""
+        if self._is_open:
+            while self.source.read(0.0):
+                pass
+        else:
             self.source.open(waiting)
             self._is_open = True
 
@@ -124,10 +127,9 @@ class AssignedSource(Source):
         """Segment → share of its sensor's charge, 0 to 1, where it is known."""
         return {self.segments[name]: charge for name, charge in self.source.batteries.items() if name in self.segments}
 
-    @property
-    def awaited(self) -> str:
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
         """As of the source."""
-        return self.source.awaited
+        return self.source.describe_awaited([name for name, own in self.segments.items() if own in sensors])
 
     def clock(self) -> float:
         return self.source.clock()

@@ -13,11 +13,10 @@ from ..errors import BadOption
 from ..kinematics import LiveKinematics
 from ..model import DEFAULT_BODY, BodyModel
 from ..simulation import simulate
-from ..simulation.tasks import TASKS
 from .state import GuideView, LivePose
 
 RATE_HZ = 30.0
-MOTION_S = 14.0  # [s] of a protocol's motion; it is drawn again and again
+MOTION_S = 14.0  # [s] of the motion of a protocol's part; it is drawn again and again
 LEAD_S = 2.0  # [s] before the phase in which the figure takes its place
 SHAKE_HZ, SHAKE_ANGLE = 2.5, 0.45  # of a shaken segment; angle in rad
 
@@ -31,9 +30,10 @@ class Demonstration:
     """
 
     def __init__(self, model: BodyModel, protocol: Protocol) -> None:
-        task = protocol.name if protocol.name in TASKS else "clasp"
         lengths = tuple(model.lengths.items()) if model.table.name == DEFAULT_BODY else ()
-        self._motion, self._phases = _simulate(lengths, task) if lengths else ({}, {})
+        self._motion, self._phases = _simulate(lengths, protocol.name) if lengths else ({}, {})
+        if lengths and not self._motion:  # a protocol of one's own
+            self._motion, self._phases = _simulate(lengths, "clasp")
         self.segments = tuple(name for name in model.table.needed)
         self._kinematics = LiveKinematics(model, self.segments)
 
@@ -59,9 +59,10 @@ class Demonstration:
 def _simulate(
     lengths: tuple[tuple[str, float], ...], task: str
 ) -> tuple[Mapping[str, np.ndarray], Mapping[str, tuple[float, float]]]:
-    """Segment → (n, 4) xyzw at `RATE_HZ`, and phase → its interval [s]; empty where the arms cannot do the motion."""
+    """Segment → (n, 4) xyzw at `RATE_HZ`, and phase → its interval [s]; empty where that cannot be simulated."""
     try:
-        motion = simulate(dict(lengths), seed=1, rate_hz=RATE_HZ, clasp_s=MOTION_S, circles=0, protocol=task)
+        motion_s = MOTION_S * len(task.split("+"))
+        motion = simulate(dict(lengths), seed=1, rate_hz=RATE_HZ, clasp_s=motion_s, circles=0, protocol=task)
     except BadOption:
         return {}, {}
     return motion.quat_WL, {name: spans[0] for name, spans in motion.phases.items() if spans}

@@ -29,6 +29,8 @@ GET_READY_S = 8.0  # [s] to leave the keyboard and stand ready
 
 NEXT = GuideAction("next", "Continue", "n")
 AGAIN = GuideAction("again", "Once more", "a")
+SKIP = GuideAction("skip", "Skip", "s")
+KEEP = GuideAction("skip", "Keep as it was", "s")
 RESTART = GuideAction("restart", "All again from the start pose", "a")
 
 
@@ -50,10 +52,12 @@ class GuideOptions:
     setup : name, start pose and body of the session; its mounts, where known
     table : of the body
     depth : segment → number of segments between it and the root
-    calibrate : calibrates a recorded file, with lengths [m] that the person measured
+    calibrate : calibrates a recorded file, with lengths [m] that the person measured, or "stature"
     estimate : calibrates the recording so far
     method : of the filter, for the recording's header
     known : sensor → segment, as in an earlier session
+    optional : phases of the protocol that may be skipped
+    measured : names of the lengths that are given already, "stature" among them where it is
     """
 
     folder: Path
@@ -65,6 +69,8 @@ class GuideOptions:
     estimate: Callable[[Recording], tuple[Calibration, CalibrationQuality]]
     method: str
     known: Mapping[str, str] = field(default_factory=dict)
+    optional: frozenset[str] = frozenset()
+    measured: frozenset[str] = frozenset()
 
 
 class Guide:
@@ -165,7 +171,9 @@ class Guide:
             self.step.enter()
 
     def restart(self, reason: str = "") -> None:
-        """Go to the start pose, and say why."""
+        """Go to the start pose; where there is a reason, what was recorded cannot go on."""
+        if reason:
+            self.discard_phases()
         self.go(next(k for k, step in enumerate(self.steps) if step.name == "start"))
         self.step.reason = reason
 
@@ -183,6 +191,12 @@ class Guide:
             header = self.options.setup.header(source.sensors, source.orientations) | {"method": self.options.method}
             self.attempt = Attempt(path, source, header)
         return self.attempt
+
+    def discard_phases(self) -> None:
+        """Take back what was recorded of the protocol."""
+        if self.attempt is not None:
+            for phase in ("start", *(step.phase for step in self.options.protocol.steps)):
+                self.attempt.mark("discard", phase=phase)
 
     def close(self) -> None:
         """End the recording; may be called twice."""

@@ -14,7 +14,7 @@ from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals
 from ..diagnostics import Diagnostic, render, render_all
 from ..errors import WeposeError
 from ..recording.arrivals import Ticks
-from .guide import GET_READY_S, RESTART, Calibrated, Guide, Step
+from .guide import GET_READY_S, RESTART, SKIP, Calibrated, Guide, Step
 from .state import GuideAction, GuideView, LengthEstimate
 from .worker import Worker
 
@@ -23,11 +23,18 @@ SENTENCE_S = 9.0  # [s] for which each sentence of an instruction stands
 ESTIMATE_PERIOD_S = 4.0  # [s] of motion between two estimates
 FIRST_ESTIMATE_S = 12.0  # [s] of motion before the first estimate
 FINISH_AFTER_S = 15.0  # [s] of a phase after which it may be finished
+STATURE = "stature"  # that a person may enter in place of a length
 MORE_S = 30.0  # [s] of motion that "more" adds
 MOST_ADVICE = 2  # sentences at a time
 APART_S, APART = 3.0, 0.10  # [s] newest motion, and its median gap [m] above which the closure seems open
 # Codes of reasons that more motion takes away, or begin so.
 TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain", "closure-open")
+# Code → what to do, of those whose remedy is an option of a command: here it is asked for.
+MEASURE = "Measure what is asked for and enter it here."
+REMEDIES = dict.fromkeys(("scale-from-prior", "scale-uncertain", "limb-scale-from-prior"), MEASURE) | {
+    "sensors-exchanged": "Exchange them here.",
+    "length-uncertain": "Move further and faster, through the whole reach.",
+}
 MOST_LOSS_S = 2.0  # [s] of a lost sensor after which its heading has to be found anew
 
 FINISH = GuideAction("next", "Finish", "n")
@@ -48,10 +55,28 @@ class ExerciseStep(Step):
         self._estimate: tuple[Calibration, CalibrationQuality] | None = None
 
     def enter(self) -> None:
-        measured_s = 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)
-        if measured_s == 0.0:
+        if self._measured_s >= self._seconds:  # the person came back to an earlier step, and kept it
+            self.guide.go_on()
+        else:
+            self._start(self._seconds)
+
+    def repeat(self) -> None:
+        self._start(max(self._seconds, self._measured_s + min(MORE_S, self._seconds)))
+
+    @property
+    def seconds(self) -> float:
+        """Duration that the protocol asks for."""
+        return self._seconds
+
+    @property
+    def _measured_s(self) -> float:
+        return 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)
+
+    def _start(self, target_s: float) -> None:
+        """Begin, or go on until so many seconds of the motion are recorded."""
+        if self._measured_s == 0.0:
             self._estimate = None
-        self._target_s = self._seconds if measured_s == 0.0 else measured_s + MORE_S
+        self._target_s = target_s
         self._begin = self.guide.now + GET_READY_S
         self._running = False
         self._estimated_s = 0.0
@@ -113,17 +138,21 @@ class ExerciseStep(Step):
         return self.guide.join_sensors([name for name in self.guide.order if name in self._lost_segments])
 
     def actions(self) -> list[GuideAction]:
-        measured_s = 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)
-        return [FINISH, RESTART] if measured_s > min(FINISH_AFTER_S, self._seconds) else [RESTART]
+        finish = [FINISH] if self._measured_s > min(FINISH_AFTER_S, self._seconds) else []
+        return [*finish, RESTART, *([SKIP] if self.name in self.guide.options.optional else [])]
 
     def act(self, action: str) -> None:
         if action == "next":
+            self.guide.go_on()
+        elif action == "skip" and self.guide.attempt is not None:
+            self._pause(self.guide.attempt.newest)
+            self.guide.attempt.mark("discard", phase=self.name)
             self.guide.go_on()
         else:
             self.guide.restart()
 
     def view(self) -> GuideView:
-        measured_s = 0.0 if self.guide.attempt is None else self.guide.attempt.measured_s(self.name)
+        measured_s = self._measured_s
         countdown = None if self._running else max(0.0, self._begin - self.guide.now)
         further = self._sentences[1:] or self._sentences
         turn = int(measured_s / SENTENCE_S)
@@ -161,9 +190,15 @@ class CalibrationStep(Step):
     def __init__(self, guide: Guide) -> None:
         super().__init__(guide)
         self._worker: Worker[Calibrated] = Worker()
-        self._measured: dict[str, float] = {}
+        self._measured: dict[str, float] = {}  # lengths [m] that the person entered
+        self._before: Calibrated | WeposeError | None = None  # the result before the newest of them
+        self._entered, self._refused = "", ""  # its name, and why it cannot be
 
     def enter(self) -> None:
+        self._entered, self._before, self._refused = "", None, ""
+        self._calibrate()
+
+    def _calibrate(self) -> None:
         self._result: Calibrated | WeposeError | None = None
         assert self.guide.attempt is not None
         self.guide.attempt.log.flush()
@@ -175,6 +210,9 @@ class CalibrationStep(Step):
 
     def update(self) -> None:
         self._result = self._worker.take() or self._result
+        if self._entered and isinstance(self._result, WeposeError):  # the result before it stays
+            del self._measured[self._entered]
+            self._result, self._refused, self._entered = self._before, str(self._result), ""
 
     @property
     def _moved(self) -> Mapping[str, str]:
@@ -200,7 +238,9 @@ class CalibrationStep(Step):
         if action == "accept" and isinstance(self._result, Calibrated):
             self.guide.accepted = self._result
         elif action == "more":
-            self.guide.go(self.guide.steps.index(self) - 1)
+            exercises = [step for step in self.guide.steps if isinstance(step, ExerciseStep)]
+            longest = max(exercises, key=lambda step: step.seconds)
+            self.guide.go(self.guide.steps.index(longest), again=True)
         elif action == "exchange":
             self._exchange(self._moved)
         else:
@@ -210,14 +250,21 @@ class CalibrationStep(Step):
         name, _, metres = stated.partition("=")
         with contextlib.suppress(ValueError):
             self._measured[name] = float(metres)
-            self.enter()
+            self._entered, self._before, self._refused = name, self._result, ""
+            self._calibrate()
 
     @property
     def _measurable(self) -> str:
-        """The length that would fix the scale best, where none was measured."""
-        if not isinstance(self._result, Calibrated) or self._result.calibration.scale_lengths:
+        """What to measure next for the scale, where it is uncertain; empty: nothing."""
+        if not isinstance(self._result, Calibrated):
             return ""
-        return self._result.calibration.measured_example.partition("=")[0]
+        calibration, quality, _ = self._result
+        if not any(REMEDIES.get(reason.code) == MEASURE for reason in quality.reasons):
+            return ""
+        known = {*self.guide.options.measured, *self._measured}
+        best = calibration.measured_example.partition("=")[0]
+        choices = (STATURE, best) if calibration.scale_lengths else (best, STATURE)
+        return next((name for name in choices if name not in known), "")
 
     def _exchange(self, moved: Mapping[str, str]) -> None:
         """Assign the sensors as the calibration found them, and calibrate again."""
@@ -242,9 +289,11 @@ class CalibrationStep(Step):
         }[quality.quality]
         if quality.quality == "poor" and all(reason.code.startswith("scale-") for reason in quality.reasons):
             sentence = "The proportions are good. One measured length gives the scale too."
+            if calibration.scale_lengths:
+                sentence = "The proportions are good. The scale is still uncertain."
         if quality.quality == "fail" and self._lacks_motion:
             sentence = "There was too little of the motion. More of it may be enough."
-        reasons = [text.line() for _, text in render_all(count_from_begin(quality.reasons, calibration))]
+        reasons = [text.line() for _, text in render_all(count_from_begin(quality.reasons, calibration), REMEDIES)]
         if self._moved:  # all other reasons follow from this one
             sentence, reasons = (
                 "Some sensors sit on other segments than assigned. The same motion will do.",
@@ -252,6 +301,7 @@ class CalibrationStep(Step):
             )
         return GuideView(
             sentence,
+            self._refused,
             progress=1.0,
             lengths=_list_lengths(calibration),
             sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES),
@@ -282,5 +332,5 @@ def _advise(quality: CalibrationQuality) -> tuple[str, ...]:
     """What to do while the person moves: about the parts of the motion that are too small, else the worst reason."""
     reasons = [reason for reason in quality.reasons if not reason.code.startswith("scale-")]
     motion = [reason for reason in reasons if reason.code.startswith("motion-")]
-    advice = [render(reason).do for reason in motion or reasons[:1]]
+    advice = [REMEDIES.get(reason.code, render(reason).do) for reason in motion or reasons[:1]]
     return tuple(dict.fromkeys(advice))[:MOST_ADVICE]

@@ -11,7 +11,7 @@ from ..recording.limits import GRAVITY_ERROR_NOTED, STANDARD_GRAVITY
 from ..tracking.start_pose import StartPoseDetector, TickRates
 from .assignment import ShakeDetector
 from .attempt import Attempt
-from .guide import AGAIN, GET_READY_S, NEXT, Guide, Step
+from .guide import AGAIN, GET_READY_S, KEEP, NEXT, SKIP, Guide, Step
 from .state import GuideAction, GuideView, join_names
 
 STATIC_S = 2.0  # [s] of standing still in which the sensors are checked
@@ -19,7 +19,6 @@ START_POSE_S = 4.0  # [s] where the protocol does not say how long
 
 READY = GuideAction("next", f"Ready: begin in {GET_READY_S:.0f} s", "n")
 ANEW = GuideAction("again", "Assign all anew", "a")
-SKIP = GuideAction("skip", "Skip", "s")
 
 
 class SensorStep(Step):
@@ -36,8 +35,9 @@ class SensorStep(Step):
     def view(self) -> GuideView:
         count, needed = len(self.guide.newest_times) - len(self.guide.silent), len(self.guide.needs)
         sentence, note = "Strap the sensors on and switch them on", self.guide.describe_silent()
-        awaited = "" if self.guide.newest_times else self.guide.source.awaited
-        sentence = f"{sentence}. Waiting for {awaited}." if awaited else f"{sentence}: {count} of {needed} send."
+        absent = [name for name in self.guide.source.sensors if name not in self.guide.newest_times]
+        awaited = self.guide.source.describe_awaited(absent)
+        sentence = f"{sentence}: {count} of {needed} send." + (f" Waiting for {awaited}." if awaited else "")
         if count >= needed:
             sentence = f"{count} sensors send. Are all strapped on tightly?"
         return GuideView(sentence, note, progress=min(1.0, count / max(needed, 1)), reasons=self._warn_of_trackers())
@@ -60,6 +60,10 @@ class AssignmentStep(Step):
 
     name, title, before_attempt = "assignment", "Segments", True
 
+    def __init__(self, guide: Guide) -> None:
+        super().__init__(guide)
+        self._before: dict[str, str] = {}  # sensor → segment, all assigned, before they are assigned anew
+
     def enter(self) -> None:
         names = {name: name for name in self.guide.newest_times if name in self.guide.order}
         known = names | dict(self.guide.options.known) | self.guide.segments
@@ -70,6 +74,8 @@ class AssignmentStep(Step):
             self.guide.go_on()
 
     def repeat(self) -> None:
+        if set(self.guide.needs) <= set(self.guide.segments.values()):
+            self._before = self.guide.segments
         self.guide.segments = {}
         self._shakes = ShakeDetector()
 
@@ -97,10 +103,14 @@ class AssignmentStep(Step):
             self.guide.go_on()
 
     def actions(self) -> list[GuideAction]:
-        return [ANEW] if self.guide.segments else []
+        return [ANEW] * bool(self.guide.segments) + [KEEP] * bool(self._before)
 
-    def act(self, action: str) -> None:  # noqa: ARG002
-        self.repeat()
+    def act(self, action: str) -> None:
+        if action == "skip":
+            self.guide.segments = self._before
+            self.guide.go_on()
+        else:
+            self.repeat()
 
     def view(self) -> GuideView:
         segment, place = self._open[0], join_names([self._open[0]])
@@ -210,9 +220,12 @@ class StartPoseStep(Step):
         self.reason = ""
         self._begin: float | None = None
         self._stillness: Stillness | None = None
-        attempt = self.guide.begin_attempt()
-        for phase in ("start", *(step.phase for step in self.guide.options.protocol.steps)):
-            attempt.mark("discard", phase=phase)
+        self.guide.begin_attempt()
+
+    @property
+    def _is_held(self) -> bool:
+        """Whether it was held already, and what was recorded then can go on."""
+        return self.guide.attempt is not None and self.guide.attempt.measured_s("start") > 0.0
 
     def push_ticks(self, ticks: Ticks) -> None:
         attempt = self.guide.attempt
@@ -229,12 +242,18 @@ class StartPoseStep(Step):
             self.guide.go_on()
 
     def actions(self) -> list[GuideAction]:
-        return [READY] if self._begin is None else [AGAIN]
+        if self._begin is not None:
+            return [AGAIN]
+        return [READY, KEEP] if self._is_held else [READY]
 
     def act(self, action: str) -> None:
+        if action == "skip":
+            self.guide.go_on()
+            return
         self.enter()
         if action == "next":
             self._begin = self.guide.now + GET_READY_S
+            self.guide.discard_phases()
 
     def view(self) -> GuideView:
         stillness, countdown, progress = self._stillness, None, 0.0

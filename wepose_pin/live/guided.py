@@ -13,6 +13,7 @@ from .demonstration import RATE_HZ, Demonstration
 from .guide import Calibrated, Guide, GuideOptions, Step
 from .guide_motion import CalibrationStep, ExerciseStep
 from .guide_preparation import AssignmentStep, SensorStep, StartPoseStep, StaticStep
+from .losses import SampleLosses
 from .sources.base import Source
 from .state import Output, SensorStatus, Status
 
@@ -48,6 +49,7 @@ class GuidedSession:
         self.guide = Guide(source, options, make_steps)
         self._figure = Demonstration(model, options.protocol)
         self._counts: dict[str, deque[tuple[float, int]]] = {}
+        self._losses = SampleLosses()
         self.ended = False
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> Calibrated | None:
@@ -76,6 +78,7 @@ class GuidedSession:
 
     def _count(self, samples: Sequence[Samples]) -> None:
         now = self.source.clock()
+        self._losses.push(samples)
         for chunk in samples:
             self._counts.setdefault(chunk.sensor, deque()).append((now, len(chunk.time)))
         for counts in self._counts.values():
@@ -108,4 +111,5 @@ class GuidedSession:
         segment = self.guide.segments.get(name, "")
         label = f"{segment} ({name})" if segment and segment != name else name
         battery = self.source.batteries.get(name, math.nan)
-        return SensorStatus(label, rate_hz, name in self.guide.silent, battery=battery)
+        missing = self._losses.count(name, self.guide.now)
+        return SensorStatus(label, rate_hz, name in self.guide.silent, missing=missing, battery=battery)

@@ -30,7 +30,6 @@ from ..recording.arrivals import (
     CUT_OFF,
     DUPLICATE,
     LATE,
-    MISSING,
     TAKEN,
     WAIT_S,
     Samples,
@@ -44,6 +43,7 @@ from ..tracking.causal import CausalSegmentEstimator
 from ..tracking.headings import CAUSAL_KNOT_S
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates
 from ..writers.live_log import LiveLog
+from .losses import SampleLosses
 from .setup import SensorSetup
 from .sources.base import Source
 from .state import LivePose, Output, SensorStatus, Status, StreamInfo, join_names
@@ -55,6 +55,7 @@ READ_TIMEOUT_S = 0.05  # [s]; keys and the status wait for a read
 MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
 MAX_LATENCIES = 1000  # newest latencies in the status
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
+BEGUN_S = 0.5  # [s] of standing still after which who moves is told so
 START_POSES = {NEUTRAL_POSE: "Stand upright and still, arms hanging, palms to the thighs"}  # what to tell a person
 
 
@@ -86,7 +87,7 @@ class SessionSummary(NamedTuple):
 
     poses: int
     seconds: float  # [s] from the first pose to the last, on the source's clock
-    counts: Mapping[str, Mapping[str, int]]  # segment → each of `arrivals.COUNTS`
+    counts: Mapping[str, Mapping[str, int]]  # segment → each of `arrivals.COUNTS`, and "lost" samples
     latency: Latencies  # of every tick with a sample: [s] from its time to its pose
     diagnostics: tuple[Diagnostic, ...]
     problem: str  # of the recording; empty where it is complete
@@ -192,6 +193,8 @@ class LiveLoop:
         if self.model.table.is_mechanism:
             self._instruction = f"{self.model.table.name} must stand still in its start configuration"
         self._stream = TickStream(source.sensors, source.rate_hz, begin, wait_s, log, source.orientations)
+        self._losses = SampleLosses()
+        self._stood_s = 0.0  # [s] longest time that the person stood still before tracking
         self._phase_edges = PhaseEdges(self.setup.phases)
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
         self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
@@ -243,6 +246,7 @@ class LiveLoop:
     def _process_samples(self, samples: list[Samples]) -> None:
         """Record the samples of one read, track the ticks that they complete, and show the last pose."""
         pose = None
+        self._losses.push(samples)
         for ticks in self._stream.push(samples):
             if (search := self._begin_search()) is not None:
                 pose = self._track_ticks(ticks, search) or pose
@@ -359,7 +363,7 @@ class LiveLoop:
     def _mark(self, key: str) -> None:
         """Mark in the recording what a key asks for: "mark TEXT", "begin PHASE", "end PHASE", or "take"."""
         synchronizer = self._stream.synchronizer
-        if key == "take" and self.log is None:
+        if (key == "take" or key.startswith("begin ")) and self.log is None:
             self._begin_recording()
         if self.log is None or synchronizer is None or not synchronizer.next_tick:
             return
@@ -424,7 +428,7 @@ class LiveLoop:
                     (float(bias[i, 0]), float(bias[i, 1]), float(bias[i, 2])),
                     float(self._heading_std[i]),
                     heading_age,
-                    int(counts[i, MISSING]),
+                    self._losses.count(name, now),
                     int(counts[i, LATE]),
                     int(counts[i, DUPLICATE]),
                     bool(frozen[i]),
@@ -461,8 +465,8 @@ class LiveLoop:
         if self._start_search is None:
             missing_sensors = [name for name in self.source.sensors if self._stream.newest_times[name] == -np.inf]
             if missing_sensors:
-                nothing, awaited = len(missing_sensors) == len(self.source.sensors), self.source.awaited
-                where = f" Waiting for {awaited}." if nothing and awaited else ""
+                awaited = self.source.describe_awaited(missing_sensors)
+                where = f" Waiting for {awaited}." if awaited else ""
                 return "waiting", f"Nothing has come yet from {join_names(missing_sensors)}.{where}", 0.0
             return "waiting", "Measuring the sampling rate.", 0.0
         search, detector = self._start_search, self._start_search.detector
@@ -472,6 +476,9 @@ class LiveLoop:
             missing = np.isin(np.arange(len(lost)), detector.missing)
             text = self._describe_lost(missing & frozen, frozen) or f"Waiting for {self._join_sensors(missing)}."
             return "waiting", text, 0.0
+        self._stood_s = max(self._stood_s, detector.held_s)
+        if detector.state == "moved" and self._stood_s < BEGUN_S:  # the person walks to the place, or joins the pose
+            return "start_pose", f"{self._instruction}.", 0.0
         if detector.state == "moved":
             moved = join_names([self.source.sensors[i] for i in detector.moving])
             again = self._instruction[0].lower() + self._instruction[1:]
@@ -504,7 +511,10 @@ class LiveLoop:
         return SessionSummary(
             self._poses,
             self._last_pose - self._first_pose if self._poses else 0.0,
-            {name: dict(zip(COUNTS, row.tolist(), strict=True)) for name, row in zip(sensors, counts, strict=True)},
+            {
+                name: dict(zip(COUNTS, row.tolist(), strict=True)) | {"lost": self._losses.count(name, -math.inf)}
+                for name, row in zip(sensors, counts, strict=True)
+            },
             self._latency,
             () if self._segment_estimator is None else self._segment_estimator.start.diagnostics,
             "" if self.log is None else self.log.problem,

@@ -19,7 +19,7 @@ from typing import Any
 from ..errors import BadOption
 from .addresses import name_host
 from .encoder import PoseEncoder
-from .state import GuideView, Status, format_heading_std, round_finite
+from .state import GuideView, Status, format_heading_std, name_length, round_finite
 
 FRAME_S = 1.0 / 60.0
 MAX_ACTION = 120  # letters of an action
@@ -335,5 +335,6 @@ def _guide_json(view: GuideView) -> dict[str, Any]:
             {"name": name, "mm": round_finite(1e3 * metres, 0), "std_mm": round_finite(1e3 * std, 1)}
             for name, metres, std in view.lengths
         ],
+        "measurable_name": name_length(view.measurable),
         "sample_size": None if view.sample_size is None else [round_finite(size, 1) for size in view.sample_size],
     }

@@ -62,7 +62,7 @@ def run_session(
     setup, record = setup.as_recorded().with_model(model), None if record is None else Path(record)
     if record is not None and record.exists() and not force:
         raise ExistingOutput(f"{record}: exists; --force replaces it, --record names another file")
-    _check_mounts(source, setup)
+    check_mounts(source, setup)
     warm_up(method)  # before samples come
     if not open_and_wait(source, outputs, until):
         for output in outputs:
@@ -70,7 +70,7 @@ def run_session(
         return EMPTY_SESSION
     log = None
     try:
-        _check_mounts(source, setup)
+        check_mounts(source, setup)
         header = setup.header(source.sensors, source.orientations) | {"method": method, "versions": versions()}
         if record is not None:
             log = LiveLog(record, header, force)
@@ -122,13 +122,16 @@ def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[],
     return not stopped
 
 
-def _check_mounts(source: Source, setup: SensorSetup) -> None:
+def check_mounts(source: Source, setup: SensorSetup) -> None:
     """Raise `BadSession` where the mount of a sensor is not known, and its orientation is not the segment's own."""
     calibrated = setup.subject.mounts if setup.subject is not None and not setup.remounted else {}
     sensors = [name for name in source.sensors if not source.orientations.get(name)]
     unknown = [name for name in sensors if name not in calibrated and name not in setup.mounts]
-    if unknown:
+    nothing_known = not (source.sensors or source.aligned or calibrated or setup.mounts)
+    if unknown or nothing_known:
+        segment = unknown[0] if unknown else "SEGMENT"
+        sensor = f"the sensor of {segment} is" if unknown else "the sensors are"
         raise BadSession(
-            f"{setup.name}: how the sensor of {unknown[0]} is mounted is not known: give --subject with calibrated "
-            f'mounts, or --session with [sensors.{unknown[0]}] mount = {{ up = "+x", forward = "-z" }}'
+            f"{setup.name}: how {sensor} mounted is not known: find it out with --guide, or give --subject with "
+            f'calibrated mounts, or --session with [sensors.{segment}] mount = {{ up = "+x", forward = "-z" }}'
         )

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+LENGTH_NAMES = {"biacromial": "breadth of the shoulders, from acromion to acromion", "stature": "body height"}
 # [rad] standard deviation of a direction that is uniform on the circle: with more, nothing is known of a heading.
 UNKNOWN_HEADING_STD = math.pi / math.sqrt(3.0)
 
@@ -40,7 +41,7 @@ class SensorStatus(NamedTuple):
     gyro_bias: tuple[float, float, float] = (math.nan, math.nan, math.nan)  # [rad/s]
     heading_std: float = math.nan  # [rad]; NaN where the filter has no covariance
     heading_age: float = math.nan  # [s] since the start, or the last reset of the headings
-    missing: int = 0  # ticks without a sample of it
+    missing: int = 0  # samples that never came
     late: int = 0  # samples that came after their tick
     duplicate: int = 0
     frozen: bool = False  # its values repeat bit for bit, though it has noise
@@ -146,6 +147,11 @@ def format_heading_std(std: float) -> str:
     if not math.isfinite(std):
         return "–"
     return f"{math.degrees(std):.1f}" if std < UNKNOWN_HEADING_STD else "unknown"
+
+
+def name_length(name: str) -> str:
+    """A measured length in words."""
+    return LENGTH_NAMES.get(name, name.replace("_", " "))
 
 
 def join_names(segments: list[str]) -> str:

@@ -8,12 +8,14 @@ import math
 import os
 import select
 import sys
-from typing import Any, TextIO
+from collections.abc import Callable
+from typing import Any, NamedTuple, TextIO
 
-from .state import GuideView, Output, SensorStatus, Status, format_heading_std
+from .state import GuideView, Output, SensorStatus, Status, format_heading_std, name_length
 
 REFRESH_HZ = 4
 KEYS = {"r": "r", "q": "q", "t": "take", "m": "mark mark"}  # key → what it asks for
+RETURN, ESCAPE, ERASE = "\r\n", "\x1b", "\b\x7f"
 STATES = {"waiting": "…", "start_pose": "■", "moved": "✕", "ready": "▶", "ended": "■"}
 # Columns, and the width of the terminal from which each is shown.
 COLUMNS = (
@@ -25,6 +27,14 @@ COLUMNS = (
     ("set ago\n[s]", 58),
     ("missing\nsamples", 44),
 )
+
+
+class Entry(NamedTuple):
+    """A text that the person types, and ends by Return."""
+
+    title: str
+    request: Callable[[str], str]  # text → what it asks for; empty: nothing
+    text: str = ""
 
 
 class TerminalView(Output):
@@ -43,6 +53,7 @@ class TerminalView(Output):
         self._live: Any = None
         self._newest: Status | None = None
         self._reported: dict[str, str] = {}
+        self._entry: Entry | None = None
         self._keyboard = Keyboard() if keys else None
         self._opened = False
 
@@ -70,9 +81,32 @@ class TerminalView(Output):
         """What the keys since the last call ask for; those of the guide's actions go before the others."""
         if self._keyboard is None:
             return []
-        guide = None if self._newest is None else self._newest.guide
-        keys = KEYS if guide is None else {"q": "q"} | {action.key: action.name for action in guide.actions}
-        return [keys[key] for key in self._keyboard.take() if key in keys]
+        requests = [self._take_key(key) for key in self._keyboard.take()]
+        return [request for request in requests if request]
+
+    def _take_key(self, key: str) -> str:
+        """What a key asks for; empty: nothing, or it is a letter of an entry."""
+        entry, status = self._entry, self._newest
+        if entry is not None:
+            if key in RETURN or key == ESCAPE:
+                self._entry = None
+                return entry.request(entry.text.strip()) if key in RETURN else ""
+            text = entry.text[:-1] if key in ERASE else entry.text + key * key.isprintable()
+            self._entry = entry._replace(text=text)
+            return ""
+        key, guide = key.lower(), None if status is None else status.guide
+        if guide is not None:
+            self._entry = _find_guide_entry(key, guide)
+            done = [step.name for step in guide.steps if step.state == "done"]
+            if key.isdigit() and 0 < int(key) <= len(done):
+                return f"go {done[int(key) - 1]}"
+            return ({"q": "q"} | {action.key: action.name for action in guide.actions}).get(key, "")
+        if status is not None and status.state == "ready":
+            phases = list_phases(status)
+            if key == "p" and phases:
+                return f"end {phases[-1]}"
+            self._entry = ENTRIES.get(key)
+        return KEYS.get(key, "")
 
     def close(self) -> None:
         """Restore the terminal; the last table stays. May be called twice."""
@@ -103,11 +137,22 @@ class TerminalView(Output):
         return [clock + (key + now[key] if key else said) for key in changed]
 
     def _render(self) -> Any:
+        from rich.console import Group
         from rich.text import Text
 
         if self._newest is None:
             return Text("Connecting …")
-        return build_table(self._newest, keys=self._keyboard is not None, width=self._console.width)
+        view = build_table(self._newest, keys=self._keyboard is not None, width=self._console.width)
+        if self._entry is None:
+            return view
+        return Group(Text(f"{self._entry.title}: {self._entry.text}▏  (Return, or Escape)", style="bold yellow"), view)
+
+
+MEASURE_KEY = "l"
+ENTRIES = {
+    "n": Entry("text of the mark", lambda text: f"mark {text or 'mark'}"),
+    "p": Entry("name of the phase, clasp without one", lambda text: f"begin {text or 'clasp'}"),
+}
 
 
 def build_table(status: Status, *, keys: bool = False, width: int = 80) -> Any:
@@ -144,7 +189,11 @@ def build_table(status: Status, *, keys: bool = False, width: int = 80) -> Any:
     if problems:
         parts.append(Text(problems, style="red"))
     if keys:
-        marks = "   t begin or end a take" * tracking + "   m mark" * bool(status.recorded_s)
+        marks = ""
+        if status.state == "ready":
+            phases = list_phases(status)
+            marks = f"   t begin or end a take   p {f'end phase {phases[-1]}' if phases else 'begin a phase'}"
+            marks += "   m mark   n mark with a text" * bool(status.recorded_s)
         parts.append(Text(f"r reset headings (stand in the start pose){marks}   q end", style="dim"))
     return Group(*parts)
 
@@ -166,6 +215,14 @@ def build_guide(status: Status, guide: GuideView, *, keys: bool = False) -> Any:
     done = round(30 * min(max(guide.progress, 0.0), 1.0))
     remaining = "" if guide.remaining is None else f"  {guide.remaining:.0f} s"
     parts.append(Text("█" * done + "░" * (30 - done) + remaining))
+    if keys:
+        offered = [f"{action.key} {action.label}" for action in guide.actions]
+        offered += [f"{MEASURE_KEY} enter the {name_length(guide.measurable)}"] if guide.measurable else []
+        back = [f"{k + 1} {step.title}" for k, step in enumerate(guide.steps) if step.state == "done"]
+        parts.append(Text("   ".join([*offered, "q end"]), style="dim"))
+        if back:
+            parts.append(Text("   ".join(["again:", *back]), style="dim"))
+    parts.append(Text("   ".join(map(_describe_sensor, status.sensors)), style="dim"))
     if guide.lengths:
         table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
         for length in guide.lengths:
@@ -175,12 +232,35 @@ def build_guide(status: Status, guide: GuideView, *, keys: bool = False) -> Any:
     if guide.sample_size is not None:
         parts.append(Text(f"effective sample size {guide.sample_size[0]:.1f}; {guide.sample_size[1]:.0f} are enough"))
     parts += [Text(reason) for reason in ([guide.quality] if guide.quality else []) + list(guide.reasons)]
-    states = [f"{s.segment} {'✕ silent' if s.lost else f'{s.rate_hz:.0f} Hz'}" for s in status.sensors]
-    parts.append(Text("   ".join(states).replace("_", " "), style="dim"))
-    if keys:
-        offered = "   ".join(f"{action.key} {action.label}" for action in guide.actions)
-        parts.append(Text(f"{offered}   q end".strip(), style="dim"))
     return Group(*parts)
+
+
+def _describe_sensor(sensor: SensorStatus) -> str:
+    """A sensor of the guide in a few words: its rate, battery and lost samples."""
+    parts = [sensor.segment.replace("_", " "), "✕ silent" if sensor.lost else f"{sensor.rate_hz:.0f} Hz"]
+    if math.isfinite(sensor.battery):
+        parts.append(f"{100.0 * sensor.battery:.0f} %")
+    if sensor.missing:
+        parts.append(f"{sensor.missing} lost")
+    return " ".join(parts)
+
+
+def _find_guide_entry(key: str, guide: GuideView) -> Entry | None:
+    """The entry that a key opens in the guide."""
+    if key != MEASURE_KEY or not guide.measurable:
+        return None
+
+    def request(text: str) -> str:
+        with contextlib.suppress(ValueError):
+            return f"measure {guide.measurable}={0.01 * float(text.replace(',', '.')):.4f}"
+        return ""
+
+    return Entry(f"{name_length(guide.measurable)} [cm]", request)
+
+
+def list_phases(status: Status) -> list[str]:
+    """The open phases that are no takes."""
+    return [phase for phase in status.open_phases if not phase.startswith("take_")]
 
 
 def _sensor_cells(sensor: SensorStatus, tracking: bool) -> tuple[str, ...]:
@@ -232,7 +312,7 @@ class Keyboard:
             pressed = b""
         if not pressed:
             self.close()  # the terminal is gone
-        return list(pressed.decode("ascii", "ignore").lower())
+        return list(pressed.decode("utf-8", "ignore"))
 
     def close(self) -> None:
         """Restore the terminal."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..recording.arrivals import JUMP_S, WAIT_S, Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
 from ..writers.live_log import LiveLog
+from .losses import measure_step
 
 RATE_MEASUREMENT_S = 1.0  # [s] over which the rate is measured if the source does not know it
 MAX_ABSENCE_S = 3.0  # [s] after which ticks begin without a sensor that has sent nothing
@@ -110,11 +111,5 @@ class TickStream:
 
 def _measure_rate(times: Sequence[np.ndarray]) -> float:
     """Measure the rate [Hz] of the slowest sensor from times [s] of each, rounded to 0.1 Hz."""
-    rates = []
-    for time_s in map(np.unique, times):
-        if len(time_s) > 2:
-            median = 1.0 / float(np.median(np.diff(time_s)))
-            mean = (len(time_s) - 1) / float(time_s[-1] - time_s[0])
-            # The mean is more precise unless samples are lost. For time stamps in bursts only the mean is right.
-            rates.append(mean if abs(mean / median - 1.0) < 0.05 or median > 3.0 * mean else median)
+    rates = [1.0 / step for step in map(measure_step, times) if step]
     return max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from ...recording.arrivals import Samples
 from .waiting import Waiting
@@ -19,7 +19,10 @@ class Source(ABC):
     sensors : segments, in the order in which results name them
     rate_hz : nominal samples a second of each; None where it has to be measured
     problems : problem → count of what was dropped so far ("bad checksums": 3)
+    aligned : whether all that it will ever send are orientations of segments, for which no mount is needed
     """
+
+    aligned = False
 
     def __init__(self, sensors: Iterable[str] = (), rate_hz: float | None = None) -> None:
         self.sensors, self.rate_hz = tuple(sensors), rate_hz
@@ -38,9 +41,8 @@ class Source(ABC):
         """Sensor → share of its charge, 0 to 1, of those that have said it."""
         return {}
 
-    @property
-    def awaited(self) -> str:
-        """What is waited for, and at which address; empty where that is not known."""
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:  # noqa: ARG002
+        """Describe what is awaited from these sensors, without any from all, and where; empty where nothing is."""
         return ""
 
     @abstractmethod

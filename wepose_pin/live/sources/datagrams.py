@@ -76,13 +76,13 @@ class DatagramSource(Source):
     Attributes
     ----------
     kind, sender, hint : of the source, who sends to it, and in what form, for messages
-    aligned : whether orientations are the segments' own; None: it has rates and specific forces
+    measures_orientations : whether it has orientations in place of rates and specific forces
     """
 
     kind: str
     sender: str
     hint = ""
-    aligned: bool | None = None
+    measures_orientations = False
 
     def __init__(
         self,
@@ -102,7 +102,7 @@ class DatagramSource(Source):
 
     @property
     def orientations(self) -> dict[str, bool]:
-        return {} if self.aligned is None else dict.fromkeys(self.sensors, self.aligned)
+        return dict.fromkeys(self.sensors, self.aligned) if self.measures_orientations else {}
 
     @abstractmethod
     def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
@@ -128,7 +128,7 @@ class DatagramSource(Source):
         """Take the sensors that send."""
         self.sensors = tuple(self._segments)
         try:
-            found = wait_for(self._find_any, lambda: self.awaited, self._wait_s, waiting)
+            found = wait_for(self._find_any, self.describe_awaited, self._wait_s, waiting)
         except BadSource:
             self.close()
             raise
@@ -146,8 +146,7 @@ class DatagramSource(Source):
         self._waiting += self.read_new(timeout_s)
         return bool(self._waiting)
 
-    @property
-    def awaited(self) -> str:
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:  # noqa: ARG002
         host, port = self.address
         dropped = ", ".join(f"{count} {problem}" for problem, count in self.problems.items())
         here = " (this machine only)" if host.startswith("127.") or host == "::1" else ""
@@ -218,6 +217,7 @@ class OrientationSource(DatagramSource):
     """
 
     has_clock: bool
+    measures_orientations = True
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)

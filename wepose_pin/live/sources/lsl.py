@@ -20,6 +20,7 @@ from ...errors import BadOption, BadSource, how_to_install, one_of
 from ...model import load_table
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
+from ..state import join_names
 from .base import Source
 from .checks import IMPLAUSIBLE, keep_plausible
 from .waiting import Waiting
@@ -144,6 +145,7 @@ class LslSource(Source):
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self._reconnector: threading.Thread | None = None
+        self._reach = ""  # of the search, once it began
 
     def open(self, waiting: Waiting | None = None) -> None:
         """Find the streams and subscribe, with `waiting` until it returns False.
@@ -154,6 +156,7 @@ class LslSource(Source):
             liblsl is missing, no such stream is found, or one has other channels than it should.
         """
         self._lsl, scope = configure_pylsl(self._scope)
+        self._reach = f"on this {scope}" if scope in SCOPES else "where LSLAPICFG looks"
         self._flags = 0 if scope == "machine" else int(self._lsl.proc_clocksync)
         self._stop.clear()
         present: list[str] = []
@@ -161,8 +164,8 @@ class LslSource(Source):
         while not present or any(segment not in present for segment in self.sensors):
             left = deadline - time.monotonic()
             if waiting is not None:
-                absent = ", ".join(name for name in self.sensors if name not in present)
-                if not waiting(f"Waiting for the LSL stream {self._name}{': ' + absent if absent else ''}."):
+                absent = [name for name in self.sensors if name not in present]
+                if not waiting(f"Waiting for {self.describe_awaited(absent)}."):
                     return
                 left = COLLECT_S
             if left <= 0.0:
@@ -175,7 +178,7 @@ class LslSource(Source):
         missing = [segment for segment in self.sensors if segment not in present]
         if not present or twice or missing:
             self.close()
-            reach = f"on this {scope}" if scope in SCOPES else "where LSLAPICFG looks"
+            reach = self._reach
             if twice:
                 raise BadSource(f"lsl:{self._name}: {min(twice)} is in two streams; stop one of them")
             problem = (
@@ -204,6 +207,10 @@ class LslSource(Source):
             if samples or left <= 0.0:
                 return samples
             time.sleep(min(POLL_S, left))
+
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
+        names = f": {join_names(list(sensors))}" if sensors else ""
+        return f"the LSL stream {self._name} {self._reach}{names}"
 
     def clock(self) -> float:
         """Now [s], liblsl's local clock."""

@@ -6,13 +6,14 @@ import os
 import select
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from queue import Empty, SimpleQueue
 from types import ModuleType
 from typing import Any
 
 from ...errors import BadSource, how_to_install
 from ...recording.arrivals import Samples
+from ..state import join_names
 from . import xbus
 from .base import Source
 from .checks import IMPLAUSIBLE, keep_plausible
@@ -46,6 +47,7 @@ class MTiSource(Source):
         super().__init__(devices, rate_hz)
         self._queue: SimpleQueue[Samples | tuple[str, int]] = SimpleQueue()
         self._devices = [_Device(segment, port, rate_hz, baud, self._queue) for segment, port in devices.items()]
+        self._ports = dict(devices)
 
     def open(self, waiting: Waiting | None = None) -> None:
         """Open and configure every port, then listen; wait for a port, with `waiting` until that returns False.
@@ -53,7 +55,7 @@ class MTiSource(Source):
         Raises
         ------
         BadSource
-            No MTi answers, or it cannot send at the rate; without `waiting` also a port that cannot be opened.
+            An MTi cannot send at the rate; without `waiting` also: a port cannot be opened, or no MTi answers there.
         """
         try:
             for device in self._devices:
@@ -87,6 +89,12 @@ class MTiSource(Source):
         for device in self._devices:
             device.close()
 
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
+        places = [
+            f"{join_names([name])} at {port}" for name, port in self._ports.items() if name in sensors or not sensors
+        ]
+        return f"MTi sensors: {', '.join(places)}"
+
     def _dispatch(self, entry: Samples | tuple[str, int], samples: list[Samples]) -> None:
         """Samples to `samples`, a count to `problems`."""
         if isinstance(entry, Samples):
@@ -95,8 +103,12 @@ class MTiSource(Source):
             self.problems[entry[0]] += entry[1]
 
 
-class _CannotOpen(BadSource):
-    """A port is not there, or in use: it may come."""
+class _NotReady(BadSource):
+    """A port cannot be opened, or no MTi answers there: it may come."""
+
+    def __init__(self, path: str, reason: str, remedy: str) -> None:
+        super().__init__(f"mti:{path}: {reason}; {remedy}")
+        self.reason = reason
 
 
 class _Device:
@@ -111,24 +123,24 @@ class _Device:
         self._port: Any = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._problem = ""  # for which the port could not be opened
+        self._problem = ""  # for which it could not be opened
 
     def open(self) -> None:
         self._stop.clear()
         self.connect()
 
     def try_to_open(self, timeout_s: float) -> bool:
-        """Open, or wait `timeout_s` and return False where the port cannot be opened."""
+        """Open, or wait `timeout_s` and return False where that cannot be done now."""
         try:
             self.open()
-        except _CannotOpen as error:
-            self._problem = str(error)
+        except _NotReady as error:
+            self._problem = error.reason
             self._stop.wait(timeout_s)
             return False
         return True
 
     def describe_wait(self) -> str:
-        return f"the MTi of {self._segment}: {self._problem}"
+        return f"the MTi of {join_names([self._segment])} at {self._path}: {self._problem}"
 
     def connect(self) -> None:
         """Open the port and start measurement; raises `BadSource`."""
@@ -142,11 +154,9 @@ class _Device:
             self._reported = self._counts()  # a running stream begins with a partial frame
         except (OSError, ValueError) as error:  # SerialException is an OSError
             self._disconnect()
-            reason = getattr(error, "strerror", None) or str(error)
-            raise _CannotOpen(
-                f"mti:{self._path}: cannot open the port ({reason}); a serial port that is there, may be read and is "
-                f"not in use, as /dev/ttyUSB0"
-            ) from None
+            reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
+            remedy = "a serial port that is there, may be read and is not in use, as /dev/ttyUSB0"
+            raise _NotReady(self._path, f"cannot open the port ({reason})", remedy) from None
         except BadSource:
             self._disconnect()
             raise
@@ -200,9 +210,8 @@ class _Device:
                         return frame
                     if frame.mid == xbus.ERROR and mid != xbus.GO_TO_CONFIG:  # then it may be an earlier one
                         raise BadSource(f"mti:{self._path}: the device says: {xbus.describe_error(frame.data)}")
-        raise BadSource(
-            f"mti:{self._path}: no MTi answers at {self._baud} baud; check the cable, the port and the baud rate"
-        )
+        remedy = "check the cable, the port and the baud rate"
+        raise _NotReady(self._path, f"no MTi answers at {self._baud} baud", remedy)
 
     def _wait_for_data(self) -> None:
         """Wait for data of a device that is not configured; start its measurement where it waits for that."""
@@ -212,10 +221,8 @@ class _Device:
                 if any(frame.mid == xbus.DATA for frame in self._frames.feed(self._read_bytes())):
                     return
             self._port.write(xbus.build_frame(xbus.GO_TO_MEASUREMENT))
-        raise BadSource(
-            f"mti:{self._path}: no MTData2 comes at {self._baud} baud; check cable, port, baud rate and outputs, "
-            f"or name a rate, as @100, for the device to be configured"
-        )
+        remedy = "check cable, port, baud rate and outputs, or name a rate, as @100, for the device to be configured"
+        raise _NotReady(self._path, f"no MTData2 comes at {self._baud} baud", remedy)
 
     def _read_bytes(self) -> bytes:
         """Bytes that came, none after a while; past pyserial, whose `read` costs twice as much."""

@@ -9,7 +9,7 @@ SlimeVR-Tracker-ESP, protocol version 22.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -82,7 +82,6 @@ class SlimeVrSource(OrientationSource):
     """
 
     kind, sender, has_clock = "slimevr", "SlimeVR trackers", False
-    aligned = False
 
     def __init__(self, *args: Any, assigned: Mapping[str, str] | None = None, **options: Any) -> None:
         super().__init__(*args, **options)
@@ -186,8 +185,7 @@ class SlimeVrSource(OrientationSource):
         )
         return stated or tracker.places.get(sensor) or (named if self._finds and tracker.mac else None)
 
-    @property
-    def awaited(self) -> str:
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
         known = ", ".join(tracker.mac or address[0] for address, tracker in self.trackers.items())
-        text = super().awaited
+        text = super().describe_awaited(sensors)
         return f"{text}; connected: {known}" if known else text

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ipaddress
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from ...errors import BadOption, BadSource, how_to_install
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
 from ..addresses import parse_address
+from ..state import join_names
 from .base import Source
 from .checks import IMPLAUSIBLE, keep_plausible
 from .clocks import HostClock
@@ -60,7 +61,7 @@ class Ximu3Source(Source):
         except ImportError as error:
             raise BadSource(f"ximu3: needs the package ximu3 ({error}): {how_to_install('ximu3')}") from None
         try:
-            found = wait_for(lambda _: self._connect_all(ximu3), self._describe_wait, self._wait_s, waiting)
+            found = wait_for(lambda _: self._connect_all(ximu3), self._describe_unconnected, self._wait_s, waiting)
         except BadSource:
             self.close()
             raise
@@ -83,9 +84,14 @@ class Ximu3Source(Source):
             self._keepers.append(ximu3.KeepOpen(connection))
         return len(self._connections) == len(self._devices)
 
-    def _describe_wait(self) -> str:
-        missing = [f"{segment} at {at}" for segment, at in self._devices.items() if segment not in self._connections]
-        return f"x-IMU3 sensors: {', '.join(missing)}"
+    def _describe_unconnected(self) -> str:
+        return self.describe_awaited([segment for segment in self._devices if segment not in self._connections])
+
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
+        places = [
+            f"{join_names([name])} at {at}" for name, at in self._devices.items() if name in sensors or not sensors
+        ]
+        return f"x-IMU3 sensors: {', '.join(places)}"
 
     def _take(self, segment: str, message: Any) -> None:
         """Take a message, in a thread of the package."""

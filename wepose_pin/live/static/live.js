@@ -145,7 +145,6 @@ function showGuide(guide) {
   guideSays = guide.note + guide.sentence;
   spokenCount = count === null ? null : Math.ceil(count);
 }
-const NAMED = { biacromial: "breadth of the shoulders, from acromion to acromion" };
 const QUALITY = { "": "So far", pass: "✓ Good", poor: "! Usable", fail: "✕ Not usable" };
 function showResult(guide) {
   $("result").hidden = !guide.lengths.length && !guide.reasons.length;
@@ -163,7 +162,7 @@ function showResult(guide) {
     return row;
   }));
   $("measure").hidden = !guide.measurable;
-  $("measure").querySelector("span").textContent = `Measured ${NAMED[guide.measurable] ?? words(guide.measurable)}:`;
+  $("measure").querySelector("span").textContent = `Measured ${guide.measurable_name}:`;
   $("measure").dataset.name = guide.measurable;
   $("sample-size").textContent = guide.sample_size === null ? ""
     : `Effective sample size ${known(guide.sample_size[0], 1)}; ${known(guide.sample_size[1], 0)} are enough.`;
@@ -172,10 +171,11 @@ function ask(action) {
   if (socket.readyState === WebSocket.OPEN) socket.send(`key ${action}`);
 }
 
-let state = "", offers = [];
+let state = "", offers = [], steps = [], phase = "";                        // phase: open, and no take
 function show(status) {
   state = status.state;
   offers = status.guide?.actions ?? [];
+  steps = status.guide?.steps ?? [];
   const begun = state === "ready" || state === "ended";                  // before, nothing is estimated
   $("say").className = `${begun ? "small" : ""} ${state}`;
   $("say").querySelector("strong").textContent = SAYS[state] ?? state;
@@ -187,6 +187,9 @@ function show(status) {
   const taking = status.open_phases.some((name) => name.startsWith("take_"));
   $("take").setAttribute("aria-pressed", taking);
   $("take").firstChild.textContent = taking ? `End ${words(status.open_phases.find((name) => name.startsWith("take_")))} ` : "Begin take ";
+  phase = status.open_phases.filter((name) => !name.startsWith("take_")).at(-1) ?? "";
+  $("phase").setAttribute("aria-pressed", phase !== "");
+  namePhase();
   $("progress").querySelector("i").style.width = `${100 * status.progress}%`;
   $("progress").hidden = state === "waiting";
   $("rows").replaceChildren(...status.sensors.map((sensor) => {
@@ -281,6 +284,7 @@ function drawCurves() {
   });
 }
 $("joint").addEventListener("change", drawCurves);
+addEventListener("resize", drawCurves);
 
 // ---- the line: nothing more comes until what came is drawn
 let socket, tries = 0, owed = 0, newestStatus = null, newestFrame = null, drawnAt = performance.now();
@@ -318,13 +322,21 @@ function toggleTrails() {
   viewer.set_dirty();
 }
 function mark() {
-  ask(`mark ${$("mark-text").value.trim() || "mark"}`);
+  ask(`mark ${typed() || "mark"}`);
   $("answer").textContent = "Marked.";
   setTimeout(() => { $("answer").textContent = ""; }, 2000);
 }
+const typed = () => $("mark-text").value.trim();
+function namePhase() {
+  $("phase").firstChild.textContent = phase ? `End ${words(phase)} ` : `Begin ${typed() || "clasp"} `;
+}
+function togglePhase() { ask(phase ? `end ${phase}` : `begin ${typed() || "clasp"}`); }
+$("mark-text").addEventListener("input", namePhase);
+$("phase").addEventListener("click", togglePhase);
 $("measure").addEventListener("submit", (event) => {
   event.preventDefault();
   ask(`measure ${$("measure").dataset.name}=${(Number($("measured").value) / 100).toFixed(4)}`);
+  $("measured").value = "";
 });
 $("take").addEventListener("click", () => ask("take"));
 $("markers").addEventListener("submit", (event) => { event.preventDefault(); mark(); });
@@ -341,8 +353,10 @@ addEventListener("keydown", (event) => {
   if (event.target instanceof HTMLInputElement) return;
   const key = event.key.toLowerCase(), offered = offers.find((action) => action.key === key);
   if (offered || (key === " " && offers.length)) ask((offered ?? offers[0]).name);
+  else if (steps[key - 1]?.state === "done") ask(`go ${steps[key - 1].name}`);
   else if (state === "ready" && key === "t") ask("take");
   else if (state === "ready" && key === "m") mark();
+  else if (state === "ready" && key === "p") togglePhase();
   else if (!offers.length && (key === " " || key === "r")) press("r");
   else return;
   event.preventDefault();

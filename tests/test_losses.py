@@ -1,0 +1,56 @@
+"""Samples that never came are counted by the times of those that did."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from wepose_pin.live.losses import SampleLosses, measure_step
+from wepose_pin.recording.arrivals import Samples
+
+RATE_HZ = 100.0
+
+
+def count(time_s: np.ndarray, now: float | None = None, block: int = 7) -> int:
+    losses = SampleLosses()
+    for k in range(0, len(time_s), block):
+        part = time_s[k : k + block]
+        losses.push([Samples("torso", part, np.zeros((len(part), 3)), np.zeros((len(part), 3)))])
+    return losses.count("torso", time_s[-1] if now is None else now)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.3])
+@pytest.mark.parametrize("jitter", [0.0, 0.15])
+@pytest.mark.parametrize("drift", [0.0, 3e-4])
+def test_lost_samples_of_a_minute(share: float, jitter: float, drift: float) -> None:
+    rng = np.random.default_rng(1)
+    time_s = (1.0 + drift) * np.arange(6000) / RATE_HZ
+    came = rng.random(6000) >= share
+    came[[0, -1]] = True
+    time_s = time_s + jitter / RATE_HZ * rng.uniform(-1.0, 1.0, 6000)
+    lost = count(time_s[came])
+    assert abs(lost - np.count_nonzero(~came)) <= 0.02 * np.count_nonzero(~came)
+    assert 1.0 / measure_step(time_s[came][:200]) == pytest.approx(RATE_HZ, rel=1.0 / 200.0)  # a step of them
+
+
+def test_samples_that_overtake_each_other_are_not_lost() -> None:
+    time_s = np.arange(1000) / RATE_HZ
+    time_s[500:503] = time_s[[502, 500, 501]]
+    assert count(time_s) == 0
+
+
+def test_a_sensor_that_is_silent_loses_samples_until_it_comes_again() -> None:
+    time_s = np.arange(1000) / RATE_HZ
+    assert count(time_s, now=time_s[-1] + 0.3) == 0
+    assert count(time_s, now=time_s[-1] + 2.0) == pytest.approx(200, abs=1)
+    assert count(np.concatenate([time_s, time_s + 12.0])) == pytest.approx(200, abs=1)
+
+
+def test_a_clock_that_is_set_loses_nothing() -> None:
+    time_s = np.arange(1000) / RATE_HZ
+    assert count(np.concatenate([time_s, time_s + 1e5])) == 0
+
+
+def test_nothing_is_said_of_too_few_samples_or_of_a_sensor_that_is_not_there() -> None:
+    assert count(np.arange(20) / RATE_HZ, now=10.0) == 0
+    assert SampleLosses().count("torso", 1.0) == 0
