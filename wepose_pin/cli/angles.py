@@ -35,7 +35,8 @@ def _print_repetitions(movement: Movement) -> None:
     repetitions = movement.repetitions
     by = f" by {repetitions.source}" if repetitions.source else ""
     if not len(repetitions.spans):
-        say(f"{movement.name}: no repetitions{by}: {repetitions.reason}")
+        other = "take another angle with --main-angle, or mark them in the session and name the phase with --repetitions"
+        say(f"{movement.name}: no repetitions{by}: {repetitions.reason}; {other}")
         return
     text = f"{movement.name}: {len(repetitions.spans)} repetitions{by}"
     if repetitions.rising is not None:

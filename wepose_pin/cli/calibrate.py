@@ -70,7 +70,7 @@ def _print_mounts(calibration: Calibration) -> None:
         rows.append((segment, f"{up} up, {forward} ahead", *cells))
     if not rows:
         return
-    header = ("sensor", "nearest axes", "heading", "tilt", "off the start pose", "heading drift [1/min]")
+    header = ("sensor", "nearest axes", "heading", "tilt", "off the start pose", "heading drift per min")
     print_table("Mounts, in deg: ± is one standard deviation", header, rows)
 
 

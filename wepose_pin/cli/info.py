@@ -16,7 +16,7 @@ def run(job: InfoJob) -> int:
         say(f"  {fact}")
     print_diagnostics(description.diagnostics)
     if description.sensors:
-        header = ("sensor", "in the file", "holds", "fastest turn", "median force", "gaps over 50 ms")
+        header = ("sensor", "in the file", "holds", "peak rate", "median specific force", "gaps over 50 ms")
         print_table("Sensors", header, description.sensors)
     if written is not None:
         then = description.then.replace("SESSION", str(written))

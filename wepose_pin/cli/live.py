@@ -68,7 +68,8 @@ def _print_robot(robot: RobotSummary) -> None:
     if robot.share:
         shares = ", ".join(f"{100.0 * share:.1f} % {state}" for state, share in robot.share.items())
         p50, p99 = (1e3 * robot.step.quantile(share) for share in (0.5, 0.99))
-        title = f"{robot.robot}: {robot.commands} commands, {shares}; each took {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
+        took = f"each took {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
+        title = f"{robot.robot}: {robot.commands} commands; with a pose {shares}; {took}"
     print_table(
         title,
         ("arm", "hand off its target [mm]", "in 90 % under"),

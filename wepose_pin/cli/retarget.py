@@ -51,7 +51,8 @@ def _print_arms(summary: Mapping[str, Any]) -> None:
         ("arm", "scale", *hand, "orientation [deg]", "elbow swivel [deg]", "reachable [%]"),
         rows,
     )
-    print_table("Hand more than 20 mm off [% of the time], for", ("arm", *arm["error_attribution"]), reasons)
+    title = "Hand more than 20 mm off [% of the time], by cause; what to do: docs/retargeting.md"
+    print_table(title, ("arm", *arm["error_attribution"]), reasons)
 
 
 def _print_checks(summary: Mapping[str, Any]) -> None:

@@ -264,17 +264,21 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal, wearer: Wear
 
 def _advise(recording: Recording, table: BodyTable) -> str:
     """Advise on the use of a session with these sensors, once its lines marked CHECK are right."""
+    name = "take the # off the lines of each sensor with ? and write its segment in place of SEGMENT"
+    then = (
+        "add the seconds of clasp to [phases] and wepose calibrate SESSION -o subject; "
+        "or state the mounts and wepose track SESSION -o result"
+    )
     worn = {segment: sensor for segment, sensor in recording.sensors.items() if segment in table.segments}
     if not worn:
-        return "take the # off each sensor's lines and write its segment in place of SEGMENT"
+        return name
+    if len(worn) < len(recording.sensors):
+        return f"{name}; then {then}"
     without = [segment for segment, sensor in worn.items() if not sensor.aligned and sensor.stated_quat_LS is None]
     if not without:
         return "wepose track SESSION -o result"
     if set(worn) >= set(table.needed) >= set(without):
-        return (
-            "name the seconds of clasp and wepose calibrate SESSION -o subject finds the mounts; or state them and "
-            "wepose track SESSION -o result"
-        )
+        return then
     return f"state the mounts of {', '.join(without)}, then wepose track SESSION -o result"
 
 
@@ -307,15 +311,16 @@ def _session_text(
         "[phases]   # seconds",
     ]
     lines += phases
-    lacking = [segment for segment in body.needed if segment not in tables]
-    known = any(name in body.segments for name in tables)
-    clasped = any(line.startswith("clasp = ") for line in phases) or (lacking and known)
-    if not clasped and body.paths and all(body.counterpart(tip) in body.paths for tip in body.paths):
+    # A sensor on an unknown segment may be one that is lacking.
+    named = bool(tables) and set(tables) <= set(body.segments)
+    lacking = [segment for segment in body.needed if segment not in tables] if named else []
+    clasped = any(line.startswith("clasp = ") for line in phases)
+    if not clasped and not lacking and body.paths and all(body.counterpart(tip) in body.paths for tip in body.paths):
         tips = " and ".join(dict.fromkeys(f"{body.shared_name(tip).replace('_', ' ')}s" for tip in body.paths))
         begin, end = ends
         example = _write_example(begin + min(10.0, (end - begin) / 4.0), begin + min(70.0, 0.75 * (end - begin)))
         lines.append(f"# clasp = {example}   # for wepose calibrate: the seconds in which the {tips} are held together")
-    if lacking and known:
+    if lacking:
         lines += ["", f"# without a sensor here, and not known without one: {', '.join(lacking)}"]
     segments = list(body.segments)
     for segment in sorted(tables, key=lambda name: segments.index(name) if name in segments else len(segments)):
