@@ -23,13 +23,14 @@ from arms import write_arm
 import wepose_pin as wp
 from wepose_pin.batch.reproduction import run_reproduce
 from wepose_pin.cli import main
+from wepose_pin.diagnostics import example
 from wepose_pin.errors import how_to_install
 from wepose_pin.jobs.reproduce import ReproduceJob
 from wepose_pin.jobs.retarget import RetargetJob
 from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.kinematics import PosedBody
 from wepose_pin.retargeting import LimitMargins
-from wepose_pin.simulation import Simulation
+from wepose_pin.simulation import Imperfections, ImuNoise, Simulation
 from wepose_pin.subject import subject_toml
 from wepose_pin.writers import write_session
 from wepose_pin.writers.provenance import read_provenance
@@ -37,7 +38,7 @@ from wepose_pin.writers.provenance import read_provenance
 ROOT = Path(__file__).resolve().parents[1]
 PUBLIC = {name: getattr(wp, name) for name in wp.__all__ if name != "__version__"}
 FUNCTIONS = [name for name, value in PUBLIC.items() if inspect.isfunction(value)]
-METHODS = [f"TrackResult.{name}" for name in ("to_dataframe", "to_pandas", "plot", "show", "save")]
+METHODS = [f"TrackResult.{name}" for name in ("to_dataframe", "to_pandas", "plot", "show", "save")] + ["Subject.save"]
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +76,7 @@ def test_examples_of_the_documentation_run(name: str, simulated: Simulation, res
         pytest.importorskip("daqp")
     if name.endswith("to_pandas"):
         pytest.importorskip("pandas")
-    if name.endswith("save"):
+    if name == "TrackResult.save":
         Path("result").unlink()
     function: Any = wp
     for part in name.split("."):
@@ -265,9 +266,42 @@ def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult
     objects = [simulated, simulated.recording(), result, result.pose, result.subject, result.model, result.plot()]
     objects += [*simulated.recording().sensors.values(), wp.joint_angles(result), wp.joint_angles(result)["thorax"]]
     objects += [wp.evaluate(result, simulated.truth()), result.show(open=False)]
+    objects += [result.source]
     for each in objects:
         assert re.fullmatch(r"\w+\(.{10,200}\)", repr(each)), repr(each)[:300]
-    assert escape(repr(result)) in result._repr_html_()
+
+
+def test_settings_print_what_differs_from_their_defaults() -> None:
+    settings = [Imperfections(dropped=0.002, mount="any"), ImuNoise(correlation_s=10.0), wp.StaticTest(alpha=3.0)]
+    printed = ["Imperfections(dropped=0.002, mount='any')", "ImuNoise(correlation_s=10.0)", "StaticTest(alpha=3.0)"]
+    assert [repr(each) for each in settings] == printed
+    assert [repr(type(each)()) for each in settings] == ["Imperfections()", "ImuNoise()", "StaticTest()"]
+
+
+def test_objects_show_themselves_in_a_notebook(simulated: Simulation, result: wp.TrackResult, tmp_path: Path) -> None:
+    recording, torso = simulated.recording(), simulated.recording().sensors["torso"]
+    orientation = wp.estimate_orientation(torso.gyro_S, torso.accel_S, recording.rate_hz, static=(0.5, 4.5))
+    objects = [recording, result, result.subject, wp.evaluate(result, simulated.truth()), orientation]
+    for each in (*objects, wp.export(result, tmp_path / "person.urdf")):
+        page = each._repr_html_()
+        assert escape(repr(each)) in page
+        assert ElementTree.fromstring(f"<div>{page}</div>") is not None
+    assert "± " in result.subject._repr_html_()
+
+
+def test_a_diagnostic_prints_its_text() -> None:
+    text = str(example("length-uncertain"))
+    assert text.startswith("warning: ")
+    assert "{" not in text
+
+
+def test_a_subject_is_saved_as_a_file_or_into_a_folder(tmp_path: Path) -> None:
+    subject = wp.population_subject(1.68, "f")
+    for file in (subject.save(str(tmp_path / "anna")), subject.save(tmp_path / "bea.toml")):
+        assert wp.load_subject(file).lengths == pytest.approx(dict(subject.lengths), abs=1e-6)
+        with pytest.raises(wp.WeposeError, match="exists"):
+            subject.save(file)
+    assert wp.load_subject(str(tmp_path / "anna")).name == subject.name
 
 
 def test_a_subject_whose_calibration_failed_is_refused(

@@ -705,4 +705,6 @@ def test_a_map_may_lie_elsewhere(session: Path, tmp_path: Path, capsys: pytest.C
         )
     assert stop.value.code == 0
     out = capsys.readouterr().out
-    assert re.search(r"mine: \d+ commands; with a pose .*% follow.*; each took \d+\.\d\d ms \(p50\)", out.replace("\n", " "))
+    assert re.search(
+        r"mine: \d+ commands; with a pose .*% follow.*; each took \d+\.\d\d ms \(p50\)", out.replace("\n", " ")
+    )

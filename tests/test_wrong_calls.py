@@ -203,7 +203,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "scale": POSITIVE,
         "smoothing_hz": (*NUMBER, None, -1.0),
         "strict": (*FLAG, None),
-        "progress": ("x", 3, None),
+        "progress": ("x", 3),
     },
     "simulate": {
         "lengths": (*LENGTHS, None),

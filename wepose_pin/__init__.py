@@ -43,7 +43,6 @@ if TYPE_CHECKING:  # what editors and type checkers see
     from .recording import ImuSensor as ImuSensor
     from .recording import OrientationSensor as OrientationSensor
     from .recording import Recording as Recording
-    from .recording import Sensor as Sensor
     from .retargeting import retarget as retarget
     from .simulation import simulate as simulate
     from .subject import Subject as Subject
@@ -58,7 +57,6 @@ _WHERE = {
     "OrientationSensor": "recording",
     "Pose": "kinematics",
     "Recording": "recording",
-    "Sensor": "recording",
     "StaticTest": "filters.static",
     "Subject": "subject",
     "TrackResult": "api",

@@ -9,7 +9,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,7 @@ import polars as pl
 
 from . import tracking
 from .arguments import check_arguments, check_value
-from .diagnostics import WARNING, Diagnostic, from_json, lines
+from .diagnostics import WARNING, Diagnostic, from_json, notebook_html
 from .errors import BadData, WeposeError, how_to_install
 from .filters import BEST
 from .filters.static import StaticTest
@@ -212,8 +211,7 @@ class TrackResult(PosedBody):
         return f"TrackResult({self.name!r}: {', '.join(parts)})"
 
     def _repr_html_(self) -> str:
-        entries = "".join(f"<li>{severity.value}: {escape(line)}</li>" for severity, line in lines(self.diagnostics))
-        return f"<p>{escape(repr(self))}</p>" + (f"<ul>{entries}</ul>" if entries else "")
+        return notebook_html(self, self.diagnostics)
 
 
 def track(

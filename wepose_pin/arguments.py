@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from numbers import Integral, Real
 from pathlib import Path
@@ -162,6 +162,13 @@ def format_object(value: object, describe: Callable[[], str]) -> str:
         return f"{name}({describe()})"
     except Exception:
         return f"{name}(invalid: its check() says why)"
+
+
+def format_settings(value: Any) -> str:
+    """``Class(name=value)`` in one line, for `__repr__`: the fields of a dataclass that differ from their defaults."""
+    chosen = {each.name: getattr(value, each.name) for each in fields(value)}
+    changed = [f"{each.name}={chosen[each.name]!r}" for each in fields(value) if chosen[each.name] != each.default]
+    return f"{type(value).__name__}({', '.join(changed)})"
 
 
 @cache

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import lru_cache
+from html import escape
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -35,7 +36,7 @@ MOST_ALIKE = 3  # of diagnostics with the same reason and remedy that are shown 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """Something that a user should know.
+    """Something that a user should know; ``str(diagnostic)`` is its text.
 
     Parameters
     ----------
@@ -52,6 +53,10 @@ class Diagnostic:
     value: float | None = None
     limit: float | None = None
     facts: Mapping[str, float | str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        """The severity and the text, in one line."""
+        return f"{self.severity.value}: {render(self).line()}"
 
 
 class Text(NamedTuple):
@@ -117,6 +122,12 @@ def render_all(
 def lines(diagnostics: Iterable[Diagnostic], titled: bool = False) -> list[tuple[Severity, str]]:
     """`render_all`, each in one line."""
     return [(severity, text.line(titled)) for severity, text in render_all(diagnostics)]
+
+
+def notebook_html(value: object, diagnostics: Iterable[Diagnostic] = (), tables: Iterable[str] = ()) -> str:
+    """What a notebook shows of an object: its one line, tables as HTML, and diagnostics in words."""
+    entries = "".join(f"<li>{severity.value}: {escape(line)}</li>" for severity, line in lines(diagnostics))
+    return f"<p>{escape(repr(value))}</p>{''.join(tables)}" + (f"<ul>{entries}</ul>" if entries else "")
 
 
 def gravest_first(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:

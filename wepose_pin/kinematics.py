@@ -120,7 +120,7 @@ class Pose:
         return self
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PosedBody:
     """A body and its pose over time.
 
@@ -135,6 +135,10 @@ class PosedBody:
     pose: Pose
     model: BodyModel
     subject: Subject
+
+    def __repr__(self) -> str:
+        parts = f"{len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points"
+        return f"{type(self).__name__}({self.name!r}: {parts})"
 
     @property
     def time(self) -> np.ndarray:

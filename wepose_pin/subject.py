@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -21,7 +22,17 @@ from .arguments import (
     check_unit,
     format_object,
 )
-from .documents import TomlTable, is_number, parse_toml, read_toml, toml_key, toml_string, toml_strings
+from .diagnostics import notebook_html
+from .documents import (
+    TomlTable,
+    is_number,
+    parse_toml,
+    read_toml,
+    toml_key,
+    toml_string,
+    toml_strings,
+    whole_file,
+)
 from .errors import BadData, BadModel, BadOption, BadSubject, one_of
 from .model import BodyModel, BodyTable, compute_population_lengths, load_table
 from .model.girdle import PARAMETERS
@@ -102,6 +113,48 @@ class Subject:
             return f"{self.name!r}: {len(self.lengths)} lengths, {len(self.mounts)} mounts{quality}"
 
         return format_object(self, describe)
+
+    def _repr_html_(self) -> str:
+        return notebook_html(self, tables=[self.lengths_html()])
+
+    def lengths_html(self) -> str:
+        """Return the lengths with their standard deviations as a table for a notebook."""
+        rows = "".join(
+            f"<tr><td>{escape(name)}</td><td>{1e3 * length:.0f} ± {1e3 * self.std(name):.0f} mm</td></tr>"
+            for name, length in self.lengths.items()
+        )
+        return f"<table>{rows}</table>"
+
+    def save(self, path: str | Path, force: bool = False) -> Path:
+        """Write ``subject.toml``, which `load_subject` and ``wepose track --subject`` read.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file, whose name ends in ``.toml``, or its folder.
+        force : bool
+            Replace an existing file.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        ExistingOutput
+            The file is there and `force` is not given, or it cannot be written.
+
+        Examples
+        --------
+        >>> wp.population_subject(1.68, "f").save("anna")
+        PosixPath('anna/subject.toml')
+        """
+        file = Path(path) if Path(path).suffix == ".toml" else Path(path) / "subject.toml"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(file, force) as partial:
+            partial.write_text(subject_toml(self), encoding="utf-8")
+        return file
 
     @property
     def is_population(self) -> bool:

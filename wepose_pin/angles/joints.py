@@ -149,7 +149,13 @@ class JointAngles:
 
 @dataclass(frozen=True)
 class Angles:
-    """The angles of all joints whose segments are known. `time` (n,) [s]; `joints`: name → its angles."""
+    """The angles of all joints whose segments are known: ``angles[joint][angle]`` is (n,) [rad].
+
+    Parameters
+    ----------
+    time : (n,) [s]
+    joints : name → `JointAngles`, with the three angles and their standard deviations
+    """
 
     time: np.ndarray
     joints: Mapping[str, JointAngles]
@@ -198,8 +204,8 @@ def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float
     """Joint angles after the ISB: thorax and pelvis in W, shoulders, elbows, wrists, hips, knees, ankles, as measured.
 
     Left joints are mirrored on the sagittal plane first, so that an angle has the same sign and meaning on both sides.
-    Angles are followed over time (`euler.follow`), without full turns near gimbal lock (`euler.drop_turns`). Standard
-    deviations are to first order, with the errors of two segments taken as independent.
+    Angles are continuous over time; full turns near gimbal lock are not added up. Standard deviations are to first
+    order, with the errors of two segments taken as independent.
 
     Parameters
     ----------

@@ -99,8 +99,9 @@ def calibrate(
         "biacromial", from which a length follows; or a distance that the protocol names. Without any the scale is the
         prior's.
     prior : Subject, optional
-        Lengths with covariance, and mounts, as known before; None: `population_subject`. The subject of an earlier
-        calibration is combined with what this recording shows.
+        Lengths with covariance, and mounts, as known before; None: `population_subject()`, which the person's stature
+        and sex narrow, as in ``population_subject(1.78, "f")``. The subject of an earlier calibration is combined with
+        what this recording shows.
     model : BodyModel, str or Path, optional
         The body, or its file or name as for `load_model`; None: that which the recording states, else the upper body.
     protocol : str, Path or Protocol, optional

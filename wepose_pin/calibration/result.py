@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..diagnostics import Diagnostic, lines, render
+from ..diagnostics import Diagnostic, notebook_html, render
 from ..model import BodyModel
 from ..subject import Subject
 from .anatomy import LabelCheck, LimbMotion, measure_limbs
@@ -116,12 +115,7 @@ class Calibration:
         return f"Calibration({self.subject.name!r}: {self.quality.quality}; {lengths}{remedy})"
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{escape(name)}</td><td>{1e3 * length:.0f} ± {1e3 * self.subject.std(name):.0f} mm</td></tr>"
-            for name, length in self.subject.lengths.items()
-        )
-        entries = "".join(f"<li>{severity.value}: {escape(line)}</li>" for severity, line in lines(self.diagnostics))
-        return f"<p>{escape(repr(self))}</p><table>{rows}</table>" + (f"<ul>{entries}</ul>" if entries else "")
+        return notebook_html(self, self.diagnostics, [self.subject.lengths_html()])
 
     @property
     def variant(self) -> str:

@@ -35,7 +35,7 @@ def _print_repetitions(movement: Movement) -> None:
     repetitions = movement.repetitions
     by = f" by {repetitions.source}" if repetitions.source else ""
     if not len(repetitions.spans):
-        other = "take another angle with --main-angle, or mark them in the session and name the phase with --repetitions"
+        other = "take another angle with --main-angle, or mark them as a phase and name it with --repetitions"
         say(f"{movement.name}: no repetitions{by}: {repetitions.reason}; {other}")
         return
     text = f"{movement.name}: {len(repetitions.spans)} repetitions{by}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from html import escape
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from .. import rotations
 from ..angles import euler, joint_angles
 from ..arguments import check_arguments
+from ..diagnostics import notebook_html
 from ..errors import BadData, BadOption
 from ..kinematics import Pose, PosedBody
 from ..model import BodyTable, load_table
@@ -67,18 +69,33 @@ class Uncertainty(NamedTuple):
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors over the time that pose and reference share."""
+    """Errors over the time that pose and reference share.
+
+    Parameters
+    ----------
+    attitude : segment → `AttitudeError` [deg]: `roll`, `pitch`, `yaw` (mean, standard deviation), `inclination_rmse`,
+        `heading_rmse`, `total_rmse`, `drift_deg_min` [deg/min]
+    joints : joint → angle → `AngleError` [deg]: `mean`, `rmse`, `worst`
+    position : point → `PositionError` [mm], relative to the root: `mean`, `std`, `rmse`, `worst`
+    position_on_limb : the same relative to where its limb begins, such as the middle of the shoulders
+    attitude_uncertainty, position_uncertainty : segment or point → `Uncertainty`, how far the stated covariance agrees
+        with the error: `nees` (3 is right), `within_1`, `within_2` (shares within one and two standard deviations)
+    interval : from, to [s], that is compared
+    samples : number of samples that are compared
+    agreement : joint → angle → `Agreement` of both measurements
+    registration : how the reference was brought to the pose; None: it is taken as it is
+    """
 
     attitude: dict[str, AttitudeError]
-    joints: dict[str, dict[str, AngleError]]  # joint → angle → its error
-    position: dict[str, PositionError]  # relative to the root
-    position_on_limb: dict[str, PositionError]  # relative to where its limb begins, such as the middle of the shoulders
-    attitude_uncertainty: dict[str, Uncertainty]  # where the pose has covariances
+    joints: dict[str, dict[str, AngleError]]
+    position: dict[str, PositionError]
+    position_on_limb: dict[str, PositionError]
+    attitude_uncertainty: dict[str, Uncertainty]
     position_uncertainty: dict[str, Uncertainty]
     interval: tuple[float, float]
     samples: int
-    agreement: dict[str, dict[str, Agreement]] = field(default_factory=dict)  # joint → angle → of both measurements
-    registration: Registration | None = None  # how the reference was brought to the pose; None: it is taken as it is
+    agreement: dict[str, dict[str, Agreement]] = field(default_factory=dict)
+    registration: Registration | None = None
 
     def __repr__(self) -> str:
         total = max((error.total_rmse for error in self.attitude.values()), default=float("nan"))
@@ -87,6 +104,12 @@ class Evaluation:
             f"Evaluation({self.samples} samples; largest rms error of a segment {total:.1f}°, of a point "
             f"{position:.0f} mm)"
         )
+
+    def _repr_html_(self) -> str:
+        errors = {name: f"{error.total_rmse:.2f}°" for name, error in self.attitude.items()}
+        errors |= {f"{name} (point)": f"{error.rmse:.0f} mm" for name, error in self.position.items()}
+        rows = "".join(f"<tr><td>{escape(name)}</td><td>{error} rms</td></tr>" for name, error in errors.items())
+        return notebook_html(self, tables=[f"<table>{rows}</table>"])
 
 
 def evaluate(

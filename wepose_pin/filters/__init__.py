@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arguments import check_arguments
-from ..diagnostics import WARNING, Diagnostic, render
+from ..diagnostics import WARNING, Diagnostic, notebook_html, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
 from ..recording.faults import find_faults, scan_sensor
 from ..recording.limits import STANDARD_GRAVITY
@@ -76,17 +76,29 @@ class Orientation(NamedTuple):
 
     W is the sensor's own world, called V outside of the filters: z up, zero heading at the first sample of the phase
     from which the filter starts.
+
+    Parameters
+    ----------
+    quat_WS : (n, 4) xyzw
+    gyro_bias : (n, 3) [rad/s]
+    static : (n,) bool, the sensor did not move
+    attitude_cov : (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_WS`; None where the filter
+        has none
+    noise : of gyroscope and accelerometer in the static phase
+    filter, detector : after the last sample, to continue live; None: it cannot
+    diagnostics : what the user should know
+    about_vertical : (n, 6), as `base.AboutVertical`; None where the filter has no covariance
     """
 
-    quat_WS: np.ndarray  # (n, 4) xyzw
-    gyro_bias: np.ndarray  # (n, 3) [rad/s]
-    static: np.ndarray  # (n,) bool
-    attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²], error on the right, in S; None where the filter has none
-    noise: SensorNoise  # of the static phase
-    filter: OrientationFilter | None = None  # after the last sample, to continue live; None: it cannot
-    detector: StaticDetector | None = None  # after the last sample as well
+    quat_WS: np.ndarray
+    gyro_bias: np.ndarray
+    static: np.ndarray
+    attitude_cov: np.ndarray | None
+    noise: SensorNoise
+    filter: OrientationFilter | None = None
+    detector: StaticDetector | None = None
     diagnostics: tuple[Diagnostic, ...] = ()
-    about_vertical: np.ndarray | None = None  # (n, 6), as `base.AboutVertical`; None where the filter has no covariance
+    about_vertical: np.ndarray | None = None
 
     def take(self, rows: np.ndarray) -> Orientation:
         """Take the samples `rows`."""
@@ -98,6 +110,9 @@ class Orientation(NamedTuple):
         bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
         share = 100.0 * float(np.mean(self.static)) if len(self.static) else float("nan")
         return f"Orientation({len(self.quat_WS)} samples, {share:.0f} % static, gyro bias {bias:.2f} deg/s)"
+
+    def _repr_html_(self) -> str:
+        return notebook_html(self, self.diagnostics)
 
 
 _OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov", "about_vertical")

@@ -19,7 +19,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from scipy.special import gammainc, gammaincinv
 
-from ..arguments import NonNegative, Positive, Range, check_fields
+from ..arguments import NonNegative, Positive, Range, check_fields, format_settings
 from ..compilation import inlined, kernel
 from ..errors import BadData, BadOption
 from .noise import BLOCK_S, SensorNoise
@@ -70,7 +70,7 @@ DETECTOR = np.dtype(
 _UPPER = np.triu_indices(3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class StaticTest:
     """When a sensor counts as static: where all six conditions hold for the window that ends with the sample.
 
@@ -106,6 +106,9 @@ class StaticTest:
     # A strapped sensor warms by 5 to 10 K in a quarter of an hour, at 0.02 deg/s a kelvin that is 0.2 deg/s, here three
     # standard deviations.
     bias_walk: NonNegative = float(np.deg2rad(0.002))
+
+    def __repr__(self) -> str:
+        return format_settings(self)
 
     def __post_init__(self) -> None:
         check_fields(self, "")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..arguments import Positive, check_array, check_fields, check_finite, check_unit, format_object
-from ..diagnostics import Diagnostic
+from ..diagnostics import Diagnostic, notebook_html
 from ..errors import BadData, BadOption, BadPhase, one_of
 from .intervals import Intervals, check_phases, check_time
 from .limits import MEDIAN_FORCE
@@ -92,6 +93,14 @@ class Recording:
             return f"{self.name!r}: {seconds:.1f} s at {self.rate_hz:g} Hz, {len(self.sensors)} sensors{phases}"
 
         return format_object(self, describe)
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><td>{escape(segment)}</td><td>{escape(repr(sensor))}</td><td>mount "
+            f"{'not ' if sensor.stated_quat_LS is None else ''}stated</td></tr>"
+            for segment, sensor in self.sensors.items()
+        )
+        return notebook_html(self, self.diagnostics, [f"<table>{rows}</table>"])
 
     def check(self) -> Recording:
         """Check a recording that was built in code, and return it.

@@ -164,7 +164,7 @@ def retarget(
     strict: bool = False,
     params: ControllerParams | None = None,
     table: BodyTable | None = None,
-    progress: Callable[[str, float], None] = lambda _text, _fraction: None,
+    progress: Callable[[str, float], None] | None = None,
 ) -> Trajectory:
     """Compute the robot's joint trajectory for a person's motion, as `wepose retarget`. It begins and ends at rest.
 
@@ -198,7 +198,7 @@ def retarget(
         Weights and gains of the controller; None: the default ones.
     table : BodyTable, optional
         Of the person's body; None: that of `pose`, where it has a body, else the upper body's.
-    progress : callable
+    progress : callable, optional
         Called with the current stage (`STAGES`) and the fraction of it that is done.
 
     Returns
@@ -233,7 +233,8 @@ def retarget(
     left_out = [name for name in ("position", "orientation") if task not in ("both", name)]
     params = replace(params or ControllerParams(), **dict.fromkeys(left_out, 0.0))
     arm_targets = compute_arm_targets(pose, robot, table=table or body_table, scale=scale, smoothing_hz=smoothing_hz)
-    return _compute_trajectory(arm_targets, robot, params, 1.0 / rate_hz, strict, progress)
+    report = progress or (lambda _text, _fraction: None)
+    return _compute_trajectory(arm_targets, robot, params, 1.0 / rate_hz, strict, report)
 
 
 def _select_pose(

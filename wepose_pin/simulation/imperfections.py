@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from ..arguments import check_fields
+from ..arguments import check_fields, format_settings
 from ..errors import BadOption
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Imperfections:
     """Sizes of the imperfections; the defaults are `IDEAL_PRESET`, without any.
 
@@ -131,6 +131,9 @@ class Imperfections:
     handle_slip: float = 0.0  # [m]
     gyro_warm_up_deg_s: float = 0.0
     clock_drift_ppm: float = 0.0
+
+    def __repr__(self) -> str:
+        return format_settings(self)
 
     def __post_init__(self) -> None:
         check_fields(self, "")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from ..arguments import NonNegative, Positive
+from ..arguments import NonNegative, Positive, format_settings
 from ..errors import BadOption
 from .imperfections import Imperfections
 
@@ -20,7 +20,7 @@ _MEAN_RUN_S = 0.02
 _WARM_UP_S = 900.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ImuNoise:
     """Noise of an IMU; the defaults are those of the Xsens MTi-3.
 
@@ -40,6 +40,9 @@ class ImuNoise:
     accel_bias_std: NonNegative = 3e-3 * GRAVITY  # [m/s^2], turn-on, each axis
     accel_bias_instability: NonNegative = 0.03e-3 * GRAVITY  # [m/s^2]
     correlation_s: Positive = 100.0  # [s], of the in-run biases
+
+    def __repr__(self) -> str:
+        return format_settings(self)
 
 
 MTI_3 = ImuNoise()

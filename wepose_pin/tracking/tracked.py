@@ -20,7 +20,7 @@ from .headings import HeadingCorrection
 from .options import TrackOptions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class TrackedRecording(PosedBody):
     """The pose of a recording or a chunk, with its inputs and intermediate results.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..arguments import check_arguments
-from ..diagnostics import Diagnostic
+from ..diagnostics import Diagnostic, notebook_html
 from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, MissingFile, one_of
 from ..kinematics import PosedBody, cut_pose
@@ -83,13 +83,22 @@ NAMES = ("isb", "opensim")
 
 
 class Exported(NamedTuple):
-    """What was written: the format, and what it cannot hold."""
+    """What `export` wrote.
+
+    Parameters
+    ----------
+    format : one of `FORMATS`
+    diagnostics : what of the result the format cannot hold
+    """
 
     format: str
     diagnostics: list[Diagnostic]
 
     def __repr__(self) -> str:
         return f"Exported({self.format!r}; {len(self.diagnostics)} diagnostics)"
+
+    def _repr_html_(self) -> str:
+        return notebook_html(self, self.diagnostics)
 
 
 def export(
