@@ -10,7 +10,7 @@ import sys
 import tomllib
 from functools import cache
 from importlib import import_module
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import NamedTuple
 
@@ -214,10 +214,37 @@ def test_commands_of_a_page_run(page: str, workplace: Path, tmp_path: Path) -> N
         if "info trial.csv --write" in line:
             complete_session(tmp_path)
     for kind, body in blocks(page):
+        if "import opensim" in body and not (GENERIC.exists() and find_spec("opensim")):
+            continue
         if kind == "python" and page in PYTHON:
             (tmp_path / "block.py").write_text(PRELUDE + body, encoding="utf-8")
             done = run(f"{sys.executable} block.py", tmp_path, workplace)
             assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", ["bvh", "mot", "sto", "trc"])
+def test_files_begin_as_the_pages_show(suffix: str, workplace: Path, tmp_path: Path) -> None:
+    [shown] = [body for kind, body in blocks(f"docs/formats/export-{suffix}.md") if kind == ""]
+    wp.export(workplace / "result", tmp_path / f"circles.{suffix}")
+    written = mask((tmp_path / f"circles.{suffix}").read_text(encoding="utf-8"))
+    parts = [mask(part) for line in shown.splitlines() for part in line.split("…")]
+    assert [part for part in parts if part not in written] == []
+
+
+@pytest.mark.slow
+def test_the_live_session_of_python_runs(workplace: Path, tmp_path: Path) -> None:
+    """docs/live.md, with a replay in place of the sensors."""
+    (tmp_path / "made").symlink_to(workplace)
+    (tmp_path / "anna").symlink_to(workplace / "anna")
+    [body] = [body for kind, body in blocks("docs/live.md") if kind == "python"]
+    replay = body.replace('open_source("udp:9000")', 'open_source("replay:made", speed="max")')
+    assert replay != body
+    (tmp_path / "block.py").write_text(replay, encoding="utf-8")
+    done = run(f"{sys.executable} -W error block.py", tmp_path, workplace)
+    assert done.returncode == 0, done.stdout
+    assert "'right_palm': array" in done.stdout
+    assert (tmp_path / "morning.wepose").is_file()
 
 
 @pytest.mark.slow
