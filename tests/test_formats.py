@@ -676,6 +676,9 @@ def test_a_counter_that_begins_anew_goes_on() -> None:
         ("forearm", None),
         ("tibia_r_imu", None),
         ("head", "head"),
+        ("UA_L", "left_upper_arm"),
+        ("FA right", "right_forearm"),
+        ("fast_l", None),
     ],
 )
 def test_segments_by_their_names(label: str, segment: str | None) -> None:

@@ -388,6 +388,21 @@ def test_sensors_without_a_segment_are_left_to_the_user(capsys: pytest.CaptureFi
     assert "write its segment in place of SEGMENT" in info(capsys, tmp_path / "a.csv", "--write")
 
 
+def test_a_sensor_without_a_segment_may_be_one_that_is_lacking(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    frames = [
+        table(f"{name}_gyr_{{}} {name}_acc_{{}}", sensor=k).drop("time") for k, name in enumerate(("torso", "x1"))
+    ]
+    pl.concat([table().select("time"), *frames], how="horizontal").write_csv(tmp_path / "a.csv")
+    text = " ".join(info(capsys, tmp_path / "a.csv", "--write").split())
+    assert re.search(
+        "in place of SEGMENT; then add the seconds of clasp .* wepose calibrate .*; or state the mounts", text
+    )
+    session = (tmp_path / "session.toml").read_text(encoding="utf-8")
+    assert ("# clasp = [[" in session, "without a sensor here" in session) == (True, False)
+
+
 @pytest.mark.parametrize(("twitch", "expected"), [(20, [(0.0, 9.99)]), (80, [(0.0, 3.99), (5.0, 9.99)])])
 def test_a_twitch_does_not_end_a_static_interval(twitch: int, expected: list[tuple[float, float]]) -> None:
     rate = np.zeros((1000, 3))
