@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -305,3 +306,23 @@ def test_broken_figures_in_a_whole_file_do_not_break_the_page() -> None:
     document = parse_document({"results": [item, {**item, "experiment": "drift", "series": {}}]}, "made")
     assert "Dynamic 100 Hz" in text_of(document)
     assert render_html(text_of(document), [])
+
+
+def test_figures_of_the_readme_are_those_of_the_page() -> None:
+    root = Path(__file__).resolve().parents[1]
+    readme, page = ((root / name).read_text(encoding="utf-8") for name in ("README.md", "docs/validation.md"))
+
+    def figure(experiment: str, column: int) -> float:
+        [section] = re.findall(rf"^## {experiment}\n(.*?)(?=^## |\Z)", page, re.MULTILINE | re.DOTALL)
+        [row] = re.findall(r"^\| amekf \|(.*)", section, re.MULTILINE)
+        return float(re.findall(r"[\d.]+", row.split("|")[column])[0])
+
+    broad, ur5 = [figure("BROAD", column) for column in (0, 1)], figure("UR5", 2)
+    mild, people = (figure(f"Arbitrary sensor mounting, {preset}", 0) for preset in ("mild", "people"))
+    stated = re.findall(r"^\|.*\| ([^|]*\d(?:°|mm| mm)[^|]*) \|", readme, re.MULTILINE)
+    assert stated == [
+        f"{broad[0]:.1f}° inclination, {broad[1]:.1f}° heading (rmse)",
+        f"{ur5:.1f}° (rmse)",
+        f"{mild:.0f} mm",
+        f"{people:.0f} mm",
+    ]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import html
 import re
 import shutil
+import tempfile
 from pathlib import Path
 
 import nbformat
+from jupyter_client import AsyncKernelManager
 from nbclient import NotebookClient
 from sphinx.application import Sphinx
 
@@ -40,7 +42,10 @@ def write_notebook(app: Sphinx) -> None:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
     notebook = nbformat.read(NOTEBOOK, as_version=4)
-    NotebookClient(notebook, timeout=LONGEST_S, resources={"metadata": {"path": str(work)}}).execute()
+    with tempfile.TemporaryDirectory() as sockets:  # over TCP the kernel warns that others on this machine could listen
+        kernel = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=f"{sockets}/kernel")
+        place = {"metadata": {"path": str(work)}}
+        NotebookClient(notebook, km=kernel, timeout=LONGEST_S, resources=place).execute()
     parts = []
     for k, cell in enumerate(notebook.cells):
         if cell.cell_type == "markdown":
