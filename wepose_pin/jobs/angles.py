@@ -33,7 +33,7 @@ class AnglesJob:
     further : RESULT…
         Further results, each compared with the first one.
     out : DIR
-        Write to this folder: repetitions.csv (minimum, maximum, range, peak rate of each angle in each repetition),
+        Write to this folder: repetitions.csv (lowest, highest, range, peak rate of each angle in each repetition),
         phases.csv (the same in the whole time and in each phase), summary.csv (mean and standard deviation over
         repetitions), curves.csv (0 to 100 %), comparison.csv (of several results), sessions.csv, definitions.csv
         (sequences and signs), the figures as .svg, and angles.html, which shows all of it.

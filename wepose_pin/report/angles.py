@@ -24,7 +24,7 @@ from .page import Page, Table
 from .words import capital, intervals, plain, signed, versions
 
 TEMPLATE = "report/templates/angles.html.j2"
-HEADINGS = ("least [°]", "most [°]", "range [°]", "fastest [°/s]")  # of MEASURES
+HEADINGS = ("lowest [°]", "highest [°]", "range [°]", "peak rate [°/s]")  # of MEASURES
 CLEAR = 2.0  # standard deviations that the poses state; a smaller difference may be an error that a session shares
 
 

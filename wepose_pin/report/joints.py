@@ -43,7 +43,7 @@ def build_joint_angles_section(tracked: TrackedRecording) -> dict[str, Any] | No
                     f"{100 * ranges.near_lock:.0f} %" if k != 1 else "",
                 ]
             )
-    header = ["angle", "least", "most", "range", "fastest", "usual ±", "near gimbal lock"]
+    header = ["angle", "lowest", "highest", "range", "peak rate", "median ±", "near gimbal lock"]
     return {"stated": has_stated_mounts(tracked), "pictures": draw_joint_angles(angles), "ranges": Table(header, rows)}
 
 
