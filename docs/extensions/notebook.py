@@ -9,9 +9,9 @@ import tempfile
 from pathlib import Path
 
 import nbformat
-from jupyter_client import AsyncKernelManager
 from nbclient import NotebookClient
 from sphinx.application import Sphinx
+from traitlets.config import Config
 
 NOTEBOOK = Path(__file__).resolve().parents[2] / "examples" / "recording_to_robot.ipynb"
 LONGEST_S = 600
@@ -43,9 +43,9 @@ def write_notebook(app: Sphinx) -> None:
         folder.mkdir(parents=True)
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     with tempfile.TemporaryDirectory() as sockets:  # over TCP the kernel warns that others on this machine could listen
-        kernel = AsyncKernelManager(kernel_name="python3", transport="ipc", ip=f"{sockets}/kernel")
+        config = Config(AsyncKernelManager={"transport": "ipc", "ip": f"{sockets}/kernel"})
         place = {"metadata": {"path": str(work)}}
-        NotebookClient(notebook, km=kernel, timeout=LONGEST_S, resources=place).execute()
+        NotebookClient(notebook, config=config, timeout=LONGEST_S, resources=place).execute()
     parts = []
     for k, cell in enumerate(notebook.cells):
         if cell.cell_type == "markdown":
