@@ -23,7 +23,7 @@ import polars as pl
 from ..errors import BadData, MissingFile, UnknownColumn, native_stderr_muted, one_of
 from .parquet import Contents, read_contents
 
-FORMATS = (".csv", ".parquet")
+FORMATS = (".csv", ".tsv", ".txt", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 # Lines of a CSV in a block.
 BLOCK_ROWS = 50_000
@@ -45,7 +45,7 @@ _UNITS = re.compile(
 
 
 def read_table(path: Path) -> pl.DataFrame:
-    """Read the table in a ``.csv`` or ``.parquet`` file. Lines of a CSV that begin with ``#`` are comments.
+    """Read the table in a file of `FORMATS`, all but ``.parquet`` as a CSV. Lines of a CSV that begin with ``#`` are comments.
 
     Raises
     ------
