@@ -150,7 +150,7 @@ def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
 
 
 def _count_turns(values: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Full turns [rad] (2,) between the least and the most of one session's repetitions and another's, (r, measures)."""
+    """Full turns [rad] (2,) between least and most of one session's repetitions and another's, (r, measures)."""
     middles = [each[:, :2][np.isfinite(each[:, :2])] for each in (values, others)]
     if not all(map(len, middles)):
         return np.zeros(2)
