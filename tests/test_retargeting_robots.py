@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import NoSolution
 from wepose_pin.kinematics import Pose
+from wepose_pin.model.meshes import find_example_data
 from wepose_pin.retargeting import (
     ROBOTS,
     Trajectory,
@@ -27,7 +28,6 @@ from wepose_pin.retargeting import (
 from wepose_pin.retargeting.checks import AT_REST
 from wepose_pin.retargeting.collision import CollisionModel
 from wepose_pin.retargeting.files import place_root
-from wepose_pin.model.meshes import find_example_data
 from wepose_pin.retargeting.targets import compute_target_reach
 
 pytest.importorskip("daqp")

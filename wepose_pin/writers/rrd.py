@@ -44,7 +44,9 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
     for link, (quat, p) in compute_link_poses_W(motion).items():
         entity = f"body/{rr.escape_entity_path_part(link)}"
         if np.ptp(p, axis=0).any() or np.ptp(quat, axis=0).any():
-            recording.send_columns(entity, indexes=index, columns=rr.Transform3D.columns(translation=p, quaternion=quat))
+            recording.send_columns(
+                entity, indexes=index, columns=rr.Transform3D.columns(translation=p, quaternion=quat)
+            )
         else:
             place = rr.Transform3D(translation=p[0], quaternion=rr.Quaternion(xyzw=quat[0]))
             recording.log(entity, place, static=True)
