@@ -194,7 +194,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     "a missing table": (lambda f: f.say("arm.csv", "amr.csv"), "amr.csv: no such file; did you mean 'arm.csv'?"),
     "a folder for a table": (
         lambda f: (f.folder / "arm.csv").mkdir(),
-        "arm.csv: is a folder; a table is wanted here, .csv",
+        "arm.csv: is a folder; a table is wanted here",
     ),
     "an unknown format": (
         lambda f: (f.say("arm.csv", "arm.xlsx"), (f.folder / "arm.xlsx").write_bytes(b"PK")),

@@ -236,7 +236,7 @@ class Chart:
     def drawn(self) -> tuple[float, list[DrawnPanel], list[DrawnKey]]:
         """Height [px], panels and legend, as the template takes them."""
         keys, top = self._drawn_legend()
-        panels = []
+        panels: list[DrawnPanel] = []
         rows = list(zip(self.rows, self.heights, strict=True))
         columns = range(max(map(len, self.rows)))
         left = [max(_room_left(row[k], height) for row, height in rows if k < len(row)) for k in columns]

@@ -156,7 +156,7 @@ class QpController:
         except ImportError:
             raise WeposeError(f"retargeting needs daqp: {how_to_install('daqp')}") from None
         self._solve = daqp.solve
-        robot, p = self.robot, self.params
+        robot = self.robot
         self.data: Any = robot.model.createData()
         n = len(robot.names)
         self._min_accel, self._max_accel = np.empty(n), np.empty(n)
@@ -217,12 +217,9 @@ class QpController:
     def _weigh_tasks(self) -> np.ndarray:
         """Return weights, gains and damping as `add_arm_tasks` takes them."""
         p = self.params
-        return np.array(
-            [
-                p.position, p.orientation, p.swivel, self.pace * p.task_gain,
-                self.pace**2 * p.max_correction_deceleration, p.singular_value_limit, p.max_damping, p.curvature_damping,
-            ]
-        )  # fmt: skip
+        gain, deceleration = self.pace * p.task_gain, self.pace**2 * p.max_correction_deceleration
+        weights = p.position, p.orientation, p.swivel
+        return np.array([*weights, gain, deceleration, p.singular_value_limit, p.max_damping, p.curvature_damping])
 
     def _solve_step(self, state: JointState, near: NearPairs, H: np.ndarray, f: np.ndarray) -> JointState | None:
         """Return the next state, within all limits, that leaves a stop open; None: none was found.

@@ -1,7 +1,7 @@
 """Recordings of rerun (.rrd), of a person or a robot: shapes on their links, and joints as curves.
 
-Entities: ``body/LINK`` with its transform in W and the link's shapes, or the bones to the next links where its meshes are
-not found; ``joints/JOINT`` [rad or m].
+Entities: ``body/LINK`` with its transform in W and the link's shapes, or the bones to the next links where its meshes
+are not found; ``joints/JOINT`` [rad or m].
 
 Source: rerun-sdk 0.41.
 """
