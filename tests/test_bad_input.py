@@ -192,10 +192,13 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     # the table
     "a missing table": (lambda f: f.say("arm.csv", "amr.csv"), "amr.csv: no such file; did you mean 'arm.csv'?"),
-    "a folder for a table": (lambda f: (f.folder / "arm.csv").mkdir(), "arm.csv: is a folder; a .csv or .parquet file"),
+    "a folder for a table": (
+        lambda f: (f.folder / "arm.csv").mkdir(),
+        "arm.csv: is a folder; a table is wanted here",
+    ),
     "an unknown format": (
         lambda f: (f.say("arm.csv", "arm.xlsx"), (f.folder / "arm.xlsx").write_bytes(b"PK")),
-        "'.xlsx' is not a known format; there is: .csv, .parquet",
+        "'.xlsx' is not a known format; there is: .csv, .tsv, .txt, .parquet",
     ),
     "an unreadable Parquet": (
         lambda f: (f.say("arm.csv", "arm.parquet"), (f.folder / "arm.parquet").write_bytes(b"no parquet at all")),

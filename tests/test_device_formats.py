@@ -70,6 +70,18 @@ def test_apdm_hdf5(version: int, tmp_path: Path) -> None:
     check_orientation(load(tmp_path, '[data]\nfile = "walk.h5"\nuse = "orientation"\n[sensors.torso]'))
 
 
+def test_a_sensor_whose_neighbours_have_no_times_is_not_taken_for_one_of_them(tmp_path: Path) -> None:
+    """The only one that is left has another segment's name."""
+    path = apdm_hdf5(tmp_path / "walk.h5")
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        del file["SI-000123/Time"]
+    check_raw(load(tmp_path, '[data]\nfile = "walk.h5"\n[sensors.left_forearm]'), "left_forearm")
+    with pytest.raises(WeposeError, match=r"which of walk.h5 is it\? there is: Left Wrist"):
+        load(tmp_path, '[data]\nfile = "walk.h5"\n[sensors.torso]')
+
+
 # Shimmer -----------------------------------------------------------------------------------------------------------
 
 

@@ -21,7 +21,7 @@ from test_export import LENGTHS, a_pose, write_folder
 from wepose_pin.errors import BadData
 from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import load_model
-from wepose_pin.retargeting.maps import find_example_data
+from wepose_pin.model.meshes import find_example_data
 from wepose_pin.writers.export import export
 from wepose_pin.writers.gmr import RIGS, write_gmr
 from wepose_pin.writers.motion import Motion

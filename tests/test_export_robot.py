@@ -23,7 +23,7 @@ from wepose_pin import cli
 from wepose_pin.errors import WeposeError
 from wepose_pin.kinematics import PosedBody
 from wepose_pin.model import read_urdf
-from wepose_pin.retargeting.maps import find_example_data
+from wepose_pin.model.meshes import find_example_data
 from wepose_pin.subject import population_subject
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import (

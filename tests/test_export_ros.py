@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 from arms import JOINTS
 from scipy.spatial.transform import Rotation
 from test_export import LENGTHS, a_pose, write_folder
@@ -19,6 +21,7 @@ from wepose_pin.kinematics import Pose, compute_link_poses, solve_configuration
 from wepose_pin.model import load_model
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import JointMotion, compute_link_poses_W, read_joint_motion
+from wepose_pin.writers.rrd import _load_meshes
 
 pytest.importorskip("rosbags")
 
@@ -179,6 +182,28 @@ def test_without_its_package_a_format_says_which(
     with pytest.raises(BadOption, match=f"pip install {package}"):
         export(trajectory, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_meshes_are_in_the_frames_of_their_links(trajectory: Path, tmp_path: Path) -> None:
+    """Scaled and placed as the URDF says; none where a file is not found."""
+    folder = tmp_path / "robot"
+    shutil.copytree(trajectory, folder)
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    (folder / "parts").mkdir()
+    trimesh.Trimesh(corners, faces, process=False).export(folder / "parts" / "hand.stl")
+    mesh = '<geometry><mesh filename="package://parts/hand.stl" scale="0.1 0.2 0.3"/></geometry>'
+    visual = f'<visual><origin xyz="0.01 0.02 0.03" rpy="0 0 {np.pi / 2.0}"/>{mesh}</visual>'
+    urdf = (folder / "robot.urdf").read_text()
+    assert urdf.count('<link name="hand">') == 1
+    (folder / "robot.urdf").write_text(urdf.replace('<link name="hand">', f'<link name="hand">{visual}'))
+    ((link, (vertices, triangles), _),) = _load_meshes(read_joint_motion(folder))
+    expected = (corners * [0.1, 0.2, 0.3])[:, [1, 0, 2]] * [-1.0, 1.0, 1.0] + [0.01, 0.02, 0.03]
+    assert link == "hand"
+    assert len(triangles) == 4
+    np.testing.assert_allclose(sorted(map(tuple, vertices)), sorted(map(tuple, expected)), atol=1e-6)
+    (folder / "parts" / "hand.stl").unlink()
+    assert _load_meshes(read_joint_motion(folder)) == []
 
 
 @pytest.mark.peer

@@ -385,6 +385,7 @@ def test_a_table_of_markers_of_ones_own(brief: Pose, tmp_path: Path) -> None:
         ("[points]\nleft_shoulder = 'A'\n", "points.left_shoulder = A"),
         ("[segments]\ntorso = [{ up = [['A'], ['B']] }]\n", "each of two directions"),
         ("[punkte]\n", "punkte"),
+        ('[points]\nleft_shoulder = [["Schulter re"]]\n', "no marker 'Schulter re', by which left_shoulder is stated"),
     ):
         (tmp_path / "m.toml").write_text(text)
         with pytest.raises(WeposeError, match=says):
@@ -431,6 +432,10 @@ SPOILED_TRC = {
     "a marker twice": (("\tCLAV\t", "\tC7\t"), "names a marker twice"),
     "a cell too many": (("3\t0.033333\t", "3\t0.033333\t1\t"), "line 9 has 45 cells; 44 are needed for 14 markers"),
     "time that goes back": (("3\t0.033333\t", "3\t0.000001\t"), "times of its rows do not increase"),
+    "a row that was cut off": (
+        ("4\t0.050000\t", "4\t0.050000\t1.0\n5\t0.060000\t"),
+        "line 10 ends within a marker, after 3 of 44",
+    ),
     "markers of nobody": (("\t" + "C7", "\tA"), ""),
 }
 

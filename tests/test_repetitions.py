@@ -265,6 +265,17 @@ def test_a_full_turn_between_repetitions_is_none() -> None:
     assert np.degrees(mean.sd).max() < 1e-6
 
 
+@pytest.mark.parametrize("turn", [360.0, -720.0])
+def test_curves_are_within_half_a_turn_of_zero(turn: float) -> None:
+    """Angles are continuous: an arm that circled about the lock hangs a full turn later."""
+    signal, spans = chain(rest(1.0), *[reach(2.0)] * 4, rest(1.0))
+    angles, plain = angles_of(signal + turn), angles_of(signal)
+    for moved, stayed in zip(
+        compute_mean_curves(angles, spans)["right_elbow"], compute_mean_curves(plain, spans)["right_elbow"], strict=True
+    ):
+        np.testing.assert_allclose(moved.mean, stayed.mean, atol=1e-9)
+
+
 def test_the_cmc_is_kadabas() -> None:
     rng = np.random.default_rng(3)
     curves = np.sin(np.linspace(0.0, 6.0, 50)) + rng.normal(0.0, 0.3, (7, 50))

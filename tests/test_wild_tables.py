@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,29 @@ def test_the_session_that_is_proposed_needs_no_editing(
     pieces = list(iter_session(tmp_path / "session.toml", 1.0))
     whole = np.concatenate([piece.sensors["left_forearm"].gyro_S for piece in pieces])
     np.testing.assert_array_equal(whole, recording.sensors["left_forearm"].gyro_S)
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a.tsv"])
+def test_a_table_of_a_spreadsheet_may_be_a_text(name: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    names = ["t", *(f"chest {k} {a}" for k in ("acc", "gyr") for a in "xyz")]
+    time = [f"{0.01 * k:.2f}".replace(".", ",") for k in range(N)]
+    (tmp_path / name).write_text("\t".join(names) + "\n" + lines(time, values(0), "\t", ","))
+    assert f"{name}: CSV table, 7 columns" in info(capsys, tmp_path / name, "--write")
+    recording = wp.load_session(tmp_path / "session.toml")
+    np.testing.assert_allclose(recording.sensors["torso"].gyro_S, GYRO, atol=0.006)
+
+
+@pytest.mark.parametrize(("name", "form"), [("Uhrzeit", "%H:%M:%S.%f"), ("datetime", "%Y-%m-%dT%H:%M:%S.%fZ")])
+def test_the_rate_follows_from_times_of_day_and_dates(
+    name: str, form: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    names = ["date", name, *(f"chest {k} {a}" for k in ("acc", "gyr") for a in "xyz")]
+    begin = datetime(2026, 3, 12, 8, 0, 59)
+    time = [f"2026-03-12,{(begin + timedelta(milliseconds=20 * k)).strftime(form)}" for k in range(N)]
+    (tmp_path / "a.csv").write_text(",".join(names) + "\n" + lines(time, values(0), ","))
+    text = info(capsys, tmp_path / "a.csv", "--write")
+    assert f"'{name}' holds dates; by the first and the last of them: 50 Hz" in text
+    assert wp.load_session(tmp_path / "session.toml").rate_hz == 50.0
 
 
 def test_a_jump_of_microseconds_is_a_gap_of_its_length(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

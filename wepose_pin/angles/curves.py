@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .euler import wrap
 from .joints import Angles
 
 POINTS = 101  # 0, 1, … 100 %
@@ -77,10 +78,10 @@ def _mean_curve(curves: np.ndarray, variances: np.ndarray) -> MeanCurve:
 
 
 def _same_turn(curves: np.ndarray) -> np.ndarray:
-    """Curves (r, p) moved by full turns so that their means are nearest to that of the first one that has any."""
+    """Curves (r, p) moved by full turns: the mean of the first one that has any to zero, the others' to that one's."""
     means = np.array([curve[np.isfinite(curve)].mean() if np.isfinite(curve).any() else np.nan for curve in curves])
     known = np.flatnonzero(np.isfinite(means))
     if not len(known):
         return curves
-    turns = np.round(np.nan_to_num((means - means[known[0]]) / (2.0 * np.pi)))
+    turns = np.round(np.nan_to_num((means - wrap(means[known[0]])) / (2.0 * np.pi)))
     return curves - 2.0 * np.pi * turns[:, None]

@@ -13,6 +13,7 @@ from ..errors import WrongOption, one_of
 from ..kinematics import Pose, find_samples
 from ..recording import Intervals
 from .curves import MeanCurve, compute_mean_curves
+from .euler import wrap
 from .joints import Angles, JointAngles, joint_angles
 from .repetitions import Repetitions, find_repetitions
 from .smoothing import smooth_pose
@@ -179,13 +180,17 @@ def _cut(joint: JointAngles, part: slice) -> JointAngles:
 
 
 def _count_turns(values: np.ndarray) -> np.ndarray:
-    """Full turns [rad] (s, 3) by which spans are off the first one that is determined: angles are unwrapped in time."""
+    """Full turns [rad] (s, 3) by which spans are off the one that moves least, and this one off zero.
+
+    Angles are continuous in time: a motion about the lock may return to a posture a full turn later.
+    """
     middle = values[:, :, :2].mean(axis=2)
     turns = np.zeros_like(middle)
     for k in range(3):
         known = np.flatnonzero(np.isfinite(middle[:, k]))
         if len(known):
-            turns[known, k] = np.round((middle[known, k] - middle[known[0], k]) / (2.0 * np.pi))
+            least = middle[known[np.argmin(np.ptp(values[known, k, :2], axis=1))], k]
+            turns[known, k] = np.round((middle[known, k] - wrap(least)) / (2.0 * np.pi))
     return 2.0 * np.pi * turns
 
 

@@ -132,11 +132,11 @@ def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
         for name in (name for name in first.curves if name in movement.curves):
             for k, angle in enumerate(first.angles[name].names):
                 about = {"session": movement.name, "against": first.name, "joint": name, "angle": angle}
+                values, others = (each.measures[name].values[:, k] for each in (first, movement))
+                others = others - np.append(_count_turns(values, others), np.zeros(len(MEASURES) - 2))
                 for m, (measure, unit) in enumerate(zip(MEASURES, UNITS, strict=True)):
-                    one, two = (
-                        compute_statistics(each.measures[name].values[:, k, m], each.measures[name].std[:, k, m])
-                        for each in (first, movement)
-                    )
+                    one = compute_statistics(values[:, m], first.measures[name].std[:, k, m])
+                    two = compute_statistics(others[:, m], movement.measures[name].std[:, k, m])
                     difference = compare_statistics(one, two)
                     numbers = {"first_mean": one.mean, "first_sd": one.sd, "mean": two.mean, "sd": two.sd}
                     numbers |= {"difference": difference.value, "ci95_low": difference.low}
@@ -147,3 +147,11 @@ def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
                 for measure, value in (("curve_rms", curve.rms), ("curve_largest", curve.largest)):
                     rows.append({**about, "measure": measure, "unit": "deg", "difference": float(np.degrees(value))})
     return pl.DataFrame(rows, infer_schema_length=None)
+
+
+def _count_turns(values: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Full turns [rad] (2,) between least and most of one session's repetitions and another's, (r, measures)."""
+    middles = [each[:, :2][np.isfinite(each[:, :2])] for each in (values, others)]
+    if not all(map(len, middles)):
+        return np.zeros(2)
+    return np.full(2, 2.0 * np.pi * np.round((middles[1].mean() - middles[0].mean()) / (2.0 * np.pi)))

@@ -141,16 +141,16 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         guess = guess_arrays(arrays.shapes, table)
         proposal = _propose_from_names(path, folder, guess, list(arrays.shapes), arrays, table)
         return _propose_session(path, folder, proposal, wearer)
-    if path.suffix.lower() in TABLES:
-        rows = Rows(path)
-        names = rows.names
+    names = (rows := Rows(path)).names if path.suffix.lower() in TABLES else []
+    if len(names) > (path.suffix.lower() == ".txt"):  # a text that is no table has one column
         if any(f"{point}_x" in names for point in table.points):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
         proposal = _propose_from_names(path, folder, guess_columns(names, table, rows.units), names, None, table)
         return _propose_session(path, folder, proposal, wearer)
     known = (
-        ".toml, .csv, .parquet, .mvnx, .txt (MT Manager), .sto, .h5, .hdf5, .mat, .wepose, .xdf, .db3, .mcap, .bag, "
-        ".c3d, .trc, .zip and .json of phones; folders of a result, an x-IMU3, a phone, a ROS bag"
+        ".toml, .csv, .parquet, .tsv and .txt (tables with tabs, semicolons or commas; MT Manager), .mvnx, .sto, .h5, "
+        ".hdf5, .mat, .wepose, .xdf, .db3, .mcap, .bag, .c3d, .trc, .zip and .json of phones; folders of a result, an "
+        "x-IMU3, a phone, a ROS bag"
     )
     raise BadData(f"{path}: is nothing that is known here; there is: {known}")
 
@@ -462,9 +462,8 @@ def _propose_from_names(
     path: Path, folder: Path, guess: Guess, names: list[str], arrays: ArrayFile | None, body: BodyTable
 ) -> _Proposal:
     """Propose a session for a table or arrays by their names."""
-    kind = {".parquet": "Parquet table", ".csv": "CSV table", ".mat": "MATLAB file"}.get(
-        path.suffix.lower(), "HDF5 file"
-    )
+    kinds = {".parquet": "Parquet table", ".mat": "MATLAB file"}
+    kind = kinds.get(path.suffix.lower(), "HDF5 file" if arrays else "CSV table")
     title = f"{kind}, {len(names)} {'arrays' if arrays else 'columns'}"
     if not guess.sensors:
         listed = one_of(names).removeprefix("there is: ")
@@ -535,15 +534,12 @@ def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[l
         except BadData as error:  # dates, or another column of this name
             refused = error
     else:
-        name = guess.times[0]
-        dates = pl.Series([], dtype=pl.Int64)
-        with contextlib.suppress(pl.exceptions.PolarsError):  # in no form that is known
-            dates = table[name].cast(pl.String).str.to_datetime(time_unit="us", strict=False).drop_nulls().to_physical()
-        span = 1e-6 * float(np.ptp(dates.to_numpy())) if len(dates) else 0.0
-        if not span:
-            return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {refused}"]
-        rate_hz = float(f"{(len(dates) - 1) / span:.6g}")
-        return [f"rate_hz = {rate_hz}"], [f"'{name}' holds dates; by the first and the last of them: {rate_hz:g} Hz"]
+        for name in guess.times:
+            rate_hz = _rate_of_dates(table[name].cast(pl.String).str.strip_chars())
+            if rate_hz:
+                fact = f"'{name}' holds dates; by the first and the last of them: {rate_hz:g} Hz"
+                return [f"rate_hz = {rate_hz}"], [fact]
+        return [f"rate_hz = 100.0{CHECK}'{name}' holds no numbers"], [f"state the rate: {refused}"]
     steps = np.diff(time)
     step = float(np.nanmedian(steps)) if np.isfinite(steps).any() else 0.0
     named = guess.units.get(name)
@@ -559,6 +555,18 @@ def _propose_time(path: Path, guess: Guess, arrays: ArrayFile | None) -> tuple[l
         )
     unit_line = [] if unit in (None, "s") else [f'time_unit = "{unit}"' + ("" if unit == named else f"{CHECK}{reason}")]
     return [line, *unit_line], facts
+
+
+def _rate_of_dates(column: pl.Series) -> float:
+    """The rate [Hz] by the first and the last date, or time of day, of a column; 0.0 where there are none."""
+    span, count = 0.0, 0
+    for kind, form in ((pl.Datetime("us"), None), (pl.Time, "%T%.f")):
+        with contextlib.suppress(pl.exceptions.PolarsError):  # in no form that is known
+            ticks = column.str.strptime(kind, form, strict=False).cast(pl.Int64).drop_nulls().to_numpy()
+            span, count = float(np.ptp(ticks)) * (1e-6 if form is None else 1e-9) if len(ticks) else 0.0, len(ticks)
+        if span:
+            return float(f"{(count - 1) / span:.6g}")
+    return 0.0
 
 
 # Contents of a recording -------------------------------------------------------------------------------------------

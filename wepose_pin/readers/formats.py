@@ -88,7 +88,7 @@ def detect_format(path: Path) -> str | None:
         return by_suffix.get(suffix, "xdf")
     if suffix in (".h5", ".hdf5"):
         return "apdm_hdf5" if is_apdm_hdf5(path) else None
-    if suffix not in (".csv", ".txt", ".xml"):
+    if suffix not in (".csv", ".tsv", ".txt", ".xml"):
         return None
     lines = read_first_lines(path, 40)
     start = "\n".join(lines)

@@ -34,7 +34,10 @@ UNITS = {
     },
 }
 # Words of a name that make it a column of times, units of it, and words that may stand beside them.
-TIME = {"time", "times", "timestamp", "timestamps", "t", "ts", "clock", "elapsed", "epoch", "zeit", "zeitstempel"}
+TIME = {
+    *("time", "times", "timestamp", "timestamps", "t", "ts", "clock", "elapsed", "epoch", "datetime", "date"),
+    *("zeit", "zeitstempel", "uhrzeit", "datum"),
+}
 TIME_UNIT = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
     **dict.fromkeys(("ms", "msec", "milli", "millis", "millisec", "millisecond", "milliseconds"), "ms"),

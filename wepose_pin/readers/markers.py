@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ class MarkerTable(NamedTuple):
     points: Mapping[str, Sequence[Sequence[str]]]
     segments: Mapping[str, Sequence[Mapping[str, Sequence[Sequence[str]]]]]
     rotations: Mapping[str, str]
+    own: Mapping[str, Sequence[Sequence[str]]] = MappingProxyType({})  # points of the user's table
 
 
 def read_marker_table(path: Path | None = None) -> MarkerTable:
@@ -55,6 +57,7 @@ def read_marker_table(path: Path | None = None) -> MarkerTable:
             for name in {**table.segments, **own.segments}
         },
         {**table.rotations, **own.rotations},
+        own.points,
     )
 
 
@@ -114,7 +117,7 @@ def locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], tabl
     Raises
     ------
     BadData
-        The table knows none of the markers.
+        The table knows none of the markers; the user's names others.
     """
     known = dict(markers)
     points: dict[str, np.ndarray] = {}
@@ -123,6 +126,10 @@ def locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], tabl
         if way is not None:
             points[name] = np.mean([known[each] for each in way], axis=0)
             known.setdefault(name, points[name])
+    for name, ways in table.own.items():
+        lost = [marker for way in ways for marker in way if marker not in known]
+        if lost and not any(set(way) <= set(known) for way in ways):
+            raise BadData(f"{path}: no marker '{lost[0]}', by which {name} is stated; {one_of(markers, lost[0])}")
     quats = {}
     for segment, frames in table.segments.items():
         for frame in frames:

@@ -16,7 +16,7 @@ from .device import Device
 
 # Suffixes of data files.
 DATA = (
-    *(".csv", ".parquet", ".txt", ".mat", ".h5", ".hdf5", ".mvnx", ".sto", ".wepose"),
+    *(".csv", ".tsv", ".txt", ".parquet", ".mat", ".h5", ".hdf5", ".mvnx", ".sto", ".wepose"),
     *(".xdf", ".db3", ".mcap", ".bag", ".zip", ".json", ".c3d", ".trc"),
 )
 SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "sensors", "joints")
@@ -90,13 +90,18 @@ def _read_names(keys: TomlTable, signal: str) -> list[str]:
 
 
 def choose_label(keys: TomlTable, device: Device, segment: str, path: Path) -> str:
-    """Choose the file's sensor on a segment: the stated label, the only sensor, or the one with the segment's name."""
+    """Choose the file's sensor on a segment: the stated label, the one with the segment's name, or the only sensor.
+
+    The only one that is left of a file, with another segment's name, is none.
+    """
     label = keys.text("label", None)
     if label is not None:
         if label not in device.labels:
             raise BadSession(f"{keys.at('label')} = '{label}' is not in {path.name}; {one_of(device.labels, label)}")
         return label
-    matches = [name for name, guess in device.labels.items() if guess == segment or len(device.labels) == 1]
+    incomplete = any(each.code == "devices-left-out" for each in device.diagnostics)
+    alone = len(device.labels) == 1 and (not incomplete or None in device.labels.values())
+    matches = [name for name, guess in device.labels.items() if guess == segment or alone]
     if len(matches) != 1:
         raise BadSession(f"{keys.at('label')} is missing; which of {path.name} is it? {one_of(device.labels)}")
     return matches[0]

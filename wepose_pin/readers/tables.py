@@ -23,7 +23,7 @@ import polars as pl
 from ..errors import BadData, MissingFile, UnknownColumn, native_stderr_muted, one_of
 from .parquet import Contents, read_contents
 
-FORMATS = (".csv", ".parquet")
+FORMATS = (".csv", ".tsv", ".txt", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 # Lines of a CSV in a block.
 BLOCK_ROWS = 50_000
@@ -45,7 +45,7 @@ _UNITS = re.compile(
 
 
 def read_table(path: Path) -> pl.DataFrame:
-    """Read the table in a ``.csv`` or ``.parquet`` file. Lines of a CSV that begin with ``#`` are comments.
+    """Read the table in a file of `FORMATS`, all but ``.parquet`` as a CSV, whose lines with ``#`` are comments.
 
     Raises
     ------
@@ -238,7 +238,7 @@ def _check_parquet(path: Path) -> Contents:
 
 def _check_table(path: Path) -> None:
     if path.is_dir():
-        raise MissingFile(f"{path}: is a folder; a {' or '.join(FORMATS)} file is wanted here")
+        raise MissingFile(f"{path}: is a folder; a table is wanted here, {', '.join(FORMATS)}")
     if path.suffix.lower() not in FORMATS:
         raise MissingFile(f"{path}: '{path.suffix}' is not a known format; {one_of(FORMATS)}")
     if not path.is_file():

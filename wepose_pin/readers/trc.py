@@ -44,6 +44,8 @@ def read_trc(path: Path, table: MarkerTable) -> Reference:
         if not line.strip():
             continue
         cells = [cell.strip() for cell in line.removesuffix("\t").split("\t")]
+        if cells[-1] and len(cells) < width and (len(cells) - 2) % 3:
+            raise BadData(f"{path}: line {k} ends within a marker, after {len(cells)} of {width} cells; it was cut off")
         cells += [""] * (width - len(cells))
         try:
             values.append([float(cell) if cell else np.nan for cell in cells[:width]])

@@ -50,7 +50,8 @@ def render_angles_page(
     over_time = [picture for picture in pictures if picture.stem == "repetitions"]
     curves = [picture for picture in pictures if picture.stem != "repetitions"]
     page.add("sessions", lambda: {"table": _tabulate_sessions(movements), **_describe(movements)}, name="Sessions")
-    page.add("repetitions", lambda: {"pictures": over_time, "reasons": _list_reasons(movements)}, "Repetitions")
+    if over_time or _list_reasons(movements):  # none where a phase marks them all
+        page.add("repetitions", lambda: {"pictures": over_time, "reasons": _list_reasons(movements)}, "Repetitions")
     if curves:
         page.add("curves", lambda: {"pictures": curves}, "Mean curves")
         page.add("measures", lambda: {"table": _tabulate_measures(movements)}, "Means over the repetitions")

@@ -19,6 +19,7 @@ _UNITS_A_PIXEL = 10  # of the integers that paths are made of
 _EDGE = 0.05  # [px] by which a rounded tick may lie beyond its axis
 _LETTER = 6.5  # [px] mean width of a letter
 _LINE = 17.0  # [px] height of a line of text
+_ROW_GAP = 8.0  # [px] between two rows of panels
 _MARKERS = {  # about their centre, of size 1
     "circle": "m-{0} 0a{0} {0} 0 1 0 {1} 0a{0} {0} 0 1 0-{1} 0z",
     "square": "m-{0}-{0}h{1}v{1}h-{1}z",
@@ -235,12 +236,13 @@ class Chart:
     def drawn(self) -> tuple[float, list[DrawnPanel], list[DrawnKey]]:
         """Height [px], panels and legend, as the template takes them."""
         keys, top = self._drawn_legend()
-        panels = []
+        panels: list[DrawnPanel] = []
         rows = list(zip(self.rows, self.heights, strict=True))
         columns = range(max(map(len, self.rows)))
         left = [max(_room_left(row[k], height) for row, height in rows if k < len(row)) for k in columns]
         width = (WIDTH - sum(left) - max(sum(panel.right for panel in row) for row in self.rows)) / len(left)
         for row, height in rows:
+            top += _ROW_GAP if panels else 0.0
             top += _LINE if any(panel.title for panel in row) else 5.0
             x = 0.0
             for panel, room in zip(row, left, strict=False):
@@ -348,7 +350,7 @@ def _room_left(panel: Panel, height: float) -> float:
     ticks = panel.y_ticks
     if ticks is None:
         ticks = _ticks(panel, "y", *panel.limits("y"), height)
-    return 12.0 + _LETTER * panel.equal + _LETTER * max((len(label) for _, label in ticks), default=0)
+    return 14.0 + _LETTER * panel.equal + _LETTER * max((len(label) for _, label in ticks), default=0)
 
 
 def _ticks(panel: Panel, axis: Literal["x", "y"], low: float, high: float, length: float) -> Sequence[Tick]:

@@ -30,6 +30,7 @@ MAX_BRAKE_SHARE = 0.9  # of the range of joint velocities in a step, used at mos
 # Where a step leaves no stop open, it is solved again with larger clearances: by this share of what a pair lacks along
 # the stop and by that distance for all pairs, both so many times more from one attempt to the next.
 MAX_RAISES, RAISE_SHARE, MIN_RAISE_M, RAISE_GROWTH = 8, 1.5, 1e-4, 3.0
+HALVINGS = 4  # of the difference between that step and the open stop's next one, where no clearance helps
 NEAR_CLEARANCE_M = 0.01  # [m] to the clearance: pairs nearer than that are counted
 _MIN_DISTANCE_JACOBIAN = 1e-3  # [m/rad] below it a joint does not change a distance
 _DAQP_INFINITY = 1e30  # a bound that daqp ignores
@@ -129,6 +130,7 @@ class QpController:
     counts : of the steps so far
     stopping : whether the last step was one of braking, since there was no other
     posture_reference : replaces the rest posture
+    pace : of the corrections of errors, above 0; 0.5: as slow as if time ran half as fast
     min_distance : [m] between hulls in the last step; inf where none were near
     nearest_pair : of `CollisionModel.pairs`, to which it belongs; -1 where none were near
     active : constraints of the last step
@@ -142,6 +144,7 @@ class QpController:
     guarded: bool = True
     counts: StepCounts = field(default_factory=StepCounts)
     posture_reference: PostureReference | None = None
+    pace: float = 1.0
     min_distance: float = np.inf
     nearest_pair: int = -1
     stopping: bool = False
@@ -153,19 +156,13 @@ class QpController:
         except ImportError:
             raise WeposeError(f"retargeting needs daqp: {how_to_install('daqp')}") from None
         self._solve = daqp.solve
-        robot, p = self.robot, self.params
+        robot = self.robot
         self.data: Any = robot.model.createData()
         n = len(robot.names)
         self._min_accel, self._max_accel = np.empty(n), np.empty(n)
         v_max, a_max, j_max = (self.limit_factor * limit for limit in (robot.v_max, robot.a_max, robot.j_max))
         a_max = reduce_acceleration_limits(a_max, v_max, j_max, robot.upper - robot.lower, self.dt)
         self._limits = (v_max, a_max, j_max)
-        self._kernel_params = np.array(
-            [
-                p.position, p.orientation, p.swivel, p.task_gain, p.max_correction_deceleration, p.singular_value_limit,
-                p.max_damping, p.curvature_damping,
-            ]
-        )  # fmt: skip
         self.active = ActiveConstraints(np.zeros(n, dtype=bool), np.zeros(len(robot.arms), dtype=bool))
         self._arms = [_ArmTasks(robot, arm, self.data) for arm in robot.arms]
         self._stop_check = StopCheck(robot, self.collision)
@@ -194,12 +191,15 @@ class QpController:
         near = self._update_distances(state)
         self.counts.near_clearance += bool((near.distance - near.clearance < NEAR_CLEARANCE_M).any())
         H, f = np.zeros((n, n)), np.zeros(n)
+        weights = self._weigh_tasks()
         for arm, target in zip(self._arms, targets, strict=True):
-            self.counts.singular += arm.add_to_objective(H, f, target, self._kernel_params, dt, state.velocity)
+            self.counts.singular += arm.add_to_objective(H, f, target, weights, dt, state.velocity)
         velocity_mid = _predict_mid_velocity(state, dt)
         H.flat[:: n + 1] += params.posture + params.joint_velocity + params.joint_velocity_change
         reference = self.posture_reference or PostureReference(robot.rest, 0.0)
-        f += params.posture * (params.posture_gain * (reference.position - state.position) + reference.velocity)
+        f += params.posture * (
+            self.pace * params.posture_gain * (reference.position - state.position) + reference.velocity
+        )
         f += params.joint_velocity_change * (velocity_mid + dt * state.acceleration)
         compute_acceleration_bounds(
             state.position, state.velocity, state.acceleration, robot.lower, robot.upper, *self._limits, dt,
@@ -214,10 +214,18 @@ class QpController:
         self.active.arms_near_contact[:] = True
         return self._take_stop(state)
 
+    def _weigh_tasks(self) -> np.ndarray:
+        """Return weights, gains and damping as `add_arm_tasks` takes them."""
+        p = self.params
+        gain, deceleration = self.pace * p.task_gain, self.pace**2 * p.max_correction_deceleration
+        weights = p.position, p.orientation, p.swivel
+        return np.array([*weights, gain, deceleration, p.singular_value_limit, p.max_damping, p.curvature_damping])
+
     def _solve_step(self, state: JointState, near: NearPairs, H: np.ndarray, f: np.ndarray) -> JointState | None:
         """Return the next state, within all limits, that leaves a stop open; None: none was found.
 
-        A solution that leaves no stop open is sought again with larger clearances, up to `MAX_RAISES` times.
+        A solution that leaves no stop open is sought again with larger clearances, up to `MAX_RAISES` times, and then
+        between the last one and the next step of the stop that is open, which keeps all limits.
         """
         velocity_mid = _predict_mid_velocity(state, self.dt)
         w_min, w_max = (velocity_mid + self.dt * limit for limit in (self._min_accel, self._max_accel))
@@ -240,6 +248,11 @@ class QpController:
                 return after
             more = RAISE_GROWTH**attempt * (RAISE_SHARE * shortfall[near.pairs] + MIN_RAISE_M)
             near, brake_share = near._replace(clearance=near.clearance + more), 1.0
+        braking = self._find_next_of_stop(state).acceleration
+        for _ in range(HALVINGS):
+            after = integrate(state, 0.5 * (after.acceleration + braking), self.dt)
+            if self._find_stop(state, after, near) is None:
+                return after
         return None
 
     def brake(self, state: JointState) -> JointState:
@@ -249,10 +262,15 @@ class QpController:
         return self._take_stop(state)
 
     def _take_stop(self, state: JointState) -> JointState:
-        k = self._stop_steps
-        if self._stop is None or k == len(self._stop.position):
-            return JointState.at_rest(state.position)
+        after = self._find_next_of_stop(state)
         self._stop_steps += 1
+        return after
+
+    def _find_next_of_stop(self, state: JointState) -> JointState:
+        """Return the next state of the stop that the last step has left open; at rest where it is over."""
+        k = self._stop_steps
+        if self._stop is None or k >= len(self._stop.position):
+            return JointState.at_rest(state.position)
         return JointState(self._stop.position[k], self._stop.velocity[k], self._stop.acceleration[k])
 
     def _find_stop(self, state: JointState, after: JointState, near: NearPairs) -> np.ndarray | None:

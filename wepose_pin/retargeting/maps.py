@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,12 +12,12 @@ import numpy as np
 from ..assets import asset
 from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadModel, MissingFile, one_of
+from ..model.meshes import find_example_data
 from .limits import JointLimit, read_joint_limits
 
 ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1", "alex")
 SIDES = ("left", "right")
 AXES = {f"{sign}{name}": (1.0 if sign == "+" else -1.0) * np.eye(3)[k] for k, name in enumerate("xyz") for sign in "+-"}
-EXAMPLE_DATA = Path("share") / "example-robot-data" / "robots"
 MAX_VALUE = 1e6  # of a number in a map
 RISE_S = 0.02  # [s] to the full acceleration, from which the jerk limit follows where the map has none
 
@@ -214,22 +213,6 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
 def list_sides(arm: str | None) -> tuple[str, ...] | None:
     """Return the sides of "left", "right" or "both"; None: all arms that a robot has."""
     return SIDES if arm == "both" else None if arm is None else (arm,)
-
-
-def package_folders(urdf: Path) -> list[str]:
-    """Folders in which ``package://`` paths of a URDF are looked up."""
-    folders = [str(folder) for folder in urdf.absolute().parents]
-    data = find_example_data()
-    return folders if data is None else [*folders, str(data), str(data.parent), str(data.parent.parent)]
-
-
-def find_example_data() -> Path | None:
-    """The folder with the robots of example-robot-data; None where it is not installed."""
-    for root in map(Path, sys.path):
-        for prefix in (root / "cmeel.prefix", root.parent.parent.parent):
-            if (prefix / EXAMPLE_DATA).is_dir():
-                return prefix / EXAMPLE_DATA
-    return None
 
 
 def _find_file(path: Path, top: TomlTable, key: str) -> Path:

@@ -12,8 +12,9 @@ import pinocchio as pin
 from scipy.optimize import minimize
 
 from ..errors import BadModel, BadOption, WrongOption, native_stderr_muted, one_of
+from ..model.meshes import package_folders
 from .limits import JointLimit
-from .maps import AXES, ArmMap, LinkPoint, RobotMap, package_folders
+from .maps import AXES, ArmMap, LinkPoint, RobotMap
 
 MIN_LIMIT_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
 MAX_SPEED_SCALE = 0.999  # of velocity, acceleration and jerk limits, for the same reason

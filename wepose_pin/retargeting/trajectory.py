@@ -281,6 +281,7 @@ def _compute_trajectory(
         params, posture=TRACKING_POSTURE_FACTOR * params.posture, posture_gain=TRACKING_POSTURE_GAIN
     )
     contact_times: tuple[float, ...] = ()
+    contact_slowdown = np.ones(n)
     settle_s = SETTLE_S
     for attempt in range(1 + CONTACT_RUNS):
         sample_time = np.concatenate([[0.0], np.cumsum(0.5 * (slowdown[1:] + slowdown[:-1])) * dt])
@@ -291,20 +292,26 @@ def _compute_trajectory(
         posture = posture_at(np.minimum(index, n - 1) * dt)
         controller = QpController(robot, collision, dt, tracking_params)
         halt_steps = round(HALT_S / dt)
-        run = _run_controller(controller, targets, posture, halt_steps, lambda fraction: progress(STAGES[1], fraction))
+        pace = np.interp(index, np.arange(n), 1.0 / contact_slowdown)
+        run = _run_controller(
+            controller, targets, posture, halt_steps, lambda fraction: progress(STAGES[1], fraction), pace
+        )
         near_contact = np.flatnonzero(run.stopping)
         # A robot that lags far behind needs longer to come to rest.
         settled = float(np.abs([run.joint_velocity[-1], run.joint_acceleration[-1]]).max()) < SETTLED
         if (settled and not len(near_contact)) or attempt == CONTACT_RUNS:
             break
-        settle_s += 0.0 if settled else SETTLE_S
+        if not settled:
+            settle_s += SETTLE_S
+            contact_slowdown[-1] *= 2.0
         if not len(near_contact):
             continue
         begins = index[near_contact[np.diff(near_contact, prepend=-2) > 1]].astype(int)
         if strict:
             raise _build_too_fast_error(robot, motion.time[begins[0]], SELF_CONTACT)
         contact_times = tuple(sorted({*contact_times, *np.round(motion.time[begins], 2).tolist()}))
-        slowdown = slowdown * _compute_contact_slowdown(index[near_contact], n, dt)
+        slower = _compute_contact_slowdown(index[near_contact], n, dt)
+        slowdown, contact_slowdown = slowdown * slower, contact_slowdown * slower
     return Trajectory(
         robot=robot,
         collision=collision,
@@ -340,8 +347,12 @@ def _run_controller(
     posture: np.ndarray | None,
     halt_steps: int,
     progress: Callable[[float], None],
+    pace: np.ndarray | None = None,
 ) -> ControllerRun:
-    """Follow the targets from rest, with a posture reference (n, joints); come to rest in the last `halt_steps`."""
+    """Follow the targets from rest; come to rest in the last `halt_steps`.
+
+    `posture` (n, joints) is a posture reference, `pace` (n,) that of corrections.
+    """
     robot, n = controller.robot, len(targets.time)
     arms, joints = len(robot.arms), len(robot.names)
     run = ControllerRun(
@@ -358,6 +369,7 @@ def _run_controller(
         begin = time.perf_counter()
         if posture is not None and velocity is not None:
             controller.posture_reference = PostureReference(posture[k], velocity[min(k + 1, n - 1)])
+        controller.pace = 1.0 if pace is None else float(pace[k])
         steps_left = n - 1 - k
         if steps_left < halt_steps:
             state = controller.brake(state)

@@ -8,12 +8,10 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from .maps import package_folders
+from ..model.meshes import package_folders, reduce_triangles, triangulate
 from .robot import Robot
 from .trajectory import Trajectory
 
-MAX_TRIANGLES = 30_000  # of the whole robot
-FINEST_CELL, CELL_GROWTH = 0.003, 1.4  # [m] size of the cells in which vertices are merged; factor until they suffice
 BODY, LEFT, RIGHT = (0.80, 0.82, 0.85, 1.0), (0.93, 0.66, 0.50, 1.0), (0.52, 0.70, 0.85, 1.0)
 SIDE_DISTANCE = 1.35  # [m] of the robot to the left of the person
 STANDING_HEIGHT = 0.75  # [m] of the shoulders above the lowest point, from which on the robot stands on the floor
@@ -35,21 +33,17 @@ def build_parts(robot: Robot) -> list[MeshPart]:
     moving = set(robot.model.names[1:])
     locked = [robot.full.getJointId(name) for name in robot.full.names[1:] if name not in moving]
     _, shapes = pin.buildReducedModel(robot.full, whole, locked, robot.rest_full)
-    meshes: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
+    joints, meshes = [], []
     for shape in shapes.geometryObjects:
-        vertices, triangles = _triangulate(shape.geometry)
+        vertices, triangles = triangulate(shape.geometry)
         if len(triangles):
-            placed = vertices @ shape.placement.rotation.T + shape.placement.translation
-            meshes.setdefault(int(shape.parentJoint), []).append((placed, triangles))
-    cell = FINEST_CELL
-    while True:
-        parts = [
-            MeshPart(joint, *_join([_simplify(*mesh, cell) for mesh in own]), _choose_colour(robot, joint))
-            for joint, own in sorted(meshes.items())
-        ]
-        if sum(len(part.triangles) for part in parts) <= MAX_TRIANGLES:
-            return parts
-        cell *= CELL_GROWTH
+            joints.append(int(shape.parentJoint))
+            meshes.append((vertices @ shape.placement.rotation.T + shape.placement.translation, triangles))
+    reduced = list(zip(joints, reduce_triangles(meshes), strict=True))
+    return [
+        MeshPart(joint, *_join([mesh for own, mesh in reduced if own == joint]), _choose_colour(robot, joint))
+        for joint in sorted(set(joints))
+    ]
 
 
 def place_beside_person(
@@ -107,41 +101,6 @@ def _choose_colour(robot: Robot, joint: int) -> tuple[float, float, float, float
                 return LEFT if arm.side == "left" else RIGHT
         joint = robot.model.parents[joint]
     return BODY
-
-
-def _triangulate(geometry: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and triangles of a mesh, box, cylinder or sphere."""
-    import trimesh
-
-    kind = type(geometry).__name__
-    if hasattr(geometry, "num_tris") and hasattr(geometry, "tri_indices"):
-        triangles = np.array(
-            [[t[0], t[1], t[2]] for t in map(geometry.tri_indices, range(geometry.num_tris))], dtype=int
-        )
-        return np.asarray(geometry.vertices(), dtype=float), triangles.reshape(-1, 3)
-    if kind == "Box":
-        mesh = trimesh.creation.box(2.0 * np.asarray(geometry.halfSide).ravel())
-    elif kind == "Cylinder":
-        mesh = trimesh.creation.cylinder(geometry.radius, 2.0 * geometry.halfLength, sections=24)
-    elif kind == "Sphere":
-        mesh = trimesh.creation.icosphere(2, geometry.radius)
-    else:
-        return np.empty((0, 3)), np.empty((0, 3), dtype=int)
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
-
-
-def _simplify(vertices: np.ndarray, triangles: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Merge the vertices of one cell into their mean; drop triangles that lose a corner."""
-    _, index, count = np.unique(
-        np.round(vertices / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    index = index.ravel()
-    mean = np.stack([np.bincount(index, vertices[:, k]) for k in range(3)], axis=1) / count[:, None]
-    corners = index[triangles]
-    whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
-    corners = corners[whole]
-    _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
-    return mean, corners[np.sort(first)]
 
 
 def _join(meshes: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """Recordings of rerun (.rrd), of a person or a robot: shapes on their links, and joints as curves.
 
-Entities: ``body/LINK`` with its transform in W and the link's shapes, or the bones to the next links where the URDF has
-meshes; ``joints/JOINT`` [rad or m].
+Entities: ``body/LINK`` with its transform in W and the link's shapes, or the bones to the next links where its meshes
+are not found; ``joints/JOINT`` [rad or m].
 
 Source: rerun-sdk 0.41.
 """
@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
-from ..errors import BadOption, how_to_install
+from ..errors import BadOption, how_to_install, native_stderr_muted
+from ..model.meshes import Mesh, package_folders, reduce_triangles, triangulate
 from ..model.visuals import Visual, visuals
-from .joint_motion import JointMotion, compute_link_poses_W, compute_link_transforms
+from .joint_motion import ROBOT_URDF, JointMotion, compute_link_poses_W, compute_link_transforms
 
 TIMELINE = "time"
 BONE_RADIUS_M = 0.012
@@ -41,12 +43,22 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
     shapes = visuals(motion.robot)
     for link, (quat, p) in compute_link_poses_W(motion).items():
         entity = f"body/{rr.escape_entity_path_part(link)}"
-        recording.send_columns(entity, indexes=index, columns=rr.Transform3D.columns(translation=p, quaternion=quat))
+        if np.ptp(p, axis=0).any() or np.ptp(quat, axis=0).any():
+            recording.send_columns(
+                entity, indexes=index, columns=rr.Transform3D.columns(translation=p, quaternion=quat)
+            )
+        else:
+            place = rr.Transform3D(translation=p[0], quaternion=rr.Quaternion(xyzw=quat[0]))
+            recording.log(entity, place, static=True)
         for k, shape in enumerate(each for each in shapes if each.link == link and each.kind != "mesh"):
             recording.log(f"{entity}/{k}", _draw(rr, shape), static=True)
     with_mesh = {shape.link for shape in shapes if shape.kind == "mesh"}
+    meshes = _load_meshes(motion) if with_mesh else []
+    for k, (link, (vertices, triangles), rgba) in enumerate(meshes):
+        mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=rgba)
+        recording.log(f"body/{rr.escape_entity_path_part(link)}/mesh_{k}", mesh, static=True)
     for link, transform in compute_link_transforms(motion).items():
-        if transform.parent in with_mesh and np.linalg.norm(transform.p[0]) > BONE_RADIUS_M:
+        if not meshes and transform.parent in with_mesh and np.linalg.norm(transform.p[0]) > BONE_RADIUS_M:
             entity = f"body/{rr.escape_entity_path_part(transform.parent)}/bone_to_{rr.escape_entity_path_part(link)}"
             bone = rr.LineStrips3D([[np.zeros(3), transform.p[0]]], radii=BONE_RADIUS_M)
             recording.log(entity, bone, static=True)
@@ -55,6 +67,27 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
         recording.send_columns(entity, indexes=index, columns=rr.Scalars.columns(scalars=motion.values(joint)))
     recording.flush()
     recording.disconnect()
+
+
+def _load_meshes(motion: JointMotion) -> list[tuple[str, Mesh, np.ndarray]]:
+    """Link, mesh in its frame and colour; empty where a file of a mesh is not found."""
+    folders = package_folders(Path(motion.where) / ROBOT_URDF)
+    try:
+        with native_stderr_muted():
+            model = pin.buildModelFromXML(motion.urdf)
+            shapes = pin.buildGeomFromUrdfString(
+                model, motion.urdf, pin.GeometryType.VISUAL, package_dirs=folders
+            ).geometryObjects
+    except (ValueError, RuntimeError):
+        return []
+    links, meshes = [], []
+    for shape in (each for each in shapes if each.meshPath not in ("", "BOX", "CYLINDER", "SPHERE", "CAPSULE")):
+        frame = model.frames[shape.parentFrame]
+        placed = frame.placement.inverse() * shape.placement
+        vertices, triangles = triangulate(shape.geometry)
+        links.append((frame.name, np.asarray(shape.meshColor).ravel()))
+        meshes.append((vertices @ placed.rotation.T + placed.translation, triangles))
+    return [(link, mesh, rgba) for (link, rgba), mesh in zip(links, reduce_triangles(meshes), strict=True)]
 
 
 def _draw(rr: Any, shape: Visual) -> Any:
