@@ -620,8 +620,11 @@ def compute_point_covariances(
     known = {name: Rotation.from_quat(quat_WL[name]).as_matrix() for name in _girdle_segments(model) if name in quat_WL}
     motions = move_girdles(model, known)
     R_WK: dict[str, np.ndarray] = {}
-    found = {link: find_carrier(model, link, quat_WL) for way in model.reaches.values() for link in way}
-    carriers = {link: carrier for link, carrier in found.items() if carrier is not None}
+    carriers = {
+        link: carrier
+        for link in dict.fromkeys(link for way in model.reaches.values() for link in way)
+        if (carrier := find_carrier(model, link, quat_WL)) is not None
+    }
     for link, carrier in carriers.items():
         if carrier in segment_cov:
             R_CK = model.neutral_rotations[carrier].T @ model.neutral_rotations[link]

@@ -191,9 +191,8 @@ def run_live(
     from ..subject import load_subject
 
     job.check()
-    following = (
-        None if job.robot is None else _load_robot(job, job.robot)
-    )  # a wrong one is found before the person does anything
+    # A wrong robot is found before the person does anything.
+    following = None if job.robot is None else _load_robot(job, job.robot)
     if job.subject is not None and not job.accept_failed:
         load_subject(job.subject).check_quality()
     setup: SensorSetup
