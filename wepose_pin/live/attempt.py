@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import BadData
 from ..readers.live_log import Markers, build_recording
 from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
@@ -38,9 +39,22 @@ class Attempt:
         return self.log.path
 
     @property
-    def rate_hz(self) -> float | None:
-        """Of the ticks; None before they begin."""
-        return None if self.stream.synchronizer is None else self.stream.synchronizer.rate_hz
+    def has_begun(self) -> bool:
+        """Whether there are ticks: all sensors have sent."""
+        return self.stream.synchronizer is not None
+
+    @property
+    def rate_hz(self) -> float:
+        """Of the ticks.
+
+        Raises
+        ------
+        BadData
+            There are none yet.
+        """
+        if self.stream.synchronizer is None:
+            raise BadData(f"{self.path}: has no samples of all sensors yet")
+        return self.stream.synchronizer.rate_hz
 
     @property
     def newest(self) -> float:
@@ -80,7 +94,6 @@ class Attempt:
 
     def recording(self) -> Recording:
         """The recording so far, as a reader of the file gets it."""
-        assert self.rate_hz is not None
         header = self._header | {"sensors": self.segments, "phases": self._phases()}
         return check_recording(build_recording(header, self.rate_hz, self._ticks, None, self.path))
 

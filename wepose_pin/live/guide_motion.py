@@ -95,8 +95,7 @@ class ExerciseStep(Step):
         self._interrupt([attempt.segments[k] for k in np.unique(sensors)], float(ticks.time[rows[0]]))
 
     def update(self) -> None:
-        attempt = self.guide.attempt
-        assert attempt is not None
+        attempt = self.guide.begin_attempt()
         if self.guide.silent:
             self._interrupt([self.guide.segments[name] for name in self.guide.silent], attempt.newest)
         elif not self._running and self.guide.now >= self._begin:
@@ -200,9 +199,9 @@ class CalibrationStep(Step):
 
     def _calibrate(self) -> None:
         self._result: Calibrated | WeposeError | None = None
-        assert self.guide.attempt is not None
-        self.guide.attempt.log.flush()
-        path, measured = self.guide.attempt.path, dict(self._measured)
+        attempt = self.guide.begin_attempt()
+        attempt.log.flush()
+        path, measured = attempt.path, dict(self._measured)
         self._worker.start(lambda: self.guide.options.calibrate(path, measured))
 
     def leave(self) -> None:
@@ -269,8 +268,7 @@ class CalibrationStep(Step):
     def _exchange(self, moved: Mapping[str, str]) -> None:
         """Assign the sensors as the calibration found them, and calibrate again."""
         segments = {label: segment for segment, label in moved.items()}
-        assert self.guide.attempt is not None
-        self.guide.attempt.exchange(segments)
+        self.guide.begin_attempt().exchange(segments)
         own = self.guide.segments
         self.guide.segments = {sensor: segments.get(segment, segment) for sensor, segment in own.items()}
         self.enter()

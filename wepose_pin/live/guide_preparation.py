@@ -129,7 +129,6 @@ class Stillness:
     """Waits in the ticks of an attempt until no sensor has moved for some seconds."""
 
     def __init__(self, attempt: Attempt, seconds: float) -> None:
-        assert attempt.rate_hz is not None
         self._attempt, self.seconds, self.measured = attempt, seconds, attempt.measured
         self.detector = StartPoseDetector(attempt.rate_hz, len(self.measured), seconds)
         self._rates = TickRates(self.measured, attempt.rate_hz)
@@ -166,8 +165,7 @@ class StaticStep(Step):
 
     def push_ticks(self, ticks: Ticks) -> None:
         if self._stillness is None:
-            assert self.guide.attempt is not None
-            self._stillness = Stillness(self.guide.attempt, STATIC_S)
+            self._stillness = Stillness(self.guide.begin_attempt(), STATIC_S)
         self._ticks = [*self._ticks[-200:], ticks]
         if self._stillness.push(ticks) is not None and not self._faults:
             self._check(self._stillness.measured)
@@ -177,8 +175,7 @@ class StaticStep(Step):
         accel = np.concatenate([each.accel_S for each in self._ticks])[-round(STATIC_S * 50) :]
         force = np.linalg.norm(np.nanmean(accel, axis=0), axis=1)
         off = (np.abs(force / STANDARD_GRAVITY - 1.0) > GRAVITY_ERROR_NOTED) & ~measured
-        assert self.guide.attempt is not None
-        names = self.guide.attempt.segments
+        names = self.guide.begin_attempt().segments
         self._faults = tuple(
             f"The accelerometer on the {join_names([name])} shows {value:.2f} m/s² at rest, and gravity is "
             f"{STANDARD_GRAVITY:.2f} m/s²: is its unit right?"
@@ -229,7 +226,7 @@ class StartPoseStep(Step):
 
     def push_ticks(self, ticks: Ticks) -> None:
         attempt = self.guide.attempt
-        if self._begin is None or self.guide.now < self._begin or attempt is None or attempt.rate_hz is None:
+        if self._begin is None or self.guide.now < self._begin or attempt is None or not attempt.has_begun:
             return
         if self._stillness is None:
             self._stillness = Stillness(attempt, self._seconds)
