@@ -330,7 +330,7 @@ TARGETS = (
     Target("live_loop", lambda: [seeds.wild()], streams.loop, (), "live.loop"),
     Target("live_page", seeds.requests, streams.page, HTTP, "live.server"),
     Target("live_log", lambda: [seeds.live_log()], file("a.wepose", _live), JSON, "readers.live_log"),
-    Target("pose", lambda: [seeds.pose()], file("pose.parquet", _pose), (), "pose"),
+    Target("pose", lambda: [seeds.pose()], file("pose.parquet", _pose), (), "kinematics"),
     Target("result", lambda: [seeds.pose_csv()], records.result, LINES, "writers.motion"),
     Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON, "writers.result"),
     Target("provenance", lambda: [seeds.provenance()], records.provenance, JSON, "batch.reproduction"),

@@ -278,8 +278,10 @@ def read_ur5(files: Ur5Files) -> Referenced:
     steps = np.diff(time)
     if len(gyro) != len(time):
         raise BadData(f"{encoder}: {len(time)} lines, but {len(gyro)} in {imu}; as many are needed")
-    if not np.all(steps > 0.0) or not np.isfinite(quat_VB).all():
-        raise BadData(f"{encoder}: TIME must grow from line to line, and no quaternion may lack a number")
+    # The largest component of a unit quaternion is between 0.5 and 1.
+    largest = np.abs(quat_VB).max(axis=1)
+    if not np.all(steps > 0.0) or not np.all((largest > 0.45) & (largest < 1.1)):
+        raise BadData(f"{encoder}: TIME must grow from line to line, and each line have a unit quaternion")
     rate_hz = 1.0 / float(np.median(steps))
     R_VB = Rotation.from_quat(quat_VB)
     turned = np.flatnonzero((R_VB[0].inv() * R_VB).magnitude() > np.deg2rad(0.3))

@@ -61,6 +61,7 @@ IMPROBABLE = 60.0
 COARSEST = np.repeat([np.deg2rad(0.25), 0.05], 3)
 WIDE = 1.5  # [digits] a step above this is wider than one digit
 FEWEST_WIDE = 10  # steps
+LARGEST = 1e9  # of what a file states, in any unit; numbers are bounded by it, so that their squares are numbers too
 ENOUGH_NOISE_S = 30.0  # [s] of noise that are evaluated
 # Up is the mean specific force over `UP_S`; for a measuring sensor it changes by less than `UP_OFF` over two windows.
 UP_S, UP_OFF = 2.0, 0.8  # [s], [rad]
@@ -434,6 +435,7 @@ class Scan:
             changed[name] = np.concatenate([[True], (np.diff(values, axis=0) != 0.0).any(axis=1)])[: len(values)]
             self._changes[name] = self._changes.get(name, 0) + int(changed[name].sum())
             good = np.isfinite(values).all(axis=1)
+            values = np.clip(values, -LARGEST, LARGEST)
             if values.shape[1] == 4:
                 norm = np.linalg.norm(values, axis=1)
                 good &= norm > 0.0  # zeros mark a lost sample
