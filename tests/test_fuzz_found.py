@@ -35,6 +35,8 @@ from wepose_pin.errors import (
 )
 from wepose_pin.readers.arrays import ArrayFile
 from wepose_pin.readers.mat5 import read_mat5
+from wepose_pin.readers.trials import Ur5Files, read_ur5
+from wepose_pin.recording.faults import Scan
 from wepose_pin.report.viewer import frame_indices
 
 pytest.importorskip("hypothesis")
@@ -569,3 +571,28 @@ def test_an_output_folder_appears_at_once(tmp_path: Path) -> None:
     assert watcher.communicate()[0] == "50\n"
     (tmp_path / "own").mkdir()
     assert (tmp_path / "out").stat().st_mode == (tmp_path / "own").stat().st_mode
+
+
+def test_numbers_whose_squares_are_none_are_scanned() -> None:
+    """A stuck axis may hold any number; the whole package warns of none."""
+    time_s = np.arange(900) / 100.0
+    values = np.random.default_rng(1).normal(scale=1e-3, size=(900, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
+    values[:, 0] = 2.5e296
+    values[300:500] = values[300]
+    scan = Scan()
+    scan.push({"torso": (time_s, values), "left_forearm": (time_s, np.full((900, 4), 1e308))})
+    with pytest.raises(BadData, match="torso"):
+        scan.finish("x", None)
+
+
+@pytest.mark.parametrize("component", [1e308, 0.0, 7.0])
+def test_a_ur5_whose_encoder_gives_no_rotation_is_refused(tmp_path: Path, component: float) -> None:
+    files = Ur5Files("a", "radius", tmp_path / "imu.csv", tmp_path / "encoder.csv")
+    rows = [[0.0, 0.0, 0.0, 0.1, 0.0, 9.8, 1e4 * k, 1.0, 0.0, 0.0, 0.0] for k in range(12)]
+    rows[3][7] = component
+    names = "gyr_x,gyr_y,gyr_z,acc_x,acc_y,acc_z,TIME,QUATERNION_0,QUATERNION_1,QUATERNION_2,QUATERNION_3"
+    text = "\n".join([names, *(",".join(map(str, row)) for row in rows)])
+    for file in (files.imu, files.encoder):
+        file.write_text(text)
+    with pytest.raises(BadData, match="each line have a unit quaternion"):
+        read_ur5(files)

@@ -117,7 +117,7 @@ def test_names_of_formats_stand_in_tables(file: str) -> None:
     text = FILES[file].read_text(encoding="utf-8")
     functions = [each for each in ast.walk(ast.parse(text)) if isinstance(each, ast.FunctionDef)]
     spans = [range(each.lineno, (each.end_lineno or each.lineno) + 1) for each in functions]
-    assert [found for found in find_names(text) if any(found[0] in span for span in spans)] == []
+    assert [name for name in find_names(text) if any(name[0] in span for span in spans)] == []
 
 
 @pytest.mark.parametrize("allowed", ALLOWED)
