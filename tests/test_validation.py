@@ -76,7 +76,7 @@ def test_each_experiment_says_what_was_known_beforehand(data: Path) -> None:
         assert len(known) > 20, name
         if name.startswith(("upper body", "arbitrary", "error budget")):
             millimetres = 1e3 * PRESETS[name.rpartition(", ")[2]].measured_std
-            assert f"shoulder width, off by {millimetres:g} mm" in known
+            assert f"shoulder width between the joint centres, off by {millimetres:g} mm" in known
         else:
             assert "shoulder" not in known
     assert describe_known("never heard of", presets) == ""
