@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -29,25 +30,36 @@ EXACT = np.zeros_like(population_subject().shape_covariance(TABLE))  # lengths a
 
 @pytest.mark.parametrize("with_hands", [False, True])
 def test_point_covariance_is_what_drawing_errors_gives(with_hands: bool) -> None:
-    """Draw orientations and shape from their covariances, let Pinocchio place the points, and look at the cloud."""
+    """Draw orientations and shape from their covariances, let Pinocchio place the points, and look at the cloud.
+
+    The headings are drawn with something in common.
+    """
     rng = np.random.default_rng(0)
     n = 40000
     names = ["torso", *ARMS, *(["left_hand", "right_hand"] if with_hands else [])]
     mean = {name: Rotation.random(random_state=rng) for name in names}
     cov = {name: np.diag(rng.uniform(0.5, 2.0, 3) * 4e-4) for name in names}
+    share = dict(zip(names, rng.uniform(-0.8, 0.8, len(names)), strict=True))  # of each heading's deviation, in common
+    heading_std = {name: np.sqrt(cov[name][2, 2]) for name in names}
+    heading_cov = {
+        (near, far): np.array([share[near] * heading_std[near] * share[far] * heading_std[far]])
+        for near, far in combinations(names, 2)
+    }
     own = {name: np.array([-0.3, *rng.normal(scale=0.01, size=6)]) for name in TABLE.girdles}
     body = replace(population_subject(), girdles=own)
     shape_cov = 0.04 * body.shape_covariance(TABLE)
     still = {name: rotation.as_quat()[None] for name, rotation in mean.items()}
     model = body.shape(load_model())
     points = compute_pose(model, np.zeros(1), still).points
-    point_cov = compute_point_covariances(model, still, {name: c[None] for name, c in cov.items()}, shape_cov)
+    segment_cov = {name: c[None] for name, c in cov.items()}
+    point_cov = compute_point_covariances(model, still, segment_cov, shape_cov, heading_cov=heading_cov)
     assert set(point_cov) == set(points)
 
-    drawn = {
-        name: (Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), cov[name], n)) * mean[name]).as_quat()
-        for name in names
-    }
+    common, drawn = rng.normal(size=n), {}
+    for name in names:
+        error = rng.multivariate_normal(np.zeros(3), cov[name], n)
+        error[:, 2] = np.sqrt(1.0 - share[name] ** 2) * error[:, 2] + share[name] * heading_std[name] * common
+        drawn[name] = (Rotation.from_rotvec(error) * mean[name]).as_quat()
     R_torso = mean["torso"].as_matrix()
     longer = [replace(body, lengths={**body.lengths, s: body.lengths[s] + 1e-3}) for s in LENGTHS]
     for girdle, values in own.items():

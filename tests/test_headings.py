@@ -241,14 +241,14 @@ def go_on(state: HeadingFilter, knots: int, about_vertical: tuple[float, ...], v
     variance = []
     for _ in range(knots):
         state.step(knot)
-        variance.append(state.problem.find_segment_variance(state.P)[0])
+        variance.append(state.problem.find_segment_covariance(state.P)[0, 0])
     return np.sqrt(variance)
 
 
 def test_a_headings_variance_is_start_pose_and_drift_until_the_filter_has_found_its_bias() -> None:
     """Nothing is observed: the mount cancels, the rate adds up, and less is left once the filter knows its bias."""
     state = make_filter_of_one()
-    np.testing.assert_allclose(state.problem.find_segment_variance(state.P), START_STD**2)
+    np.testing.assert_allclose(np.diag(state.problem.find_segment_covariance(state.P)), START_STD**2)
     growing = go_on(state, 10, (0.0, 0.0, 0.0, BIAS_STD**2))
     assert growing[-1] == pytest.approx(np.hypot(START_STD, 20.0 * np.hypot(BIAS_STD, PERSON_NOISE.rate_std)), rel=0.05)
     known_std = 0.02 * BIAS_STD
@@ -296,7 +296,7 @@ def test_a_bias_corrected_within_a_knot_has_drifted_up_to_there_alone() -> None:
             Knot(0.0, np.zeros(0), np.zeros((0, 1, 4)), (), FilterHeadings(np.zeros(1), corrected), np.zeros(1, bool))
         )
         errors.append(start + bias * (KNOT_S + at) + other * 2.0 * KNOT_S - state.x[0])
-    std = np.sqrt(state.problem.find_segment_variance(state.P)[0])
+    std = np.sqrt(state.problem.find_segment_covariance(state.P)[0, 0])
     assert 0.7 * std < np.sqrt(np.mean(np.square(errors))) < 1.3 * std
 
 

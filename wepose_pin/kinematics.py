@@ -592,14 +592,15 @@ def compute_point_covariances(
     segment_cov: Mapping[str, np.ndarray],
     shape_cov: np.ndarray,
     q: np.ndarray | None = None,
+    heading_cov: Mapping[tuple[str, str], np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
     """Compute the covariance (n, 3, 3) [m²] in W of the known points.
 
     Only of points for which every segment between root and point has a covariance. A point is the sum of vectors v that
     rotate with segments: an error δ of a segment's orientation moves the point by δ × v, errors of different sensors
-    are independent, errors of the lengths act along the vectors. A girdle adds the errors of its parameters and what
-    leaves its law. The points of a mechanism move with the joints, which
-    the fit takes from all orientations.
+    are independent but for their headings, errors of the lengths act along the vectors. A girdle adds the errors of its
+    parameters and what leaves its law. The points of a mechanism move with the joints, which the fit takes from all
+    orientations.
 
     Parameters
     ----------
@@ -608,13 +609,14 @@ def compute_point_covariances(
     shape_cov : (k + 7 g, k + 7 g) of the model's lengths and then its girdles' parameters, in the order of the
         table, as `Subject.shape_covariance`; zeros: known exactly
     q : (n, nq) of a mechanism; without it its points have none
+    heading_cov : two segments → (n,) [rad²], the covariance of their headings; a pair left out: independent
     """
     covariances: dict[str, np.ndarray] = {}
     points = find_known_points(model, quat_WL)
     if model.table.is_mechanism:
         if not points or q is None or not set(quat_WL) <= set(segment_cov):
             return covariances
-        return _propagate_through_joints(model, q, segment_cov, shape_cov, points)
+        return _propagate_through_joints(model, q, segment_cov, shape_cov, points, heading_cov or {})
     lengths = np.array(list(model.lengths.values()))
     girdles = list(model.table.girdles)
     known = {name: Rotation.from_quat(quat_WL[name]).as_matrix() for name in _girdle_segments(model) if name in quat_WL}
@@ -660,6 +662,9 @@ def compute_point_covariances(
         for moving_segment, vector in vectors.items():
             skew = _build_skew_matrices(vector)
             cov = cov + skew @ segment_cov[moving_segment] @ skew.swapaxes(1, 2)
+        for (near, far), shared in (heading_cov or {}).items():
+            if near in vectors and far in vectors:
+                _add_shared_heading(cov, vectors[near], vectors[far], shared)
         covariances[point] = cov
     return covariances
 
@@ -670,6 +675,7 @@ def _propagate_through_joints(
     segment_cov: Mapping[str, np.ndarray],
     lengths_cov: np.ndarray,
     points: Sequence[str],
+    heading_cov: Mapping[tuple[str, str], np.ndarray],
 ) -> dict[str, np.ndarray]:
     """Compute the covariances of a mechanism's points in `q` (n, nq), as `compute_point_covariances`.
 
@@ -681,6 +687,9 @@ def _propagate_through_joints(
     segments = [m.getFrameId(segment) for segment in segment_cov]
     frames = [m.getFrameId(model.point_frames[point]) for point in points]
     cov_W = np.stack(list(segment_cov.values()), axis=1)  # (n, k, 3, 3)
+    shared, order = np.zeros((len(q), k, k)), list(segment_cov)
+    for (near, far), cov in heading_cov.items():
+        shared[:, order.index(near), order.index(far)] = shared[:, order.index(far), order.index(near)] = cov
     by_length = [_find_length_vectors(model, data, point) if lengths_cov.any() else [] for point in points]
     out = np.empty((len(points), len(q), 3, 3))
     for row, values in enumerate(np.ascontiguousarray(q)):
@@ -692,6 +701,7 @@ def _propagate_through_joints(
             gain = pin.getFrameJacobian(m, data, frame, pin.LOCAL_WORLD_ALIGNED)[:3] @ inverse  # (3, 3 k)
             parts = gain.reshape(3, k, 3).swapaxes(0, 1)
             out[i, row] = np.sum(parts @ cov_W[row] @ parts.swapaxes(1, 2), axis=0)
+            out[i, row] += parts[:, :, 2].T @ shared[row] @ parts[:, :, 2]
             if by_length[i]:
                 along = sum(R_WK @ part for R_WK, part in by_length[i])
                 out[i, row] += along @ lengths_cov @ along.T
@@ -725,6 +735,18 @@ def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str 
         own = model.table.segments.get(segment)
         segment = model.parents[segment] if own is not None and own.rigid_without_sensor else None
     return segment
+
+
+def _add_shared_heading(cov: np.ndarray, near: np.ndarray, far: np.ndarray, shared: np.ndarray) -> None:
+    """Add to `cov` (n, 3, 3) [m²] that the headings of two vectors (n, 3) [m] in W covary by `shared` (n,) [rad²].
+
+    A heading error ε moves the end of a vector by ε e_z × v.
+    """
+    cross = -shared * (near[:, 1] * far[:, 0] + near[:, 0] * far[:, 1])
+    cov[:, 0, 0] += 2.0 * shared * near[:, 1] * far[:, 1]
+    cov[:, 1, 1] += 2.0 * shared * near[:, 0] * far[:, 0]
+    cov[:, 0, 1] += cross
+    cov[:, 1, 0] += cross
 
 
 def _build_skew_matrices(v: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """The error budget: the contribution of each source of error to the standard deviation of each point.
 
 The contributions add up in variance. They are independent of one another but for lengths and girdles, whose
-correlation goes to the lengths.
+correlation goes to the lengths, and the headings of segments, whose correlations go to the parts of the sensors, in
+proportion to these.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ class ErrorBudget:
 
     def __init__(self) -> None:
         self._variances: dict[str, dict[str, float]] = {}  # point → part → sum over samples [m²], mean of the axes
+        self._correlated: dict[str, float] = {}  # point → what correlated headings add, summed likewise
         self._samples = self._received = 0
 
     def add(self, tracked: TrackedRecording) -> None:
@@ -61,6 +63,9 @@ class ErrorBudget:
                 sums = self._variances.setdefault(point, {})
                 for value in values.tolist():  # one by one: a sum of sums would depend on the chunks
                     sums[part] = sums.get(part, 0.0) + value
+        for point, independent in variances(total, shape_cov).items():
+            correlated = np.trace(pose.point_cov[point][rows], axis1=1, axis2=2) / 3.0 - independent
+            self._correlated[point] = sum(correlated.tolist(), self._correlated.get(point, 0.0))
         self._samples += len(rows)
 
     def summarize(self) -> dict[str, dict[str, float]]:
@@ -69,7 +74,10 @@ class ErrorBudget:
         Parts below a tenth of a millimetre are left out.
         """
         budget = {}
-        for point, parts in self._variances.items():
+        for point, independent in self._variances.items():
+            sensors = sum(value for part, value in independent.items() if part.endswith(SENSOR))
+            ratio = 1.0 + self._correlated[point] / sensors if sensors else 1.0
+            parts = {p: value * ratio if p.endswith(SENSOR) else value for p, value in independent.items()}
             std = {part: float(np.sqrt(max(value, 0.0) / self._samples)) for part, value in parts.items()}
             ordered = sorted(std.items(), key=lambda item: -item[1])
             budget[point] = {part: value for part, value in ordered if value >= 1e-4}

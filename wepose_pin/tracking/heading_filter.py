@@ -382,13 +382,13 @@ class SmoothedHeadings(NamedTuple):
     Parameters
     ----------
     errors, covariance : (m, k) [rad] and (m, k, k) [rad²] of δ
-    segment_var : (m, k) [rad²] of the segments' headings, see `HeadingProblem.find_segment_variance`
+    segment_covariance : (m, k, k) [rad²] of the segments' headings, see `HeadingProblem.find_segment_covariance`
     clasps : [s] intervals in which points were found to coincide
     """
 
     errors: np.ndarray
     covariance: np.ndarray
-    segment_var: np.ndarray
+    segment_covariance: np.ndarray
     clasps: tuple[tuple[float, float], ...]
 
 
@@ -401,7 +401,7 @@ def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> SmoothedHeadings:
         changes.append(forward.step(knot))
         filtered.append((forward.x, forward.P))
     x, P = filtered[-1]
-    means, covs, segment_vars = [x[:k]], [P[:k, :k]], [problem.find_segment_variance(P)]
+    means, covs, of_segments = [x[:k]], [P[:k, :k]], [problem.find_segment_covariance(P)]
     for i in range(len(knots) - 2, -1, -1):
         forward.x, forward.P = filtered[i]
         forward.predict(changes[i + 1])
@@ -410,6 +410,6 @@ def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> SmoothedHeadings:
         P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)
         means.append(x[:k])
         covs.append(P[:k, :k])
-        segment_vars.append(problem.find_segment_variance(P))
-    errors, covariance, segment_var = (np.array(each[::-1]) for each in (means, covs, segment_vars))
-    return SmoothedHeadings(errors, covariance, segment_var, tuple(forward.clasps))
+        of_segments.append(problem.find_segment_covariance(P))
+    errors, covariance, segment_covariance = (np.array(each[::-1]) for each in (means, covs, of_segments))
+    return SmoothedHeadings(errors, covariance, segment_covariance, tuple(forward.clasps))

@@ -238,15 +238,15 @@ class HeadingProblem:
     def size_without_levers(self) -> int:
         return self.find_column("force", 3 * len(self.names))
 
-    def find_segment_variance(self, P: np.ndarray) -> np.ndarray:
-        """Find the variance (k,) [rad²] of the segments' headings near the start pose, in the covariance of the state.
+    def find_segment_covariance(self, P: np.ndarray) -> np.ndarray:
+        """Find the covariance (k, k) [rad²] of the segments' headings near the start pose, in that of the state.
 
         δ begins at s − ε_z, by errors s of the start pose and ε_z of the mount, and grows by the drift; a segment that
         hangs is off by δ + ε_z.
         """
         k, first = len(self.names), self.find_column("mount", 0)
         mounts = slice(first, first + k)
-        return np.asarray(np.diag(P)[:k] + np.diag(P)[mounts] + 2.0 * np.diag(P[:k, mounts]))
+        return np.asarray(P[:k, :k] + P[mounts, mounts] + P[:k, mounts] + P[mounts, :k])
 
     def find_column(self, state: str, index: int) -> int:
         """Find the column of a state; `index` is that of its segment, joint or hinge, of a force 3 times that."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -69,12 +70,42 @@ class HeadingCorrection(NamedTuple):
     segments: tuple[str, ...] = ()  # of the k rows of `covariance`
     time: np.ndarray = np.zeros(0)  # (m,) [s] of the covariances
     covariance: np.ndarray = np.zeros((0, 0, 0))  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
+    segment_covariance: np.ndarray = np.zeros((0, 0, 0))  # (m, k, k) [rad²] of the segments' headings
+    delay_s: float | None = None  # [s] after which a causal covariance is used; None: interpolated, offline
 
     def relative_std(self, near: str, far: str, time: np.ndarray) -> np.ndarray:
         """Return the standard deviation (n,) [rad] of the heading between two segments at these times [s]."""
         i, j = self.segments.index(near), self.segments.index(far)
         variance = self.covariance[:, i, i] + self.covariance[:, j, j] - 2.0 * self.covariance[:, i, j]
         return np.asarray(np.sqrt(np.interp(time, self.time, variance)))
+
+    def correlate_segments(
+        self, time: np.ndarray, segment_cov: Mapping[str, np.ndarray]
+    ) -> dict[tuple[str, str], np.ndarray]:
+        """Return two segments → the covariance (n,) [rad²] of their headings at these times [s].
+
+        Neighbours share what one tells of the other. Where `segment_cov` (n, 3, 3) [rad²] in W, given for each segment,
+        states less than the heading filter knew, the correlation stays and the covariance shrinks.
+        """
+        names = [name for name in self.segments if name in segment_cov]
+        rows = [self.segments.index(name) for name in names]
+        if not len(self.time):
+            return {}
+        scale = []
+        for name, i in zip(names, rows, strict=True):
+            variance = self._read(self.segment_covariance[:, i, i], time)
+            with np.errstate(divide="ignore"):
+                scale.append(np.sqrt(np.minimum(1.0, find_conditional_heading_variance(segment_cov[name]) / variance)))
+        return {
+            (names[a], names[b]): scale[a] * scale[b] * self._read(self.segment_covariance[:, rows[a], rows[b]], time)
+            for a, b in combinations(range(len(names)), 2)
+        }
+
+    def _read(self, values: np.ndarray, time: np.ndarray) -> np.ndarray:
+        """Return what is known (n,) at these times [s] of `values` (m,) at the knots; causally 0 before the first."""
+        if self.delay_s is None:
+            return np.asarray(np.interp(time, self.time, values))
+        return np.concatenate(([0.0], values))[np.searchsorted(self.time, time - self.delay_s, side="right")]
 
 
 def find_stride(rate_hz: float) -> int:
@@ -359,7 +390,7 @@ class HeadingCorrector:
                 with_heading, filter_var = filter_cov
                 start_var = compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
                 before = filter_var + start_var
-                variance = np.interp(chunk.time, self._knot_times, self._smoothed.segment_var[:, i])
+                variance = np.interp(chunk.time, self._knot_times, self._smoothed.segment_covariance[:, i, i])
                 # The filter alone may know the heading better; to it a correction is an error of that size.
                 variance = np.minimum(variance, before + delta**2)
                 gap = chunk.sensors[name].gap
@@ -395,6 +426,7 @@ class HeadingCorrector:
             segments=self._names,
             time=self._knot_times,
             covariance=self._smoothed.covariance,
+            segment_covariance=self._smoothed.segment_covariance,
         )
 
     def _add_residuals(self, stage: str, time: np.ndarray, R_WL: np.ndarray) -> None:
@@ -451,7 +483,7 @@ class CausalHeadings:
         self.variance = self._find_variances()
         self._max_correction = np.zeros(len(problem.names))
         self._marked: dict[str, list[tuple[int, int | None]]] = {}  # phase → first sample, and the one after the last
-        self._history: list[tuple[float, np.ndarray]] = []
+        self._history: list[tuple[float, np.ndarray, np.ndarray]] = []
 
     @property
     def phases(self) -> set[str]:
@@ -521,7 +553,8 @@ class CausalHeadings:
         yield from self._filter.step_gradually(knot)
         k = len(filters.var)
         if self._record:
-            self._history.append((self._start_end + knot.end, self._filter.P[:k, :k].copy()))
+            P = self._filter.P
+            self._history.append((self._start_end + knot.end, P[:k, :k].copy(), self._problem.find_segment_covariance(P)))
 
     def _apply(self) -> None:
         """Finish the last knot; its correction fades in from the next sample on."""
@@ -548,7 +581,7 @@ class CausalHeadings:
 
     def _find_variances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what `variance` is now."""
-        of_segments = self._problem.find_segment_variance(self._filter.P)
+        of_segments = np.diag(self._problem.find_segment_covariance(self._filter.P))
         return of_segments, self._var_at_knot, (self._end - self._undone - self._at_reset) ** 2
 
     def summarize(self) -> HeadingCorrection:
@@ -562,8 +595,10 @@ class CausalHeadings:
             hinges=tuple(hinge.joint for hinge in self._problem.hinges),
             found_clasps=tuple((self._start_end + a, self._start_end + b) for a, b in self._filter.clasps),
             segments=names,
-            time=np.array([time for time, _ in self._history]),
-            covariance=np.array([cov for _, cov in self._history]),
+            time=np.array([time for time, _, _ in self._history]),
+            covariance=np.array([cov for _, cov, _ in self._history]),
+            segment_covariance=np.array([cov for _, _, cov in self._history]),
+            delay_s=self._problem.knot_s,
         )
 
 
@@ -641,6 +676,17 @@ def _compute_filter_covariance(orientations: SegmentOrientations, name: str) -> 
 def compute_heading_covariance(R_VS: Rotation, attitude_cov: np.ndarray) -> np.ndarray:
     """Compute the covariance (n, 3) [rad²] of the heading with each axis of V, from that in S (n, 3, 3)."""
     return np.asarray(R_VS.apply(np.einsum("nab,nb->na", attitude_cov, R_VS.inv().apply([0.0, 0.0, 1.0]))))
+
+
+def find_conditional_heading_variance(cov_W: np.ndarray) -> np.ndarray:
+    """Find the variance (n,) [rad²] of the heading where the tilt is known, of covariances (n, 3, 3) [rad²] in W.
+
+    As much of `cov_W` may be shared with other segments.
+    """
+    xx, xy, yy = cov_W[:, 0, 0], cov_W[:, 0, 1], cov_W[:, 1, 1]
+    xz, yz, zz = cov_W[:, 0, 2], cov_W[:, 1, 2], cov_W[:, 2, 2]
+    explained = (yy * xz**2 - 2.0 * xy * xz * yz + xx * yz**2) / (xx * yy - xy**2)
+    return np.asarray(np.maximum(zz - explained, 0.0))
 
 
 def replace_heading_variance(

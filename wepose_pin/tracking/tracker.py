@@ -129,18 +129,20 @@ class Tracker:
                 body, segments.quat_WL, limits=self.options.limits, start=tracked_body.start
             )
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
-        shape_cov = person.shape_covariance(body.table)
-        pose = replace(
-            pose,
-            segment_cov=segments.covariance_W,
-            point_cov=compute_point_covariances(body, pose.quat_WL, segments.covariance_W, shape_cov, pose.q)
-            if self._with_point_cov
-            else {},
-            gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
-        )
         first = self._estimator.first if isinstance(self._estimator, DoubledEstimator) else self._estimator
         headings = first.headings if isinstance(first, CausalEstimator) else self._headings
         correction = None if headings is None else headings.summarize()
+        point_cov: dict[str, np.ndarray] = {}
+        if self._with_point_cov:
+            segment_cov, shape_cov = segments.covariance_W, person.shape_covariance(body.table)
+            shared = {} if correction is None else correction.correlate_segments(recording.time, segment_cov)
+            point_cov = compute_point_covariances(body, pose.quat_WL, segment_cov, shape_cov, pose.q, shared)
+        pose = replace(
+            pose,
+            segment_cov=segments.covariance_W,
+            point_cov=point_cov,
+            gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
+        )
         return TrackedRecording(recording.name, pose, body, person, recording, segments, self.options, correction)
 
 
