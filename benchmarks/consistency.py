@@ -27,7 +27,9 @@ from wepose_pin.simulation import (
 )
 from wepose_pin.subject import Subject, mount_rows
 from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.validation.contenders import list_contenders
 from wepose_pin.validation.mounting import compute_mount_errors
+from wepose_pin.validation.paper import orient_recording
 
 FIRST_SEED = 5000  # of persons that no other measurement or test draws
 CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand")
@@ -48,21 +50,29 @@ def measure_sessions(seed: int, preset: str, sessions: int) -> list[dict[str, An
     return results
 
 
-def measure_person(seed: int, preset: str, protocol: str = "clasp") -> dict[str, Any]:
-    """Errors [m, rad] and standard deviations of a person, by quantity: lists of pairs."""
+def measure_person(seed: int, preset: str, protocol: str = "clasp", trackers: bool = False) -> dict[str, Any]:
+    """Errors [m, rad] and standard deviations of a person, by quantity: lists of pairs; of `trackers` as `run`."""
     person = simulate_person(seed, PEOPLE_MEASURED_STD if preset == "people" else MEASURED_STD)
     simulation = simulate(
         person.lengths, seed=seed, imperfections=replace(PRESETS[preset], mount="any"), protocol=protocol
     )
-    return {"seed": seed, **measure_simulation(person, simulation, protocol)}
+    return {"seed": seed, **measure_simulation(person, simulation, protocol, trackers)}
 
 
-def measure_simulation(person: Person, simulation: Simulation, protocol: str = "clasp") -> dict[str, Any]:
+def measure_simulation(
+    person: Person, simulation: Simulation, protocol: str = "clasp", trackers: bool = False
+) -> dict[str, Any]:
     """As `measure_person`, of what was simulated."""
     recording = simulation.recording()
+    if trackers:
+        recording, _ = orient_recording(recording, list_contenders("real")[0]._replace(method=None))
     try:
         calibration = calibrate(
-            recording, measured=person.measured, prior=person.prior, measured_std=person.measured_std, protocol=protocol
+            replace(recording, remounted=True),  # all mounts are unknown
+            measured=person.measured,
+            prior=person.prior,
+            measured_std=person.measured_std,
+            protocol=protocol,
         )
     except WeposeError as error:
         return {"error": str(error)}
@@ -88,7 +98,14 @@ def compare_subject(subject: Subject, person: Person, simulation: Simulation) ->
         std = [subject.std(row) for row in mount_rows(name)]
         tilts += list(zip(error[:2], std[:2], strict=True))
         headings.append((error[2], std[2]))
-    return {"lengths": lengths, "whole arms": arms, "mounts, tilt": tilts, "mounts, heading": headings}
+    torso = headings[list(simulation.quat_LS).index("torso")]
+    return {
+        "lengths": lengths,
+        "whole arms": arms,
+        "mounts, tilt": tilts,
+        "mounts, heading": headings,
+        "torso, heading": [torso],
+    }
 
 
 def _compare_pose(tracked: TrackedRecording, simulation: Simulation) -> dict[str, Any]:
@@ -162,12 +179,21 @@ def run_sessions(presets: list[str], persons: int, first: int, workers: int, ses
             print_summary(f"{preset}, session {session + 1}", [person[session] for person in results])
 
 
-def run(presets: list[str], persons: int, first: int = FIRST_SEED, workers: int = 2, protocol: str = "clasp") -> None:
-    """Measure and print."""
+def run(
+    presets: list[str],
+    persons: int,
+    first: int = FIRST_SEED,
+    workers: int = 2,
+    protocol: str = "clasp",
+    trackers: bool = False,
+) -> None:
+    """Measure and print; `trackers`: sensors measure orientations, by the default filter, and no accelerations."""
     for preset in presets:
         with ProcessPoolExecutor(workers) as pool:
             seeds = range(first, first + persons)
-            results = list(pool.map(measure_person, seeds, [preset] * persons, [protocol] * persons))
+            results = list(
+                pool.map(measure_person, seeds, *zip(*[(preset, protocol, trackers)] * persons, strict=True))
+            )
         print_summary(preset, results)
 
 
@@ -181,9 +207,11 @@ if __name__ == "__main__":
     parser.add_argument("--workers", type=int, default=2, help="processes")
     parser.add_argument("--sessions", type=int, default=1, help="of each person, each with the last subject as prior")
     parser.add_argument("--protocol", default="clasp", help="of the calibration")
+    parser.add_argument("--trackers", action="store_true", help="sensors measure orientations and no accelerations")
     options = parser.parse_args()
     if options.sessions > 1:
         chosen = options.preset or list(PRESETS)
         run_sessions(chosen, options.persons, options.first, options.workers, options.sessions)
         raise SystemExit
-    run(options.preset or list(PRESETS), options.persons, options.first, options.workers, options.protocol)
+    presets = options.preset or list(PRESETS)
+    run(presets, options.persons, options.first, options.workers, options.protocol, options.trackers)

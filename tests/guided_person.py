@@ -27,11 +27,13 @@ TRACKERS = tuple(f"4c:11:ae:00:00:a{k}/0" for k in range(5))
 
 
 @lru_cache(maxsize=4)
-def perform(seed: int = 3, clasp_s: float = 100.0, preset: str = "mild", mount: str = "any") -> Simulation:
+def perform(
+    seed: int = 3, clasp_s: float = 100.0, preset: str = "mild", mount: str = "any", protocol: str = "clasp"
+) -> Simulation:
     """A person whose clasp lasts longer than the guide asks for."""
     lengths = simulate_person(seed).lengths
     imperfections = replace(PRESETS[preset], mount=mount, dropped=0.0)
-    return simulate(lengths, seed=seed, imperfections=imperfections, clasp_s=clasp_s, circles=0)
+    return simulate(lengths, seed=seed, imperfections=imperfections, clasp_s=clasp_s, circles=0, protocol=protocol)
 
 
 class GuidedPerson:
@@ -39,7 +41,7 @@ class GuidedPerson:
 
     Attributes
     ----------
-    doing : "stand", "clasp", or "shake SEGMENT"
+    doing : "stand", "clasp", "await bow", "bow", or "shake SEGMENT"
     silent : segments whose sensors send nothing
     hurries : returns to the start pose faster than the motion went
     worn : sensor → segment that it sits on
@@ -57,7 +59,8 @@ class GuidedPerson:
         """Do what the guide's view says."""
         shakes = step == "assignment" and highlight
         self.doing = f"shake {highlight}" if shakes else "clasp" if step in ("clasp", "quality") else "stand"
-        del countdown
+        if step == "bow":
+            self.doing = "bow" if countdown is None else "await bow"
 
     def step(self) -> tuple[float, dict[str, tuple[np.ndarray, np.ndarray]]]:
         """Time [s] of the next sample, and sensor → gyro (3,) and accel (3,)."""
@@ -70,6 +73,8 @@ class GuidedPerson:
             self._direction = 1
         returns = self.hurries and self._direction < 0 and self._k > STAND[1] + RETURN_FASTER
         self._k += self._direction * (RETURN_FASTER if returns else 1)
+        if self.doing.endswith("bow"):
+            self._k = self._go_to_bow(before)
         row = max(before, self._k)  # the rate over the interval between the two
         self._sent += 1
         time_s = self._sent / RATE_HZ
@@ -87,6 +92,13 @@ class GuidedPerson:
             else:
                 samples[sensor] = gyro, simulation.accel_S[segment][self._k]
         return time_s, samples
+
+    def _go_to_bow(self, row: int) -> int:
+        """The row after this one: quickly to the bow, which waits until it is asked for, then through it."""
+        begin, end = np.searchsorted(self.simulation.time, self.simulation.phases["bow"][0]).tolist()
+        if row < begin or row >= end:
+            return max(row, min(row + RETURN_FASTER, begin))
+        return row + 1 if self.doing == "bow" else row
 
     def _orient(self, segment: str, time_s: float) -> np.ndarray:
         """Orientation (4,) xyzw of a segment in W, or of its sensor in a world of its own; a shake turns it."""

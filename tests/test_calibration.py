@@ -235,8 +235,8 @@ def test_wrong_requests_are_named(exact: tuple[Person, Recording]) -> None:
         calibrate(recording, measured={"sholder_width": 0.38})
     with pytest.raises(BadOption, match=r"measured shoulder_width=38: a length in metres"):
         calibrate(recording, measured={"shoulder_width": 38.0})
-    with pytest.raises(BadOption, match="protocol 'bow' is not known"):
-        calibrate(recording, protocol="bow")
+    with pytest.raises(BadOption, match="protocol 'stoop' is not known"):
+        calibrate(recording, protocol="stoop")
     with pytest.raises(BadPhase, match=r"phases\.clasp is needed"):
         calibrate(replace(recording, phases={"start": recording.phases["start"]}))
     fewer = {name: sensor for name, sensor in recording.sensors.items() if name != "left_forearm"}

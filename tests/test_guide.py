@@ -23,8 +23,9 @@ from wepose_pin.calibration import Calibration, CalibrationQuality, assess, cali
 from wepose_pin.calibration.observability import format_longest
 from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadSession
-from wepose_pin.jobs.guide import choose_parts
+from wepose_pin.jobs.guide import choose_parts, choose_protocol
 from wepose_pin.jobs.live import LiveJob, run_live
+from wepose_pin.live import open_source
 from wepose_pin.live.assignment import AssignedSource, ShakeDetector, read_segments, write_segments
 from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
 from wepose_pin.live.guide_motion import count_from_begin
@@ -335,6 +336,32 @@ def test_the_parts_of_a_protocol_whose_phases_are_there() -> None:
     assert choose_parts("clasp", {"start", "clasp"}) == "clasp"
 
 
+@pytest.mark.parametrize(
+    ("source", "mounts", "protocol"),
+    [
+        ("slimevr:6969", {}, "clasp+bow"),
+        ("slimevr:6969", {"torso": np.array([0.0, 0.0, 0.0, 1.0])}, "clasp"),
+        ("slimevr:6969", {"left_forearm": np.array([0.0, 0.0, 0.0, 1.0])}, "clasp+bow"),
+        ("mvn:9763", {}, "clasp"),
+        ("udp:9000", {}, "clasp"),
+    ],
+)
+def test_who_wears_trackers_bows_unless_the_torsos_mount_is_stated(
+    source: str, mounts: dict[str, np.ndarray], protocol: str
+) -> None:
+    model = load_model()
+    opened = open_source(source, segments=list(model.table.segments), any_name=True)
+    assert choose_protocol(opened, SensorSetup(mounts=mounts), model) == protocol
+
+
+@pytest.mark.parametrize("protocol", ["clasp", "clasp+bow"])
+def test_without_a_bow_trackers_are_told_what_is_missing(tmp_path: Path, protocol: str) -> None:
+    person = GuidedPerson(perform(*PERSON), orientations="sensor")
+    guide = Guide(PersonSource(person), make_options(tmp_path, None, {}, protocol), make_steps)
+    reasons = guide.view().reasons
+    assert [("+bow" in reason) for reason in reasons] == [True] * (protocol == "clasp")
+
+
 def test_a_setup_with_a_wrong_segment_is_refused(tmp_path: Path) -> None:
     for text, said in (
         ('format = 1\n[sensors]\na = "tail"', "sensors.a = 'tail' is not a segment"),
@@ -394,7 +421,7 @@ class Follower(Output):
             self.person.follow("", "", None)
             return
         step = next(step.name for step in guide.steps if step.state == "now")
-        self.person.follow(step, guide.highlight, None)
+        self.person.follow(step, guide.highlight, guide.countdown)
         if step not in self.steps:
             self.steps.append(step)
         if guide.actions and (step, guide.actions[0].name) in PRESSED:
@@ -407,13 +434,8 @@ class Follower(Output):
 
 @pytest.mark.slow
 def test_trackers_are_guided_and_a_robot_follows_at_once(tmp_path: Path) -> None:
-    """The command as a person without a screen runs it: trackers of no stated place, a stated torso, a robot's arm."""
-    simulation = perform(*PERSON, mount="stated")
-    up, forward = simulation.stated_mount["torso"]
-    (tmp_path / "session.toml").write_text(
-        f'name = "trackers"\n[data]\nfile = "none.csv"\ntime = "t"\n[sensors.torso]\n'
-        f'orientation = ["x", "y", "z", "w"]\nmount = {{ up = "{up}", forward = "{forward}" }}\n'
-    )
+    """The command as a person without a screen runs it: trackers of no stated place and mount, a robot's arm."""
+    simulation = perform(*PERSON, protocol="clasp+bow")
     protocol = asset("calibration", "clasp.toml").read_text(encoding="utf-8")
     (tmp_path / "short.toml").write_text(protocol.replace("seconds = 60", "seconds = 24"), encoding="utf-8")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver, socket.socket(type=socket.SOCK_DGRAM) as free:
@@ -437,8 +459,7 @@ def test_trackers_are_guided_and_a_robot_follows_at_once(tmp_path: Path) -> None
             f"slimevr:{port}",
             guide=True,
             out=tmp_path / "anna",
-            session=tmp_path / "session.toml",
-            protocol=str(tmp_path / "short.toml"),
+            protocol=f"{tmp_path / 'short.toml'}+bow",
             measured=MEASURED,
             page=False,
             robot=str(write_arm(tmp_path)),
@@ -447,7 +468,7 @@ def test_trackers_are_guided_and_a_robot_follows_at_once(tmp_path: Path) -> None
         )
         with TrackerPerson(person, port):
             outcome = run_live(job, views=[view], stop=contextlib.nullcontext(stop))
-    assert view.steps == ["sensors", "assignment", "static", "start", "clasp", "quality"]
+    assert view.steps == ["sensors", "assignment", "static", "start", "clasp", "bow", "quality"]
     assert read_segments(tmp_path / "anna", load_model().table.segments) == person.worn
     assert {"hold", "approach", "follow"} <= states
     assert outcome.session is not None

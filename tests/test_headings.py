@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import wepose_pin as wp
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate
 from wepose_pin.filters import AboutVertical
+from wepose_pin.kinematics import compute_axis_std, compute_point_covariances
 from wepose_pin.model import load_model
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.rotations import heading
@@ -426,3 +428,32 @@ def test_hinges_hold_for_the_strapping_in_which_they_were_found(made: tuple[Simu
     assert usual.correction is not None
     assert not np.array_equal(calibrated.quat_WL["right_forearm"], usual.quat_WL["right_forearm"])
     assert all(np.array_equal(remounted.quat_WL[name], quat) for name, quat in usual.quat_WL.items())
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_headings_known_from_each_other_are_uncertain_together(made: tuple[Simulation, Subject], causal: bool) -> None:
+    """A limb is turned as a whole: what two segments share, and the covariance of all is one."""
+    simulation, subject = made
+    subject = replace(subject, mounts=simulation.quat_LS)
+    tracked = track(simulation.recording(), subject, causal=causal)
+    assert tracked.correction is not None
+    shared = tracked.correction.correlate_segments(tracked.time, tracked.pose.segment_cov)
+    names = list(tracked.pose.segment_cov)
+    assert {frozenset(pair) for pair in shared} == {frozenset(pair) for pair in combinations(names, 2)}
+    rows = np.arange(0, len(tracked.time), 500)
+    together = np.zeros((len(rows), 3 * len(names), 3 * len(names)))
+    for i, name in enumerate(names):
+        together[:, 3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = tracked.pose.segment_cov[name][rows]
+    for (near, far), cov in shared.items():
+        i, j = 3 * names.index(near) + 2, 3 * names.index(far) + 2
+        together[:, i, j] = together[:, j, i] = cov[rows]
+    assert np.linalg.eigvalsh(together).min() > -1e-12
+    heading = together[-1, 2::3, 2::3]
+    correlation = heading / np.sqrt(np.outer(np.diag(heading), np.diag(heading)))
+    assert correlation[names.index("right_upper_arm"), names.index("right_forearm")] > 0.1
+    # The ends of the limbs show it.
+    apart = compute_point_covariances(
+        tracked.model, tracked.quat_WL, tracked.pose.segment_cov, subject.shape_covariance(TABLE)
+    )
+    palm = compute_axis_std(tracked.pose.point_cov["right_palm"]) / compute_axis_std(apart["right_palm"])
+    assert np.abs(palm - 1.0).max() > 0.01

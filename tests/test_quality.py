@@ -141,15 +141,15 @@ CASES: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, st
         "fail",
         [("sensors-exchanged", "torso and right_upper_arm", "")],
     ),
-    "twelve seconds of motion": (
-        lambda r: replace(r, phases={**r.phases, "clasp": ((20.0, 32.0),)}),
+    "eight seconds of motion": (
+        lambda r: replace(r, phases={**r.phases, "clasp": ((20.0, 28.0),)}),
         "fail",
         [("mount-heading-uncertain", "torso", "coincide")],
     ),
 }
 
 
-QUICK = ("as it should be", "the forearms exchanged", "twelve seconds of motion")
+QUICK = ("as it should be", "the forearms exchanged", "eight seconds of motion")
 
 
 def codes(quality: CalibrationQuality) -> list[str]:

@@ -121,7 +121,7 @@ def draws(motion: Motion, count: int, seed: int = 0) -> Iterator[Draw]:
         for name in SENSORS:
             psi, drift = rng.uniform(-np.pi, np.pi), rng.normal(scale=DRIFT_STD)
             tilt = Rotation.from_rotvec([*rng.normal(scale=TABLE.segments[name].start_std[:2]), 0.0])
-            tissue = rng.normal(scale=TABLE.segments[name].soft_tissue_std, size=(3, 3))
+            tissue = rng.normal(size=(3, 3)) * np.array(TABLE.segments[name].soft_tissue_std)[:, None]
             turned = R_WL[name]
             for _ in range(8):
                 turned = R_WL[name] * Rotation.from_rotvec((turned.inv().apply(UP) - UP) @ tissue.T).inv()

@@ -85,7 +85,7 @@ class Pointing:
 
 @dataclass(frozen=True)
 class Level:
-    """The segment turns forwards about `axis` (3,), which stays level to within `std` [rad]."""
+    """The segment bends about `axis` (3,), level in the start pose; people bend about one within `std` [rad] of it."""
 
     segment: str
     axis: Vector

@@ -14,8 +14,8 @@ s, A and the hinges are nuisance parameters: the covariance of lengths and mount
 Each sample belongs to one condition of the protocol. A closure (`Loop`) gives the gap, whitened by the covariance that
 errors of the orientations and slipping palms give it, and of each hinge the angle by which the segment that it moves
 leaves its plane. The covariance depends on the lengths, so that scaling all lengths does not shrink the residual (see
-`lengths`). A stated pose (`Pointing`) gives the deviation of a segment from its direction, an axis (`Level`) its
-deviation from the horizontal. Each sample has the same residuals: three of its condition and one a hinge; those that do
+`lengths`). A stated pose (`Pointing`) gives the deviation of a segment from its direction, an axis (`Level`) how far it
+rises while the segment bends. Each sample has the same residuals: three of its condition and one a hinge; those that do
 not apply are zero.
 """
 
@@ -285,8 +285,10 @@ def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any
         )
         whitened = (along - ca.DM(condition.direction)) / condition.std
     else:
-        level = rotate(quat_WL[condition.segment], ca.DM(condition.axis))[2]
-        whitened = ca.vertcat(level / condition.std, 0.0, 0.0)
+        i, axis = sensors.index(condition.segment), ca.DM(condition.axis)
+        before = rotate(small_turn(ca.vertcat(tilt[2 * i], tilt[2 * i + 1], 0.0)), axis)
+        rise = rotate(quat_WL[condition.segment], axis)[2] - before[2]
+        whitened = ca.vertcat(rise / condition.std, 0.0, 0.0)
     r = ca.cse(ca.vertcat(whitened, hinges))
     return ca.Function("sample", [x, data], ca.cse([r, ca.densify(ca.jacobian(r, x)).T, ca.densify(gap)]))
 

@@ -106,8 +106,8 @@ def calibrate(
         The body, or its file or name as for `load_model`; None: that which the recording states, else the upper body.
     protocol : str, Path or Protocol, optional
         What the person did in which phase: the name of a protocol, such as "clasp" or "free", a .toml file, or what
-        `wepose_pin.calibration.load_protocol` returned; None: "clasp", and "t_pose" if the recording has that phase
-        and the formulation is not "paper".
+        `wepose_pin.calibration.load_protocol` returned; None: "clasp", with "t_pose" and "bow" if the recording has
+        those phases and the formulation is not "paper".
     method : str
         The orientation filter: "amekf", "smoother", "smekf", "ncf" or "gdc", as in `estimate_orientation`.
     measured_std : float

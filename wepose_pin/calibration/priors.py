@@ -25,6 +25,7 @@ from .sample_losses import FREE_STD, HEADING_STD
 # Priors, one standard deviation. A stated mount names sensor axes, estimated by eye.
 STATED_STD = np.deg2rad(10.0)  # [rad] of a stated mount's heading
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
+LEAST_SOFT_TISSUE = 1e-4  # [rad/rad] about an axis that a table states as rigid
 LEAST_GIRDLE_STD = 1e-5  # [m] of a parameter that a table states as exact
 POINT_STD = 3.0  # [m] of an unknown point of W
 
@@ -58,8 +59,8 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
         mean[rows] += offset
     information[layout.drift, layout.drift] = np.eye(len(layout.sensors)) / DRIFT_STD**2
     segments = problem.model.table.segments
-    soft_tissue = [segments[name].soft_tissue_std for name in layout.soft]
-    information[layout.soft_tissue, layout.soft_tissue] = np.diag(np.repeat(soft_tissue, 9) ** -2.0)
+    soft_tissue = np.ravel([3 * segments[name].soft_tissue_std for name in layout.soft])
+    information[layout.soft_tissue, layout.soft_tissue] = np.diag(np.maximum(soft_tissue, LEAST_SOFT_TISSUE) ** -2.0)
     _add_hinges(information, layout, problem.model.table)
     return Gaussian(place_points(mean, observations), information)
 

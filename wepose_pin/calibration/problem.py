@@ -236,7 +236,7 @@ class CalibrationProblem:
             sum(closure.kind == "plane" for closure in protocol.closures),
             protocol.distances,
             recorded=any(closure.kind == "recorded" for closure in protocol.closures),
-            rigid=tuple(name for name in sensors if self.model.table.segments[name].soft_tissue_std == 0.0),
+            rigid=tuple(name for name in sensors if not any(self.model.table.segments[name].soft_tissue_std)),
             attitude_std=tuple(_estimate_attitude_std(self.model.table.segments[name]) for name in sensors),
         )
         losses = find_sample_losses(recording, filtered.start, layout.sensors)

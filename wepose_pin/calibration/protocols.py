@@ -10,7 +10,7 @@ those of the body's table (`wepose_pin.model.BodyTable`). There are four kinds o
 - ``[[motion]]``: limbs move freely. Hinges show headings and mounts, accelerations that two sensors share at a joint
   show headings; nothing shows lengths.
 - ``[[pose]]``: segments point in given directions of the body's first segment; `std_deg` is how well a person does it.
-- ``[[axis]]``: a segment turns forwards about its own y, as the torso in a bow.
+- ``[[axis]]``: a segment bends forwards about its own y, as the torso in a bow; `std_deg` is how far people are off.
 
 Names joined by "+", as in ``clasp+elbows``, are one protocol after another in the same session.
 
@@ -34,6 +34,7 @@ from ..errors import BadOption, one_of
 from ..model import BodyTable, list_breadths
 
 PROTOCOLS = (
+    "bow",
     "clasp",
     "clasp_measured",
     "elbows",
@@ -49,8 +50,8 @@ PROTOCOLS = (
     "touch_left",
     "touch_right",
 )
-DEFAULT = "clasp"
-ALSO = ("t_pose",)  # what makes it better within the same minute (docs/people.md), by phases of their names
+DEFAULT, WITH_BOW = "clasp", "clasp+bow"
+ALSO = ("t_pose", "bow")  # what makes it better within the same minute, by phases of their names
 # How many points each kind takes, and the keys that are its own.
 KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}
 _KEYS = ("phase", "kind", "points", "slip", "in_front_of")
@@ -119,7 +120,7 @@ class Direction:
 
 @dataclass(frozen=True)
 class Axis:
-    """The segment turns forwards about its own y, which stays level to within `std` [rad]."""
+    """The segment bends forwards about a level axis that is within `std` [rad] of its own y."""
 
     phase: str
     segment: str
@@ -210,7 +211,7 @@ class Protocol:
 
 
 def choose_protocol(phases: Collection[str], formulation: str = "full") -> str:
-    """The protocol of a recording with these phases where none is named: `DEFAULT`, with the T-pose if it was held.
+    """The protocol of a recording with these phases where none is named: `DEFAULT`, with those of `ALSO` that it has.
 
     The paper's formulation takes no poses.
     """

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..model.girdle import PARAMETERS
 from ..subject import mount_rows
-from .conditions import Loop, Moving, StartPose
+from .conditions import Level, Loop, Moving, StartPose
 from .least_squares import GAP_ROWS, HINGE_STD, Gaussian, Layout, Observations
 from .solver import STEPS, Fit, LeastSquares, solve
 
@@ -33,6 +33,7 @@ MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
 MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about right
 # [rad] by which people's elbows leave a hinge (docs/people.md): an oblique axis, and one that wanders.
 ELBOW_STD = np.deg2rad(4.0)
+LEAST_BEND = 0.2  # sine of the angle by which a segment must bend to show its axis
 CONTRADICTED = 3.0  # standard deviations between a measured length and what is known without it
 
 
@@ -87,6 +88,8 @@ def solve_reweighted(
         # The error of a pose is constant, and how an elbow leaves its hinge follows its angles: one effective sample.
         if not isinstance(condition, Loop):
             size = ELBOW_STD / HINGE_STD if isinstance(condition, Moving) else 1.0
+            if isinstance(condition, Level):
+                size = _measure_bend(observations, span, condition)
             weights[span] = size**-2 / (span.stop - span.start)
     effective = float(closed.sum())
     if not closed.any():
@@ -108,6 +111,14 @@ def solve_reweighted(
             weights[closed, GAP_ROWS:] = _weigh(fit.hinge[closed], np.ones(int(closed.sum())), correlation)
     fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, not quick)
     return WeightedFit(fit, weights, contact, effective)
+
+
+def _measure_bend(observations: Observations, span: slice, level: Level) -> float:
+    """The rms sine of the angle by which a segment bends: by so much its axis leaves the horizontal if it is off."""
+    first = 4 * observations.layout.sensors.index(level.segment)
+    x, y, _, _ = observations.data[first : first + 4, span]
+    cosine = 1.0 - 2.0 * (x**2 + y**2)
+    return max(float(np.sqrt(np.mean(1.0 - cosine**2))), LEAST_BEND)
 
 
 def _correlate_all(loop: Loop, span: slice) -> int:

@@ -37,14 +37,14 @@ class CalibrateJob:
     out : DIR
         Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     protocol : NAME|FILE.toml
-        Calibrate by this protocol. Without it clasp, and t_pose as well where the session has that phase (not with
-        --formulation paper). Protocols:
+        Calibrate by this protocol. Without it clasp, and t_pose and bow as well where the session has those phases (not
+        with --formulation paper). Protocols:
         clasp (hands together), clasp_measured (the same with a measured length), handle (hands on a bar of known
         length), touch_left or touch_right (one palm on a fixed point), table (both palms on a table), tip (of a robot's
         arm or another chain: its point "tip" on a fixed point), feet (of a body with legs: both on the floor),
         touch_body (palms on hips, shoulders, head), poses (T-pose and bow: determines headings and no lengths), t_pose,
-        elbows (elbows bend), swing (arms swing), free (any motion, no protocol: headings and mounts alone), or a file
-        of your own, made like those in calibration/.
+        bow, elbows (elbows bend), swing (arms swing), free (any motion, no protocol: headings and mounts alone), or a
+        file of your own, made like those in calibration/.
         Several in one session are joined by +, as in clasp+t_pose.
     model : NAME|FILE
         Calibrate this body: a name (upper_body, whole_body), a table of a body (.toml), or a URDF beside its table

@@ -74,7 +74,8 @@ def run_guide(
     from ..live.session import open_and_wait
 
     folder = make_guide_folder(job)
-    options = _make_options(job, folder, setup, model)
+    protocol = job.protocol or choose_protocol(source, setup, model)
+    options = _make_options(job, protocol, folder, setup, model)
     threading.Thread(target=warm_up, args=(job.method,), daemon=True).start()  # tracking begins without a wait then
     if not open_and_wait(source, views, until):
         return None
@@ -98,7 +99,16 @@ def _with_subject(setup: SensorSetup, folder: Path) -> SensorSetup:
     return replace(setup, subject=load_subject(folder))
 
 
-def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyModel) -> GuideOptions:
+def choose_protocol(source: Source, setup: SensorSetup, model: BodyModel) -> str:
+    """Choose the protocol where none is named: a bow follows where else nothing shows the reference's heading."""
+    from ..calibration.protocols import DEFAULT, WITH_BOW
+
+    trackers = source.measures_orientations and not source.aligned
+    known = model.table.is_mechanism or model.table.reference in setup.mounts
+    return WITH_BOW if trackers and not known else DEFAULT
+
+
+def _make_options(job: LiveJob, joined: str, folder: Path, setup: SensorSetup, model: BodyModel) -> GuideOptions:
     """What the guide does, by the functions that `wepose calibrate` calls too."""
     from ..calibration import assess, calibrate, load_protocol
     from ..calibration.protocols import split_protocol
@@ -109,7 +119,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
     from ..readers.subject import read_subject
     from ..subject import population_subject
 
-    protocol, parts = load_protocol(job.protocol), split_protocol(job.protocol)
+    protocol, parts = load_protocol(joined), split_protocol(joined)
     prior = read_subject(job.subject) if job.subject else population_subject(job.stature, None, model)
     order = tuple(model.table.segments)
 
@@ -119,7 +129,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
         calibration = CalibrateJob(
             path,
             out,
-            protocol=choose_parts(job.protocol, load_session(path).phases),
+            protocol=choose_parts(joined, load_session(path).phases),
             measured=lengths,
             stature=stature,
             prior=job.subject,
@@ -135,7 +145,7 @@ def _make_options(job: LiveJob, folder: Path, setup: SensorSetup, model: BodyMod
             measured=dict(job.measured),
             prior=prior,
             model=model,
-            protocol=load_protocol(choose_parts(job.protocol, recording.phases)),
+            protocol=load_protocol(choose_parts(joined, recording.phases)),
             method=job.method,
         )
         return calibration, assess(calibration)

@@ -41,7 +41,7 @@ class SimulateJob:
         Sample the sensors at this rate, 20 to 2000 Hz.
     protocol : NAME
         Simulate the motion of this calibration protocol (see `wepose calibrate --help`): clasp, handle, touch_left,
-        touch_right, poses; or clasp, elbows, swing, t_pose, touch_body, one or several joined by +. Without it
+        touch_right, poses; or bow, clasp, elbows, swing, t_pose, touch_body, one or several joined by +. Without it
         clasp+t_pose, or clasp alone for less than 30 s.
     activity
         Simulate an activity in place of a protocol. Of the whole body, with sensors on pelvis, head, hands and legs

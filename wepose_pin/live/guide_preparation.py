@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..calibration.protocols import Axis
 from ..recording.arrivals import Samples, Ticks
 from ..recording.limits import GRAVITY_ERROR_NOTED, STANDARD_GRAVITY
 from ..tracking.start_pose import StartPoseDetector, TickRates
@@ -44,14 +45,16 @@ class SensorStep(Step):
 
     def _warn_of_trackers(self) -> tuple[str, ...]:
         """What the motion cannot show of sensors that measure orientations in worlds of their own."""
-        table, setup = self.guide.options.table, self.guide.options.setup
+        table, setup, protocol = self.guide.options.table, self.guide.options.setup, self.guide.options.protocol
         trackers = [name for name, aligned in self.guide.source.orientations.items() if not aligned]
-        if table.is_mechanism or not trackers or table.reference in setup.mounts:
+        bows = any(isinstance(each, Axis) and each.segment == table.reference for each in protocol.conditions)
+        if table.is_mechanism or not trackers or bows or table.reference in setup.mounts:
             return ()
         place = join_names([table.reference])
         return (
             f"These sensors measure orientations and no accelerations: the motion does not show how the one on the "
-            f"{place} is turned, and the calibration will not pass. State its mount, as docs/live-guide.md says.",
+            f"{place} is turned, and the calibration will not pass. Add a bow to the protocol (+bow), or state that "
+            f"sensor's mount, as docs/live-guide.md says.",
         )
 
 

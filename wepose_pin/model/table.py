@@ -68,7 +68,8 @@ class Segment(NamedTuple):
     rigid_without_sensor : without a sensor it is rigid with the segment above; False: it is unknown then
     labels : a regular expression of words that mean it in a sensor's name
     joint : the name of the joint to the segment above, where no point names it
-    soft_tissue_std : [rad/rad] of the rotation of a sensor by soft tissue per rotation of the segment, in a calibration
+    soft_tissue_std : (3,) [rad/rad] of the rotation of a sensor by soft tissue, about the segment's axes, per rotation
+        of the segment, in a calibration
     soft_tissue : the same while the body is tracked
     start_mean : (3,) [rad] mean rotation vector, in its axes, of people off the neutral pose
     start_std : (3,) [rad] about its axes, one standard deviation of its rotation off the start pose among people
@@ -83,7 +84,7 @@ class Segment(NamedTuple):
     rigid_without_sensor: bool = False
     labels: str = ""
     joint: str = ""
-    soft_tissue_std: float = float(np.deg2rad(0.6))
+    soft_tissue_std: tuple[float, float, float] = _same(0.6)
     soft_tissue: SoftTissue = SoftTissue(_same(1.5))
     start_mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     start_std: tuple[float, float, float] = _same(4.0)
@@ -96,7 +97,7 @@ class Segment(NamedTuple):
         return cls(
             link,
             rigid_without_sensor=True,
-            soft_tissue_std=0.0,
+            soft_tissue_std=(0.0, 0.0, 0.0),
             soft_tissue=rigid,
             start_std=_same(0.5),
             repeat_std=_same(0.5),

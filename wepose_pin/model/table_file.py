@@ -188,10 +188,13 @@ def _read_segments(top: TomlTable, base: BodyTable, kind: str) -> dict[str, Segm
         except re.error as error:
             raise BadModel(f"{entry.at('labels')} = {labels!r} is no regular expression: {error}") from None
         joint = entry.text("joint", segment.joint or None) or ""
-        soft = _read_angle(entry, "soft_tissue_deg", segment.soft_tissue_std)
-        start, repeat = (
+        soft, start, repeat = (
             _read_angles(entry, key, value)
-            for key, value in (("start_std_deg", segment.start_std), ("repeat_std_deg", segment.repeat_std))
+            for key, value in (
+                ("soft_tissue_deg", segment.soft_tissue_std),
+                ("start_std_deg", segment.start_std),
+                ("repeat_std_deg", segment.repeat_std),
+            )
         )
         segments[name] = segment._replace(
             labels=labels,
@@ -530,7 +533,7 @@ def format_table(table: BodyTable, urdf: str) -> str:
         lines += ['without_sensor = "rigid"'] if segment.rigid_without_sensor else []
         lines += [f"labels = {toml_string(segment.labels)}"] if segment.labels else []
         lines += [f"joint = {toml_string(segment.joint)}"] if segment.joint else []
-        lines.append(f"soft_tissue_deg = {np.degrees(segment.soft_tissue_std):.6g}")
+        lines.append(f"soft_tissue_deg = {np.degrees(segment.soft_tissue_std).round(6).tolist()}")
         lines.append(f"start_mean_deg = {np.degrees(segment.start_mean).round(6).tolist()}")
         lines.append(f"start_std_deg = {np.degrees(segment.start_std).round(6).tolist()}")
         lines.append(f"repeat_std_deg = {np.degrees(segment.repeat_std).round(6).tolist()}")

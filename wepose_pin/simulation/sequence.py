@@ -1,4 +1,4 @@
-"""Motions of protocols in turn: joined hands, elbows that bend, arms that swing, a T-pose, palms on the body."""
+"""Motions of protocols in turn: joined hands, elbows that bend, arms that swing, a T-pose, palms on the body, a bow."""
 
 from __future__ import annotations
 
@@ -9,21 +9,31 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadOption
+from ..rotations import compose
 from .motion import LIFT_S, MARGIN_S, SIDES, FreeArm, Motion
 from .people import Offset
 from .signals import Process, Wander, integrate_pulse, make_pulse, make_step
 
 _LONG_S = 45.0  # [s] of a session, from which on parts have their full length
-_PART_S = {"elbows": (7.0, 10.0), "swing": (7.0, 10.0), "t_pose": (4.0, 5.0), "touch_body": (4.0, 6.0)}  # short, full
+_PART_S = {
+    "bow": (5.0, 6.0),
+    "elbows": (7.0, 10.0),
+    "swing": (7.0, 10.0),
+    "t_pose": (4.0, 5.0),
+    "touch_body": (4.0, 6.0),
+}  # short, full
 _LEAST_CLASP_S = 5.0
 _BLEND_S = 1.5  # between hanging arms and hands that are led, or arms held sideways
-_RAMP_S, _CLASP_RAMP_S = 1.0, 2.0  # in which a part's motion grows and dies away
+_RAMP_S = 1.0  # in which a part's motion grows and dies away
+_LONG_RAMPS_S = {"bow": 2.0, "clasp": 2.0}
 _BEND = np.deg2rad(45.0)  # half the range of the elbow
 _TURN = np.deg2rad(60.0)  # of the forearm to either side
 _STILL = np.deg2rad(3.0)  # of upper arms that are to hang still, assumption
 _SWING = np.deg2rad((40.0, 35.0))  # forwards and backwards; half of what the arm is raised sideways
 _TRUNK = np.deg2rad((15.0, 12.0, 10.0))  # yaw, pitch, roll while arms swing
 _TRUNK_HZ = np.array((0.65, 0.5, 0.37))
+BOW = np.deg2rad(45.0)
+BOW_AXIS_STD = np.deg2rad(3.5)  # from the torso's y: such axes repeat within 2 to 5 deg (Luinge 2007, de Vries 2010)
 # How people hold the T-pose, each their own: assumptions, held to N- and T-poses in Robert-Lachaine 2017.
 T_POSE = {
     "elevation": Offset(-3.0, 5.0),
@@ -67,8 +77,12 @@ class _Part(NamedTuple):
         """True where palms are led to a point."""
         return self.kind in ("clasp", "touch_body")
 
+    @property
+    def ramp(self) -> float:
+        return _LONG_RAMPS_S.get(self.kind, _RAMP_S)
+
     def gate(self, t: np.ndarray) -> np.ndarray:
-        return make_pulse(t, self.start, self.stop, _CLASP_RAMP_S if self.kind == "clasp" else _RAMP_S)
+        return make_pulse(t, self.start, self.stop, self.ramp)
 
 
 class Sequence(Motion):
@@ -113,6 +127,7 @@ class Sequence(Motion):
             }
         self.still = {side: [Wander(rng) for _ in range(2)] for side in SIDES}
         self.own_slip = {side: Process(rng, _SLIP_S, 3) for side in SIDES}
+        self.bow_axis = self.flaws.sizes.start_pose * BOW_AXIS_STD * np.clip(rng.standard_normal(), -2.3, 2.3)
 
     @staticmethod
     def _changes(kind: str) -> bool:
@@ -130,11 +145,7 @@ class Sequence(Motion):
         return moving + sum((make_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
 
     def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
-        ramps = [_CLASP_RAMP_S if part.kind == "clasp" else _RAMP_S for part in self.schedule]
-        moving = sum(
-            (integrate_pulse(t, p.start, p.stop, ramp) for p, ramp in zip(self.schedule, ramps, strict=True)),
-            np.zeros_like(t),
-        )
+        moving = sum((integrate_pulse(t, p.start, p.stop, p.ramp) for p in self.schedule), np.zeros_like(t))
         return moving + sum((integrate_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
 
     def _motion_share(self, t: np.ndarray) -> np.ndarray:
@@ -187,7 +198,11 @@ class Sequence(Motion):
             if part.kind == "swing":
                 wave = np.sin(2.0 * np.pi * np.outer(t - part.start, self.rates["left"][2] * _TRUNK_HZ))
                 lean += part.gate(t)[:, None] * _TRUNK * wave
-        return super()._torso(t, lean)
+        torso = super()._torso(t, lean)
+        for part in self.schedule:
+            if part.kind == "bow":
+                torso = compose(make_bow(part.gate(t), self.bow_axis), torso)
+        return torso
 
     def _free(self, t: np.ndarray, side: str) -> FreeArm:
         y, rates = SIDES[side], self.rates[side]
@@ -229,6 +244,12 @@ class Sequence(Motion):
                 s = 2.0 * np.pi * 0.4 * self.rates[side][4] * (t - part.start)
                 total = total + weight * (middle + part.gate(t) * reach * np.sin(s))
         return total
+
+
+def make_bow(share: np.ndarray, axis_angle: float) -> Rotation:
+    """Make a bow by shares (n,) of `BOW` about an axis that is so far [rad] from y."""
+    axis = np.array((-np.sin(axis_angle), np.cos(axis_angle), 0.0))
+    return Rotation.from_rotvec(BOW * share[:, None] * axis)
 
 
 def make_sequence(parts: tuple[str, ...]) -> type[Sequence]:

@@ -9,12 +9,11 @@ from ..errors import BadOption, one_of
 from ..rotations import compose, turn_about
 from .imperfections import Imperfections
 from .motion import MARGIN_S, SIDES, Motion
-from .sequence import make_sequence
+from .sequence import make_bow, make_sequence
 from .signals import Wander, make_pulse, make_step
 
 _T_POSE_S = (7.5, 12.5)
 _BOW_S = (15.5, 22.0)
-_BOW_DEG = 45.0
 _BAR_DEG = np.array((40.0, 80.0))  # paddle, steering wheel
 _TURN_S = 2.5  # into the T-pose, and back
 
@@ -119,9 +118,7 @@ class Poses(Motion):
         return 0.0 * t
 
     def _torso(self, t: np.ndarray, lean: np.ndarray) -> Rotation:
-        axis = np.array((-np.sin(self.bow_axis), np.cos(self.bow_axis), 0.0))
-        bow = np.deg2rad(_BOW_DEG) * make_pulse(t, *_BOW_S, _TURN_S)
-        return compose(Rotation.from_rotvec(bow[:, None] * axis), turn_about("ZYX", lean))
+        return compose(make_bow(make_pulse(t, *_BOW_S, _TURN_S), self.bow_axis), turn_about("ZYX", lean))
 
     def _lead_share(self, t: np.ndarray, _lead_share: np.ndarray, _table: np.ndarray) -> dict[str, np.ndarray]:
         raised = make_step(t, _T_POSE_S[0] - _TURN_S, _TURN_S) * (1.0 - make_step(t, _T_POSE_S[1], _TURN_S))
@@ -133,7 +130,7 @@ class Poses(Motion):
         return Rotation.from_rotvec(np.tile(raised.as_rotvec(), (n, 1))), np.full(n, self.elbow[side])
 
 
-SEQUENCE_PARTS = ("clasp", "elbows", "swing", "t_pose", "touch_body")  # what a sequence may have
+SEQUENCE_PARTS = ("bow", "clasp", "elbows", "swing", "t_pose", "touch_body")  # what a sequence may have
 TASKS: dict[str, type[Motion]] = {
     "clasp": Motion,
     "handle": Handle,

@@ -554,7 +554,9 @@ class CausalHeadings:
         k = len(filters.var)
         if self._record:
             P = self._filter.P
-            self._history.append((self._start_end + knot.end, P[:k, :k].copy(), self._problem.find_segment_covariance(P)))
+            self._history.append(
+                (self._start_end + knot.end, P[:k, :k].copy(), self._problem.find_segment_covariance(P))
+            )
 
     def _apply(self) -> None:
         """Finish the last knot; its correction fades in from the next sample on."""

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..alignment import SegmentOrientations
 from ..errors import BadOption, BadPhase
 from ..kinematics import KinematicsSolver, compute_point_covariances

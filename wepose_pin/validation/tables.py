@@ -19,11 +19,16 @@ AS_PUBLISHED = f"{OURS}, as published"  # with the paper's transition, static te
 WITH_TRUNK = f"{OURS}, trunk measured"  # beside the shoulder width
 DEFAULT_WITH_TRUNK = f"{DEFAULT}, trunk measured"
 AS_COMMANDED = f"{DEFAULT}, mounts as stated"  # by the session, to the next axis, and the start pose
+ORIENTATIONS_ALONE = f"{DEFAULT}, orientations alone"  # without joint accelerations and covariance, as others enter
+CAUSAL = f"{DEFAULT}, causal"  # tracked as live, with past samples only
 LENGTHS_ALONE = f"{OURS}, lengths alone"  # calibrated in the paper's formulation
 OPEN_LOOP = f"{OURS}, open loop"  # tracked without heading correction
 PROTOCOL = f"{OURS}, the paper's protocol"  # both, and mounts by the session and the start pose
 # Rows that are no filters of their own.
-VARIANTS = AS_PUBLISHED, WITH_TRUNK, DEFAULT_WITH_TRUNK, AS_COMMANDED, LENGTHS_ALONE, OPEN_LOOP, PROTOCOL
+VARIANTS = (
+    *(AS_PUBLISHED, WITH_TRUNK, DEFAULT_WITH_TRUNK, AS_COMMANDED, ORIENTATIONS_ALONE, CAUSAL),
+    *(LENGTHS_ALONE, OPEN_LOOP, PROTOCOL),
+)
 # Experiments; those of people have one of each preset: "upper body, mild".
 UPPER_BODY = "upper body"
 ERROR_BUDGET = "error budget"

@@ -76,13 +76,11 @@ class DatagramSource(Source):
     Attributes
     ----------
     kind, sender, hint : of the source, who sends to it, and in what form, for messages
-    measures_orientations : whether it has orientations in place of rates and specific forces
     """
 
     kind: str
     sender: str
     hint = ""
-    measures_orientations = False
 
     def __init__(
         self,
