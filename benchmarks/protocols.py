@@ -34,6 +34,7 @@ FIRST_SEED = 300  # of persons; none of them was looked at while sizes were chos
 FIRST_RETURNING_SEED = 320  # of persons who do several sessions
 SESSIONS = 3
 CIRCLES = 1
+SCATTER = 0.6  # of the ratio of one person, whose lengths and headings are far from independent
 CLOCKS: dict[str, Any] = {"clock_jitter": 0.0, "clock_offset": 0.0, "clock_drift_ppm": 0.0}
 # Quantity of `consistency` → key, name, factor, unit
 QUANTITIES = {
@@ -59,6 +60,7 @@ CELLS = (
     Cell("clasp+t_pose", 30.0),
     Cell("clasp", 60.0),
     Cell("clasp+t_pose", 60.0),
+    Cell("clasp+bow", 60.0),
     Cell("clasp+elbows", 60.0),
     Cell("clasp+swing", 60.0),
     Cell("clasp+touch_body", 60.0),
@@ -174,7 +176,9 @@ def summarize_cells(results: Results) -> dict[Cell, dict[str, float]]:
 def write_page(results: Results) -> str:
     """The page of the results, in Markdown."""
     rows = summarize_cells(results)
-    text = [_PAGE.format(closed=_format_table([c for c in CELLS if c in rows], rows, "protocol"))]
+    persons = max(round(row["persons"]) for row in rows.values())
+    closed = _format_table([cell for cell in CELLS if cell in rows], rows, "protocol")
+    text = [_PAGE.format(persons=persons, scatter=SCATTER / np.sqrt(persons), closed=closed)]
     series = [cell for cell in SERIES if cell in rows]
     if series:
         text.append(_SERIES.format(series=_format_table(series, rows, "sessions")))
@@ -204,11 +208,12 @@ def _format_table(cells: list[Cell], rows: dict[Cell, dict[str, float]], first: 
 
 _PAGE = """# What calibration protocols are worth
 
-Written by `python -m benchmarks protocols --persons 8 --page docs/protocols.md`. Simulated people
+Written by `python -m benchmarks protocols --persons {persons} --page docs/protocols.md`. Simulated people
 ([simulated-people.md](simulated-people.md)) with sensors mounted at any rotation; stature and sex known, shoulder width
 and trunk measured to 12 mm. Seconds are those after the start pose, with all changes from one part to the next. Each
 entry has the root mean square of the error over people, ± the stated standard deviation, and the root mean square of
-error over standard deviation: 1 is right, above it the ± is too small. That figure scatters by 0.2 with eight people.
+error over standard deviation: 1 is right, above it the ± is too small. That figure scatters by {scatter:.2f} with
+{persons} people.
 The people are the same in all rows. What is known of their lengths without any closure is in the rows `poses` and
 `free`.
 

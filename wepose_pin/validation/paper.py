@@ -180,8 +180,16 @@ def _upper_body(experiment: str, trial: str, seed: int, preset: Preset) -> list[
     exact, stated = set_exact_mounts(person.prior, simulation), person.prior
     results = []
 
-    def score(label: str, recording: Recording, subject: Subject, method: str, **how: bool) -> None:
-        tracked = track(recording, subject, method=method, **how)
+    def score(
+        label: str,
+        recording: Recording,
+        subject: Subject,
+        method: str,
+        *,
+        open_loop: bool = False,
+        causal: bool = False,
+    ) -> None:
+        tracked = track(recording, subject, method=method, open_loop=open_loop, causal=causal)
         recording, pose = tracked.recording, tracked.pose  # causal: from the end of the start pose on
         series = {}
         if seed == 0:
