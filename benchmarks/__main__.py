@@ -15,7 +15,19 @@ from wepose_pin.errors import BadOption, ExistingOutput, WeposeError
 
 from .tables import Section, document, print_table, read_document
 
-KINDS = ("filters", "calibration", "live", "batch", "long", "headings", "doubled", "protocols", "robots", "bodies")
+KINDS = (
+    "filters",
+    "calibration",
+    "live",
+    "batch",
+    "long",
+    "headings",
+    "doubled",
+    "protocols",
+    "robots",
+    "bodies",
+    "kinematics",
+)
 DEFAULT = ("filters", "calibration")
 
 
@@ -40,7 +52,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "minutes; doubled: two sensors on an upper arm beside either alone, ten minutes; protocols: what each "
         "calibration protocol is worth on simulated people, an hour for eight; robots: "
         "the upper-body recording of --data on every robot, offline and live, half an hour; bodies: chains, other "
-        "bodies and legs by the commands, on the recordings of --data and simulated, three minutes. "
+        "bodies and legs by the commands, on the recordings of --data and simulated, three minutes; kinematics: beside "
+        "a bare loop of Pinocchio. "
         f"Without any: {' and '.join(DEFAULT)}",
     )
     add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 12 sessions, up to one hour")
@@ -119,6 +132,10 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
             from . import bodies
 
             chosen |= bodies.sections(options.quick, Path(named) if named else None)
+        elif kind == "kinematics":
+            from . import kinematics
+
+            chosen |= kinematics.sections(options.quick)
         else:
             from . import long_recordings
 
