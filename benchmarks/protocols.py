@@ -18,10 +18,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wepose_pin.calibration import calibrate, calibrate_sessions
+from wepose_pin.errors import BadOption
 from wepose_pin.simulation import (
     PEOPLE_MEASURED_STD,
     PRESETS,
     Imperfections,
+    Person,
+    Simulation,
     simulate,
     simulate_activity,
     simulate_person,
@@ -79,20 +82,33 @@ def _people() -> Imperfections:
 def measure(cell: Cell, seed: int) -> dict[str, Any]:
     """Errors and standard deviations of a person, as `consistency.measure_person`."""
     person = simulate_person(seed, PEOPLE_MEASURED_STD)
+    try:
+        simulation = _simulate(cell, seed, person)
+    except BadOption:
+        return {"seed": seed, "out_of_reach": True}
+    return {"seed": seed, **measure_simulation(person, simulation, cell.protocol)}
+
+
+def _simulate(cell: Cell, seed: int, person: Person) -> Simulation:
+    """A person's session.
+
+    Raises
+    ------
+    BadOption
+        The arms do not reach through the motion that was drawn.
+    """
     if cell.protocol == "free":
-        simulation = simulate_activity(
+        return simulate_activity(
             "tasks", seed=seed, imperfections=_people(), seconds=cell.seconds, lengths=person.lengths
         )
-    else:
-        simulation = simulate(
-            person.lengths,
-            seed=seed,
-            imperfections=_people(),
-            clasp_s=cell.seconds,
-            protocol=cell.protocol,
-            circles=0 if cell.protocol == "poses" else CIRCLES,
-        )
-    return {"seed": seed, **measure_simulation(person, simulation, cell.protocol)}
+    return simulate(
+        person.lengths,
+        seed=seed,
+        imperfections=_people(),
+        clasp_s=cell.seconds,
+        protocol=cell.protocol,
+        circles=0 if cell.protocol == "poses" else CIRCLES,
+    )
 
 
 def measure_series(seed: int) -> dict[Cell, dict[str, Any]]:
@@ -157,7 +173,7 @@ def summarize_cells(results: Results) -> dict[Cell, dict[str, float]]:
     """Of each cell the persons, how many pass, and of each quantity error, standard deviation and their ratio."""
     rows = {}
     for cell in (*CELLS, *SERIES):
-        own = [result for (other, _), result in sorted(results.items()) if other == cell]
+        own = [r for (other, _), r in sorted(results.items()) if other == cell and "out_of_reach" not in r]
         good = [result for result in own if "error" not in result]
         if not good:
             continue
@@ -214,8 +230,8 @@ and trunk measured to 12 mm. Seconds are those after the start pose, with all ch
 entry has the root mean square of the error over people, ± the stated standard deviation, and the root mean square of
 error over standard deviation: 1 is right, above it the ± is too small. That figure scatters by {scatter:.2f} with
 {persons} people.
-The people are the same in all rows. What is known of their lengths without any closure is in the rows `poses` and
-`free`.
+The people are the same in all rows, but for those whose arms do not reach through the motion that was drawn. What is
+known of their lengths without any closure is in the rows `poses` and `free`.
 
 Headings are those of the mounts, all sensors. Most of an error is common to all of them, as the torso's heading defines
 which way is forward. The palm is the right one on a circle drawn after the calibration, from the root and from the
