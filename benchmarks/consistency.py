@@ -87,25 +87,25 @@ def measure_simulation(
 
 def compare_subject(subject: Subject, person: Person, simulation: Simulation) -> dict[str, Any]:
     """Errors and standard deviations of a calibrated subject, by quantity: lists of pairs."""
-    lengths = [(subject.lengths[name] - person.lengths[name], subject.std(name)) for name in CLOSED]
-    arms = []
-    for side in ("left", "right"):
-        names = [name for name in CLOSED if name.startswith(side)]
-        error = sum(subject.lengths[name] - person.lengths[name] for name in names)
-        arms.append((error, float(np.sqrt(subject.lengths_covariance(names).sum()))))
     tilts, headings = [], []
     for name, error in zip(simulation.quat_LS, compute_mount_errors(subject, simulation), strict=True):
         std = [subject.std(row) for row in mount_rows(name)]
         tilts += list(zip(error[:2], std[:2], strict=True))
         headings.append((error[2], std[2]))
     torso = headings[list(simulation.quat_LS).index("torso")]
-    return {
-        "lengths": lengths,
-        "whole arms": arms,
-        "mounts, tilt": tilts,
-        "mounts, heading": headings,
-        "torso, heading": [torso],
-    }
+    mounts = {"mounts, tilt": tilts, "mounts, heading": headings, "torso, heading": [torso]}
+    return compare_lengths(subject, person) | mounts
+
+
+def compare_lengths(subject: Subject, person: Person) -> dict[str, Any]:
+    """Errors and standard deviations [m] of a subject's lengths, by quantity: lists of pairs."""
+    lengths = [(subject.lengths[name] - person.lengths[name], subject.std(name)) for name in CLOSED]
+    arms = []
+    for side in ("left", "right"):
+        names = [name for name in CLOSED if name.startswith(side)]
+        error = sum(subject.lengths[name] - person.lengths[name] for name in names)
+        arms.append((error, float(np.sqrt(subject.lengths_covariance(names).sum()))))
+    return {"lengths": lengths, "whole arms": arms}
 
 
 def _compare_pose(tracked: TrackedRecording, simulation: Simulation) -> dict[str, Any]:

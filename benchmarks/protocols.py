@@ -30,7 +30,7 @@ from wepose_pin.simulation import (
     simulate_person,
 )
 
-from .consistency import compare_subject, measure_simulation, summarize
+from .consistency import compare_lengths, compare_subject, measure_simulation, summarize
 from .tables import Column, Section, Table
 
 FIRST_SEED = 300  # of persons; none of them was looked at while sizes were chosen
@@ -71,6 +71,7 @@ CELLS = (
     Cell("poses", 14.5),
     Cell("free", 60.0),
 )
+BEFORE = Cell("sessions: none", 0.0)
 SERIES = tuple(Cell(f"sessions: {name}", 60.0) for name in ("1", "2", "3", "1, then 2", "1, then 2, then 3", "1 2 3"))
 Results = dict[tuple[Cell, int], dict[str, Any]]
 
@@ -161,6 +162,10 @@ def run(persons: int, file: Path, workers: int = 2) -> Results:
     with ProcessPoolExecutor(workers) as pool:
         pending = {pool.submit(measure, *key): key for key in cells if key not in results}
         series = {pool.submit(measure_series, seed): seed for seed in returning if (SERIES[-1], seed) not in results}
+        for seed in returning:
+            person = simulate_person(seed, PEOPLE_MEASURED_STD)
+            if (BEFORE, seed) not in results:
+                add(BEFORE, seed, {"seed": seed, **compare_lengths(person.prior, person)})
         for future in as_completed(pending):
             add(*pending[future], future.result())
         for later in as_completed(series):
@@ -172,7 +177,7 @@ def run(persons: int, file: Path, workers: int = 2) -> Results:
 def summarize_cells(results: Results) -> dict[Cell, dict[str, float]]:
     """Of each cell the persons, how many pass, and of each quantity error, standard deviation and their ratio."""
     rows = {}
-    for cell in (*CELLS, *SERIES):
+    for cell in (*CELLS, BEFORE, *SERIES):
         own = [r for (other, _), r in sorted(results.items()) if other == cell and "out_of_reach" not in r]
         good = [result for result in own if "error" not in result]
         if not good:
@@ -195,7 +200,7 @@ def write_page(results: Results) -> str:
     persons = max(round(row["persons"]) for row in rows.values())
     closed = _format_table([cell for cell in CELLS if cell in rows], rows, "protocol")
     text = [_PAGE.format(persons=persons, scatter=SCATTER / np.sqrt(persons), closed=closed)]
-    series = [cell for cell in SERIES if cell in rows]
+    series = [cell for cell in (BEFORE, *SERIES) if cell in rows]
     if series:
         text.append(_SERIES.format(series=_format_table(series, rows, "sessions")))
     return "\n".join(text)
@@ -225,7 +230,7 @@ def _format_table(cells: list[Cell], rows: dict[Cell, dict[str, float]], first: 
 _PAGE = """# What calibration protocols are worth
 
 Written by `python -m benchmarks protocols --persons {persons} --page docs/protocols.md`. Simulated people
-([simulated-people.md](simulated-people.md)) with sensors mounted at any rotation; stature and sex known, shoulder width
+([simulated people](simulated-people.md)) with sensors mounted at any rotation; stature and sex known, shoulder width
 and trunk measured to 12 mm. Seconds are those after the start pose, with all changes from one part to the next. Each
 entry has the root mean square of the error over people, ± the stated standard deviation, and the root mean square of
 error over standard deviation: 1 is right, above it the ± is too small. That figure scatters by {scatter:.2f} with
@@ -241,7 +246,8 @@ middle of the shoulders; of `free` in the tasks themselves.
 """
 _SERIES = """## Several sessions of one person
 The default protocol, clasp with T-pose, 60 s each, new mounts each time; other people than above. "1, then 2": the
-second with `--prior`; "1 2 3": all three in one command.
+second with `--prior`; "1 2 3": all three in one command; "none": what stature and sex tell beforehand. Sessions of one
+person err alike, as the person's skin, shoulders and measured width are the same.
 
 {series}
 """
