@@ -53,15 +53,18 @@ from .least_squares import HINGE_STD, Gaussian, Observations, place_points, resi
 from .observability import diagnose_closures, diagnose_distances, diagnose_lengths, diagnose_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .priors import build_prior, combine_lengths
-from .problem import SAMPLE_RATE_HZ, CalibrationProblem
+from .problem import LOOSE, SAMPLE_RATE_HZ, CalibrationProblem
 from .protocols import Protocol, choose_protocol, load_protocol
 from .result import Calibration
 from .sessions import fuse_sessions, separate_mounts
 from .solver import MIN_LENGTH
 from .weights import (
+    CONTRADICTED,
     MIN_CONTACT,
+    SUSPECT,
     WeightedFit,
     compare_measured,
+    compare_posed,
     compute_information_shares,
     estimate_covariance,
     project_to_subject,
@@ -206,7 +209,7 @@ def _check_fixed_scale(measured: Collection[str], protocol: Protocol, model: Bod
 
 
 def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
-    """The calibration without the mounts that gravity or the motion contradicts, and with its labels checked."""
+    """The calibration without the mounts and poses that gravity or the motion contradicts, its labels checked."""
     wrong = problem.mounts_against_gravity()
     unused = [_diagnose_unused_mount(name, angle, MAX_MOUNT_ERROR_DEG) for name, angle in wrong.items()]
     problem = problem.remove_mounts(wrong)
@@ -234,6 +237,18 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
         best = solve_calibration(problem)
     except NoSolution as error:
         raise NoSolution(f"{problem.recording.where()}: {error}") from error
+    posed = {phase: deviation for phase, deviation in best.posed.items() if phase not in problem.loose}
+    phase = max(posed, key=lambda name: posed[name], default="")
+    if phase and posed[phase] > SUSPECT and problem.protocol.closures:
+        # Where a pose is wrong all else fits worse: what it is compared with must be found without it.
+        loose = problem.loosen_phase(phase)
+        deviation = solve_calibration(loose).posed[phase]
+        if deviation > CONTRADICTED:
+            without = _calibrate_checked(loose)
+            left_out = Diagnostic("phase-not-used", WARNING, phase, deviation, CONTRADICTED)
+            mounts = (*unused, *without.unused_mounts)
+            return replace(without, remarks=(left_out, *without.remarks), unused_mounts=mounts)
+    best = replace(best, posed={} if problem.protocol.closures else posed)
     return replace(best, labels=LabelCheck.from_motion(best.limbs(), problem.model.table), unused_mounts=tuple(unused))
 
 
@@ -424,6 +439,12 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
         closure=next((closure.kind for closure in protocol.closures), ""),
         measured_example=problem.measured_example,
         measured_lengths=compare_measured(fit, layout, measured),
+        posed=compare_posed(
+            observations,
+            solution.result,
+            [condition.phase for condition in protocol.conditions],
+            dict.fromkeys(problem.loose, LOOSE),
+        ),
         scale_lengths=tuple(scale_lengths),
         model=problem.model,
         start_pose=problem.start_pose,

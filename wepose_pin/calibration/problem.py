@@ -31,13 +31,14 @@ from .conditions import (
 )
 from .initial_headings import find_linear
 from .least_squares import Layout, Observations
-from .protocols import Closure, Condition, FreeMotion, Protocol
+from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 from .recorded import read_recorded_places
 from .sample_losses import check_start_pose, find_sample_losses, find_unknown_tilt, group_steps, mask_connected
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
 MIN_SAMPLES = 10  # of each condition
+LOOSE = 100.0  # times the standard deviation of a pose that is not used
 FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phase states it: headings drift
 USUAL_ELEVATION = np.deg2rad(60.0)  # [rad] of the arms off hanging, hands joined before the chest
 RIGID_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a link's orientation where nothing is soft; only ratios matter
@@ -57,6 +58,7 @@ class CalibrationProblem:
     prior : lengths with their covariance, and mounts
     measured : name of a length, or of a distance of the protocol → value and standard deviation [m]
     model : the body
+    loose : phases whose poses are not used, as they contradict all else
     """
 
     recording: Recording
@@ -65,6 +67,7 @@ class CalibrationProblem:
     prior: Subject
     measured: Mapping[str, tuple[float, float]]
     model: BodyModel
+    loose: tuple[str, ...] = ()
 
     @cached_property
     def start_pose(self) -> StartPose:
@@ -167,6 +170,16 @@ class CalibrationProblem:
         mounts = {name: mount for name, mount in self.prior.mounts.items() if name not in segments}
         recording, prior = replace(self.recording, sensors=sensors), replace(self.prior, mounts=mounts)
         return replace(self, recording=recording, prior=prior)
+
+    def loosen_phase(self, phase: str) -> CalibrationProblem:
+        """Return the same problem with poses of this phase that tell next to nothing."""
+        conditions = tuple(
+            replace(condition, std=LOOSE * condition.std)
+            if isinstance(condition, Direction | Axis) and condition.phase == phase
+            else condition
+            for condition in self.protocol.conditions
+        )
+        return replace(self, protocol=replace(self.protocol, conditions=conditions), loose=(*self.loose, phase))
 
     def relabel(self, moved: Mapping[str, str]) -> CalibrationProblem:
         """Return the same problem with sensors exchanged between segments; a stated mount goes with its sensor.

@@ -63,6 +63,7 @@ OPEN_SHARE = Limits(MOST_OPEN, 0.60)  # share of samples
 # (docs/people.md): 18 deg off in all, give or take 6.
 TILT = Limits(np.deg2rad(35.0), np.deg2rad(45.0))
 UNUSUAL = Limits(4.0, 6.0)  # standard deviations of a length from the population prior
+POSED = Limits(CONTRADICTED, 8.0)  # of a pose or a bow that is used, from the estimate without it
 MEASURED = Limits(CONTRADICTED, 5.0)  # of a measured length from the estimate without it
 SAMPLES = Limits(6.0, 2.0)  # effective sample size, at least
 DOUBT = Limits(1.0, 1.0)  # of anatomy, see `anatomy`
@@ -221,6 +222,8 @@ def _check_sensors(calibration: Calibration) -> list[Check]:
         checks.append(_check(labels.diagnostic(), DOUBT, labels.contradiction))
     for mount in calibration.unused_mounts:
         checks.append(_check(mount, Limits(float(mount.limit or 0.0), np.pi), quality="poor"))
+    for phase, deviation in calibration.posed.items():
+        checks.append(_check(Diagnostic("pose-contradicted", INFO, phase, deviation), POSED))
     return checks
 
 

@@ -54,6 +54,8 @@ class Calibration:
     measured_example : the length that would fix the scale best, as ``name=metres``
     measured_lengths : name → measured length beside the estimate without it
     labels : the check that each sensor is on the segment that the session states
+    posed : phase of poses → by how many standard deviations it deviates from what is known without it; where no
+        closure tells which of them is wrong
     unused_mounts : diagnostics of stated mounts that gravity or the motion contradicts
     scale_lengths : names of the measured lengths that fix the scale; empty: the prior does
     model, start_pose, conditions : the body, its links in the start pose, and the protocol's conditions on it
@@ -87,6 +89,7 @@ class Calibration:
     measured_example: str = ""
     measured_lengths: Mapping[str, MeasuredLength] = field(default_factory=dict)
     labels: LabelCheck = field(default_factory=LabelCheck)
+    posed: Mapping[str, float] = field(default_factory=dict)
     unused_mounts: tuple[Diagnostic, ...] = ()
     scale_lengths: tuple[str, ...] = ()
     formulation: str = "full"

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..model.girdle import PARAMETERS
 from ..subject import mount_rows
-from .conditions import Level, Loop, Moving, StartPose
+from .conditions import Level, Loop, Moving, Pointing, StartPose
 from .least_squares import GAP_ROWS, HINGE_STD, Gaussian, Layout, Observations
 from .solver import STEPS, Fit, LeastSquares, solve
 
@@ -34,7 +34,8 @@ MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about rig
 # [rad] by which people's elbows leave a hinge (docs/people.md): an oblique axis, and one that wanders.
 ELBOW_STD = np.deg2rad(4.0)
 LEAST_BEND = 0.2  # sine of the angle by which a segment must bend to show its axis
-CONTRADICTED = 3.0  # standard deviations between a measured length and what is known without it
+CONTRADICTED = 3.0  # standard deviations between a measured length, or a pose, and what is known without it
+SUSPECT = 1.5  # the same of a pose from which on it is compared with a solution without it
 
 
 class MeasuredLength(NamedTuple):
@@ -213,6 +214,48 @@ def compare_measured(
         expected = metres + (fit.x[rows[name]] - metres) / (variance * rest)
         compared[name] = MeasuredLength(metres, float(expected), float(rest**-0.5), std)
     return compared
+
+
+def compare_posed(
+    observations: Observations, result: WeightedFit, phases: Sequence[str], loose: Mapping[str, float]
+) -> dict[str, float]:
+    """By how many standard deviations each phase of poses deviates from what is known without it.
+
+    A pose has no residual that would show how it was held, as a closure has: only the other conditions can.
+
+    Parameters
+    ----------
+    phases : of the conditions, in their order
+    loose : phases that are not used → factor by which the standard deviations of their poses are too large
+    """
+    fit, deviations = result.fit, {}
+    spans = [
+        (phase, condition, span)
+        for (condition, span), phase in zip(observations.spans(), phases, strict=True)
+        if isinstance(condition, Pointing | Level)
+    ]
+    for phase in dict.fromkeys(phase for phase, _, _ in spans):
+        own = [(condition, span) for name, condition, span in spans if name == phase]
+        information, pull, mean_r, mean_J, degrees = 0.0, 0.0, [], [], 0
+        for condition, span in own:
+            r, J, w = fit.closure[span], fit.jacobian[span, :GAP_ROWS], result.weights[span, :GAP_ROWS]
+            information = information + np.einsum("nk,nki,nkj->ij", w, J, J)
+            pull = pull + np.einsum("nk,nki,nk->i", w, J, r)
+            whiten = loose.get(phase, 1.0) * np.sqrt(w.sum(axis=0))
+            mean_r.append(whiten * r.mean(axis=0))
+            mean_J.append(whiten[:, None] * J.mean(axis=0))
+            degrees += 2 if isinstance(condition, Pointing) else 1
+        rest, H = np.linalg.inv(fit.information - information), np.concatenate(mean_J)
+        z = np.concatenate(mean_r) + H @ rest @ pull  # at the solution without this phase
+        chi2 = float(z @ np.linalg.solve(np.eye(len(z)) + H @ rest @ H.T, z))
+        deviations[phase] = _find_normal_deviate(chi2, degrees)
+    return deviations
+
+
+def _find_normal_deviate(chi2: float, degrees: int) -> float:
+    """The standard deviations of a normal variable that are as rare as chi², by Wilson and Hilferty 1931."""
+    spread = 2.0 / (9.0 * degrees)
+    return float((np.cbrt(chi2 / degrees) - (1.0 - spread)) / np.sqrt(spread))
 
 
 def project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose) -> tuple[tuple[str, ...], np.ndarray]:

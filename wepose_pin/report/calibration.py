@@ -518,6 +518,7 @@ def _describe_check(check: Check, contact: _Contact) -> tuple[str, str]:
         "limb-motion-implausible": ("doubt of the sensors' places, by anatomy", "number"),
         "sensors-exchanged": ("doubt of the sensors' places, by anatomy", "number"),
         "mount-not-used": (f"stated mount that was not used, {place}", "deg"),
+        "pose-contradicted": (f"standard deviations of {place} from all else", "number"),
         "length-uncertain": (f"± {place}, without the common scale", "mm"),
         "mount-heading-uncertain": (f"± heading, {place}", "deg"),
         "scale-uncertain": ("± scale, all lengths together", "percent"),
