@@ -339,11 +339,11 @@ def test_the_parts_of_a_protocol_whose_phases_are_there() -> None:
 @pytest.mark.parametrize(
     ("source", "mounts", "protocol"),
     [
-        ("slimevr:6969", {}, "clasp+bow"),
-        ("slimevr:6969", {"torso": np.array([0.0, 0.0, 0.0, 1.0])}, "clasp"),
-        ("slimevr:6969", {"left_forearm": np.array([0.0, 0.0, 0.0, 1.0])}, "clasp+bow"),
-        ("mvn:9763", {}, "clasp"),
-        ("udp:9000", {}, "clasp"),
+        ("slimevr:6969", {}, "clasp+t_pose+bow"),
+        ("slimevr:6969", {"torso": np.array([0.0, 0.0, 0.0, 1.0])}, "clasp+t_pose"),
+        ("slimevr:6969", {"left_forearm": np.array([0.0, 0.0, 0.0, 1.0])}, "clasp+t_pose+bow"),
+        ("mvn:9763", {}, "clasp+t_pose"),
+        ("udp:9000", {}, "clasp+t_pose"),
     ],
 )
 def test_who_wears_trackers_bows_unless_the_torsos_mount_is_stated(

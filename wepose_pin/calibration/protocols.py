@@ -50,8 +50,9 @@ PROTOCOLS = (
     "touch_left",
     "touch_right",
 )
-DEFAULT, WITH_BOW = "clasp", "clasp+bow"
-ALSO = ("t_pose", "bow")  # what makes it better within the same minute, by phases of their names
+DEFAULT = "clasp"
+GUIDED, BOW = "clasp+t_pose", "bow"  # the best of docs/protocols.md in a minute; for whom hands alone are not enough
+ALSO = ("t_pose", BOW)  # what makes it better within the same minute, by phases of their names
 # How many points each kind takes, and the keys that are its own.
 KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}
 _KEYS = ("phase", "kind", "points", "slip", "in_front_of")

@@ -41,9 +41,9 @@ class LiveJob:
         With --guide: write subject, recordings and the sensors' setup to this folder. Without it to a new folder
         named by the date.
     protocol : NAME|FILE.toml
-        With --guide: calibrate by this protocol, as `wepose calibrate`. Without it clasp, and a bow after it
-        (clasp+bow) for sensors that measure orientations and no accelerations where no session states the torso's
-        mount.
+        With --guide: calibrate by this protocol, as `wepose calibrate`. Without it clasp+t_pose, and a bow after them
+        for sensors that measure orientations and no accelerations where no session states the torso's mount. All but
+        the first part may be skipped.
     measured : NAME=METRES
         With --guide: use this measured length, such as shoulder_width=0.385; may be given several times.
     stature : METRES
@@ -297,7 +297,7 @@ def _open_page(
 def _load_robot(job: LiveJob, name: str) -> RobotOptions:
     """The robot, and how it is to follow."""
     from ..calibration import load_protocol
-    from ..calibration.protocols import DEFAULT
+    from ..calibration.protocols import GUIDED
     from ..live.robot import PORT, RobotOptions
     from ..retargeting import LimitMargins, find_map, load_robot
     from ..retargeting.maps import list_sides
@@ -307,7 +307,7 @@ def _load_robot(job: LiveJob, name: str) -> RobotOptions:
     margins = LimitMargins(job.speed_scale, job.limit_margin)
     robot = load_robot(find_map(name), list_sides(job.arm), margins)
     if job.guide:
-        check_segments(robot, load_protocol(job.protocol or DEFAULT).needs)
+        check_segments(robot, load_protocol(job.protocol or GUIDED).needs)
     return RobotOptions(robot, job.to or str(PORT), timing)
 
 
