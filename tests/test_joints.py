@@ -132,7 +132,7 @@ def test_a_coupling_keeps_whole_turns_and_shares_with_the_drift() -> None:
 
 @pytest.mark.parametrize("seed", [0, pytest.param(6, marks=pytest.mark.monte_carlo)])
 def test_soft_tissue_of_the_torso_is_no_heading(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The closure alone is off by 3 to 5 deg on these people, whose tissue turns the sensor as they lean."""
+    """The closure alone is off by 7 deg on these people, whose tissue turns the sensor as they lean."""
     person, off = simulate_person(seed), {}
     simulation = simulate(person.lengths, seed=seed, imperfections=replace(MILD_PRESET, mount="any"), circles=0)
     measured = {"shoulder_width": person.measured["shoulder_width"]}
@@ -145,8 +145,8 @@ def test_soft_tissue_of_the_torso_is_no_heading(seed: int, monkeypatch: pytest.M
         off[coupled] = abs(float(np.degrees(error.as_rotvec()[2])))
         assert off[coupled] < 2.0 * np.degrees(subject.std("mounts.torso.z"))
     print(off)
-    assert off[False] > 3.0
-    assert off[True] < 2.5
+    assert off[False] > 5.0
+    assert off[True] < 0.5 * off[False]
 
 
 def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> None:
