@@ -19,7 +19,7 @@ from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession
 from ..filters import BEST
 from ..kinematics import LiveKinematics, compute_axis_std
-from ..model import BodyModel, load_table
+from ..model import BodyModel, load_model, load_table
 from ..model.body import load_sensed_model
 from ..model.start_pose import compute_start_configuration
 from ..model.table import NEUTRAL_POSE
@@ -562,5 +562,6 @@ def warm_up(method: str) -> None:
     for _ in range(round(2.0 * CAUSAL_KNOT_S * recording.rate_hz)):
         estimator.step(np.zeros((len(sensors), 3)), np.tile([0.0, 0.0, 9.81], (len(sensors), 1)))
     estimator.covariance()
+    LiveKinematics(load_model(), sensors).compute_points(np.tile([0.0, 0.0, 0.0, 1.0], (len(sensors), 1)))
     synchronizer = StreamSynchronizer(sensors, 100.0, 0.0)
     synchronizer.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))
