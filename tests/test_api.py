@@ -235,6 +235,7 @@ def test_a_result_goes_into_each_step_as_object_and_as_folder(
         angles["left_elbow"]["bend"]
 
 
+@pytest.mark.slow
 def test_a_result_is_retargeted_as_object_and_as_folder(result: wp.TrackResult, saved: Path, tmp_path: Path) -> None:
     pytest.importorskip("daqp")
     urdf = write_arm(tmp_path)

@@ -147,6 +147,7 @@ def test_noise_in_the_orientations_does_not_shrink_the_person(exact: tuple[Perso
     assert arm == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_hand_with_a_sensor_is_seen_by_itself(exact: tuple[Person, Recording]) -> None:
     """The wrists bend: forearm and hand then turn apart, and the closure tells one from the other."""
     person, recording = exact

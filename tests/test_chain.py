@@ -348,6 +348,7 @@ def test_a_table_names_segments_points_and_the_start_pose(urdf: Path, table: Pat
     np.testing.assert_allclose(reach, 0.5, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_covariance_of_points_is_that_of_many_fits(urdf: Path, table: Path) -> None:
     """Orientations and the length drawn from what is stated of them; two of the arm's six axes carry no sensor."""
     recording, _ = made(urdf, MARKED_WITH_SENSORS, 8.0)

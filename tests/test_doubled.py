@@ -63,6 +63,7 @@ def test_both_are_used_and_their_difference_is_said(made: tuple[Person, Simulati
     np.testing.assert_array_equal(np.concatenate([c.quat_WL["torso"] for c in chunks]), both.quat_WL["torso"])
 
 
+@pytest.mark.slow
 def test_the_drift_of_the_second_sensor_is_not_in_corrected_headings() -> None:
     simulation = simulate(simulate_person(3).lengths, seed=3, clasp_s=60.0, circles=1)
     recording = simulation.recording()

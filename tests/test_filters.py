@@ -291,6 +291,7 @@ def test_nees_is_right_when_the_filter_is_told_the_truth() -> None:
     assert abs(average - 3) < 0.3
 
 
+@pytest.mark.slow
 def test_where_the_papers_start_and_bias_noise_are_wrong() -> None:
     """The figures in the docstring of `SmekfParams`."""
     # A bias that drifts by 10 deg/h over 100 s, as a random walk: δt² Σ_b = 2 σ² δt / 100 s.

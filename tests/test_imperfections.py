@@ -216,6 +216,7 @@ def test_shoulders_wander_with_elevation(body: Simulation) -> None:
         assert np.linalg.norm(off_T[within(body, "start")], axis=1).max() < 2e-5
 
 
+@pytest.mark.slow
 def test_start_pose_is_off_as_stated() -> None:
     sizes = Imperfections(start_elbow_deg=5.0)
     elbows = []
@@ -240,6 +241,7 @@ def test_start_pose_is_off_as_stated() -> None:
     assert rms(np.array(turns)) == pytest.approx(1.5, rel=0.12)
 
 
+@pytest.mark.slow
 def test_a_standing_person_sways() -> None:
     for seed in range(5):
         sway = Sway(np.random.default_rng(seed))

@@ -131,6 +131,7 @@ def test_a_coupling_keeps_whole_turns_and_shares_with_the_drift() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(6, marks=pytest.mark.monte_carlo)])
+@pytest.mark.slow
 def test_soft_tissue_of_the_torso_is_no_heading(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The closure alone is off by 7 deg on these people, whose tissue turns the sensor as they lean."""
     person, off = simulate_person(seed), {}

@@ -225,6 +225,7 @@ def test_a_jump_of_a_metre_is_gone_after_slowly(arm: Robot) -> None:
     keeps_its_limits(run.messages(), arm)
 
 
+@pytest.mark.slow
 def test_five_seconds_out_of_reach(arm: Robot) -> None:
     pose = far_away(person(14.0, swing=0.0), (4.0, 9.0), 1.6)
     run = Session(arm, stream_info(pose)).run(live_poses(pose))
@@ -250,6 +251,7 @@ def test_a_pose_that_is_no_number_stops_the_robot(arm: Robot) -> None:
     keeps_its_limits(run.messages(), arm)
 
 
+@pytest.mark.slow
 def test_a_lost_sensor_slows_it_and_its_return_is_no_jump(arm: Robot) -> None:
     """The forearm stays as it was for two seconds and is elsewhere when its sensor comes back."""
     pose = person(14.0, swing=45.0)
@@ -592,6 +594,7 @@ def test_r_goes_on_and_the_person_is_told(robot_out, arm: Robot, receiver: Recei
     keeps_its_limits(receiver.messages, arm)
 
 
+@pytest.mark.slow
 def test_the_same_recording_gives_the_same_commands(
     simulation: Simulation, arm: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

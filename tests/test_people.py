@@ -409,6 +409,7 @@ def test_random_part_has_its_size_and_stands_with_the_segment(segment: str) -> N
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(turns), axis=(0, 1))), (across, across, twist), rtol=0.08)
 
 
+@pytest.mark.slow
 def test_breath_creep_slips_and_wobble() -> None:
     t = np.arange(0.0, 600.0, 0.1)
     still = (joints(), joints())

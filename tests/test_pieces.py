@@ -84,6 +84,7 @@ def test_pieces_put_together_are_the_whole(session: Path, subject: Subject, meth
     assert accumulator.finish().content == summarize(whole).content
 
 
+@pytest.mark.slow
 def test_of_a_csv_too_and_with_lost_samples(session: Path, subject: Subject, monkeypatch) -> None:
     """Gaps over the edges of pieces, over a whole piece, and of rows: what is marked is marked in both."""
     monkeypatch.setattr("wepose_pin.readers.tables.BLOCK_ROWS", 333)

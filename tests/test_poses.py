@@ -82,7 +82,7 @@ def test_a_bow_shows_where_the_torso_faces_to_sensors_without_accelerations() ->
     assert "phase-not-used" not in [each.code for each in bowed.diagnostics]
 
 
-SLOW = ("a bow to the side", "arms forwards")
+SLOW = ("a bow to the side", "arms forwards", "arms that hang")
 
 
 @pytest.mark.parametrize("what", [pytest.param(what, marks=[pytest.mark.slow] * (what in SLOW)) for what in WRONG])

@@ -181,6 +181,7 @@ def test_without_a_measured_length_the_scale_is_the_priors(unmeasured: Calibrati
     assert "scale-from-prior" not in {each.code for each in quality.further}  # not twice
 
 
+@pytest.mark.slow
 def test_a_measured_length_that_contradicts_all_else_is_named_once(
     anywhere: Simulation, person: Person, good: Calibration, unmeasured: Calibration
 ) -> None:
@@ -295,6 +296,7 @@ def test_a_sensor_upside_down_is_another_mount_or_said_and_solved(
     assert np.abs(heading_errors(calibration, true)).max() < 8.0
 
 
+@pytest.mark.slow
 def test_a_mount_that_faces_elsewhere_is_said_and_solved(person: Person, stated: Simulation) -> None:
     """Gravity does not see it, the motion does."""
     quarter = Rotation.from_rotvec([np.pi / 2, 0.0, 0.0])  # about the axis that points up

@@ -86,6 +86,7 @@ def test_track_again_is_the_same(result: Path, capsys: pytest.CaptureFixture[str
     assert {path: path.read_bytes() for path in result.rglob("*")} == before
 
 
+@pytest.mark.slow
 def test_what_is_made_by_other_commands(session: Path, result: Path, tmp_path: Path) -> None:
     assert run("calibrate", session, "--measured", "shoulder_width=0.36", "-o", tmp_path / "anna") in (0, 3, 4)
     assert run("reproduce", tmp_path / "anna") == 0

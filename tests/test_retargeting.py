@@ -286,6 +286,7 @@ def test_a_link_may_have_the_name_of_its_fixed_joint(tmp_path: Path) -> None:
     np.testing.assert_array_equal(retarget(person(2.0), str(urdf)).joint_position, plain.joint_position)
 
 
+@pytest.mark.slow
 def test_turned_bases_move_alike(arm, tmp_path: Path) -> None:
     straight = retarget(person(4.0), arm)
     turned = load_robot(find_map(str(write_arm(tmp_path, turned=(0.5 * np.pi, 0.2, -1.1)))))
@@ -433,6 +434,7 @@ def test_a_jump_of_a_metre_is_no_jump_of_the_robot(arm) -> None:
     assert trajectory.targets[0].lost[trajectory.approach_samples :].any()
 
 
+@pytest.mark.slow
 def test_nan_and_lost_samples_slow_the_robot(arm, swung: Trajectory) -> None:
     pose = person(8.0)
     points = {name: p.copy() for name, p in pose.points.items()}
@@ -474,6 +476,7 @@ def test_an_arm_that_is_never_known_is_refused(arm) -> None:
         retarget(person(2.0, side="left"), arm)
 
 
+@pytest.mark.slow
 def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     pose = person(6.0, flexion=80.0, swing=10.0)
     points = dict(pose.points)

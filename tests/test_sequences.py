@@ -99,6 +99,7 @@ def test_parts_are_done_as_they_say(joined: tuple[Person, Simulation]) -> None:
             assert np.ptp(in_torso(simulation, f"{side}_elbow", rows), axis=0).max() > 0.05
 
 
+@pytest.mark.slow
 def test_exact_parts_give_headings_and_lengths_back(joined: tuple[Person, Simulation]) -> None:
     """The T-pose is left out: it is held as people hold it, not exactly."""
     person, simulation = joined

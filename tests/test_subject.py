@@ -48,6 +48,7 @@ def test_stature_narrows_the_prior_and_left_follows_right() -> None:
     assert np.linalg.eigvalsh(wide.lengths_covariance())[0] > 0
 
 
+@pytest.mark.slow
 def test_people_drawn_have_the_priors_spread() -> None:
     average, rng = population_subject(), np.random.default_rng(0)
     drawn = np.array([[average.sample(rng).lengths[name] for name in LENGTHS] for _ in range(2000)])

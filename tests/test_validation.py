@@ -53,6 +53,7 @@ def test_two_runs_give_the_same_figures_on_any_number_of_workers() -> None:
     assert list(run_jobs(jobs, workers=2)) == [alone, again]
 
 
+@pytest.mark.slow
 def test_the_drift_experiment_is_the_papers() -> None:
     mean = {method: figures for _, method, figures, _ in summarize(run("drift"))}
     assert mean["smekf"]["drift_deg_min"] < 0.1
@@ -131,6 +132,7 @@ def test_each_half_of_the_authors_trial_is_scored_with_the_other(
     assert figures["smekf"]["total_rmse"] < figures["ncf, default gains"]["total_rmse"]
 
 
+@pytest.mark.slow
 def test_a_run_of_some_experiments_keeps_the_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def validate(*words: object) -> int:
         with pytest.raises(SystemExit) as stop:
