@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, batch, bodies, calibration, doubled, filters, tables
+from benchmarks import accuracy, batch, bodies, calibration, doubled, filters, kinematics, tables
 from benchmarks.__main__ import main
 from wepose_pin.filters import METHODS
 from wepose_pin.simulation import IDEAL_PRESET
@@ -163,6 +163,13 @@ def test_what_cannot_be_measured_is_one_line(tmp_path: Path, capsys: pytest.Capt
     with pytest.raises(SystemExit) as stop:
         run("thoughts")
     assert stop.value.code == 2
+
+
+def test_kinematics_beside_a_bare_loop() -> None:
+    rows = kinematics.measure_kinematics(0.02).rows
+    assert rows[kinematics.BARE]["ratio"] == 1.0
+    assert len(rows) == 3
+    assert all(row["ratio"] > 0.0 for row in rows.values())
 
 
 def test_every_kind_names_its_sections() -> None:

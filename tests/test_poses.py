@@ -1,13 +1,15 @@
-"""Poses and bows beside joined hands: what they show, and what happens where they were held otherwise."""
+"""Poses and bows beside joined hands: what they show, and what happens where people do others."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from wepose_pin.calibration import Calibration, calibrate
+from wepose_pin.errors import BadSession
 from wepose_pin.filters import FilterSettings, run_filter
 from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.recording import OrientationSensor, Recording
@@ -86,7 +88,7 @@ SLOW = ("a bow to the side", "arms forwards", "arms that hang")
 
 
 @pytest.mark.parametrize("what", [pytest.param(what, marks=[pytest.mark.slow] * (what in SLOW)) for what in WRONG])
-def test_what_was_held_otherwise_is_said_and_left_out(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_pose_than_the_protocols_is_said_and_left_out(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     protocol, name, value = WRONG[what]
     monkeypatch.setattr(sequence, name, value)
     person, simulation = perform(protocol)
@@ -111,3 +113,11 @@ def test_without_joined_hands_nobody_knows_which_pose_is_wrong_and_that_is_said(
     bad = solve(person, hanging, "poses")
     assert ("pose-contradicted", "t_pose") in [(each.code, each.place) for each in bad.quality.reasons]
     assert bad.quality.quality != "pass"
+
+
+@pytest.mark.parametrize("condition", ['[[axis]]\nsegment = "head"', "[[pose]]\ndirections.head = [0, 0, 1]"])
+def test_a_pose_of_a_segment_without_a_sensor_is_one_line(tmp_path: Path, condition: str) -> None:
+    person, simulation = perform("t_pose")
+    (tmp_path / "own.toml").write_text(f'{condition}\nphase = "t_pose"\nstd_deg = 4.0\n', encoding="utf-8")
+    with pytest.raises(BadSession, match="no sensor on head, which a pose or an axis is about"):
+        solve(person, simulation.recording(), str(tmp_path / "own.toml"))

@@ -164,14 +164,14 @@ def resolve_conditions(
     BadOption
         A point or segment that the body does not have.
     BadSession
-        A closure between points that no sensor determines.
+        A closure between points that no sensor determines, or a pose of a segment without a sensor.
     """
     table, constraints = model.table, list[Constraint]()
     for condition in protocol.conditions:
         if isinstance(condition, Closure):
             constraints.append(_resolve_closure(condition, protocol, model, start, sensors))
         elif isinstance(condition, Direction):
-            table.check_segments((condition.segment,), f"protocol '{protocol.name}': ", BadOption)
+            _check_posed((condition.segment, table.reference), protocol, model, sensors)
             constraints.append(
                 Pointing(
                     condition.segment,
@@ -182,12 +182,23 @@ def resolve_conditions(
                 )
             )
         elif isinstance(condition, Axis):
-            table.check_segments((condition.segment,), f"protocol '{protocol.name}': ", BadOption)
+            _check_posed((condition.segment,), protocol, model, sensors)
             axis = start.turn(condition.segment, (0.0, 1.0, 0.0))
             constraints.append(Level(condition.segment, axis, condition.std))
         else:
             constraints.append(Moving(tuple(s for s in condition.segments or table.segments if s in sensors)))
     return tuple(constraints)
+
+
+def _check_posed(segments: tuple[str, ...], protocol: Protocol, model: BodyModel, sensors: Collection[str]) -> None:
+    """Raise `BadOption` where the body lacks a segment of a pose, `BadSession` where it has no sensor."""
+    model.table.check_segments(segments, f"protocol '{protocol.name}': ", BadOption)
+    lacking = [segment for segment in segments if segment not in sensors]
+    if lacking:
+        raise BadSession(
+            f"protocol '{protocol.name}': no sensor on {lacking[0]}, which a pose or an axis is about; add it, or "
+            f"leave out that condition"
+        )
 
 
 def _resolve_closure(

@@ -291,8 +291,8 @@ class CalibrationStep(Step):
                 sentence = "The proportions are good. The scale is still uncertain."
         if quality.quality == "fail" and self._lacks_motion:
             sentence = "There was too little of the motion. More of it may be enough."
-        found = (*quality.reasons, *(each for each in quality.further if each.code == "phase-not-used"))
-        reasons = [text.line() for _, text in render_all(count_from_begin(found, calibration), REMEDIES)]
+        diagnostics = (*quality.reasons, *(each for each in quality.further if each.code == "phase-not-used"))
+        reasons = [text.line() for _, text in render_all(count_from_begin(diagnostics, calibration), REMEDIES)]
         if self._moved:  # all other reasons follow from this one
             sentence, reasons = (
                 "Some sensors sit on other segments than assigned. The same motion will do.",
