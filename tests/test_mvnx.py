@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -15,6 +16,7 @@ import wepose_pin as wp
 from wepose_pin.errors import BadData, BadSession, MissingFile
 from wepose_pin.kinematics import compute_pose
 from wepose_pin.readers.mvnx import read_frames, read_mvnx
+from wepose_pin.readers.subject import read_subject
 from wepose_pin.subject import Hinge
 from wepose_pin.tracking import track
 
@@ -34,17 +36,20 @@ def mvnx(
     before: str = "",
     end: str = "</frames></subject></mvnx>",
     arm: tuple[float, float, float] | None = None,
+    t_pose: str | None = "1 0 0 0 " * len(SEGMENTS),
 ) -> Path:
     """A file with these orientations (n, 6, 4) and, with `raw`, two sensors that rest with gravity on z.
 
     `arm`: from joint to joint in the frames of the left arm's segments; its positions are in the file then.
+    `t_pose`: the orientations in its frame of type tpose; None: it has no such frame.
     """
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', before, HEAD.format(version=version, rate=rate), "<segments>"]
     lines += [f'<segment label="{name}" id="{k}"><points/></segment>' for k, name in enumerate(SEGMENTS, 1)]
     lines += ["</segments><sensors>", '<sensor label="T8"/><sensor label="LeftForeArm"/>', "</sensors><frames>"]
-    ones = " ".join(["1 0 0 0"] * len(SEGMENTS))
-    poses = ("npose", "tpose") if version == "2" else ("identity", "tpose", "tpose-isb")
-    lines += [f'<frame time="0" type="{pose}"><orientation>{ones}</orientation></frame>' for pose in poses]
+    poses = {"npose" if version == "2" else "identity": "1 0 0 0 " * len(SEGMENTS)}
+    if t_pose is not None:
+        poses["tpose"] = t_pose
+    lines += [f'<frame type="{pose}"><orientation>{quats}</orientation></frame>' for pose, quats in poses.items()]
     for k, quats in enumerate(quat_wxyz):
         number = k if index is None else index[k]
         lines.append(f'<frame time="{round(20 * number)}" index="{number}" type="normal">')
@@ -124,12 +129,30 @@ def test_elbow_and_wrist_stand_to_the_shoulder_as_in_xsens(tracked, side: str, n
         assert np.linalg.norm(ours - theirs, axis=1).max() < 1e-3  # 0.17 mm found
 
 
+def repeat_frames(path: Path, out: Path, count: int) -> None:
+    """Write a copy whose frames of motion are repeated, one after the other, to `count` at least."""
+    tree = ElementTree.parse(path)
+    frames = tree.getroot().find(".//{*}frames")
+    assert frames is not None
+    moving = [frame for frame in frames if frame.get("type") == "normal"]
+    for k in range(len(moving), count):
+        frames.append(deepcopy(moving[k % len(moving)]))
+        frames[-1].set("index", str(k))
+    tree.write(out)
+
+
+@pytest.mark.parametrize("file", ["test_mocap.mvnx", "Meri-020.mvnx"])
 @pytest.mark.parametrize(("side", "name"), [("left", "Left"), ("right", "Right")])
-def test_elbow_and_wrist_have_the_joint_angles_of_xsens(data: Path, tmp_path: Path, side: str, name: str) -> None:
+def test_elbow_and_wrist_have_the_joint_angles_of_xsens(
+    data: Path, tmp_path: Path, file: str, side: str, name: str
+) -> None:
     """Of MVN's three, z, x, y of a Z-X-Y sequence as the ISB has it, abduction (x) has the other sign."""
-    path = data / "mvnx" / "test_mocap.mvnx"
+    path = tmp_path / file
+    repeat_frames(data / "mvnx" / file, path, 100)
     angles = wp.joint_angles(
-        wp.track(wp.load_session(session(tmp_path, path, (*OURS, "left_hand", "right_hand")))).pose
+        wp.track(
+            wp.load_session(session(tmp_path, path, (*OURS, "left_hand", "right_hand"), 'use = "orientation"'))
+        ).pose
     )
     root = ElementTree.parse(path).getroot()
     xmlns = "{http://www.xsens.com/mvn/mvnx}"
@@ -145,6 +168,23 @@ def test_elbow_and_wrist_have_the_joint_angles_of_xsens(data: Path, tmp_path: Pa
         assert np.degrees(off.max()) < 0.001
     if side == "right":  # the left elbow goes through gimbal lock
         np.testing.assert_allclose(np.degrees(angles["right_wrist"].values), np.column_stack([z, -x, y]), atol=0.001)
+
+
+def test_a_subject_from_an_mvnx_has_the_lengths_as_they_are(
+    xsens: tuple[Path, dict[str, np.ndarray], dict[str, np.ndarray]],
+) -> None:
+    path, _, moving = xsens
+    subject = read_subject(path)
+    for side in ("left", "right"):
+        arm = [moving[f"{side.capitalize()}{part}"] for part in ("UpperArm", "ForeArm", "Hand")]
+        for segment, upper, lower in (("upper_arm", *arm[:2]), ("forearm", *arm[1:])):
+            length = np.median(np.linalg.norm(lower - upper, axis=1))
+            assert subject.lengths[f"{side}_{segment}"] == pytest.approx(length, abs=1e-9)
+            assert subject.std(f"{side}_{segment}") == pytest.approx(0.01)
+    prior = wp.population_subject()
+    assert subject.lengths["left_hand"] != prior.lengths["left_hand"]  # that of people with these arms
+    assert 0.004 < subject.std("left_hand") < prior.std("left_hand")
+    assert np.linalg.eigvalsh(subject.covariance).min() > 0.0
 
 
 def test_one_rigid_trunk_costs_millimetres_at_the_shoulders(tracked) -> None:
@@ -206,33 +246,45 @@ def test_poses_are_no_motion_and_segment_frames_are_those_of_the_n_pose(version:
     np.testing.assert_allclose(right.apply([0.0, 0.0, -1.0]), [0.0, -1.0, 0.0], atol=1e-9)
 
 
-@pytest.mark.parametrize("arm", [(0.0, 1.0, 0.0), (0.0, 0.0, -1.0), None])
-def test_arms_referred_to_either_pose_are_told_by_the_positions(
-    arm: tuple[float, float, float] | None, tmp_path: Path
-) -> None:
-    """Our forearm lies along −z of its frame, whatever MVN's does; without positions it is as in the T-pose."""
+ISB = "1 0 0 0  1 0 0 0  0.70711 0.70711 0 0  0.48970 0.51009 0.48970 -0.51009  0.5 0.5 0.5 -0.5  0.70711 -0.70711 0 0"
+
+
+@pytest.mark.parametrize("t_pose", [ISB, None], ids=["tpose", "none"])
+def test_arms_in_the_frames_of_the_isb(t_pose: str | None, tmp_path: Path) -> None:
+    """Told by the T-pose or, without one, by the positions. A hanging palm is at the thigh in our frames."""
     quat = turning()
-    device = read_mvnx(mvnx(tmp_path, quat, arm=arm))
-    for k, label in ((2, "LeftUpperArm"), (3, "LeftForeArm"), (4, "LeftHand")):
+    device = read_mvnx(mvnx(tmp_path, quat, arm=(0.0, 0.0, -1.0), t_pose=t_pose))
+    for k, label, palm in ((2, "LeftUpperArm", -90.0), (3, "LeftForeArm", 0.0), (4, "LeftHand", 0.0)):
         ours = Rotation.from_quat(device.table.select([f"{label} orientation {c}" for c in "xyzw"]).to_numpy())
-        along_W = Rotation.from_quat(quat[:, k][:, [1, 2, 3, 0]]).apply(arm or (0.0, 1.0, 0.0))
-        np.testing.assert_allclose(ours.apply([0.0, 0.0, -1.0]), along_W, atol=1e-6)
-    assert [each.code for each in device.diagnostics] == ["arm-frames-assumed"] * (arm is None)
+        theirs = Rotation.from_quat(quat[:, k][:, [1, 2, 3, 0]])
+        np.testing.assert_allclose(ours.apply([0.0, 0.0, -1.0]), theirs.apply([0.0, 0.0, -1.0]), atol=1e-6)
+        inward = [np.cos(np.radians(palm)), np.sin(np.radians(palm)), 0.0]  # what is -y, inward, of our frame
+        np.testing.assert_allclose(ours.apply([0.0, -1.0, 0.0]), theirs.apply(inward), atol=1e-6)
+    assert [each.code for each in device.diagnostics] == ["arm-frames-assumed"] * (t_pose is None)
     torso = device.table.select([f"T8 orientation {c}" for c in "xyzw"]).to_numpy()
     np.testing.assert_allclose(torso, quat[:, 1][:, [1, 2, 3, 0]], atol=1e-8)
 
 
+@pytest.mark.parametrize("t_pose", ["1 0 0 0 " * len(SEGMENTS), None], ids=["tpose", "none"])
 @pytest.mark.parametrize("arm", [(1.0, 0.0, 0.0), (0.0, 0.7, -0.7), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)])
-def test_arms_of_neither_pose_are_refused(arm: tuple[float, float, float], tmp_path: Path) -> None:
-    with pytest.raises(BadData, match=r"LeftUpperArm lies \d+ deg off y .* and \d+ deg off -z") as error:
-        read_mvnx(mvnx(tmp_path, turning(), arm=arm))
+def test_arms_that_do_not_lie_along_their_frames_are_refused(
+    arm: tuple[float, float, float], t_pose: str | None, tmp_path: Path
+) -> None:
+    with pytest.raises(BadData, match=r"Left(Upper|Fore)Arm lies \d+ deg off the axis of its frame") as error:
+        read_mvnx(mvnx(tmp_path, turning(), arm=arm, t_pose=t_pose))
     assert "\n" not in str(error.value)
     assert read_mvnx(mvnx(tmp_path, turning(), arm=arm, raw=True)).kind == "raw"  # raw data do not need them
 
 
+def test_a_t_pose_of_another_pose_is_refused(tmp_path: Path) -> None:
+    path = mvnx(tmp_path, turning(), t_pose=f"{'1 0 0 0 ' * 3} 0.9239 0.3827 0 0 {'1 0 0 0 ' * 2}")
+    with pytest.raises(BadData, match="frame of type tpose is no T-pose: LeftForeArm is 45 deg off a quarter turn"):
+        read_mvnx(path)
+
+
 @pytest.mark.parametrize("name", ["Meri-020.mvnx", "test_mocap.mvnx"])
 def test_real_arms_lie_along_their_frames(name: str, data: Path) -> None:
-    """The one export refers the arms to the N-pose, the other to the T-pose."""
+    """The one export has the arms in the frames of the ISB, the other in those of the T-pose."""
     path = data / "mvnx" / name
     device = read_mvnx(path, "orientation")
     frames = read_frames(path)

@@ -2,15 +2,17 @@
 
 Each frame of type `normal` holds the segments' orientations (w x y z, to a world with z up) and, in exports before MVN
 2018, the sensors' `sensorAcceleration` [m/s²] and `sensorAngularVelocity` [rad/s]. An Xsens segment's frame is the
-world's (x forward, y left, z up) in the T-pose with palms down; ours is in the N-pose, an arm's thus a quarter turn
-about x away. Some exports (MVN 4.2) refer the arms to the N-pose, as we do. Which of the two it is, the segments'
-positions in the same frames say: from joint to joint an arm's segment lies along y of its frame, or along −z.
+world's (x forward, y left, z up) in the T-pose with palms down; ours is in the N-pose. MVN 4.2 exports the arms in the
+frames of the ISB: these are the world's where the arms hang with palms forward. The file's frame of type `tpose` tells
+which. Without it the segments' positions tell: from joint to joint an arm's segment lies along y of its frame, or along
+−z.
 
-Source: MVN User Manual, MVNX structure; the frames `identity` and `tpose` of exported files.
+Source: MVN User Manual, MVNX structure; the frames `tpose` and `tpose-isb` of exported files.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,8 +38,23 @@ SEGMENT_OF = {
     "LeftHand": "left_hand",
     "RightHand": "right_hand",
 }
-# R_BL, our segment frame in Xsens's: arms fall from the T-pose to the N-pose by a quarter turn about x.
-_QUARTER = {"left": 0.5 * np.pi, "right": -0.5 * np.pi}
+
+
+def _quarter_turns(axis: tuple[float, float, float], parts: tuple[str, ...]) -> dict[str, Rotation]:
+    """Return a turn for each label: of these parts a quarter about the axis, the other way on the right; else none."""
+    turns = dict.fromkeys(SEGMENT_OF, Rotation.identity())
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        turns |= {f"{side}{part}": Rotation.from_rotvec(sign * 0.5 * np.pi * np.array(axis)) for part in parts}
+    return turns
+
+
+# R_WL in the T-pose: from the N-pose an arm rises by a quarter turn.
+_RAISED = _quarter_turns((1.0, 0.0, 0.0), ("UpperArm", "ForeArm", "Hand"))
+# R_BL of the ISB's frames, in which the palm of a hanging arm is forward.
+_SUPINATED = _quarter_turns((0.0, 0.0, 1.0), ("ForeArm", "Hand"))
+# In the T-pose each of Xsens's frames is one of these, but for the tilts of that pose: 13 deg at the head.
+_QUARTERS = Rotation.create_group("O")
+T_POSE_DEG = 30.0
 WIDTH = {"orientation": 4, "position": 3, "sensorAngularVelocity": 3, "sensorAcceleration": 3}
 # An arm's segment and the one that begins at its other end.
 ARM = {
@@ -67,6 +84,7 @@ class Frames(NamedTuple):
     segments: list[str]
     sensors: list[str]
     values: dict[str, np.ndarray]  # element → (n, count, width)
+    t_pose: np.ndarray | None  # (count, 4) xyzw, the segments' orientations in the T-pose
 
 
 def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
@@ -77,7 +95,7 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
     Raises
     ------
     MissingFile, BadData
-        Not there; no MVNX, damaged, cut off, or without what `use` asks for; arms whose frames fit neither pose.
+        Not there; no MVNX, damaged, cut off, or without what `use` asks for; arms that do not lie along their frames.
     """
     frames = read_frames(path, rate_hz)
     assumed: tuple[Diagnostic, ...] = ()
@@ -95,15 +113,9 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
             if label in SEGMENT_OF
         }
     else:
-        quat = frames.values["orientation"]
-        pose = _reference_pose(path, frames)
-        if pose is None:
+        values = {label: {"orientation": quat} for label, quat in _read_orientations(path, frames).items()}
+        if frames.t_pose is None:
             assumed = (Diagnostic("arm-frames-assumed", WARNING, path.name),)
-        values = {
-            label: {"orientation": _segment_quat(label, quat[:, k], pose or "T")}
-            for k, label in enumerate(frames.segments)
-            if label in SEGMENT_OF
-        }
     if not values:
         listed = ", ".join(frames.segments[:12])
         raise BadData(f"{path}: none of the upper body's segments, such as T8; there is: {listed}")
@@ -126,12 +138,7 @@ def read_mvnx_reference(path: Path) -> Reference:
         As `read_mvnx`.
     """
     frames = read_frames(path)
-    pose = _reference_pose(path, frames) or "T"
-    quats = {
-        SEGMENT_OF[label]: _segment_quat(label, frames.values["orientation"][:, k], pose)
-        for k, label in enumerate(frames.segments)
-        if label in SEGMENT_OF
-    }
+    quats = {SEGMENT_OF[label]: quat for label, quat in _read_orientations(path, frames).items()}
     return Reference(frames.time, quats, _find_joints(frames), "+z")
 
 
@@ -168,57 +175,77 @@ def _find_joints(frames: Frames) -> dict[str, np.ndarray]:
     }
 
 
-def _reference_pose(path: Path, frames: Frames) -> str | None:
-    """The pose, "T" or "N", in which the frames of the arms' segments are the world's; None without their positions.
+def _read_orientations(path: Path, frames: Frames) -> dict[str, np.ndarray]:
+    """Read each label's `quat_WL` (n, 4) xyzw, of our frame; rows of zeros or NaN become NaN."""
+    turns = _find_turns(path, frames)
+    orientations = {}
+    for k, label in enumerate(frames.segments):
+        if label in SEGMENT_OF:
+            quat, good = _select_good(frames.values["orientation"][:, k])
+            orientations[label] = np.full(quat.shape, np.nan)
+            orientations[label][good] = (Rotation.from_quat(quat[good]) * turns[label]).as_quat()
+    return orientations
+
+
+def _select_good(quat_wxyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return quaternions (n, 4) as xyzw, and which of them are neither zeros nor NaN."""
+    quat = rotations.xyzw_from_wxyz(quat_wxyz)
+    return quat, np.isfinite(quat).all(axis=1) & (np.linalg.norm(np.nan_to_num(quat), axis=1) > 0.5)
+
+
+def _find_turns(path: Path, frames: Frames) -> dict[str, Rotation]:
+    """Find each label's R_BL, our frame in Xsens's, by the file's T-pose; without one by the positions.
 
     Raises
     ------
     BadData
-        A segment's axis fits neither, or another one's says otherwise.
+        The frame `tpose` is of another pose; an arm does not lie along its frame.
     """
-    if "position" not in frames.values:
-        return None
+    if frames.t_pose is not None:
+        turns = _read_t_pose(path, frames.segments, frames.t_pose)
+        choices = [{label: R_WB.inv() * _RAISED[label] for label, R_WB in turns.items()}]
+    else:
+        choices = [_RAISED, _SUPINATED]
+    (label, off_deg), turns = min(
+        ((_find_off_axis(frames, turns), turns) for turns in choices), key=lambda choice: choice[0][1]
+    )
+    if off_deg > ALONG_DEG:
+        raise BadData(
+            f"{path}: {label} lies {off_deg:.0f} deg off the axis of its frame, by its <position> and that of "
+            f"{ARM[label]}; the orientations are not read. Export the file again"
+        )
+    return turns
+
+
+def _read_t_pose(path: Path, segments: Sequence[str], quats: np.ndarray) -> dict[str, Rotation]:
+    """Read each label's R_WB in the T-pose, to a quarter turn."""
+    turns = {}
+    for label, quat in zip(segments, quats, strict=True):
+        if label in SEGMENT_OF:
+            off = (_QUARTERS.inv() * Rotation.from_quat(quat)).magnitude()
+            if off.min() > np.radians(T_POSE_DEG):
+                raise BadData(
+                    f"{path}: its frame of type tpose is no T-pose: {label} is {np.degrees(off.min()):.0f} deg off a "
+                    f"quarter turn there; the orientations are not read. Export the file again"
+                )
+            turns[label] = _QUARTERS[int(np.argmin(off))]
+    return turns
+
+
+def _find_off_axis(frames: Frames, turns: Mapping[str, Rotation]) -> tuple[str, float]:
+    """Find the arm's segment that lies furthest off −z of our frame, and that angle [deg]; 0 without positions."""
     at = {label: k for k, label in enumerate(frames.segments)}
-    poses = {}
-    for label, end in ARM.items():
+    off_deg = {"": 0.0}
+    for label, end in ARM.items() if "position" in frames.values else ():
         if label not in at or end not in at:
             continue
-        quat = rotations.xyzw_from_wxyz(frames.values["orientation"][:, at[label]])
+        quat, good = _select_good(frames.values["orientation"][:, at[label]])
         along_W = frames.values["position"][:, at[end]] - frames.values["position"][:, at[label]]
-        good = np.isfinite(quat).all(axis=1) & (np.linalg.norm(np.nan_to_num(quat), axis=1) > 0.5)
         good &= np.linalg.norm(np.nan_to_num(along_W), axis=1) > 1e-3
-        if not good.any():
-            continue
-        along_B = np.median(Rotation.from_quat(quat[good]).inv().apply(along_W[good]), axis=0)
-        along_B /= np.linalg.norm(along_B)
-        axes = {"T": [0.0, 1.0 if label.startswith("Left") else -1.0, 0.0], "N": [0.0, 0.0, -1.0]}
-        off = {pose: float(np.degrees(np.arccos(np.clip(along_B @ axis, -1.0, 1.0)))) for pose, axis in axes.items()}
-        poses[label] = min(off, key=lambda pose: off[pose])
-        if off[poses[label]] > ALONG_DEG:
-            raise BadData(
-                f"{path}: by its <position> and {end}'s, {label} lies {off['T']:.0f} deg off y of its frame (as in the "
-                f"T-pose) and {off['N']:.0f} deg off -z (N-pose); its orientations are of neither and are not read"
-            )
-    if len(set(poses.values())) > 1:
-        names = ", ".join(f"{label} {pose}-pose" for label, pose in poses.items())
-        raise BadData(
-            f"{path}: the arms' frames are the world's in two poses: {names}; export it again, with one of them"
-        )
-    return next(iter(poses.values()), None)
-
-
-def _segment_quat(label: str, quat_WB: np.ndarray, pose: str) -> np.ndarray:
-    """`quat_WL` (n, 4) xyzw of our frame from Xsens's (n, 4) wxyz, an arm's being the world's in the T- or N-pose.
-
-    Rows of zeros or NaN become NaN.
-    """
-    quat = rotations.xyzw_from_wxyz(quat_WB)
-    good = np.isfinite(quat).all(axis=1) & (np.linalg.norm(np.nan_to_num(quat), axis=1) > 0.5)
-    turned = np.full(quat.shape, np.nan)
-    side = SEGMENT_OF[label].partition("_")[0]
-    R_BL = Rotation.from_rotvec([_QUARTER.get(side, 0.0) if pose == "T" else 0.0, 0.0, 0.0])
-    turned[good] = (Rotation.from_quat(quat[good]) * R_BL).as_quat()
-    return turned
+        if good.any():
+            along_L = np.median((Rotation.from_quat(quat[good]) * turns[label]).inv().apply(along_W[good]), axis=0)
+            off_deg[label] = float(np.degrees(np.arccos(np.clip(-along_L[2] / np.linalg.norm(along_L), -1.0, 1.0))))
+    return max(off_deg.items(), key=lambda each: each[1])
 
 
 def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
@@ -235,6 +262,7 @@ def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
     sensors: list[str] = []
     times: list[tuple[str, str]] = []
     texts: dict[str, list[str]] = {}
+    t_pose: list[str] = []
     own_rate_hz = 0.0
     try:
         with path.open("rb") as file:
@@ -259,6 +287,8 @@ def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
                         for child in element:
                             if (tag := _name(child)) in WIDTH:
                                 texts.setdefault(tag, []).append(child.text or "")
+                    elif element.get("type") == "tpose":
+                        t_pose = [child.text or "" for child in element if _name(child) == "orientation"][:1]
                     element.clear()
                     while element.getprevious() is not None:
                         del element.getparent()[0]
@@ -278,7 +308,14 @@ def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
         tag: _values(path, tag, rows, len(segments) if tag in ("orientation", "position") else len(sensors), len(times))
         for tag, rows in texts.items()
     }
-    return Frames(_times(path, times, rate_hz or own_rate_hz), segments, sensors, values)
+    quats = _values(path, "orientation", t_pose, len(segments), len(t_pose)).reshape(-1, 4)
+    return Frames(
+        _times(path, times, rate_hz or own_rate_hz),
+        segments,
+        sensors,
+        values,
+        _select_good(quats)[0] if len(quats) and _select_good(quats)[1].all() else None,
+    )
 
 
 def _name(element: Any) -> str:
