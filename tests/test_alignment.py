@@ -11,6 +11,7 @@ from bodies import SEGMENTS, TABLE
 from scipy.spatial.transform import Rotation
 from simulated import estimate_segments
 
+import wepose_pin as wp
 from wepose_pin.alignment import (
     MOUNT_MOVED_STDS,
     N_POSE,
@@ -27,7 +28,7 @@ from wepose_pin.filters.phases import COMMON_RATE
 from wepose_pin.model import load_model
 from wepose_pin.model.start_pose import orient_links
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, compute_mount, find_mount_axes
-from wepose_pin.simulation import Simulation, simulate_paper_dynamic
+from wepose_pin.simulation import Person, Simulation, simulate_paper_dynamic
 from wepose_pin.subject import StartPoseOffset, Subject, mount_rows, population_subject
 
 
@@ -344,3 +345,34 @@ def test_soft_tissue_without_the_segment_that_it_is_relative_to() -> None:
     quat_WL = {"left_upper_arm": Rotation.from_rotvec([0.0, 0.0, 40.0], degrees=True).as_quat()[None]}
     cov = compute_soft_tissue_covariances(TABLE, quat_WL)["left_upper_arm"][0]
     np.testing.assert_allclose(np.degrees(np.sqrt(np.diag(cov))), [2.0, 2.0, 2.5], rtol=1e-9)
+
+
+def with_start(recording: Recording, begin: float, end: float) -> Recording:
+    return replace(recording, phases={**recording.phases, "start": ((begin, end),)})
+
+
+def test_a_start_interval_that_reaches_into_the_motion_is_trimmed_for_a_calibration(
+    half_minute: Recording, person: Person
+) -> None:
+    right, longer = (
+        wp.calibrate(with_start(half_minute, 3.3, end), measured=person.measured, prior=person.prior)
+        for end in (5.2, 5.75)
+    )
+    assert [each.code for each in longer.quality.reasons] == [each.code for each in right.quality.reasons]
+    new = {each.code for each in longer.diagnostics} - {each.code for each in right.diagnostics}
+    assert new == {"static-phase-trimmed"}
+
+
+def test_a_start_interval_that_reaches_into_the_motion_is_trimmed_for_tracking(half_minute: Recording) -> None:
+    segments = estimate_segments(with_start(half_minute, 3.3, 5.75))
+    [trimmed] = segments.diagnostics
+    assert trimmed.code == "static-phase-trimmed"
+    assert segments.start[0] == pytest.approx(3.3)
+    assert 4.9 < segments.start[1] < 5.4
+    assert "[phases] start = [[3.3, " in str(trimmed)
+    assert not estimate_segments(with_start(half_minute, *segments.start)).diagnostics
+
+
+def test_a_start_interval_with_too_little_static_time_is_refused(half_minute: Recording) -> None:
+    with pytest.raises(BadPhase, match=r"phases\.start: sensors\.\w+ turns at up to .* less than 1 s of it is static"):
+        estimate_segments(with_start(half_minute, 4.6, 5.9))

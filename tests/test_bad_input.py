@@ -184,11 +184,11 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     ),
     "a start phase in motion": (
         lambda f: f.say("[[0.5, 2.5]]", "[[4.0, 6.0]]"),
-        "session.toml: sensors.torso turns by ",
+        "session.toml: phases.start: sensors.torso turns at up to 61 deg/s in 4 to 6 s, and less than 1 s of it is",
     ),
     "a ready sensor in motion": (
         lambda f: (setattr(f, "session", QUATS), f.say("[[0.5, 2.5]]", "[[4.0, 6.0]]")),
-        "deg/s rms in phases.start (4 to 6 s); name seconds in which it is static",
+        "phases.start: sensors.torso turns at up to 61 deg/s in 4 to 6 s, and less than 1 s of it is static; name sec",
     ),
     # the table
     "a missing table": (lambda f: f.say("arm.csv", "amr.csv"), "amr.csv: no such file; did you mean 'arm.csv'?"),

@@ -43,7 +43,13 @@ CAUSES = {
     "identical": {"orientations-copied"},
     "swapped": {"sensors-exchanged"},
     "gap": {"long-gaps-bridged"},
-    "start": {"start-pose-guessed", "start-pose-sway", "mount-contradicts-gravity", "mount-moved"},
+    "start": {
+        "start-pose-guessed",
+        "start-pose-sway",
+        "static-phase-trimmed",
+        "mount-contradicts-gravity",
+        "mount-moved",
+    },
     "bias": {"person-rotates"},
 }
 ALWAYS = ("start", "bias")

@@ -12,6 +12,7 @@ from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase
 from ..recording import OrientationSensor, Recording, format_span, format_time
+from ..recording.sensors import compute_rate
 from .noise import SensorNoise, find_static_window
 
 # Motion in the start pose: root mean square of the rate, and largest rotation from the mean. A standing person sways
@@ -24,6 +25,10 @@ SWAYS_DEG_S, SWAYS_DEG = 6.0, 5.0
 COMMON_RATE, COMMON_RATE_CHANCE = float(np.deg2rad(0.5)), 1e-3
 LARGEST_BIAS = float(np.deg2rad(5.0))
 
+
+# Where a sensor turns faster than `SWAYS_DEG_S` over `BLOCK_S`, it moves; a tremor averages out over so long.
+BLOCK_S = 0.2
+LEAST_STATIC_S = 1.0  # of an interval with motion in it, that must be static
 
 # Samples of a static phase, and the share of them that each sensor must have measured.
 FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
@@ -61,7 +66,77 @@ def find_reference_phases(recording: Recording) -> tuple[tuple[float, float], tu
                     f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: its tilt "
                     f"is not known; name seconds in which it measures, or take [sensors.{segment}] out"
                 )
-    return start, static[0] if static else start, diagnostics
+    if recording.phases.get("start") and not recording.start_is_guessed:
+        start, moved = _find_static_part(recording, start, "start")
+        diagnostics += moved
+    if not static:
+        return start, start, diagnostics
+    lying, moved = _find_static_part(recording, static[0], "static")
+    return start, lying, [*diagnostics, *moved]
+
+
+def _find_static_part(
+    recording: Recording, interval: tuple[float, float], phase: str
+) -> tuple[tuple[float, float], list[Diagnostic]]:
+    """Find the longest part [s] of a stated interval in which no sensor moves, and the diagnostic that says so.
+
+    Raises
+    ------
+    BadPhase
+        The interval has motion in it, and no part of `LEAST_STATIC_S` without.
+    """
+    span = recording.span(interval)
+    size = max(1, round(BLOCK_S * recording.rate_hz))
+    firsts = np.arange(span.start, span.stop, size)  # first sample of each block
+    rates_deg_s = {
+        segment: _compute_block_rates(recording, segment, firsts, span.stop)
+        for segment, sensor in recording.sensors.items()
+        if not sensor.aligned
+    }
+    moves = np.any([rates > SWAYS_DEG_S for rates in rates_deg_s.values()], axis=0)
+    if not moves.any():
+        return interval, []
+    moves = np.convolve(moves, [1, 1, 1], mode="same") > 0  # motion begins and ends gently: a block more on both sides
+    edges = np.flatnonzero(np.diff(np.concatenate(([True], moves, [True]))))
+    begin, end = max(zip(edges[::2], edges[1::2], strict=True), key=lambda run: run[1] - run[0], default=(0, 0))
+    stops = np.append(firsts[1:], span.stop)
+    static = (float(recording.time[firsts[begin]]), float(recording.time[stops[end - 1] - 1]))
+    fastest = max(rates_deg_s, key=lambda segment: float(np.nanmax(rates_deg_s[segment])))
+    rate_deg_s = float(np.nanmax(rates_deg_s[fastest]))
+    if begin == end or static[1] - static[0] < LEAST_STATIC_S:
+        raise BadPhase(
+            f"{recording.where()}: phases.{phase}: sensors.{fastest} turns at up to {rate_deg_s:.0f} deg/s in "
+            f"{format_span(interval)}, and less than {LEAST_STATIC_S:g} s of it is static; name seconds in which "
+            f"nothing moves, better four"
+        )
+    facts: dict[str, float | str] = {
+        "phase": f"phases.{phase}",
+        "stated_start": interval[0],
+        "stated_end": interval[1],
+        "start": static[0],
+        "end": static[1],
+        "example": f"{phase} = [[{format_time(static[0])}, {format_time(static[1])}]]",
+    }
+    value, limit = np.deg2rad([rate_deg_s, SWAYS_DEG_S]).tolist()
+    return static, [Diagnostic("static-phase-trimmed", WARNING, fastest, value, limit, facts)]
+
+
+def _compute_block_rates(recording: Recording, segment: str, firsts: np.ndarray, stop: int) -> np.ndarray:
+    """Compute the mean rate (k,) [deg/s] of a sensor over blocks of samples, without its bias; NaN where it is lost.
+
+    Parameters
+    ----------
+    firsts : (k,) the first sample of each block
+    stop : the sample after the last block
+    """
+    part = recording.sensors[segment].part(slice(int(firsts[0]), stop))
+    gyro_S = compute_rate(part, recording.rate_hz)
+    measured = np.ones(len(gyro_S)) if part.gap is None else 1.0 - part.gap
+    rows = firsts - firsts[0]
+    counts = np.add.reduceat(measured, rows)
+    sums = np.add.reduceat(gyro_S * measured[:, None], rows)
+    means = np.divide(sums, counts[:, None], out=np.full_like(sums, np.nan), where=counts[:, None] > 0.0)
+    return np.degrees(np.linalg.norm(means - np.nanmedian(means, axis=0), axis=1))
 
 
 def _report_ignored_intervals(phase: str, first: tuple[float, float]) -> Diagnostic:
