@@ -324,6 +324,15 @@ def test_elbows_that_cannot_be(pose: TrackedRecording) -> None:
     assert "by 15° in the first half of the recording and by 45° in the second" in render(drifting).what
 
 
+def test_an_elbow_that_is_folded_too_far_and_drifts_out_of_its_plane(pose: TrackedRecording) -> None:
+    n = len(pose.time)
+    flexion = np.where(np.arange(n) < n // 4, 170.0, 90.0)
+    tracked = with_elbow(pose, flexion, np.linspace(0.0, 60.0, n))
+    assert the("hinge-overflexed", tracked).facts.get("variant") is None
+    assert the("hinge-out-of-plane", tracked).facts["variant"] == "drifting"
+    assert render(the("hinge-overflexed", tracked)).what
+
+
 def test_new_strapping(simulation: Simulation, pose: TrackedRecording) -> None:
     known: Subject = replace(pose.subject, mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])})
     anew = track(replace(simulation.recording("new"), remounted=True), known)

@@ -195,10 +195,11 @@ def _diagnose_hinges(tracked: TrackedRecording, hinges: Mapping[str, HingeMotion
         if np.count_nonzero(aside) / rate_hz > LASTING_S:
             most = float(np.abs(motion.aside[aside]).max())
             early, late = _median_of_halves(motion)
-            facts |= {"first_half": early, "second_half": late}
-            if abs(late - early) > APART:
-                facts["variant"] = "drifting"
-            yield Diagnostic("hinge-out-of-plane", WARNING, hinge.moves, most, float(ASIDE), facts)
+            halves: dict[str, float | str] = {"first_half": early, "second_half": late}
+            variant = {"variant": "drifting"} if abs(late - early) > APART else {}
+            yield Diagnostic(
+                "hinge-out-of-plane", WARNING, hinge.moves, most, float(ASIDE), {**facts, **halves, **variant}
+            )
 
 
 def _median_of_halves(motion: HingeMotion) -> tuple[float, float]:
