@@ -344,7 +344,8 @@ def test_the_commands(
     person, simulation, recording = made
     (tmp_path / "session").mkdir()
     write_session(tmp_path / "session", recording, simulation.truth())
-    words = ["calibrate", tmp_path / "session", "--formulation", "paper", "--method", "smekf", "-o", tmp_path / "anna"]
+    options = ["--formulation", "paper", "--method", "smekf_published"]
+    words = ["calibrate", tmp_path / "session", *options, "-o", tmp_path / "anna"]
     assert run(*words) == 2
     captured = capsys.readouterr().err
     assert captured.count("\n") == 1
@@ -365,13 +366,13 @@ def test_the_commands(
     assert run("reproduce", tmp_path / "anna") == 0
 
     out = tmp_path / "result"
-    options = ["--method", "smekf", "--open-loop", "--no-view", "--no-report"]
+    options = ["--method", "smekf_published", "--open-loop", "--no-view", "--no-report"]
     assert run("track", tmp_path / "session", "--subject", tmp_path / "anna", *options, "-o", out) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["heading_correction"] is None
     assert summary["provenance"]["options"]["open_loop"] is True
     assert run("reproduce", out) == 0
-    tracked = track(recording, load_subject(tmp_path / "anna"), method="smekf", open_loop=True)
+    tracked = track(recording, load_subject(tmp_path / "anna"), method="smekf_published", open_loop=True)
     palm = pl.read_parquet(out / "pose.parquet", columns=["right_palm_x"]).to_series().to_numpy()
     np.testing.assert_allclose(palm, tracked.points["right_palm"][:, 0], atol=1e-9)
 

@@ -27,7 +27,7 @@ from wepose_pin.validation import (
 from wepose_pin.validation.document import check_same_settings, parse_document
 from wepose_pin.validation.paper import MEASURED, calibrate_person, set_exact_mounts, switch_off
 from wepose_pin.validation.presets import PRESETS
-from wepose_pin.validation.tables import describe_known
+from wepose_pin.validation.tables import PUBLISHED, describe_known
 
 
 def run(name: str, quick: bool = True) -> list[Result]:
@@ -37,7 +37,7 @@ def run(name: str, quick: bool = True) -> list[Result]:
 def test_the_papers_order_comes_back_out_of_the_box_only() -> None:
     """As they come, NCF and GDC are behind as in the paper; with tuned gains and the bias removed they are not."""
     mean = {method: figures for _, method, figures, _ in summarize(run("dynamic 100 Hz"))}
-    assert set(METHODS) < set(mean)
+    assert set(METHODS) - {PUBLISHED} < set(mean)
     for axis in ("roll", "pitch", "yaw"):
         assert mean["smekf"][axis] < mean["gdc, default gains"][axis] < 5.0
         assert mean["smekf"][axis] < mean["ncf, default gains"][axis] < 5.0

@@ -236,7 +236,8 @@ def track(
         Lengths and mounts; None: the mean lengths of the population, or of a chosen model its own, and the mounts that
         the session states.
     method : str
-        The orientation filter: "amekf", "smoother", "smekf", "ncf" or "gdc", as in `estimate_orientation`.
+        The orientation filter: "amekf", "smoother", "smekf", "smekf_published", "ncf" or "gdc", as in
+        `estimate_orientation`.
     model : BodyModel, str or Path, optional
         A body; or its file, as for `load_model`, or the URDF of a mechanism whose links carry the sensors; or the name
         of a body of the package. None: the one that the recording names, else the upper body. It is scaled to the

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-METHODS = ("amekf", "smoother", "smekf", "ncf", "gdc")
+METHODS = ("amekf", "smoother", "smekf", "smekf_published", "ncf", "gdc")
 OFFLINE = ("smoother",)  # methods that cannot run causally
 EXPORTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("out.csv", ()),

@@ -112,7 +112,8 @@ def calibrate(
         `wepose_pin.calibration.load_protocol` returned; None: "clasp", with "t_pose" and "bow" if the recording has
         those phases and the formulation is not "paper".
     method : str
-        The orientation filter: "amekf", "smoother", "smekf", "ncf" or "gdc", as in `estimate_orientation`.
+        The orientation filter: "amekf", "smoother", "smekf", "smekf_published", "ncf" or "gdc", as in
+        `estimate_orientation`.
     measured_std : float
         Standard deviation [m] of each measured value; 3 mm by default.
     formulation : str

@@ -23,7 +23,7 @@ from .base import AboutVertical, FilterRun, OrientationFilter
 from .gdc import Gdc, GdcParams
 from .ncf import Ncf, NcfParams
 from .noise import SensorNoise, estimate_noise
-from .smekf import Smekf, SmekfParams, starting_params
+from .smekf import PublishedSmekf, Smekf, SmekfParams, starting_params
 from .smoother import Smoother
 from .start import MOVING_TILT_STD, StartTilt, estimate_start_tilt
 from .static import StaticDetector, StaticTest
@@ -32,6 +32,7 @@ __all__ = [
     "BEST",
     "METHODS",
     "OFFLINE",
+    "STATIC_ONLY",
     "TYPICAL",
     "AboutVertical",
     "Amekf",
@@ -44,6 +45,7 @@ __all__ = [
     "NcfParams",
     "Orientation",
     "OrientationFilter",
+    "PublishedSmekf",
     "SensorRun",
     "Smekf",
     "SmekfParams",
@@ -55,9 +57,17 @@ __all__ = [
     "run_filter",
 ]
 
-METHODS: dict[str, type] = {"amekf": Amekf, "smoother": Smoother, "smekf": Smekf, "ncf": Ncf, "gdc": Gdc}
+METHODS: dict[str, type] = {
+    "amekf": Amekf,
+    "smoother": Smoother,
+    "smekf": Smekf,
+    "smekf_published": PublishedSmekf,
+    "ncf": Ncf,
+    "gdc": Gdc,
+}
 BEST = "amekf"  # of those that need no future (docs/validation.md)
 OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
+STATIC_ONLY = frozenset({"smekf", "smekf_published"})  # they correct while the sensor is static
 
 # For a sensor without a static phase: noise of a usual MEMS sensor at 100 to 300 Hz, a bias as it may be from the
 # factory. Only amekf and smoother estimate the bias in motion.
@@ -168,15 +178,16 @@ def estimate_orientation(
         Samples a second, uniform.
     method : str
         "amekf": Kalman filter that corrects the tilt in motion too; "smoother": the same forward and backward over all
-        samples; "smekf": Kalman filter that corrects in static phases alone; "ncf": complementary filter (Mahony 2008);
-        "gdc": gradient descent (Madgwick 2011). "ncf" and "gdc" have no covariance.
+        samples; "smekf": Kalman filter that corrects in static phases alone (Lisini Baldi 2019, with an exact
+        covariance and two more conditions of the static test); "smekf_published": the same as published; "ncf":
+        complementary filter (Mahony 2008); "gdc": gradient descent (Madgwick 2011). "ncf" and "gdc" have no covariance.
     static : (float, float) or None
         The static phase, from and to [s] after the first sample: the sensor does not move there, and its noise and bias
         are measured. None: there is none; the noise is that of a usual MEMS sensor, and the bias starts at zero.
     params : optional
         The filter's own parameters, such as `wepose_pin.filters.AmekfParams`; None: its defaults.
     static_test : StaticTest, optional
-        When the sensor counts as static; None: the default values.
+        When the sensor counts as static; None: the default values. "smekf_published" uses conditions (1) to (4) alone.
 
     Returns
     -------
@@ -260,7 +271,7 @@ class FilterSettings:
     ----------
     method : a key of `METHODS`
     params : the filter's own; None: its defaults
-    static_test : when the sensor counts as static
+    static_test : when the sensor counts as static; "smekf_published" uses conditions (1) to (4) alone, the paper's
     measured_start : without `params`, smekf takes P₀ from the noise in place of the paper's (`smekf.starting_params`)
     start : samples of the start phase, in the first chunk; None: the first window of `static_test`, static or not
     gyro_range : [rad/s] at which an axis of gyro saturates
@@ -295,6 +306,8 @@ class SensorRun:
     def __init__(self, rate_hz: float, noise: SensorNoise, settings: FilterSettings) -> None:
         self._rate_hz, self._noise, self._settings = rate_hz, noise, settings
         self._method, self._test = settings.method, settings.static_test
+        if METHODS[settings.method] is PublishedSmekf:
+            self._test = replace(self._test, rate_stds=np.inf)
         self._detector = StaticDetector(noise, rate_hz, self._test)
         self._filter: Any = None
         self._before: Orientation | None = None  # before the start phase, until it is returned

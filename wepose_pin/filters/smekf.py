@@ -3,7 +3,7 @@
 One thing differs from the paper, which works to first order. Its transition Φ = I − [ω δt]× lets the standard deviation
 grow by √(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz to 10⁶ deg in 20 s. Its corrections rotate the attitude and not
 the covariance, so that static phases seem to measure the heading. Here Φ = exp(−[ω δt]×), and a correction rotates the
-covariance too; `SmekfParams.first_order` is the paper's.
+covariance too. `PublishedSmekf` is the paper's, to the first order.
 
 The state is x = [a; b]: the attitude error a [rad] on the right of `quat_WS`, in the sensor frame, and the gyroscope
 bias b [rad/s]. Measurement model: gyro = ω + b + w_ω, accel/g = R_WSᵀ e_z + w_g. In a static phase ω = 0, so gyro
@@ -62,7 +62,6 @@ class SmekfParams:
     static_gyro_cov: np.ndarray | None = None  # (3, 3) [rad²/s²] of static gyro about the bias; None: Σ_ω
     static_accel_cov: np.ndarray | None = None  # (3, 3) of static accel/g about the vertical; None: Σ_g
     static_turn_noise: float = 0.0  # [rad/√s] of undetected rotation about the vertical in a static phase; the paper: 0
-    first_order: bool = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
     gyro_scale_std: float = 0.0  # of the gyroscope's scale, which no static phase shows; the paper: 0
     gyro_range: float = np.inf  # [rad/s]; a sample at it is used, and the covariance grows by what may be beyond
 
@@ -154,13 +153,15 @@ class Smekf:
     missed (HOLD_S, LOST_RATE_STD). `run` and `update` are those of `base.OrientationFilter`.
     """
 
+    first_order = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
+
     def __init__(
         self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: SmekfParams | None = None
     ) -> None:
         self.params = params or SmekfParams()
         self.noise = noise
         self.rate_hz = rate_hz
-        self.model = _model(noise, 1.0 / rate_hz, self.params)
+        self.model = _model(noise, 1.0 / rate_hz, self.params, self.first_order)
         record = np.zeros(1, STATE)
         record["quat_WS"], record["gyro_bias"] = quat_WS, noise.gyro_bias
         record["P_aa"] = record["attitude_cov"] = _matrix(self.params.attitude_cov0)[_UPPER]
@@ -189,6 +190,15 @@ class Smekf:
         return one.quat_WS[0].copy()
 
 
+class PublishedSmekf(Smekf):
+    """sMEKF as published: transition and corrections of the covariance to the first order.
+
+    `filters.SensorRun` gives it the paper's static test too.
+    """
+
+    first_order = True
+
+
 def _matrix(cov: float | np.ndarray) -> np.ndarray:
     """A covariance (3, 3) that may be given as one variance."""
     array = np.asarray(cov, dtype=float)
@@ -198,7 +208,7 @@ def _matrix(cov: float | np.ndarray) -> np.ndarray:
     return matrix
 
 
-def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
+def _model(noise: SensorNoise, dt: float, params: SmekfParams, first_order: bool) -> np.ndarray:
     """Return the constants of a sensor's filter, (1,) of `MODEL`."""
 
     def upper(cov: np.ndarray | None, default: np.ndarray) -> np.ndarray:
@@ -210,7 +220,7 @@ def _model(noise: SensorNoise, dt: float, params: SmekfParams) -> np.ndarray:
     model["bias_step"] = dt * dt * upper(params.bias_step_cov, noise.bias_step_cov)
     model["static_gyro_cov"] = upper(params.static_gyro_cov, noise.gyro_cov)
     model["static_accel_cov"] = upper(params.static_accel_cov, noise.accel_cov)
-    model["fade"], model["first_order"] = np.exp(-dt / HOLD_S), params.first_order
+    model["fade"], model["first_order"] = np.exp(-dt / HOLD_S), first_order
     model["static_turn"], model["gyro_range"] = params.static_turn_noise**2 * dt, params.gyro_range
     model["scale_var"] = params.gyro_scale_std**2
     return model

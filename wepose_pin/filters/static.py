@@ -75,8 +75,8 @@ class StaticTest:
     """When a sensor counts as static: where all six conditions hold for the window that ends with the sample.
 
     Conditions (1) to (4) and their limits are those of Lisini Baldi et al. 2019, who do not state a window. (5) and (6)
-    are additions of this package; ``rate_stds=inf`` leaves them out. "Static phase" is that of the recording, in which
-    noise and bias were measured.
+    are additions of this package; ``rate_stds=inf`` leaves them out, as the method "smekf_published" does. "Static
+    phase" is that of the recording, in which noise and bias were measured.
 
     Parameters
     ----------

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
-Method = Literal["amekf", "smoother", "smekf", "ncf", "gdc"]
-LiveMethod = Literal["amekf", "smekf", "ncf", "gdc"]
+Method = Literal["amekf", "smoother", "smekf", "smekf_published", "ncf", "gdc"]
+LiveMethod = Literal["amekf", "smekf", "smekf_published", "ncf", "gdc"]
 Formulation = Literal["full", "paper"]
 Arms = Literal["left", "right", "both"]
 Progress = Callable[[str, float], None]  # the current step, and the fraction of the job that is done; may raise

@@ -69,7 +69,8 @@ class CalibrateJob:
         Narrow the population prior to women or men.
     method
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
-        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases), ncf
+        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases, with an
+        exact covariance and two more conditions of the static test), smekf_published (the same as published), ncf
         (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011).
     gaps
         Accept gaps of more than 50 ms and bridge them. Without it such a gap is an error.

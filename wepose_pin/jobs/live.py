@@ -62,7 +62,8 @@ class LiveJob:
         it the first take (key T) begins such a file, which also holds what came before the take.
     method
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smekf (Kalman filter of
-        Lisini Baldi et al. 2019, corrected in static phases), ncf (complementary filter, Mahony et al. 2008), gdc
+        Lisini Baldi et al. 2019, corrected in static phases, with an exact covariance and two more conditions of the
+        static test), smekf_published (the same as published), ncf (complementary filter, Mahony et al. 2008), gdc
         (gradient descent, Madgwick et al. 2011).
     model : URDF|TOML|NAME
         Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package

@@ -26,8 +26,8 @@ class TrackJob:
     A recording of `wepose live` is tracked causally, with the subject and the method of that session, and gives the
     displayed poses again, bit-identical. With --subject or --method it is tracked as any other recording.
 
-    To track as Lisini Baldi et al. 2019 do, give --method smekf --open-loop and a subject of `wepose calibrate
-    --formulation paper`, which holds lengths and no mounts.
+    To track as Lisini Baldi et al. 2019 do, give --method smekf_published --open-loop and a subject of `wepose
+    calibrate --formulation paper --method smekf_published`, which holds lengths and no mounts.
 
     Parameters
     ----------
@@ -48,7 +48,8 @@ class TrackJob:
         its links. Without it the body that the session names, else the upper body.
     method : METHOD
         Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
-        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases), ncf
+        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases, with an
+        exact covariance and two more conditions of the static test), smekf_published (the same as published), ncf
         (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011). Without it amekf, or
         the method of the live session.
     causal

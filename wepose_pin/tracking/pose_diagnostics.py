@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from ..diagnostics import INFO, WARNING, Diagnostic, render
+from ..filters import STATIC_ONLY
 from ..recording import OrientationSensor
 from ..recording.limits import STANDARD_GRAVITY
 from .measures import (
@@ -88,7 +89,7 @@ def _diagnose_signals(tracked: TrackedRecording, signals: Mapping[str, Signal]) 
             continue
         share, seconds = float(signal.static.mean()), longest_run_s(~signal.static, recording.rate_hz)
         if seconds > LONG_MOTION_S or share < LITTLE_STATIC:
-            severity = WARNING if tracked.options.method == "smekf" else INFO
+            severity = WARNING if tracked.options.method in STATIC_ONLY else INFO
             yield Diagnostic("static-phases-rare", severity, name, share, LITTLE_STATIC, {"longest": seconds})
     late = tracked.segments.start[0] - float(recording.time[0])
     if late > LATE_START_S:
@@ -114,7 +115,7 @@ def _diagnose_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> 
 def _diagnose_method(
     tracked: TrackedRecording, budgets: Mapping[str, Budget], tips: Mapping[str, TipMotion]
 ) -> Iterator[Diagnostic]:
-    if tracked.options.method == "smekf" and (
+    if tracked.options.method in STATIC_ONLY and (
         _find_uncertain_headings(tracked, budgets) or _find_uncertain_tips(tracked, tips)
     ):
         yield Diagnostic("method-needs-static", WARNING, facts={"method": tracked.options.method})

@@ -15,11 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import rotations
-from ..filters import METHODS, FilterSettings, GdcParams, NcfParams, SmekfParams, run_filter
+from ..filters import METHODS, FilterSettings, GdcParams, NcfParams, run_filter
 from ..filters.noise import SensorNoise
 from ..filters.static import StaticTest
 from .gains import make_gains
-from .tables import AS_PUBLISHED, OURS
+from .tables import AS_PUBLISHED, PUBLISHED
 
 Orient = Callable[[np.ndarray, np.ndarray, float, SensorNoise], np.ndarray]
 
@@ -48,8 +48,8 @@ def list_contenders(setting: str, trial: str = "") -> list[Contender]:
     `setting`: "real" or a key of `gains.STATED`; `trial`: the name of a real one (see `make_gains`).
     """
     tuned = make_gains(setting, trial)._asdict()
-    filters = [_make_ours(method) for method in METHODS if method not in tuned]
-    filters.append(Contender(AS_PUBLISHED, _run_as_published))
+    filters = [_make_ours(method) for method in METHODS if method not in (*tuned, PUBLISHED)]
+    filters.append(_make_ours(PUBLISHED)._replace(label=AS_PUBLISHED, method=None))
     filters += [_make_tuned(method, params) for method, params in tuned.items()]
     filters += [_make_default(method, params) for method, params in DEFAULT_GAINS.items()]
     return filters + [Contender(label, orient) for label, (module, orient) in _PEERS.items() if find_spec(module)]
@@ -60,12 +60,6 @@ def _make_ours(method: str) -> Contender:
         return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(method, measured_start=True)).quat_WS
 
     return Contender(method, orient, method)
-
-
-def _run_as_published(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-    """Run the paper's own form: transition to the first order, initial covariance and static test of the paper's."""
-    params, test = SmekfParams(first_order=True), StaticTest(rate_stds=np.inf)
-    return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(OURS, params, test)).quat_WS
 
 
 def _make_tuned(method: str, params: Any) -> Contender:

@@ -15,7 +15,8 @@ from .jobs import Result
 OURS = "smekf"  # the paper's filter
 DEFAULT = "amekf"  # the default of the commands
 DEFAULTS = ", default gains"  # suffix of the label of a filter's second row
-AS_PUBLISHED = f"{OURS}, as published"  # with the paper's transition, static test and initial covariance
+PUBLISHED = "smekf_published"
+AS_PUBLISHED = f"{OURS}, as published"  # the label of `PUBLISHED`
 WITH_TRUNK = f"{OURS}, trunk measured"  # beside the shoulder width
 DEFAULT_WITH_TRUNK = f"{DEFAULT}, trunk measured"
 AS_COMMANDED = f"{DEFAULT}, mounts as stated"  # by the session, to the next axis, and the start pose
