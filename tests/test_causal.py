@@ -105,6 +105,9 @@ def test_measured_orientations_beside_raw_data_step_and_run_alike(recording: Rec
             tracker.mark_phase("clasp", begins=k == 1200)
         stepped = tracker.step(gyro[k], accel[k])
         assert all(np.array_equal(stepped[i], pose.quat_WL[name][k - begin]) for i, name in enumerate(tracker.names)), k
+        if k % 7 == 0:
+            stated = np.stack([pose.segments.covariance_W[name][k - begin] for name in tracker.names])
+            np.testing.assert_allclose(tracker.covariance(), stated, rtol=1e-9, atol=1e-12, err_msg=f"{k}")
     held = pose.quat_WL["left_forearm"][1501 - begin : 1540 - begin]
     swing = Rotation.from_quat(held[0]).inv() * Rotation.from_quat(held)
     assert np.degrees(swing.magnitude().max()) < 1.0

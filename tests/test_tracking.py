@@ -13,7 +13,7 @@ from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, as_json
 from wepose_pin.evaluation import evaluate
 from wepose_pin.filters import METHODS
 from wepose_pin.readers import load_session
-from wepose_pin.recording import Recording, join_recordings
+from wepose_pin.recording import OrientationSensor, Recording, join_recordings
 from wepose_pin.simulation import NOISE_FREE, Person, Simulation, simulate
 from wepose_pin.subject import population_subject
 from wepose_pin.tracking import SummaryAccumulator, Tracker, summarize, track
@@ -42,6 +42,34 @@ def test_a_noisy_world_is_tracked_by_every_filter(simulation: Simulation, person
     summary = summarize(pose).content
     assert summary["method"] == method
     assert set(summary["sensors"]) == set(simulation.gyro_S)
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_the_uncertainty_of_measured_orientations_grows_in_gaps(
+    half_minute: Recording, simulation: Simulation, causal: bool
+) -> None:
+    n, segment = len(half_minute), "left_forearm"
+    gap = np.zeros(n, dtype=bool)
+    gap[1500:1700] = True
+    sensors = {
+        name: OrientationSensor(simulation.quat_WS[name][:n], sensor.stated_quat_LS)
+        for name, sensor in half_minute.sensors.items()
+    }
+    held = sensors[segment].quat_WS.copy()
+    held[gap] = held[1499]
+    with_gap = {**sensors, segment: replace(sensors[segment], quat_WS=held, gap=gap)}
+    without, tracked = (track(replace(half_minute, sensors=each), causal=causal) for each in (sensors, with_gap))
+    lost = gap[n - len(tracked.time) :]
+    true = Rotation.from_quat(simulation.quat_WL[segment][n - len(tracked.time) : n])
+    error = np.linalg.norm((Rotation.from_quat(tracked.quat_WL[segment]) * true.inv()).as_rotvec(), axis=1)
+    std, std_without = (
+        np.sqrt(np.trace(each.pose.segment_cov[segment], axis1=1, axis2=2) / 3.0) for each in (tracked, without)
+    )
+    assert np.degrees(error[lost].max()) > 20.0
+    assert (error[lost] < 3.0 * std[lost]).all()
+    assert (np.diff(std[lost][:20]) > 0.0).all()
+    assert std[lost].max() > np.pi / 2.0
+    np.testing.assert_allclose(std[~lost], std_without[~lost], rtol=0.05)
 
 
 def test_sensors_that_are_missing_leave_out_what_cannot_be_known(half_minute: Recording) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +21,7 @@ from .diagnostics import WARNING, Diagnostic
 from .errors import BadSession
 from .filters import Orientation, join_orientations
 from .filters.sensors import FilteredRecording, collect_rotations
+from .filters.smekf import HOLD_S, LOST_RATE_STD
 from .filters.start import ACCEL_BIAS_STD
 from .model import BodyModel, BodyTable, load_table
 from .model.start_pose import compute_start_configuration, orient_links
@@ -296,20 +298,24 @@ def orient_segments(
     orientation: Mapping[str, Orientation],
     subject: Subject | None,
     start_frames: StartFrames,
+    lost_before: Mapping[str, int] = MappingProxyType({}),
 ) -> SegmentOrientations:
-    """Return the segment orientations of a recording or a chunk of it, from the results of its sensors' filters."""
+    """Return the segment orientations of a recording or a chunk of it, from the results of its sensors' filters.
+
+    `lost_before`: sensor with measured orientations → for how many samples before the chunk it has been lost.
+    """
     quat_WL, covariance_W = {}, {}
     for segment, R_VS in collect_rotations(chunk, orientation).items():
         R_LS, quat_WS = alignment.R_LS[segment], rotations.multiply(alignment.R_WV[segment].as_quat(), R_VS.as_quat())
-        if chunk.sensors[segment].aligned:
-            quat_WL[segment] = quat_WS
-            covariance_W[segment] = np.tile(MEASURED_ORIENTATION_STD**2 * np.eye(3), (len(chunk), 1, 1))
+        sensor, filtered = chunk.sensors[segment], orientation.get(segment)
+        attitude_cov = None if filtered is None else filtered.attitude_cov
+        if isinstance(sensor, OrientationSensor):
+            lost = count_lost_samples(sensor, lost_before.get(segment, 0))
+            attitude_cov = compute_measured_covariance(lost / chunk.rate_hz)
+        if sensor.aligned:
+            quat_WL[segment], covariance_W[segment] = quat_WS, attitude_cov
             continue
         quat_WL[segment] = rotations.multiply(quat_WS, rotations.conjugate(R_LS.as_quat()))
-        filtered = orientation.get(segment)
-        attitude_cov = None if filtered is None else filtered.attitude_cov
-        if filtered is None:
-            attitude_cov = np.tile(MEASURED_ORIENTATION_STD**2 * np.eye(3), (len(chunk), 1, 1))
         if attitude_cov is not None:
             covariance_W[segment] = compute_segment_covariance(
                 chunk, segment, subject, quat_WS, R_LS, attitude_cov, start_frames
@@ -328,6 +334,23 @@ def orient_segments(
         alignment.static_phase,
         alignment.diagnostics,
     )
+
+
+def count_lost_samples(sensor: OrientationSensor, before: int = 0) -> np.ndarray:
+    """Count (n,) the samples since the last that was measured; `before`: those before the first."""
+    samples = np.arange(len(sensor.quat_WS))
+    if sensor.gap is None:
+        return np.zeros_like(samples)
+    return samples - np.maximum.accumulate(np.where(sensor.gap, -1 - before, samples))
+
+
+def compute_measured_covariance(lost_s: np.ndarray) -> np.ndarray:
+    """Compute the covariance (n, 3, 3) [rad²] of measured orientations that have been lost for `lost_s` (n,) [s].
+
+    It grows by the motion that may have been missed, as that of the filters.
+    """
+    missed_std = np.minimum(np.pi, LOST_RATE_STD * lost_s**2 / (lost_s + HOLD_S))
+    return (MEASURED_ORIENTATION_STD**2 + missed_std**2)[:, None, None] * np.eye(3)
 
 
 def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..alignment import (
-    MEASURED_ORIENTATION_STD,
     N_POSE,
     SegmentOrientations,
     StartFrames,
@@ -23,9 +22,11 @@ from ..alignment import (
     check_mounts,
     compute_heading_offset,
     compute_heading_variance,
+    compute_measured_covariance,
     compute_segment_covariance,
     compute_soft_tissue_covariances,
     compute_start_heading_var,
+    count_lost_samples,
     join_segments,
     orient_segments,
 )
@@ -55,7 +56,6 @@ from .start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates, cut_sta
 # From the recording of the start pose and its orientations: what observes headings; None: nothing.
 MakeProblem = Callable[[Recording, SegmentOrientations], HeadingProblem | None]
 
-_MEASURED_COV = MEASURED_ORIENTATION_STD**2 * np.eye(3)  # [rad²] of a measured orientation
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
 
 
@@ -226,6 +226,7 @@ class CausalSegmentEstimator:
         self.names = tuple(start_recording.sensors)
         self.rate_hz = start_recording.rate_hz
         self._measured = find_measured(start_recording)
+        self._lost = np.zeros(len(self.names), dtype=int)  # samples since a measured orientation
         self._all_measured, self._any_measured = bool(self._measured.all()), bool(self._measured.any())
         self._bank: LiveBank | OneByOne | None = None
         if not self._all_measured:
@@ -317,6 +318,7 @@ class CausalSegmentEstimator:
         row, before, measured = self._recent[self._oldest], self._recent[self._oldest - 1], self._measured
         quat_VS = unpack_orientations(gyro_S, accel_S)
         lost = ~np.isfinite(quat_VS).all(axis=1)
+        self._lost = np.where(lost & measured, self._lost + 1, 0)
         orientations = np.where(lost[:, None], before, quat_VS)
         if self._bank is not None:
             orientations[~measured] = self._bank.update(gyro_S[~measured], accel_S[~measured])
@@ -373,8 +375,10 @@ class CausalSegmentEstimator:
         covs = {name: o.attitude_cov for name, o in orientation.items() if o.attitude_cov is not None}
         if covs:
             self._run_var = read_filter_headings(orientation, self.names, len(chunk) - 1).var
-        for i in np.flatnonzero(self._measured):
-            covs[self.names[i]] = np.tile(_MEASURED_COV, (len(chunk), 1, 1))
+        for i, (name, sensor) in enumerate(chunk.sensors.items()):
+            if isinstance(sensor, OrientationSensor):
+                lost = count_lost_samples(sensor, self._lost[i])
+                covs[name], self._lost[i] = compute_measured_covariance(lost / self.rate_hz), lost[-1]
         if covs:
             soft = compute_soft_tissue_covariances(
                 self._start_frames.table, {name: quat_WL[:, i] for i, name in enumerate(self.names)}
@@ -478,7 +482,7 @@ class CausalSegmentEstimator:
         There may be steps between the parts: the result is that of the step before the first one.
         """
         cov = np.full((len(self.names), 3, 3), np.nan)
-        cov[self._measured] = _MEASURED_COV
+        cov[self._measured] = compute_measured_covariance(self._lost[self._measured] / self.rate_hz)
         filtered = None if self._bank is None else self._bank.attitude_cov
         if filtered is not None:
             cov[~self._measured] = filtered

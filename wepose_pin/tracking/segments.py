@@ -9,12 +9,13 @@ from ..alignment import (
     StartFrames,
     align_sensors,
     check_mounts,
+    count_lost_samples,
     orient_segments,
 )
 from ..filters import BEST, Orientation
 from ..filters.sensors import SensorFilters, combine_chunk
 from ..filters.static import StaticTest
-from ..recording import Recording
+from ..recording import OrientationSensor, Recording
 from ..subject import Subject
 
 Oriented = tuple[Recording, SegmentOrientations]
@@ -43,6 +44,7 @@ class SegmentEstimator:
         self._subject, self._start_frames, self._method, self._static_test = subject, start_frames, method, static_test
         self._filters: SensorFilters | None = None
         self._alignment: SensorAlignment | None = None
+        self._lost: dict[str, int] = {}  # sensor with measured orientations → samples lost at the end of the last chunk
 
     def push(self, chunk: Recording) -> list[Oriented]:
         """Take a chunk; gives it and its segments, or with the smoother those of the chunk before.
@@ -70,4 +72,10 @@ class SegmentEstimator:
         if self._alignment is None:
             filtered = combine_chunk(filters, chunk, orientation)
             self._alignment = align_sensors(chunk, self._subject, filtered, self._start_frames)
-        return chunk, orient_segments(chunk, self._alignment, orientation, self._subject, self._start_frames)
+        oriented = orient_segments(chunk, self._alignment, orientation, self._subject, self._start_frames, self._lost)
+        self._lost = {
+            name: int(count_lost_samples(sensor, self._lost.get(name, 0))[-1])
+            for name, sensor in chunk.sensors.items()
+            if isinstance(sensor, OrientationSensor)
+        }
+        return chunk, oriented
