@@ -312,9 +312,9 @@ def orient_segments(
         if isinstance(sensor, OrientationSensor):
             lost = count_lost_samples(sensor, lost_before.get(segment, 0))
             attitude_cov = compute_measured_covariance(lost / chunk.rate_hz)
-        if sensor.aligned:
-            quat_WL[segment], covariance_W[segment] = quat_WS, attitude_cov
-            continue
+            if sensor.aligned:
+                quat_WL[segment], covariance_W[segment] = quat_WS, attitude_cov
+                continue
         quat_WL[segment] = rotations.multiply(quat_WS, rotations.conjugate(R_LS.as_quat()))
         if attitude_cov is not None:
             covariance_W[segment] = compute_segment_covariance(
