@@ -5,7 +5,7 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs_ready
 PEERS_READY := $(VENV)/.peers_ready
 
-.PHONY: demo test test-all check lint types docs picture package oldest workflows wheel fuzz recordings bench clean
+.PHONY: demo test test-all check lint types docs picture package oldest workflows wheel fuzz recordings bench validation clean
 
 demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 	$(BIN)/wepose demo -o demo --force
@@ -40,6 +40,10 @@ recordings: $(READY)      ## random recordings of ordinary behaviour, SEEDS=0:10
 BENCH ?= filters calibration
 bench: $(PEERS_READY)     ## speed and accuracy on this machine; BENCH="live" and others: python -m benchmarks --help
 	$(BIN)/python -m benchmarks $(BENCH)
+
+DATA ?= $(WEPOSE_DATA)
+validation: $(PEERS_READY)  ## docs/validation.md anew, hours: the paper's experiments, and the real recordings in DATA
+	$(BIN)/python -m benchmarks validation $(if $(DATA),--data $(DATA))
 
 docs: $(DOCS_READY)       ## the site: docs/_build/html/index.html; runs examples/ and checks spelling and links, offline
 	$(BIN)/python -m sphinx -E -W --keep-going -q -b html docs docs/_build/html

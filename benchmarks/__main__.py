@@ -27,6 +27,7 @@ KINDS = (
     "robots",
     "bodies",
     "kinematics",
+    "validation",
 )
 DEFAULT = ("filters", "calibration")
 
@@ -53,7 +54,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "calibration protocol is worth on simulated people, an hour for eight; robots: "
         "the upper-body recording of --data on every robot, offline and live, half an hour; bodies: chains, other "
         "bodies and legs by the commands, on the recordings of --data and simulated, three minutes; kinematics: beside "
-        "a bare loop of Pinocchio. "
+        "a bare loop of Pinocchio; validation: the paper's experiments and real recordings, hours, into its page. "
         f"Without any: {' and '.join(DEFAULT)}",
     )
     add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 12 sessions, up to one hour")
@@ -62,12 +63,13 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     add("--sessions", type=int, metavar="N", help="number of sessions of batch")
     add("--robot", action="append", default=[], metavar="NAME", help="with robots: only this one; may be repeated")
     add("--persons", type=int, default=8, metavar="N", help="number of simulated people of protocols")
-    add("--results", type=Path, metavar="FILE", help="where protocols keeps what it has measured, to go on from there")
-    add("--page", type=Path, metavar="FILE", help="write the page of protocols there, in Markdown")
+    add("--results", type=Path, metavar="FILE", help="where protocols and validation keep what they have measured")
+    add("--page", type=Path, metavar="FILE", help="write the page of protocols or validation there, in Markdown")
+    add("--only", metavar="NAME", help="with validation: only the experiments whose names begin so")
     add(
         "--data",
         type=Path,
-        help="real recordings (broad/, wepose_hr/) on which filters are measured, and upper_body/ "
+        help="real recordings (broad/, wepose_hr/) for filters and validation, upper_body/ "
         "for robots, ring/, ur5/ and mvnx/ for bodies; or WEPOSE_DATA",
     )
     add("--save", type=Path, metavar="FILE", help="write the figures there with versions, machine and date, as JSON")
@@ -136,6 +138,11 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
             from . import kinematics
 
             chosen |= kinematics.sections(options.quick)
+        elif kind == "validation":
+            from . import validation
+
+            data = Path(named) if named else None
+            chosen |= validation.sections(options.quick, data, options.only, options.results, options.page)
         else:
             from . import long_recordings
 

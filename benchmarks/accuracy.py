@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.trials import read_authors_trial, read_broad
 from wepose_pin import rotations
 from wepose_pin.errors import MissingFile
 from wepose_pin.evaluation import attitude_error
 from wepose_pin.filters import METHODS, FilterSettings, run_filter
 from wepose_pin.filters.noise import estimate_noise
-from wepose_pin.readers.trials import read_authors_trial, read_broad
 
 from .filters import STANDARD_GRAVITY, Sample, imufusion_filter, simulated_trial
 from .tables import Column, Table, is_installed

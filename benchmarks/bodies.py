@@ -15,6 +15,9 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation, Slerp
 
+from benchmarks.trials import RING_SEGMENTS, find_ring
+from benchmarks.validation import real
+from benchmarks.validation.experiment import align_rotation
 from wepose_pin import rotations
 from wepose_pin.cli import main
 from wepose_pin.errors import BadData, BadOption
@@ -23,12 +26,9 @@ from wepose_pin.jobs.evaluate import EvaluateJob, run_evaluate
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.mvnx import SEGMENT_OF, read_frames
-from wepose_pin.readers.trials import RING_SEGMENTS, find_ring
 from wepose_pin.simulation import NOISE_FREE
 from wepose_pin.subject import load_subject, population_subject, subject_toml
 from wepose_pin.tracking import track
-from wepose_pin.validation import real
-from wepose_pin.validation.series import align_rotation
 from wepose_pin.writers import write_session
 
 from .four_bar import PROTOCOL, STD_PERCENT, move_four_bar, write_four_bar
@@ -117,13 +117,13 @@ def measure_ring_links(data: Path, mounts: Sequence[str], folder: Path) -> Table
     for mount in mounts:
         ring = calibrate_ring(data, mount, folder)
         subject = load_subject(folder / "cal")
-        by_script = [each for each in real.compare_links("", "", find_ring(data)[0], mount) if each.method == "amekf"]
+        by_script = {each.method: each.figures for each in real.compare_links(find_ring(data)[0], mount)}["amekf"]
         for name, true in ring.true_lengths.items():
             links = 2.0 if name == "seg2_and_seg3" else 1.0
             table.rows[f"{mount} {name}"] = {
                 "calibrated_mm": 1e3 * links * subject.lengths[name],
                 "std_mm": 1e3 * links * subject.std(name),
-                "script_mm": by_script[0].figures[f"{name}_mm"],
+                "script_mm": by_script[f"{name.replace('_', ' ')} [mm]"],
                 "optical_mm": 1e3 * links * true,
             }
     return table

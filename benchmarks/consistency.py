@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.validation.contenders import list_contenders
+from benchmarks.validation.simulated import compute_mount_errors, orient_recording
 from wepose_pin.calibration import assess, calibrate
 from wepose_pin.errors import WeposeError
 from wepose_pin.kinematics import compute_axis_std
@@ -27,9 +29,6 @@ from wepose_pin.simulation import (
 )
 from wepose_pin.subject import Subject, mount_rows
 from wepose_pin.tracking import TrackedRecording, track
-from wepose_pin.validation.contenders import list_contenders
-from wepose_pin.validation.mounting import compute_mount_errors
-from wepose_pin.validation.paper import orient_recording
 
 FIRST_SEED = 5000  # of persons that no other measurement or test draws
 CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand")

@@ -11,8 +11,8 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.readers.trials import RING_SEGMENTS, RingFiles
-from wepose_pin.validation import real
+from benchmarks.trials import RING_SEGMENTS, RingFiles
+from benchmarks.validation import real
 
 START_S = 0.7  # until seg1 is taken up; nothing moves before
 MOTION_S = (real.UNSCORED_S, 66.0)  # that on which the validation's own script fits its lengths

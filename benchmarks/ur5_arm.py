@@ -12,11 +12,11 @@ import pinocchio as pin
 import polars as pl
 from scipy.spatial.transform import Rotation
 
+from benchmarks.trials import find_ur5, read_ur5
+from benchmarks.validation.real import UR5_EXCLUDED
 from wepose_pin.model import BodyModel
-from wepose_pin.readers.trials import find_ur5, read_ur5
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording
 from wepose_pin.simulation import MTI_3, ImuNoise
-from wepose_pin.validation.real import UR5_EXCLUDED
 
 # The axes of a UR5's joints while all are at zero, the arm stretched out along x.
 UR5 = {

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.trials import read_authors_trial, read_broad
 from wepose_pin import rotations
 from wepose_pin.errors import BadOption, WeposeWarning
 from wepose_pin.evaluation import attitude_error, uncertainty
@@ -29,7 +30,6 @@ from wepose_pin.filters.amekf import BLOCK, ERROR, STATES, fill_transition_rows
 from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector
-from wepose_pin.readers.trials import read_authors_trial, read_broad
 from wepose_pin.simulation import IDEAL_PRESET, MILD_PRESET, simulate_paper_dynamic
 
 RATE = 100.0
@@ -90,7 +90,7 @@ def cov(result: FilterRun) -> np.ndarray:
 
 
 def errors(of: Case, quat_VS: np.ndarray) -> Rotation:
-    """Error on the left, in W; heading aligned at rest as `wepose validate` does."""
+    """Error on the left, in W; heading aligned at rest as the validation does."""
     R_VS, true = Rotation.from_quat(quat_VS), Rotation.from_quat(of.true)
     psi = rotations.heading((true[50:450] * R_VS[50:450].inv()).mean().as_quat())
     return Rotation.from_rotvec([0.0, 0.0, float(psi)]) * R_VS * true.inv()

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.trials import read_broad
 from wepose_pin import rotations
 from wepose_pin.filters import FilterSettings, GdcParams, Smekf, run_filter
 from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
-from wepose_pin.readers.trials import read_broad
 
 ROWS = ("smekf", "smekf, no correction in motion", "smekf, start measured", "ncf", "gdc 0.12", "gdc 0.01")
 

@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.ur5_arm import RUNS, UPRIGHT, UR5, write_ur5_session, write_urdf
+from benchmarks.validation.real import UNSCORED_S
 from wepose_pin.cli import main
 from wepose_pin.errors import BadModel, BadSession, BadSubject, WeposeError
 from wepose_pin.jobs.track import TrackJob, run_track
@@ -30,7 +31,6 @@ from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.subject import Subject, load_subject
 from wepose_pin.tracking import Tracker, summarize, track
-from wepose_pin.validation.real import UNSCORED_S
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import read_result, write_subject
 

@@ -220,6 +220,8 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
     ("words", "says"),
     [
         (["trak"], "did you mean 'track'?"),
+        (["reproduce", "result"], "run the command that `provenance` in the result's summary.json names again"),
+        (["validate", "--quick"], "in a clone of the project, run make validation DATA=DIR"),
         (["track"], "wepose track needs SESSION and -o DIR; see wepose track --help"),
         (["track", "s.toml", "-o"], "-o/--out: expected one argument; see wepose track --help"),
         (["track", "s.toml", "t.toml", "-o", "OUT"], "'t.toml' is one word too many for wepose track"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 from itertools import product
 from pathlib import Path
 
@@ -11,15 +10,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.validation import gains as tuning
+from benchmarks.validation.contenders import PUBLISHED, DEFAULT_GAINS, Contender, list_contenders
+from benchmarks.validation.experiment import align_rotation
+from benchmarks.validation.gains import STATED, compute_rmse, list_trials, make_gains
 from wepose_pin.evaluation import attitude_error
 from wepose_pin.filters import METHODS, GdcParams, NcfParams
 from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.simulation import SingleSensor, simulate_paper_dynamic
-from wepose_pin.validation import gains as tuning
-from wepose_pin.validation.contenders import DEFAULT_GAINS, Contender, list_contenders
-from wepose_pin.validation.gains import STATED, compute_rmse, list_trials, make_gains
-from wepose_pin.validation.series import align_rotation
-from wepose_pin.validation.tables import AS_PUBLISHED, PUBLISHED
 
 SETTING = "simulated 100 Hz"
 ALL = list_contenders(SETTING)
@@ -38,13 +36,12 @@ def at_rest(sensor: SingleSensor) -> np.ndarray:
 def test_who_takes_part() -> None:
     others = ["ncf", "gdc", "ncf, default gains", "gdc, default gains"]
     ours = [method for method in METHODS if method not in (*others, PUBLISHED)]
-    assert NAMES[: len(ours) + 5] == [*ours, AS_PUBLISHED, *others]
+    assert NAMES[: len(ours) + 5] == [*ours, PUBLISHED, *others]
     assert {contender.label for contender in ALL if contender.method} == set(ours)
 
 
 def test_peers_take_part_where_they_are_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    module = import_module("wepose_pin.validation.contenders")  # the package has a function of that name
-    monkeypatch.setattr(module, "find_spec", lambda name: name == "vqf" or None)
+    monkeypatch.setattr("benchmarks.validation.contenders.find_spec", lambda name: name == "vqf" or None)
     labels = [contender.label for contender in list_contenders(SETTING)]
     assert labels[-2:] == ["vqf", "offline vqf"]
     assert "imufusion" not in labels
@@ -106,7 +103,7 @@ def test_tuning_trials_are_scored_nowhere_else() -> None:
 @pytest.mark.peer
 @pytest.mark.parametrize("setting", STATED)
 def test_the_stated_gains_are_the_best_around(setting: str, request: pytest.FixtureRequest) -> None:
-    """No neighbour on the grid is better, and the grid goes on beyond them; `wepose validate` searches all of it."""
+    """No neighbour on the grid is better, and the grid goes on beyond them; "gains" searches all of it."""
     folder: Path | None = None
     if setting.startswith("BROAD"):
         folder = request.getfixturevalue("data")

@@ -160,8 +160,8 @@ READS = [
     *("track ODD.toml -o OUT", "track ODD.wepose -o OUT", "track SESSION --subject ODD.toml -o OUT"),
     *("track SESSION --model ODD.urdf -o OUT", "track SESSION --model ODD.toml -o OUT", "evaluate ODD SESSION"),
     *("calibrate SESSION --protocol ODD.toml -o OUT", "evaluate RESULT ODD.parquet", "evaluate RESULT ODD.csv"),
-    *("evaluate RESULT ODD.toml", "export ODD -o OUT.csv", "view ODD --no-open", "reproduce ODD"),
-    *("batch ODD.toml -o OUT", "validate --from ODD.json", "live --no-page --source replay:ODD.toml"),
+    *("evaluate RESULT ODD.toml", "export ODD -o OUT.csv", "view ODD --no-open"),
+    *("batch ODD.toml -o OUT", "live --no-page --source replay:ODD.toml"),
     *("live --no-page --source udp:9 --session ODD.toml", "info ODD.csv", "info ODD.parquet", "info ODD.h5"),
     *("info ODD.mat", "info ODD.mvnx", "info ODD.sto", "info ODD.toml", "info ODD"),
 ]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.trials import read_authors_trial
 from wepose_pin.errors import BadData, BadOption, BadPhase
 from wepose_pin.filters import (
     METHODS,
@@ -30,7 +31,6 @@ from wepose_pin.filters.base import run_in_parallel
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.smekf import starting_params
 from wepose_pin.filters.static import StaticDetector, StaticTest
-from wepose_pin.readers.trials import read_authors_trial
 from wepose_pin.rotations import quat_from_gravity
 from wepose_pin.simulation import simulate_paper_dynamic
 

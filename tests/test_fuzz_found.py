@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import signal
 import struct
@@ -35,7 +34,6 @@ from wepose_pin.errors import (
 )
 from wepose_pin.readers.arrays import ArrayFile
 from wepose_pin.readers.mat5 import read_mat5
-from wepose_pin.readers.trials import Ur5Files, read_ur5
 from wepose_pin.recording.faults import Scan
 from wepose_pin.report.viewer import frame_indices
 
@@ -339,33 +337,7 @@ def test_times_in_a_live_recording_that_would_make_years_of_ticks(tmp_path: Path
     )
 
 
-# Trials of others, results, tables ---------------------------------------------------------------------------------
-
-
-def test_a_trial_of_broad_on_which_scipy_died(tmp_path: Path) -> None:
-    """SciPy's reader ended the process with a segmentation fault on some of these: it is not asked any more."""
-    good = seeds.broad(False)
-    outcomes = set()
-    for at in range(128, len(good), 3):
-        data = bytearray(good)
-        data[at] ^= 0xFF
-        outcomes.add(try_one(BY_NAME["broad"], tmp_path, bytes(data)) is None)
-    assert outcomes == {True, False}
-
-
-def test_a_matlab_array_whose_name_is_made_of_fractions(tmp_path: Path) -> None:
-    """NumPy warned on the user's terminal."""
-    good = seeds.broad(False)
-    at = good.index(struct.pack("<I", 1) + struct.pack("<I", 7) + b"imu_gyr")
-    spoiled = good[:at] + struct.pack("<2Id", 9, 8, float("nan")) + good[at + 16 :]
-    assert "the head of an array is damaged" in told("broad", tmp_path, spoiled, BadData)
-
-
-@pytest.mark.parametrize("rate", [0.0, np.nan, np.inf, 1e12, -5.0])
-def test_a_trial_of_broad_without_a_rate(rate: float, tmp_path: Path) -> None:
-    content = {"imu_gyr": seeds.GYRO, "imu_acc": seeds.ACCEL, "opt_quat": seeds.QUAT, "movement": np.ones(seeds.N)}
-    savemat(tmp_path / "a.mat", {**content, "sampling_rate": rate})
-    assert "sampling_rate" in told("broad", tmp_path, (tmp_path / "a.mat").read_bytes(), BadData)
+# Results, tables ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -432,22 +404,6 @@ def test_a_byte_order_mark_and_dos_lines(name: str, tmp_path: Path) -> None:
     """As editors on Windows write them."""
     for seed in BY_NAME[name].seeds():
         assert try_one(BY_NAME[name], tmp_path, b"\xef\xbb\xbf" + seed.replace(b"\n", b"\r\n")) is None
-
-
-def test_a_record_of_what_made_a_result_without_end(tmp_path: Path) -> None:
-    assert "damaged, no JSON" in told("provenance", tmp_path, b"[" * 100_000, BadData)
-
-
-@pytest.mark.parametrize("command", ["batch", "live", "info"])
-def test_a_record_has_no_other_command_run_than_those_that_write_records(command: str, tmp_path: Path) -> None:
-    """`wepose batch` with a scheduler that a stranger's record names would unpickle what that sends."""
-    options = {
-        "batch": {"plan": "a.toml", "scheduler": "tcp://127.0.0.1:9", "workers": None},
-        "live": {"source": "udp:9", "record": "a.wepose"},
-        "info": {"file": "a.csv", "write": True},
-    }[command]
-    record = {"format": 1, "command": command, "options": options, "inputs": {}}
-    assert "cannot be made again" in told("provenance", tmp_path, json.dumps(record).encode(), BadData)
 
 
 @pytest.mark.parametrize("name", ["..", ".", "..."])
@@ -583,16 +539,3 @@ def test_numbers_whose_squares_are_none_are_scanned() -> None:
     scan.push({"torso": (time_s, values), "left_forearm": (time_s, np.full((900, 4), 1e308))})
     with pytest.raises(BadData, match="torso"):
         scan.finish("x", None)
-
-
-@pytest.mark.parametrize("component", [1e308, 0.0, 7.0])
-def test_a_ur5_whose_encoder_gives_no_rotation_is_refused(tmp_path: Path, component: float) -> None:
-    files = Ur5Files("a", "radius", tmp_path / "imu.csv", tmp_path / "encoder.csv")
-    rows = [[0.0, 0.0, 0.0, 0.1, 0.0, 9.8, 1e4 * k, 1.0, 0.0, 0.0, 0.0] for k in range(12)]
-    rows[3][7] = component
-    names = "gyr_x,gyr_y,gyr_z,acc_x,acc_y,acc_z,TIME,QUATERNION_0,QUATERNION_1,QUATERNION_2,QUATERNION_3"
-    text = "\n".join([names, *(",".join(map(str, row)) for row in rows)])
-    for file in (files.imu, files.encoder):
-        file.write_text(text)
-    with pytest.raises(BadData, match="each line have a unit quaternion"):
-        read_ur5(files)

@@ -1,10 +1,9 @@
-"""Jobs: the command line, batch and `wepose reproduce` build the same dataclass and call the same function."""
+"""Jobs: the command line and batch build the same dataclass and call the same function."""
 
 from __future__ import annotations
 
-import json
 import shlex
-from dataclasses import FrozenInstanceError, fields, replace
+from dataclasses import FrozenInstanceError, fields
 from pathlib import Path
 from typing import Any, get_args
 
@@ -13,7 +12,6 @@ import pytest
 from benchmarks.results import adapter
 from wepose_pin import calibration
 from wepose_pin.batch.plan import STEPS, step_options
-from wepose_pin.batch.reproduction import REPRODUCIBLE
 from wepose_pin.calibration import PROTOCOLS
 from wepose_pin.cli import COMMANDS, find_command
 from wepose_pin.cli.parser import parse
@@ -25,14 +23,13 @@ from wepose_pin.jobs.calibrate import CalibrateJob
 from wepose_pin.jobs.demo import DemoJob
 from wepose_pin.jobs.evaluate import EvaluateJob
 from wepose_pin.jobs.export import ExportJob
-from wepose_pin.jobs.fields import REQUIRED, build_job, field_values
+from wepose_pin.jobs.fields import REQUIRED, build_job
 from wepose_pin.jobs.retarget import RetargetJob
 from wepose_pin.jobs.simulate import SimulateJob, run_simulate
 from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.simulation.tasks import TASKS
 from wepose_pin.writers import write_session
-from wepose_pin.writers.provenance import collect_provenance
 
 JOBS = {
     "track": TrackJob(
@@ -59,24 +56,6 @@ def test_choices_of_options_are_those_of_the_rooms() -> None:
     assert get_args(Formulation) == get_args(calibration.Formulation)
     assert get_args(LiveMethod) == tuple(name for name in METHODS if name not in OFFLINE)
     assert set(TASKS) <= set(PROTOCOLS)
-
-
-@pytest.mark.parametrize("command", REPRODUCIBLE)
-def test_a_job_is_built_again_from_its_provenance(
-    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Options and the paths of inputs, as JSON holds them, are the whole job but where it writes."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("s.toml", "anna", "result"):
-        Path(name).touch()
-    job = JOBS[command]
-    provenance = json.loads(json.dumps(collect_provenance(command, field_values(job))))
-    paths = {name: about["path"] for name, about in provenance["inputs"].items()}
-    assert set(paths) <= {"session", "subject", "result"}
-    assert {"out", "force"}.isdisjoint(provenance["options"])
-    kind, _ = REPRODUCIBLE[command]
-    again = build_job(kind, {**provenance["options"], **paths, "out": str(job.out)})
-    assert again == replace(job, **{name: tmp_path / getattr(job, name) for name in paths})
 
 
 @pytest.mark.parametrize(

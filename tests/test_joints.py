@@ -11,6 +11,7 @@ import pytest
 from bodies import LENGTHS
 from scipy.spatial.transform import Rotation, Slerp
 
+from benchmarks.validation.real import RING_SEGMENTS, assume_noise, register_ring
 from wepose_pin import rotations
 from wepose_pin.alignment import compute_heading_offset
 from wepose_pin.calibration import calibrate, lengths
@@ -28,7 +29,6 @@ from wepose_pin.filters import FilterSettings, run_filter
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
-from wepose_pin.validation.real import RING_SEGMENTS, assume_noise, register_ring
 
 NAMES = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 PAIRS = [

@@ -295,17 +295,6 @@ def test_two_sessions_become_tables_figures_and_a_page(
     assert "--force" in capsys.readouterr().err
 
 
-def test_a_folder_of_two_results_is_made_again_from_its_provenance(
-    results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(*results, "-o", tmp_path / "a", "--low-pass-hz", 5, "--shoulder", "XZY", "--interval", 1, 9) == 0
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        main(["reproduce", str(tmp_path / "a")])
-    assert "the same, made again by wepose angles" in capsys.readouterr().out
-    assert not stop.value.code
-
-
 def test_a_phase_marks_the_repetitions(results: tuple[Path, Path], tmp_path: Path) -> None:
     assert run(results[0], "-o", tmp_path / "a", "--repetitions", "bend", "--interval", 3, 9) == 0
     table = pl.read_csv(tmp_path / "a" / "repetitions.csv").unique("repetition", maintain_order=True)

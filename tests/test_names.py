@@ -90,12 +90,7 @@ def find_identifiers(text: str) -> Iterator[tuple[int, str]]:
 
 
 FILES = {path.relative_to(PACKAGE).as_posix(): path for path in sorted(PACKAGE.rglob("*.py"))}
-# The page of the validation tells of experiments on the upper body.
-PAGES = [
-    path
-    for path in sorted(PACKAGE.rglob("*.*"))
-    if path.suffix in (".js", ".j2", ".css", ".html") and path.parent.parent.name != "validation"
-]
+PAGES = [path for path in sorted(PACKAGE.rglob("*.*")) if path.suffix in (".js", ".j2", ".css", ".html")]
 
 
 def covers(allowed: str, file: str) -> bool:

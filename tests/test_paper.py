@@ -16,6 +16,9 @@ from bodies import LENGTHS, SEGMENTS
 from scipy.spatial.transform import Rotation
 from test_calibration import with_rigid_shoulders
 
+from benchmarks.validation import simulated
+from benchmarks.validation.contenders import list_contenders
+from benchmarks.validation.experiment import run_experiment
 from wepose_pin.calibration import Calibration, assess, calibrate, load_protocol
 from wepose_pin.calibration.paper import _Constraints, _minimise, check_paper_formulation
 from wepose_pin.calibration.solver import MIN_LENGTH
@@ -29,15 +32,6 @@ from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, s
 from wepose_pin.subject import load_subject, population_subject
 from wepose_pin.tracking import TrackOptions, track, track_chunks
 from wepose_pin.tracking.pose_diagnostics import describe_heading_remedy
-from wepose_pin.validation import contenders, list_experiments, summarize
-from wepose_pin.validation.tables import (
-    LENGTHS_ALONE,
-    OPEN_LOOP,
-    PAPER_HAND,
-    PROTOCOL,
-    WITH_TRUNK,
-    make_overview_table,
-)
 from wepose_pin.writers import write_session
 
 SENSORS = SEGMENTS[:5]
@@ -363,7 +357,6 @@ def test_the_commands(
     assert {values[0] for values in load_subject(tmp_path / "anna").girdles.values()} == {-1.0}  # fixed shoulders
     page = (tmp_path / "anna" / "report.html").read_text(encoding="utf-8")
     assert "Lengths alone estimated" in page
-    assert run("reproduce", tmp_path / "anna") == 0
 
     out = tmp_path / "result"
     options = ["--method", "smekf_published", "--open-loop", "--no-view", "--no-report"]
@@ -371,7 +364,6 @@ def test_the_commands(
     summary = json.loads((out / "summary.json").read_text())
     assert summary["heading_correction"] is None
     assert summary["provenance"]["options"]["open_loop"] is True
-    assert run("reproduce", out) == 0
     tracked = track(recording, load_subject(tmp_path / "anna"), method="smekf_published", open_loop=True)
     palm = pl.read_parquet(out / "pose.parquet", columns=["right_palm_x"]).to_series().to_numpy()
     np.testing.assert_allclose(palm, tracked.points["right_palm"][:, 0], atol=1e-9)
@@ -382,19 +374,18 @@ def test_the_commands(
 
 @pytest.mark.slow
 def test_the_validation_has_rows_of_the_papers_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
-    smekf = [each for each in contenders.list_contenders("upper body, mild") if each.label == "smekf"]
-    monkeypatch.setattr("wepose_pin.validation.paper.list_contenders", lambda _: smekf)
-    monkeypatch.setattr("wepose_pin.validation.paper.simulate", partial(simulate, clasp_s=30.0, circles=2))
-    (job,) = list_experiments(True)["upper body, mild"]
-    rows = {row.method: row for row in summarize(job())}
-    assert list(rows) == ["smekf", WITH_TRUNK, LENGTHS_ALONE, OPEN_LOOP, PROTOCOL]
-    mean, std = PAPER_HAND["smekf"]
-    assert {row.paper for row in rows.values()} == {f"{mean:.2f} ± {std:.2f}"}
-    figures = {method: row.figures for method, row in rows.items()}
-    assert figures[OPEN_LOOP]["lengths_rms_mm"] == figures["smekf"]["lengths_rms_mm"]
-    assert len({figures[method]["from shoulders"] for method in figures if method != WITH_TRUNK}) == 4
-    assert figures["smekf"]["from shoulders"] < figures[PROTOCOL]["from shoulders"]
-    assert [row[-1] for row in make_overview_table(list(rows.values())).rows] == ["smekf", "smekf"]
+    smekf = [each for each in list_contenders("upper body, mild") if each.label == "smekf"]
+    monkeypatch.setattr(simulated, "list_contenders", lambda _: smekf)
+    monkeypatch.setattr(simulated, "simulate", partial(simulate, clasp_s=30.0, circles=2))
+    rows = run_experiment(simulated.list_experiments(True)["upper body, mild"]).rows
+    trunk, alone, open_loop, protocol = (
+        f"smekf, {name}" for name in ("trunk measured", "lengths alone", "open loop", "the paper's protocol")
+    )
+    assert list(rows) == ["smekf", trunk, alone, open_loop, protocol]
+    assert rows[open_loop]["lengths rms [mm]"] == rows["smekf"]["lengths rms [mm]"]
+    hand = {method: row["hand from shoulders [mm]"][0] or 0.0 for method, row in rows.items()}
+    assert len({hand[method] for method in hand if method != trunk}) == 4
+    assert hand["smekf"] < hand[protocol]
 
 
 def test_a_quadratic_program_without_a_solution_is_an_error_and_prints_nothing(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.validation.simulated import compute_mount_errors
 from wepose_pin.calibration import Calibration, calibrate
 from wepose_pin.errors import BadSession
 from wepose_pin.filters import FilterSettings, run_filter
@@ -23,7 +24,6 @@ from wepose_pin.simulation import (
     simulate_person,
 )
 from wepose_pin.simulation.people import Offset
-from wepose_pin.validation.mounting import compute_mount_errors
 
 SEED = 5301
 BOW = sequence.make_bow

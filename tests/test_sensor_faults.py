@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from simulated import estimate_segments
 from test_bad_input import refused
 
+from benchmarks.trials import read_broad
 from wepose_pin import estimate_orientation, load_session, rotations
 from wepose_pin.diagnostics import Diagnostic, render
 from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.filters.noise import find_static_window
 from wepose_pin.readers import iter_session
 from wepose_pin.readers.session import SessionReader
-from wepose_pin.readers.trials import read_broad
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.recording.clocks import build_clock
 from wepose_pin.recording.faults import SensorScan, find_faults, scan_sensor

@@ -204,9 +204,6 @@ def test_the_command_takes_several_sessions(
         main(["calibrate", "a", "b", "-o", "both", "--no-report"])
     assert stopped.value.code in (3, 4)
     assert "a: quality" in capsys.readouterr().out
-    with pytest.raises(SystemExit) as stopped:
-        main(["reproduce", "both"])
-    assert stopped.value.code == 0
     assert set(load_subject(Path("both")).mounts) == set(sessions[1].sensors)
     with pytest.raises(SystemExit) as stopped:
         main(["calibrate", "a", "b", "-o", "paper", "--formulation", "paper", "--measured", "shoulder_width=0.37"])

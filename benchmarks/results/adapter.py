@@ -204,10 +204,7 @@ class Outcome:
 
 
 def solve_by_loop() -> None:
-    """Solve calibrations by the Gauss-Newton loop from now on: here, in the workers of `batch`, and in `validate`."""
-    from functools import partial
-
-    from wepose_pin import validation
+    """Solve calibrations by the Gauss-Newton loop from now on: here, and in the workers of `batch`."""
     from wepose_pin.batch import cluster
 
     from ..calibration import exchange_solver, solve_without_bounds
@@ -215,7 +212,6 @@ def solve_by_loop() -> None:
     exchange_solver(solve_without_bounds)
     preload = "from benchmarks.calibration import exchange_solver, solve_without_bounds as loop; exchange_solver(loop)"
     cluster.SETTINGS["distributed.worker.preload"].append(preload)
-    validation.run_jobs = partial(validation.run_jobs, workers=1)  # in this process
 
 
 def run(argv: list[str]) -> Outcome:
@@ -324,10 +320,6 @@ formats = ["trc"]
 """,
         encoding="utf-8",
     )
-
-
-def validate(out: Path, data: Path | None) -> list[str]:
-    return ["validate", "--quick", "-o", str(out), *(["--data", str(data)] if data else [])]
 
 
 # Functions ---------------------------------------------------------------------------------------------------------

@@ -219,11 +219,6 @@ def _live(method: str) -> Callable[[Places], Arrays]:
     return run
 
 
-def _validate(places: Places) -> Arrays:
-    command(adapter.validate(places.work / "out", places.data))
-    return folder_values(places.work / "out", "validate")
-
-
 def _broad(file: str) -> Callable[[Places], Arrays]:
     def run(places: Places) -> Arrays:
         from scipy.io import loadmat
@@ -275,7 +270,6 @@ def tasks() -> list[Task]:
     plain = {"whole": (), "causal": ("causal",)}
     real = {"whole": ("torques",), "chunks": ("chunks",), "causal": ("causal",)}
     found = [
-        Task("validate", _validate, 100.0),
         *_methods("mild", ("amekf", "smoother")),
         Task("ideal", Person("ideal", variants={**plain, "chunks": ("chunks",)})),
         Task("unknown_mounts", Person("unknown_mounts", variants={**plain, "chunks": ("chunks",)})),

@@ -1,19 +1,13 @@
-"""What wepose itself wrote earlier, or others for it, and reads again: plans, provenance, figures, trials, results."""
+"""What wepose itself wrote earlier, or others for it, and reads again: plans and results."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import io
-import shutil
-from collections.abc import Callable
 from pathlib import Path
-from unittest import mock
 
 from . import seeds
-from .target import file
-
-REPRODUCED = ("track", "calibrate", "simulate", "retarget", "demo", "export", "angles")
 
 
 def plan(folder: Path, data: bytes) -> object:
@@ -52,98 +46,6 @@ def _beside_a_plan(folder: Path) -> None:
     (folder / "anna.toml").write_bytes(seeds.subject())
     (folder / "arm.urdf").write_text(seeds.ARM, encoding="utf-8")
     (folder / "arm.toml").write_bytes(seeds.ARM_MAP)
-
-
-def _silently(do: Callable[[], object]) -> None:
-    with contextlib.redirect_stdout(io.StringIO()):
-        do()
-
-
-def _validation(path: Path) -> object:
-    from wepose_pin.cli.validate import print_experiments
-    from wepose_pin.validation import read_document
-
-    document = read_document(path)
-    _silently(lambda: print_experiments(document))
-    return document
-
-
-validation = file("validation.json", _validation)
-
-
-def provenance(folder: Path, data: bytes) -> object:
-    """The input is what a result says made it; what would make it again copies another."""
-    from wepose_pin.batch import reproduction
-    from wepose_pin.jobs.reproduce import ReproduceJob
-
-    result, made = folder / "result", folder / "made"
-    for place in (result, made):
-        if not place.is_dir():
-            place.mkdir()
-            (place / "pose.parquet").write_bytes(seeds.pose())
-    (folder / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
-    (result / "provenance.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
-    copies = {name: (kind, lambda job: shutil.copytree(made, job.out)) for name, (kind, _) in _reproducible().items()}
-    with mock.patch.dict(reproduction.REPRODUCIBLE, copies):
-        return reproduction.run_reproduce(ReproduceJob(result))
-
-
-def _reproducible() -> dict[str, tuple[type, Callable[..., object]]]:
-    from wepose_pin.batch.reproduction import REPRODUCIBLE
-
-    assert set(REPRODUCIBLE) == set(REPRODUCED), "a stranger's record runs only what makes a result"
-    return REPRODUCIBLE
-
-
-def done(folder: Path, data: bytes) -> object:
-    """The input is what an item of a batch says made it; read as batch does before it makes it again."""
-    from wepose_pin.batch.items import _find_change, _read_done, read_item
-    from wepose_pin.batch.reproduction import _read_item_provenance
-
-    (folder / "item").mkdir(exist_ok=True)
-    (folder / "session.toml").write_text(seeds.SESSION, encoding="utf-8")
-    (folder / "item" / "done.json").write_bytes(data.replace(b"FOLDER", str(folder).encode()))
-    record = _read_done(str(folder / "item"))
-    item = read_item(_read_item_provenance(folder / "item"))
-    return None if record is None else _find_change(item, "", record)
-
-
-# Recordings with a truth, for `wepose validate --data` ------------------------------------------------------------
-
-
-def _broad(path: Path) -> object:
-    from wepose_pin.readers.trials import read_broad
-
-    return read_broad(path)
-
-
-def _authors(path: Path) -> object:
-    from wepose_pin.readers.trials import read_authors_trial
-
-    return read_authors_trial(path)
-
-
-broad = file("trial.mat", _broad)
-authors = file("prova_HR.txt", _authors)
-
-
-def ring(folder: Path, data: bytes) -> object:
-    """One text for all three tables."""
-    from wepose_pin.readers.trials import RING_MOUNTS, RingFiles, read_ring
-
-    for name in ("omc", "imu_rigid", "imu_nonrigid"):
-        (folder / f"{name}.csv").write_bytes(data)
-    imu = dict(zip(RING_MOUNTS, (folder / "imu_rigid.csv", folder / "imu_nonrigid.csv"), strict=True))
-    return read_ring(RingFiles(folder, folder / "omc.csv", imu))
-
-
-def ur5(folder: Path, data: bytes) -> object:
-    from wepose_pin.readers.trials import Ur5Files, read_ur5
-
-    for name in ("imu/a/radius_adx.csv", "encoder/a/radius.csv"):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(data)
-    return read_ur5(Ur5Files("a", "radius", folder / "imu/a/radius_adx.csv", folder / "encoder/a/radius.csv"))
 
 
 # A result, to what is made of it ------------------------------------------------------------------------------------

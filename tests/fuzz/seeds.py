@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import struct
@@ -423,73 +422,6 @@ PLAN_TABLE = b"""session,name,subject,truth,stature,sex,measured.shoulder_width
 one,first,anna,truth.parquet,1.7,f,0.385
 two,second,,,,,
 """
-
-
-def provenance() -> bytes:
-    block = {
-        **{"format": 1, "command": "track", "version": "0.1.0", "commit": None, "code": "0", "machine": "a"},
-        "options": {"method": None, "causal": False, "subject": None, "limits": True},
-        "inputs": {"session": {"path": "FOLDER/session.toml", "files": {"session.toml": session_hash()}}},
-        "packages": {"numpy": "1"},
-    }
-    return json.dumps(block, indent=1).encode()
-
-
-def done() -> bytes:
-    body = {"stature": 1.7, "sex": "f", "measured": {"shoulder_width": 0.385}}
-    options = {"name": "item", "subject": None, "body": body, "steps": {"track": {"method": "amekf"}}}
-    files = {"path": "FOLDER/session.toml", "files": {"session.toml": session_hash()}}
-    block = {"format": 1, "command": "batch item", "options": options, "inputs": {"session": files}}
-    return json.dumps({"key": "", "provenance": block, "stamps": {"session": {}}, "row": {"item": "item"}}).encode()
-
-
-def session_hash() -> str:
-    return hashlib.sha256(SESSION.encode()).hexdigest()
-
-
-def validation() -> bytes:
-    from wepose_pin.validation import Result, format_document
-
-    dynamic = {"roll": [1.1, 0.5], "pitch": [1.2, 0.5], "yaw": [1.3, 0.5], "total_rmse": 2.0}
-    hand = {key: {"mean": 17.0, "std": 2.0, "rmse": 18.0} for key in ("hand_mm", "hand_from_shoulders_mm")}
-    series = {"time": [0.0, 1.0], "error_mm": [1.0, 2.0]}
-    results = [Result("dynamic 100 Hz", "0", method, dynamic) for method in ("ncf", "gdc", "smekf")]
-    results += [Result("upper body, ideal", "0", method, hand, series) for method in ("ncf", "smekf")]
-    board = {"inclination_rmse": 0.6, "heading_rmse": 2.0, "total_rmse": 2.5}
-    results += [Result("BROAD", trial, method, board) for trial in "12" for method in ("amekf", "smekf")]
-    return format_document(results, True, {"wepose-pin": "0.1.0"}).encode()
-
-
-def broad(compressed: bool) -> bytes:
-    n = 12
-    out = io.BytesIO()
-    moving = np.arange(n) > 8
-    content = {"imu_gyr": GYRO, "imu_acc": ACCEL, "opt_quat": QUAT[:, [3, 0, 1, 2]], "movement": moving[:, None]}
-    savemat(out, {**content, "sampling_rate": 2.0}, do_compression=compressed)
-    return out.getvalue()
-
-
-def authors() -> bytes:
-    still = [0, 0, 0, 1, 0, 0, 0]
-    lines = [[10 * k, *GYRO[k], *ACCEL[k], *still, *QUAT[k], 1, 2, 3] for k in range(N)]
-    return "".join(" ".join(f"{v:.6f}" for v in line) + " ; \n" for line in lines).encode()
-
-
-def ring() -> bytes:
-    columns: dict[str, np.ndarray] = {}
-    for k, marker in enumerate((2, 2, 1, 2, 4), 1):
-        columns |= {f"seg{k}_quat_{axis}": QUAT[:, j] for axis, j in zip("wxyz", (3, 0, 1, 2), strict=True)}
-        columns |= {f"seg{k}_marker{marker}_{axis}": TIME for axis in "xyz"}
-        columns |= {f"seg{k}_gyr_{axis}": GYRO[:, j] for j, axis in enumerate("xyz")}
-        columns |= {f"seg{k}_acc_{axis}": ACCEL[:, j] for j, axis in enumerate("xyz")}
-    return b"# sampling frequency: 40\n" + pl.DataFrame(columns).head(4).write_csv().encode()
-
-
-def ur5() -> bytes:
-    columns = {f"gyr_{axis}": GYRO[:, j] for j, axis in enumerate("xyz")}
-    columns |= {f"acc_{axis}": ACCEL[:, j] for j, axis in enumerate("xyz")} | {"TIME": 1e6 * TIME}
-    columns |= {f"QUATERNION_{k}": QUAT[:, j] for k, j in enumerate((3, 0, 1, 2))}
-    return pl.DataFrame(columns).write_csv().encode()
 
 
 def pose_csv() -> bytes:

@@ -333,11 +333,4 @@ TARGETS = (
     Target("pose", lambda: [seeds.pose()], file("pose.parquet", _pose), (), "kinematics"),
     Target("result", lambda: [seeds.pose_csv()], records.result, LINES, "writers.motion"),
     Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON, "writers.result"),
-    Target("provenance", lambda: [seeds.provenance()], records.provenance, JSON, "batch.reproduction"),
-    Target("done", lambda: [seeds.done()], records.done, JSON, "batch.items"),
-    Target("validation", lambda: [seeds.validation()], records.validation, JSON, "validation.document"),
-    Target("broad", lambda: [seeds.broad(False), seeds.broad(True)], records.broad, (), "readers.trials"),
-    Target("authors", lambda: [seeds.authors()], records.authors, LINES, "readers.trials"),
-    Target("ring", lambda: [seeds.ring()], records.ring, LINES, "readers.trials"),
-    Target("ur5", lambda: [seeds.ur5()], records.ur5, LINES, "readers.trials"),
 )

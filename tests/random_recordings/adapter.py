@@ -28,7 +28,7 @@ from .recordings import Recorded, Table
 from .sensors import DEG, GRAVITY
 
 # Exit codes that a command may end with.
-CODES = {"calibrate": {0, 2, 3, 4}, "batch": {0, 2, 3}, "reproduce": {0, 2, 3}}
+CODES = {"calibrate": {0, 2, 3, 4}, "batch": {0, 2, 3}}
 USUAL_CODES = {0, 2}
 ACCEPTED = {"calibrate": {0, 3, 4}}
 COMMANDS: dict[str, str] = {}  # ours → the project's, where they differ
@@ -216,10 +216,6 @@ def export(result: Path, out: Path) -> list[str]:
 
 def info(file: Path, session: Path | None = None) -> list[str]:
     return ["info", str(file), *(["-o", str(session)] if session else [])]
-
-
-def reproduce(result: Path) -> list[str]:
-    return ["reproduce", str(result)]
 
 
 def retarget(result: Path, out: Path) -> list[str]:

@@ -291,7 +291,6 @@ def _commands(case: Case, rng: np.random.Generator) -> None:
         ("view", 0.15),
         ("export", 0.5),
         ("info", 0.15),
-        ("reproduce", 0.15),
         ("again", 0.1),
         ("chunks", 0.3),
         ("retarget", 0.03),

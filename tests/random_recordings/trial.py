@@ -152,11 +152,6 @@ class Trial:
             argv = adapter.track(written, out, "amekf", self.case.options & {"gaps"})
             self.command(argv, out, "may: a proposal is to be completed")
 
-    def reproduce(self) -> None:
-        outcome = self.command(adapter.reproduce(self.result_folder), acceptance="")
-        if outcome.code == 3:
-            self.report.failures.append(Failure("the same bits again", " ".join(outcome.argv), outcome.out[-300:]))
-
     def again(self) -> None:
         self._compared("again", "the same bits again", None)
 
@@ -187,7 +182,7 @@ class Trial:
 
 STEPS: dict[str, Callable[[Trial], None]] = {
     name: getattr(Trial, name)
-    for name in ("calibrate", "track", "evaluate", "view", "export", "info", "reproduce", "again", "chunks", "retarget")
+    for name in ("calibrate", "track", "evaluate", "view", "export", "info", "again", "chunks", "retarget")
 }
 
 

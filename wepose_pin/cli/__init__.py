@@ -16,8 +16,13 @@ from .stopping import catch_signals, ignore_signals, is_stopped, whats_written
 # In the order of `wepose --help`; each is a module here.
 COMMANDS = (
     *("demo", "info", "simulate", "calibrate", "track", "view", "evaluate", "angles", "export", "retarget"),
-    *("live", "batch", "reproduce", "validate"),
+    *("live", "batch"),
 )
+
+REMOVED = {
+    "reproduce": "run the command that `provenance` in the result's summary.json names again, with the same versions",
+    "validate": "in a clone of the project, run make validation DATA=DIR",
+}
 
 
 def find_command(name: str) -> Command:
@@ -31,7 +36,7 @@ def main(argv: list[str] | None = None) -> None:
     is_process = argv is None
     if argv is None:
         argv = sys.argv[1:]
-        # Before numpy loads: BLAS's last bits depend on its number of threads, and `wepose reproduce` compares them.
+        # Before numpy loads: BLAS's last bits depend on its number of threads.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         catch_signals()
     for stream in (sys.stdout, sys.stderr):
@@ -70,6 +75,8 @@ def _run(argv: list[str]) -> int:
 
         print(f"wepose-pin {__version__}")
         return 0
+    if first in REMOVED:
+        raise BadOption(f"'{first}' is no command any more: {REMOVED[first]}")
     if first not in COMMANDS:
         raise BadOption(f"'{first}' is not a command; {one_of(COMMANDS, first)}")
     command = find_command(first)

@@ -1,6 +1,6 @@
 """One function a command does the whole job: a frozen dataclass of its options in, an outcome out, nothing printed.
 
-The command line, batch and `wepose reproduce` build the same dataclass and call the same function. A docstring's
+The command line and batch build the same dataclass and call the same function. A docstring's
 ``Parameters`` are the help of the options: of ``name : METAVAR`` the second word is what the value is called there. An
 option that is true by default is described as what happens by default; its switch is ``--no-NAME``.
 

@@ -15,7 +15,7 @@ from typing import Any
 from .. import __version__
 from ..assets import asset
 from ..documents import parse_toml
-from ..errors import BadData, MissingFile
+from ..errors import MissingFile
 from .result import versions
 
 FORMAT = 1
@@ -209,34 +209,3 @@ def write_provenance(folder: Path, provenance: Mapping[str, Any]) -> None:
 def provenance_text(provenance: Mapping[str, Any]) -> str:
     """A provenance as a file of its own holds it."""
     return json.dumps(provenance, indent=1, ensure_ascii=False) + "\n"
-
-
-def read_provenance(result: Path) -> dict[str, Any]:
-    """The provenance of a result folder, or of an exported file.
-
-    Raises
-    ------
-    MissingFile
-        There is no such result.
-    BadData
-        It does not say what made it, or is damaged.
-    """
-    if not result.exists():
-        raise MissingFile(f"{result}: no such result; a folder, or an exported file, is wanted here")
-    alone = result / ALONE if result.is_dir() else provenance_file(result)
-    places = [alone, *(result / name for name in INSIDE if result.is_dir())]
-    for place in (place for place in places if place.is_file()):
-        try:
-            content = json.loads(place.read_text(encoding="utf-8"))
-        except (ValueError, RecursionError) as error:
-            raise BadData(f"{place}: is damaged, no JSON: {error}") from error
-        if place != alone:
-            content = content.get("provenance") if isinstance(content, dict) else None
-        if content is None:
-            continue
-        if not isinstance(content, dict) or content.get("format") != FORMAT:
-            raise BadData(f"{place}: provenance is not of format {FORMAT}; made by another version")
-        if not all(isinstance(content.get(key), dict) for key in ("options", "inputs")):
-            raise BadData(f"{place}: provenance is damaged: options and inputs, tables both, are needed")
-        return content
-    raise BadData(f"{result}: does not say what made it ({alone.name}, or provenance in {' or '.join(INSIDE)})")

@@ -1,4 +1,4 @@
-"""The paper's three experiments on simulated sensors and people with exact truth.
+"""The paper's three experiments on simulated sensors and people with exact truth, arbitrary mounting, error budget.
 
 The bias measured in the static phase is removed for every filter, and the heading is aligned once, in that phase, and
 never fitted to the truth afterwards.
@@ -6,7 +6,7 @@ never fitted to the truth afterwards.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from functools import lru_cache
 
@@ -14,13 +14,13 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from .. import rotations
-from ..calibration import Formulation, calibrate
-from ..evaluation import AttitudeError, Evaluation, attitude_error, evaluate
-from ..filters.noise import estimate_noise
-from ..model import ROOT, BodyTable, load_table
-from ..recording import OrientationSensor, Recording
-from ..simulation import (
+from wepose_pin import rotations
+from wepose_pin.calibration import Formulation, calibrate
+from wepose_pin.evaluation import AttitudeError, Evaluation, attitude_error, evaluate
+from wepose_pin.filters.noise import estimate_noise
+from wepose_pin.model import ROOT, BodyTable, load_table
+from wepose_pin.recording import OrientationSensor, Recording
+from wepose_pin.simulation import (
     CIRCLING_POINT,
     IDEAL_PRESET,
     MEASURED_LENGTHS,
@@ -32,30 +32,28 @@ from ..simulation import (
     simulate_paper_drift,
     simulate_paper_dynamic,
 )
-from ..subject import Subject, mount_rows
-from ..tracking import track
-from .contenders import Contender, list_contenders
-from .jobs import Job, Result
-from .presets import PRESETS, Preset
-from .series import align_rotation, decimate_curves
-from .tables import (
-    AS_COMMANDED,
-    CAUSAL,
-    DEFAULT,
-    ERROR_BUDGET,
-    LENGTHS_ALONE,
-    OPEN_LOOP,
-    ORIENTATIONS_ALONE,
-    OURS,
-    PROTOCOL,
-    UPPER_BODY,
-    WITH_TRUNK,
-)
+from wepose_pin.subject import Subject, mount_rows
+from wepose_pin.tracking import track
 
+from .contenders import DEFAULT, OURS, Contender, list_contenders
+from .experiment import Job, Result, align_rotation
+from .presets import PRESETS, UPPER_BODY, Preset
+
+ARBITRARY_MOUNTING, ERROR_BUDGET = "arbitrary sensor mounting", "error budget"
+# Rows of the upper body that are no filters of their own.
+WITH_TRUNK = ", trunk measured"  # beside the shoulder width
+AS_COMMANDED = f"{DEFAULT}, mounts as stated"  # by the session, to the next axis, and the start pose
+ORIENTATIONS_ALONE = f"{DEFAULT}, orientations alone"  # without joint accelerations and covariance, as others enter
+CAUSAL = f"{DEFAULT}, causal"  # tracked as live, with past samples only
+LENGTHS_ALONE = f"{OURS}, lengths alone"  # calibrated in the paper's formulation
+OPEN_LOOP = f"{OURS}, open loop"  # tracked without heading correction
+PROTOCOL = f"{OURS}, the paper's protocol"  # both, and mounts by the session and the start pose
+
+AXES = ("roll", "pitch", "yaw")
 RATES = {"100 Hz": 100.0, "1 kHz": 1000.0}
 MEASURED, MEASURED_WITH_TRUNK = MEASURED_LENGTHS[:1], MEASURED_LENGTHS  # lengths that are measured beforehand
 KNOWN_MOUNT_STD = np.deg2rad(0.5)  # stated standard deviation of exact mounts
-TRIALS = {"dynamic": 12, "drift": 10, UPPER_BODY: 10, ERROR_BUDGET: 10}  # the paper's numbers; the budget's is ours
+TRIALS = {"dynamic": 12, "drift": 10, UPPER_BODY: 10, ARBITRARY_MOUNTING: 10, ERROR_BUDGET: 10}  # the paper's; ours
 # Parts of the error budget: parts of the chain known exactly, or not as well; then groups of imperfections switched
 # off, by how their names begin. An imperfection that is in none of them is a group of its own.
 CHAIN_PARTS = ("all on", "orientations exact", "lengths exact", "trunk measured", "mounts as stated")
@@ -76,28 +74,25 @@ GROUPS = {
 }
 
 
-def list_experiments(quick: bool = False, trials: int | None = None) -> dict[str, list[Job]]:
-    """List the jobs of each experiment.
+def list_experiments(quick: bool = False) -> dict[str, list[Job]]:
+    """List the jobs of each experiment; `quick`: one trial of each, and no error budget."""
+    experiments = {}
 
-    `quick`: one trial of each, and no error budget; `trials`: at most so many of each.
-    """
+    def add(name: str, kind: str, function: Callable[..., list[Result]], *arguments: object) -> None:
+        trials = range(1 if quick else TRIALS[kind])
+        experiments[name] = [Job(str(seed), function, (seed, *arguments)) for seed in trials]
 
-    def count(kind: str) -> range:
-        return range(1 if quick else min(TRIALS[kind], trials or TRIALS[kind]))
-
-    jobs = {}
     for rate, rate_hz in RATES.items():
-        name = f"dynamic {rate}"
-        jobs[name] = [Job(name, str(k), _dynamic, (k, rate, rate_hz)) for k in count("dynamic")]
-    jobs["drift"] = [Job("drift", str(k), _drift, (k,)) for k in count("drift")]
+        add(f"dynamic {rate}", "dynamic", _dynamic, rate, rate_hz)
+    add("drift", "drift", _drift)
     for label, preset in PRESETS.items():
-        name = f"{UPPER_BODY}, {label}"
-        jobs[name] = [Job(name, str(k), _upper_body, (k, preset)) for k in count(UPPER_BODY)]
+        add(f"{UPPER_BODY}, {label}", UPPER_BODY, _upper_body, label, preset)
     for label, preset in PRESETS.items():
-        if not quick and preset.imperfections != IDEAL_PRESET:
-            name = f"{ERROR_BUDGET}, {label}"
-            jobs[name] = [Job(name, str(k), _error_budget, (k, preset)) for k in count(ERROR_BUDGET)]
-    return jobs
+        if preset.imperfections != IDEAL_PRESET:
+            add(f"{ARBITRARY_MOUNTING}, {label}", ARBITRARY_MOUNTING, _arbitrary_mounting, preset)
+            if not quick:
+                add(f"{ERROR_BUDGET}, {label}", ERROR_BUDGET, _error_budget, preset)
+    return experiments
 
 
 def switch_off(imperfections: Imperfections) -> dict[str, Imperfections]:
@@ -118,17 +113,16 @@ def _is_on(imperfections: Imperfections, name: str) -> bool:
     return name not in places and bool(getattr(imperfections, name) != getattr(IDEAL_PRESET, name))
 
 
-def _dynamic(experiment: str, trial: str, seed: int, rate: str, rate_hz: float) -> list[Result]:
+def _dynamic(seed: int, rate: str, rate_hz: float) -> list[Result]:
     """Run the dynamic experiment: 5 s static, 50 s of free motion, 5 s static; errors over the motion."""
     sensor = simulate_paper_dynamic(seed, rate_hz)
-    results = []
-    for method, scored, error in _run_single(sensor, f"simulated {rate}"):
-        series = decimate_curves(sensor.time, total_deg=np.degrees(error.magnitude())) if seed == 0 else {}
-        results.append(Result(experiment, trial, method, scored._asdict(), series))
-    return results
+    return [
+        Result(label, {f"{axis} [deg]": getattr(scored, axis) for axis in AXES})
+        for label, scored, _ in _run_single(sensor, f"simulated {rate}")
+    ]
 
 
-def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
+def _drift(seed: int) -> list[Result]:
     """Run the drift experiment: 25 s static, 10 s of shaking and rotating, 25 s static.
 
     The heading error is the change from before the motion to after it.
@@ -136,13 +130,12 @@ def _drift(experiment: str, trial: str, seed: int) -> list[Result]:
     sensor = simulate_paper_drift(seed)
     after = sensor.time > sensor.moving[1] + 1.0
     results = []
-    for method, _, error in _run_single(sensor, "simulated 1 kHz"):
-        yaw, pitch, roll = np.abs(error.as_euler("ZYX", degrees=True)[after]).T
+    for label, _, error in _run_single(sensor, "simulated 1 kHz"):
+        angles = np.abs(error.as_euler("ZYX", degrees=True)[after, ::-1]).mean(axis=0)
         heading = np.degrees(np.unwrap(rotations.heading(error.as_quat())))
-        slope = np.polyfit(sensor.time[after], heading[after], 1)[0]
-        figures = {"roll": roll.mean(), "pitch": pitch.mean(), "yaw": yaw.mean(), "drift_deg_min": 60.0 * abs(slope)}
-        series = decimate_curves(sensor.time, heading_deg=heading) if seed == 0 else {}
-        results.append(Result(experiment, trial, method, {k: float(v) for k, v in figures.items()}, series))
+        slope = 60.0 * abs(float(np.polyfit(sensor.time[after], heading[after], 1)[0]))
+        figures = {f"{axis} [deg]": float(angle) for axis, angle in zip(AXES, angles, strict=True)}
+        results.append(Result(label, {**figures, "drift [deg/min]": slope}))
     return results
 
 
@@ -167,7 +160,7 @@ def _simulate_person(seed: int, preset: Preset) -> tuple[Person, Simulation]:
     return person, simulate(person.lengths, seed=seed, imperfections=preset.imperfections)
 
 
-def _upper_body(experiment: str, trial: str, seed: int, preset: Preset) -> list[Result]:
+def _upper_body(seed: int, label: str, preset: Preset) -> list[Result]:
     """Calibrate by each filter with a measured shoulder width and known mounts, then track six circles.
 
     smekf has a row for each part of the paper's protocol, one for the whole of it, and one with a measured trunk;
@@ -189,22 +182,11 @@ def _upper_body(experiment: str, trial: str, seed: int, preset: Preset) -> list[
         open_loop: bool = False,
         causal: bool = False,
     ) -> None:
-        tracked = track(recording, subject, method=method, open_loop=open_loop, causal=causal)
-        recording, pose = tracked.recording, tracked.pose  # causal: from the end of the start pose on
-        series = {}
-        if seed == 0:
-            inside = recording.span(circles)
-            true_path = truth.points[CIRCLING_POINT][recorded.span(circles)]
-            off = pose.points[CIRCLING_POINT][inside] - true_path
-            paths = {f"{axis}_mm": 1e3 * pose.points[CIRCLING_POINT][inside, k] for k, axis in enumerate("xyz")}
-            paths |= {f"true_{axis}_mm": 1e3 * true_path[:, k] for k, axis in enumerate("xyz")}
-            series = decimate_curves(recording.time[inside], error_mm=1e3 * np.linalg.norm(off, axis=1), **paths)
-        figures = collect_hand_errors(evaluate(pose, truth, circles)) | {
-            "lengths_rms_mm": _compute_lengths_rms(subject, person)
-        }
-        results.append(Result(experiment, trial, label, figures, series))
+        pose = track(recording, subject, method=method, open_loop=open_loop, causal=causal).pose
+        figures = collect_hand_errors(evaluate(pose, truth, circles)) | compare_lengths(subject, person)
+        results.append(Result(label, figures))
 
-    for contender in list_contenders(experiment):
+    for contender in list_contenders(f"{UPPER_BODY}, {label}"):
         recording, method = orient_recording(recorded, contender)
         subject = calibrate_person(recording, person, method, exact)
         score(contender.label, recording, subject, method)
@@ -215,7 +197,7 @@ def _upper_body(experiment: str, trial: str, seed: int, preset: Preset) -> list[
             score(ORIENTATIONS_ALONE, alone, calibrate_person(alone, person, DEFAULT, exact), DEFAULT)
         if contender.label == OURS:
             with_trunk = calibrate_person(recording, person, OURS, exact, measured=MEASURED_WITH_TRUNK)
-            score(WITH_TRUNK, recording, with_trunk, OURS)
+            score(OURS + WITH_TRUNK, recording, with_trunk, OURS)
             lengths_alone = calibrate_person(recording, person, OURS, exact, formulation="paper")
             score(LENGTHS_ALONE, recording, lengths_alone, OURS)
             score(OPEN_LOOP, recording, subject, OURS, open_loop=True)
@@ -224,7 +206,52 @@ def _upper_body(experiment: str, trial: str, seed: int, preset: Preset) -> list[
     return results
 
 
-def _error_budget(experiment: str, trial: str, seed: int, preset: Preset) -> list[Result]:
+def _arbitrary_mounting(seed: int, preset: Preset) -> list[Result]:
+    """Calibrate without stated mounts, then track six circles."""
+    person = preset.sample_person(seed)
+    simulation = simulate(person.lengths, seed=seed, imperfections=replace(preset.imperfections, mount="any"))
+    recording, truth = simulation.recording(), simulation.truth()
+    results = []
+    for method, extra in ((DEFAULT, ""), (DEFAULT, WITH_TRUNK), (OURS, "")):
+        measured = MEASURED_WITH_TRUNK if extra else MEASURED
+        subject = calibrate_person(recording, person, method, person.prior, measured=measured)
+        errors = evaluate(track(recording, subject, method=method).pose, truth, simulation.phases["circles"][0])
+        figures = collect_hand_errors(errors) | compare_lengths(subject, person)
+        results.append(Result(method + extra, figures | _compare_mounts(subject, person, simulation)))
+    return results
+
+
+def _compare_mounts(subject: Subject, person: Person, simulation: Simulation) -> dict[str, float]:
+    """Compute errors of the mounts, and of mounts and lengths as multiples of their standard deviations."""
+    errors = compute_mount_errors(subject, simulation)
+    stated = [[subject.std(row) for row in mount_rows(name)] for name in simulation.quat_LS]
+    lengths = [(subject.lengths[n] - person.lengths[n]) / subject.std(n) for n in list_closed_lengths(load_table())]
+    return {
+        "headings rms [deg]": float(np.degrees(_rms(errors[:, 2]))),
+        "tilts rms [deg]": float(np.degrees(_rms(errors[:, :2]))),
+        "error / ± rms": _rms(np.concatenate([lengths, (errors / stated).ravel()])),
+    }
+
+
+def compute_mount_errors(subject: Subject, simulation: Simulation) -> np.ndarray:
+    """Compute the errors (sensors, 3) [rad] of the mounts in L, the heading last.
+
+    A mount's heading is relative to the start pose, however the person turned the segment in it: no closure shows that
+    turn, and it is in the ± of what is tracked.
+    """
+    start = simulation.time <= simulation.phases["start"][0][1]
+    facing = rotations.heading(Rotation.from_quat(simulation.quat_WL[load_table().reference][start]).mean().as_quat())
+    turn = Rotation.from_rotvec([0.0, 0.0, -float(facing)])
+    errors = []
+    for name, quat_LS in simulation.quat_LS.items():
+        R_LS = Rotation.from_quat(subject.mounts[name])
+        error = (R_LS * Rotation.from_quat(quat_LS).inv()).as_rotvec()
+        R_WS_start = turn * Rotation.from_quat(simulation.quat_WS[name][start]).mean()
+        errors.append([*error[:2], (R_LS * R_WS_start.inv()).as_rotvec()[2]])
+    return np.array(errors)
+
+
+def _error_budget(seed: int, preset: Preset) -> list[Result]:
     """Run smekf with one group of imperfections switched off, or one part known exactly, at a time."""
     results = []
     full = preset.imperfections
@@ -245,8 +272,7 @@ def _error_budget(experiment: str, trial: str, seed: int, preset: Preset) -> lis
         errors = evaluate(
             track(recording, subject, method=OURS).pose, simulation.truth(), simulation.phases["circles"][0]
         )
-        figures = collect_hand_errors(errors) | {"lengths_rms_mm": _compute_lengths_rms(subject, person)}
-        results.append(Result(experiment, trial, label, figures))
+        results.append(Result(label, collect_hand_errors(errors) | compare_lengths(subject, person)))
     return results
 
 
@@ -270,21 +296,25 @@ def calibrate_person(
     ).subject
 
 
-def collect_hand_errors(errors: Evaluation) -> dict[str, dict[str, float]]:
-    """Collect the errors of the hand that circles, from the shoulders first, and how far its ± is right."""
-    figures = {
-        "hand_from_shoulders_mm": errors.position_on_limb[CIRCLING_POINT]._asdict(),
-        "hand_mm": errors.position[CIRCLING_POINT]._asdict(),
+def collect_hand_errors(errors: Evaluation) -> dict[str, float | tuple[float, float]]:
+    """Collect the errors of the hand that circles, and how far its ± is right: nees is 3 then."""
+    figures: dict[str, float | tuple[float, float]] = {
+        "hand from shoulders [mm]": errors.position_on_limb[CIRCLING_POINT][:2],
+        "hand from root [mm]": errors.position[CIRCLING_POINT][:2],
     }
     if CIRCLING_POINT in errors.position_uncertainty:
-        figures["hand_uncertainty"] = errors.position_uncertainty[CIRCLING_POINT]._asdict()
+        figures["hand nees"] = errors.position_uncertainty[CIRCLING_POINT].nees
     return figures
 
 
-def _compute_lengths_rms(subject: Subject, person: Person) -> float:
-    """Compute the rms error [mm] of the lengths that the closed chain observes."""
+def compare_lengths(subject: Subject, person: Person) -> dict[str, float]:
+    """Compute the error of the lengths that the closed chain observes."""
     errors = [subject.lengths[name] - person.lengths[name] for name in list_closed_lengths(load_table())]
-    return 1e3 * float(np.sqrt(np.mean([error**2 for error in errors])))
+    return {"lengths rms [mm]": 1e3 * _rms(np.array(errors))}
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def list_closed_lengths(table: BodyTable) -> list[str]:

@@ -14,12 +14,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .. import rotations
-from ..filters import METHODS, FilterSettings, GdcParams, NcfParams, run_filter
-from ..filters.noise import SensorNoise
-from ..filters.static import StaticTest
+from wepose_pin import rotations
+from wepose_pin.filters import METHODS, FilterSettings, GdcParams, NcfParams, run_filter
+from wepose_pin.filters.noise import SensorNoise
+from wepose_pin.filters.static import StaticTest
+
 from .gains import make_gains
-from .tables import AS_PUBLISHED, PUBLISHED
+
+OURS = "smekf"  # the paper's filter
+DEFAULT = "amekf"  # the default of the commands
+PUBLISHED = "smekf_published"
 
 Orient = Callable[[np.ndarray, np.ndarray, float, SensorNoise], np.ndarray]
 
@@ -49,7 +53,8 @@ def list_contenders(setting: str, trial: str = "") -> list[Contender]:
     """
     tuned = make_gains(setting, trial)._asdict()
     filters = [_make_ours(method) for method in METHODS if method not in (*tuned, PUBLISHED)]
-    filters.append(_make_ours(PUBLISHED)._replace(label=AS_PUBLISHED, method=None))
+    # Of people it enters as measured orientations: joint accelerations are not the paper's.
+    filters.append(_make_ours(PUBLISHED)._replace(method=None))
     filters += [_make_tuned(method, params) for method, params in tuned.items()]
     filters += [_make_default(method, params) for method, params in DEFAULT_GAINS.items()]
     return filters + [Contender(label, orient) for label, (module, orient) in _PEERS.items() if find_spec(module)]

@@ -1,7 +1,7 @@
 """Registration of a reference to a sensor: clock, body frame and world, from an interval that is not scored.
 
 No filter takes part: the gyroscope is integrated over the stretch, so what is found is the same for all that are
-compared. Only the heading, which each filter has of its own, is left to `series.align_rotation`.
+compared. Only the heading, which each filter has of its own, is left to `experiment.align_rotation`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation, Slerp
 
-from .. import rotations
-from ..errors import BadData
-from ..readers.trials import Referenced
+from wepose_pin import rotations
+from wepose_pin.errors import BadData
+
+from ..trials import Referenced
 
 LARGEST_OFFSET_S = 0.3  # of the clocks
 # Rotations are compared over this time: long against errors of foam and a flexing arm, short against gyroscope drift.
@@ -38,16 +39,6 @@ class Registration(NamedTuple):
     def tilt_deg(self) -> float:
         """Tilt [deg] of the reference's world."""
         return float(np.degrees(Rotation.from_quat(self.quat_WV).magnitude()))
-
-    def figures(self) -> dict[str, float]:
-        """Return the figures for the table of trials."""
-        return {
-            "clock_offset_ms": 1e3 * self.offset_s,
-            "mount_deg": float(np.degrees(Rotation.from_quat(self.quat_BS).magnitude())),
-            "world_tilt_deg": self.tilt_deg,
-            "gyro_bias_deg_s": float(np.degrees(np.linalg.norm(self.gyro_bias))),
-            "registration_left_deg": self.residual_deg,
-        }
 
 
 def register_sensors(

@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import rotations
-from ..errors import BadData, MissingFile
-from .mat5 import read_mat5
-from .tables import limit_bytes, read_columns, read_table
+from wepose_pin import rotations
+from wepose_pin.errors import BadData, MissingFile
+from wepose_pin.readers.mat5 import read_mat5
+from wepose_pin.readers.tables import limit_bytes, read_columns, read_table
 
 RING_SEGMENTS = ("seg1", "seg2", "seg3", "seg4", "seg5")
 RING_MOUNTS = ("rigid", "loose")

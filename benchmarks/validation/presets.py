@@ -5,8 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
-from .. import simulation
-from ..simulation import MEASURED_STD, PEOPLE_MEASURED_STD, PEOPLE_PRESET, Imperfections, Person, simulate_person
+from wepose_pin import simulation
+from wepose_pin.simulation import (
+    MEASURED_STD,
+    PEOPLE_MEASURED_STD,
+    PEOPLE_PRESET,
+    Imperfections,
+    Person,
+    simulate_person,
+)
+
+UPPER_BODY = "upper body"  # the experiment, one of each preset: "upper body, mild"
 
 
 class Preset(NamedTuple):

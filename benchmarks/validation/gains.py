@@ -17,17 +17,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .. import rotations
-from ..errors import BadOption
-from ..filters import Gdc, GdcParams, Ncf, NcfParams
-from ..filters.noise import SensorNoise, estimate_noise
-from ..filters.static import StaticTest
-from ..readers.trials import read_broad
-from ..simulation import simulate, simulate_paper_dynamic
-from .jobs import Job, Result
-from .presets import PRESETS, Preset
-from .series import align_rotation
-from .tables import UPPER_BODY
+from wepose_pin import rotations
+from wepose_pin.errors import BadOption
+from wepose_pin.filters import Gdc, GdcParams, Ncf, NcfParams
+from wepose_pin.filters.noise import SensorNoise, estimate_noise
+from wepose_pin.filters.static import StaticTest
+from wepose_pin.simulation import simulate, simulate_paper_dynamic
+
+from ..trials import read_broad
+from .experiment import Job, Result, align_rotation
+from .presets import PRESETS, UPPER_BODY, Preset
 
 # The grid: zero, which leaves the term out, and steps of a quarter or half a decade.
 PROPORTIONAL = (0.0, *np.logspace(-3.0, 0.5, 15))  # [1/s] k_P
@@ -192,25 +191,18 @@ def _make_trial(
 
 
 def list_experiments(data: Path | None = None) -> dict[str, list[Job]]:
-    """List the grid searches as jobs, one a setting: best gains, their score, and every grid point."""
+    """List the grid searches as jobs, one a setting: best gains, their score, and that of the stated ones."""
     settings = [*RATES, *PEOPLE, *(BROAD if data is not None and any((data / "broad").glob("*.mat")) else ())]
-    return {"gains": [Job("gains", setting, _search_experiment, (data,)) for setting in settings]}
+    return {"gains": [Job(setting, _search_experiment, (setting, data)) for setting in settings]}
 
 
-def _search_experiment(experiment: str, setting: str, data: Path | None) -> list[Result]:
+def _search_experiment(setting: str, data: Path | None) -> list[Result]:
     results = []
     stated = STATED[setting]
     for name, scores, params in zip(("ncf", "gdc"), search_gains(list_trials(setting, data)), stated, strict=True):
         gains, rmse = find_best(scores)
         at_stated = next(score.total_rmse for score in scores if score.gains == params)
         gain, integral = (*vars(gains).values(), 0.0)[:2]
-        grid = [[*vars(score.gains).values(), score.total_rmse] for score in scores]
-        figures = {
-            "gain": gain,
-            "integral": integral,
-            "total_rmse_deg": rmse,
-            "stated_gives_deg": at_stated,
-            "grid": grid,
-        }
-        results.append(Result(experiment, setting, f"{name}, {setting}", {**figures, "grid": grid}))
+        figures = {"k_P or β [1/s]": gain, "k_I [1/s²]": integral, "best [deg]": rmse, "stated [deg]": at_stated}
+        results.append(Result(f"{name}, {setting}", figures))
     return results

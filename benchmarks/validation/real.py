@@ -13,22 +13,23 @@ from collections.abc import Iterator
 from functools import lru_cache
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..errors import MissingFile
-from ..evaluation import attitude_error
-from ..filters.noise import SensorNoise, estimate_noise
-from ..readers.trials import (
+from wepose_pin.errors import MissingFile
+from wepose_pin.evaluation import attitude_error
+from wepose_pin.filters.noise import SensorNoise, estimate_noise
+from wepose_pin.simulation.imu import GRAVITY, MTI_3
+
+from ..trials import (
     RING_MOUNTS,
     RING_SEGMENTS,
     Chain,
     Referenced,
     RingFiles,
-    Trial,
     Ur5Files,
     find_ring,
     find_ur5,
@@ -37,11 +38,9 @@ from ..readers.trials import (
     read_ring,
     read_ur5,
 )
-from ..simulation.imu import GRAVITY, MTI_3
 from .contenders import list_contenders
-from .jobs import Job, Result
+from .experiment import Job, Result, align_rotation
 from .registration import Registration, register_sensors
-from .series import align_rotation, decimate_curves
 
 UNSCORED_S = 10.0  # [s] of RING and UR5 for the alignment of clocks, frames and headings
 BIAS_STD = np.deg2rad(0.05)  # [rad/s] error of biases from RING's ten seconds against its whole recording
@@ -59,42 +58,32 @@ def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
     MissingFile
         Nothing of them does.
     """
-    experiments = {}
-    paths = sorted((data / "broad").glob("*.mat"))
-    authors = data / "wepose_hr" / "prova_HR.txt"
-    if paths:
-        experiments["BROAD"] = [
-            Job("BROAD", path.stem, _broad, (path, n == 0)) for n, path in enumerate(paths[: 2 if quick else None])
+    few = slice(1 if quick else None)
+    experiments: dict[str, list[Job]] = {
+        "BROAD": [
+            Job(path.stem, _broad, (path,)) for path in sorted((data / "broad").glob("*.mat"))[: 2 if quick else None]
         ]
+    }
+    authors = data / "wepose_hr" / "prova_HR.txt"
     if authors.is_file():
         experiments["the authors' trial"] = [
-            Job("the authors' trial", f"{begin:g} to {end:g} s", _authors, (authors, (begin, end)))
+            Job(f"{begin:g} to {end:g} s", _authors, (authors, (begin, end)))
             for begin, end in AUTHORS_HALVES[: 1 if quick else None]
         ]
-    rings = find_ring(data)[: 1 if quick else None]
+    rings = find_ring(data)[few]
     for mount, bias in product(RING_MOUNTS, ("", ", bias unknown")):
-        name = f"RING, {mount} mounts{bias}"
-        experiments[name] = [
-            Job(
-                name,
-                segment if len(rings) == 1 else f"{ring.folder.name} {segment}",
-                _ring,
-                (ring, segment, mount, not bias),
-            )
+        experiments[f"RING, {mount} mounts{bias}"] = [
+            Job(f"{ring.folder.name} {segment}", _ring, (ring, segment, mount, not bias))
             for ring in rings
             if mount in ring.imu
-            for segment in RING_SEGMENTS[: 1 if quick else None]
+            for segment in RING_SEGMENTS[few]
         ]
     for mount in RING_MOUNTS:
-        name = f"RING, link lengths, {mount} mounts"
-        experiments[name] = [
-            Job(name, ring.folder.name, compare_links, (ring, mount)) for ring in rings if mount in ring.imu
+        experiments[f"RING, link lengths, {mount} mounts"] = [
+            Job(ring.folder.name, compare_links, (ring, mount)) for ring in rings if mount in ring.imu
         ]
     ur5 = [files for files in find_ur5(data) if (files.recording, files.sensor) not in UR5_EXCLUDED]
-    experiments["UR5"] = [
-        Job("UR5", f"{files.recording} {files.sensor}", _ur5, (files, n == 0))
-        for n, files in enumerate(ur5[: 1 if quick else None])
-    ]
+    experiments["UR5"] = [Job(f"{files.recording} {files.sensor}", _ur5, (files,)) for files in ur5[few]]
     experiments = {name: jobs for name, jobs in experiments.items() if jobs}
     if not experiments:
         raise MissingFile(
@@ -104,20 +93,24 @@ def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
     return experiments
 
 
-def _broad(experiment: str, name: str, path: Path, first: bool) -> list[Result]:
+def _broad(path: Path) -> list[Result]:
     """Compute errors over the marked motion; the heading is aligned in the static phase."""
     trial = read_broad(path)
     known = np.isfinite(trial.quat_true).all(axis=1)
     at_rest = np.zeros(len(known), dtype=bool)
     at_rest[trial.static] = known[trial.static]
     true = Rotation.from_quat(np.where(known[:, None], trial.quat_true, [0.0, 0.0, 0.0, 1.0]))
-    return [
-        Result(experiment, name, label, *_score(align_rotation(R_VS, true, at_rest), true, trial, first))
-        for label, R_VS in _run_contenders(trial)
-    ]
+    time = np.flatnonzero(trial.scored) / trial.rate_hz
+    noise = estimate_noise(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
+    results = []
+    for contender in list_contenders("real", trial.name):
+        R_VS = Rotation.from_quat(contender.orient(trial.gyro_S, trial.accel_S, trial.rate_hz, noise))
+        R_WS = align_rotation(R_VS, true, at_rest)
+        results.append(Result(contender.label, compute_errors(R_WS[trial.scored], true[trial.scored], time)))
+    return results
 
 
-def _authors(experiment: str, name: str, path: Path, scored: tuple[float, float]) -> list[Result]:
+def _authors(path: Path, scored: tuple[float, float]) -> list[Result]:
     """Compute errors over the interval `scored` [s]; clocks and frames are aligned on the trial's other part.
 
     Vicon's samples are late by 16 to 18 ms and stand 2.5 deg askew, which every filter would have as an error of its
@@ -136,40 +129,28 @@ def _authors(experiment: str, name: str, path: Path, scored: tuple[float, float]
     other = (scored[1], end) if scored[1] < end else (0.0, scored[0])
     (registration,) = register_sensors([sensor], other, irregular=True)
     noise = estimate_noise(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
-    return _score_reference(
-        experiment, name, sensor, registration, noise, scored == AUTHORS_HALVES[0], Intervals(other, scored)
-    )
+    return _score_reference(sensor, registration, noise, Intervals(other, scored))
 
 
-def _run_contenders(trial: Trial) -> Iterator[tuple[str, Rotation]]:
-    noise = estimate_noise(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
-    for contender in list_contenders("real", trial.name):
-        yield contender.label, Rotation.from_quat(contender.orient(trial.gyro_S, trial.accel_S, trial.rate_hz, noise))
+def compute_errors(estimated: Rotation, true: Rotation, time: np.ndarray) -> dict[str, float]:
+    """Compute the root mean square errors [deg] of a trial."""
+    error = attitude_error(estimated, true, time)
+    return {
+        "total [deg]": error.total_rmse,
+        "inclination [deg]": error.inclination_rmse,
+        "heading [deg]": error.heading_rmse,
+    }
 
 
-def _score(R_WS: Rotation, true: Rotation, trial: Trial, keep: bool) -> tuple[dict[str, Any], dict[str, list[float]]]:
-    time = np.arange(len(trial.scored))[trial.scored] / trial.rate_hz
-    return _make_errors(R_WS[trial.scored], true[trial.scored], time, keep)
-
-
-def _make_errors(
-    estimated: Rotation, true: Rotation, time: np.ndarray, keep: bool
-) -> tuple[dict[str, Any], dict[str, list[float]]]:
-    """Compute figures, and the curve with `keep`."""
-    angle = np.degrees((estimated * true.inv()).magnitude())
-    figures = {**attitude_error(estimated, true, time)._asdict(), "mean_angle": float(angle.mean())}
-    return figures, decimate_curves(time, total_deg=angle) if keep else {}
-
-
-def _ring(experiment: str, name: str, files: RingFiles, segment: str, mount: str, bias_known: bool) -> list[Result]:
+def _ring(files: RingFiles, segment: str, mount: str, bias_known: bool) -> list[Result]:
     """Compute errors of one segment from 10 s on."""
     chain, registered = register_ring(files.folder)
     sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
     noise = assume_noise(sensor.rate_hz, registration.gyro_bias if bias_known else None)
-    return _score_reference(experiment, name, sensor, registration, noise, segment == RING_SEGMENTS[0])
+    return _score_reference(sensor, registration, noise)
 
 
-def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result]:
+def _ur5(files: Ur5Files) -> list[Result]:
     """Compute errors from 10 s on; noise and bias are from the 0.6 s to 4 s before the arm moves.
 
     The tilt of the world comes out as 1.0 to 2.6 deg where it is one robot on one base: some 20 mg of error of the
@@ -178,30 +159,30 @@ def _ur5(experiment: str, name: str, files: Ur5Files, keep: bool) -> list[Result
     trial = read_ur5(files)
     (registration,) = register_sensors([trial], (0.0, UNSCORED_S))
     noise = estimate_noise(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
-    return _score_reference(experiment, name, trial, registration, noise, keep)
+    return _score_reference(trial, registration, noise)
 
 
-def compare_links(experiment: str, name: str, files: RingFiles, mount: str) -> list[Result]:
+def compare_links(files: RingFiles, mount: str) -> list[Result]:
     """Compare lengths of the chain's links, from contenders' orientations and the optical tip, with optical ones."""
     chain, registered = register_ring(files.folder)
     links = fit_optical_links(chain)
-    optical = (links.lengths["seg2"] + links.lengths["seg3"], links.lengths["seg4"])
     orientations = []
     for segment in ("seg2", "seg3", "seg4"):
         sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
         noise = assume_noise(sensor.rate_hz, registration.gyro_bias)
         orientations.append(dict(run_orientations(sensor, registration, noise)))
     tip_W = Rotation.from_quat(registered[mount, "seg2"].quat_WV).apply(links.tip_V)
-    results = []
+    optical = links.lengths["seg2"] + links.lengths["seg3"], links.lengths["seg4"]
+    results = [Result("optical", _name_links(*optical))]
     for contender in list_contenders("real"):
         own_runs = [each[contender.label] for each in orientations]
         fitted = fit_links(tip_W[own_runs[0].scored], *(each.estimated[each.scored] for each in own_runs))
-        figures: dict[str, float] = {}
-        for link, length, true in zip(("seg2_and_seg3", "seg4"), fitted, optical, strict=True):
-            figures |= {f"{link}_mm": 1e3 * float(length), f"{link}_optical_mm": 1e3 * true}
-            figures[f"{link}_difference_mm"] = 1e3 * (float(length) - true)
-        results.append(Result(experiment, name, contender.label, figures))
+        results.append(Result(contender.label, _name_links(*fitted)))
     return results
+
+
+def _name_links(both: float, last: float) -> dict[str, float]:
+    return {"seg2 and seg3 [mm]": 1e3 * float(both), "seg4 [mm]": 1e3 * float(last)}
 
 
 class Links(NamedTuple):
@@ -310,16 +291,9 @@ def assume_noise(rate_hz: float, gyro_bias: np.ndarray | None = None) -> SensorN
 
 
 def _score_reference(
-    experiment: str,
-    name: str,
-    sensor: Referenced,
-    registration: Registration,
-    noise: SensorNoise,
-    keep: bool,
-    intervals: Intervals = AFTER_TEN_SECONDS,
+    sensor: Referenced, registration: Registration, noise: SensorNoise, intervals: Intervals = AFTER_TEN_SECONDS
 ) -> list[Result]:
-    results = []
-    for label, run in run_orientations(sensor, registration, noise, intervals):
-        figures, series = _make_errors(run.estimated[run.scored], run.true[run.scored], sensor.time[run.scored], keep)
-        results.append(Result(experiment, name, label, figures | registration.figures(), series))
-    return results
+    return [
+        Result(label, compute_errors(run.estimated[run.scored], run.true[run.scored], sensor.time[run.scored]))
+        for label, run in run_orientations(sensor, registration, noise, intervals)
+    ]
