@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation import gains as tuning
-from benchmarks.validation.contenders import PUBLISHED, DEFAULT_GAINS, Contender, list_contenders
+from benchmarks.validation.contenders import DEFAULT_GAINS, PUBLISHED, Contender, list_contenders
 from benchmarks.validation.experiment import align_rotation
 from benchmarks.validation.gains import STATED, compute_rmse, list_trials, make_gains
 from wepose_pin.evaluation import attitude_error
