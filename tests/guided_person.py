@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from wepose_pin.live.sources.base import Source
 from wepose_pin.recording.arrivals import Samples, pack_orientations, unpack_orientations
@@ -82,15 +83,18 @@ class GuidedPerson:
         for sensor, segment in self.worn.items():
             bias = simulation.gyro_bias[segment][row]
             gyro = bias + self._direction * (simulation.gyro_S[segment][row] - bias)
-            if self.doing == f"shake {segment}":
-                gyro = gyro + SHAKE_RATE * np.sin(2.0 * np.pi * SHAKE_HZ * time_s) * (time_s % 3.0 < 1.5)
+            accel = simulation.accel_S[segment][self._k]
+            if self.doing == f"shake {segment}" and time_s % 3.0 < 1.5:
+                wave = 2.0 * np.pi * SHAKE_HZ
+                gyro = gyro + SHAKE_RATE * np.cos(wave * time_s)
+                accel = Rotation.from_rotvec(np.full(3, -SHAKE_RATE / wave * np.sin(wave * time_s))).apply(accel)
             gyro = self.disturb(segment, gyro)
             if segment in self.silent:
                 continue
             if self.orientations:
                 samples[sensor] = pack_orientations(self._orient(segment, time_s))
             else:
-                samples[sensor] = gyro, simulation.accel_S[segment][self._k]
+                samples[sensor] = gyro, accel
         return time_s, samples
 
     def _go_to_bow(self, row: int) -> int:
@@ -119,6 +123,7 @@ class PersonSource(Source):
         self.person = person
         self._rows, self._now = round(step_s * RATE_HZ), 0.0
         self.asleep_s = 0.0  # [s] for which nothing comes
+        self.gyro_scale = self.accel_scale = 1.0  # of the units that it sends to SI
 
     @property
     def orientations(self) -> dict[str, bool]:
@@ -141,7 +146,8 @@ class PersonSource(Source):
         for sensor in self.person.worn:
             own = [(t, *values[sensor]) for t, values in rows if sensor in values]
             if own:
-                samples.append(Samples(sensor, *(np.array(column) for column in zip(*own, strict=True))))
+                time_s, gyro, accel = (np.array(column) for column in zip(*own, strict=True))
+                samples.append(Samples(sensor, time_s, self.gyro_scale * gyro, self.accel_scale * accel))
         return samples
 
     def close(self) -> None: ...

@@ -37,6 +37,7 @@ from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
+from wepose_pin.recording.limits import STANDARD_GRAVITY
 from wepose_pin.simulation import simulate_person
 from wepose_pin.subject import load_subject
 
@@ -202,6 +203,43 @@ def test_who_moves_in_the_start_pose_is_told_which_sensor_moved(tmp_path: Path) 
     session.person.disturb = lambda _segment, gyro: gyro
     begin_s = session.run(lambda m: m.step == "clasp")[-1].time
     assert begin_s - moved.time == pytest.approx(4.0, abs=0.4)
+    session.guide.close()
+
+
+def test_an_accelerometer_in_g_is_not_calibrated(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    session.source.accel_scale = 1.0 / STANDARD_GRAVITY
+    view = session.run(lambda m: bool(m.view.reasons))[-1].view
+    assert "accel: norm 1" in view.reasons[0]
+    assert ": g? The source must give rad/s and m/s^2" in view.reasons[0]
+    assert [action.name for action in view.actions] == ["again"]
+    session.guide.close()
+
+
+def test_rates_in_deg_s_are_said_before_a_sensor_is_shaken(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    session.source.gyro_scale = np.rad2deg(1.0)
+    moment = session.run(lambda m: "gravity" in m.view.note)[-1]
+    assert moment.step in ("sensors", "assignment")
+    assert "rad/s while gravity does not turn: deg/s? The source must give rad/s" in moment.view.note
+    assert moment.time < 10.0
+
+
+def test_a_gentle_shake_is_seen_and_a_stronger_one_asked_for(tmp_path: Path) -> None:
+    session = Session(tmp_path)
+    session.obeys = lambda _step, _view: ""
+    rate = 2.4 * np.sqrt(2.0)  # amplitude [rad/s] of one with 2.4 rad/s rms
+
+    def shake(segment: str, gyro: np.ndarray) -> np.ndarray:
+        now = session.source.clock()
+        return gyro + rate * np.sin(6.0 * np.pi * now) * np.array([segment == "torso" and now > 3.0, 0.0, 0.0])
+
+    session.person.disturb = shake
+    assert session.run(lambda m: bool(m.view.note))[-1].view.note == "Too gentle: a7. Shake harder."
+    session.guide.act("again")
+    rate = 12.0
+    session.run(lambda _: len(session.guide.segments) == 1)
+    assert session.run(lambda m: bool(m.view.note))[-1].view.note == "Hold all sensors still for a moment. Moving: a7."
     session.guide.close()
 
 

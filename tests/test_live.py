@@ -25,6 +25,7 @@ from wepose_pin.model import load_model
 from wepose_pin.readers.live_log import SAMPLES, read_blocks, read_live_log
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.arrivals import Samples
+from wepose_pin.recording.limits import STANDARD_GRAVITY
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import mount_rows, parse_subject, population_subject
 from wepose_pin.tracking import TrackedRecording, track
@@ -123,6 +124,50 @@ def live(
         outputs=[watcher] if watcher else [],
     )
     return loop.run()
+
+
+def scale(recording: Recording, *, gyro: float = 1.0, accel: float = 1.0) -> Recording:
+    """The recording in other units, without a stated start pose."""
+    sensors = {
+        name: replace(sensor, gyro_S=gyro * sensor.gyro_S, accel_S=accel * sensor.accel_S)
+        for name, sensor in recording.imus.items()
+    }
+    return replace(recording, sensors=sensors, phases={})
+
+
+def test_an_accelerometer_in_g_is_not_tracked_and_nothing_is_recorded(recording: Recording, tmp_path: Path) -> None:
+    source, watcher = ReplaySource(scale(recording, accel=1.0 / STANDARD_GRAVITY), math.inf), Watcher()
+    with pytest.raises(
+        BadData, match=r"sensors\.torso\.accel: norm 1.* m/s\^2 in phases\.start .*: g\? The source must"
+    ):
+        run_session(source, SensorSetup.from_recording(recording), record=tmp_path / "a", outputs=[watcher])
+    assert (watcher.poses, list(tmp_path.iterdir())) == ([], [])
+    assert watcher.statuses[-1].state == "ended"
+    assert "sensors.torso.accel: norm 1" in watcher.statuses[-1].message
+
+
+@pytest.mark.parametrize("where", ["worn", "table"])
+def test_rates_in_deg_s_are_said_while_the_person_waits(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    """A person who stands, and sensors on a table, whose bias alone turns gravity."""
+    monkeypatch.setattr("wepose_pin.live.loop.STATUS_PERIOD_S", 1e-3)
+    waits = replace(recording.cut(slice(0, 440)), phases={})
+    if where == "table":
+        noise = 1e-3 * np.random.default_rng(1).standard_normal((440, 3))
+        sensors = {
+            name: replace(each, gyro_S=np.deg2rad(0.2) + noise, accel_S=each.accel_S.mean(axis=0) + noise)
+            for name, each in waits.imus.items()
+        }
+        waits = replace(waits, sensors=sensors)
+    said = []
+    for gyro in (1.0, np.rad2deg(1.0)):
+        watcher, scaled = Watcher(), scale(waits, gyro=gyro)
+        arrivals = [(float(t), single(scaled, name, k)) for k, t in enumerate(waits.time) for name in waits.sensors]
+        live(scaled, tmp_path / f"{gyro:g}", Chaos(scaled, arrivals), watcher)
+        said.append([status.message for status in watcher.statuses if status.state != "ended"][-1])
+    assert said[0] == "Tracking."
+    assert "rad/s while gravity does not turn: deg/s? The source must give rad/s" in said[1]
 
 
 def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Recording, tmp_path: Path) -> None:

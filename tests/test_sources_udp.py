@@ -17,11 +17,12 @@ import numpy as np
 import pytest
 from bodies import SEGMENTS
 
-from wepose_pin.errors import BadSource
+from wepose_pin.errors import BadOption, BadSource
 from wepose_pin.live.sources import open_source, packets
 from wepose_pin.live.sources.datagrams import MAX_KINDS
 from wepose_pin.live.sources.udp import UdpSource
 from wepose_pin.recording.arrivals import Samples
+from wepose_pin.recording.limits import STANDARD_GRAVITY
 
 GOOD = {"sensor": "torso", "t": 12.345, "gyro": [0.1, -0.2, 0.3], "accel": [0.0, 0.5, 9.81]}
 
@@ -73,6 +74,41 @@ def test_a_json_line_of_one_sample(source: UdpSource, sender: socket.socket) -> 
     np.testing.assert_array_equal(samples.accel_S, [GOOD["accel"]])
     assert before <= samples.time[0] <= source.clock()
     assert source.problems == {}
+
+
+@pytest.mark.parametrize("stated", ["line", "source"])
+def test_a_sender_states_its_units(sender: socket.socket, stated: str) -> None:
+    units = {"gyro_unit": "deg/s", "accel_unit": "g"}
+    options = ",gyro_unit=deg/s,accel_unit=g" if stated == "source" else ""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        spec = f"udp:{free.getsockname()[1]}{options}"
+    source = open_source(spec, sensors=["torso", "head"])
+    source.open()
+    lines = [GOOD | units] if stated == "line" else [GOOD, GOOD | {"sensor": "head", "gyro_unit": "rad/s"}]
+    for line in lines:
+        sender.sendto(json.dumps(line).encode(), source.address)
+    samples = read_until(source, len(lines))
+    np.testing.assert_allclose(samples["torso"].gyro_S, [np.deg2rad(GOOD["gyro"])])
+    np.testing.assert_allclose(samples["torso"].accel_S, [np.multiply(STANDARD_GRAVITY, GOOD["accel"])])
+    if stated == "source":
+        np.testing.assert_array_equal(samples["head"].gyro_S, [GOOD["gyro"]])
+        sender.sendto(binary(0, [12.4], [[90.0, 0, 0, 0, 0, 1.0]]), source.address)
+        np.testing.assert_allclose(read_until(source, 1)["torso"].gyro_S, [[0.5 * np.pi, 0, 0]])
+    assert source.problems == {}
+    sender.sendto(json.dumps(GOOD | {"gyro_unit": "rpm"}).encode(), source.address)
+    assert source.read(0.2) == []
+    assert list(source.problems) == ["JSON lines with gyro_unit 'rpm'; there is: rad/s, deg/s"]
+    source.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [("gyro_unit=rpm", "gyro_unit 'rpm' is not known; there is: rad/s, deg/s"), ("unit=g", "'unit=g' is no unit")],
+)
+def test_units_that_are_none_are_refused(options: str, said: str) -> None:
+    with pytest.raises(BadOption, match=said):
+        open_source(f"udp:9000,{options}")
 
 
 def test_many_lines_and_lists_of_samples(source: UdpSource, sender: socket.socket) -> None:

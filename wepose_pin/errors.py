@@ -57,12 +57,14 @@ class WrongUnit(BadData):
 
     Parameters
     ----------
+    finding : what shows it
     key, unit : what would fit in a session's [data], as ``gyro_unit`` and ``deg/s``
+    otherwise : what else can be wrong
     """
 
-    def __init__(self, text: str, key: str = "", unit: str = "") -> None:
-        super().__init__(text)
-        self.key, self.unit = key, unit
+    def __init__(self, finding: str, key: str = "", unit: str = "", otherwise: str = "") -> None:
+        super().__init__(f'{finding}; data.{key} = "{unit}" would fit{otherwise}')
+        self.finding, self.key, self.unit = finding, key, unit
 
 
 class MissingRate(BadData):

@@ -70,6 +70,15 @@ class ShakeDetector:
         """Whether a sensor moves as one that is shaken, and not still from the last shake."""
         return self._calm and self._rate(sensor) > SHAKE_RATE and self._lasts(sensor)
 
+    def list_moving(self) -> list[str]:
+        """The sensors that have not come to rest."""
+        return [sensor for sensor in self._recent if self._lasts(sensor) and self._rate(sensor) > CALM_RATE]
+
+    @property
+    def is_calm(self) -> bool:
+        """Whether all have come to rest since the last shake: the next one counts."""
+        return self._calm
+
     def _lasts(self, sensor: str) -> bool:
         """Whether it was seen for as long as a shake takes."""
         recent = self._recent.get(sensor, deque())
@@ -130,6 +139,10 @@ class AssignedSource(Source):
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
         """As of the source."""
         return self.source.describe_awaited([name for name, own in self.segments.items() if own in sensors])
+
+    def explain_unit(self, key: str, unit: str) -> str:
+        """As of the source."""
+        return self.source.explain_unit(key, unit)
 
     def clock(self) -> float:
         return self.source.clock()

@@ -23,6 +23,7 @@ from .attempt import Attempt
 from .setup import SensorSetup
 from .sources.base import Source
 from .state import GuideAction, GuideStep, GuideView, join_names
+from .units import RateWatch
 
 SILENCE_S = 1.0  # [s] without a sample after which a sensor counts as silent
 GET_READY_S = 8.0  # [s] to leave the keyboard and stand ready
@@ -100,6 +101,7 @@ class Guide:
         self.accepted: Calibrated | None = None
         self.steps = make_steps(self)
         self._index = 0
+        self._rates = RateWatch()
         self._postponed: list[Sequence[Samples]] = []  # that came while an attempt is evaluated
         self.step.enter()
 
@@ -129,6 +131,7 @@ class Guide:
         for chunk in samples:
             if len(chunk.time):
                 self.newest_times[chunk.sensor] = float(chunk.time[-1])
+        self._rates.push(samples, self.source.orientations)
         self.step.push_samples(samples)
         self._postponed.append(samples)
         if self.attempt is not None and self.step.records:
@@ -212,10 +215,12 @@ class Guide:
         view = self.step.view()
         return view._replace(steps=steps, segments=sensors, actions=tuple(self.step.actions()))
 
-    def describe_silent(self) -> str:
-        """A sentence on the sensors that send nothing; empty: all do."""
+    def describe_problems(self) -> str:
+        """A sentence on sensors that send nothing, else on rates in another unit; empty: there are none."""
         silent = [self.segments.get(name, name) for name in self.silent]
-        return f"No samples from {self.join_sensors(silent)}. Switched on and in reach?" if silent else ""
+        if silent:
+            return f"No samples from {self.join_sensors(silent)}. Switched on and in reach?"
+        return self._rates.describe(self.source)
 
     def join_sensors(self, names: Sequence[str]) -> str:
         """Sensors as words."""

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-
-import numpy as np
+from dataclasses import replace
 
 from ..calibration.protocols import Axis
+from ..diagnostics import render
+from ..errors import BadData
 from ..recording.arrivals import Samples, Ticks
-from ..recording.limits import GRAVITY_ERROR_NOTED, STANDARD_GRAVITY
 from ..tracking.start_pose import StartPoseDetector, TickRates
 from .assignment import ShakeDetector
 from .attempt import Attempt
 from .guide import AGAIN, GET_READY_S, KEEP, NEXT, SKIP, Guide, Step
 from .state import GuideAction, GuideView, join_names
+from .units import check_units
 
 STATIC_S = 2.0  # [s] of standing still in which the sensors are checked
 START_POSE_S = 4.0  # [s] where the protocol does not say how long
@@ -35,7 +36,7 @@ class SensorStep(Step):
 
     def view(self) -> GuideView:
         count, needed = len(self.guide.newest_times) - len(self.guide.silent), len(self.guide.needs)
-        sentence, note = "Strap the sensors on and switch them on", self.guide.describe_silent()
+        sentence, note = "Strap the sensors on and switch them on", self.guide.describe_problems()
         absent = [name for name in self.guide.source.sensors if name not in self.guide.newest_times]
         awaited = self.guide.source.describe_awaited(absent)
         sentence = f"{sentence}: {count} of {needed} send." + (f" Waiting for {awaited}." if awaited else "")
@@ -117,15 +118,26 @@ class AssignmentStep(Step):
 
     def view(self) -> GuideView:
         segment, place = self._open[0], join_names([self._open[0]])
-        shaken = [name for name in self.guide.segments if self._shakes.is_shaken(name)]
-        moving = [name for name in self._free if self._shakes.is_shaken(name)]
-        note = self.guide.describe_silent()
-        if len(moving) > 1:
-            note = "Several sensors move. Hold the others still."
-        elif shaken and not moving:
-            note = f"This is the sensor on the {join_names([self.guide.segments[shaken[-1]]])}, which is known already."
+        note = self.guide.describe_problems() or self._describe_motion()
         done = len(self.guide.segments) / len(self.guide.needs)
         return GuideView(f"Shake the sensor on the {place}.", note, progress=done, highlight=segment)
+
+    def _describe_motion(self) -> str:
+        """A sentence on motion that assigns no sensor; empty: there is none."""
+        moving = self._shakes.list_moving()
+        if not moving:
+            return ""
+        if not self._shakes.is_calm:
+            return f"Hold all sensors still for a moment. Moving: {join_names(moving)}."
+        shaken = [name for name in moving if self._shakes.is_shaken(name)]
+        known = [name for name in shaken if name in self.guide.segments]
+        if len(shaken) - len(known) > 1:
+            return "Several sensors move. Hold the others still."
+        if len(shaken) == len(known) > 0:
+            return f"This is the sensor on the {join_names([self.guide.segments[known[-1]]])}, which is known already."
+        if not shaken:
+            return f"Too gentle: {join_names(moving)}. Shake harder."
+        return ""
 
 
 class Stillness:
@@ -162,33 +174,32 @@ class StaticStep(Step):
 
     def enter(self) -> None:
         self._stillness: Stillness | None = None
-        self._ticks: list[Ticks] = []
-        self._faults: tuple[str, ...] = ()
+        self._refused, self._faults = False, tuple[str, ...]()
         self.guide.begin_attempt()
 
     def push_ticks(self, ticks: Ticks) -> None:
         if self._stillness is None:
             self._stillness = Stillness(self.guide.begin_attempt(), STATIC_S)
-        self._ticks = [*self._ticks[-200:], ticks]
-        if self._stillness.push(ticks) is not None and not self._faults:
-            self._check(self._stillness.measured)
+        last = self._stillness.push(ticks)
+        if last is not None and not self._faults:
+            self._check(float(ticks.time[last]))
 
-    def _check(self, measured: np.ndarray) -> None:
-        """Compare the specific force of each sensor with gravity; `measured` (k,) ones have none."""
-        accel = np.concatenate([each.accel_S for each in self._ticks])[-round(STATIC_S * 50) :]
-        force = np.linalg.norm(np.nanmean(accel, axis=0), axis=1)
-        off = (np.abs(force / STANDARD_GRAVITY - 1.0) > GRAVITY_ERROR_NOTED) & ~measured
-        names = self.guide.begin_attempt().segments
-        self._faults = tuple(
-            f"The accelerometer on the {join_names([name])} shows {value:.2f} m/s² at rest, and gravity is "
-            f"{STANDARD_GRAVITY:.2f} m/s²: is its unit right?"
-            for name, value, is_off in zip(names, force.tolist(), off.tolist(), strict=True)
-            if is_off
-        )
+    def _check(self, end: float) -> None:
+        """Check the units of the sensors, which have been static up to `end` [s]."""
+        attempt = self.guide.begin_attempt()
+        recording = replace(attempt.recording(), phases={"static": ((end - STATIC_S, end),)})
+        try:
+            diagnostics = check_units(recording, self.guide.source)
+        except BadData as error:
+            self._refused, self._faults = True, (str(error),)
+            return
+        self._faults = tuple(render(each).line() for each in diagnostics if each.code == "accel-scale")
         if not self._faults:
             self.guide.go_on()
 
     def actions(self) -> list[GuideAction]:
+        if self._refused:
+            return [AGAIN]
         return [AGAIN, SKIP] if self._faults else [SKIP]
 
     def act(self, action: str) -> None:
@@ -198,8 +209,8 @@ class StaticStep(Step):
             self.enter()
 
     def view(self) -> GuideView:
-        stillness, note = self._stillness, self.guide.describe_silent()
-        if stillness is not None and stillness.moving:
+        stillness, note = self._stillness, self.guide.describe_problems()
+        if stillness is not None and stillness.moving and not note:
             note = f"{stillness.moving.capitalize()} moved."
         progress = 0.0 if stillness is None else stillness.progress
         return GuideView("Stand still for a moment.", note, progress=progress, reasons=self._faults)
@@ -257,12 +268,12 @@ class StartPoseStep(Step):
 
     def view(self) -> GuideView:
         stillness, countdown, progress = self._stillness, None, 0.0
-        note = self.guide.describe_silent() or self.reason
+        note = self.guide.describe_problems() or self.reason
         if self._begin is not None and self.guide.now < self._begin:
             countdown = self._begin - self.guide.now
         elif stillness is not None:
             progress = stillness.progress
             countdown = (1.0 - progress) * self._seconds
-            if stillness.moving:
+            if stillness.moving and not note:
                 note = f"You moved ({stillness.moving}). Once more: {self._seconds:.0f} s still."
         return GuideView(self._do, note, countdown, progress=progress)

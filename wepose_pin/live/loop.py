@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..diagnostics import Diagnostic
-from ..errors import BadModel, BadSession
+from ..errors import BadModel, BadSession, WeposeError
 from ..filters import BEST
 from ..kinematics import LiveKinematics, compute_axis_std
 from ..model import BodyModel, load_model, load_table
@@ -37,6 +37,7 @@ from ..recording.arrivals import (
     Ticks,
     order_arrivals,
 )
+from ..recording.plausibility import check_signals, find_unseen_rate
 from ..subject import population_subject
 from ..tracking import Tracker, TrackOptions
 from ..tracking.causal import CausalSegmentEstimator
@@ -48,6 +49,7 @@ from .setup import SensorSetup
 from .sources.base import Source
 from .state import LivePose, Output, SensorStatus, Status, StreamInfo, join_names
 from .ticks import TickStream
+from .units import RateWatch, check_units
 
 STATUS_PERIOD_S = 0.2  # [s]
 SWITCH_INTERVAL_S = 5e-4  # [s] after which page and robot hand over the interpreter to the loop; Python has 5 ms
@@ -194,6 +196,7 @@ class LiveLoop:
             self._instruction = f"{self.model.table.name} must stand still in its start configuration"
         self._stream = TickStream(source.sensors, source.rate_hz, begin, wait_s, log, source.orientations)
         self._losses = SampleLosses()
+        self._rates = RateWatch()
         self._stood_s = 0.0  # [s] longest time that the person stood still before tracking
         self._phase_edges = PhaseEdges(self.setup.phases)
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
@@ -209,10 +212,17 @@ class LiveLoop:
         self._events: list[tuple[str, dict[str, Any]]] = []  # that decide poses
         self._open_phases: list[str] = []
         self._takes = 0
-        self._ended = False
+        self._end_message = ""  # empty: it goes on
+        self._unit_diagnostics: tuple[Diagnostic, ...] = ()
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> SessionSummary:
-        """Run until the source ends, the user presses q, or `should_stop` returns True."""
+        """Run until the source ends, the user presses q, or `should_stop` returns True.
+
+        Raises
+        ------
+        BadData
+            The start pose shows that a sensor sends another unit. Nothing is recorded then.
+        """
         next_status, switch_interval = 0.0, sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.freeze()
@@ -229,8 +239,14 @@ class LiveLoop:
                 if time.monotonic() >= next_status:
                     next_status = time.monotonic() + STATUS_PERIOD_S
                     self._send_status()
-            self._ended = True
+            self._end_message = "The session has ended."
             self._send_status()
+        except WeposeError as error:
+            self._end_message = f"The session has ended: {error}"
+            if self.log is not None and self._segment_estimator is None:
+                self.log.discard()
+            self._send_status()
+            raise
         finally:
             gc.unfreeze()
             sys.setswitchinterval(switch_interval)
@@ -247,6 +263,8 @@ class LiveLoop:
         """Record the samples of one read, track the ticks that they complete, and show the last pose."""
         pose = None
         self._losses.push(samples)
+        if self._segment_estimator is None:
+            self._rates.push(samples, self.source.orientations)
         for ticks in self._stream.push(samples):
             if (search := self._begin_search()) is not None:
                 pose = self._track_ticks(ticks, search) or pose
@@ -316,6 +334,7 @@ class LiveLoop:
             (begin, end),
             last=end,
         )
+        self._unit_diagnostics = check_units(recording, self.source)
         tracker = Tracker(self.setup.subject, model=self.model, options=TrackOptions(self.method, causal=True))
         tracker.push(recording)
         for phase in self._open_phases:
@@ -454,8 +473,8 @@ class LiveLoop:
 
     def _describe_state(self, lost: np.ndarray, frozen: np.ndarray) -> tuple[str, str, float]:
         """Return the state, the message to the person, and the progress of the start pose."""
-        if self._ended:
-            return "ended", "The session has ended.", 1.0
+        if self._end_message:
+            return "ended", self._end_message, 1.0
         if self._segment_estimator is not None:
             sentences = [
                 self._describe_lost(lost, frozen) or "Tracking.",
@@ -476,6 +495,8 @@ class LiveLoop:
             missing = np.isin(np.arange(len(lost)), detector.missing)
             text = self._describe_lost(missing & frozen, frozen) or f"Waiting for {self._join_sensors(missing)}."
             return "waiting", text, 0.0
+        if wrong_unit := self._rates.describe(self.source):
+            return "moved", wrong_unit, search.progress
         self._stood_s = max(self._stood_s, detector.held_s)
         if detector.state == "moved" and self._stood_s < BEGUN_S:  # the person walks to the place, or joins the pose
             return "start_pose", f"{self._instruction}.", 0.0
@@ -516,7 +537,9 @@ class LiveLoop:
                 for name, row in zip(sensors, counts, strict=True)
             },
             self._latency,
-            () if self._segment_estimator is None else self._segment_estimator.start.diagnostics,
+            ()
+            if self._segment_estimator is None
+            else (*self._segment_estimator.start.diagnostics, *self._unit_diagnostics),
             "" if self.log is None else self.log.problem,
             None if self.log is None else self.log.path,
         )
@@ -556,6 +579,8 @@ def warm_up(method: str) -> None:
         },
         {"start": ((0.0, 1.9),)},
     )
+    check_signals(recording)
+    find_unseen_rate(np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1)), recording.rate_hz)
     tracker = Tracker(options=TrackOptions(method, causal=True))
     tracker.push(recording)
     estimator = tracker.segment_estimator

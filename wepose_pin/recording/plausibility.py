@@ -40,6 +40,10 @@ TUMBLES, COHERENT = 0.6, 0.8  # the share, and the least coherence of the smalle
 TUMBLES_FAST, FAST = 0.85, 8.0  # the share, and the least mean rate [rad/s]
 STIFF = 0.93  # the share of the coherence of rates larger by a factor 57.3, where these are coherent
 TILTED = np.deg2rad(20.0)  # [rad] tilt between two windows that the gyroscope must measure
+# Rates in deg/s that are taken for rad/s: gravity would turn by more than `TURNED` in both halves of some seconds while
+# accel turns by less than `STEADY`, both averaged over `STEADY_MEAN_S`. In four seconds that is 6 deg/s, the fastest
+# sway of a start pose.
+TURNED, STEADY, STEADY_MEAN_S = np.deg2rad(10.0), np.deg2rad(5.0), 0.25  # [rad], [rad], [s]
 UNSEEN = 0.25  # largest share of that tilt in the gyroscope's rotation where its unit is too small
 
 # An axis with `PLATEAU` samples at its extreme is saturated if the motion before and after leads beyond it by `BEYOND`
@@ -115,7 +119,7 @@ def _make_gravity_error(text: str, norm: float) -> BadData:
         (1e-3, "mg"),  # stated in g
     ):
         if abs(norm * factor / STANDARD_GRAVITY - 1.0) < GRAVITY_ERROR_REFUSED:
-            return WrongUnit(f'{text}; data.accel_unit = "{unit}" would fit', "accel_unit", unit)
+            return WrongUnit(text, "accel_unit", unit)
     return BadData(f"{text}; {_explain_norm(norm)}")
 
 
@@ -123,7 +127,7 @@ def _explain_norm(norm: float) -> str:
     """Explain a norm [m/s²] that is not gravity's in any unit."""
     if norm < 0.5:
         return "gravity seems to have been taken out; specific force is needed, +g up of a static sensor"
-    return "check data.accel_unit and the sensor's calibration, and that it is static there"
+    return "check the unit and the sensor's calibration, and that it is static there"
 
 
 def _find_static_second(recording: Recording, sensor: ImuSensor) -> np.ndarray:
@@ -160,17 +164,18 @@ def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
         if tumbles or (as_stated < TUMBLES_FAST * smaller and speed[moving].mean() > FAST):
             raise WrongUnit(
                 f"{place}.gyro: with rates up to {peak:.3g} rad/s gravity would tumble, and accel shows that it does "
-                f'not; data.gyro_unit = "deg/s" would fit, or the time or rate_hz is wrong',
+                f"not",
                 "gyro_unit",
                 "deg/s",
+                ", or the time or rate_hz is wrong",
             )
         measurable = peak * 180.0 / np.pi < HIGHEST_RATE  # a saturated sensor turns too little in its own unit
         if measurable and as_stated < STIFF * larger and larger > COHERENT:
             raise WrongUnit(
-                f"{place}.gyro: with rates up to {peak:.3g} rad/s the sensor turns too little for what accel shows; "
-                f'data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong',
+                f"{place}.gyro: with rates up to {peak:.3g} rad/s the sensor turns too little for what accel shows",
                 "gyro_unit",
                 "rad/s",
+                ", or the time or rate_hz is wrong",
             )
     mean = accel.mean(axis=1)
     norm = np.linalg.norm(mean, axis=1)
@@ -185,10 +190,48 @@ def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
         raise WrongUnit(
             f"{place}.gyro: accel shows a tilt by {np.degrees(tilt[k]):.0f} deg between {k * size / rate_hz:g} and "
             f"{(k + 2) * size / rate_hz:g} s from the beginning, gyro turns by {np.degrees(path[k] + path[k + 1]):.2g} "
-            f'deg; data.gyro_unit = "rad/s" would fit, or the gyroscope does not measure',
+            f"deg",
             "gyro_unit",
             "rad/s",
+            ", or the gyroscope does not measure",
         )
+
+
+def find_unseen_rate(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
+    """Find the largest rate [rad/s] of a sensor whose gyroscope turns gravity and whose accelerometer does not.
+
+    NaN: they agree. The samples (n, 3) are some seconds without gaps; the unit of `accel_S` does not matter.
+    """
+    up = accel_S.mean(axis=0)
+    if not np.linalg.norm(up) > 0.0 or _tilt_most(accel_S, rate_hz) > STEADY:
+        return np.nan
+    halves = np.array_split(_turn_by(gyro_S / rate_hz, up), 2)  # in both: a lost sample is no unit
+    turned = min(_tilt_most(half, rate_hz) for half in halves)
+    return float(np.linalg.norm(gyro_S, axis=1).max()) if turned > TURNED else np.nan
+
+
+def _tilt_most(vectors: np.ndarray, rate_hz: float) -> float:
+    """Return the largest angle [rad] between means of vectors (n, 3) over `STEADY_MEAN_S` and the first of these."""
+    size = max(1, round(rate_hz * STEADY_MEAN_S))
+    count = len(vectors) // size
+    means = vectors[: count * size].reshape(count, size, 3).mean(axis=1)
+    lengths = np.linalg.norm(means, axis=1)
+    if count < 2 or not lengths.min() > 0.0:
+        return 0.0
+    return float(np.arccos(np.clip(means @ means[0] / (lengths * lengths[0]), -1.0, 1.0)).max())
+
+
+@compiled
+def _turn_by(rotvec, vector):  # type: ignore[no-untyped-def]
+    """Return a vector (3,) turned by each of `rotvec` (n, 3) [rad] after all before it, (n, 3)."""
+    turned = np.empty_like(rotvec)
+    quat, R = np.array([0.0, 0.0, 0.0, 1.0]), np.empty((3, 3))
+    for n in range(len(rotvec)):
+        rotate_by_vector(quat, rotvec[n, 0], rotvec[n, 1], rotvec[n, 2])
+        fill_matrix(quat, R)
+        for i in range(3):
+            turned[n, i] = R[i, 0] * vector[0] + R[i, 1] * vector[1] + R[i, 2] * vector[2]
+    return turned
 
 
 def _average_coherence(scale: float, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:

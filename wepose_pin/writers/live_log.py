@@ -97,6 +97,12 @@ class LiveLog:
             except OSError as error:
                 self._give_up(error)
 
+    def discard(self) -> None:
+        """Close and remove the file: nothing in it can be tracked."""
+        self.close()
+        with contextlib.suppress(OSError):
+            self.path.unlink()
+
     def close(self) -> None:
         """Write the rest; may be called twice."""
         self.flush()

@@ -15,7 +15,7 @@ from .packets import AnyName
 FORMS = {
     "replay": "replay:PATH",
     "lsl": "lsl:NAME[@machine|link|site]",
-    "udp": "udp:[HOST:]PORT",
+    "udp": "udp:[HOST:]PORT[,gyro_unit=deg/s][,accel_unit=g]",
     "mti": "mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]",
     "ximu3": "ximu3:DEVICE=SEGMENT,DEVICE=SEGMENT",
     "slimevr": "slimevr:[HOST][:PORT][,TRACKER=SEGMENT...]",
@@ -108,10 +108,20 @@ def _open_lsl(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float
 
 
 def _open_udp(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Collection[str]) -> Source:
+    from .packets import UNITS
     from .udp import UdpSource
 
-    host, port = parse_address(rest, f"source '{spec}':", 9000)
-    return UdpSource(host, port, sensors, segments, wait_s)
+    address, *options = rest.split(",")
+    host, port = parse_address(address, f"source '{spec}':", 9000)
+    units: dict[str, str] = {}
+    for option in options:
+        key, _, unit = option.partition("=")
+        if key not in UNITS:
+            raise BadOption(f"source '{spec}': '{option}' is no unit; {one_of(UNITS, key)}, as gyro_unit=deg/s")
+        if unit not in UNITS[key]:
+            raise BadOption(f"source '{spec}': {key} '{unit}' is not known; {one_of(UNITS[key], unit)}")
+        units[key] = unit
+    return UdpSource(host, port, sensors, segments, wait_s, units=units)
 
 
 def _open_mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int, segments: Sequence[str]) -> Source:

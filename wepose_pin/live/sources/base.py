@@ -46,6 +46,10 @@ class Source(ABC):
         """Describe what is awaited from these sensors, without any from all, and where; empty where nothing is."""
         return ""
 
+    def explain_unit(self, key: str, unit: str) -> str:
+        """What to do where samples are in `unit`; `key` as in a session's [data], ``gyro_unit`` or ``accel_unit``."""
+        return f"The source must give rad/s and m/s^2, not {unit} ({key})"
+
     @abstractmethod
     def open(self, waiting: Waiting | None = None) -> None:
         """Connect, or bind, and wait for what is not there yet: with `waiting` until it returns False.

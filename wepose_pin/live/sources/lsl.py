@@ -147,6 +147,10 @@ class LslSource(Source):
         self._reconnector: threading.Thread | None = None
         self._reach = ""  # of the search, once it began
 
+    def explain_unit(self, key: str, unit: str) -> str:
+        channels = SIGNALS[:3] if key == "gyro_unit" else SIGNALS[3:]
+        return f'State the unit "{unit}" of the channels {", ".join(channels)} in the stream\'s description'
+
     def open(self, waiting: Waiting | None = None) -> None:
         """Find the streams and subscribe, with `waiting` until it returns False.
 

@@ -6,12 +6,14 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
+from ...errors import one_of
 from ...model import load_table
+from ...readers.device import ACCEL_UNITS, GYRO_UNITS
 
 MAGIC = b"WPIN"
 VERSION = 1
@@ -22,6 +24,8 @@ CRC = struct.Struct("<I")
 NUMBERS = tuple(
     "torso left_upper_arm left_forearm right_upper_arm right_forearm pelvis head left_hand right_hand".split()
 )
+UNITS = {"gyro_unit": GYRO_UNITS, "accel_unit": ACCEL_UNITS}  # key → unit → factor to SI
+SI = {"gyro_unit": "rad/s", "accel_unit": "m/s^2"}
 MAX_NAME = 24  # letters of a sensor's name
 
 
@@ -51,15 +55,21 @@ class _Malformed(Exception):
     """A malformed line or datagram; its text is the problem."""
 
 
-def decode(datagram: bytes, segments: Collection[str] | None = None) -> tuple[list[Batch], list[str]]:
+def decode(
+    datagram: bytes, segments: Collection[str] | None = None, units: Mapping[str, str] = SI
+) -> tuple[list[Batch], list[str]]:
     """The batches in a datagram, and a problem for each line that is dropped; raises nothing.
 
-    `segments` : names of sensors in lines of JSON; None: those of the upper body
+    Parameters
+    ----------
+    segments : names of sensors in lines of JSON; None: those of the upper body
+    units : as `SI`, of packets and of lines that do not state their own
     """
     segments = load_table().segments if segments is None else segments
     if datagram[:4] == MAGIC:
         try:
-            return [_decode_binary(datagram)], []
+            batch = _decode_binary(datagram)
+            return [batch._replace(values=batch.values * find_scale(units))], []
         except _Malformed as error:
             return [], [str(error)]
     sensors: dict[str, tuple[list[float], list[list[float]]]] = {}
@@ -68,7 +78,7 @@ def decode(datagram: bytes, segments: Collection[str] | None = None) -> tuple[li
     for line in datagram.splitlines():
         if line.strip():
             try:
-                sensor, time, rows, battery = _decode_line(line, segments)
+                sensor, time, rows, battery = _decode_line(line, segments, units)
             except _Malformed as error:
                 problems.append(str(error))
                 continue
@@ -78,6 +88,11 @@ def decode(datagram: bytes, segments: Collection[str] | None = None) -> tuple[li
             charge[sensor] = battery
     batches = [Batch(name, np.array(time), np.array(rows), charge[name]) for name, (time, rows) in sensors.items()]
     return batches, problems
+
+
+def find_scale(units: Mapping[str, str]) -> np.ndarray:
+    """Factors (6,) from these units to rad/s and m/s²."""
+    return np.repeat([known[units[key]] for key, known in UNITS.items()], 3)
 
 
 def _decode_binary(datagram: bytes) -> Batch:
@@ -100,7 +115,9 @@ def _refuse_constant(text: str) -> NoReturn:
     raise _Malformed(f"JSON lines with {text}, which is no number")
 
 
-def _decode_line(line: bytes, segments: Collection[str]) -> tuple[str, list[float], list[list[float]], float]:
+def _decode_line(
+    line: bytes, segments: Collection[str], units: Mapping[str, str]
+) -> tuple[str, list[float], list[list[float]], float]:
     """Sensor, times (m), rows of gyro and accel (m, 6), battery; lists, which are faster for a single sample."""
     try:
         message = json.loads(line, parse_constant=_refuse_constant)
@@ -120,6 +137,12 @@ def _decode_line(line: bytes, segments: Collection[str]) -> tuple[str, list[floa
     if type(battery) not in (int, float) or battery < 0.0 or battery > 1.0:
         raise _Malformed("JSON lines whose battery is not a share, 0 to 1")
     rows = [_check_triple(a) + _check_triple(b) for a, b in zip(gyro, accel, strict=True)]
+    stated = {key: message.get(key, units[key]) for key in UNITS}
+    if stated != SI:
+        for key, known in UNITS.items():
+            if not isinstance(stated[key], str) or stated[key] not in known:
+                raise _Malformed(f"JSON lines with {key} {str(stated[key])[:MAX_NAME]!r}; {one_of(known)}")
+        rows = (find_scale(stated) * rows).tolist()
     return sensor, _check_numbers(time), rows, float(battery)
 
 

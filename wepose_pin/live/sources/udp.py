@@ -4,30 +4,36 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ...recording.arrivals import Samples
+from ..addresses import LOOPBACK
 from .checks import IMPLAUSIBLE, MAX_TIME, keep_plausible
 from .clocks import HostClock
 from .datagrams import DatagramSource
-from .packets import Batch, decode
+from .packets import SI, Batch, decode
 
 MAX_CLOCKS = 64  # of senders
 
 
 class UdpSource(DatagramSource):
-    """Samples of raw sensors; parameters and errors as `DatagramSource`.
+    """Samples of raw sensors; other parameters and errors as `DatagramSource`.
 
     Times of each sender, an address and port, are mapped to our clock (`HostClock`).
+
+    Parameters
+    ----------
+    units : ``gyro_unit`` and ``accel_unit`` of what does not state its own
     """
 
     kind, sender, hint = "udp", "samples", ", in a format of docs/live-sources.md"
 
-    def __init__(self, *args: Any, **options: Any) -> None:
+    def __init__(self, *args: Any, units: Mapping[str, str] | None = None, **options: Any) -> None:
         super().__init__(*args, **options)
+        self._units = {**SI, **(units or {})}
         self._batteries: dict[str, float] = {}
         self._clocks: OrderedDict[tuple[str, int], HostClock] = OrderedDict()
 
@@ -35,11 +41,16 @@ class UdpSource(DatagramSource):
     def batteries(self) -> dict[str, float]:
         return self._batteries
 
+    def explain_unit(self, key: str, unit: str) -> str:
+        host, port = self.address
+        at = f"{port}" if host == LOOPBACK else f"{host}:{port}"
+        return f'State the unit: --source udp:{at},{key}={unit}, or "{key}": "{unit}" in each line of JSON'
+
     def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
         """Each sender's samples together, since its newest one determines its clock best."""
         came: dict[tuple[str, int], list[Batch]] = {}
         for datagram, sender in datagrams:
-            batches, problems = decode(datagram, self._segments)
+            batches, problems = decode(datagram, self._segments, self._units)
             for problem in problems:
                 self._count(problem)
             batches = [batch for batch in batches if self._accepts(batch)]
