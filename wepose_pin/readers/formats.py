@@ -7,7 +7,6 @@ from pathlib import Path
 
 from ..errors import BadData, MissingFile, WeposeError
 from .apdm import is_apdm, read_apdm
-from .apdm_hdf5 import is_apdm_hdf5, read_apdm_hdf5
 from .delsys import is_delsys, read_delsys
 from .device import Device, read_first_lines
 from .dot import read_dot
@@ -31,7 +30,6 @@ FORMATS: Mapping[str, Callable[[Path, str | None, float | None], Device]] = {
     "dot": read_dot,
     "ximu3": read_ximu3,
     "apdm": read_apdm,
-    "apdm_hdf5": read_apdm_hdf5,
     "shimmer": read_shimmer,
     "delsys": read_delsys,
     "noraxon": read_noraxon,
@@ -48,7 +46,6 @@ TITLES = {
     "dot": "CSV of a Movella (Xsens) DOT",
     "ximu3": "CSV of an x-io x-IMU3",
     "apdm": "CSV of APDM",
-    "apdm_hdf5": "HDF5 of APDM",
     "shimmer": "CSV of Shimmer Consensys",
     "delsys": "CSV of Delsys",
     "noraxon": "CSV of Noraxon MR3",
@@ -60,7 +57,7 @@ TITLES = {
     "wepose_live": "recording of wepose live",
 }
 # Formats with all sensors of a recording in one file, and those that may be a folder.
-WHOLE = ("mvnx", "opensim", "apdm", "apdm_hdf5", "delsys", "noraxon", "rosbag", "xdf")
+WHOLE = ("mvnx", "opensim", "apdm", "delsys", "noraxon", "rosbag", "xdf")
 FOLDERS = {"ximu3": "x-IMU3", "sensor_logger": "Sensor Logger", "phyphox": "phyphox", "rosbag": "ROS"}
 USES = ("raw", "orientation")
 
@@ -86,8 +83,6 @@ def detect_format(path: Path) -> str | None:
     by_suffix = {".mvnx": "mvnx", ".sto": "opensim", **dict.fromkeys(ROSBAGS, "rosbag")}
     if suffix in by_suffix or is_xdf(path):
         return by_suffix.get(suffix, "xdf")
-    if suffix in (".h5", ".hdf5"):
-        return "apdm_hdf5" if is_apdm_hdf5(path) else None
     if suffix not in (".csv", ".tsv", ".txt", ".xml"):
         return None
     lines = read_first_lines(path, 40)

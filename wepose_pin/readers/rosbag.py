@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import BadData, how_to_install
+from ..errors import BadData
 from ..model import load_table
 from .device import Device, check_measured, make_device
+from .libraries import import_library, library_errors
 
 SUFFIXES = (".db3", ".mcap", ".bag")
 MESSAGE = "sensor_msgs/msg/Imu"
@@ -65,15 +66,13 @@ def read_rosbag(path: Path, use: str | None = None, rate_hz: float | None = None
 
 def _read_messages(path: Path) -> dict[tuple[str, str], list[list[float]]]:
     """Read rows of numbers by topic and frame; times count from the first message, in ns."""
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise BadData(f"{path}: is a ROS bag, which needs rosbags: {how_to_install('rosbags')}") from None
+    highlevel = import_library("rosbags.highlevel", path, "a ROS bag")
+    typesys = import_library("rosbags.typesys", path, "a ROS bag")
     frames: dict[tuple[str, str], list[list[float]]] = {}
     first = 0
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+    with library_errors(path, "a ROS bag"):
+        types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        with highlevel.AnyReader([path], default_typestore=types) as reader:
             wanted = [each for each in reader.connections if each.msgtype == MESSAGE]
             for connection, bag_time, raw in reader.messages(connections=wanted) if wanted else ():
                 message: Any = reader.deserialize(raw, connection.msgtype)
@@ -81,9 +80,6 @@ def _read_messages(path: Path) -> dict[tuple[str, str], list[list[float]]]:
                 first = first or stamp
                 row = [float(stamp - first), *_read_values(message)]
                 frames.setdefault((connection.topic, message.header.frame_id), []).append(row)
-    except Exception as error:  # rosbags, sqlite, zstd and others raise errors of many kinds
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise BadData(f"{path}: is no ROS bag, damaged or cut off: {reason}") from error
     return frames
 
 

@@ -250,6 +250,11 @@ class SessionReader:
         """Read a file of a known format, which defines its columns."""
         path = self._find_file(keys, data)
         own = keys if "format" in keys else data
+        if own.values.get("format") == "apdm_hdf5":
+            raise BadSession(
+                f"{own.at('format')} = 'apdm_hdf5' is no longer known; name each sensor's arrays, as `wepose info "
+                f"{path.name}` proposes"
+            )
         format = own.choice("format", FORMATS) if "format" in own else detect_format(path) if path.exists() else None
         self._used |= {"format", "use"} if own is data else {"use"}
         if format is None:

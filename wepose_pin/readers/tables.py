@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from ..errors import BadData, MissingFile, UnknownColumn, native_stderr_muted, one_of
-from .parquet import Contents, read_contents
+from ..errors import BadData, MissingFile, UnknownColumn, one_of
+from .libraries import library_errors
 
 FORMATS = (".csv", ".tsv", ".txt", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
@@ -29,8 +29,6 @@ NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"
 BLOCK_ROWS = 50_000
 # Rows of a Parquet column in a block.
 COLUMN_ROWS = 1_000_000
-# A compressed file has at most so many bytes of numbers, or so many times its own size: sensor noise packs to a tenth.
-MOST_BYTES, MOST_GROWTH = 1 << 28, 50
 # Characters of a line without values.
 EMPTY = b",; \t\r\n"
 # The names of a CSV stand within its first lines, or bytes.
@@ -56,8 +54,7 @@ def read_table(path: Path) -> pl.DataFrame:
     """
     _check_table(path)
     if _is_parquet(path):
-        _check_parquet(path)
-        with _polars_errors(path):
+        with library_errors(path, "a Parquet file"):
             return pl.read_parquet(_open_source(path))
     layout = read_layout(path)
     if layout.is_plain:
@@ -132,7 +129,7 @@ class Rows:
     def __post_init__(self) -> None:
         _check_table(self.path)
         self._layout = None if _is_parquet(self.path) else read_layout(self.path)
-        self.names = list(_check_parquet(self.path).sizes if self._layout is None else self._layout.names)
+        self.names = list(_read_parquet_names(self.path) if self._layout is None else self._layout.names)
         self._restart()
 
     @property
@@ -148,7 +145,7 @@ class Rows:
         if rows.stop <= rows.start:
             return pl.DataFrame(schema=dict.fromkeys(self.names, pl.Float64))
         if _is_parquet(self.path):
-            with _polars_errors(self.path):
+            with library_errors(self.path, "a Parquet file"):
                 return pl.scan_parquet(_open_source(self.path)).slice(rows.start, rows.stop - rows.start).collect()
         if rows.start < self._first:
             self._restart()
@@ -163,13 +160,14 @@ def read_column(path: Path, name: str | None, file: str, place: str) -> tuple[np
     """Read a column (n,) of a large table by blocks, with the number of rows; without a name an empty array."""
     _check_table(path)
     if _is_parquet(path):
-        height, sizes = _check_parquet(path)
-        if name is None:
-            return np.empty(0), height
-        if name not in sizes:
-            raise _make_column_error(name, list(sizes), file, place)
-        with _polars_errors(path):
-            values, lazy = np.empty(height), pl.scan_parquet(_open_source(path)).select(name)
+        with library_errors(path, "a Parquet file"):
+            table = pl.scan_parquet(_open_source(path))
+            height = int(table.select(pl.len()).collect().item())
+            if name is None:
+                return np.empty(0), height
+            if name not in (names := _read_parquet_names(path)):
+                raise _make_column_error(name, names, file, place)
+            values, lazy = np.empty(height), table.select(name)
             for first in range(0, height, COLUMN_ROWS):  # polars keeps the memory of its largest read
                 part = lazy.slice(first, COLUMN_ROWS).collect()
                 values[first : first + part.height] = read_columns(part, [name], file, place, first)[:, 0]
@@ -217,23 +215,9 @@ def _is_parquet(path: Path) -> bool:
     return path.suffix.lower() == ".parquet"
 
 
-def limit_bytes(path: Path) -> int:
-    """Return the largest number of bytes of numbers in a compressed file."""
-    return max(MOST_BYTES, MOST_GROWTH * path.stat().st_size)
-
-
-def explain_size(path: Path) -> str:
-    """Explain, at an error's end, that a compressed file states more bytes than `limit_bytes`."""
-    return f"in a file of {path.stat().st_size} bytes: no recording packs so well; write it anew without compression"
-
-
-def _check_parquet(path: Path) -> Contents:
-    """Read the contents of a Parquet file before polars does: some damaged files make polars end the process."""
-    contents = read_contents(path)
-    if max(8 * contents.rows, sum(contents.sizes.values())) > limit_bytes(path):
-        rows, width = contents.rows, len(contents.sizes)
-        raise BadData(f"{path}: says that it holds {rows} rows of {width} columns, {explain_size(path)}")
-    return contents
+def _read_parquet_names(path: Path) -> list[str]:
+    with library_errors(path, "a Parquet file"):
+        return list(pl.read_parquet_schema(_open_source(path)))
 
 
 def _check_table(path: Path) -> None:
@@ -244,26 +228,6 @@ def _check_table(path: Path) -> None:
     if not path.is_file():
         beside = [p.name for p in path.parent.iterdir() if p.suffix.lower() in FORMATS] if path.parent.is_dir() else []
         raise MissingFile(f"{path}: no such file; {one_of(sorted(beside), path.name)}")
-
-
-class _polars_errors:
-    """Turns errors of polars into one line of ours."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        # polars prints its panics on several lines.
-        self._quiet = native_stderr_muted() if _is_parquet(path) else contextlib.nullcontext()
-
-    def __enter__(self) -> None:
-        self._quiet.__enter__()
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        self._quiet.__exit__(None, None, None)
-        # A panic, an internal error of polars, is no Exception.
-        if isinstance(error, pl.exceptions.PolarsError | pl.exceptions.PanicException | OSError):
-            what = "Parquet file" if _is_parquet(self.path) else "table"
-            reason = " ".join(str(error).split("\n")[0].split())
-            raise BadData(f"{self.path}: cannot be read as a {what}: {reason}") from error
 
 
 @dataclass(frozen=True)
@@ -411,7 +375,7 @@ def _parse_csv(path: Path, layout: CsvLayout, part: bytes = b"", first_row: int 
             _find_ragged(path, layout, part, first_row)
         if "utf-8" in str(error):
             raise BadData(f"{path}: is not UTF-8 text; save it as CSV in UTF-8") from error
-        with _polars_errors(path):
+        with library_errors(path, "a table"):
             raise
     if len(numbers) == table.width:
         table.columns = list(names)  # polars reads quotes within names in its own way

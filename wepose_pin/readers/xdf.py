@@ -16,11 +16,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadData, how_to_install
+from ..errors import BadData
 from ..model import load_table
 from ..recording.limits import STANDARD_GRAVITY
 from .device import ACCEL_UNITS, Device, check_measured, convert, join_signals, make_device
 from .guess import group_columns
+from .libraries import import_library, library_errors
 
 MAGIC = b"XDF:", b"\x1f\x8b"  # the latter of gzip
 
@@ -90,20 +91,15 @@ def read_xdf(path: Path, use: str | None = None, rate_hz: float | None = None) -
 
 
 def _load(path: Path) -> list[dict[str, Any]]:
-    try:
-        import pyxdf
-    except ImportError:
-        raise BadData(f"{path}: is an XDF, which needs pyxdf: {how_to_install('pyxdf')}") from None
+    pyxdf = import_library("pyxdf", path, "an XDF")
     with path.open("rb") as file:
         if not file.read(4).startswith(MAGIC):
             raise BadData(f"{path}: is no XDF: it does not begin with 'XDF:'")
     logger, level = logging.getLogger("pyxdf"), logging.getLogger("pyxdf").level
     logger.setLevel(logging.CRITICAL)  # it reports what it mends
     try:
-        streams, _ = pyxdf.load_xdf(str(path))
-    except Exception as error:  # of many kinds
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise BadData(f"{path}: is no XDF, damaged or cut off: {reason}") from error
+        with library_errors(path, "an XDF"):
+            streams, _ = pyxdf.load_xdf(str(path))
     finally:
         logger.setLevel(level)
     return list(streams)

@@ -18,6 +18,9 @@ from ..kinematics import compute_link_poses, find_known_links, solve_configurati
 from .motion import Motion, find_measured_points, resample_evenly
 
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
+# A matrix whose rows are less orthogonal than 1e-8 is no rotation to readers such as kineticstoolkit.
+SKEW = 9e-9
+MOST_TURN = 1e-5  # [rad] about each axis
 
 
 def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
@@ -94,7 +97,7 @@ def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
     transforms = {}
     for k, (segment, link) in enumerate(zip(segments, links, strict=True)):
         T = np.tile(np.eye(4), (len(pose.time), 1, 1))
-        T[:, :3, :3] = Rotation.from_quat(quat_WL[segment]).as_matrix()
+        T[:, :3, :3] = _round_rotations(Rotation.from_quat(quat_WL[segment]).as_matrix())
         good, above = known[segment], model.parents.get(segment)
         if link in placed:
             T[:, :3, 3] = 1e3 * p_W[:, k]
@@ -103,6 +106,25 @@ def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
         T[~good] = np.nan
         transforms[segment] = T
     return transforms
+
+
+def _round_rotations(R: np.ndarray) -> np.ndarray:
+    """Round rotation matrices (n, 3, 3) to single precision so that their rows are orthogonal to `SKEW`.
+
+    The nearest numbers leave 6e-8. So the rotation is turned at random, by as little as lets it be rounded well.
+    """
+    rounded = R.astype(np.float32).astype(float)
+    random = np.random.default_rng(0)
+    skewed = np.arange(len(R))
+    for turn in np.geomspace(1e-3 * MOST_TURN, MOST_TURN, 1000):
+        x, y, z = rounded[skewed].transpose(1, 0, 2)
+        products = [np.einsum("ni,ni->n", *pair) for pair in ((x, y), (y, z), (z, x))]
+        skewed = skewed[np.abs(products).max(axis=0) > SKEW]
+        if not len(skewed):
+            break
+        turns = Rotation.from_rotvec(turn * random.uniform(-1.0, 1.0, (len(skewed), 3))).as_matrix()
+        rounded[skewed] = (turns @ R[skewed]).astype(np.float32)
+    return rounded
 
 
 def _check(file: Path, size: int) -> None:
