@@ -314,7 +314,8 @@ def test_one_function_says_how_to_install_and_knows_the_packages_of_the_extras()
             if room == "wepose_pin" and file.name not in ("errors.py", "maps.py"):  # without their dependencies: robots
                 assert "pip install" not in text, file
             for call in re.findall(r"how_to_install\(([^)]*)\)", text):
-                assert set(re.findall(r"[\w-]+", call)) <= known | {"packages", "str"}, file
+                assert set(re.findall(r"[\w-]+", call)) <= known | {"package", "packages", "str"}, file
+            assert set(re.findall(r'import_library\("(\w+)', text)) <= known, file
 
 
 def test_every_step_of_the_workflows_is_a_target() -> None:
