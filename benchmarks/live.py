@@ -19,11 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from wepose_pin.live import Output, SensorSetup, Status, run_session
-from wepose_pin.live.mvn_output import MvnOutput
 from wepose_pin.live.outputs import UdpOutput
 from wepose_pin.live.robot import RobotOptions, RobotOutput, connect_robot
 from wepose_pin.live.sources.replay import ReplaySource
-from wepose_pin.live.vmc_output import VmcOutput
 from wepose_pin.recording import Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.retargeting import find_map, load_robot
@@ -106,8 +104,8 @@ def live_session(seconds: float) -> Table:
             page = LivePage(load_model())
             page.open()
             with _reader(page.url):
-                outputs = [page, UdpOutput("9"), MvnOutput("9"), VmcOutput("9"), robot]
-                row = "and a robot's arm, UDP, MVN, VMC"
+                outputs = [page, UdpOutput("9"), robot]
+                row = "and a robot's arm, UDP"
                 table.rows[row] = _measure(recording, Path(folder) / "c.wepose", outputs)
     table.notes.append(
         "Latency is from the moment at which the newest sample was due to its pose. Limits: p50 under "
@@ -150,7 +148,7 @@ def live_samples(seconds: float) -> Table:
     table = Table(f"Processor time of the loop for a sample: five sensors at {RATE_HZ:g} Hz, {seconds:g} s", columns)
     for row, outputs in (
         ("poses and file", []),
-        ("and UDP, MVN, VMC", [UdpOutput("9"), MvnOutput("9"), VmcOutput("9")]),
+        ("and UDP", [UdpOutput("9")]),
     ):
         source = _OneByOne(recording)
         with tempfile.TemporaryDirectory() as folder:

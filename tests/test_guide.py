@@ -380,7 +380,6 @@ def test_the_parts_of_a_protocol_whose_phases_are_there() -> None:
         ("slimevr:6969", {}, "clasp+t_pose+bow"),
         ("slimevr:6969", {"torso": np.array([0.0, 0.0, 0.0, 1.0])}, "clasp+t_pose"),
         ("slimevr:6969", {"left_forearm": np.array([0.0, 0.0, 0.0, 1.0])}, "clasp+t_pose+bow"),
-        ("mvn:9763", {}, "clasp+t_pose"),
         ("udp:9000", {}, "clasp+t_pose"),
     ],
 )

@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from bodies import SEGMENTS
+from bodies import LENGTHS, SEGMENTS
 from test_causal import first
 
 from wepose_pin import cli
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.simulation import Simulation
+from wepose_pin.subject import mount_rows, population_subject, subject_toml
 from wepose_pin.writers import write_session
 
 SPEED = 4.0
@@ -107,6 +108,8 @@ def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest
         err = capsys.readouterr().err.strip()
         assert said in err
         assert len(err.splitlines()) == 1
+    run("live", "--source", replay, "--vmc", "39539", code=2)
+    assert "--vmc is no option any more: --udp sends each pose as JSON" in capsys.readouterr().err
     assert file.read_bytes() == b"something"
     run("track", str(file), "-o", str(tmp_path / "r"), code=2)
 
@@ -161,7 +164,14 @@ def test_ctrl_c_stops_the_wait_for_senders_at_once(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-    command = [sys.executable, "-c", _WAITING, f"mvn:127.0.0.1:{port}"]
+    subject = replace(
+        population_subject(),
+        mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])},
+        order=(*LENGTHS, *mount_rows("torso")),
+        covariance=1e-4 * np.eye(len(LENGTHS) + 3),
+    )
+    (tmp_path / "subject.toml").write_text(subject_toml(subject))
+    command = [sys.executable, "-c", _WAITING, f"udp:{port}"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     assert process.stdout is not None
     assert process.stdout.readline() == "open\n"
@@ -181,7 +191,7 @@ def say(self, waiting):
     print("open", flush=True)
     find(self, waiting)
 DatagramSource._find_sensors = say
-sys.argv[1:] = ["live", "--source", sys.argv[1], "--no-page"]
+sys.argv[1:] = ["live", "--source", sys.argv[1], "--subject", "subject.toml", "--no-page"]
 cli.main()
 """
 

@@ -224,7 +224,7 @@ def test_nothing_listens_but_on_loopback() -> None:
         "import sys\nfrom wepose_pin.live.page import LivePage\nfrom wepose_pin.live.outputs import UdpOutput\n"
         "from wepose_pin.live.terminal import TerminalView\nfrom wepose_pin.model import load_model\n"
         "page, out, view = LivePage(load_model()), UdpOutput('127.0.0.1:9'), TerminalView()\n"
-        "page.open(); view.open()\nprint(page.url, flush=True)\nsys.stdin.read()\npage.close()\nout.close()\n"
+        "page.open()\nprint(page.url, flush=True)\nsys.stdin.read()\npage.close()\nout.close()\n"
     )
     run = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert run.stdin is not None

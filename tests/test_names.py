@@ -27,10 +27,8 @@ IDENTIFIER = re.compile(rf"(left|right)_({'|'.join(PARTS)})|\b({'|'.join(name fo
 ALLOWED = {
     "angles/definitions.py": "definitions of joint angles",
     "angles/joints.py": "definitions of joint angles",
-    "live/figure.py": "the figure of formats that have a person",
     "live/sources/packets.py": "the numbers of a format",
     "live/sources/slimevr.py": "the numbers of a format",
-    "live/vmc_output.py": "the names of a format",
     "report/words.py": "a plural of English",
     "readers/mvnx.py": "the names of a format",
     "readers/opensim.py": "the names of a format",
@@ -48,7 +46,6 @@ TABLES_ALONE = (
     "angles/definitions.py",
     "live/sources/packets.py",
     "live/sources/slimevr.py",
-    "live/vmc_output.py",
     "readers/mvnx.py",
     "writers/bvh.py",
     "writers/standing.py",

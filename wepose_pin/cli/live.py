@@ -81,4 +81,10 @@ def _print_robot(robot: RobotSummary) -> None:
     print_diagnostics(robot.diagnostics)
 
 
-COMMAND = Command(LiveJob, run, example="live --source udp:9000 --subject anna --record morning.wepose")
+ON_YOUR_OWN = "--udp sends each pose as JSON, from which examples/live_consumer.py shows how to go on"
+COMMAND = Command(
+    LiveJob,
+    run,
+    example="live --source udp:9000 --subject anna --record morning.wepose",
+    removed={"--mvn": ON_YOUR_OWN, "--vmc": ON_YOUR_OWN},
+)

@@ -9,7 +9,7 @@ import re
 import shutil
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -32,6 +32,7 @@ class Command:
     example : a line that works, without the program's name
     arguments : fields that are given by position; all others are options
     exit_codes : what they mean; empty: `EXIT_CODES`
+    removed : options of earlier versions → what to do instead
     """
 
     job: type
@@ -39,6 +40,7 @@ class Command:
     example: str
     arguments: tuple[str, ...] = ()
     exit_codes: str = ""
+    removed: Mapping[str, str] = field(default_factory=dict)
 
     def summary(self) -> str:
         """Its line in the list of commands."""
@@ -58,6 +60,8 @@ def parse(name: str, command: Command, argv: Sequence[str]) -> Any:
     known = ["--help", *(each.switch for each in options.values() if each.switch)]
     for word in argv[: argv.index("--") if "--" in argv else None]:
         switch = word.partition("=")[0]
+        if switch in command.removed:
+            raise BadOption(f"{switch} is no option any more: {command.removed[switch]}")
         if switch.startswith("--") and switch not in known:
             raise BadOption(f"{switch} is not an option of wepose {name}; {one_of(known, switch)}; {see}")
     parser = _parser(name, command, list(options.values()))

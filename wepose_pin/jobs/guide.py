@@ -103,9 +103,8 @@ def choose_protocol(source: Source, setup: SensorSetup, model: BodyModel) -> str
     """Choose the protocol where none is named: a bow follows where else nothing shows the reference's heading."""
     from ..calibration.protocols import BOW, GUIDED
 
-    trackers = source.measures_orientations and not source.aligned
     known = model.table.is_mechanism or model.table.reference in setup.mounts
-    return f"{GUIDED}+{BOW}" if trackers and not known else GUIDED
+    return f"{GUIDED}+{BOW}" if source.measures_orientations and not known else GUIDED
 
 
 def _make_options(job: LiveJob, joined: str, folder: Path, setup: SensorSetup, model: BodyModel) -> GuideOptions:

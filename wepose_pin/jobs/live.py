@@ -32,8 +32,8 @@ class LiveJob:
     Parameters
     ----------
     source : SOURCE
-        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME, mti:DEVICE=SEGMENT,..., ximu3:DEVICE=SEGMENT,...,
-        slimevr:[HOST] or mvn:[HOST] (docs/live-sources.md). Without HOST only this machine can send.
+        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME, mti:DEVICE=SEGMENT,... or slimevr:[HOST]
+        (docs/live-sources.md). Without HOST only this machine can send.
     guide
         Lead through the calibration first: which sensor sits where, the start pose, the motion, its quality
         (docs/live-guide.md). Needs no subject and no session.
@@ -82,11 +82,6 @@ class LiveJob:
         Serve the page at this port; 0 takes any that is free.
     udp : [HOST:]PORT
         Send each pose as JSON to this UDP port (docs/live-page.md). Without HOST to this machine.
-    mvn : [HOST:]PORT
-        Send each pose to this UDP port as the Xsens MVN network streamer does (usually 9763): the whole figure,
-        its legs standing where no sensor measures them.
-    vmc : [HOST:]PORT
-        Send each pose to this UDP port by the VMC protocol (OSC; usually 39539), for Unity, VSeeFace or Blender.
     lsl : NAME
         Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
     robot : NAME|FILE
@@ -131,8 +126,6 @@ class LiveJob:
     host: str | None = None
     port: int = 0
     udp: str | None = None
-    mvn: str | None = None
-    vmc: str | None = None
     lsl: str | None = None
     robot: str | None = None
     arm: Arms | None = None
@@ -319,14 +312,6 @@ def _open_senders(job: LiveJob) -> list[Output]:
         from ..live.outputs import UdpOutput
 
         senders.append(UdpOutput(job.udp))
-    if job.mvn is not None:
-        from ..live.mvn_output import MvnOutput
-
-        senders.append(MvnOutput(job.mvn))
-    if job.vmc is not None:
-        from ..live.vmc_output import VmcOutput
-
-        senders.append(VmcOutput(job.vmc))
     if job.lsl is not None:
         from ..live.outputs import LslOutput
 

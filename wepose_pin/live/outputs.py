@@ -84,8 +84,8 @@ class UdpSender:
             self._socket = None
 
 
-class DatagramOutput(Output):
-    """Sends each pose in datagrams to one receiver; `encode` makes them.
+class UdpOutput(Output):
+    """Sends each pose as JSON in a datagram of its own.
 
     Parameters
     ----------
@@ -98,11 +98,8 @@ class DatagramOutput(Output):
         No such host, port or rate.
     """
 
-    option: str  # for error messages
-    port: int  # an example there
-
     def __init__(self, to: str, rate_hz: float | None = RATE_HZ) -> None:
-        self._limiter, self._sender = RateLimiter(rate_hz), UdpSender(to, self.option, self.port)
+        self._limiter, self._sender = RateLimiter(rate_hz), UdpSender(to, "--udp", PORT)
         self._info: StreamInfo | None = None
 
     def start(self, info: StreamInfo) -> None:
@@ -110,24 +107,10 @@ class DatagramOutput(Output):
 
     def show(self, pose: LivePose) -> None:
         if self._info is not None and self._limiter.accepts(pose.time):
-            for datagram in self.encode(self._info, pose):
-                self._sender.send(datagram)
-
-    def encode(self, info: StreamInfo, pose: LivePose) -> list[bytes]:
-        """The datagrams of a pose."""
-        raise NotImplementedError
+            self._sender.send(pose_json(self._info, pose))
 
     def close(self) -> None:
         self._sender.close()
-
-
-class UdpOutput(DatagramOutput):
-    """Sends each pose as JSON in a datagram of its own."""
-
-    option, port = "--udp", PORT
-
-    def encode(self, info: StreamInfo, pose: LivePose) -> list[bytes]:
-        return [pose_json(info, pose)]
 
 
 def pose_json(info: StreamInfo, pose: LivePose) -> bytes:

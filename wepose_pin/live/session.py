@@ -127,7 +127,7 @@ def check_mounts(source: Source, setup: SensorSetup) -> None:
     calibrated = setup.subject.mounts if setup.subject is not None and not setup.remounted else {}
     sensors = [name for name in source.sensors if not source.orientations.get(name)]
     unknown = [name for name in sensors if name not in calibrated and name not in setup.mounts]
-    nothing_known = not (source.sensors or source.aligned or calibrated or setup.mounts)
+    nothing_known = not (source.sensors or calibrated or setup.mounts)
     if unknown or nothing_known:
         segment = unknown[0] if unknown else "SEGMENT"
         sensor = f"the sensor of {segment} is" if unknown else "the sensors are"

@@ -17,11 +17,12 @@ FORMS = {
     "lsl": "lsl:NAME[@machine|link|site]",
     "udp": "udp:[HOST:]PORT[,gyro_unit=deg/s][,accel_unit=g]",
     "mti": "mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]",
-    "ximu3": "ximu3:DEVICE=SEGMENT,DEVICE=SEGMENT",
     "slimevr": "slimevr:[HOST][:PORT][,TRACKER=SEGMENT...]",
-    "mvn": "mvn:[HOST][:PORT]",
 }
-LISTENING = ("slimevr", "mvn")  # at an address that has a default
+REMOVED = {  # kind → what to do instead
+    "mvn": "export the trial of MVN as .mvnx, which `wepose track` reads",
+    "ximu3": "send its samples to udp:PORT, or read the CSV of the x-IMU3 GUI",
+}
 
 
 def open_source(
@@ -54,7 +55,9 @@ def open_source(
         No such kind of source, or it names what does not exist; WeposeErrors of the recording that is replayed.
     """
     kind, colon, rest = spec.partition(":")
-    if kind not in FORMS or not colon or not (rest or kind in LISTENING):
+    if kind in REMOVED:
+        raise BadOption(f"source '{spec}' is none any more: {REMOVED[kind]}")
+    if kind not in FORMS or not colon or not (rest or kind == "slimevr"):
         raise BadOption(f"source '{spec}' is none; {one_of(FORMS.values(), kind)}")
     if kind == "replay":
         return _open_replay(spec, rest, sensors, speed)
@@ -68,10 +71,6 @@ def open_source(
         return _open_udp(spec, rest, sensors, wait_s, AnyName() if any_name else segments)
     if kind == "slimevr":
         return _open_slimevr(spec, rest, sensors, wait_s, segments, any_name)
-    if kind == "mvn":
-        return _open_mvn(spec, rest, sensors or (segments if any_name else None), wait_s, segments)
-    if kind == "ximu3":
-        return _open_ximu3(spec, rest, sensors, baud, wait_s, segments)
     return _open_mti(spec, rest, sensors, baud, segments)
 
 
@@ -137,17 +136,6 @@ def _open_mti(spec: str, rest: str, sensors: Sequence[str] | None, baud: int, se
     return MTiSource(devices, rate_hz, baud)
 
 
-def _open_ximu3(
-    spec: str, rest: str, sensors: Sequence[str] | None, baud: int, wait_s: float, segments: Sequence[str]
-) -> Source:
-    from .ximu3 import Ximu3Source, check_device
-
-    devices = _choose_devices(spec, _read_pairs(spec, rest, segments, "192.168.1.2"), sensors)
-    for device in devices.values():
-        check_device(device, spec)
-    return Ximu3Source(devices, baud, wait_s)
-
-
 def _open_slimevr(
     spec: str,
     rest: str,
@@ -168,13 +156,6 @@ def _open_slimevr(
         }
     names = AnyName() if any_name else segments
     return SlimeVrSource(host, port, sensors or list(assigned.values()), names, wait_s, assigned=assigned)
-
-
-def _open_mvn(spec: str, rest: str, sensors: Sequence[str] | None, wait_s: float, segments: Sequence[str]) -> Source:
-    from .mvn import PORT, MvnSource
-
-    host, port = parse_listening_address(rest, f"source '{spec}':", PORT)
-    return MvnSource(host, port, sensors, segments, wait_s)
 
 
 def _read_pairs(spec: str, text: str, segments: Sequence[str], example: str) -> dict[str, str]:

@@ -19,11 +19,10 @@ class Source(ABC):
     sensors : segments, in the order in which results name them
     rate_hz : nominal samples a second of each; None where it has to be measured
     problems : problem → count of what was dropped so far ("bad checksums": 3)
-    aligned : whether all that it will ever send are orientations of segments, for which no mount is needed
     measures_orientations : whether it has orientations in place of rates and specific forces
     """
 
-    aligned = measures_orientations = False
+    measures_orientations = False
 
     def __init__(self, sensors: Iterable[str] = (), rate_hz: float | None = None) -> None:
         self.sensors, self.rate_hz = tuple(sensors), rate_hz

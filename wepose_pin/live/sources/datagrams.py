@@ -1,20 +1,17 @@
-"""What sources over UDP share: `DatagramSource`, and `OrientationSource` where senders measure orientations."""
+"""What sources over UDP share: `DatagramSource`."""
 
 from __future__ import annotations
 
-import math
 import select
 import socket
 import time
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Sequence
-from typing import Any, NamedTuple
-
-import numpy as np
+from collections.abc import Collection, Sequence
+from typing import Any
 
 from ...errors import BadSource
 from ...model import load_table
-from ...recording.arrivals import Samples, pack_orientations
+from ...recording.arrivals import Samples
 from ..addresses import name_host
 from .base import Source
 from .packets import AnyName
@@ -26,8 +23,6 @@ BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some secon
 COLLECT_S = 1.0  # [s] after the first sample in which the other sensors may appear
 MAX_SENSORS = 64  # of any name
 MAX_KINDS = 24  # of problems
-UNIT_ERROR = 0.05  # of a quaternion's length
-LONGEST_STEP_S = 0.02  # [s] between orientations that came together, of senders that do not tell their time
 
 
 def bind_socket(kind: str, host: str, port: int) -> socket.socket:
@@ -53,14 +48,6 @@ def bind_socket(kind: str, host: str, port: int) -> socket.socket:
         ) from None
     bound.setblocking(False)
     return bound
-
-
-class OrientationSample(NamedTuple):
-    """One orientation of one segment's sensor."""
-
-    segment: str
-    time: float  # [s] on our clock
-    quat: np.ndarray  # (4,) xyzw, not yet of unit length
 
 
 class DatagramSource(Source):
@@ -97,10 +84,6 @@ class DatagramSource(Source):
         self._wait_s = wait_s
         self._socket: socket.socket | None = None
         self._waiting: list[Samples] = []
-
-    @property
-    def orientations(self) -> dict[str, bool]:
-        return dict.fromkeys(self.sensors, self.aligned) if self.measures_orientations else {}
 
     @abstractmethod
     def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
@@ -204,57 +187,3 @@ class DatagramSource(Source):
         if problem not in self.problems and len(self.problems) >= MAX_KINDS:
             problem = "other problems"
         self.problems[problem] += number
-
-
-class OrientationSource(DatagramSource):
-    """Measured orientations, which `_decode` reads from datagrams.
-
-    Attributes
-    ----------
-    has_clock : whether datagrams hold the sender's time; else that of their arrival is taken
-    """
-
-    has_clock: bool
-    measures_orientations = True
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self._last_times: dict[str, float] = {}
-
-    @abstractmethod
-    def _decode(self, datagram: bytes, sender: Any, now: float, /) -> Iterator[OrientationSample]:
-        """Iterate over the orientations of a datagram that came at `now` [s]; what cannot be read is counted."""
-
-    def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
-        by_segment: dict[str, list[OrientationSample]] = {}
-        for datagram, sender in datagrams:
-            for sample in self._decode(datagram, sender, now):
-                size = float(np.linalg.norm(sample.quat))
-                if not self._tracks(sample.segment):
-                    self._count(f"orientations of {sample.segment}, which is not tracked")
-                elif not (math.isfinite(size) and abs(size - 1.0) < UNIT_ERROR):
-                    self._count("orientations that are none")
-                else:
-                    by_segment.setdefault(sample.segment, []).append(sample._replace(quat=sample.quat / size))
-        return [
-            Samples(segment, self._find_times(segment, own), *pack_orientations(np.array([each.quat for each in own])))
-            for segment, own in by_segment.items()
-        ]
-
-    def _find_times(self, segment: str, samples: Sequence[OrientationSample]) -> np.ndarray:
-        """Return the times (m,) [s] of a sensor's samples; those that came together were sent one after the other."""
-        times = np.array([each.time for each in samples])
-        if self.has_clock:
-            return times
-        count, newest = len(times), float(times[-1])
-        begin = max(self._last_times.get(segment, -math.inf), newest - LONGEST_STEP_S * count)
-        self._last_times[segment] = newest
-        return begin + (newest - begin) * np.arange(1, count + 1) / count
-
-    def _send(self, data: bytes, to: Any) -> None:
-        """Send a datagram; one that cannot be sent is left out."""
-        if self._socket is not None:
-            try:
-                self._socket.sendto(data, to)
-            except OSError:
-                self._count("answers that could not be sent")

@@ -8,19 +8,23 @@ SlimeVR-Tracker-ESP, protocol version 22.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from .datagrams import OrientationSample, OrientationSource
+from ...recording.arrivals import Samples, pack_orientations
+from .datagrams import DatagramSource
 
 PORT = 6969
 HEARTBEAT_S = 0.5  # [s] from one to the next
 SILENT_S = 60.0  # [s] without a packet after which a tracker is forgotten
 MAX_TRACKERS = 64
+UNIT_ERROR = 0.05  # of a quaternion's length
+LONGEST_STEP_S = 0.02  # [s] between orientations that came together
 HEADER = struct.Struct(">IQ")
 QUAT = struct.Struct(">4f")
 BUNDLED_QUAT = struct.Struct(">4h")
@@ -67,7 +71,14 @@ class Tracker:
     battery: float = float("nan")
 
 
-class SlimeVrSource(OrientationSource):
+class OrientationSample(NamedTuple):
+    """One orientation of one segment's sensor."""
+
+    segment: str
+    quat: np.ndarray  # (4,) xyzw, not yet of unit length
+
+
+class SlimeVrSource(DatagramSource):
     """Orientations of SlimeVR trackers; other parameters and errors as `DatagramSource`.
 
     With `AnyName` a tracker that states no place is ``MAC/SENSOR``.
@@ -81,13 +92,19 @@ class SlimeVrSource(OrientationSource):
     trackers : address → tracker
     """
 
-    kind, sender, has_clock = "slimevr", "SlimeVR trackers", False
+    kind, sender = "slimevr", "SlimeVR trackers"
+    measures_orientations = True
 
     def __init__(self, *args: Any, assigned: Mapping[str, str] | None = None, **options: Any) -> None:
         super().__init__(*args, **options)
         self.trackers: dict[Any, Tracker] = {}
         self._assigned = dict(assigned or {})
         self._heartbeat = -np.inf
+        self._last_times: dict[str, float] = {}
+
+    @property
+    def orientations(self) -> dict[str, bool]:
+        return dict.fromkeys(self.sensors, False)
 
     @property
     def batteries(self) -> dict[str, float]:
@@ -107,6 +124,36 @@ class SlimeVrSource(OrientationSource):
         self.trackers = {at: tracker for at, tracker in self.trackers.items() if now - tracker.newest_time < SILENT_S}
         for address in self.trackers:
             self._send(HEARTBEAT, address)
+
+    def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
+        by_segment: dict[str, list[np.ndarray]] = {}
+        for datagram, sender in datagrams:
+            for segment, quat in self._decode(datagram, sender, now):
+                size = float(np.linalg.norm(quat))
+                if not self._tracks(segment):
+                    self._count(f"orientations of {segment}, which is not tracked")
+                elif not (math.isfinite(size) and abs(size - 1.0) < UNIT_ERROR):
+                    self._count("orientations that are none")
+                else:
+                    by_segment.setdefault(segment, []).append(quat / size)
+        return [
+            Samples(segment, self._find_times(segment, len(own), now), *pack_orientations(np.array(own)))
+            for segment, own in by_segment.items()
+        ]
+
+    def _find_times(self, segment: str, count: int, now: float) -> np.ndarray:
+        """Return the times (count,) [s] of samples that came together by `now`, sent one after the other."""
+        begin = max(self._last_times.get(segment, -math.inf), now - LONGEST_STEP_S * count)
+        self._last_times[segment] = now
+        return begin + (now - begin) * np.arange(1, count + 1) / count
+
+    def _send(self, data: bytes, to: Any) -> None:
+        """Send a datagram; one that cannot be sent is left out."""
+        if self._socket is not None:
+            try:
+                self._socket.sendto(data, to)
+            except OSError:
+                self._count("answers that could not be sent")
 
     def _decode(self, datagram: bytes, sender: Any, now: float, /) -> Iterator[OrientationSample]:
         if len(datagram) < HEADER.size or datagram[:3] != b"\0\0\0":
@@ -135,7 +182,7 @@ class SlimeVrSource(OrientationSource):
         elif kind == BATTERY and len(data) >= 8:
             tracker.battery = float(np.clip(struct.unpack_from(">2f", data)[1], 0.0, 1.0))
         elif kind in (ROTATION_1, ROTATION_2, ROTATION, ROTATION_ACCEL):
-            yield from self._read_rotation(kind, data, tracker, now)
+            yield from self._read_rotation(kind, data, tracker)
         elif kind not in UNUSED:
             self._count(f"SlimeVR packets of type {kind}, which is not read")
 
@@ -152,7 +199,7 @@ class SlimeVrSource(OrientationSource):
         self.trackers[sender] = Tracker(":".join(f"{byte:02x}" for byte in mac), now, places=places)
         self._send(HANDSHAKE_ANSWER, sender)
 
-    def _read_rotation(self, kind: int, data: bytes, tracker: Tracker, now: float) -> Iterator[OrientationSample]:
+    def _read_rotation(self, kind: int, data: bytes, tracker: Tracker) -> Iterator[OrientationSample]:
         sensor, at, layout = 0, 0, QUAT
         if kind == ROTATION_2:
             sensor = 1
@@ -174,7 +221,7 @@ class SlimeVrSource(OrientationSource):
         if segment is None:
             self._count(f"orientations of {tracker.mac or 'a tracker'}/{sensor}, whose place on the body is not known")
             return
-        yield OrientationSample(segment, now, quat)
+        yield OrientationSample(segment, quat)
 
     def _find_segment(self, tracker: Tracker, sensor: int) -> str | None:
         named = f"{tracker.mac}/{sensor}"
