@@ -22,7 +22,6 @@ KINDS = (
     "batch",
     "long",
     "headings",
-    "doubled",
     "protocols",
     "robots",
     "bodies",
@@ -50,7 +49,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "sessions on one worker, two, and two of which one is killed (stopped, the same command goes on from there); "
         "long: recordings of up to 24 hours in chunks; headings: relative headings of simulated people with and "
         "without their correction, half an hour; with --live an hour of one person who clasps the hands every ten "
-        "minutes; doubled: two sensors on an upper arm beside either alone, ten minutes; protocols: what each "
+        "minutes; protocols: what each "
         "calibration protocol is worth on simulated people, an hour for eight; robots: "
         "the upper-body recording of --data on every robot, offline and live, half an hour; bodies: chains, other "
         "bodies and legs by the commands, on the recordings of --data and simulated, three minutes; kinematics: beside "
@@ -118,10 +117,6 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
             from . import headings
 
             chosen |= headings.sections(options.quick)
-        elif kind == "doubled":
-            from . import doubled
-
-            chosen |= doubled.sections(options.quick)
         elif kind == "protocols":
             from . import protocols
 

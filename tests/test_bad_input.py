@@ -169,6 +169,11 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
         lambda f: f.say('file = "arm.csv"', 'file = "arm.csv"\ntruth = "t.parquet"'),
         "session.toml: data.truth: no such file 't.parquet'",
     ),
+    "a second sensor on a segment": (
+        lambda f: setattr(f, "session", f.session + "\n[sensors.back]\nsegment = 'torso'\n"),
+        "session.toml: sensors.back.segment = 'torso': a segment has one sensor, and its table has the segment's name; "
+        "keep one of [sensors.torso] and [sensors.back], and name it [sensors.torso]",
+    ),
     # phases
     "a phase outside": (
         lambda f: f.say("[[0.5, 2.5]]", "[[0.5, 25.0]]"),

@@ -5,17 +5,15 @@ from __future__ import annotations
 import importlib.util
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, batch, bodies, calibration, doubled, filters, kinematics, tables
+from benchmarks import accuracy, batch, bodies, calibration, filters, kinematics, tables
 from benchmarks.__main__ import main
 from wepose_pin.filters import METHODS
-from wepose_pin.simulation import IDEAL_PRESET
 
 TINY = filters.Effort(2, 8.0, 1.0, (200, 400), (1, 3), 1, 1, False)
 
@@ -208,15 +206,3 @@ def test_bodies_need_their_recordings_and_measure_a_simulated_arm(
     for row in rows.values():
         assert abs(row["z"]) < 3.0
         assert row["std_mm"] < 20.0
-
-
-@pytest.mark.slow
-def test_two_sensors_on_a_segment_are_measured() -> None:
-    preset = replace(IDEAL_PRESET, soft_tissue_deg=4.0)
-    first, second = doubled.simulate_two_sensors(1, preset, 20.0)
-    np.testing.assert_array_equal(first.quat_WL["torso"], second.quat_WL["torso"])
-    assert np.abs(first.soft_tissue["torso"] - second.soft_tissue["torso"]).max() > 0.01
-    rows = doubled.measure_doubled("ideal", preset, 1, 20.0).rows
-    for row in rows.values():
-        assert row["both"] < max(row["first"], row["second"])
-        assert min(row.values()) > 0.5

@@ -28,7 +28,6 @@ from .documents import (
     is_number,
     parse_toml,
     read_toml,
-    toml_key,
     toml_string,
     toml_strings,
     whole_file,
@@ -41,7 +40,7 @@ _ROW = re.compile(
     r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law"
 )  # of a covariance, other than lengths
 LONGEST = 3.0  # [m] of a plausible length
-_LEARNED = ("mounts", "hinges", "girdles", "start_pose_offset", "heading_drift", "doubled")
+_LEARNED = ("mounts", "hinges", "girdles", "start_pose_offset", "heading_drift")
 _TABLES = ("lengths", "lengths_std", *_LEARNED, "covariance")
 FORMAT = 2
 Quality = Literal["pass", "poor", "fail"]  # of a calibration
@@ -88,7 +87,6 @@ class Subject:
     start_pose_offset : segment → `StartPoseOffset`, its angles to the start pose in the calibration, which a person
         nearly repeats
     heading_drift : segment → `HeadingDrift` of its sensor in the calibration; on another day it has a similar size
-    doubled : name of the second sensor on a segment → that segment; its mount is in `mounts` under the sensor's name
     girdles : shoulder point → (7,) by which the person differs from the body's law of the shoulder girdle: a share of
         the law, then a displacement x, y, z [m] at rest and another [m] with the arm raised by 90°
     quality : "pass", "poor" or "fail", of the calibration that estimated it; empty where none did
@@ -103,7 +101,6 @@ class Subject:
     hinges: Mapping[str, Hinge] = field(default_factory=dict)
     start_pose_offset: Mapping[str, StartPoseOffset] = field(default_factory=dict)
     heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
-    doubled: Mapping[str, str] = field(default_factory=dict)
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
     quality: Literal["", "pass", "poor", "fail"] = ""
 
@@ -213,8 +210,7 @@ class Subject:
             missing = [name for name in table.lengths if name not in self.lengths]
             if missing:
                 raise BadOption(f"{where}lengths: {', '.join(missing)} of the body {table.name} is missing")
-            check_names(f"{where}mounts", self.mounts, (*table.segments, *self.doubled))
-            check_names(f"{where}doubled", self.doubled.values(), table.segments)
+            check_names(f"{where}mounts", self.mounts, table.segments)
             for name in ("start_pose_offset", "heading_drift"):
                 check_names(f"{where}{name}", getattr(self, name), table.segments)
             check_names(f"{where}hinges", self.hinges, table.hinges)
@@ -418,9 +414,6 @@ def subject_toml(subject: Subject) -> str:
         lines += ["", f"[heading_drift.{segment}]   # of its sensor's heading in the calibration"]
         rates = {"rate_deg_min": drift.rate, "std_deg_min": drift.std}
         lines += [f"{key} = {60.0 * np.degrees(value):.4f}" for key, value in rates.items()]
-    if subject.doubled:
-        lines += ["", "[doubled]   # second sensors, and their segments"]
-        lines += [f"{toml_key(name)} = {toml_string(segment)}" for name, segment in subject.doubled.items()]
     if subject.order:
         lines += ["", "[covariance]    # of lengths [m], mount errors [rad] and girdles [m], jointly"]
         lines.append(f"order = {toml_strings(subject.order)}")
@@ -482,7 +475,8 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         raise BadSubject(f"{path}: is a session; a subject is needed here, as `wepose calibrate` writes one")
     if values.get("format") != FORMAT:
         raise BadSubject(f"{path}: format = {values.get('format')!r}; this version reads format = {FORMAT}")
-    top.allow("format", "name", "note", "quality", *_TABLES)
+    second = "is of second sensors, and a segment has one now; calibrate again with one sensor on each segment"
+    top.allow("format", "name", "note", "quality", *_TABLES, renamed={"doubled": second})
     quality = values.get("quality", "")
     if quality not in ("", *get_args(Quality)):
         raise BadSubject(f"{path}: quality = {quality!r} is not known; {one_of(get_args(Quality), str(quality))}")
@@ -518,7 +512,6 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         start_pose_offset={segment: StartPoseOffset(v[:2], float(v[2])) for segment, v in offset.items()},
         heading_drift={segment: HeadingDrift(float(rate), float(std)) for segment, (rate, std) in drift.items()},
         girdles={point: np.array(entry.numbers(*PARAMETERS, most=LONGEST)) for point, entry in girdles.items()},
-        doubled={name: tables["doubled"].text(name, None) or "" for name in tables["doubled"].values},
         quality=quality,
     )
 

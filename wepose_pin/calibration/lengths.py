@@ -46,7 +46,6 @@ from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, wi
 from .anatomy import BETTER, LabelCheck, check_labels
 from .conditions import Level, Pointing, find_hinges, find_measured_lengths, group_lengths, is_scale_observed
 from .contact import find_initial_guess
-from .doubled import add_second_mounts
 from .initial_headings import Coupling, estimate_joint_headings
 from .joints import add_couplings, estimate_couplings
 from .least_squares import HINGE_STD, Gaussian, Observations, place_points, residuals
@@ -186,7 +185,7 @@ def calibrate(
     if earlier is not None and not calibration.labels.moved:
         fused = fuse_sessions([earlier, calibration.subject], prior, problem.measured, table)
         calibration = replace(calibration, subject=fused, prior=earlier)
-    return add_second_mounts(calibration, recording, method).state_quality()
+    return calibration.state_quality()
 
 
 def _check_measured(measured: Mapping[str, float], protocol: Protocol, model: BodyModel) -> None:

@@ -422,7 +422,7 @@ def _range(values: np.ndarray) -> Range:
 
 def _find_directions(calibration: Calibration) -> tuple[InformationDirection, ...]:
     """The information of the motion in units of the prior's: eigenvectors of one covariance in the other."""
-    # Without what the prior knows exactly, and second sensors, whose mounts follow from the first ones.
+    # Without what the prior knows exactly.
     unknown = np.flatnonzero(np.diag(calibration.prior_covariance) > 0.0)
     names = [calibration.subject.order[k] for k in unknown]
     if not names:

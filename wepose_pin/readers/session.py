@@ -15,7 +15,6 @@ from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, printable
 from ..model.table import NEUTRAL_POSE
 from ..recording import (
-    DoubledSensor,
     ImuSensor,
     Intervals,
     OrientationSensor,
@@ -176,7 +175,6 @@ class SessionReader:
             truth=find_truth(self.path, data),
         )
         stated = {segment: read_sensor_keys(table) for segment, table in tables.items()}
-        self._segments = self._find_segments(tables)
         self._units: Mapping[str, float] = SI
         if any(sensor.signals for sensor in stated.values()):
             raw = any("gyro" in sensor.signals for sensor in stated.values())
@@ -213,18 +211,6 @@ class SessionReader:
         self.phases, self.start_pose, self.remounted = self._head.phases, start_pose, self._head.remounted
         self._refuse_shared_columns()
         self._scanned: Scan | None = None
-
-    def _find_segments(self, tables: Mapping[str, TomlTable]) -> dict[str, str]:
-        """Find the segment of each sensor: the table's name, or what its key `segment` states."""
-        segments = {name: table.text("segment", None) or name for name, table in tables.items()}
-        for segment in dict.fromkeys(segments.values()):
-            names = [name for name, own in segments.items() if own == segment]
-            if len(names) > 2:
-                raise BadSession(
-                    f"{self.path}: {', '.join(f'sensors.{name}' for name in names)} are all on '{segment}'; a segment "
-                    f"bears two sensors at most"
-                )
-        return segments
 
     def _refuse_shared_columns(self) -> None:
         """Raise an error where two sensors have a column in common."""
@@ -448,7 +434,7 @@ class SessionReader:
             self._head,
             time=time,
             rate_hz=self.rate_hz,
-            **self._split_doubled(sensors),
+            sensors=sensors,
             phases=self._head.phases if whole else _cut_phases(self._head.phases, time),
             diagnostics=(*self._diagnostics, *scan.diagnostics(), *bridged),
         )
@@ -456,15 +442,6 @@ class SessionReader:
         begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
         warnings = check_signals(recording, whole=begins, units=first == 0)
         return replace(recording, diagnostics=(*recording.diagnostics, *warnings))
-
-    def _split_doubled(self, sensors: Mapping[str, Sensor]) -> dict[str, Any]:
-        """Split sensors by table into the first of each segment, and the second ones."""
-        first: dict[str, str] = {}
-        doubled: dict[str, DoubledSensor] = {}
-        for name in sensors:
-            if first.setdefault(self._segments[name], name) != name:
-                doubled[self._segments[name]] = DoubledSensor(name, sensors[name])
-        return {"sensors": {segment: sensors[name] for segment, name in first.items()}, "doubled": doubled}
 
     def _window(self, plan: _Plan, first: int, last: int) -> tuple[int, int]:
         """Find the samples on a sensor's clock that the chunk needs, with neighbours for bridging and resampling."""

@@ -62,9 +62,15 @@ def check_session_keys(values: Mapping[str, Any], path: Path) -> TomlTable:
 
 def read_sensor_keys(keys: TomlTable) -> SensorKeys:
     """Read the columns by signal, the mount, and whether the orientations are the segment's own."""
+    if "segment" in keys:
+        name, segment = keys.place[:-1], keys.text("segment", None)
+        raise BadSession(
+            f"{keys.at('segment')} = '{segment}': a segment has one sensor, and its table has the segment's name; keep "
+            f"one of [sensors.{segment}] and [{name}], and name it [sensors.{segment}]"
+        )
     keys.allow(
         *("gyro", "accel", "orientation", "mount", "file", "time", "time_unit", "rate_hz", "offset_s"),
-        *("format", "label", "aligned", "segment"),
+        *("format", "label", "aligned"),
     )
     mount = _read_mount(keys.table("mount")) if "mount" in keys else None
     aligned = keys.flag("aligned") if "aligned" in keys else None

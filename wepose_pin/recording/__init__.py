@@ -14,14 +14,13 @@ from .intervals import (
     format_time,
     select_interval,
 )
-from .recording import CONFIGURATION, EACH_TIME, DoubledSensor, Mark, Recording, check_recording, join_recordings
+from .recording import CONFIGURATION, EACH_TIME, Mark, Recording, check_recording, join_recordings
 from .sensors import AXES, ImuSensor, OrientationSensor, Sensor, compute_mount, find_mount_axes
 
 __all__ = [
     "AXES",
     "CONFIGURATION",
     "EACH_TIME",
-    "DoubledSensor",
     "ImuSensor",
     "Intervals",
     "Mark",

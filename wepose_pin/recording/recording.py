@@ -33,13 +33,6 @@ class Mark(NamedTuple):
     text: str
 
 
-class DoubledSensor(NamedTuple):
-    """A second sensor on a segment, and its name."""
-
-    name: str
-    sensor: Sensor
-
-
 @dataclass(frozen=True)
 class Recording:
     """Sensors on one uniform time base.
@@ -63,7 +56,6 @@ class Recording:
     model : the body that wears the sensors: the file of a table or a URDF, or the name of a body of the package;
         empty: the upper body
     diagnostics : assumptions, bridged gaps and faults from reading
-    doubled : segment → its second sensor, where it has two
     """
 
     name: str
@@ -81,7 +73,6 @@ class Recording:
     joints: Mapping[str, float] = field(default_factory=dict)
     model: str = ""
     diagnostics: tuple[Diagnostic, ...] = ()
-    doubled: Mapping[str, DoubledSensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -150,9 +141,8 @@ class Recording:
         first, last, _ = span.indices(len(self))
         span = slice(first, last)
         sensors = {name: sensor.part(span) for name, sensor in self.sensors.items()}
-        doubled = {name: second._replace(sensor=second.sensor.part(span)) for name, second in self.doubled.items()}
         resets = tuple(tick - first for tick in self.resets if first <= tick < last)
-        return replace(self, time=self.time[first:last], sensors=sensors, doubled=doubled, resets=resets)
+        return replace(self, time=self.time[first:last], sensors=sensors, resets=resets)
 
     def chunks(self, seconds: float) -> Iterator[Recording]:
         """Iterate over consecutive chunks of `seconds`; the last one may be half a chunk longer or shorter."""
@@ -190,14 +180,10 @@ class Recording:
 def join_recordings(first: Recording, second: Recording) -> Recording:
     """Join two recordings of the same sensors in time; diagnostics are those of both, all else is the first's."""
     sensors = {name: join_sensors([sensor, second.sensors[name]]) for name, sensor in first.sensors.items()}
-    doubled = {
-        name: own._replace(sensor=join_sensors([own.sensor, second.doubled[name].sensor]))
-        for name, own in first.doubled.items()
-    }
     resets = (*first.resets, *(len(first) + tick for tick in second.resets))
     diagnostics = (*first.diagnostics, *(each for each in second.diagnostics if each not in first.diagnostics))
     time = np.concatenate([first.time, second.time])
-    return replace(first, time=time, sensors=sensors, doubled=doubled, resets=resets, diagnostics=diagnostics)
+    return replace(first, time=time, sensors=sensors, resets=resets, diagnostics=diagnostics)
 
 
 def check_recording(recording: Recording) -> Recording:
@@ -225,10 +211,6 @@ def check_recording(recording: Recording) -> Recording:
         raise BadOption(f"{where}: resets = {recording.resets}: samples from 0 to {len(time) - 1} are needed")
     for segment, sensor in recording.sensors.items():
         _check_sensor(f"{where}: sensors.{segment}", time, sensor)
-    for segment, second in recording.doubled.items():
-        if segment not in recording.sensors:
-            raise BadData(f"{where}: doubled.{segment}: the segment has no first sensor")
-        _check_sensor(f"{where}: sensors.{second.name}", time, second.sensor)
     check_phases(where, time, recording.phases)
     return recording
 

@@ -15,7 +15,6 @@ from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject
 from .causal import CausalEstimator, CausalSegmentEstimator
-from .doubled import DoubledEstimator, rename_mounts
 from .heading_problem import HeadingProblem
 from .headings import HeadingCorrector, make_heading_problem
 from .options import TrackOptions
@@ -61,7 +60,7 @@ class Tracker:
         self._with_point_cov = with_point_cov
         self._subject, self._model = subject, model
         self._headings, self._solved = headings, observed
-        self._estimator: SegmentEstimator | CausalEstimator | DoubledEstimator | None = None  # made at the first chunk
+        self._estimator: SegmentEstimator | CausalEstimator | None = None  # made at the first chunk
         self._body: TrackedBody | None = None
         self._kinematics: KinematicsSolver | None = None
         self._waiting: list[Oriented] = []  # until the headings are solved
@@ -91,7 +90,7 @@ class Tracker:
         """
         if self._estimator is None or self._body is None:
             self._body = make_body(self._subject, self._model, chunk)
-            self._estimator = _make_estimator(self._subject, self._body, self.options, chunk)
+            self._estimator = _make_estimator(self._subject, self._body, self.options)
         if self.options.open_loop and chunk.resets:
             chunk = replace(chunk, resets=())
         return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented, self._body)]
@@ -131,8 +130,7 @@ class Tracker:
                 body, segments.quat_WL, limits=self.options.limits, start=tracked_body.start
             )
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
-        first = self._estimator.first if isinstance(self._estimator, DoubledEstimator) else self._estimator
-        headings = first.headings if isinstance(first, CausalEstimator) else self._headings
+        headings = self._estimator.headings if isinstance(self._estimator, CausalEstimator) else self._headings
         correction = None if headings is None else headings.summarize()
         point_cov: dict[str, np.ndarray] = {}
         if self._with_point_cov:
@@ -178,11 +176,11 @@ def _estimate(
 ) -> Iterator[tuple[Oriented, TrackedBody]]:
     """Iterate over all chunks with their segment orientations, each with the body."""
     body: TrackedBody | None = None
-    estimator: SegmentEstimator | CausalEstimator | DoubledEstimator | None = None
+    estimator: SegmentEstimator | CausalEstimator | None = None
     for chunk in chunks:
         if body is None or estimator is None:
             body = make_body(subject, model, chunk)
-            estimator = _make_estimator(subject, body, options, chunk)
+            estimator = _make_estimator(subject, body, options)
         for oriented in estimator.push(chunk):
             yield oriented, body
     if body is not None and estimator is not None:
@@ -236,32 +234,22 @@ def track_chunks(
 
 
 def _make_estimator(
-    subject: Subject | None, body: TrackedBody, options: TrackOptions, chunk: Recording
-) -> SegmentEstimator | CausalEstimator | DoubledEstimator:
-    """Return the estimator of segment orientations for a recording whose first chunk this is."""
+    subject: Subject | None, body: TrackedBody, options: TrackOptions
+) -> SegmentEstimator | CausalEstimator:
+    """Return the estimator of segment orientations of a recording."""
 
     def make_problem(recording: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
         if any(sensor.aligned for sensor in recording.sensors.values()):
             return None
         return make_heading_problem(recording, segments, body.subject, body.model, causal=True)
 
-    def make(person: Subject | None, *, corrects: bool) -> SegmentEstimator | CausalEstimator:
-        if not options.causal:
-            return SegmentEstimator(
-                person, start_frames=body.start_frames, method=options.method, static_test=options.static_test
-            )
-        return CausalEstimator(
-            person,
-            start_frames=body.start_frames,
-            method=options.method,
-            static_test=options.static_test,
-            make_problem=make_problem if corrects else None,
-        )
-
-    corrects = not options.open_loop
-    first = make(subject, corrects=corrects)
-    if not chunk.doubled:
-        return first
-    names = {segment: doubled.name for segment, doubled in chunk.doubled.items()}
-    second = make(rename_mounts(subject, names), corrects=False)
-    return DoubledEstimator(first, second, names, follow=corrects)
+    start_frames, method, static_test = body.start_frames, options.method, options.static_test
+    if not options.causal:
+        return SegmentEstimator(subject, start_frames=start_frames, method=method, static_test=static_test)
+    return CausalEstimator(
+        subject,
+        start_frames=start_frames,
+        method=method,
+        static_test=static_test,
+        make_problem=None if options.open_loop else make_problem,
+    )

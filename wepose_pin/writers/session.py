@@ -35,17 +35,14 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
     if recording.joints:
         lines += ["", "[joints]   # rad, m for a prismatic joint"]
         lines += [f"{toml_key(name)} = {float(value)!r}" for name, value in recording.joints.items()]
-    second = {doubled.name: (segment, doubled.sensor) for segment, doubled in recording.doubled.items()}
-    for name, (segment, sensor) in {**{s: (s, own) for s, own in recording.sensors.items()}, **second}.items():
-        lines += ["", f"[sensors.{toml_key(name)}]"]
-        if name != segment:
-            lines.append(f"segment = {toml_string(segment)}")
+    for segment, sensor in recording.sensors.items():
+        lines += ["", f"[sensors.{toml_key(segment)}]"]
         if isinstance(sensor, ImuSensor):
             signals = {"gyro": ("gyr_", sensor.gyro_S), "accel": ("acc_", sensor.accel_S)}
         else:
             signals = {"orientation": ("q", sensor.quat_WS)}
         for key, (short, values) in signals.items():
-            names = [f"{name}_{short}{c}" for c in "xyzw"[: values.shape[1]]]
+            names = [f"{segment}_{short}{c}" for c in "xyzw"[: values.shape[1]]]
             table |= {column: values[:, k] for k, column in enumerate(names)}
             lines.append(f"{key} = {toml_strings(names)}")
         if sensor.aligned:
