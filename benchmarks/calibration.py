@@ -170,18 +170,13 @@ def pose_cases(seconds: float) -> dict[str, Posed]:
         ).recording()
 
     free = recorded(mount="any")
-    begin, end = free.phases["clasp"][0]
+    begin = free.phases["clasp"][0][0]
     still = replace(free, phases={**free.phases, "clasp": ((begin, begin + 5.0),)})
-    middle = (begin + end) / 2.0
-    gap = (free.time > middle) & (free.time < middle + 2.0)
-    arm = free.imus["left_upper_arm"]
-    lost = replace(arm, gyro_S=np.where(gap[:, None], 0.0, arm.gyro_S), gap=gap)
     recordings = {
         "clasp": ("clasp", recorded()),
         "clasp, unknown mounts": ("clasp", free),
-        "clasp, samples lost": ("clasp", replace(free, sensors={**free.sensors, "left_upper_arm": lost})),
         "clasp, 5 s": ("clasp", still),
-        **{protocol: (protocol, recorded(protocol)) for protocol in ("handle", "touch_left", "poses")},
+        "t_pose+bow": ("t_pose+bow", recorded("t_pose+bow")),
     }
     posed = {}
     for name, (protocol, recording) in recordings.items():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from copy import deepcopy
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from wepose_pin.simulation.motion import SIDES, Motion
 from wepose_pin.simulation.signals import Wander
@@ -20,24 +19,22 @@ class FreeMotion(Motion):
 
     phase = "free"
 
-    def fit_to_person(self, rng: np.random.Generator, pose_deg: float) -> None:
+    def fit_to_person(self, rng: np.random.Generator) -> None:
         """Prepare the motion: hands that miss their aim by millimetres are as good."""
-        self.prepare(deepcopy(rng), pose_deg)
+        self.prepare(deepcopy(rng))
         if self.flaws.iterates:
             time = np.arange(*self.clasp, 0.05)
             moving = self._motion_share(time)
             distance = np.linalg.norm(self._clasp_point(time, moving), axis=1)
             self.flaws.wrists.fit(time, moving, np.column_stack((distance, distance)))
 
-    def prepare(self, rng: np.random.Generator, _pose_deg: float) -> None:
+    def prepare(self, rng: np.random.Generator) -> None:
         self.hand = {side: [Wander(rng) for _ in MIDDLE] for side in SIDES}
 
     def protocol_phases(self) -> dict[str, list[tuple[float, float]]]:
         return {}
 
-    def _palms(
-        self, t: np.ndarray, motion_share: np.ndarray, _clasp_T: np.ndarray, _R_WT: Rotation
-    ) -> dict[str, np.ndarray]:
+    def _palms(self, t: np.ndarray, motion_share: np.ndarray, _clasp_T: np.ndarray) -> dict[str, np.ndarray]:
         omega = 2.0 * np.pi / PAUSE_S
         own_time = t + np.sin(omega * t) / omega  # stands still in a pause
         palms = {}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.recording import Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, PEOPLE_PRESET, Imperfections, Simulation, simulate, simulate_person
-from wepose_pin.simulation.tasks import TASKS
+from wepose_pin.simulation.sequence import TASKS
 from wepose_pin.tracking import TrackedRecording, track
 
 from .free_motion import FreeMotion

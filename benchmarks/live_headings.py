@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.recording import Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import PEOPLE_PRESET, Person, Simulation, simulate, simulate_person
+from wepose_pin.simulation.sequence import TASKS
 from wepose_pin.simulation.signals import make_pulse
-from wepose_pin.simulation.tasks import TASKS
 from wepose_pin.subject import Subject, mount_rows
 from wepose_pin.tracking import TrackOptions
 from wepose_pin.tracking.tracker import track_chunks
@@ -51,15 +51,13 @@ class ClaspedFreeMotion(FreeMotion):
     def protocol_phases(self) -> dict[str, list[tuple[float, float]]]:
         return {"clasp": self.clasps}
 
-    def _palms(
-        self, t: np.ndarray, motion_share: np.ndarray, clasp_T: np.ndarray, R_WT: Rotation
-    ) -> dict[str, np.ndarray]:
+    def _palms(self, t: np.ndarray, motion_share: np.ndarray, clasp_T: np.ndarray) -> dict[str, np.ndarray]:
         joined = np.zeros_like(t)
         for begin, end in self.clasps:
             joined += make_pulse(t, begin - APPROACH_S, end + APPROACH_S, APPROACH_S)
         shoulders_T = np.array((0.0, 0.0, self.lengths["trunk"]))
         meeting_T = shoulders_T + self._clasp_point(t, CLASP_REACH * motion_share)
-        free = super()._palms(t, motion_share, clasp_T, R_WT)
+        free = super()._palms(t, motion_share, clasp_T)
         return {side: palm_T + joined[:, None] * (meeting_T - palm_T) for side, palm_T in free.items()}
 
 

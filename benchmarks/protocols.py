@@ -1,9 +1,9 @@
 """What each calibration protocol is worth on simulated people: errors, stated standard deviations and seconds.
 
 Each person of the preset `people` does each protocol with arbitrary mounts, a measured shoulder width and trunk, and
-then draws a circle with the right hand, on which the palm is compared; some do three sessions of the default. Clocks
-are exact, which makes the simulation twice as fast and changes no angle by more than 0.2 deg. Results are appended to a
-file, so that a run goes on where it was stopped.
+then draws a circle with the right hand, on which the palm is compared. Clocks are exact, which makes the simulation
+twice as fast and changes no angle by more than 0.2 deg. Results are appended to a file, so that a run goes on where it
+was stopped.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from wepose_pin.calibration import calibrate, calibrate_sessions
 from wepose_pin.errors import BadOption
 from wepose_pin.simulation import (
     PEOPLE_MEASURED_STD,
@@ -30,12 +29,10 @@ from wepose_pin.simulation import (
     simulate_person,
 )
 
-from .consistency import compare_lengths, compare_subject, measure_simulation, summarize
+from .consistency import measure_simulation, summarize
 from .tables import Column, Section, Table
 
 FIRST_SEED = 300  # of persons; none of them was looked at while sizes were chosen
-FIRST_RETURNING_SEED = 320  # of persons who do several sessions
-SESSIONS = 3
 CIRCLES = 1
 SCATTER = 0.6  # of the ratio of one person, whose lengths and headings are far from independent
 CLOCKS: dict[str, Any] = {"clock_jitter": 0.0, "clock_offset": 0.0, "clock_drift_ppm": 0.0}
@@ -64,15 +61,9 @@ CELLS = (
     Cell("clasp", 60.0),
     Cell("clasp+t_pose", 60.0),
     Cell("clasp+bow", 60.0),
-    Cell("clasp+elbows", 60.0),
-    Cell("clasp+swing", 60.0),
-    Cell("clasp+touch_body", 60.0),
-    Cell("handle", 60.0),
-    Cell("poses", 14.5),
+    Cell("t_pose+bow", 14.5),
     Cell("free", 60.0),
 )
-BEFORE = Cell("sessions: none", 0.0)
-SERIES = tuple(Cell(f"sessions: {name}", 60.0) for name in ("1", "2", "3", "1, then 2", "1, then 2, then 3", "1 2 3"))
 Results = dict[tuple[Cell, int], dict[str, Any]]
 
 
@@ -108,35 +99,8 @@ def _simulate(cell: Cell, seed: int, person: Person) -> Simulation:
         imperfections=_people(),
         clasp_s=cell.seconds,
         protocol=cell.protocol,
-        circles=0 if cell.protocol == "poses" else CIRCLES,
+        circles=CIRCLES,
     )
-
-
-def measure_series(seed: int) -> dict[Cell, dict[str, Any]]:
-    """Errors and standard deviations of a person's sessions: each alone, one after another, all at once."""
-    person = simulate_person(seed, PEOPLE_MEASURED_STD)
-    simulations = [
-        simulate(
-            person.lengths, seed=seed, imperfections=_people(), protocol="clasp+t_pose", circles=0, session=session
-        )
-        for session in range(SESSIONS)
-    ]
-    recordings = [
-        replace(simulation.recording(f"session {k + 1}"), remounted=k > 0) for k, simulation in enumerate(simulations)
-    ]
-    subjects, prior = [], person.prior
-    options: dict[str, Any] = {"measured": person.measured, "measured_std": person.measured_std}
-    subjects += [calibrate(recording, prior=person.prior, **options).subject for recording in recordings]
-    for k, recording in enumerate(recordings):
-        # A length is measured once.
-        prior = calibrate(recording, prior=prior, **(options if k == 0 else {})).subject
-        subjects += [prior] if k else []
-    subjects.append(calibrate_sessions(recordings, prior=person.prior, **options)[-1].subject)
-    of_session = (*range(SESSIONS), *range(1, SESSIONS), SESSIONS - 1)
-    return {
-        cell: {"seed": seed, **compare_subject(subject, person, simulations[k])}
-        for cell, subject, k in zip(SERIES, subjects, of_session, strict=True)
-    }
 
 
 def read_results(file: Path) -> Results:
@@ -158,26 +122,17 @@ def run(persons: int, file: Path, workers: int = 2) -> Results:
             lines.write(json.dumps(row, default=float) + "\n")
 
     cells = [(cell, seed) for cell in CELLS for seed in range(FIRST_SEED, FIRST_SEED + persons)]
-    returning = range(FIRST_RETURNING_SEED, FIRST_RETURNING_SEED + persons)
     with ProcessPoolExecutor(workers) as pool:
         pending = {pool.submit(measure, *key): key for key in cells if key not in results}
-        series = {pool.submit(measure_series, seed): seed for seed in returning if (SERIES[-1], seed) not in results}
-        for seed in returning:
-            person = simulate_person(seed, PEOPLE_MEASURED_STD)
-            if (BEFORE, seed) not in results:
-                add(BEFORE, seed, {"seed": seed, **compare_lengths(person.prior, person)})
         for future in as_completed(pending):
             add(*pending[future], future.result())
-        for later in as_completed(series):
-            for cell, result in later.result().items():
-                add(cell, series[later], result)
     return results
 
 
 def summarize_cells(results: Results) -> dict[Cell, dict[str, float]]:
     """Of each cell the persons, how many pass, and of each quantity error, standard deviation and their ratio."""
     rows = {}
-    for cell in (*CELLS, BEFORE, *SERIES):
+    for cell in CELLS:
         own = [r for (other, _), r in sorted(results.items()) if other == cell and "out_of_reach" not in r]
         good = [result for result in own if "error" not in result]
         if not good:
@@ -198,23 +153,15 @@ def write_page(results: Results) -> str:
     """The page of the results, in Markdown."""
     rows = summarize_cells(results)
     persons = max(round(row["persons"]) for row in rows.values())
-    closed = _format_table([cell for cell in CELLS if cell in rows], rows, "protocol")
-    text = [_PAGE.format(persons=persons, scatter=SCATTER / np.sqrt(persons), closed=closed)]
-    series = [cell for cell in (BEFORE, *SERIES) if cell in rows]
-    if series:
-        text.append(_SERIES.format(series=_format_table(series, rows, "sessions")))
-    return "\n".join(text)
+    return _PAGE.format(persons=persons, scatter=SCATTER / np.sqrt(persons), closed=_format_table(rows))
 
 
-def _format_table(cells: list[Cell], rows: dict[Cell, dict[str, float]], first: str) -> str:
-    shown = [entry for entry in QUANTITIES.values() if any(entry[0] in rows[cell] for cell in cells)]
-    passed = any("passed" in rows[cell] for cell in cells)
-    header = [first, "seconds", "people", *(["pass"] if passed else []), *(f"{n} [{unit}]" for _, n, _, unit in shown)]
+def _format_table(rows: dict[Cell, dict[str, float]]) -> str:
+    shown = list(QUANTITIES.values())
+    header = ["protocol", "seconds", "people", "pass", *(f"{name} [{unit}]" for _, name, _, unit in shown)]
     lines = [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}"]
-    for cell in cells:
-        row = rows[cell]
-        entries = [cell.protocol.removeprefix("sessions: "), f"{cell.seconds:g}", f"{row['persons']:.0f}"]
-        entries += [f"{row['passed']:.0f}"] if passed else []
+    for cell, row in rows.items():
+        entries = [cell.protocol, f"{cell.seconds:g}", f"{row['persons']:.0f}", f"{row['passed']:.0f}"]
         for key, _, _, unit in shown:
             digits = ".0f" if unit == "mm" and key != "length" else ".1f"
             std = (
@@ -236,20 +183,13 @@ entry has the root mean square of the error over people, ± the stated standard 
 error over standard deviation: 1 is right, above it the ± is too small. That figure scatters by {scatter:.2f} with
 {persons} people.
 The people are the same in all rows, but for those whose arms do not reach through the motion that was drawn. What is
-known of their lengths without any closure is in the rows `poses` and `free`.
+known of their lengths without any closure is in the rows `t_pose+bow` and `free`.
 
 Headings are those of the mounts, all sensors. Most of an error is common to all of them, as the torso's heading defines
 which way is forward. The palm is the right one on a circle drawn after the calibration, from the root and from the
 middle of the shoulders; of `free` in the tasks themselves.
 
 {closed}
-"""
-_SERIES = """## Several sessions of one person
-The default protocol, clasp with T-pose, 60 s each, new mounts each time; other people than above. "1, then 2": the
-second with `--prior`; "1 2 3": all three in one command; "none": what stature and sex tell beforehand. Sessions of one
-person err alike, as the person's skin, shoulders and measured width are the same.
-
-{series}
 """
 
 

@@ -156,12 +156,6 @@ def test_a_mistake_gets_one_line_that_names_it(folder: Path, text: str, said: st
     assert "\n" not in str(error.value)
 
 
-def test_the_distance_that_a_protocol_needs_may_be_measured(folder: Path) -> None:
-    subject = '[subjects.a]\nmeasured = { handle = 0.42 }\n[steps.calibrate]\nprotocol = "handle"\n'
-    plan = planned(folder, f'[sessions]\nfiles = "ben/one"\nsubject = "a"\n{subject}')
-    assert plan.items[0].anthropometrics.measured == {"handle": 0.42}
-
-
 @pytest.mark.parametrize(
     ("table", "said"),
     [

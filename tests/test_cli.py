@@ -229,9 +229,11 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["simulate", "-o", "OUT", "--rate-hz", "fast"], "--rate-hz: 'fast' is not a number; see wepose simulate"),
         (["simulate", "-o", "OUT", "--prset", "ideal"], "not an option of wepose simulate; did you mean '--preset'?"),
         (
-            ["calibrate", "s.toml", "-o", "OUT", "--model", "upper_body", "--measured", "handle=0.4"],
-            "a distance of --protocol handle",
+            ["calibrate", "s.toml", "-o", "OUT", "--protocol", "poses"],
+            "protocol 'poses' is no longer there; use t_pose+bow",
         ),
+        (["simulate", "-o", "OUT", "--protocol", "handle"], "protocol 'handle' is no longer there; use clasp with"),
+        (["calibrate", "a", "b", "-o", "OUT"], "'b' is one word too many for wepose calibrate"),
         (["track", "s.toml"], "wepose track needs -o DIR"),
         (["track", "s.toml", "-o", "OUT", "--method", "ekf"], "--method: 'ekf' is not known; did you mean 'smekf'?"),
         (["track", "nowhere.toml", "-o", "OUT"], "nowhere.toml: no such file"),

@@ -21,7 +21,7 @@ def wrist_heights(protocol: str, phase: str) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("protocol", ["clasp+t_pose", "poses", "clasp+t_pose+elbows+swing"])
+@pytest.mark.parametrize("protocol", ["clasp+t_pose", "t_pose+bow", "clasp+t_pose+bow"])
 def test_each_phase_of_a_joined_protocol_is_shown(protocol: str) -> None:
     lengths = load_model().lengths
     heights = wrist_heights(protocol, "t_pose")

@@ -28,7 +28,7 @@ from wepose_pin.jobs.retarget import RetargetJob
 from wepose_pin.jobs.simulate import SimulateJob, run_simulate
 from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.simulation import simulate, simulate_person
-from wepose_pin.simulation.tasks import TASKS
+from wepose_pin.simulation.sequence import TASKS
 from wepose_pin.writers import write_session
 
 JOBS = {
@@ -36,8 +36,8 @@ JOBS = {
         Path("s.toml"), Path("out"), Path("anna"), method="smekf", open_loop=True, limits=False, chunk_seconds=20.0
     ),
     "calibrate": CalibrateJob(
-        *(Path("s.toml"), Path("out"), "handle"),
-        measured={"handle": 0.4, "trunk": 0.5},
+        *(Path("s.toml"), Path("out"), "table"),
+        measured={"biacromial": 0.4, "trunk": 0.5},
         stature=1.7,
         sex="f",
         formulation="paper",
@@ -95,7 +95,7 @@ def test_the_example_of_a_command_is_a_job(name: str) -> None:
 
 
 def test_words_and_defaults_become_the_fields() -> None:
-    words = "s.toml --measured handle=0.4 --protocol handle --measured trunk=0.5 --stature 1.7 --sex f"
+    words = "s.toml --measured biacromial=0.4 --protocol table --measured trunk=0.5 --stature 1.7 --sex f"
     words += " --formulation paper -o out"
     assert parse("calibrate", find_command("calibrate"), words.split()) == JOBS["calibrate"]
     words = "--out=out s.toml --subject anna --method smekf --open-loop --no-limits --chunk-seconds 20"
@@ -133,5 +133,5 @@ def test_jobs_print_nothing_and_tell_a_growing_share(tmp_path: Path, capfd: pyte
     assert shares[0][1] == 0.0
     assert sorted(share for _, share in shares) == [share for _, share in shares]
     assert all(0.0 <= share < 1.0 for _, share in shares)
-    run_simulate(SimulateJob(tmp_path / "made", protocol="poses"))
+    run_simulate(SimulateJob(tmp_path / "made", protocol="t_pose+bow"))
     assert capfd.readouterr() == ("", "")

@@ -253,7 +253,7 @@ def test_legs_on_the_upper_body_are_refused_with_the_body_that_has_them(
     assert run("track", made, "-o", tmp_path / "result") == 2
     error = capsys.readouterr().err
     assert "sensors.left_thigh is no segment of upper_body; the body whole_body has it" in error
-    assert run("simulate", "-o", made, "--activity", "sit", "--protocol", "handle", "--force") == 2
-    assert "--activity sit with --protocol handle" in capsys.readouterr().err
+    assert run("simulate", "-o", made, "--activity", "sit", "--protocol", "clasp", "--force") == 2
+    assert "--activity sit with --protocol clasp" in capsys.readouterr().err
     assert run("track", made, "--model", "half_body", "-o", tmp_path / "result") == 2
     assert "no body 'half_body' comes with the package; did you mean 'whole_body'" in capsys.readouterr().err

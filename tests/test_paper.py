@@ -219,8 +219,8 @@ def test_mounts_of_the_prior_are_used_and_stay(made: tuple[Person, Simulation, R
     [
         ({}, "needs one measured length that fixes the scale, as in --measured biacromial=0.41; there is: shoul"),
         ({"measured": {"trunk": 0.5, "left_hand": 0.07}}, "needs one measured length that fixes the scale"),
-        ({"measured": {"handle": 0.4}, "protocol": "handle"}, "points of the body coincide .* not 'handle'"),
-        ({"measured": {"shoulder_width": 0.4}, "protocol": "poses"}, "points of the body coincide .* not 'poses'"),
+        ({"measured": {"shoulder_width": 0.4}, "protocol": "table"}, "points of the body coincide .* not 'table'"),
+        ({"measured": {"shoulder_width": 0.4}, "protocol": "t_pose"}, "points of the body coincide .* not 't_pose'"),
         ({"formulation": "linear"}, "formulation = 'linear' is not known; .*full, paper"),
     ],
 )

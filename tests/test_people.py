@@ -36,10 +36,10 @@ from wepose_pin.simulation import (
 from wepose_pin.simulation.girdle import Girdle, compute_girdle
 from wepose_pin.simulation.motion import SIDES, Flaws
 from wepose_pin.simulation.people import START_POSE, Elbow, StartPoseOffsets
+from wepose_pin.simulation.sequence import TASKS
 from wepose_pin.simulation.signals import Process, RandomWalk, integrate_pulse, integrate_step, make_pulse, make_step
 from wepose_pin.simulation.soft_tissue import GAINS, RANDOM_DEG, JointRotations, SoftTissue, lost_twist
 from wepose_pin.simulation.subject import spawn_streams
-from wepose_pin.simulation.tasks import TASKS
 
 MILD_GYRO = [-2.522546184523055, 0.08628641931856733, -0.49321743388267497]
 MILD_ACCEL = [-9.551337890625, 1.59029296875, -0.0622705078125]
@@ -268,28 +268,14 @@ def test_residual_abduction() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.monte_carlo) for seed in (1, 2))])
-@pytest.mark.parametrize("protocol", ["clasp", "handle"])
-def test_palms_close_but_for_slip(protocol: str, seed: int) -> None:
-    stiff = replace(BODY, palm_slip=0.0, handle_slip=0.0)
-    apart = 0.4 if protocol == "handle" else 0.0
+def test_palms_close_but_for_slip(seed: int) -> None:
     person = simulate_person(seed)
     options = {"seed": seed, "noise": NOISE_FREE, "rate_hz": 20.0, "clasp_s": 20.0, "circles": 0}
-    for sizes, most_mm in ((stiff, 0.01), (BODY, 12.0 if protocol == "handle" else 30.0)):
-        sim = simulate(person.lengths, imperfections=sizes, protocol=protocol, **options)
-        gap = np.linalg.norm(sim.points["left_palm"] - sim.points["right_palm"], axis=1)[within(sim, protocol)]
-        assert 1e3 * np.abs(gap - apart).max() < most_mm
-    if protocol == "clasp":
-        assert 1e3 * rms(gap) == pytest.approx(10.0, rel=0.1)
-    else:
-        assert 0.5 < 1e3 * rms(gap - apart) < 4.0
-
-
-def test_touching_palm_stays_but_for_slip() -> None:
-    sim = simulate(
-        SUBJECT, seed=4, imperfections=replace(BODY, palm_slip=0.0), protocol="touch_left", rate_hz=20.0, circles=0
-    )
-    touching = sim.points["left_palm"][within(sim, "touch")]
-    assert 1e3 * np.ptp(touching, axis=0).max() < 0.01
+    for sizes, most_mm in ((replace(BODY, palm_slip=0.0), 0.01), (BODY, 30.0)):
+        sim = simulate(person.lengths, imperfections=sizes, **options)
+        gap = np.linalg.norm(sim.points["left_palm"] - sim.points["right_palm"], axis=1)[within(sim, "clasp")]
+        assert 1e3 * np.abs(gap).max() < most_mm
+    assert 1e3 * rms(gap) == pytest.approx(10.0, rel=0.1)
 
 
 def test_wrists_bend(body: Simulation) -> None:
@@ -497,8 +483,8 @@ def test_people_reach_in_every_protocol(protocol: str) -> None:
         person, rngs = simulate_person(seed), spawn_streams(seed)
         lengths = {name: float(value) for name, value in person.lengths.items()}
         flaws = Flaws(PEOPLE_PRESET, rngs, lengths["shoulder_width"])
-        motion = TASKS[protocol](lengths, rngs["motion"], 30.0, 0 if protocol == "poses" else 2, flaws)
-        motion.fit_to_person(rngs["task"], 4.0)
+        motion = TASKS[protocol](lengths, rngs["motion"], 30.0, 2, flaws)
+        motion.fit_to_person(rngs["task"])
         t = np.arange(0.0, motion.span[1], 0.02)
         pose = motion(t)
         for side in SIDES:
@@ -628,7 +614,6 @@ def test_switching_one_off_leaves_the_draws_of_the_others(name: str) -> None:
 @pytest.mark.parametrize("name", NEW)
 def test_switching_one_on_changes_only_it(name: str) -> None:
     options = {"seed": 5, "rate_hz": 20.0, "clasp_s": 8.0, "circles": 0}
-    options["protocol"] = "handle" if name == "handle_slip" else "clasp"
     without = only("girdle") if name == "girdle_hysteresis" else IDEAL_PRESET  # it is one of the girdle
     ideal = simulate(SUBJECT, imperfections=without, **options)
     one = simulate(SUBJECT, imperfections=replace(without, **{name: getattr(PEOPLE_PRESET, name)}), **options)
@@ -642,7 +627,7 @@ def test_switching_one_on_changes_only_it(name: str) -> None:
         assert np.array_equal(one.p_LS[segment], ideal.p_LS[segment]) != moved
         assert np.array_equal(one.gyro_bias[segment], ideal.gyro_bias[segment]) == (name != "gyro_warm_up_deg_s")
         assert np.array_equal(one.sample_time[segment], ideal.sample_time[segment]) == (name != "clock_drift_ppm")
-    if name not in ("handle_slip", "wrist_flexion_deg", "wrist_deviation_deg"):
+    if name not in ("wrist_flexion_deg", "wrist_deviation_deg"):
         clasp = within(one, "clasp")
         assert 1e3 * np.abs(one.points["left_palm"] - one.points["right_palm"])[clasp].max() < 0.01
 

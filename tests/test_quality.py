@@ -24,7 +24,7 @@ from wepose_pin.errors import BadSubject
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import MILD_PRESET, Imperfections, Person, Simulation, simulate, simulate_person
 from wepose_pin.simulation import motion as motions
-from wepose_pin.simulation.tasks import TASKS
+from wepose_pin.simulation.sequence import TASKS
 from wepose_pin.writers import write_session
 
 ANY = replace(MILD_PRESET, mount="any")

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from html import unescape
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -190,8 +191,10 @@ def test_without_a_mount_it_says_why_there_is_no_motion(made: Made) -> None:
     ]
 
 
-def test_one_hand_at_a_point(made: Made) -> None:
-    page = render_calibration_report(made[0], made[1], tracked=made[2], protocol="touch_left")
+def test_one_hand_at_a_point(made: Made, tmp_path: Path) -> None:
+    own = tmp_path / "corner.toml"
+    own.write_text('[[closure]]\nphase = "clasp"\nkind = "fixed_point"\npoints = ["left_palm"]\n')
+    page = render_calibration_report(made[0], made[1], tracked=made[2], protocol=own)
     assert "Palm to its point over time" in headings(page)
     assert "The left palm went from" in text_of(page)
     assert "Not in the chain, known by the prior's proportions" in text_of(page)

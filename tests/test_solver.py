@@ -25,7 +25,7 @@ def largest_difference(problem: LeastSquares, a: np.ndarray, b: np.ndarray) -> f
     return float(np.abs((a - b) / np.sqrt(np.diag(np.linalg.inv(problem.evaluate(a).information)))).max())
 
 
-CASES = ["clasp", "clasp, unknown mounts", "clasp, samples lost", "clasp, 5 s", "handle", "touch_left", "poses"]
+CASES = ["clasp", "clasp, unknown mounts", "clasp, 5 s", "t_pose+bow"]
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -61,7 +61,7 @@ def test_a_length_stays_above_its_bound(cases: dict[str, Posed]) -> None:
 
 
 def test_steps_that_do_not_suffice(cases: dict[str, Posed]) -> None:
-    problem, start = cases["touch_left"].problem, cases["touch_left"].start
+    problem, start = cases["clasp, unknown mounts"].problem, cases["clasp, unknown mounts"].start
     with pytest.raises(NoSolution, match=r"the lengths did not converge \(.* standard deviations to go\)"):
         solve(problem, start, 1)
     loose = solve(problem, start, 1, strict=False)
@@ -89,14 +89,14 @@ def test_many_small_ways_to_go_are_gone(cases: dict[str, Posed], monkeypatch: py
 
 
 def test_a_solution_is_not_evaluated_again(cases: dict[str, Posed]) -> None:
-    problem, start = cases["handle"].problem, cases["handle"].start
+    problem, start = cases["clasp, 5 s"].problem, cases["clasp, 5 s"].start
     fit = solve(problem, start)
     assert count_evaluations(lambda: solve(problem, fit)) == 0
     assert solve(problem, fit).x is fit.x
 
 
 def test_an_interruption_passes_through_casadi(cases: dict[str, Posed], monkeypatch: pytest.MonkeyPatch) -> None:
-    problem, start = cases["poses"].problem, cases["poses"].start
+    problem, start = cases["t_pose+bow"].problem, cases["t_pose+bow"].start
     calls = 0
 
     def interrupted(*arguments: object) -> object:
@@ -118,7 +118,7 @@ def test_where_a_quadratic_program_has_no_solution_it_goes_on_from_the_last_step
     cases: dict[str, Posed], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], factor: float
 ) -> None:
     """CasADi writes nothing meanwhile: a program that raises would print its matrices."""
-    problem, start = cases["touch_left"].problem, cases["touch_left"].start
+    problem, start = cases["clasp, unknown mounts"].problem, cases["clasp, unknown mounts"].start
     curvature, calls = solver._Oracle.curvature, 0
 
     def broken_once(oracle: solver._Oracle, z: np.ndarray) -> tuple[np.ndarray, ...]:

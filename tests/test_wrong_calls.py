@@ -214,7 +214,6 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "clasp_s": (*POSITIVE, None),
         "circles": (*COUNT, None),
         "protocol": (*NAME, None),
-        "pose_deg": (*NUMBER, None, -1.0),
     },
 }
 

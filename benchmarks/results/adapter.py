@@ -115,7 +115,7 @@ def simulated(
         rate_hz=rate_hz,
         protocol=protocol,
         clasp_s=20.0,
-        circles=0 if protocol == "poses" else 1,
+        circles=1,
         imperfections=replace({"ideal": IDEAL_PRESET, "mild": MILD_PRESET}[preset], mount=mount),
     )
     signals = {
@@ -128,8 +128,7 @@ def simulated(
         truth |= {f"{name}_{axis}": point[:, k] for k, axis in enumerate("xyz")}
     phases = {name: spans for name, spans in made.phases.items() if spans}
     session = Session(f"{preset}-{seed}", (Table(made.time, signals),), phases, truth=truth)
-    measured = {"handle": {"handle": 0.4}, "poses": {}}.get(protocol, {"shoulder_width": 0.0})
-    measured = {name: value or person.measured["shoulder_width"] for name, value in measured.items()}
+    measured = {"shoulder_width": person.measured["shoulder_width"]}
     return Simulated(session, made.quat_WS, measured, round(person.stature, 2), person.sex)
 
 

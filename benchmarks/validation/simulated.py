@@ -61,7 +61,7 @@ GROUPS = {
     "soft tissue off": ("soft_tissue_deg", "tissue_", "wobble_deg"),
     "breath, creep and slip of straps off": ("breath_deg", "creep_deg", "strap_slip_deg"),
     "shoulder girdle off": ("shoulder_wander", "girdle"),
-    "palm slip off": ("palm_slip", "handle_slip"),
+    "palm slip off": ("palm_slip",),
     "wrists straight": ("wrist_",),
     "elbows as hinges": ("carrying_angle", "elbow_abduction_deg"),
     "start pose exact": ("start_",),

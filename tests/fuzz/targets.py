@@ -243,7 +243,7 @@ right_wrist = { link = "right_hand", at = [0.0, 0.0, 0.0] }
 """
 LSL = b"imu-torso\n" + b"".join(b"gyr_%s\nrad/s\n" % a for a in (b"x", b"y", b"z")) + b"acc_x\ng\nacc_y\ng\nacc_z\ng"
 SUMMARY = b'{"recording": "a", "sensors": {"torso": {}}, "points": ["left_palm"], "warnings": ["b"]}'
-_PROTOCOLS = ("calibration/clasp.toml", "calibration/poses.toml", "calibration/handle.toml")
+_PROTOCOLS = ("calibration/clasp.toml", "calibration/t_pose.toml", "calibration/tip.toml")
 
 
 def _device(name: str, format: str) -> Callable[[Path, bytes], object]:

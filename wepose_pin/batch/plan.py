@@ -121,7 +121,7 @@ def _read_plan(path: Path, items_folder: str) -> Plan:
     top = TomlTable(read_toml(path, "a plan"), str(path))
     top.allow("name", "sessions", "subjects", "steps")
     steps = _read_steps(top, path.parent)
-    lengths = (*load_table().lengths, *_list_protocol_lengths(steps))
+    lengths = tuple(load_table().lengths)
     tables = top.table("subjects", {})
     subjects = {name: _read_subject(tables.table(name), path, lengths) for name in tables.values}
     named = [
@@ -224,15 +224,6 @@ def _check_step(step: str, options: Mapping[str, Any], keys: TomlTable) -> None:
         raise BadPlan(f"{keys.file}: {keys.place}{key} = {error.value}: {error.needed}") from None
     except WeposeError as error:
         raise BadPlan(f"{keys.file}: {keys.place.rstrip('.')}: {error}") from None
-
-
-def _list_protocol_lengths(steps: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
-    """Lengths besides those of the body that the protocol measures, such as a bar between the palms."""
-    if "calibrate" not in steps:
-        return ()
-    from ..calibration.protocols import DEFAULT, load_protocol
-
-    return tuple(load_protocol(steps["calibrate"]["protocol"] or DEFAULT).distances)
 
 
 # Subjects ------------------------------------------------------------------------------------------------------------

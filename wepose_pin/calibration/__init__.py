@@ -3,10 +3,10 @@
 `lengths` is the calibration from a recording to a subject. `protocols` describes what a person does, `problem` collects
 inputs and samples, `chain` is the model's chains in CasADi, `least_squares` unknowns and residuals, `solver` the
 problem and its solution by `nlpsol`, `priors` what is known before. `initial_headings` and `contact` give the initial
-guess, `joints` adds what accelerations observe of headings, `sample_losses` what lost samples change, `weights` weighs
-the samples, `alternatives` searches other minima, `anatomy` checks sensors and mounts. `paper` is the published
-calibration of the lengths alone. `series` calibrates several sessions of one person. `result` is what comes of it,
-`observability` and `quality` assess it.
+guess, `joints` adds what accelerations observe of headings, `sample_losses` finds the samples connected with the start
+pose, `weights` weighs the samples, `alternatives` searches other minima, `anatomy` checks sensors and mounts. `paper`
+is the published calibration of the lengths alone. `fusion` adds an earlier calibration of the person. `result` is what
+comes of it, `observability` and `quality` assess it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from .protocols import PROTOCOLS, Protocol, load_protocol
     from .quality import CalibrationQuality, Check, assess, document
     from .result import Calibration
-    from .series import calibrate_sessions
 
 # Loaded on first use: tracking takes protocols and conditions from here, and does not need CasADi.
 _WHERE = {
@@ -33,7 +32,6 @@ _WHERE = {
     "Protocol": "protocols",
     "assess": "quality",
     "calibrate": "lengths",
-    "calibrate_sessions": "series",
     "document": "quality",
     "load_protocol": "protocols",
 }
@@ -47,7 +45,6 @@ __all__ = [
     "Protocol",
     "assess",
     "calibrate",
-    "calibrate_sessions",
     "document",
     "load_protocol",
 ]

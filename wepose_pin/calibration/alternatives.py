@@ -64,7 +64,7 @@ def find_alternatives(
     best = solve_from(fit.x[rows])
     std = np.sqrt(np.diag(np.linalg.inv(fit.information))[rows])
     alternatives: list[Alternative] = []
-    closed = observations.take(observations.closed).apply_steps(fit.x)
+    closed = observations.take(observations.closed)
     for psi in find_distinct_headings(closed, fit.x, stated):
         other = solve_from(psi)
         offset = other.x - best.x

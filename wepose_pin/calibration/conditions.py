@@ -8,7 +8,7 @@ is the frame of such a segment that equals W in the start pose: of a person in t
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -66,9 +66,9 @@ class Loop:
 
 
 def choose_variant(closure: Closure, table: BodyTable) -> str:
-    """The variant of texts about a closure: its kind, "general" where it is not one of a person's hands."""
+    """The variant of texts about a closure: its kind, "general" where it is not one of a protocol for hands."""
     of_hands = closure.kind == "recorded" or set(closure.points) <= set(table.paths)
-    return closure.kind if of_hands and not table.is_mechanism else "general"
+    return closure.kind if of_hands and closure.kind != "fixed_point" and not table.is_mechanism else "general"
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ def resolve_conditions(
             axis = start.turn(condition.segment, (0.0, 1.0, 0.0))
             constraints.append(Level(condition.segment, axis, condition.std))
         else:
-            constraints.append(Moving(tuple(s for s in condition.segments or table.segments if s in sensors)))
+            constraints.append(Moving(tuple(segment for segment in table.segments if segment in sensors)))
     return tuple(constraints)
 
 
@@ -210,17 +210,12 @@ def _resolve_closure(
             f"protocol '{protocol.name}': no sensor moves {' and '.join(closure.points)}; a point that moves is needed"
         )
     between = {part.sensor for way in ways for part in way}
-    if closure.kind in ("coincide", "distance") and len(between) == 1:
+    if closure.kind == "coincide" and len(between) == 1:
         raise BadSession(
             f"protocol '{protocol.name}': {' and '.join(closure.points)} both move with the sensor on {between.pop()}, "
             f"so that their distance cannot change; points on two segments with sensors are needed"
         )
-    girdles = tuple(find_girdle_signs(model, points) for points in closure.ways)
-    if closure.on and closure.on not in sensors:
-        raise BadSession(f"protocol '{protocol.name}': no sensor on {closure.on}, on which a point stays; add it")
-    if closure.on and closure.at is not None:
-        closure = replace(closure, at=start.turn(closure.on, closure.at))
-    return Loop(closure, ways, girdles)
+    return Loop(closure, ways, tuple(find_girdle_signs(model, points) for points in closure.ways))
 
 
 def find_girdle_signs(model: BodyModel, points: Collection[tuple[str, float]]) -> tuple[tuple[str, float], ...]:
@@ -332,9 +327,8 @@ def _find_lengths_in(model: BodyModel, by_length: np.ndarray) -> list[str]:
 def find_segments(protocol: Protocol, model: BodyModel) -> frozenset[str]:
     """The segments whose orientation some condition of a protocol uses where all of them have sensors."""
     used = {condition.segment for condition in protocol.conditions if isinstance(condition, Direction | Axis)}
-    for motion in protocol.free_motions:
-        used |= set(motion.segments or model.table.needed)
-    used |= {closure.on for closure in protocol.closures if closure.on}
+    if protocol.free_motions:
+        used |= set(model.table.needed)
     if any(isinstance(condition, Direction) for condition in protocol.conditions):
         used.add(model.table.reference)
     for closure in protocol.closures:
@@ -348,9 +342,7 @@ def is_scale_observed(constraints: Collection[Constraint]) -> bool:
     """Whether the closures determine the scale: by a recorded or known place, or by a link of known size."""
     loops = [constraint for constraint in constraints if isinstance(constraint, Loop)]
     return any(
-        loop.kind == "recorded"
-        or (loop.closure.at is not None and not loop.closure.on)
-        or any(np.any(part.constant) for part in loop.parts)
+        loop.kind == "recorded" or loop.closure.at is not None or any(np.any(part.constant) for part in loop.parts)
         for loop in loops
     )
 

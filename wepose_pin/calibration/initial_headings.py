@@ -5,11 +5,10 @@ Poses show them directly: the azimuth at which an arm is raised, the axis about 
 Where two points coincide and all parts of the way between them but one hang vertically in the start pose, the closure
 is linear in lengths times headings. A hanging part's direction in its sensor's start world is v(t) = Q(t)(−e_z), and
 L Rz(ψ) v is linear in (L cos ψ, L sin ψ, L). So R_0(t) s + Σ ± L_i Rz(ψ_i) v_i(t) = 0, with s the other part at the
-start, such as the line between the shoulders, has its least-squares solution in the smallest singular vector. Beyond a
-heading step of the sensor, or of that of s, to which all others are relative, ψ is another unknown and L is the same.
+start, such as the line between the shoulders, has its least-squares solution in the smallest singular vector.
 
-A fixed point is nearly the same, but a torso that hardly turns solves it by itself (s = c, no arms); a distance or a
-plane is not linear at all. There the headings are searched: Gauss-Newton from many starts at once, over headings and
+A fixed point is nearly the same, but a torso that hardly turns solves it by itself (s = c, no arms); a plane shows one
+axis only. There the headings are searched: Gauss-Newton from many starts at once, over headings and
 the size of each sensor's part of the chain, with the prior's few per cent of uncertainty.
 """
 
@@ -46,13 +45,13 @@ class Coupling(NamedTuple):
 
 
 def estimate_headings(observations: Observations, x: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
-    """ψ [rad] of each sensor of the chain, then each heading step [rad], which is zero where the closure is not linear.
+    """ψ [rad] of each sensor of the chain.
 
     ψ turns the sensor's world to W, in which the body's start pose is known.
 
     Parameters
     ----------
-    x : (m,) with the lengths, points, heights and distances as known before
+    x : (m,) with the lengths, points and heights as known before
     stated : sensor → ψ [rad] of its stated mount
     """
     sensors = observations.layout.sensors
@@ -60,11 +59,11 @@ def estimate_headings(observations: Observations, x: np.ndarray, stated: Mapping
     if linear is not None:
         held = np.array([c is linear for c in observations.conditions])[observations.condition_index]
         return _solve_linear(observations.take(held), linear, x, stated)
-    known, steps = {**_solve_poses(observations, stated), **stated}, np.zeros(len(observations.layout.steps))
+    known = {**_solve_poses(observations, stated), **stated}
     if observations.closed.any() and not set(sensors) <= set(known):
         minima = _find_minima(observations, x, known, NEARER)
-        return np.append(minima[0, : len(sensors)], steps)
-    return np.append([known.get(name, 0.0) for name in sensors], steps)
+        return minima[0, : len(sensors)]
+    return np.array([known.get(name, 0.0) for name in sensors])
 
 
 def find_linear(conditions: Sequence[Constraint]) -> Loop | None:
@@ -111,77 +110,30 @@ def _solve_poses(observations: Observations, stated: Mapping[str, float]) -> dic
 
 
 def _solve_linear(observations: Observations, loop: Loop, x: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:
-    """ψ of each sensor and each heading step [rad], from the smallest singular vector of the closure."""
+    """ψ [rad] of each sensor, from the smallest singular vector of the closure; a stated one as it is."""
     layout = observations.layout
     lengths, (first, *others) = x[layout.length], loop.parts
     rotations = _rotations(observations)
-    columns, parts = [rotations[first.sensor].as_matrix()], []
+    columns = [rotations[first.sensor].as_matrix()]
     for other in others:
         v = rotations[other.sensor].apply([0.0, 0.0, float(np.sign(other.vector(lengths)[2]))])
         zero = np.zeros(len(v))
-        part = _group_by_steps(observations, other.sensor, first.sensor)
-        parts.append(part)
-        across = np.stack((np.column_stack((v[:, 0], v[:, 1], zero)), np.column_stack((-v[:, 1], v[:, 0], zero))), 2)
-        columns += [across * (part == k)[:, None, None] for k in range(part.max() + 1)]
+        columns.append(
+            np.stack((np.column_stack((v[:, 0], v[:, 1], zero)), np.column_stack((-v[:, 1], v[:, 0], zero))), 2)
+        )
         columns.append(np.column_stack((zero, zero, v[:, 2]))[:, :, None])
     A = np.concatenate(columns, axis=2).reshape(3 * observations.data.shape[1], -1)
     z = np.linalg.svd(A, full_matrices=False)[2][-1]
-    sizes = [2 * (int(part.max()) + 1) for part in parts]
-    ends = 3 + np.cumsum([size + 1 for size in sizes])
-    if z[ends - 1].sum() < 0.0:  # lengths are positive; their mirror image solves it as well
-        z = -z
+    solved = z[3:].reshape(-1, 3)  # L cos ψ, L sin ψ, L of each other sensor
+    if solved[:, 2].sum() < 0.0:  # lengths are positive; their mirror image solves it as well
+        z, solved = -z, -solved
     known = first.vector(lengths)
-    reference = np.arctan2(known[1], known[0]) - np.arctan2(z[1], z[0])  # turns s to its direction
-    solved = [z[end - 1 - size : end - 1].reshape(-1, 2) for end, size in zip(ends, sizes, strict=True)]
-    # (m − 1, n) ψ and steps of each sensor at each sample, less the reference's steps
-    relative = {
-        other.sensor: (np.arctan2(xy[:, 1], xy[:, 0]) + reference)[part]
-        for other, xy, part in zip(others, solved, parts, strict=True)
+    reference = float(np.arctan2(known[1], known[0]) - np.arctan2(z[1], z[0]))  # turns s to its direction
+    headings = {
+        other.sensor: float(np.arctan2(xy[1], xy[0]) + reference) for other, xy in zip(others, solved, strict=True)
     }
-    n = observations.data.shape[1]
-    headings = np.array([relative.get(name, np.full(n, stated.get(name, 0.0))) for name in layout.sensors])
-    k = layout.sensors.index(first.sensor)
-    headings[k] = reference
-    return _separate_steps(observations, headings, k, stated)
-
-
-def _group_by_steps(observations: Observations, name: str, reference: str) -> np.ndarray:
-    """(n,) which samples have the same heading of a sensor relative to the reference, numbered from 0 on."""
-    steps = zip(observations.layout.steps, observations.beyond, strict=True)
-    between = [row for sensor, row in steps if sensor in (name, reference)]
-    if not between:
-        return np.zeros(observations.data.shape[1], dtype=int)
-    return np.unique(np.array(between), axis=1, return_inverse=True)[1].ravel()
-
-
-def _separate_steps(
-    observations: Observations, headings: np.ndarray, reference: int, stated: Mapping[str, float]
-) -> np.ndarray:
-    """ψ of each of the m sensors and each step [rad], of `headings` (m, n) relative to the reference at each sample.
-
-    The steps are solved from the start pose outwards: ψ is that before any of them, or the `stated` one.
-    """
-    layout, beyond = observations.layout, observations.beyond
-    index = np.array([layout.sensors.index(name) for name in layout.steps], dtype=int)
-    steps, known = np.zeros(len(index)), np.zeros(len(index), dtype=bool)
-    psi = np.array([stated.get(name, np.nan) for name in layout.sensors])
-    psi[reference] = headings[reference, 0]
-    for k in np.argsort(beyond.sum(axis=0), kind="stable") if len(index) else [0]:
-        passed_steps = beyond[:, k]
-        psi = np.where(np.isnan(psi), headings[:, k], psi)
-        if known[passed_steps].all():
-            continue
-        passed = np.bincount(index[passed_steps], steps[passed_steps], len(psi))
-        off = _within_half_turn(headings[:, k] - psi - passed + passed[reference])
-        new = passed_steps & ~known
-        old = np.setdiff1d(np.arange(len(psi)), [reference, *index[new]])
-        turn = 0.0  # of the reference, back
-        if reference in index[new] and len(old):
-            turn = float(np.angle(np.exp(1j * off[old]).sum()))
-        for step in np.flatnonzero(new):
-            steps[step] = -turn if index[step] == reference else _within_half_turn(off[index[step]] - turn)
-        known |= passed_steps
-    return np.append(psi, steps)
+    headings = {**headings, **stated, first.sensor: reference}
+    return np.array([headings.get(name, 0.0) for name in layout.sensors])
 
 
 def find_distinct_headings(observations: Observations, x: np.ndarray, known: Mapping[str, float]) -> np.ndarray:
@@ -189,7 +141,7 @@ def find_distinct_headings(observations: Observations, x: np.ndarray, known: Map
 
     Parameters
     ----------
-    x : (n,) with the lengths, points, heights and distances
+    x : (n,) with the lengths, points and heights
     known : sensor → ψ [rad] from a mount or a pose; the others may be anywhere
     """
     minima = _find_minima(observations, x, known, MINIMA)
@@ -231,7 +183,7 @@ def _find_minima(
             parts.append((loop, Q, u, still))
 
     def closure_residuals(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return _closure_residuals(x, parts, observations, known_x[layout.distances])
+        return _closure_residuals(x, parts)
 
     is_known = np.array([name in known for name in sensors])
     center = np.array([known.get(name, 0.0) for name in sensors] + [0.0] * m)
@@ -271,11 +223,9 @@ def _descend(
     return x, cost
 
 
-def _closure_residuals(
-    x: np.ndarray, parts: list, observations: Observations, distances: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _closure_residuals(x: np.ndarray, parts: list) -> tuple[np.ndarray, np.ndarray]:
     """Residuals (starts, r) of the closures and their Jacobian (starts, r, 2 sensors), for `x` (starts, 2 sensors)."""
-    m, sensors = x.shape[1] // 2, observations.layout.sensors
+    m = x.shape[1] // 2
     psi, size = x[:, :m], np.exp(x[:, m:])
     rs, Js = [], []
     for loop, Q, u, still in parts:
@@ -292,33 +242,15 @@ def _closure_residuals(
 
         parts_W, J = turned(Qb), np.concatenate([turned(slope), turned(Qb)], axis=1)  # (B, m, n, 3), (B, 2m, n, 3)
         gap = parts_W.sum(axis=1) + still
-        if loop.closure.on:
-            gap, J = _see_from(gap, J, Q, psi, sensors.index(loop.closure.on))
-        if loop.kind == "fixed_point" and loop.closure.at is not None and not loop.closure.on:
+        if loop.kind == "fixed_point" and loop.closure.at is not None:
             gap = gap - np.array(loop.closure.at)
         elif loop.kind in ("fixed_point", "plane"):
             gap, J = gap - gap.mean(axis=1, keepdims=True), J - J.mean(axis=2, keepdims=True)
         if loop.kind == "plane":
             gap, J = gap[..., 2:], J[..., 2:]
-        if loop.kind == "distance":
-            length = np.linalg.norm(gap, axis=2) + 1e-9
-            J = np.einsum("bkni,bni->bkn", J, gap / length[:, :, None])[..., None]
-            gap = (length - distances[observations.layout.distance_names.index(loop.closure.distance)])[..., None]
         rs.append(gap.reshape(len(x), -1) / GAP_STD)
         Js.append(J.reshape(len(x), 2 * m, -1).swapaxes(1, 2) / GAP_STD)
     return np.concatenate(rs, axis=1), np.concatenate(Js, axis=1)
-
-
-def _see_from(gap: np.ndarray, J: np.ndarray, Q: np.ndarray, psi: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gaps (B, n, 3) and their Jacobian (B, 2m, n, 3) in W, seen from the k-th sensor's segment, M = Rz(ψ) Q Rz(−ψ)."""
-    turn = Rotation.from_rotvec(psi[:, k, None] * [0.0, 0.0, 1.0]).as_matrix()
-    M = np.einsum("bij,njk,blk->bnil", turn, Q[k], turn)
-    inner, slope = np.einsum("bnji,bnj->bni", M, gap), np.einsum("bnji,bsnj->bsni", M, J)
-    # dMᵀ/dψ g = e_z × Mᵀ g − Mᵀ (e_z × g)
-    across = np.stack([-gap[..., 1], gap[..., 0], 0.0 * gap[..., 2]], axis=-1)
-    turned = np.stack([-inner[..., 1], inner[..., 0], 0.0 * inner[..., 2]], axis=-1)
-    slope[:, k] += turned - np.einsum("bnji,bnj->bni", M, across)
-    return inner, slope
 
 
 def estimate_joint_headings(

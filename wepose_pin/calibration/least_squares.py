@@ -4,12 +4,12 @@ For each sensor i the filter gives R_VS(t) in a world V of its own heading, and 
 the frame of its segment that equals W in the start pose (L' in `conditions`). With a start pose that is ε off the
 stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
 
-    R_WL(t) = Rz(ψ + d τ + s) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
+    R_WL(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
 
-with ψ the heading, d its drift since the start, s its steps where samples were lost since (`sample_losses`), and A the
-soft-tissue artefact: soft tissue rotates a sensor as the direction of gravity in the segment changes. A segment's
-points may move, as the shoulders do by collarbones and shoulder blades while the arms are raised (`model.girdle`). d,
-s, A and the hinges are nuisance parameters: the covariance of lengths and mounts includes their effect.
+with ψ the heading, d its drift since the start, and A the soft-tissue artefact: soft tissue rotates a sensor as the
+direction of gravity in the segment changes. A segment's points may move, as the shoulders do by collarbones and
+shoulder blades while the arms are raised (`model.girdle`). d, A and the hinges are nuisance parameters: the covariance
+of lengths and mounts includes their effect.
 
 Each sample belongs to one condition of the protocol. A closure (`Loop`) gives the gap, whitened by the covariance that
 errors of the orientations and slipping palms give it, and of each hinge the angle by which the segment that it moves
@@ -22,13 +22,12 @@ not apply are zero.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..model.girdle import PARAMETERS, displace
 from ..model.reaches import UNIVERSE
@@ -51,8 +50,6 @@ class Layout:
     hinges, girdles : between segments of these sensors
     fixed : number of unknown fixed points
     planes : number of level planes of unknown height
-    distance_names : of the unknown distances outside the body
-    steps : the sensor of each heading step
     recorded : the samples have a recorded place
     rigid : sensors without a soft-tissue artefact
     attitude_std : [rad] of each sensor's orientation about an axis across its segment; only the ratios matter
@@ -64,8 +61,6 @@ class Layout:
     girdles: tuple[GirdleTerm, ...] = ()
     fixed: int = 0
     planes: int = 0
-    distance_names: tuple[str, ...] = ()
-    steps: tuple[str, ...] = ()
     recorded: bool = False
     rigid: tuple[str, ...] = ()
     attitude_std: tuple[float, ...] = ()
@@ -121,18 +116,8 @@ class Layout:
         return slice(self.points.stop, self.points.stop + self.planes)
 
     @cached_property
-    def distances(self) -> slice:
-        """Distances outside the body [m]."""
-        return slice(self.heights.stop, self.heights.stop + len(self.distance_names))
-
-    @cached_property
-    def step(self) -> slice:
-        """Steps of headings [rad]."""
-        return slice(self.distances.stop, self.distances.stop + len(self.steps))
-
-    @cached_property
     def size(self) -> int:
-        return self.step.stop
+        return self.heights.stop
 
     @cached_property
     def rows(self) -> int:
@@ -140,14 +125,9 @@ class Layout:
         return self.place.stop + 1
 
     @cached_property
-    def beyond(self) -> slice:
-        """Of a sample's data: whether it is beyond each heading step."""
-        return slice(4 * len(self.sensors), 4 * len(self.sensors) + len(self.steps))
-
-    @cached_property
     def place(self) -> slice:
         """Of a sample's data: the recorded place (3,) [m] in W."""
-        return slice(self.beyond.stop, self.beyond.stop + 3 * self.recorded)
+        return slice(4 * len(self.sensors), 4 * len(self.sensors) + 3 * self.recorded)
 
     @cached_property
     def residuals(self) -> int:
@@ -167,10 +147,9 @@ class Observations:
     """n samples, each of one condition."""
 
     layout: Layout
-    data: np.ndarray  # (rows, n): Q of each sensor xyzw, `Layout.beyond`, `Layout.place`, [s] since the start pose
+    data: np.ndarray  # (rows, n): Q of each sensor xyzw, `Layout.place`, [s] since the start pose
     conditions: tuple[Constraint, ...]
     condition_index: np.ndarray  # (n,) number of each sample's condition, in ascending order
-    step_std: np.ndarray = field(default_factory=lambda: np.empty(0))  # [rad] of each step, before the motion
 
     def __len__(self) -> int:
         return self.data.shape[1]
@@ -178,21 +157,6 @@ class Observations:
     def take(self, columns: np.ndarray) -> Observations:
         """Return some of the samples: ascending numbers, or bool (n,)."""
         return replace(self, data=self.data[:, columns], condition_index=self.condition_index[columns])
-
-    @property
-    def beyond(self) -> np.ndarray:
-        """(steps, n) bool: which samples are beyond each heading step."""
-        return self.data[self.layout.beyond] > 0.5
-
-    def apply_steps(self, x: np.ndarray) -> Observations:
-        """Return the same samples with the heading steps of `x` applied to Q, and without steps among the unknowns."""
-        data = self.data.copy()
-        for name, step, beyond in zip(self.layout.steps, x[self.layout.step], self.beyond, strict=True):
-            i = 4 * self.layout.sensors.index(name)
-            Q = Rotation.from_quat(data[i : i + 4, beyond].T)
-            data[i : i + 4, beyond] = (Rotation.from_rotvec([0.0, 0.0, step]) * Q).as_quat().T
-        data = np.delete(data, self.layout.beyond, axis=0)
-        return replace(self, layout=replace(self.layout, steps=()), data=data, step_std=np.empty(0))
 
     def spans(self) -> list[tuple[Constraint, slice]]:
         """Return each condition with the slice of its samples."""
@@ -262,9 +226,6 @@ def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any
     quat_WL = {}
     for i, name in enumerate(sensors):
         now = heading[i] + drift[i] * data[-1]
-        for k, sensor in enumerate(layout.steps):
-            if sensor == name:
-                now += x[layout.step.start + k] * data[layout.beyond.start + k]
         turned = product(about_z(now), data[4 * i : 4 * i + 4])
         turned = product(turned, about_z(-heading[i]))
         quat = product(turned, small_turn(ca.vertcat(tilt[2 * i], tilt[2 * i + 1], 0.0)))
@@ -327,22 +288,16 @@ def _closure_residual(
     `place` is the number of its unknown point or plane, `recorded` (3) [m] the sample's recorded place.
     """
     gaps, covariances = [], []
-    names, on = [term.name for term in layout.girdles], loop.closure.on
+    names = [term.name for term in layout.girdles]
     for way, girdles in zip(loop.ways, loop.girdles, strict=True):
         gap, covariance = ca.SX.zeros(3), loop.closure.slip**2 * ca.SX.eye(3)
         for name, sign in girdles:
             if name in names:
                 gap += sign * _displace_girdle(layout, x, quat_WL, names.index(name))
-        others = ca.SX.zeros(3)
         for sensor, v in orient_parts(layout, x, quat_WL, way):
             gap += v
-            if sensor not in (UNIVERSE, on):
-                others += v
+            if sensor != UNIVERSE:
                 covariance += _spread(layout, sensor, v)
-        if on:  # in the segment's frame an error of its own sensor rotates all other parts
-            inward = inverse(quat_WL[on])
-            R = ca.horzcat(*(rotate(inward, ca.DM(axis)) for axis in np.eye(3)))
-            gap, covariance = R @ gap, R @ (covariance + _spread(layout, on, others)) @ R.T
         gaps.append(gap)
         covariances.append(covariance)
     if loop.kind == "plane":
@@ -351,10 +306,6 @@ def _closure_residual(
         missing = GAP_ROWS - len(off)
         return ca.vertcat(*rows, *[0.0] * missing), ca.vertcat(*off, *[0.0] * missing)
     [gap], [covariance] = gaps, covariances
-    if loop.kind == "distance":
-        size = ca.norm_2(gap)
-        off = size - x[layout.distances][layout.distance_names.index(loop.closure.distance)]
-        return ca.vertcat(off / ca.sqrt(gap.T @ covariance @ gap) * size, 0.0, 0.0), off * gap / size
     if loop.kind == "fixed_point":
         first = layout.points.start + 3 * place
         gap -= x[first : first + 3]

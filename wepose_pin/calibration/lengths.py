@@ -23,7 +23,7 @@ a length of the chain is known as it is on a robot, which decides the form of th
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -44,18 +44,18 @@ from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
 from .anatomy import BETTER, LabelCheck, check_labels
-from .conditions import Level, Pointing, find_hinges, find_measured_lengths, group_lengths, is_scale_observed
+from .conditions import Level, Pointing, find_hinges, group_lengths, is_scale_observed
 from .contact import find_initial_guess
+from .fusion import fuse_calibrations, separate_mounts
 from .initial_headings import Coupling, estimate_joint_headings
 from .joints import add_couplings, estimate_couplings
 from .least_squares import HINGE_STD, Gaussian, Observations, place_points, residuals
-from .observability import diagnose_closures, diagnose_distances, diagnose_lengths, diagnose_mounts
+from .observability import diagnose_closures, diagnose_lengths, diagnose_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .priors import build_prior, combine_lengths
 from .problem import LOOSE, SAMPLE_RATE_HZ, CalibrationProblem
 from .protocols import Protocol, choose_protocol, load_protocol
 from .result import Calibration
-from .sessions import fuse_sessions, separate_mounts
 from .solver import MIN_LENGTH
 from .weights import (
     CONTRADICTED,
@@ -72,7 +72,7 @@ from .weights import (
 
 # One standard deviation [m] of a length measured over the skin, where the user gives none.
 MEASURED_STD = 0.003
-MEASURED_RANGE = 0.02, 1.0  # [m] of lengths and distances that a user may measure
+MEASURED_RANGE = 0.02, 1.0  # [m] of lengths that a user may measure
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
 
 
@@ -98,8 +98,7 @@ def calibrate(
         With the phases of the protocol, "clasp" for joined hands.
     measured : mapping, optional
         Name → [m] that was measured on the person: a length of the body such as "shoulder_width"; the breadth
-        "biacromial", from which a length follows; or a distance that the protocol names. Without any the scale is the
-        prior's.
+        "biacromial", from which a length follows. Without any the scale is the prior's.
     prior : Subject, optional
         Lengths with covariance, and mounts, as known before; None: `population_subject()`, which the person's stature
         and sex narrow, as in ``population_subject(1.78, "f")``. The subject of an earlier calibration is combined with
@@ -128,7 +127,7 @@ def calibrate(
     ------
     BadOption
         An unknown protocol, method or formulation; a measured name that is no length of the body, an implausible value,
-        or none where one is needed.
+        or none with the formulation "paper".
     BadSession, BadPhase
         The recording lacks a sensor or a phase that the protocol needs.
     BadModel
@@ -158,7 +157,7 @@ def calibrate(
             f"docs/models.md shows"
         )
     protocol.check_body(table)
-    _check_measured(measured or {}, protocol, model)
+    _check_measured(measured or {}, model)
     with_std = convert_breadths(measured or {}, table, measured_std)
     for segment in protocol.needs:
         if segment not in recording.sensors:
@@ -168,7 +167,6 @@ def calibrate(
             )
     prior = prior or population_subject(body=model)
     prior.check_body(table)
-    _check_fixed_scale(with_std, protocol, model)
     if formulation == "paper":
         check_paper_formulation(protocol, model, with_std, recording.sensors, recording.start_pose)
     for condition in protocol.conditions:
@@ -183,14 +181,14 @@ def calibrate(
         return solve_paper_calibration(problem).state_quality()
     calibration = _calibrate_checked(problem)
     if earlier is not None and not calibration.labels.moved:
-        fused = fuse_sessions([earlier, calibration.subject], prior, problem.measured, table)
+        fused = fuse_calibrations(earlier, calibration.subject, prior, problem.measured, table)
         calibration = replace(calibration, subject=fused, prior=earlier)
     return calibration.state_quality()
 
 
-def _check_measured(measured: Mapping[str, float], protocol: Protocol, model: BodyModel) -> None:
-    """Raises `BadOption` where what is measured is no length, breadth or distance, or not plausible."""
-    names, (low, high) = (*model.lengths, *list_breadths(model.table), *protocol.distances), MEASURED_RANGE
+def _check_measured(measured: Mapping[str, float], model: BodyModel) -> None:
+    """Raises `BadOption` where what is measured is no length or breadth, or not plausible."""
+    names, (low, high) = (*model.lengths, *list_breadths(model.table)), MEASURED_RANGE
     for name, metres in measured.items():
         if name not in names:
             raise BadOption(f"measured {name}: not a length; {one_of(names, name)}")
@@ -198,22 +196,12 @@ def _check_measured(measured: Mapping[str, float], protocol: Protocol, model: Bo
             raise BadOption(f"measured {name}={metres:g}: a length in metres is needed, between {low} and {high}")
 
 
-def _check_fixed_scale(measured: Collection[str], protocol: Protocol, model: BodyModel) -> None:
-    """Raises `BadOption` where the protocol needs a measured length and none is of its chain."""
-    chain = find_measured_lengths(protocol, model)
-    if len(set(measured) & set(chain)) < protocol.min_measured:
-        raise BadOption(
-            f"protocol '{protocol.name}' needs {protocol.min_measured} measured length of its chain, as in --measured "
-            f"{protocol.measured_example}; {one_of(chain)}"
-        )
-
-
 def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
     """The calibration without the mounts and poses that gravity or the motion contradicts, its labels checked."""
     wrong = problem.mounts_against_gravity()
     unused = [_diagnose_unused_mount(name, angle, MAX_MOUNT_ERROR_DEG) for name, angle in wrong.items()]
     problem = problem.remove_mounts(wrong)
-    problem.check_start_pose()
+    problem.observe()  # raises where a phase is too short, before anything is estimated
     _check_free_motion(problem)
     stated = solve_calibration(problem, quick=True)
     doubt = stated.limbs().doubt()
@@ -385,11 +373,6 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1) if len(lengths) else float("nan")
     # A length outside the chain, such as the trunk where the hands are joined, does not fix its scale.
     scale_lengths = [name for name in problem.measured if name in (problem.lengths_in_closures or layout.lengths)]
-    scale_lengths += protocol.distances
-    measured = dict(problem.measured)
-    measured |= {
-        c.distance: (c.metres, c.metres_std) for c in protocol.closures if c.distance and c.distance not in measured
-    }
     bending = observations.bending
     hinges = _hinges(fit.hinge[bending], fit.x[layout.hinge], problem) if bending.any() else {}
     offsets = Rotation.from_rotvec(np.pad(fit.x[layout.tilt].reshape(-1, 2), ((0, 0), (0, 1)))).as_rotvec()[:, :2]
@@ -406,12 +389,11 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
     gap[~observations.closed] = prior_gap[~observations.closed] = np.nan
     touching = observations.closed & (contact > MIN_CONTACT)
 
-    diagnostics = list(problem.filtered.diagnostics)
+    diagnostics = [*problem.filtered.diagnostics, *problem.diagnose_losses()]
     prior_lengths_cov = np.linalg.inv(solution.prior.information[layout.length, layout.length])
     if not scale_observed:
         free_scale_std = None if scale_lengths else scale_std
         diagnostics += diagnose_lengths(problem, lengths, covariance, prior_lengths_cov, free_scale_std)
-    diagnostics += diagnose_distances(problem)
     diagnostics += diagnose_ambiguity(solution.alternatives, layout)
     diagnostics += diagnose_mounts([name for name in problem.filtered.R_VS if name not in subject.mounts], problem)
     diagnostics += diagnose_closures(recording.time[samples], contact, observations, problem.model)
@@ -438,7 +420,7 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
         protocol=protocol.name,
         closure=next((closure.kind for closure in protocol.closures), ""),
         measured_example=problem.measured_example,
-        measured_lengths=compare_measured(fit, layout, measured),
+        measured_lengths=compare_measured(fit, layout, problem.measured),
         posed=compare_posed(
             observations,
             solution.result,

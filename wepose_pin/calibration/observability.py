@@ -82,15 +82,6 @@ def _is_first(problem: CalibrationProblem, length: str) -> bool:
     return all(segment is None or segments[segment].spine for segment in above)
 
 
-def diagnose_distances(problem: CalibrationProblem) -> list[Diagnostic]:
-    """Distances of the protocol that were not measured."""
-    return [
-        Diagnostic("protocol-distance-assumed", INFO, c.distance, c.metres, facts={"metres": f"{c.metres:g}"})
-        for c in problem.protocol.closures
-        if c.distance and c.distance not in problem.measured
-    ]
-
-
 def diagnose_mounts(segments: Sequence[str], problem: CalibrationProblem) -> list[Diagnostic]:
     """Sensors whose mount neither the session states nor this protocol estimates."""
     diagnostics = []

@@ -20,10 +20,10 @@ from .conditions import Loop
 from .initial_headings import estimate_headings
 from .least_squares import Gaussian, Layout, Observations, place_points
 from .problem import CalibrationProblem
-from .sample_losses import FREE_STD, HEADING_STD
 
 # Priors, one standard deviation. A stated mount names sensor axes, estimated by eye.
 STATED_STD = np.deg2rad(10.0)  # [rad] of a stated mount's heading
+HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of an unknown heading: the whole circle
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
 LEAST_SOFT_TISSUE = 1e-4  # [rad/rad] about an axis that a table states as rigid
 LEAST_GIRDLE_STD = 1e-5  # [m] of a parameter that a table states as exact
@@ -41,17 +41,10 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     layout = observations.layout
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
     _add_shape(mean, information, problem, layout)
-    for name, row in zip(layout.distance_names, range(layout.size)[layout.distances], strict=True):
-        stated = next(c for c in observations.conditions if isinstance(c, Loop) and c.closure.distance == name).closure
-        mean[row], std = problem.measured.get(name, (stated.metres, stated.metres_std))
-        information[row, row] = std**-2
     _add_places(mean, information, observations)
 
     stated_headings = problem.stated_headings(layout.sensors)
     headings = estimate_headings(observations, mean, stated_headings)
-    free = observations.step_std > FREE_STD
-    mean[layout.step] = np.where(free, headings[len(layout.sensors) :], 0.0)
-    information[layout.step, layout.step] = np.diag(np.where(free, HEADING_STD, observations.step_std) ** -2.0)
     for i, name in enumerate(layout.sensors):
         rows = [layout.tilt.start + 2 * i, layout.tilt.start + 2 * i + 1, layout.heading.start + i]
         mean[rows[2]] = stated_headings.get(name, headings[i])

@@ -11,11 +11,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
 from ..model import BodyModel, Segment, list_breadths
 from ..model.start_pose import compute_start_configuration, orient_links
-from ..recording import Intervals, Recording
+from ..recording import Intervals, Recording, format_span
 from ..subject import Subject
 from .conditions import (
     Constraint,
@@ -29,11 +30,10 @@ from .conditions import (
     find_measured_lengths,
     resolve_conditions,
 )
-from .initial_headings import find_linear
 from .least_squares import Layout, Observations
 from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 from .recorded import read_recorded_places
-from .sample_losses import check_start_pose, find_sample_losses, find_unknown_tilt, group_steps, mask_connected
+from .sample_losses import SampleLoss, find_sample_losses, mask_connected
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
@@ -56,7 +56,7 @@ class CalibrationProblem:
     filtered : the orientations of its sensors, each in its own world
     protocol : what the person did in which phase
     prior : lengths with their covariance, and mounts
-    measured : name of a length, or of a distance of the protocol → value and standard deviation [m]
+    measured : name of a length → value and standard deviation [m]
     model : the body
     loose : phases whose poses are not used, as they contradict all else
     """
@@ -133,7 +133,7 @@ class CalibrationProblem:
         used = set[str]()
         for condition in self.conditions:
             if isinstance(condition, Loop):
-                used |= {part.sensor for part in condition.parts} | {condition.closure.on}
+                used |= {part.sensor for part in condition.parts}
             elif isinstance(condition, Moving):
                 used |= set(condition.segments)
             else:
@@ -235,7 +235,7 @@ class CalibrationProblem:
         Raises
         ------
         BadPhase
-            A condition has too few samples at which all its sensors are measured.
+            A condition has too few samples at which all sensors measure, connected with the start pose.
         """
         recording, filtered, protocol = self.recording, self.filtered, self.protocol
         stride = max(1, round(recording.rate_hz / rate_hz))
@@ -247,69 +247,89 @@ class CalibrationProblem:
             find_girdles(self.model, start, sensors),
             sum(closure.kind == "fixed_point" for closure in protocol.closures),
             sum(closure.kind == "plane" for closure in protocol.closures),
-            protocol.distances,
             recorded=any(closure.kind == "recorded" for closure in protocol.closures),
             rigid=tuple(name for name in sensors if not any(self.model.table.segments[name].soft_tissue_std)),
             attitude_std=tuple(_estimate_attitude_std(self.model.table.segments[name]) for name in sensors),
         )
-        losses = find_sample_losses(recording, filtered.start, layout.sensors)
-        # Only the linear start can estimate a heading step of any size.
-        linear, free = find_linear(self.conditions), [loss for loss in losses if loss.free]
         parts, places = [], []
-        gaps = {name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None}
         for condition, constraint in zip(protocol.conditions, self.conditions, strict=True):
-            spans = [recording.span(interval) for interval in self.intervals(condition)]
-            separate = [] if constraint is linear else free
-            # Intervals may overlap: each sample counts once.
-            phase = np.unique(np.concatenate([np.arange(len(recording))[span] for span in spans]))[::stride]
-            missing = {name: gap[phase] for name, gap in gaps.items()}
-            for name in {loss.sensor for loss in losses}:
-                missing[name] = missing[name] | find_unknown_tilt(filtered.orientation[name], phase)
-            lost = [name for name, rows in missing.items() if rows.any()]
-            measured = phase[~np.any([missing[name] for name in lost], axis=0)] if lost else phase
-            measured = measured[mask_connected(separate, measured)]
+            phase = self._find_samples(condition, stride)
+            measured = phase[self._mask_measured(phase) & mask_connected(self._losses, phase)]
             place = np.zeros((len(measured), 3))
             unseen = ""
             if isinstance(constraint, Loop) and constraint.kind == "recorded":
                 place = read_recorded_places(recording, constraint.closure, recording.time[measured])
                 known = np.isfinite(place).all(axis=1)
-                unseen = "" if known.all() else f"; {np.sum(~known)} more are without a recorded place"
+                if not known.all():
+                    unseen = f"; {np.sum(~known) * stride / recording.rate_hz:.1f} s more are without a recorded place"
                 measured, place = measured[known], place[known]
             parts.append(measured)
             places.append(place)
-            if len(parts[-1]) < MIN_SAMPLES * rate_hz / SAMPLE_RATE_HZ:
-                lost += [loss.sensor for loss in separate if loss.beyond(measured).any()]
-                place_name = f"phases.{condition.phase}" if condition.phase else "the motion"
+            if len(measured) < MIN_SAMPLES * rate_hz / SAMPLE_RATE_HZ:
+                better = "five seconds" if isinstance(constraint, Pointing | Level) else "a minute"
+                seconds = len(measured) * stride / recording.rate_hz
                 raise BadPhase(
-                    f"{recording.where()}: {place_name} holds {len(parts[-1])} samples at "
-                    f"{SAMPLE_RATE_HZ:g} Hz; at least {MIN_SAMPLES} are needed"
-                    + (", better five seconds" if isinstance(constraint, Pointing | Level) else ", better a minute")
-                    + (
-                        f"; lost in the others: {', '.join(f'sensors.{n}' for n in dict.fromkeys(lost))}"
-                        if lost
-                        else ""
-                    )
-                    + (", or their tilt is not known again" if losses else "")
-                    + unseen
+                    f"{recording.where()}: {_name_phase(condition)} has {seconds:.1f} s in which all sensors measure; "
+                    f"at least {MIN_SAMPLES / SAMPLE_RATE_HZ:g} s are needed, better {better}{unseen}"
+                    f"{self._describe_losses(phase)}"
                 )
         samples = np.concatenate(parts)
-        steps, step_std, beyond = group_steps(losses, samples)
-        layout = replace(layout, steps=steps)
         rotations_since_start = [
             (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
         ]
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         recorded = np.concatenate(places).T if layout.recorded else np.empty((0, len(samples)))
-        data = np.vstack([*rotations_since_start, beyond, recorded, recording.time[samples] - filtered.start[1]])
-        return Observations(layout, data, self.conditions, condition_index, step_std), samples
+        data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - filtered.start[1]])
+        return Observations(layout, data, self.conditions, condition_index), samples
 
-    def check_start_pose(self) -> None:
-        """Raise `BadPhase` where lost samples keep the motion from showing a mount that is not known."""
-        observations, samples = self.observe()
-        sensors = observations.layout.sensors
-        unknown = [name for name in sensors if self.mount(name) is None]
-        losses = find_sample_losses(self.recording, self.filtered.start, sensors)
-        check_start_pose(self.recording, losses, samples, unknown, self.model.table.reference, MIN_SAMPLES)
+    @cached_property
+    def _losses(self) -> list[SampleLoss]:
+        return find_sample_losses(self.recording, self.filtered.start, self.sensors)
+
+    def _find_samples(self, condition: Condition, stride: int) -> np.ndarray:
+        """Return the numbers (n,) of the samples in which a condition holds, every `stride`-th."""
+        spans = [self.recording.span(interval) for interval in self.intervals(condition)]
+        # Intervals may overlap: each sample counts once.
+        return np.unique(np.concatenate([np.arange(len(self.recording))[span] for span in spans]))[::stride]
+
+    def _mask_measured(self, samples: np.ndarray) -> np.ndarray:
+        """Return (n,) bool: all sensors measured these samples (n,)."""
+        gaps = [sensor.gap[samples] for sensor in self.recording.sensors.values() if sensor.gap is not None]
+        return ~np.any(gaps, axis=0) if gaps else np.ones(len(samples), dtype=bool)
+
+    def _describe_losses(self, phase: np.ndarray) -> str:
+        """Return what a refusal says of losses between the start pose and the samples (n,) of a phase."""
+        between = [loss for loss in self._losses if loss.beyond(phase).any()]
+        if not between:
+            return ""
+        worst = max(between, key=lambda loss: np.count_nonzero(loss.beyond(phase)))
+        span = format_span(self.recording.time[[worst.first, worst.last]])
+        return (
+            f"; sensors.{worst.sensor} is lost from {span}, and its heading with it: name a start pose and a motion "
+            f"with nothing lost between them, or record again"
+        )
+
+    def diagnose_losses(self) -> list[Diagnostic]:
+        """Return what is not used of each phase, as a sensor was lost between it and the start pose."""
+        diagnostics, rate_hz = [], self.recording.rate_hz
+        for condition in self.protocol.conditions:
+            phase = self._find_samples(condition, 1)
+            unused = ~mask_connected(self._losses, phase)
+            if unused.any():
+                worst = max(self._losses, key=lambda loss: np.count_nonzero(loss.beyond(phase)))
+                facts: dict[str, float | str] = {
+                    "phase": _name_phase(condition),
+                    "seconds": len(phase) / rate_hz,
+                    "start": float(self.recording.time[worst.first]),
+                    "end": float(self.recording.time[worst.last]),
+                }
+                value = float(unused.sum() / rate_hz)
+                diagnostics.append(Diagnostic("samples-not-connected", WARNING, worst.sensor, value, facts=facts))
+        return diagnostics
+
+
+def _name_phase(condition: Condition) -> str:
+    return f"phases.{condition.phase}" if condition.phase else "the motion"
 
 
 def _estimate_attitude_std(segment: Segment) -> float:

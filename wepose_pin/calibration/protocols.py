@@ -3,16 +3,15 @@
 A ``calibration/<name>.toml`` lists steps for the person and conditions for the solver. Points, segments and lengths are
 those of the body's table (`wepose_pin.model.BodyTable`). There are four kinds of conditions:
 
-- ``[[closure]]``: two points coincide (``kind = "coincide"``) or keep a distance (``"distance"``), one stays at a point
-  of W or of a segment (``"fixed_point"``), unknown or stated by ``at``, points move on a level plane of unknown height
-  (``"plane"``), or a point is where the session's truth recorded it (``"recorded"``). All of them show lengths and
-  headings by motion.
+- ``[[closure]]``: two points coincide (``kind = "coincide"``), one stays at a point of W (``"fixed_point"``), unknown
+  or stated by ``at``, points move on a level plane of unknown height (``"plane"``), or a point is where the session's
+  truth recorded it (``"recorded"``). All of them show lengths and headings by motion.
 - ``[[motion]]``: limbs move freely. Hinges show headings and mounts, accelerations that two sensors share at a joint
   show headings; nothing shows lengths.
 - ``[[pose]]``: segments point in given directions of the body's first segment; `std_deg` is how well a person does it.
 - ``[[axis]]``: a segment bends forwards about its own y, as the torso in a bow; `std_deg` is how far people are off.
 
-Names joined by "+", as in ``clasp+elbows``, are one protocol after another in the same session.
+Names joined by "+", as in ``clasp+t_pose``, are one protocol after another in the same session.
 
 The residual of a pose does not show how exactly it was taken, so its weight is stated; that of a closure is measured.
 """
@@ -33,39 +32,36 @@ from ..documents import is_number, read_toml
 from ..errors import BadOption, one_of
 from ..model import BodyTable, list_breadths
 
-PROTOCOLS = (
-    "bow",
-    "clasp",
-    "clasp_measured",
-    "elbows",
-    "feet",
-    "free",
-    "handle",
-    "poses",
-    "swing",
-    "t_pose",
-    "table",
-    "tip",
-    "touch_body",
-    "touch_left",
-    "touch_right",
-)
+PROTOCOLS = ("bow", "clasp", "free", "t_pose", "table", "tip")
+_OF_CLASP = "clasp with a measured length, as in --measured biacromial=0.41"
+_OWN = "a protocol of your own whose point stays at a fixed place (docs/closure.md)"
+# Protocols of earlier versions → what to do instead.
+REMOVED = {
+    "clasp_measured": _OF_CLASP,
+    "elbows": "clasp+t_pose",
+    "feet": _OWN,
+    "handle": _OF_CLASP,
+    "poses": "t_pose+bow",
+    "swing": "clasp+t_pose",
+    "touch_body": "clasp+t_pose",
+    "touch_left": _OWN,
+    "touch_right": _OWN,
+}
 DEFAULT = "clasp"
 GUIDED, BOW = "clasp+t_pose", "bow"  # the best of docs/protocols.md in a minute; for whom hands alone are not enough
 ALSO = ("t_pose", BOW)  # what makes it better within the same minute, by phases of their names
 # How many points each kind takes, and the keys that are its own.
-KINDS = {"coincide": (2,), "distance": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}
+KINDS = {"coincide": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}
 _KEYS = ("phase", "kind", "points", "slip", "in_front_of")
 _OWN_KEYS: dict[str, tuple[str, ...]] = {
-    "distance": ("distance", "metres", "metres_std"),
-    "fixed_point": ("at", "at_std", "on", "origin"),
+    "fixed_point": ("at", "at_std", "origin"),
     "recorded": ("origin",),
 }
 
 
 @dataclass(frozen=True)
 class Closure:
-    """Points that stay together, at a distance, on a point of W, on a level plane, or where they were recorded.
+    """Points that stay together, at a point of W, on a level plane, or where they were recorded.
 
     Parameters
     ----------
@@ -73,10 +69,7 @@ class Closure:
     kind : one of `KINDS`
     points : of the body
     slip : [m] one standard deviation, each axis, of what holds only nearly; sets the weights' shape, not their size
-    distance : its name, as in ``--measured handle=0.4``; empty for other kinds
-    metres, metres_std : the distance where the user gives none, and one standard deviation [m]
-    at, at_std : (3,) [m] the fixed point in W, or in the segment `on`, and its standard deviation, where it is known
-    on : the segment to which the fixed point belongs; empty: W
+    at, at_std : (3,) [m] the fixed point in W, and its standard deviation, where it is known
     origin : the point from which a recorded place or the fixed point is counted; empty: the root
     in_front_of : segment behind which a person does not bring the points; empty: they may be anywhere
     """
@@ -85,24 +78,20 @@ class Closure:
     kind: str
     points: tuple[str, ...]
     slip: float = PALM_SLIP_STD
-    distance: str = ""
-    metres: float = 0.0
-    metres_std: float = 0.003
     at: tuple[float, float, float] | None = None
     at_std: float = 0.005
-    on: str = ""
     origin: str = ""
     in_front_of: str = ""
 
     @property
     def rows(self) -> int:
         """How many residuals a sample has."""
-        return {"distance": 1, "plane": len(self.points)}.get(self.kind, 3)
+        return len(self.points) if self.kind == "plane" else 3
 
     @property
     def ways(self) -> tuple[tuple[tuple[str, float], ...], ...]:
         """Each way that it closes, as a signed sum of points."""
-        if self.kind in ("coincide", "distance"):
+        if self.kind == "coincide":
             return (((self.points[0], 1.0), (self.points[1], -1.0)),)
         if self.origin:
             return (((self.points[0], 1.0), (self.origin, -1.0)),)
@@ -135,11 +124,9 @@ class FreeMotion:
     Parameters
     ----------
     phase : of the session; empty: from the start pose on
-    segments : whose sensors take part; empty: all
     """
 
     phase: str
-    segments: tuple[str, ...] = ()
 
 
 Condition = Closure | Direction | Axis | FreeMotion
@@ -165,7 +152,6 @@ class Protocol:
     needs : segments that must carry a sensor
     steps : for the person
     conditions : for the solver
-    min_measured : how many lengths of the chain the user must measure
     measured_example : the length that fixes the scale best, as ``name=metres``; empty: any
     """
 
@@ -174,7 +160,6 @@ class Protocol:
     needs: tuple[str, ...]
     steps: tuple[Step, ...]
     conditions: tuple[Condition, ...]
-    min_measured: int = 0
     measured_example: str = ""
 
     @property
@@ -184,11 +169,6 @@ class Protocol:
     @property
     def free_motions(self) -> tuple[FreeMotion, ...]:
         return tuple(c for c in self.conditions if isinstance(c, FreeMotion))
-
-    @property
-    def distances(self) -> tuple[str, ...]:
-        """Names of distances outside the body that the user can measure."""
-        return tuple(dict.fromkeys(c.distance for c in self.closures if c.distance))
 
     def check_body(self, table: BodyTable) -> None:
         """Raise `BadOption` where the body lacks a point or a segment of the protocol."""
@@ -203,11 +183,10 @@ class Protocol:
                 if point not in table.points:
                     raise BadOption(f"{where}'{point}' is no point of {table.name}; {one_of(table.points, point)}")
         named = [c.segment for c in self.conditions if isinstance(c, Direction | Axis)]
-        named += [segment for motion in self.free_motions for segment in motion.segments]
-        named += [segment for c in self.closures for segment in (c.in_front_of, c.on) if segment]
+        named += [closure.in_front_of for closure in self.closures if closure.in_front_of]
         table.check_segments((*named, *self.needs), where, BadOption)
         measured = self.measured_example.partition("=")[0]
-        if measured and measured not in (*table.lengths, *list_breadths(table), *self.distances):
+        if measured and measured not in (*table.lengths, *list_breadths(table)):
             raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")
 
 
@@ -231,6 +210,8 @@ def load_protocol(name: str | Path) -> Protocol:
     if len(names) > 1:
         return _join_protocols(str(name), [load_protocol(each) for each in names])
     own = str(name).endswith(".toml")
+    if name in REMOVED:
+        raise BadOption(f"protocol '{name}' is no longer there; use {REMOVED[str(name)]}")
     if not own and name not in PROTOCOLS:
         raise BadOption(
             f"protocol '{name}' is not known; {one_of(PROTOCOLS, str(name))}; or the path of a .toml of one's own"
@@ -261,14 +242,13 @@ def _join_protocols(name: str, protocols: list[Protocol]) -> Protocol:
         tuple(dict.fromkeys(segment for protocol in protocols for segment in protocol.needs)),
         tuple(step for each in steps for step in each),
         tuple(condition for protocol in protocols for condition in protocol.conditions),
-        max(protocol.min_measured for protocol in protocols),
         next((protocol.measured_example for protocol in protocols if protocol.measured_example), ""),
     )
 
 
 def _protocol(table: dict[str, Any], path: Path) -> Protocol:
     lists = ("step", "closure", "pose", "axis", "motion")
-    known = ("name", "title", "needs", "min_measured", "measured_example", *lists)
+    known = ("name", "title", "needs", "measured_example", *lists)
     for key, value in table.items():
         if key not in known:
             raise BadOption(f"{path}: '{key}' is no key of a protocol; {one_of(known, key)}")
@@ -299,10 +279,9 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
     for i, entry in enumerate(table.get("motion", [])):
         place = f"{path}: motion {i + 1}"
         for key in entry:
-            if key not in ("phase", "segments"):
-                raise BadOption(f"{place}: '{key}' is no key of a motion; {one_of(('phase', 'segments'), key)}")
-        segments = tuple(str(segment) for segment in _list({"segments": [], **entry}, "segments", place))
-        conditions.append(FreeMotion(str(entry.get("phase", "")), segments))
+            if key != "phase":
+                raise BadOption(f"{place}: '{key}' is no key of a motion; {one_of(('phase',), key)}")
+        conditions.append(FreeMotion(str(entry.get("phase", ""))))
     if not conditions:
         raise BadOption(f"{path}: no [[closure]], [[pose]], [[axis]] or [[motion]]; a protocol needs one at least")
     needs = tuple(str(segment) for segment in _list({"needs": [], **table}, "needs", str(path)))
@@ -314,8 +293,7 @@ def _protocol(table: dict[str, Any], path: Path) -> Protocol:
     name = str(table.get("name", path.stem))
     measured_example = str(table.get("measured_example", ""))
     title = str(table.get("title", name))
-    min_measured = round(_number({"min_measured": 0, **table}, "min_measured", str(path), 0, 20))
-    return Protocol(name, title, needs, tuple(steps), tuple(conditions), min_measured, measured_example)
+    return Protocol(name, title, needs, tuple(steps), tuple(conditions), measured_example)
 
 
 def _closure(entry: dict[str, Any], place: str) -> Closure:
@@ -329,8 +307,6 @@ def _closure(entry: dict[str, Any], place: str) -> Closure:
         if key not in known:
             raise BadOption(f"{place}: '{key}' is no key of kind '{kind}'; {one_of(known, key)}")
     more: dict[str, Any] = {"in_front_of": str(entry.get("in_front_of", ""))}
-    if kind == "fixed_point":
-        more["on"] = str(entry.get("on", ""))
     if kind in ("recorded", "fixed_point"):
         more["origin"] = str(entry.get("origin", ""))
         if more["origin"] in points:
@@ -343,11 +319,6 @@ def _closure(entry: dict[str, Any], place: str) -> Closure:
         more["at_std"] = _number({"at_std": Closure.at_std, **entry}, "at_std", place, 1e-5, 1.0)
     if "slip" in entry:
         more["slip"] = _number(entry, "slip", place, 1e-4, 0.1)
-    if kind == "distance":
-        more["distance"] = str(_get(entry, "distance", place))
-        more["metres"] = _number(entry, "metres", place, 0.02, 2.0)
-        if "metres_std" in entry:
-            more["metres_std"] = _number(entry, "metres_std", place, 1e-5, 0.1)
     return Closure(str(_get(entry, "phase", place)), kind, points, **more)
 
 

@@ -105,9 +105,8 @@ def solve_reweighted(
             if isinstance(closure, Loop):
                 r = fit.closure[span, : closure.rows]
                 contact[span] = _estimate_contact(r, MIN_LATE_CONTACT if k > 1 else MIN_CONTACT)
-                least = max(correlation, _correlate_all(closure, span))
-                weights[span, :3] = _weigh(r, contact[span], least)
-                effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], least)
+                weights[span, :3] = _weigh(r, contact[span], correlation)
+                effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], correlation)
         if observations.layout.hinges and not quick:
             weights[closed, GAP_ROWS:] = _weigh(fit.hinge[closed], np.ones(int(closed.sum())), correlation)
     fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, not quick)
@@ -120,11 +119,6 @@ def _measure_bend(observations: Observations, span: slice, level: Level) -> floa
     x, y, _, _ = observations.data[first : first + 4, span]
     cosine = 1.0 - 2.0 * (x**2 + y**2)
     return max(float(np.sqrt(np.mean(1.0 - cosine**2))), LEAST_BEND)
-
-
-def _correlate_all(loop: Loop, span: slice) -> int:
-    """The samples of a closure whose errors are one: of a palm on the body, whose wrist bends as the elbow moves."""
-    return span.stop - span.start if loop.closure.on else 0
 
 
 def _estimate_contact(r: np.ndarray, least: float) -> np.ndarray:
@@ -190,8 +184,7 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
             # The fit has reduced the residuals: their variance gets back what it took.
             size = np.sum(r[span][:, rows] ** 2, axis=1) + np.einsum("nki,ij,nkj->n", slope, C, slope, optimize=True)
             variance = max(float(share @ size) / (len(rows) * float(share.sum())), LEAST_VARIANCE)
-            all_alike = _correlate_all(condition, span) if isinstance(condition, Loop) and rows != hinges else 0
-            duration = round(count_correlated_samples(r[span][:, rows] * share[:, None], max(least, all_alike)))
+            duration = round(count_correlated_samples(r[span][:, rows] * share[:, None], least))
             summed = np.concatenate((np.zeros((1, *pull.shape[1:])), np.cumsum(pull, axis=0)))
             ends = np.arange(1, len(pull) + duration)
             windows = summed[np.minimum(ends, len(pull))] - summed[np.maximum(ends - duration, 0)]
@@ -203,11 +196,9 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
 def compare_measured(
     fit: Fit, layout: Layout, measured: Mapping[str, tuple[float, float]]
 ) -> dict[str, MeasuredLength]:
-    """Each measured length or distance, name → ([m], its standard deviation [m]), beside the solution without it."""
+    """Each measured length, name → ([m], its standard deviation [m]), beside the solution without it."""
     C, compared = np.linalg.inv(fit.information), {}
-    rows = dict(zip(layout.lengths, range(layout.size), strict=False)) | dict(
-        zip(layout.distance_names, range(layout.size)[layout.distances], strict=True)
-    )
+    rows = {name: row for row, name in enumerate(layout.lengths)}
     for name, (metres, std) in measured.items():
         variance = C[rows[name], rows[name]]
         rest = 1.0 / variance - 1.0 / std**2  # information without that of the measured length

@@ -17,7 +17,6 @@ EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
 COLOURS = {"pass": "green", "poor": "yellow", "fail": "red"}
 GAPS = {
     "coincide": "Gap between {}",
-    "distance": "Error of the distance between {}",
     "fixed_point": "Gap from {} to its place",
     "plane": "Height of {} off the plane",
     "recorded": "Gap from {} to its recorded place",
@@ -30,8 +29,6 @@ def run(job: CalibrateJob) -> int:
         outcome = run_calibrate(job, progress)
     calibration, quality, protocol = outcome.calibration, outcome.quality, outcome.protocol
     print_diagnostics([*quality.further, *outcome.page_failures])
-    for path, each in outcome.others:
-        say(f"{path}: quality {each.quality}")
     of_people = outcome.prior.is_population and not calibration.model.table.is_mechanism
     prior_name = "population prior" if of_people else "prior"
     print_lengths(
@@ -52,7 +49,7 @@ def run(job: CalibrateJob) -> int:
         say_pages(job.out, {"Report": "report.html"})
     say(f"Subject: {job.out / 'subject.toml'}  {job.out / 'subject.urdf'}  {job.out / 'calibration.json'}")
     _print_quality(quality)
-    return max(EXIT_CODES[each.quality] for each in (quality, *(each for _, each in outcome.others)))
+    return EXIT_CODES[quality.quality]
 
 
 def _print_mounts(calibration: Calibration) -> None:
@@ -88,7 +85,7 @@ COMMAND = Command(
     CalibrateJob,
     run,
     example="calibrate session.toml --measured biacromial=0.41 --stature 1.78 --sex f -o anna",
-    arguments=("session", "further"),
+    arguments=("session",),
     exit_codes="0 quality pass, 3 poor, 4 fail, by the limits in docs/calibrate.md; the files are written in all three "
     "cases; 2 invalid input, nothing is written.",
 )

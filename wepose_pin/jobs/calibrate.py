@@ -31,20 +31,14 @@ class CalibrateJob:
     session : SESSION
         The recording: session.toml, or the folder that holds it. It names the phases of the protocol, such as clasp, in
         which the palms are held together.
-    further : SESSION…
-        Further sessions of the same person, of the same protocol. Lengths and shoulders come from all of them, mounts
-        from the last one.
     out : DIR
         Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
     protocol : NAME|FILE.toml
         Calibrate by this protocol. Without it clasp, and t_pose and bow as well where the session has those phases (not
         with --formulation paper). Protocols:
-        clasp (hands together), clasp_measured (the same with a measured length), handle (hands on a bar of known
-        length), touch_left or touch_right (one palm on a fixed point), table (both palms on a table), tip (of a robot's
-        arm or another chain: its point "tip" on a fixed point), feet (of a body with legs: both on the floor),
-        touch_body (palms on hips, shoulders, head), poses (T-pose and bow: determines headings and no lengths), t_pose,
-        bow, elbows (elbows bend), swing (arms swing), free (any motion, no protocol: headings and mounts alone), or a
-        file of your own, made like those in calibration/.
+        clasp (hands together), t_pose (arms held sideways), bow (the trunk bends forwards), table (both palms on a
+        table), tip (of a robot's arm or another chain: its point "tip" on a fixed point), free (any motion, no
+        protocol: headings and mounts alone), or a file of your own, made like those in calibration/.
         Several in one session are joined by +, as in clasp+t_pose.
     model : NAME|FILE
         Calibrate this body: a name (upper_body, whole_body), a table of a body (.toml), or a URDF beside its table
@@ -53,7 +47,7 @@ class CalibrateJob:
         Use this measured length; may be given several times. biacromial=0.41 is the breadth over the acromions, the
         bony edges on top of the shoulders, which a tape reaches: the distance of the shoulder joints is 0.83 ± 0.03 of
         it. The other names are those of [lengths] in subject.toml, such as left_forearm: from joint centre to joint
-        centre. With --protocol handle also handle=0.42, the distance of the palms on the bar.
+        centre.
     formulation
         Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
         priors) or paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the
@@ -94,7 +88,6 @@ class CalibrateJob:
     gaps: bool = False
     report: bool = True
     force: bool = False
-    further: tuple[Path, ...] = ()
 
     def check(self) -> None:
         """Raise `WeposeError` where an option is wrong whatever the session holds."""
@@ -105,10 +98,6 @@ class CalibrateJob:
 
         load_protocol(self.protocol or DEFAULT)
         check_stature(self.stature)
-        if self.further and self.formulation != "full":
-            raise WrongOption(
-                "formulation", self.formulation, "takes one session; several are calibrated together by full alone"
-            )
         if self.prior is not None and (self.stature is not None or self.sex is not None):
             raise WrongOption(
                 "prior", self.prior, "has the lengths of a person; --stature and --sex narrow those of the population"
@@ -119,30 +108,23 @@ class CalibrateJob:
 
 
 def _check_measured(job: CalibrateJob, model: BodyModel) -> None:
-    """Raise `WrongOption` where a length is measured that neither the body nor the protocol has."""
-    from ..calibration import PROTOCOLS, load_protocol
-    from ..calibration.protocols import DEFAULT
+    """Raise `WrongOption` where a length is measured that the body does not have."""
     from ..model import list_breadths
 
-    known = (*model.lengths, *list_breadths(model.table), *load_protocol(job.protocol or DEFAULT).distances)
+    known = (*model.lengths, *list_breadths(model.table))
     for name, metres in job.measured.items():
-        stated = f"{name}={metres:g}"
-        others = [each for each in PROTOCOLS if name in load_protocol(each).distances]
-        if name not in known and others:
-            raise WrongOption("measured", stated, f"a distance of --protocol {others[0]}, which is not given")
         if name not in known:
-            raise WrongOption("measured", stated, f"'{name}' is not a length; {one_of(known, name)}")
+            raise WrongOption("measured", f"{name}={metres:g}", f"'{name}' is not a length; {one_of(known, name)}")
 
 
 class CalibrateOutcome(NamedTuple):
     """What came of a `CalibrateJob`."""
 
     calibration: Calibration
-    quality: CalibrationQuality  # of the last session
+    quality: CalibrationQuality
     protocol: Protocol
     prior: Subject
     page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
-    others: tuple[tuple[Path, CalibrationQuality], ...] = ()  # the sessions before the last one
 
 
 def run_calibrate(
@@ -159,7 +141,7 @@ def run_calibrate(
     WeposeError
         What the session, the protocol or an option lacks.
     """
-    from ..calibration import assess, calibrate, calibrate_sessions, load_protocol
+    from ..calibration import assess, calibrate, load_protocol
     from ..calibration.protocols import choose_protocol
     from ..model.body import load_sensed_model
     from ..readers import load_session
@@ -174,27 +156,23 @@ def run_calibrate(
     job.check()
     with result_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
-        recordings = [load_session(session, gaps=job.gaps) for session in (job.session, *job.further)]
-        recording = recordings[-1]
+        recording = load_session(job.session, gaps=job.gaps)
         protocol = load_protocol(job.protocol or choose_protocol(recording.phases, job.formulation))
         model = load_sensed_model(job.model or recording.model or None, recording.sensors, recording.where())
         _check_measured(job, model)
         prior = read_subject(job.prior) if job.prior is not None else None
         prior = prior or population_subject(job.stature, job.sex, model)
         progress("calibrating", 1 / 3)
-        options: dict[str, Any] = {
-            "measured": dict(job.measured),
-            "prior": prior,
-            "model": model,
-            "protocol": job.protocol,
-            "method": job.method,
-        }
-        if job.further:
-            *before, calibration = calibrate_sessions(recordings, **options)
-        else:
-            before, calibration = [], calibrate(recording, formulation=job.formulation, **options)
+        calibration = calibrate(
+            recording,
+            measured=dict(job.measured),
+            prior=prior,
+            model=model,
+            protocol=job.protocol,
+            method=job.method,
+            formulation=job.formulation,
+        )
         quality = assess(calibration)
-        others = tuple((path, assess(each)) for path, each in zip((job.session, *job.further), before, strict=False))
         write_subject(folder, calibration.subject, calibration.body)
         if provenance is None:
             provenance = collect_provenance("calibrate", field_values(job))
@@ -205,4 +183,4 @@ def run_calibrate(
         failures = write_calibration_page(
             job.out, calibration, recording, method=job.method, protocol=protocol, quality=quality
         )
-    return CalibrateOutcome(calibration, quality, protocol, prior, failures, others)
+    return CalibrateOutcome(calibration, quality, protocol, prior, failures)

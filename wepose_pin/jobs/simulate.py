@@ -26,9 +26,9 @@ CIRCLES = 6  # drawn by the right hand after the protocol
 class SimulateJob:
     """Simulate the recording of a person with five sensors, or fifteen on the whole body, and its known truth.
 
-    The person stands in the start pose, does the motion of the protocol, then draws circles with the right hand (not
-    after poses). The sensors have the noise and bias of an Xsens MTi-3. Continue with `wepose calibrate DIR --measured
-    ...` and `wepose track DIR`; after walk or sit with `wepose track DIR --model whole_body`.
+    The person stands in the start pose, does the motion of the protocol, then draws circles with the right hand.
+    The sensors have the noise and bias of an Xsens MTi-3. Continue with `wepose calibrate DIR --measured ...` and
+    `wepose track DIR`; after walk or sit with `wepose track DIR --model whole_body`.
 
     Parameters
     ----------
@@ -40,9 +40,8 @@ class SimulateJob:
     rate_hz : HZ
         Sample the sensors at this rate, 20 to 2000 Hz.
     protocol : NAME
-        Simulate the motion of this calibration protocol (see `wepose calibrate --help`): clasp, handle, touch_left,
-        touch_right, poses; or bow, clasp, elbows, swing, t_pose, touch_body, one or several joined by +. Without it
-        clasp+t_pose, or clasp alone for less than 30 s.
+        Simulate the motion of this calibration protocol (see `wepose calibrate --help`): clasp, t_pose, bow, or
+        several of them joined by +. Without it clasp+t_pose, or clasp alone for less than 30 s.
     activity
         Simulate an activity in place of a protocol. Of the whole body, with sensors on pelvis, head, hands and legs
         too: walking on the spot (walk), or sitting down and standing up (sit). Of the upper body: reaches, rests and
@@ -70,7 +69,7 @@ class SimulateJob:
         (offsets of the start pose); others: breath_deg (pitch of the torso's sensor), creep_deg (a strap in 10 min),
         strap_slip_deg, wobble_deg (per g), upper_arm_place and forearm_place (of the sensor, share of the length),
         girdle_hysteresis (share of elevation), elbow_abduction_deg, start_heading_deg (torso against W), sway_tilt_deg,
-        wrist_flexion_deg, wrist_deviation_deg, handle_slip [m], gyro_warm_up_deg_s (of the bias, in 15 min),
+        wrist_flexion_deg, wrist_deviation_deg, gyro_warm_up_deg_s (of the bias, in 15 min),
         clock_drift_ppm.
     force
         Replace the files of an earlier run in DIR.
@@ -88,9 +87,11 @@ class SimulateJob:
 
     def check(self) -> None:
         """Raise `BadOption` where a number is out of its range, or an imperfection is none."""
-        from ..simulation.tasks import find_task
+        from ..calibration import load_protocol
+        from ..simulation.sequence import find_task
 
         check_seed(self.seed)
+        load_protocol(self.protocol or PROTOCOL)
         find_task(self.protocol or PROTOCOL)
         if not 20.0 <= self.rate_hz <= 2000.0:
             raise BadOption(f"--rate-hz {self.rate_hz:g}: between 20 and 2000 samples a second")
@@ -179,7 +180,7 @@ def run_simulate(job: SimulateJob, progress: Progress = no_progress) -> Simulate
                 imperfections=job.imperfections(),
                 clasp_s=seconds,
                 protocol=job.protocol or (PROTOCOL if seconds >= LEAST_S else SHORT_PROTOCOL),
-                circles=0 if job.protocol == "poses" else CIRCLES,
+                circles=CIRCLES,
             )
         turned = job.imperfections().start_heading_deg > 0.0  # tracking's W faces where the torso does
         truth = simulation.truth_facing_torso() if turned else simulation.truth()

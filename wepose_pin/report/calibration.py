@@ -143,7 +143,6 @@ def _describe_contact(protocol: Protocol, calibration: Calibration) -> _Contact:
         return _Contact(protocol.name, points, f"the {plain(points[0])}", f"{each[0]} to its point", chain)
     noun, gap = {
         "coincide": (f"the joined {nouns}", " to ".join(each)),
-        "distance": (f"the {nouns} on the {closure.distance}", f"{several} against the {closure.distance}"),
         "plane": (f"the {nouns}", f"{several} against the plane"),
     }.get(closure.kind, (f"the {nouns}", f"{several} to their points"))
     return _Contact(protocol.name, points, noun, gap, chain)

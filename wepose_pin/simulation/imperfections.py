@@ -85,7 +85,6 @@ class Imperfections:
         whole sway has 0.3 deg [assumption]
     wrist_flexion_deg, wrist_deviation_deg : of the hands against straight wrists, rms over the clasp; four parts
         follow the distance of the hands from the chest, three wander (as 0.8 : 0.6). People: 12, 8 [assumption]
-    handle_slip : [m] as `palm_slip`, which it replaces, of hands on a handle. People: 4 mm [assumption]
     gyro_warm_up_deg_s : most change of the bias in the first 15 min, log-uniform from a tenth of it. People: 0.2, a
         sensor that warms by 5 to 10 K under its strap, with data sheets of BMI055, BMI160, ICM-20602, ICM-42688
     clock_drift_ppm : standard deviation of each clock's rate. People: 5, after synchronisation
@@ -128,7 +127,6 @@ class Imperfections:
     sway_tilt_deg: float = 0.0
     wrist_flexion_deg: float = 0.0
     wrist_deviation_deg: float = 0.0
-    handle_slip: float = 0.0  # [m]
     gyro_warm_up_deg_s: float = 0.0
     clock_drift_ppm: float = 0.0
 
@@ -198,7 +196,6 @@ PEOPLE_PRESET = replace(
     sway_tilt_deg=0.22,
     wrist_flexion_deg=12.0,
     wrist_deviation_deg=8.0,
-    handle_slip=0.004,
     gyro_warm_up_deg_s=0.2,
     clock_drift_ppm=5.0,
 )

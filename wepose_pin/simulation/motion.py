@@ -176,14 +176,13 @@ def _turn_to(vectors: np.ndarray, directions: np.ndarray) -> Rotation:
 
 
 class Motion(BodyMotion):
-    """The motion of a protocol, with torso and arms; `tasks` holds those of other protocols than the clasp."""
+    """The motion of a protocol, with torso and arms; `sequence` has those of other protocols than the clasp."""
 
     phase = "clasp"
-    leads = True  # the palms lead the arms
     lean_deg: float | np.ndarray = 15.0  # yaw, pitch, roll of the torso in the clasp
 
-    def prepare(self, rng: np.random.Generator, pose_deg: float) -> None:
-        """Draw what a protocol needs beyond the clasp; `pose_deg` is the error of poses about each axis."""
+    def prepare(self, rng: np.random.Generator) -> None:
+        """Draw what a protocol needs beyond the clasp."""
 
     def protocol_phases(self) -> dict[str, list[tuple[float, float]]]:
         """Return the phases between start and circles: phase → intervals [s]."""
@@ -236,13 +235,9 @@ class Motion(BodyMotion):
         grid = np.arange(*self.clasp, 0.05)
         gate = make_pulse(grid, *self.clasp, _RAMP_S)
         rms = np.array([np.sqrt(np.mean((gate * wander(grid)) ** 2)) for wander in flaws.slip])
-        self.slip_gain = self._slip(flaws.sizes) / np.sqrt(3.0) / rms
+        self.slip_gain = flaws.sizes.palm_slip / np.sqrt(3.0) / rms
 
-    def _slip(self, sizes: Imperfections) -> float:
-        """Return the slip of the palms, rms [m]."""
-        return sizes.palm_slip
-
-    def fit_to_person(self, rng: np.random.Generator, pose_deg: float) -> None:
+    def fit_to_person(self, rng: np.random.Generator) -> None:
         """Prepare the motion; where shoulders and wrists move, hands stay as near as the arms then need.
 
         Raises
@@ -252,11 +247,11 @@ class Motion(BodyMotion):
         """
         flaws = self.flaws
         if not flaws.iterates:
-            self.prepare(rng, pose_deg)
+            self.prepare(rng)
             return
         self.least_flexion, self.most_missing = _PERSON_LEAST_FLEXION, _MOST_MISSING
         for self.rounds, flaws.slack in _REACHES:
-            self.prepare(deepcopy(rng), pose_deg)
+            self.prepare(deepcopy(rng))
             grid, clasp_t = np.arange(*self.span, 0.05), np.arange(*self.clasp, 0.05)
             moving = self._motion_share(clasp_t)
             distance = np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1)
@@ -306,9 +301,7 @@ class Motion(BodyMotion):
         """Return R_WT from `lean` (n, 3) [rad]: yaw, pitch, roll."""
         return turn_about("ZYX", lean)
 
-    def _palms(
-        self, _t: np.ndarray, _motion_share: np.ndarray, clasp_T: np.ndarray, _R_WT: Rotation
-    ) -> dict[str, np.ndarray]:
+    def _palms(self, _t: np.ndarray, _motion_share: np.ndarray, clasp_T: np.ndarray) -> dict[str, np.ndarray]:
         """Return the position (n, 3) [m] in T of each palm before the right one moves to the table."""
         return {"left": clasp_T, "right": clasp_T}
 
@@ -319,10 +312,6 @@ class Motion(BodyMotion):
     def _free(self, _t: np.ndarray, _side: str) -> FreeArm | None:
         """Return what an arm does while its palm is led nowhere; None: it hangs."""
         return None
-
-    def _aim_swivel(self, _t: np.ndarray, _side: str, swivel: np.ndarray) -> np.ndarray:
-        """Return the swivel (n,) [rad] of an elbow; `swivel` is that of the clasp."""
-        return swivel
 
     def _arm(self, side: str, palm_T: np.ndarray, swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:
         """Upper arm in T and elbow flexion [rad] to bring the palm to `palm_T` (n, 3) [m], from the shoulder.
@@ -370,7 +359,7 @@ class Motion(BodyMotion):
         centred_T = self._clasp_point(t, moving)
         clasp_T = centred_T + self.lengths["trunk"] * E_Z
         hand_W = self.table_W + sum((c.offset_W(t, self.table_W) for c in self.circles), np.zeros((len(t), 3)))
-        palm_T = self._palms(t, moving, clasp_T, R_WT)
+        palm_T = self._palms(t, moving, clasp_T)
         palm_T["right"] = palm_T["right"] + table[:, None] * (R_WT.inv().apply(hand_W) - palm_T["right"])
         if self.slip_gain.any():
             slip_T = moving[:, None] * np.column_stack(
@@ -380,7 +369,7 @@ class Motion(BodyMotion):
         swivel, pronation = {}, {}
         for side in SIDES:
             wander = self.wander[f"{side}_swivel"](t)
-            swivel[side] = self._aim_swivel(t, side, np.deg2rad(35.0 + 30.0 * (moving + 0.3 * circling) * wander))
+            swivel[side] = np.deg2rad(35.0 + 30.0 * (moving + 0.3 * circling) * wander)
             palm_down = np.deg2rad(40.0) * table if side == "right" else 0.0 * t
             wander = np.deg2rad(55.0 * moving + 15.0 * circling) * self.wander[f"{side}_pronation"](t)
             pronation[side] = wander + palm_down
@@ -436,16 +425,15 @@ class Motion(BodyMotion):
             palm_T = aim.palm_T[side] - shoulder_T
             R_TU, straight = self._arm(side, palm_T, aim.swivel[side])
             flexion = flexion if flexion.size else straight
-            if self.leads:
-                flexion = flexion + opening(palm_T) - opening(bend(flexion))
-                R_TU = compose(_turn_to(R_TU.apply(bend(flexion)), palm_T), R_TU)
+            flexion = flexion + opening(palm_T) - opening(bend(flexion))
+            R_TU = compose(_turn_to(R_TU.apply(bend(flexion)), palm_T), R_TU)
             along_T = Rotation.from_rotvec(blend * log(R_TU.as_quat())).apply(down_U)
             # A shoulder that rises lowers the arm, which lowers the shoulder: a part of the way settles sooner.
             displaced_T = centre_T + flaws.girdle.displace(along_T, y, raising)
             shoulder_T = shoulder_T + _RELAXATION * (displaced_T - shoulder_T)
         missing = np.linalg.norm(aim.palm_T[side] - shoulder_T - R_TU.apply(bend(flexion)), axis=1)
         worst = float(np.max(missing * (aim.lead[side] == 1.0), initial=0.0))
-        if self.leads and worst > self.most_missing:
+        if worst > self.most_missing:
             raise BadOption(f"lengths: the {side} arm does not reach through the motion, by {1e3 * worst:.2g} mm")
         return shoulder_T, R_TU, flexion
 

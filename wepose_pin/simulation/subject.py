@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arguments import Count, NonNegative, Positive, check_arguments, check_names
+from ..arguments import Count, Positive, check_arguments, check_names
 from ..errors import BadOption
 from ..kinematics import Pose
 from ..model import DEFAULT_BODY, SEXES, load_table
@@ -23,9 +23,9 @@ from ..subject import Subject, check_lengths, population_subject
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
 from .motion import E_Z, SEGMENTS, STAND_S, BodyMotion, BodyPose, Flaws, locate_sensor
+from .sequence import find_task
 from .signals import Wander
 from .soft_tissue import JointRotations, SoftTissue, is_on, read_joints
-from .tasks import find_task
 
 MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
@@ -269,7 +269,6 @@ def simulate(
     clasp_s: Positive = 60.0,
     circles: Count = 6,
     protocol: str = "clasp",
-    pose_deg: NonNegative = 0.0,
     session: Count = 0,
 ) -> Simulation:
     """Simulate a person with five sensors in the upper-body experiment of Lisini Baldi et al. 2019; the truth is known.
@@ -299,11 +298,7 @@ def simulate(
     circles : int
         Number of circles, 0 or more.
     protocol : str
-        What the person does in place of the clasp, one of `tasks.TASKS`, or several joined by "+". "handle": 0.4 m
-        between the palms; "touch_left" and "touch_right": the palm on a fixed point while the trunk leans and turns;
-        "poses": T-pose and bow, no circles.
-    pose_deg : float
-        [deg] one standard deviation about each axis by which T-pose and bow are inexact.
+        What the person does in the time of the clasp: "clasp", "t_pose", "bow", or several of them joined by "+".
     session : int
         Number of the person's session. Another number is another day: sensors are mounted again; motion, start pose and
         noise are others.
@@ -340,12 +335,10 @@ def simulate(
     if not (clasp_s >= 5.0 and circles >= 0 and rate_hz > 0.0):
         raise BadOption(f"clasp_s {clasp_s} must be >= 5, circles {circles} >= 0, rate_hz {rate_hz} > 0")
     task = find_task(protocol)
-    if protocol == "poses" and circles:
-        raise BadOption("protocol 'poses': circles must be 0")
     lengths = {name: float(lengths[name]) for name in names}
     rngs = spawn_streams(seed, session)
     motion = task(lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs, lengths["shoulder_width"]))
-    motion.fit_to_person(rngs["task"], pose_deg)
+    motion.fit_to_person(rngs["task"])
     return measure_motion(motion, rngs, rate_hz, noise, imperfections)
 
 

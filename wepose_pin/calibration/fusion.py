@@ -1,4 +1,4 @@
-"""Several calibrations of one person: what an earlier one knew of lengths and shoulders, fused with a new one.
+"""Two calibrations of one person: what an earlier one knew of lengths and shoulders, fused with a new one.
 
 Most of a calibration's error comes again in the next one: soft tissue follows the joints, and the shoulders leave the
 law in the same way. So each is solved on the population prior, and they are fused by covariance intersection, which
@@ -20,26 +20,30 @@ from ..subject import Subject, girdle_rows
 
 # Share of a calibration's variance that recurs: on simulated people nearly all of it does.
 RECURRING = 0.9
-# Of the shares of sessions: relative variance that is given for alike ones, and rounds and steps of the search.
+# Of the shares of the two: relative variance that is given for alike ones, and rounds and steps of the search.
 ALIKE = 0.2
 ROUNDS, STEP = 200, 0.1
 LEAST_STD = 1e-6  # [m] keeps covariances of what is known exactly invertible
 
 
-def fuse_sessions(
-    subjects: Sequence[Subject], population: Subject, measured: Mapping[str, tuple[float, float]], table: BodyTable
+def fuse_calibrations(
+    earlier: Subject,
+    subject: Subject,
+    population: Subject,
+    measured: Mapping[str, tuple[float, float]],
+    table: BodyTable,
 ) -> Subject:
-    """The last subject with lengths and girdles of all of them; its mounts follow by their correlation.
+    """The subject of a calibration with lengths and girdles of an earlier one too; its mounts follow by correlation.
 
     Parameters
     ----------
-    population : the prior with which each was found
+    population : the prior with which both were found
     measured : lengths that were measured beside it, name → value and standard deviation [m]
     """
     lengths = tuple(table.lengths)
-    x = [_shape(subject, table) for subject in subjects]
+    x = [_shape(each, table) for each in (earlier, subject)]
     least = LEAST_STD**2 * np.eye(len(x[0]))
-    C = [subject.shape_covariance(table) + least for subject in subjects]
+    C = [each.shape_covariance(table) + least for each in (earlier, subject)]
     K, K0 = [np.linalg.inv(each) for each in C], np.linalg.inv(population.shape_covariance(table) + least)
     for name, (_, std) in measured.items():
         if name in lengths:
@@ -53,14 +57,14 @@ def fuse_sessions(
         value, vector = np.linalg.eigh(each - K0)
         information += (vector * np.maximum(value, 0.0)) @ vector.T
     fused = RECURRING * intersection + (1.0 - RECURRING) * np.linalg.inv(information)
-    return _replace_shape(subjects[-1], mean, fused, x[-1], C[-1], table)
+    return _replace_shape(subject, mean, fused, x[-1], C[-1], table)
 
 
 def _find_shares(K: Sequence[np.ndarray], lengths: int) -> np.ndarray:
-    """The shares (k,) of the informations in their weighted sum.
+    """The shares (2,) of two informations in their weighted sum.
 
-    The least of ln(variance of the lengths) + `ALIKE` Σ share ln(share), which is convex: sessions that know as much
-    have nearly equal shares, so that what does not recur is averaged, and one that knows less has less.
+    The least of ln(variance of the lengths) + `ALIKE` Σ share ln(share), which is convex: two calibrations that know as
+    much have nearly equal shares, so that what does not recur is averaged, and one that knows less has less.
     """
     shares = np.full(len(K), 1.0 / len(K))
     for _ in range(ROUNDS):
