@@ -203,7 +203,7 @@ def test_the_reader_of_the_recipe_reads(tmp_path: Path) -> None:
 
 
 def test_the_protocol_and_the_robot_of_the_recipes_are_read(tmp_path: Path) -> None:
-    protocol = load_protocol(example("calibration/rod.toml", tmp_path))
+    protocol = load_protocol(example("calibration/corner.toml", tmp_path))
     assert {condition.phase for condition in protocol.conditions} == {step.phase for step in protocol.steps} - {"start"}
     file = example("urdf/robots/xarm7.toml", tmp_path)
     file.write_text(re.sub(r"(?m)^srdf = .*\n", "", file.read_text(encoding="utf-8")), encoding="utf-8")

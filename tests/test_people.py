@@ -88,7 +88,7 @@ def shoulder_offset(sim: Simulation, side: str) -> np.ndarray:
 def test_the_mild_preset_is_what_it_was() -> None:
     assert PRESETS == {"ideal": IDEAL_PRESET, "mild": MILD_PRESET, "people": PEOPLE_PRESET}
     assert all(getattr(MILD_PRESET, name) == 0.0 for name in NEW)
-    assert len(NEW) == 23
+    assert len(NEW) == 22
     sim = simulate(SUBJECT, seed=1, imperfections=MILD_PRESET, clasp_s=5.0, circles=1)
     # Figures of the version before the people preset.
     np.testing.assert_allclose(sim.gyro_S["left_forearm"][1000], MILD_GYRO, rtol=1e-9)
