@@ -265,7 +265,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     # time
     "time that stands still": (
         lambda f: f.put("time", slice(100, 101), 0.99),
-        "arm.csv: time stands still in row 101: 0.99 s after 0.99 s",
+        "arm.csv: time stands still in row 101: 0.99 s after 0.99 s; it must grow in every row: delete one of",
     ),
     "time that goes back": (lambda f: f.put("time", slice(100, 101), 0.5), "arm.csv: time goes back in row 101: 0.5 s"),
     "time without a number": (

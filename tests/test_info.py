@@ -410,3 +410,54 @@ def test_a_twitch_does_not_end_a_static_interval(twitch: int, expected: list[tup
     sensor = ImuSensor(gyro_S=rate, accel_S=np.tile([0.0, 0.0, 9.81], (1000, 1)))
     recording = Recording("stands", np.arange(1000) / 100.0, 100.0, {"torso": sensor}, {})
     np.testing.assert_allclose(find_static_intervals(recording), expected)
+
+
+# What is guessed ---------------------------------------------------------------------------------------------------
+
+
+def write_swing(path: Path, scale: float, names: str = "torso_gyr_{}", deg: float = 60.0) -> Path:
+    """A sensor that swings slowly about x by `deg`, rates [rad/s] times `scale`; without a unit in the names."""
+    time = np.arange(2000) / 100.0
+    angle = np.radians(deg) * np.sin(0.5 * time)
+    accel = 9.81 * np.column_stack([0.0 * time, np.sin(angle), np.cos(angle)])
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (2000, 6))
+    gyro = np.column_stack([np.gradient(angle, time), 0.0 * time, 0.0 * time]) + 0.1 * noise[:, :3]
+    columns = {"time": time} | {names.format(axis): scale * gyro[:, k] for k, axis in enumerate("xyz")}
+    columns |= {names.replace("gyr", "acc").format(axis): (accel + noise[:, 3:])[:, k] for k, axis in enumerate("xyz")}
+    pl.DataFrame(columns).write_csv(path)
+    return path
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1.0, "rad/s"), (180.0 / np.pi, "deg/s")])
+def test_the_unit_of_rates_is_told_by_gravity(
+    scale: float, unit: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """30 deg/s at most: a person may as well turn by 30 rad/s."""
+    session = info(capsys, write_swing(tmp_path / "a.csv", scale))
+    assert f'gyro_unit = "{unit}"\n' in session
+
+
+def test_a_unit_that_nothing_shows_is_to_be_checked(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert 'gyro_unit = "rad/s"   # CHECK: ' in info(capsys, write_swing(tmp_path / "a.csv", 1.0, deg=0.0))
+    stated = write_swing(tmp_path / "b.csv", 1.0, "torso_gyr_{} [rad/s]", deg=0.0)
+    assert 'gyro_unit = "rad/s"\n' in info(capsys, stated)
+
+
+def test_no_phase_is_proposed_where_there_is_no_room_for_it(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    for segment in ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"):
+        pl.read_csv(write_swing(path, 1.0, f"{segment}_gyr_{{}}")).head(8).write_csv(tmp_path / f"{segment}.csv")
+    tables = [pl.read_csv(tmp_path / f"{segment}.csv") for segment in ("torso", "left_forearm", "right_forearm")]
+    tables += [pl.read_csv(tmp_path / f"{segment}.csv") for segment in ("left_upper_arm", "right_upper_arm")]
+    moved = [table.drop("time") + 0.001 * k for k, table in enumerate(tables)]
+    pl.concat([tables[0].select("time"), *moved], how="horizontal").write_csv(path)
+    assert "[[" not in info(capsys, path)
+
+
+def test_a_folder_with_a_file_for_each_sensor(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for k, segment in enumerate(("left_forearm", "left_upper_arm", "torso")):
+        write_swing(tmp_path / f"{segment}.csv", 1.0 + 0.1 * k, "gyr_{}")
+    (tmp_path / "a_list.csv").write_text("file,person\ntorso.csv,anna\n")
+    info(capsys, tmp_path, "--write")
+    recording = wp.load_session(tmp_path)
+    assert set(recording.sensors) == {"torso", "left_upper_arm", "left_forearm"}

@@ -25,7 +25,7 @@ class InfoJob:
     Parameters
     ----------
     file : FILE
-        A file or folder.
+        A file, or a folder: of one recording, or of files of one sensor each.
     write
         Write the session to session.toml beside the file.
     out : FILE
@@ -43,17 +43,13 @@ class InfoJob:
     model: Path | None = None
     force: bool = False
 
-    @property
-    def session_file(self) -> Path:
-        """Where the session is written, or would be."""
-        return self.out or self.file.absolute().parent / "session.toml"
-
 
 class InfoOutcome(NamedTuple):
     """What came of an `InfoJob`."""
 
     description: Description
-    written: Path | None  # the session
+    session_file: Path  # where the session is written, or would be
+    written: bool
 
 
 def run_info(job: InfoJob, progress: Progress = no_progress) -> InfoOutcome:
@@ -66,16 +62,19 @@ def run_info(job: InfoJob, progress: Progress = no_progress) -> InfoOutcome:
     """
     from ..documents import check_file, whole_file
     from ..model import load_model
-    from ..readers.describe import Wearer, describe_file
+    from ..readers.describe import Wearer, describe_file, find_file
 
     progress("reading", 0.0)
     wearer = Wearer(load_model(job.model).table, job.model) if job.model is not None else None
+    file = find_file(job.file, wearer)
+    session = job.out or file.absolute().parent / "session.toml"
+    if job.write or job.out:
+        check_file(session, job.force)
+    description = describe_file(file, session.absolute().parent, wearer)
     if not (job.write or job.out):
-        return InfoOutcome(describe_file(job.file, job.file.absolute().parent, wearer), None)
-    check_file(job.session_file, job.force)
-    description = describe_file(job.file, job.session_file.absolute().parent, wearer)
+        return InfoOutcome(description, session, False)
     if description.session is None:
         raise BadOption(f"--write: there is no session to write for {description.what}")
-    with whole_file(job.session_file, job.force) as partial:
+    with whole_file(session, job.force) as partial:
         partial.write_text(description.session, encoding="utf-8")
-    return InfoOutcome(description, job.session_file)
+    return InfoOutcome(description, session, True)

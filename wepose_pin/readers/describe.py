@@ -31,10 +31,10 @@ from ..recording import (
 )
 from ..recording.clocks import TIME_UNITS, guess_time_unit
 from ..recording.gaps import find_runs
-from ..recording.limits import LONGEST_STEP_S
+from ..recording.limits import LONGEST_STEP_S, STANDARD_GRAVITY
 from ..recording.sensors import compute_rate
 from .arrays import ArrayFile, is_array_file
-from .device import Device, read_first_lines
+from .device import GYRO_UNITS, Device, read_first_lines
 from .formats import FOLDERS, TITLES, WHOLE, detect_format, read_device
 from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
@@ -49,9 +49,14 @@ _STATED_RATE = re.compile(r"(sampl\w*|frame|data)[ _]*(frequency|rate)[^0-9]{0,1
 # standing person is below.
 BLOCK_S, STATIC_GYRO, STATIC_ACCEL = 0.25, np.deg2rad(3.0), 0.4
 SHORTEST_STATIC_S = 1.0
+SHORTEST_EXAMPLE_S = 2.0  # a shorter recording has no room for a phase
 JOINED_S = 0.5  # static intervals nearer than this are one: a person twitches
 MOST_SIBLINGS = 20
 CHECK = "   # CHECK: "
+GUESSED_GYRO_UNIT = f'gyro_unit = "rad/s"{CHECK}neither the file nor the motion says so'
+# Gravity turns in a sensor as its rates say, to a factor of 7: other accelerations disturb it. Radians and degrees are
+# 57 apart. Where the two correlate by less, or in fewer places, the motion does not show the unit.
+TURN_FACTOR, TURN_CORRELATION, FEWEST_TURNS = 7.0, 0.4, 10
 _YEAR_2000, _YEAR_2100 = 946_684_800.0, 4_102_444_800.0  # [s] since 1970
 
 
@@ -102,8 +107,34 @@ class Wearer(NamedTuple):
         return f"model = {_relative(self.model, folder) if self.model.is_file() else toml_string(str(self.model))}"
 
 
+def find_file(path: Path, wearer: Wearer | None = None) -> Path:
+    """Find what is described of a path: the session or subject in a folder, or the first recording in it.
+
+    A file, a result, and a folder that is one recording are returned as they are.
+
+    Raises
+    ------
+    MissingFile
+        The folder holds nothing that is known.
+    """
+    if not path.is_dir() or (path / "pose.parquet").is_file():
+        return path
+    named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
+    if named is not None or detect_format(path) is not None:
+        return named or path
+    files = [file for file in sorted(path.iterdir()) if file.is_file()]
+    data = [file for file in files if file.suffix.lower() in TABLES or is_array_file(file) or detect_format(file)]
+    if not data:
+        raise MissingFile(
+            f"{path}: a folder without session.toml, subject.toml or pose.parquet, none of an x-IMU3, a phone or a ROS "
+            f"bag, and without recordings in it; name a file"
+        )
+    table = (wearer or Wearer(load_table())).table
+    return next((file for file in data if table.guess_segment(file.stem)), data[0])
+
+
 def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None = None) -> Description:
-    """Describe a file or folder.
+    """Describe a file or folder, as `find_file` returns it.
 
     Parameters
     ----------
@@ -119,14 +150,6 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         raise MissingFile(f"{path}: no such file or folder")
     if path.is_dir() and (path / "pose.parquet").is_file():
         return _describe_result(path)
-    named = next((path / name for name in ("session.toml", "subject.toml") if (path / name).is_file()), None)
-    if named is not None or (path.is_dir() and detect_format(path) is None):
-        if named is None:
-            raise MissingFile(
-                f"{path}: a folder without session.toml, subject.toml or pose.parquet, none of an x-IMU3, a phone or a "
-                f"ROS bag; name a file"
-            )
-        path = named
     if path.suffix.lower() == ".toml":
         return _describe_toml(path)
     if path.suffix.lower() in (".c3d", ".trc"):
@@ -239,7 +262,10 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal, wearer: Wear
             values["sensors"] = {segment: parse_toml("\n".join(table)) for segment, table in proposal.tables.items()}
             reader = SessionReader(folder / "session.toml", gaps=True, values=values)
             recording = reader.recording(0, len(reader.time))
-            break
+            unit = guess_gyro_unit(recording) if GUESSED_GYRO_UNIT in head else None
+            if unit is None:
+                break
+            head = [f"gyro_unit = {toml_string(unit)}" if line == GUESSED_GYRO_UNIT else line for line in head]
         except WeposeError as error:
             # The reader's check of units is better than a guess from names.
             if not isinstance(error, WrongUnit):
@@ -254,12 +280,34 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal, wearer: Wear
     static = find_static_intervals(recording)
     comments = {segment: _mount_comment(recording, segment, static) for segment in proposal.tables}
     ends = float(recording.time[0]), float(recording.time[-1])
-    phases = phases or _start_lines(static, ends[0])
+    phases = phases or _start_lines(static, ends)
     text = _session_text(title, head, phases, proposal.tables, comments, wearer.table, ends)
     facts, rows = (*proposal.facts, *_facts(recording)), _rows(recording, proposal.labels)
     # A sensor on an unknown segment has its name in the file.
     read = (replace(each, place=each.place.removeprefix("?")) for each in recording.diagnostics)
     return Description(what, facts, rows, text, _advise(recording, wearer.table), (*diagnostics, *read))
+
+
+def guess_gyro_unit(recording: Recording) -> str | None:
+    """Guess the unit of rates that were read as rad/s from how gravity turns in the sensors; None: it does not show."""
+    size = max(2, round(BLOCK_S * recording.rate_hz))
+    blocks = len(recording) // size
+    predicted, measured = [np.empty((0, 3))], [np.empty((0, 3))]
+    for sensor in recording.imus.values():
+        # A vector that is fixed in the world turns by -gyro x vector in the sensor.
+        turns = -np.cross(sensor.gyro_S, sensor.accel_S)[: blocks * size] / recording.rate_hz
+        turn = turns.reshape(blocks, size, 3).sum(axis=1)
+        force = sensor.accel_S[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
+        upright = np.abs(np.linalg.norm(force, axis=1) - STANDARD_GRAVITY) < STATIC_ACCEL
+        known = np.flatnonzero(upright[:-2] & upright[2:])
+        predicted.append((0.5 * turn[:-2] + turn[1:-1] + 0.5 * turn[2:])[known])
+        measured.append((force[2:] - force[:-2])[known])
+    said, seen = np.concatenate(predicted), np.concatenate(measured)
+    product = float(np.sum(said * seen))
+    if len(said) < FEWEST_TURNS or product <= TURN_CORRELATION * np.linalg.norm(said) * np.linalg.norm(seen):
+        return None
+    ratio = product / float(np.sum(said**2))
+    return next((unit for unit, factor in GYRO_UNITS.items() if 1.0 / TURN_FACTOR < ratio / factor < TURN_FACTOR), None)
 
 
 def _advise(recording: Recording, table: BodyTable) -> str:
@@ -282,12 +330,15 @@ def _advise(recording: Recording, table: BodyTable) -> str:
     return f"state the mounts of {', '.join(without)}, then wepose track SESSION -o result"
 
 
-def _start_lines(static: list[tuple[float, float]], begin: float) -> list[str]:
-    """Propose the start pose: the first static interval, else an example after the recording's `begin` [s]."""
+def _start_lines(static: list[tuple[float, float]], ends: tuple[float, float]) -> list[str]:
+    """Propose the start pose: the first static interval, else an example between the recording's `ends` [s]."""
     if static and static[0][1] - static[0][0] >= SHORTEST_STATIC_S:
         first, last = static[0]
         return [f"start = [[{first:.2f}, {last:.2f}]]{CHECK}all sensors are static there; is it the start pose?"]
-    example = _write_example(begin + 0.5, begin + 4.5)
+    begin, end = ends
+    if end - begin < SHORTEST_EXAMPLE_S:
+        return []
+    example = _write_example(begin + 0.5, min(begin + 4.5, end))
     return [f"# start = {example}   # name the seconds in which the person stands still in the start pose"]
 
 
@@ -315,9 +366,10 @@ def _session_text(
     named = bool(tables) and set(tables) <= set(body.segments)
     lacking = [segment for segment in body.needed if segment not in tables] if named else []
     clasped = any(line.startswith("clasp = ") for line in phases)
-    if not clasped and not lacking and body.paths and all(body.counterpart(tip) in body.paths for tip in body.paths):
+    begin, end = ends
+    paired = body.paths and all(body.counterpart(tip) in body.paths for tip in body.paths)
+    if not clasped and not lacking and paired and end - begin > SHORTEST_EXAMPLE_S:
         tips = " and ".join(dict.fromkeys(f"{body.shared_name(tip).replace('_', ' ')}s" for tip in body.paths))
-        begin, end = ends
         example = _write_example(begin + min(10.0, (end - begin) / 4.0), begin + min(70.0, 0.75 * (end - begin)))
         lines.append(f"# clasp = {example}   # for wepose calibrate: the seconds in which the {tips} are held together")
     if lacking:
@@ -475,7 +527,7 @@ def _propose_from_names(
     head = [*([] if beside else [f"file = {_relative(path, folder)}"]), *time]
     if raw:
         head += [
-            f"gyro_unit = {toml_string(guess.units.get('gyro', 'rad/s'))}",
+            f"gyro_unit = {toml_string(guess.units['gyro'])}" if "gyro" in guess.units else GUESSED_GYRO_UNIT,
             f"accel_unit = {toml_string(guess.units.get('accel', 'm/s^2'))}",
         ]
     tables = {}

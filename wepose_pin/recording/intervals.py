@@ -30,10 +30,13 @@ def check_time(where: str, time: np.ndarray) -> None:
     back = np.flatnonzero(time[1:] <= time[:-1])
     if back.size:
         k = int(back[0])
-        fault = "stands still" if time[k + 1] == time[k] else "goes back"
+        if time[k + 1] == time[k]:
+            fault, remedy = "stands still", "delete one of the two rows"
+        else:
+            fault, remedy = "goes back", "sort the rows by time, or cut the recording there"
         raise BadData(
             f"{where}: time {fault} in row {k + 2}: {format_time(time[k + 1], 6)} s after {format_time(time[k], 6)} s; "
-            f"it must grow in every row"
+            f"it must grow in every row: {remedy}"
         )
 
 
