@@ -432,8 +432,8 @@ def write_swing(path: Path, scale: float, names: str = "torso_gyr_{}", deg: floa
 def test_the_unit_of_rates_is_told_by_gravity(
     scale: float, unit: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """30 deg/s at most: a person may as well turn by 30 rad/s."""
-    session = info(capsys, write_swing(tmp_path / "a.csv", scale))
+    """6 deg/s at most: a person may as well turn by 6 rad/s."""
+    session = info(capsys, write_swing(tmp_path / "a.csv", scale, deg=12.0))
     assert f'gyro_unit = "{unit}"\n' in session
 
 
