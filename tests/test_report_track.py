@@ -288,9 +288,9 @@ def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
 def test_headings_that_were_turned_far(pose: TrackedRecording) -> None:
     from wepose_pin.tracking.headings import HeadingCorrection
 
-    turned = replace(pose, correction=HeadingCorrection(None, {}, {"right_forearm": 23.0, "torso": 1.0}))
-    corrected = the("heading-corrected-far", turned)
-    assert (corrected.place, corrected.value) == ("right_forearm", pytest.approx(np.deg2rad(23.0)))
+    turned = replace(pose, correction=HeadingCorrection(None, {}, {"right_forearm": 23.0, "torso": 12.0}))
+    corrected = the("heading-corrected-far", turned)  # a forearm's start pose may be off by as much, the torso's not
+    assert (corrected.place, corrected.value) == ("torso", pytest.approx(np.deg2rad(12.0)))
 
 
 def bent(forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0) -> dict[str, np.ndarray]:
