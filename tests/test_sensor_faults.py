@@ -132,6 +132,22 @@ def cut_off_swing(made: Simulation) -> tuple[Recording, Rotation, float]:
     return with_sensor(whole, BROKEN, gyro_S=np.clip(fast, -level, level), accel_S=accel), turned, level
 
 
+def test_a_gyroscope_at_its_limit_is_not_taken_for_static(made: Simulation, tmp_path: Path) -> None:
+    """A spin that is cut off for seconds varies less than rest does, and the accelerometer measures more than g."""
+    whole, level = replace(made.recording("spin"), phases={}), 20.0
+    sensor, time = whole.sensors[BROKEN], whole.time
+    up = int(np.argmax(np.abs(sensor.accel_S[100])))
+    swing = np.where((time > 8.0) & (time < 18.0), 2.0 * level * np.sin(2.0 * np.pi * (time - 8.0) / 10.0), 0.0)
+    gyro_S, accel_S = (
+        np.tile(values[50:450], (len(time) // 400 + 1, 1))[: len(time)] for values in (sensor.gyro_S, sensor.accel_S)
+    )
+    gyro_S[:, up] = np.clip(gyro_S[:, up] + swing, -level, level)
+    accel_S[:, (up + 1) % 3] += 0.026 * swing.clip(-level, level) ** 2  # an arm of 26 mm
+    path = written(tmp_path / "in", with_sensor(whole, BROKEN, gyro_S=gyro_S, accel_S=accel_S))
+    (saturated,) = (each for each in load_session(path).diagnostics if each.code == "signal-saturated")
+    assert (saturated.place, saturated.facts["range"]) == (BROKEN, pytest.approx(level))
+
+
 @pytest.mark.parametrize("unit", ["rad/s", "deg/s"])
 @pytest.mark.parametrize("method", ["amekf", "smoother"])
 def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(

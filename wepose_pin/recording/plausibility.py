@@ -131,13 +131,15 @@ def _explain_norm(norm: float) -> str:
 
 
 def _find_static_second(recording: Recording, sensor: ImuSensor) -> np.ndarray:
-    """Find the samples of the second without gaps in which the rate varies least; empty: there is none."""
+    """Find the samples of the second in which the rate varies least, without gaps and saturation; empty: none."""
     n = len(recording)
     size = min(n, max(2, round(recording.rate_hz)))
     count = n // size
     motion = sensor.gyro_S[: count * size].reshape(count, size, 3).var(axis=1).sum(axis=1)
     if sensor.gap is not None:
         motion[sensor.gap[: count * size].reshape(count, size).any(axis=1)] = np.inf
+    saturated = (np.abs(sensor.gyro_S) >= sensor.gyro_range).any(axis=1)  # a rate at the limit varies least of all
+    motion[saturated[: count * size].reshape(count, size).any(axis=1)] = np.inf
     first = int(np.argmin(motion))
     return np.arange(first * size, (first + 1) * size) if np.isfinite(motion[first]) else np.empty(0, dtype=int)
 
