@@ -45,6 +45,30 @@ def test_a_noisy_world_is_tracked_by_every_filter(simulation: Simulation, person
 
 
 @pytest.mark.parametrize("causal", [False, True])
+def test_exact_measured_orientations_are_used_as_they_are(
+    half_minute: Recording, simulation: Simulation, person: Person, causal: bool
+) -> None:
+    """What joined hands show of their headings is less than its own uncertainty; a heading that drifts is corrected."""
+    n, segment = len(half_minute), "left_forearm"
+    sensors = {
+        name: OrientationSensor(simulation.quat_WS[name][:n], sensor.stated_quat_LS)
+        for name, sensor in half_minute.sensors.items()
+    }
+    drift = Rotation.from_euler("z", np.interp(half_minute.time, [5.0, 30.0], [0.0, 50.0])[:, None], degrees=True)
+    drifting = (drift * Rotation.from_quat(sensors[segment].quat_WS)).as_quat()
+    off = {**sensors, segment: replace(sensors[segment], quat_WS=drifting)}
+    subject, change = replace(population_subject(), lengths=person.lengths), {}
+    for name, each in (("exact", sensors), ("drifting", off)):
+        recording = replace(half_minute, sensors=each)
+        corrected, as_measured = (
+            track(recording, subject, causal=causal, open_loop=open_loop) for open_loop in (False, True)
+        )
+        change[name] = max(np.abs(corrected.quat_WL[s] - as_measured.quat_WL[s]).max() for s in corrected.quat_WL)
+    assert change["exact"] == 0.0
+    assert change["drifting"] > 0.05
+
+
+@pytest.mark.parametrize("causal", [False, True])
 def test_the_uncertainty_of_measured_orientations_grows_in_gaps(
     half_minute: Recording, simulation: Simulation, causal: bool
 ) -> None:

@@ -322,7 +322,7 @@ class HeadingCorrector:
     def __init__(self, chunk: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
         self._problem, self._start_end = problem, orientations.start[1]
         self._start_frames = StartFrames(table=problem.model.table)
-        self._names = problem.names
+        self._names, self._measured = problem.names, find_measured_headings(chunk, problem.names)
         mounts = np.array([orientations.quat_LS[name] for name in self._names])
         offsets = np.array([orientations.heading_offset[name] for name in self._names])
         self._reader = KnotReader(mounts, offsets, chunk.rate_hz, problem)
@@ -370,6 +370,8 @@ class HeadingCorrector:
             levers = np.array([learn.x[problem.find_lever_columns(i)] for i in range(len(problem.pairs))])
             problem = replace(problem, levers_at=levers)
         self._smoothed = smooth(problem, self._knots)
+        if not exceed_uncertainty(self._smoothed.errors, self._smoothed.covariance, self._measured):
+            self._smoothed.errors[:, self._measured] = 0.0
         ends = np.array([knot.end for knot in self._knots])
         begins = np.array([knot.time[0] for knot in self._knots])
         self._knot_times = 0.5 * (begins + ends)  # the errors are constant before the first and after the last
@@ -476,6 +478,8 @@ class CausalHeadings:
         self._solving: Iterator[None] | None = None  # the last knot, until its correction is applied
         self._record = False
         self._begin, self._end, self._at_reset = np.zeros((3, len(problem.names)))
+        self._measured = find_measured_headings(recording, problem.names)
+        self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
         self.at_start = np.nan_to_num(start.about_vertical.heading)
         self._undone = np.zeros(len(problem.names))  # [rad] what the filters have corrected since, at the last knot
         self._knot_filters: FilterHeadings | None = None  # of the last complete knot
@@ -567,7 +571,11 @@ class CausalHeadings:
         self._solving = None
         self._var_at_knot = np.nan_to_num(self._knot_filters.var)
         self._undone = np.nan_to_num(self._knot_filters.about_vertical.heading - self.at_start)
-        self._begin, self._end = self._end, self._filter.x[: len(self._end)].copy()
+        k = len(self._end)
+        self._begin, self._end = self._end, self._filter.x[:k].copy()
+        if not self._corrects_measured:
+            self._corrects_measured = exceed_uncertainty(self._end[None], self._filter.P[None, :k, :k], self._measured)
+            self._end[self._measured] *= self._corrects_measured
         self._max_correction = np.maximum(self._max_correction, np.abs(self._end - self._undone))
         self.variance = self._find_variances()
 
@@ -577,6 +585,7 @@ class CausalHeadings:
         error = heading_offset - self.offset
         error = error + 2.0 * np.pi * np.round((self._end - error) / (2.0 * np.pi))
         self._filter.reset(error)
+        self._corrects_measured = True
         self._begin = self._end = error
         self._at_reset = error - self._undone
         self.variance = self._find_variances()
@@ -602,6 +611,29 @@ class CausalHeadings:
             segment_covariance=np.array([cov for _, _, cov in self._history]),
             delay_s=self._problem.knot_s,
         )
+
+
+def find_measured_headings(recording: Recording, names: Sequence[str]) -> np.ndarray:
+    """Find (k,) bool the segments whose sensors measure orientations."""
+    return np.array([isinstance(recording.sensors[name], OrientationSensor) for name in names], dtype=bool)
+
+
+def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray, measured: np.ndarray) -> bool:
+    """Return whether corrections of measured headings exceed their uncertainty, by one standard deviation.
+
+    Smaller ones are none: measured orientations are used as they are. The correction of a segment counts, and that of
+    two against each other.
+
+    Parameters
+    ----------
+    errors, covariance : (m, k) [rad], (m, k, k) [rad²] of all headings at the knots
+    measured : (k,) bool
+    """
+    variance = np.einsum("mii->mi", covariance)
+    apart = errors[:, measured, None] - errors[:, None, :]
+    apart_var = variance[:, measured, None] + variance[:, None, :] - 2.0 * covariance[:, measured, :]
+    alone = errors[:, measured] ** 2 > variance[:, measured]
+    return bool(alone.any() or (apart**2 > np.maximum(apart_var, 0.0)).any())
 
 
 def _stack_samples(

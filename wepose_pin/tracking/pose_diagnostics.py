@@ -36,8 +36,8 @@ LOST = 0.01  # share of samples
 JITTER = 0.2  # of a step, one standard deviation
 HEADING = np.deg2rad(10.0)  # one standard deviation of the drift between the segments of a joint
 PLACE = 0.1  # [m], one standard deviation of a tip: what 10 deg of heading do at the end of an arm
-# Correction of a heading: beyond this, and beyond so many standard deviations of what start pose and mount leave open. In
-# eight walks of `people` right corrections are 2.1 of them and less, the start poses being as people hold them.
+# Correction of a heading: beyond this, and beyond so many standard deviations of what start pose and mount leave open.
+# In four walks of the preset `people`, whose start poses are as people hold them, it is at most 2.1 of them.
 TURNED, TURNED_STDS = np.deg2rad(10.0), 2.5
 # Beyond the range of a hinge while it extends, and before its end while it flexes, where flesh meets flesh. Of an elbow
 # 20 and 160 deg: in the start pose a hanging one is bent by 5 to 15 deg; few open by more than 10 deg beyond straight.
