@@ -370,7 +370,7 @@ class HeadingCorrector:
             levers = np.array([learn.x[problem.find_lever_columns(i)] for i in range(len(problem.pairs))])
             problem = replace(problem, levers_at=levers)
         self._smoothed = smooth(problem, self._knots)
-        if not exceed_uncertainty(self._smoothed.errors, self._smoothed.covariance, self._measured):
+        if self._measured.any() and not exceed_uncertainty(self._smoothed.errors, self._smoothed.covariance):
             self._smoothed.errors[:, self._measured] = 0.0
         ends = np.array([knot.end for knot in self._knots])
         begins = np.array([knot.time[0] for knot in self._knots])
@@ -573,8 +573,8 @@ class CausalHeadings:
         self._undone = np.nan_to_num(self._knot_filters.about_vertical.heading - self.at_start)
         k = len(self._end)
         self._begin, self._end = self._end, self._filter.x[:k].copy()
-        if not self._corrects_measured:
-            self._corrects_measured = exceed_uncertainty(self._end[None], self._filter.P[None, :k, :k], self._measured)
+        if self._measured.any() and not self._corrects_measured:
+            self._corrects_measured = exceed_uncertainty(self._end[None], self._filter.P[None, :k, :k])
             self._end[self._measured] *= self._corrects_measured
         self._max_correction = np.maximum(self._max_correction, np.abs(self._end - self._undone))
         self.variance = self._find_variances()
@@ -618,22 +618,17 @@ def find_measured_headings(recording: Recording, names: Sequence[str]) -> np.nda
     return np.array([isinstance(recording.sensors[name], OrientationSensor) for name in names], dtype=bool)
 
 
-def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray, measured: np.ndarray) -> bool:
-    """Return whether corrections of measured headings exceed their uncertainty, by one standard deviation.
+def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:
+    """Return whether a combination of corrections exceeds its own standard deviation, at one of the knots.
 
-    Smaller ones are none: measured orientations are used as they are. The correction of a segment counts, and that of
-    two against each other.
+    Otherwise measured orientations are used as they are: what corrects them is less than what is not known.
 
     Parameters
     ----------
     errors, covariance : (m, k) [rad], (m, k, k) [rad²] of all headings at the knots
-    measured : (k,) bool
     """
-    variance = np.einsum("mii->mi", covariance)
-    apart = errors[:, measured, None] - errors[:, None, :]
-    apart_var = variance[:, measured, None] + variance[:, None, :] - 2.0 * covariance[:, measured, :]
-    alone = errors[:, measured] ** 2 > variance[:, measured]
-    return bool(alone.any() or (apart**2 > np.maximum(apart_var, 0.0)).any())
+    weighted = np.linalg.solve(covariance, errors[:, :, None])[:, :, 0]
+    return bool((np.sum(errors * weighted, axis=1) > 1.0).any())
 
 
 def _stack_samples(
