@@ -21,8 +21,9 @@ from wepose_pin.evaluation import evaluate
 from wepose_pin.jobs.evaluate import EvaluateJob, run_evaluate
 from wepose_pin.kinematics import Pose, parse_pose_table
 from wepose_pin.model import load_model
-from wepose_pin.simulation import NOISE_FREE, Simulation, simulate_activity
+from wepose_pin.simulation import NOISE_FREE, Imperfections, Simulation, simulate_activity
 from wepose_pin.simulation.activities import ACTIVITIES
+from wepose_pin.simulation.subject import spawn_streams
 
 URDF = Path(__file__).resolve().parent.parent / "urdf"
 SIDES = ("left", "right")
@@ -36,6 +37,9 @@ def parts(name: str) -> dict[tuple[str, str | None], ET.Element]:
     return {(element.tag, element.get("name")): element for element in root}
 
 
+RATE_HZ = {"run": 400.0, "throw": 400.0}  # for differences of what is fast
+
+
 @pytest.fixture(scope="module", params=[name for name in ACTIVITIES if name != "tasks"])
 def activity(request: pytest.FixtureRequest) -> str:
     return request.param
@@ -43,7 +47,9 @@ def activity(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="module")
 def made(activity: str) -> Simulation:
-    return simulate_activity(activity, seed=2, noise=NOISE_FREE, seconds=10.0)
+    return simulate_activity(
+        activity, seed=2, noise=NOISE_FREE, seconds=10.0, rate_hz=400.0 if activity == "run" else 100.0
+    )
 
 
 # The model --------------------------------------------------------------------------------------------------------
@@ -131,12 +137,14 @@ def test_the_true_pose_has_the_angles_of_the_activity(activity: str) -> None:
         between = slice(700, 900)
         left, right = (motion.leg(side, t).knee[:, 0] for side in SIDES)
         assert np.corrcoef(left[between], right[700 + half : 900 + half])[0, 1] > 0.99
-    else:
+    elif activity == "sit":
         assert 90.0 < most["left_knee"][0] < 95.0
         assert 90.0 < most["left_hip"][0] < 105.0
 
 
-def test_points_and_sensors_are_where_the_segments_put_them(made: Simulation) -> None:
+def test_points_and_sensors_are_where_the_segments_put_them(activity: str, made: Simulation) -> None:
+    motion = ACTIVITIES[activity](load_model("whole_body", made.lengths), spawn_streams(2)["motion"], 10.0)
+    root = motion.root(made.time)
     lengths, R_WL = made.lengths, {segment: Rotation.from_quat(quat) for segment, quat in made.quat_WL.items()}
     for side, y in (("left", 1.0), ("right", -1.0)):
         p_W = R_WL["pelvis"].apply([0.0, y * lengths["hip_width"] / 2.0, 0.0])
@@ -153,12 +161,54 @@ def test_points_and_sensors_are_where_the_segments_put_them(made: Simulation) ->
         for segment, origin in origins.items():
             sensor = f"{side}_{segment}"
             p_WS = origin + R_WL[sensor].apply(made.p_LS[sensor])
+            if root is not None:
+                p_WS = p_WS + root
             R_WS = R_WL[sensor] * Rotation.from_quat(made.quat_LS[sensor])
             accel_W = R_WS.apply(made.accel_S[sensor]) - [0.0, 0.0, 9.81]
             spline = CubicSpline(made.time, p_WS).derivative(2)(made.time)
             assert np.abs(accel_W - spline)[10:-10].max() < 0.02 * max(1.0, np.abs(accel_W).max())
             turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() * made.rate_hz
             np.testing.assert_allclose(made.gyro_S[sensor][1:], turned, atol=1e-9)
+
+
+def test_running_shakes_the_trunk_and_a_throw_turns_one_upper_arm() -> None:
+    """Steps of 2.5 to 3 Hz with impacts, speed won and lost again; an arm at 15 to 20 rad/s, and one that hangs."""
+    run, throw = (
+        simulate_activity(name, seed=3, noise=NOISE_FREE, seconds=12.0, rate_hz=400.0) for name in ("run", "throw")
+    )
+    R_WS = Rotation.from_quat(run.quat_WS["pelvis"])
+    accel_W = R_WS.apply(run.accel_S["pelvis"]) - [0.0, 0.0, 9.81]
+    middle = (run.time > 8.0) & (run.time < 14.0)
+    up = accel_W[middle, 2]
+    frequency = np.fft.rfftfreq(len(up), 1.0 / 400.0)[np.argmax(np.abs(np.fft.rfft(up - up.mean())))]
+    assert 2.5 < frequency < 3.0
+    assert 2.0 < up.max() / 9.81 + 1.0 < 4.0
+    assert (up / 9.81 + 1.0).min() < 0.3  # in flight
+    speed = np.cumsum(accel_W[:, 0]) / 400.0
+    assert speed[middle].mean() == pytest.approx(3.0, abs=0.2)
+    assert abs(speed[-1]) < 0.05
+    peaks = {side: np.linalg.norm(throw.gyro_S[f"{side}_upper_arm"], axis=1).max() for side in SIDES}
+    assert 15.0 < max(peaks.values()) < 20.0
+    assert min(peaks.values()) < 6.0  # it turns with the trunk
+
+
+def test_an_accelerometer_that_averages_is_half_a_sample_late() -> None:
+    """At 50 Hz it measures the mean of twenty samples at 1 kHz, in the sensor that turns meanwhile."""
+    options = {"seed": 2, "noise": NOISE_FREE, "seconds": 5.0}
+    fine = simulate_activity("walk", rate_hz=1000.0, **options)
+    at_once, averaged = (
+        simulate_activity("walk", rate_hz=50.0, imperfections=Imperfections(accel_average=share), **options)
+        for share in (0.0, 1.0)
+    )
+    for segment, accel_S in averaged.accel_S.items():
+        mean = np.lib.stride_tricks.sliding_window_view(fine.accel_S[segment], 21, axis=0)[::20]
+        mean = (mean.sum(axis=-1) - 0.5 * (mean[..., 0] + mean[..., -1])) / 20.0  # trapezoids
+        n = min(len(mean), len(accel_S) - 1)
+        late = np.abs(accel_S - at_once.accel_S[segment]).max()
+        assert np.abs(accel_S[1 : n + 1] - mean[:n]).max() < 0.04 * late, segment  # of four points against twenty
+        np.testing.assert_array_equal(averaged.gyro_S[segment], at_once.gyro_S[segment])
+    with pytest.raises(BadOption, match=r"accel_average 2\.0 must be at most 1"):
+        Imperfections(accel_average=2.0)
 
 
 def test_standing_at_the_start_is_the_n_pose(made: Simulation) -> None:
@@ -169,8 +219,8 @@ def test_standing_at_the_start_is_the_n_pose(made: Simulation) -> None:
 
 
 def test_an_activity_that_is_none_or_too_short_is_named() -> None:
-    with pytest.raises(BadOption, match=r"activity 'run' is not known; .*walk, sit, tasks"):
-        simulate_activity("run", seed=1)
+    with pytest.raises(BadOption, match=r"activity 'swim' is not known; .*walk, sit, tasks, run, throw"):
+        simulate_activity("swim", seed=1)
     with pytest.raises(BadOption, match="seconds 5: sitting down and standing up once takes 8"):
         simulate_activity("sit", seed=1, seconds=5.0)
 

@@ -28,7 +28,8 @@ class SimulateJob:
 
     The person stands in the start pose, does the motion of the protocol, then draws circles with the right hand.
     The sensors have the noise and bias of an Xsens MTi-3. Continue with `wepose calibrate DIR --measured ...` and
-    `wepose track DIR`; after walk or sit with `wepose track DIR --model whole_body`.
+    `wepose track DIR`; after walk, sit, run or throw with `wepose track DIR --model
+    whole_body`.
 
     Parameters
     ----------
@@ -44,9 +45,9 @@ class SimulateJob:
         several of them joined by +. Without it clasp+t_pose, or clasp alone for less than 30 s.
     activity
         Simulate an activity in place of a protocol. Of the whole body, with sensors on pelvis, head, hands and legs
-        too: walking on the spot (walk), or sitting down and standing up (sit). Of the upper body: reaches, rests and
-        typing of both arms, hands apart (tasks). Of the imperfections of the body in --preset mild, an activity has
-        only the soft-tissue artefacts.
+        too: walking on the spot (walk), sitting down and standing up (sit), running (run), or throwing overhand
+        (throw). Of the upper body: reaches, rests and typing of both arms, hands apart (tasks). Of the imperfections of
+        the body in --preset mild, an activity has only the soft-tissue artefacts.
     seconds
         Simulate this many seconds of the activity (without it 40) or of the protocol's motion (without it 60); at least
         5.
@@ -69,8 +70,8 @@ class SimulateJob:
         (offsets of the start pose); others: breath_deg (pitch of the torso's sensor), creep_deg (a strap in 10 min),
         strap_slip_deg, wobble_deg (per g), upper_arm_place and forearm_place (of the sensor, share of the length),
         girdle_hysteresis (share of elevation), elbow_abduction_deg, start_heading_deg (torso against W), sway_tilt_deg,
-        wrist_flexion_deg, wrist_deviation_deg, gyro_warm_up_deg_s (of the bias, in 15 min),
-        clock_drift_ppm.
+        wrist_flexion_deg, wrist_deviation_deg, gyro_warm_up_deg_s (of the bias, in 15 min), clock_drift_ppm,
+        accel_average (share of the sample interval over which the accelerometer averages).
     force
         Replace the files of an earlier run in DIR.
     """
@@ -79,7 +80,7 @@ class SimulateJob:
     seed: int = 1
     rate_hz: float = 100.0
     protocol: str | None = None
-    activity: Literal["walk", "sit", "tasks"] | None = None
+    activity: Literal["walk", "sit", "tasks", "run", "throw"] | None = None
     seconds: float | None = None
     preset: Literal["ideal", "mild", "people"] = "ideal"
     imperfection: Mapping[str, float | str] = field(default_factory=dict)

@@ -1,9 +1,10 @@
-"""Activities with known truth: walking on the spot, sitting down and standing up; `arm_tasks` has that of the arms.
+"""Activities with known truth: walking on the spot, sitting down, running, throwing; `arm_tasks` has that of the arms.
 
 One of the whole body is a set of joint angles as closed forms of time, of the hips and ankles after Wu et al. 2002, of
 the knees after Grood and Suntay 1983; segment orientations are put together from them here, without the code of the
-angles room. Where the segments and their sensors are follows from the model by Pinocchio: the root, midway between the
-hips, stays where it is, so a person who sits down raises the feet.
+angles room. Where the segments and their sensors are follows from the model by Pinocchio. Points are relative to the
+root, midway between the hips, so a person who sits down raises the feet. A person who runs moves the root, which the
+accelerometers measure.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from .girdle import Girdle
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
 from .motion import ARM, E_Z, MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, Flaws, place_arm, place_sensors
-from .signals import integrate_pulse, make_pulse
+from .signals import integrate_pulse, make_pulse, make_step
 from .subject import Simulation, measure_motion, spawn_streams
 
 WHOLE_BODY = "whole_body"
@@ -82,6 +83,14 @@ class Activity(BodyMotion):
     def arm(self, side: str, t: np.ndarray) -> np.ndarray:
         """Compute flexion of shoulder and elbow (n, 2) [rad] at the times `t` (n,) [s]."""
 
+    def shoulder(self, side: str, t: np.ndarray) -> Rotation:
+        """Compute the rotation of the upper arm in the torso at the times `t` (n,) [s]."""
+        return turn_about("Y", -self.arm(side, t)[:, :1])
+
+    def root(self, _t: np.ndarray, /) -> np.ndarray | None:
+        """Compute where the root is at times (n,) [s]: (n, 3) [m] in a world at rest; None: it does not move."""
+        return None
+
     @property
     def span(self) -> tuple[float, float]:
         return STAND_S, STAND_S + self.seconds + _END_S
@@ -110,6 +119,9 @@ class Activity(BodyMotion):
         points = {point: p_W[:, len(R_WL) + k] for k, point in enumerate(frames)}
         if self.flaws and self.flaws.girdle.moves:
             points |= self._move_shoulders(self.flaws.girdle, t, R_WL, origins)
+        root = self.root(t)
+        if root is not None:
+            origins = {segment: origin + root for segment, origin in origins.items()}
         return BodyPose(R_WL, points, origins)
 
     def _move_shoulders(
@@ -137,8 +149,8 @@ class Activity(BodyMotion):
             R_WL["torso"] = R_WL["torso"] * Rotation.from_rotvec(start.torso)
             R_WL["head"] = R_WL["head"] * Rotation.from_rotvec(start.head)
         for side, y in SIDES.items():
-            shoulder, elbow = self.arm(side, t).T
-            R_WU = compose(R_WL["torso"], turn_about("Y", -shoulder[:, None]))
+            elbow = self.arm(side, t)[:, 1]
+            R_WU = compose(R_WL["torso"], self.shoulder(side, t))
             if self.flaws is None or start is None:
                 R_WF = compose(R_WU, turn_about("Y", -elbow[:, None]))
             else:
@@ -215,6 +227,103 @@ class Walk(Activity):
         return self.activity(t)[:, None] * np.radians(degrees)
 
 
+class Run(Walk):
+    """Running straight on at 3 m/s with 2.6 to 3 steps/s and arms that swing; it begins and ends within `_RAMP_S`.
+
+    All sizes are assumptions; hip, knee and ankle are near those of Novacheck 1998, Gait & Posture 7, 77-95. The trunk
+    has 2 g at mid-stance, another g of impact at the contact, and brakes before it pushes off.
+    """
+
+    phase = "run"
+    _STRIDE = np.array(
+        [
+            (0.00, 35.0, 15.0, 5.0),
+            (0.15, 25.0, 40.0, 20.0),
+            (0.35, -10.0, 15.0, -20.0),
+            (0.50, -5.0, 55.0, -15.0),
+            (0.65, 25.0, 95.0, 0.0),
+            (0.80, 45.0, 80.0, 5.0),
+            (0.92, 42.0, 25.0, 5.0),
+            (1.00, 35.0, 15.0, 5.0),
+        ]
+    )
+    _STRIDE_S = 0.72
+    _SPEED = 3.0  # [m/s]
+    _BOUNCE, _BRAKING, _IMPACT = 0.035, 0.008, 0.0012  # [m]
+
+    def trunk(self, t: np.ndarray) -> TrunkAngles:
+        angle, size = 2.0 * np.pi * self._cycle(t, "right"), np.radians(self.activity(t))[:, None]
+        pelvis = np.column_stack((-5.0 * np.sin(angle), 8.0 + 3.0 * np.sin(2.0 * angle), 8.0 * np.cos(angle)))
+        torso = np.column_stack((3.0 * np.sin(angle), 10.0 + 2.0 * np.sin(2.0 * angle), -12.0 * np.cos(angle)))
+        return TrunkAngles(size * torso, size * pelvis, size * 0.2 * torso)
+
+    def arm(self, side: str, t: np.ndarray) -> np.ndarray:
+        forward = 0.5 - 0.5 * np.cos(2.0 * np.pi * self._cycle(t, side))
+        return self.activity(t)[:, None] * np.radians(np.column_stack((-50.0 + 75.0 * forward, 75.0 + 25.0 * forward)))
+
+    def root(self, t: np.ndarray, /) -> np.ndarray:
+        after = 4.0 * np.pi * self._cycle(t, "right")  # [rad] since a foot's contact, a turn is a step
+        impact = self._IMPACT * (0.5 + 0.5 * np.cos(after)) ** 4 * np.cos(5.0 * after)
+        up = -self._BOUNCE * np.cos(after - 1.0) - impact
+        forward = -self._BRAKING * np.sin(after - 1.0)
+        steps = self.activity(t)[:, None] * np.column_stack((forward, np.zeros_like(t), up))
+        return steps + np.outer(self._SPEED * self.moving_time(t), np.eye(3)[0])
+
+
+class Throw(Activity):
+    """Overhand throws from where the person stands: one arm throws, the other hangs.
+
+    The upper arm is cocked, turns by 110° about its long axis and by 75° forward in `_THROW_S`, at 15 to 20 rad/s, and
+    is braked while it goes down. All sizes are assumptions: a pitcher's arm turns several times faster.
+    """
+
+    phase = "throw"
+    _PERIOD_S, _THROW_S = 4.0, 0.4
+    # Begin [s], duration [s]; then plane of elevation (0 to the side, forward positive), elevation, external rotation
+    # and elbow flexion of the arm, turn of the trunk towards the other side and its lean [deg].
+    _THROW = np.array(
+        [
+            (0.0, 0.9, -15.0, 95.0, 100.0, 95.0, -25.0, -5.0),
+            (1.1, _THROW_S, 60.0, 95.0, -10.0, 20.0, 20.0, 15.0),
+            (1.1 + _THROW_S, 0.35, 85.0, 50.0, -25.0, 30.0, 30.0, 25.0),
+            (2.0, 1.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        ]
+    )
+
+    def prepare(self, rng: np.random.Generator) -> None:
+        self.side = str(rng.choice(list(SIDES)))
+        self.sizes = rng.uniform(0.93, 1.05, max(1, int(self.seconds // self._PERIOD_S)))  # of each throw
+
+    def _angles(self, t: np.ndarray) -> np.ndarray:
+        """Compute the columns of `_THROW` from the third on, (n, 6) [rad]."""
+        postures = np.radians(self._THROW[:, 2:])
+        changes = np.diff(postures, axis=0, prepend=0.0)
+        angles = np.zeros((len(t), postures.shape[1]))
+        for k, size in enumerate(self.sizes):
+            for (begin, duration), change in zip(self._THROW[:, :2], changes, strict=True):
+                at = STAND_S + k * self._PERIOD_S + 0.5 + begin
+                angles += np.outer(make_step(t, at, duration), size * change)
+        return angles
+
+    def leg(self, _side: str, t: np.ndarray) -> LegAngles:
+        return LegAngles(*np.zeros((3, len(t), 3)))
+
+    def trunk(self, t: np.ndarray) -> TrunkAngles:
+        turn, lean = self._angles(t)[:, 4:].T
+        torso = np.column_stack((np.zeros_like(t), lean, SIDES[self.side] * -turn))
+        return TrunkAngles(torso, 0.4 * torso, 0.2 * torso)
+
+    def arm(self, side: str, t: np.ndarray) -> np.ndarray:
+        """Compute no flexion of the shoulder, which `shoulder` turns, and that of the elbow."""
+        return np.column_stack((np.zeros_like(t), self._angles(t)[:, 3] if side == self.side else np.zeros_like(t)))
+
+    def shoulder(self, side: str, t: np.ndarray) -> Rotation:
+        if side != self.side:
+            return super().shoulder(side, t)
+        plane, elevation, external = self._angles(t)[:, :3].T
+        return turn_about("ZXZ", SIDES[side] * np.column_stack((-plane, elevation, external)))
+
+
 class Sit(Activity):
     """Sitting down and standing up again, some times; the trunk leans forward while the body moves.
 
@@ -284,7 +393,13 @@ class Sit(Activity):
         return self._moving(t)[:, None] * reach + self._seated(t)[:, None] * rest
 
 
-ACTIVITIES: dict[str, type[Activity | ArmTasks]] = {"walk": Walk, "sit": Sit, "tasks": ArmTasks}
+ACTIVITIES: dict[str, type[Activity | ArmTasks]] = {
+    "walk": Walk,
+    "sit": Sit,
+    "tasks": ArmTasks,
+    "run": Run,
+    "throw": Throw,
+}
 
 
 def simulate_activity(
@@ -304,9 +419,9 @@ def simulate_activity(
     Parameters
     ----------
     activity : one of `ACTIVITIES`
-    imperfections : as in `simulate`. Of the mild preset's body only soft tissue counts. Walking and sitting leave sway,
-        wrists and the hysteresis of the girdle out; of the people preset's soft tissue the legs have creep, slips and
-        wobble only, and what people hold in the start pose they hold throughout
+    imperfections : as in `simulate`. Of the mild preset's body only soft tissue counts. Activities of the whole body
+        leave sway, wrists and the hysteresis of the girdle out; of the people preset's soft tissue the legs have creep,
+        slips and wobble only, and what people hold in the start pose they hold throughout
     lengths : of the body [m]; those not named, or None: a person of 1.75 m
     seed, rate_hz, noise : as in `simulate`
 

@@ -88,6 +88,8 @@ class Imperfections:
     gyro_warm_up_deg_s : most change of the bias in the first 15 min, log-uniform from a tenth of it. People: 0.2, a
         sensor that warms by 5 to 10 K under its strap, with data sheets of BMI055, BMI160, ICM-20602, ICM-42688
     clock_drift_ppm : standard deviation of each clock's rate. People: 5, after synchronisation
+    accel_average : share of the sample interval, up to the sample, over which the accelerometer averages the specific
+        force, as a device with a low-pass filter does; at 1 it is half a sample late. In no preset
     """
 
     soft_tissue_deg: float = 0.0
@@ -129,6 +131,7 @@ class Imperfections:
     wrist_deviation_deg: float = 0.0
     gyro_warm_up_deg_s: float = 0.0
     clock_drift_ppm: float = 0.0
+    accel_average: float = 0.0
 
     def __repr__(self) -> str:
         return format_settings(self)
@@ -144,9 +147,9 @@ class Imperfections:
             raise BadOption(f"bits {self.bits} need a finite gyro_range_deg_s and accel_range_g")
         if self.dropped > 0.2:
             raise BadOption(f"dropped {self.dropped} must be at most 0.2: runs of 50 ms would meet")
-        for name in ("upper_arm_place", "forearm_place"):
+        for name, end in (("upper_arm_place", "segment"), ("forearm_place", "segment"), ("accel_average", "interval")):
             if getattr(self, name) > 1.0:
-                raise BadOption(f"{name} {getattr(self, name)} must be at most 1, the end of the segment")
+                raise BadOption(f"{name} {getattr(self, name)} must be at most 1, the end of the {end}")
 
 
 IDEAL_PRESET = Imperfections()

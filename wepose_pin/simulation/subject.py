@@ -35,6 +35,7 @@ MEASURED_STD = 0.003  # [m] of each
 # 400 mm.
 PEOPLE_MEASURED_STD = 0.012
 _STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
+_MIDPOINTS = (np.arange(4) + 0.5) / 4.0  # of an interval's quarters, for its mean
 _GAIN_RATE_HZ = 20.0  # at which soft-tissue motion is scaled to its rms
 # Streams of random numbers: new ones go to the end.
 _STREAMS = (
@@ -403,6 +404,13 @@ def measure_motion(
             R_before = before.R_WL * Rotation.from_rotvec(soft_before) * R_LS
             rate_S[0] = (R_before[0].inv() * R_WS[0]).as_rotvec() * rate_hz
         force_S = R_WS.inv().apply(moved.p_ddot + GRAVITY * E_Z)
+        if sizes.accel_average:
+            parts = []
+            for age in sizes.accel_average / rate_hz * _MIDPOINTS:
+                then, soft_then = skin.turn(_Sampled(motion, own_time - age, segment, joints=start is not None))
+                R_then = then.R_WL * Rotation.from_rotvec(soft_then) * R_LS
+                parts.append(R_then.inv().apply(then.p_ddot + GRAVITY * E_Z))
+            force_S = np.mean(parts, axis=0)
 
         device = Device.sample(rngs["device"], imperfections, rngs["gyro_warm_up"])
         readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, rngs["noise"])
