@@ -36,6 +36,7 @@ from .controller import (
     sample_hand_targets,
 )
 from .maps import find_map, list_sides
+from .reconfiguration import Planner
 from .robot import LimitMargins, Robot, load_robot
 from .targets import (
     SMOOTHING_HZ,
@@ -268,10 +269,12 @@ def _compute_trajectory(
     uniform_time = np.arange(0.0, arm_targets.time[-1] - arm_targets.time[0] + 0.5 * dt, dt)
     motion = resample_targets(arm_targets, arm_targets.time[0] + uniform_time, uniform_time)
     motion, approach_samples = _prepend_approach(QpController(robot, collision, dt, params), motion)
-    n = len(motion.time)
     wide_controller = QpController(robot, collision, dt, params, WIDE_LIMIT_FACTOR, guarded=False)
     wide_run = _run_controller(wide_controller, motion, None, 0, lambda fraction: progress(STAGES[0], fraction))
-    path = gaussian_filter1d(wide_run.joint_position, PATH_SMOOTHING_S / dt, axis=0, mode="nearest")
+    planner = Planner(wide_controller, motion, approach_samples)
+    motion, path, approach_samples = planner.plan(wide_run.joint_position, wide_run.hand, wide_run.rotation)
+    n = len(motion.time)
+    path = gaussian_filter1d(path, PATH_SMOOTHING_S / dt, axis=0, mode="nearest")
     slowdown, limiting = _compute_slowdown(path, robot, dt, motion, approach_samples)
     if strict and limiting is not None and limiting.factor > MAX_STRICT_RATIO:
         reason = f"{limiting.joint} would need {limiting.factor:.1f} times its {limiting.quantity} limit"

@@ -1,0 +1,297 @@
+"""Where an arm stays away from targets that it could reach: which other posture to continue from, and how to get there.
+
+An arm of six joints reaches a hand pose in several postures. One that follows the hand step by step stays in its family
+of postures until a joint limit or its own links stop it, though another family goes on. As in IKLink (Wang, Sisco and
+Gleicher 2024, "End-effector trajectory tracking with minimal reconfigurations") the arm then leaves its path, moves to
+the posture from which it follows the longest, and continues. No other change would need fewer reconfigurations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .collision import CollisionModel
+from .controller import ControllerParams, HandTarget, JointState, QpController, sample_hand_targets
+from .robot import Robot
+from .targets import ArmTargets, HandPath, differentiate
+
+LOST_M = 0.05  # [m] of a hand's position; its rotation counts as the tasks weigh it: 20 deg as much
+LOST_S = 1.0  # [s] for which an error beyond that lasts when the arm is lost
+REACHED_M = 0.02  # [m] below it, rotation included, a posture reaches its targets
+HORIZON_S = 10.0  # [s] over which postures are compared
+ALIKE_S = 0.5  # [s] of being lost, below which a difference between postures does not count: the nearest is taken
+MIN_WEIGHT = 0.5  # of a hand; where its target is more uncertain, its error does not count
+RANDOM_STARTS = 12  # of the search for postures
+SEARCH_STEPS = 25
+SAME_POSTURE = 0.3  # [rad or m] largest difference of a joint between two postures that are one
+PENETRATION_M = 4e-3  # into the clearance, above which a posture does not count as reached
+CHANGE_SPEED_SHARE = 0.5  # of the limits of velocity and acceleration, which a change of posture uses
+CHANGE_CHECKS = 40  # postures on the way that are checked for self-contact
+CHANGE_REST_S = 0.2  # after it
+QUINTIC_PEAK_SPEED, QUINTIC_PEAK_ACCELERATION = 1.875, 5.774  # from rest to rest, over distance and duration
+
+
+class Posture(NamedTuple):
+    """A posture that a search ended in."""
+
+    position: np.ndarray  # (n,) [rad or m]
+    distance: np.ndarray  # (arms,) [m] of the hands from their targets
+    cost: np.ndarray  # (arms,) of position and rotation, as the tasks weigh them
+
+
+class PostureSearch:
+    """Moves the robot as near to targets as joints and clearances allow, without limits of time."""
+
+    def __init__(self, robot: Robot, collision: CollisionModel, params: ControllerParams) -> None:
+        params = replace(
+            params,
+            task_gain=40.0,
+            max_correction_deceleration=1e9,
+            joint_velocity_change=0.0,
+            posture=1e-5,
+            joint_velocity=1e-4,
+        )
+        self.controller = QpController(robot, collision, 0.01, params, limit_factor=1e4, guarded=False)
+
+    def search(self, targets: tuple[HandTarget, ...], start: np.ndarray) -> Posture | None:
+        """Return the posture that is found from `start` (n,); None where links are too near each other in it."""
+        targets = tuple(
+            target._replace(velocity=np.zeros(3), angular_velocity=np.zeros(3), weight=1.0) for target in targets
+        )
+        state = JointState.at_rest(start)
+        for _ in range(SEARCH_STEPS):
+            state = self.controller.step(state, targets)
+        if not self.is_clear(state.position):
+            return None
+        distance, cost = measure_errors(self.controller, targets)
+        return Posture(state.position, distance, cost)
+
+    def is_clear(self, position: np.ndarray) -> bool:
+        """Whether all pairs of links keep their clearance at joint positions (n,)."""
+        self.controller.update_kinematics(position)
+        near = self.controller.collision.find_near_pairs(self.controller.data)
+        return not bool((near.distance < near.clearance - PENETRATION_M).any())
+
+
+def measure_errors(controller: QpController, targets: tuple[HandTarget, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return distance [m] and cost (arms,) of the hands against their targets, at the controller's joint positions."""
+    distance, cost = np.empty(len(targets)), np.empty(len(targets))
+    for i, target in enumerate(targets):
+        pose = controller.get_arm_pose(i)
+        distance[i] = np.linalg.norm(pose.hand - target.position)
+        angle = Rotation.from_matrix(pose.rotation.T @ target.rotation).magnitude()
+        cost[i] = controller.params.position * distance[i] ** 2 + controller.params.orientation * angle**2
+    return distance, cost
+
+
+def find_lost(params: ControllerParams, target: HandPath, hand: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Return (n,) bool: the hand at (n, 3) and (n, 3, 3) is more than `LOST_M` off a target that is certain."""
+    distance = np.linalg.norm(hand - target.position, axis=1)
+    angle = (Rotation.from_matrix(rotation).inv() * Rotation.from_matrix(target.rotation)).magnitude()
+    cost = params.position * distance**2 + params.orientation * angle**2
+    return np.asarray((cost > limit_cost(params, LOST_M)) & (target.weight >= MIN_WEIGHT) & ~target.lost)
+
+
+def find_lasting(lost: np.ndarray, samples: int) -> list[tuple[int, int]]:
+    """Return begin and end of each run of at least `samples` true values (n,) in `lost`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]]).astype(int)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= samples]
+
+
+def limit_cost(params: ControllerParams, error_m: float) -> float:
+    """Return the cost of a hand that is `error_m` off, or rotated by what the tasks weigh alike."""
+    return error_m**2 * (params.position or 1.0)
+
+
+class PlannedMotion(NamedTuple):
+    """The targets and the joints' path to follow; while a hand's weight is 0 its arm changes its posture."""
+
+    motion: ArmTargets
+    path: np.ndarray  # (n, joints)
+    approach_samples: int
+
+
+class _Run(NamedTuple):
+    """The motion as followed from one of its samples on."""
+
+    first: int  # that sample
+    position: np.ndarray  # (m, joints)
+    lost: np.ndarray  # (m, arms) bool: the hand is more than `LOST_M` off
+
+
+class _Failure(NamedTuple):
+    """Samples of the motion, `begin` to `end`, in which arms are lost."""
+
+    begin: int
+    end: int
+    arms: np.ndarray  # (arms,) bool
+
+
+class _Part(NamedTuple):
+    """A part of the plan."""
+
+    samples: np.ndarray  # (m,) int, of the motion
+    position: np.ndarray  # (m, joints)
+    changing: np.ndarray  # (arms,) bool: arms that change their posture
+
+
+@dataclass
+class Planner:
+    """Plans changes of posture where the arms would stay away from targets that they can reach.
+
+    Parameters
+    ----------
+    controller : follows the motion
+    motion : targets; `approach_samples` of them are the way from the rest posture
+    """
+
+    controller: QpController
+    motion: ArmTargets
+    approach_samples: int
+
+    def __post_init__(self) -> None:
+        self._robot, dt = self.controller.robot, self.controller.dt
+        self._search = PostureSearch(self._robot, self.controller.collision, self.controller.params)
+        self._lasting, self._horizon = round(LOST_S / dt), round(HORIZON_S / dt)
+
+    def plan(self, path: np.ndarray, hand: np.ndarray, rotation: np.ndarray) -> PlannedMotion:
+        """Return the motion and the joints' path to follow; those given where no change of posture helps.
+
+        Parameters
+        ----------
+        path, hand, rotation : (n, joints), (arms, n, 3), (arms, n, 3, 3), as the controller followed the motion
+        """
+        n, begin, approach_samples = len(path), self.approach_samples, self.approach_samples
+        run = _Run(0, path, self._find_lost(0, hand, rotation))
+        failure = self._find_failure(run, begin)
+        if failure is None:
+            return PlannedMotion(self.motion, path, approach_samples)
+        parts: list[_Part] = []
+        change = self._choose(begin, self._robot.rest, failure.arms, run.lost[begin:])
+        if change is not None:  # another posture to begin with
+            parts.append(_Part(np.full(len(change), begin), change, np.ones_like(failure.arms)))
+            run, approach_samples = self._follow(change[-1], begin, n), len(change)
+        while (failure := self._find_failure(run, begin)) is not None:
+            at = failure.begin - run.first
+            change = self._choose(failure.begin, run.position[at], failure.arms, run.lost[at:][: self._horizon])
+            begin = failure.end
+            if change is not None:
+                parts.append(_Part(np.arange(run.first, failure.begin), run.position[:at], np.zeros_like(failure.arms)))
+                parts.append(_Part(np.full(len(change), failure.begin), change, failure.arms))
+                run, begin = self._follow(change[-1], failure.begin, n), failure.begin
+        if not parts:
+            return PlannedMotion(self.motion, path, approach_samples)
+        parts.append(_Part(np.arange(run.first, n), run.position, np.zeros(len(self._robot.arms), dtype=bool)))
+        path = np.concatenate([part.position for part in parts])
+        return PlannedMotion(self._rearrange_motion(parts), path, approach_samples)
+
+    def _follow(self, position: np.ndarray, begin: int, end: int) -> _Run:
+        """Follow the motion from rest at `position` (n,), from sample `begin` to `end`."""
+        controller, arms = self.controller, len(self._robot.arms)
+        state, positions = JointState.at_rest(position), []
+        hand, rotation = np.empty((arms, end - begin, 3)), np.empty((arms, end - begin, 3, 3))
+        for k in range(begin, end):
+            positions.append(state.position)
+            state = controller.step(state, sample_hand_targets(self.motion.hands, k, controller.dt))
+            for i in range(arms):
+                hand[i, k - begin], rotation[i, k - begin], _ = controller.get_arm_pose(i)
+        return _Run(begin, np.array(positions), self._find_lost(begin, hand, rotation))
+
+    def _find_lost(self, first: int, hand: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """Return (m, arms) bool: hands at (arms, m, 3) and (arms, m, 3, 3) from sample `first` on are `LOST_M` off."""
+        part = slice(first, first + hand.shape[1])
+        return np.stack(
+            [
+                find_lost(self.controller.params, path._make(values[part] for values in path), hand[i], rotation[i])
+                for i, path in enumerate(self.motion.hands)
+            ],
+            axis=1,
+        )
+
+    def _find_failure(self, run: _Run, begin: int) -> _Failure | None:
+        """Return the first time from sample `begin` on in which an arm is lost for `LOST_S`."""
+        spans = [span for lost in run.lost.T for span in find_lasting(lost[begin - run.first :], self._lasting)]
+        if not spans:
+            return None
+        first, last = (begin + k for k in min(spans))
+        return _Failure(first, last, run.lost[first - run.first : last - run.first].any(axis=0))
+
+    def _choose(self, k: int, start: np.ndarray, arms: np.ndarray, lost: np.ndarray) -> np.ndarray | None:
+        """Return the way (m, joints) from `start` to the posture from which the arms follow best; None: none is better.
+
+        `lost` (m, arms) are the samples from `k` on that it has to better by `LOST_S`.
+        """
+        best, least = None, lost.any(axis=1).sum() - self._lasting
+        for posture in self._find_postures(k, start, arms):
+            way = self._find_way(start, posture)
+            if way is None:
+                continue
+            followed = self._follow(posture, k, k + len(lost)).lost.any(axis=1)
+            count = followed.sum()
+            if followed[: self._lasting].any() or count > least:
+                continue
+            alike = best is not None and count > least - round(ALIKE_S / self.controller.dt)
+            if not alike or len(way) < len(best):
+                best, least = way, min(count, least)
+        return best
+
+    def _find_postures(self, k: int, start: np.ndarray, arms: np.ndarray) -> list[np.ndarray]:
+        """Return postures that reach the targets of sample `k`; only the joints of `arms` may differ much."""
+        robot, targets = self._robot, sample_hand_targets(self.motion.hands, k, self.controller.dt)
+        joints = np.concatenate([arm.joints for arm, moves in zip(robot.arms, arms, strict=True) if moves])
+        rng, limit = np.random.default_rng(0), limit_cost(self.controller.params, REACHED_M)
+        starts = np.tile(start, (RANDOM_STARTS + 3, 1))
+        others = [robot.rest, self._unwind(start), *rng.uniform(*robot.bounds, (RANDOM_STARTS, len(start)))]
+        starts[1:, joints] = np.array(others)[:, joints]
+        found: list[np.ndarray] = []
+        for each in starts:
+            posture = self._search.search(targets, each)
+            if posture is None or (posture.cost > limit).any():
+                continue
+            for position in (posture.position, self._unwind(posture.position)):
+                if all(np.abs(position - other).max() > SAME_POSTURE for other in found):
+                    found.append(position)
+        return found
+
+    def _unwind(self, position: np.ndarray) -> np.ndarray:
+        """Return joint positions (n,) with whole turns taken off, where that is the same posture nearer the middle."""
+        lower, upper = self._robot.lower, self._robot.upper
+        winds = np.isfinite(upper - lower) & (upper - lower > 2.0 * np.pi)
+        middle = np.where(winds, 0.5 * (lower + upper), position)
+        return np.asarray(position - 2.0 * np.pi * np.round((position - middle) / (2.0 * np.pi)))
+
+    def _find_way(self, start: np.ndarray, end: np.ndarray) -> np.ndarray | None:
+        """Return positions (m, joints) on the way, in a straight line or over the rest posture; None: links meet."""
+        for stops in ((start, end), (start, self._robot.rest, end)):
+            if all(self._is_clear(a, b) for a, b in pairwise(stops)):
+                return np.concatenate([self._interpolate(a, b) for a, b in pairwise(stops)])
+        return None
+
+    def _is_clear(self, start: np.ndarray, end: np.ndarray) -> bool:
+        return all(self._search.is_clear(start + x * (end - start)) for x in np.linspace(0.0, 1.0, CHANGE_CHECKS)[1:])
+
+    def _interpolate(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Return positions (m, joints) from rest to rest."""
+        robot, dt, way = self._robot, self.controller.dt, np.abs(end - start)
+        by_velocity = QUINTIC_PEAK_SPEED * way / (CHANGE_SPEED_SHARE * robot.v_max)
+        by_acceleration = np.sqrt(QUINTIC_PEAK_ACCELERATION * way / (CHANGE_SPEED_SHARE * robot.a_max))
+        steps = max(1, round(float(np.maximum(by_velocity, by_acceleration).max()) / dt))
+        x = np.minimum(np.arange(steps + round(CHANGE_REST_S / dt)) / steps, 1.0)[:, None]
+        return start + x**3 * (10.0 - 15.0 * x + 6.0 * x**2) * (end - start)
+
+    def _rearrange_motion(self, parts: list[_Part]) -> ArmTargets:
+        """Return the motion of the parts; the targets rest while an arm changes its posture, and its weight is 0."""
+        samples = np.concatenate([part.samples for part in parts])
+        hands = []
+        for i, hand in enumerate(self.motion.hands):
+            changing = np.concatenate([np.full(len(part.samples), part.changing[i]) for part in parts])
+            path = hand._make(values[samples] for values in hand)
+            path = path._replace(weight=np.where(changing, 0.0, path.weight))
+            hands.append(differentiate(path, np.arange(len(samples)) * self.controller.dt))
+        motion = self.motion
+        return replace(motion, time=motion.time[samples], hands=tuple(hands), slowdown=motion.slowdown[samples])
