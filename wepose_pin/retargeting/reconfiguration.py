@@ -20,9 +20,11 @@ from .controller import ControllerParams, HandTarget, JointState, QpController, 
 from .robot import Robot
 from .targets import ArmTargets, HandPath, differentiate
 
-LOST_M = 0.05  # [m] of a hand's position; its rotation counts as the tasks weigh it: 20 deg as much
-LOST_S = 1.0  # [s] for which an error beyond that lasts when the arm is lost
-REACHED_M = 0.02  # [m] below it, rotation included, a posture reaches its targets
+# [m] of a hand's position; its rotation counts as the tasks weigh it: 8 and 20 deg as much. Beyond the first a posture
+# to begin with is compared with others; beyond the second the arm leaves its path for another posture.
+BEGIN_LOST_M, LOST_M = 0.02, 0.05
+LOST_S = 1.0  # [s] for which such an error lasts when the arm is lost
+REACHED_M = 0.01  # [m] below it, rotation included, a posture reaches its targets
 HORIZON_S = 10.0  # [s] over which postures are compared
 ALIKE_S = 0.5  # [s] of being lost, below which a difference between postures does not count: the nearest is taken
 MIN_WEIGHT = 0.5  # of a hand; where its target is more uncertain, its error does not count
@@ -89,12 +91,22 @@ def measure_errors(controller: QpController, targets: tuple[HandTarget, ...]) ->
     return distance, cost
 
 
-def find_lost(params: ControllerParams, target: HandPath, hand: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Return (n,) bool: the hand at (n, 3) and (n, 3, 3) is more than `LOST_M` off a target that is certain."""
-    distance = np.linalg.norm(hand - target.position, axis=1)
-    angle = (Rotation.from_matrix(rotation).inv() * Rotation.from_matrix(target.rotation)).magnitude()
-    cost = params.position * distance**2 + params.orientation * angle**2
-    return np.asarray((cost > limit_cost(params, LOST_M)) & (target.weight >= MIN_WEIGHT) & ~target.lost)
+def find_lost(
+    params: ControllerParams, targets: tuple[HandPath, ...], hand: np.ndarray, rotation: np.ndarray, error_m: float
+) -> np.ndarray:
+    """Return (n, arms) bool: the hand at (arms, n, 3), (arms, n, 3, 3) is `error_m` off a target that is certain."""
+    lost = []
+    for target, at, turned in zip(targets, hand, rotation, strict=True):
+        distance = np.linalg.norm(at - target.position, axis=1)
+        angle = (Rotation.from_matrix(turned).inv() * Rotation.from_matrix(target.rotation)).magnitude()
+        cost = params.position * distance**2 + params.orientation * angle**2
+        lost.append((cost > limit_cost(params, error_m)) & is_certain(target))
+    return np.stack(lost, axis=1)
+
+
+def is_certain(target: HandPath) -> np.ndarray:
+    """Return (n,) bool: the target is measured, and not so uncertain that its error does not count."""
+    return np.asarray((target.weight >= MIN_WEIGHT) & ~target.lost)
 
 
 def find_lasting(lost: np.ndarray, samples: int) -> list[tuple[int, int]]:
@@ -121,7 +133,7 @@ class _Run(NamedTuple):
 
     first: int  # that sample
     position: np.ndarray  # (m, joints)
-    lost: np.ndarray  # (m, arms) bool: the hand is more than `LOST_M` off
+    lost: np.ndarray  # (m, arms) bool: the hand is farther off than allowed
 
 
 class _Failure(NamedTuple):
@@ -157,6 +169,7 @@ class Planner:
     def __post_init__(self) -> None:
         self._robot, dt = self.controller.robot, self.controller.dt
         self._search = PostureSearch(self._robot, self.controller.collision, self.controller.params)
+        self._certain = np.stack([is_certain(hand) for hand in self.motion.hands], axis=1)
         self._lasting, self._horizon = round(LOST_S / dt), round(HORIZON_S / dt)
 
     def plan(self, path: np.ndarray, hand: np.ndarray, rotation: np.ndarray) -> PlannedMotion:
@@ -167,15 +180,17 @@ class Planner:
         path, hand, rotation : (n, joints), (arms, n, 3), (arms, n, 3, 3), as the controller followed the motion
         """
         n, begin, approach_samples = len(path), self.approach_samples, self.approach_samples
-        run = _Run(0, path, self._find_lost(0, hand, rotation))
+        run = _Run(0, path, find_lost(self.controller.params, self.motion.hands, hand, rotation, BEGIN_LOST_M))
         failure = self._find_failure(run, begin)
         if failure is None:
             return PlannedMotion(self.motion, path, approach_samples)
         parts: list[_Part] = []
-        change = self._choose(begin, self._robot.rest, failure.arms, run.lost[begin:])
+        change = self._choose(begin, self._robot.rest, failure.arms, run.lost[begin:], BEGIN_LOST_M)
         if change is not None:  # another posture to begin with
             parts.append(_Part(np.full(len(change), begin), change, np.ones_like(failure.arms)))
             run, approach_samples = self._follow(change[-1], begin, n), len(change)
+        else:
+            run = _Run(0, path, find_lost(self.controller.params, self.motion.hands, hand, rotation, LOST_M))
         while (failure := self._find_failure(run, begin)) is not None:
             at = failure.begin - run.first
             change = self._choose(failure.begin, run.position[at], failure.arms, run.lost[at:][: self._horizon])
@@ -190,28 +205,21 @@ class Planner:
         path = np.concatenate([part.position for part in parts])
         return PlannedMotion(self._rearrange_motion(parts), path, approach_samples)
 
-    def _follow(self, position: np.ndarray, begin: int, end: int) -> _Run:
-        """Follow the motion from rest at `position` (n,), from sample `begin` to `end`."""
-        controller, arms = self.controller, len(self._robot.arms)
-        state, positions = JointState.at_rest(position), []
-        hand, rotation = np.empty((arms, end - begin, 3)), np.empty((arms, end - begin, 3, 3))
+    def _follow(
+        self, position: np.ndarray, begin: int, end: int, error_m: float = LOST_M, most: float = np.inf
+    ) -> _Run:
+        """Follow the motion from rest at `position` (n,), from sample `begin` to `end`, or until `most` are lost."""
+        state, positions, lost = JointState.at_rest(position), [], []
         for k in range(begin, end):
             positions.append(state.position)
-            state = controller.step(state, sample_hand_targets(self.motion.hands, k, controller.dt))
-            for i in range(arms):
-                hand[i, k - begin], rotation[i, k - begin], _ = controller.get_arm_pose(i)
-        return _Run(begin, np.array(positions), self._find_lost(begin, hand, rotation))
-
-    def _find_lost(self, first: int, hand: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-        """Return (m, arms) bool: hands at (arms, m, 3) and (arms, m, 3, 3) from sample `first` on are `LOST_M` off."""
-        part = slice(first, first + hand.shape[1])
-        return np.stack(
-            [
-                find_lost(self.controller.params, path._make(values[part] for values in path), hand[i], rotation[i])
-                for i, path in enumerate(self.motion.hands)
-            ],
-            axis=1,
-        )
+            targets = sample_hand_targets(self.motion.hands, k, self.controller.dt)
+            state = self.controller.step(state, targets)
+            _, cost = measure_errors(self.controller, targets)
+            lost.append((cost > limit_cost(self.controller.params, error_m)) & self._certain[k])
+            most -= lost[-1].any()
+            if most < 0:
+                break
+        return _Run(begin, np.array(positions), np.array(lost))
 
     def _find_failure(self, run: _Run, begin: int) -> _Failure | None:
         """Return the first time from sample `begin` on in which an arm is lost for `LOST_S`."""
@@ -221,7 +229,9 @@ class Planner:
         first, last = (begin + k for k in min(spans))
         return _Failure(first, last, run.lost[first - run.first : last - run.first].any(axis=0))
 
-    def _choose(self, k: int, start: np.ndarray, arms: np.ndarray, lost: np.ndarray) -> np.ndarray | None:
+    def _choose(
+        self, k: int, start: np.ndarray, arms: np.ndarray, lost: np.ndarray, error_m: float = LOST_M
+    ) -> np.ndarray | None:
         """Return the way (m, joints) from `start` to the posture from which the arms follow best; None: none is better.
 
         `lost` (m, arms) are the samples from `k` on that it has to better by `LOST_S`.
@@ -231,7 +241,7 @@ class Planner:
             way = self._find_way(start, posture)
             if way is None:
                 continue
-            followed = self._follow(posture, k, k + len(lost)).lost.any(axis=1)
+            followed = self._follow(posture, k, k + len(lost), error_m, least).lost.any(axis=1)
             count = followed.sum()
             if followed[: self._lasting].any() or count > least:
                 continue
@@ -251,7 +261,7 @@ class Planner:
         found: list[np.ndarray] = []
         for each in starts:
             posture = self._search.search(targets, each)
-            if posture is None or (posture.cost > limit).any():
+            if posture is None or (posture.cost[arms] > limit).any():
                 continue
             for position in (posture.position, self._unwind(posture.position)):
                 if all(np.abs(position - other).max() > SAME_POSTURE for other in found):
