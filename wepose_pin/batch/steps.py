@@ -94,7 +94,7 @@ class ItemSteps:
         }
 
     def _export(self, out: Path, options: Row) -> Row:
-        from ..writers.export import BIDS, SUFFIXES, WITHOUT_MOTION
+        from ..writers.export import SUFFIXES, WITHOUT_MOTION
 
         out.mkdir()
         formats, diagnostics = options.pop("formats"), 0
@@ -102,8 +102,7 @@ class ItemSteps:
             file = out / (f"{format}{SUFFIXES[format]}" if format in SUFFIXES else f"motion.{format}")
             unused = {} if format == "mot" else {"names": None}
             unused |= {"rate_hz": None} if format in WITHOUT_MOTION else {}
-            unused |= {} if format in ("osim", "sto") else {"osim_model": None}
-            unused |= {} if format == BIDS else {"bids_name": None}
+            unused |= {} if format in ("sto", "scale") else {"osim_model": None}
             result = {"result": self._files.folder / "track", "out": file, "format": format}
             written = run_export(build_job(ExportJob, options | unused | result), provenance={})
             diagnostics += len(written.diagnostics)

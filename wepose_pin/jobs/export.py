@@ -29,13 +29,12 @@ class ExportJob:
     out : FILE
         Write this file. Its suffix selects the format.
     format : FORMAT
-        Write this format instead of that of the suffix: csv, parquet (pose and joint angles), mot (joint angles for
-        OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU Placer),
-        osim (OpenSim's model of the subject), trc (points, as markers), c3d (points and rotations of segments), bvh
-        (skeleton and motion, for animation), bvh-lafan1, bvh-nokov, bvh-soma, bvh-xsens (a whole person, for GMR),
-        motion-bids (a dataset, of which FILE is the folder); of persons and robots rosbag (for ROS 2, in a folder),
-        mcap, rrd (for rerun), urdf; of robots lerobot (a data set of episodes, in a folder; joints in rad, not in units
-        of LeRobot's drivers), pkl (for GMR), npz, csv-beyondmimic (for BeyondMimic).
+        Write this format instead of that of the suffix. Of a person: csv, parquet (pose and joint angles), mot (joint
+        angles for OpenSim), sto (orientations for OpenSense), placement (one sample of orientations for OpenSim's IMU
+        Placer), scale (set-up of OpenSim's Scale Tool, .xml), trc (points, as markers), c3d (points and rotations of
+        segments), bvh (skeleton and motion, for animation). Of a person or a robot: rosbag (for ROS 2, in a folder),
+        mcap, rrd (for rerun), urdf. Of robots: lerobot (a data set of episodes, in a folder; joints in rad, not in
+        units of LeRobot's drivers).
     names
         Only for .mot: write only the joint angles of the International Society of Biomechanics (isb), or only the
         coordinates of OpenSim's Rajagopal model (opensim). Without it both, the ISB's first.
@@ -52,11 +51,9 @@ class ExportJob:
         Only for lerobot: the text that says what the robot does, in all episodes. Without it "follow", and the name of
         the recording.
     osim_model : FILE
-        Only for .osim and .sto: scale this generic model of OpenSim to the subject. With .sto the model and the set-up
-        files of OpenSim's IMU Placer and IMU Inverse Kinematics are written beside it.
-    bids_name : NAME
-        Only for motion-bids: the name of the recording in the dataset, such as sub-01_task-reach_run-2. What it lacks
-        is taken from the names of subject and recording.
+        Only for .sto and scale. With .sto: write the set-up files of OpenSim's IMU Placer and IMU Inverse Kinematics
+        for this model of the subject beside it. With scale: the generic model that is scaled. Without it
+        Rajagopal_2015.osim. Only the name is used.
     force
         Replace an existing file.
     """
@@ -72,7 +69,6 @@ class ExportJob:
     episodes: str | None = None
     instruction: str | None = None
     osim_model: Path | None = None
-    bids_name: str | None = None
     force: bool = False
 
     def check(self) -> None:
@@ -117,7 +113,6 @@ def run_export(
         episodes=job.episodes,
         instruction=job.instruction,
         osim_model=job.osim_model,
-        bids_name=job.bids_name,
         force=job.force,
         provenance=provenance or None,
     )

@@ -234,7 +234,8 @@ class Planner:
     ) -> np.ndarray | None:
         """Return the way (m, joints) from `start` to the posture from which the arms follow best; None: none is better.
 
-        `lost` (m, arms) are the samples from `k` on that it has to better by `LOST_S`.
+        `lost` (m, arms) are the samples from `k` on that it has to better, by as long as the way there takes the hand
+        off its path. The approach is needed anyhow.
         """
         best, least = None, lost.any(axis=1).sum() - self._lasting
         for posture in self._find_postures(k, start, arms):
@@ -242,7 +243,7 @@ class Planner:
             if way is None:
                 continue
             followed = self._follow(posture, k, k + len(lost), error_m, least).lost.any(axis=1)
-            count = followed.sum()
+            count = followed.sum() + (0 if k == self.approach_samples else len(way))
             if followed[: self._lasting].any() or count > least:
                 continue
             alike = best is not None and count > least - round(ALIKE_S / self.controller.dt)

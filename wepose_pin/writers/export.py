@@ -15,12 +15,9 @@ from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, MissingFile, one_of
 from ..kinematics import PosedBody, cut_pose
 from ..recording import select_interval
-from ..subject import Subject, load_subject
 from ..tracking.tracked import TrackedRecording
 from .bvh import write_bvh
 from .c3d import write_c3d
-from .gmr import RIGS, write_gmr
-from .humanoid import write_motion_csv, write_motion_npz, write_pickle
 from .joint_motion import (
     ROBOT_URDF,
     TRAJECTORY,
@@ -33,11 +30,9 @@ from .joint_motion import (
 )
 from .lerobot import diagnose_episodes, list_episodes, write_lerobot
 from .motion import Motion, check_rate, resampled
-from .motion_bids import parse_bids_name, write_motion_bids
-from .opensim import OpenSenseFiles, write_mot, write_placement, write_setups, write_sto, write_trc
-from .osim import write_osim
+from .opensim import OpenSenseFiles, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
 from .provenance import provenance_file, provenance_text, write_provenance
-from .result import SUBJECT_URDF, format_urdf, read_marks, read_phases, read_result
+from .result import SUBJECT_URDF, format_urdf, read_result
 from .ros import write_mcap, write_rosbag
 from .rrd import write_rrd
 from .tables import write_csv, write_parquet
@@ -56,29 +51,24 @@ WRITERS: dict[str, Writer] = {
     "trc": write_trc,
     "bvh": write_bvh,
     "c3d": write_c3d,
-    **{f"bvh-{name}": functools.partial(write_gmr, rig=rig) for name, rig in RIGS.items()},
+    "scale": write_scale,
 }
 JOINT_WRITERS: dict[str, JointWriter] = {"rosbag": write_rosbag, "mcap": write_mcap, "rrd": write_rrd}
-ROBOT_WRITERS: dict[str, JointWriter] = {
-    "pkl": write_pickle,
-    "npz": write_motion_npz,
-    "csv-beyondmimic": write_motion_csv,
-}
 LEROBOT = "lerobot"
-ROBOTS_ALONE = (*ROBOT_WRITERS, LEROBOT)
-OSIM, BIDS = "osim", "motion-bids"
-OF_PERSONS = (*WRITERS, OSIM, BIDS)
-FORMATS = (*OF_PERSONS, "urdf", *JOINT_WRITERS, *ROBOT_WRITERS, LEROBOT)
+FORMATS = (*WRITERS, "urdf", *JOINT_WRITERS, LEROBOT)
 # Formats that are folders → what an earlier run left in one, which `force` replaces.
 FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*"), "rosbag": ("*.db3", "*.mcap", "metadata.yaml")}
-# Where it is not the format's name; a folder has none.
-SUFFIXES = {
-    **{"placement": ".sto", "csv-beyondmimic": ".csv"},
-    **{f"bvh-{name}": ".bvh" for name in RIGS},
-    **dict.fromkeys((*FOLDERS, BIDS), ""),
+SUFFIXES = {"placement": ".sto", "scale": ".xml", **dict.fromkeys(FOLDERS, "")}  # where it is not the format's name
+# Format that was written before → what to do instead.
+_OF_ROBOTS = "trajectory.csv of `wepose retarget` has the joints, and lerobot, mcap and rosbag are written"
+REMOVED = {
+    "osim": "--format scale -o NAME.xml writes the set-up of OpenSim's Scale Tool, which makes the model",
+    "motion-bids": "csv has the same columns",
+    **dict.fromkeys(("bvh-lafan1", "bvh-nokov", "bvh-soma", "bvh-xsens"), "bvh has the person's own skeleton"),
+    **dict.fromkeys(("pkl", "npz", "csv-beyondmimic"), _OF_ROBOTS),
 }
 FILE_SUFFIXES = (*FORMATS, "bag", "db3")
-WITHOUT_MOTION = ("urdf", OSIM, "placement")
+WITHOUT_MOTION = ("urdf", "placement", "scale")
 NAMES = ("isb", "opensim")
 
 
@@ -113,7 +103,6 @@ def export(
     episodes: str | None = None,
     instruction: str | None = None,
     osim_model: str | Path | None = None,
-    bids_name: str | None = None,
     force: bool = False,
     provenance: Mapping[str, Any] | None = None,
 ) -> Exported:
@@ -125,13 +114,11 @@ def export(
         A person's motion: what `track` or `load_result` gives, or a result folder. A robot's: what `retarget` gives, or
         a folder that `wepose retarget` wrote. Several only for "lerobot", which makes episodes of them.
     file : str or Path
-        The file to write; of "lerobot" and "rosbag" the folder, of "motion-bids" the folder of a data set, to which the
-        recording is added where it exists.
+        The file to write; of "lerobot" and "rosbag" the folder.
     format : str, optional
-        One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "osim", "trc", "c3d", "bvh",
-        "bvh-lafan1", "bvh-nokov", "bvh-soma", "bvh-xsens", "motion-bids". Of either: "urdf", "rosbag", "mcap", "rrd".
-        Of a robot: "lerobot", "pkl", "npz", "csv-beyondmimic". None: by the suffix of `file`; a stated
-        format needs a file with its own suffix.
+        One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "scale", "trc", "c3d", "bvh". Of
+        either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot". None: by the suffix of `file`; a stated format
+        needs a file with its own suffix.
     names : str, optional
         Of a .mot's columns: only the angles of the ISB, "isb", or only the coordinates of OpenSim's model, "opensim";
         None: both, the ISB's first.
@@ -146,11 +133,8 @@ def export(
     instruction : str, optional
         Of "lerobot": what the robot does, in all episodes; None: "follow NAME".
     osim_model : str or Path, optional
-        The generic OpenSim model that an .osim is scaled from. With a .sto also the scaled model and the set-up files
-        of OpenSense's tools are written beside it.
-    bids_name : str, optional
-        What the recording is called in a dataset of Motion-BIDS, such as "sub-01_task-reach_run-2"; what it lacks is
-        taken from the names of subject and recording.
+        Of "sto": the subject's OpenSim model, to which OpenSense's set-up files are written beside it. Of "scale": the
+        generic model that is scaled; None: "Rajagopal_2015.osim". Only its name is used.
     force : bool
         Replace an existing file, or a data set of the same format.
     provenance : mapping, optional
@@ -191,16 +175,11 @@ def export(
         episodes=episodes,
         instruction=instruction,
         osim_model=osim_model,
-        bids_name=bids_name,
     )
     if len(results) != 1 and format != LEROBOT:
         raise BadOption(
             f"--format {format}: a file of {len(results)} results; only {LEROBOT} takes several, as episodes"
         )
-    if format == BIDS:
-        motion = _read_motion(results[0], format, interval, phase, rate_hz)
-        name = parse_bids_name(bids_name, motion.subject, motion.name)
-        return Exported(format, write_motion_bids(file, motion, name, force, provenance))
     with contextlib.ExitStack() as files:
         if format in FOLDERS:
             partial = files.enter_context(_replaced_folder(file, FOLDERS[format], force))
@@ -214,18 +193,19 @@ def export(
         if format == "urdf":
             _write_urdf(partial, results[0])
             return Exported(format, [])
-        if format in OF_PERSONS:
+        if format in WRITERS:
             motion = _read_motion(results[0], format, interval, phase, rate_hz)
-            if format == OSIM:
-                return Exported(format, write_osim(partial, motion, Path(str(osim_model))))
-            write = WRITERS[format] if names is None else functools.partial(write_mot, names=names)
+            write = WRITERS[format]
+            if names is not None:
+                write = functools.partial(write_mot, names=names)
+            if format == "scale" and osim_model is not None:
+                write = functools.partial(write_scale, model=str(osim_model))
             diagnostics = write(partial, motion)
-            if osim_model is not None:
-                beside = OpenSenseFiles.beside(file)
-                others = (beside.model, beside.placement, beside.placer, beside.ik)
+            if format == "sto" and osim_model is not None:
+                beside = OpenSenseFiles.beside(file, str(osim_model))
+                others = (beside.placement, beside.placer, beside.ik)
                 written = OpenSenseFiles(partial, *(files.enter_context(whole_file(path, force)) for path in others))
-                diagnostics += write_osim(written.model, motion, Path(osim_model), begin=True)
-                diagnostics += write_setups(beside, written, motion)
+                write_setups(beside, written, motion)
             return Exported(format, diagnostics)
         motions = [_read_joint_motion(each, format, interval, phase) for each in results]
         if rate_hz is not None:
@@ -233,7 +213,7 @@ def export(
         if format == LEROBOT:
             write_lerobot(partial, [one for each in motions for one in list_episodes(each, episodes, instruction)])
             return Exported(format, [one for each in motions for one in diagnose_episodes(each, episodes)])
-        (JOINT_WRITERS | ROBOT_WRITERS)[format](partial, motions[0])
+        JOINT_WRITERS[format](partial, motions[0])
         return Exported(format, [])
 
 
@@ -254,13 +234,9 @@ def _check_options(format: str, **options: Any) -> None:
     if format in WITHOUT_MOTION and (unused := [name for name in ("rate-hz", "interval", "phase") if name in stated]):
         value = f" {rate_hz:g}" if rate_hz is not None else ""
         raise BadOption(f"--{unused[0]}{value}: there is no motion in a file of format {format}")
-    osim_model, bids_name = stated.get("osim-model"), stated.get("bids-name")
-    if osim_model is None and format == OSIM:
-        raise BadOption(f"--format {OSIM}: scales a model; --osim-model names a generic one, such as Rajagopal's")
-    if osim_model is not None and format not in (OSIM, "sto"):
-        raise BadOption(f"--osim-model {osim_model}: only an .osim and a .sto have use for it; the format is {format}")
-    if bids_name is not None and format != BIDS:
-        raise BadOption(f"--bids-name {bids_name}: only {BIDS} has such names, and the format is {format}")
+    osim_model = stated.get("osim-model")
+    if osim_model is not None and format not in ("sto", "scale"):
+        raise BadOption(f"--osim-model {osim_model}: only of formats sto and scale, and the format is {format}")
 
 
 @contextlib.contextmanager
@@ -301,9 +277,9 @@ def _read_joint_motion(
     """The motion of a robot, or of a person by joints, or the selected part of it."""
     if isinstance(result, HasJointMotion):
         return select_motion(result.joint_motion(), interval, phase)
-    if isinstance(result, str | Path) and (format in ROBOTS_ALONE or _is_of_robot(result)):
+    if isinstance(result, str | Path) and (format == LEROBOT or _is_of_robot(result)):
         return select_motion(read_joint_motion(Path(result)), interval, phase)
-    if format in ROBOTS_ALONE:
+    if format == LEROBOT:
         raise BadOption(f"--format {format}: is of robots, and this is a person's motion; `wepose retarget` makes one")
     return convert_person(_read_motion(result, format, interval, phase))
 
@@ -319,41 +295,36 @@ def _read_motion(
     if _is_of_robot(result):
         raise BadOption(
             f"--format {format}: is of a person's motion, and this is a robot's trajectory; "
-            f"of that there is: {', '.join(FORMATS[len(OF_PERSONS) :])}"
+            f"of that there is: {', '.join(FORMATS[len(WRITERS) :])}"
         )
     if isinstance(result, PosedBody):
         recorded = result.recording if isinstance(result, TrackedRecording) else result
-        phases, marks = getattr(recorded, "phases", {}), getattr(recorded, "marks", ())
+        phases = getattr(recorded, "phases", {})
         selected = select_interval(result.time, phases, interval, phase)
         pose = result.pose if selected is None else cut_pose(result.pose, selected)
-        motion = Motion(pose, result.model, result.name, result.name, _name_person(result.subject), phases, marks)
+        motion = Motion(pose, result.model, result.name, result.name)
     else:
         folder = Path(str(result))
         pose, model, summary = read_result(folder, interval, phase)
-        subject = load_subject(folder) if (folder / "subject.toml").is_file() else None
-        name, phases, marks = summary.get("recording") or folder.name, read_phases(summary), read_marks(summary)
-        motion = Motion(pose, model, str(name), str(folder), _name_person(subject), phases, marks)
+        motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder))
     if len(motion.pose.time) < 2:
         raise BadData(f"{motion.where}: a pose of {len(motion.pose.time)} samples; a motion has at least 2")
     return motion if rate_hz is None else resampled(motion, rate_hz)
 
 
-def _name_person(subject: Subject | None) -> str:
-    """The name of a subject; empty where none was stated."""
-    return "" if subject is None or subject.is_population else subject.name
-
-
 def _format(file: Path, format: str | None) -> str:
     if format is None:
         format = file.suffix.lower().removeprefix(".")
-        if format not in FORMATS:
+        if format not in FORMATS and format not in REMOVED:
             raise BadOption(
                 f"-o {file}: '{file.suffix}' is no format's suffix; state it by --format; {one_of(FORMATS)}"
             )
+    if format in REMOVED:
+        raise BadOption(f"--format {format}: no longer written; {REMOVED[format]}")
     if format not in FORMATS:
         raise BadOption(f"--format {format}: not known; {one_of(FORMATS, format)}")
     suffix = SUFFIXES.get(format, f".{format}")
-    if format in (*FOLDERS, BIDS):
+    if format in FOLDERS:
         if file.suffix.lower().removeprefix(".") in FILE_SUFFIXES:  # readers would take the folder for a file
             raise BadOption(f"-o {file}: format {format} is a folder; name it {file.stem}")
     elif file.suffix.lower() != suffix:

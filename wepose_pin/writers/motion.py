@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -12,7 +12,7 @@ from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, WrongOption
 from ..kinematics import Pose, compute_pose
 from ..model import BodyModel
-from ..recording import Intervals, Mark, format_span
+from ..recording import format_span
 
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
@@ -29,17 +29,12 @@ class Motion:
     pose, model : as `read_result` gives them
     name : of the recording
     where : the result's folder, for error texts
-    subject : name of the person; empty where none is known
-    phases, marks : of the recording, all of them also where `pose` is a part
     """
 
     pose: Pose
     model: BodyModel
     name: str
     where: str
-    subject: str = ""
-    phases: Mapping[str, Intervals] = field(default_factory=dict)
-    marks: tuple[Mark, ...] = ()
 
     @property
     def rate_hz(self) -> float:

@@ -1,4 +1,4 @@
-"""OpenSim's tables: joint angles (.mot), orientations for OpenSense (.sto), points (.trc).
+"""OpenSim's files: joint angles (.mot), orientations for OpenSense (.sto), points (.trc), the set-ups of its tools.
 
 In OpenSim's ground G (x forward, y up, z right), the angles and the bodies those of Rajagopal's model (`rajagopal`).
 
@@ -16,26 +16,28 @@ What OpenSim's readers demand (opensim-core, OpenSim/Common):
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from xml.sax.saxutils import escape
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 import polars as pl
-from scipy.spatial.transform import Rotation
 
 from ..angles import diagnose_lock, joint_angles
-from ..diagnostics import WARNING, Diagnostic
+from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, BadOption
 from ..readers.opensim import OWN
 from .motion import Motion, check_complete, check_joint_names, diagnose_gaps, find_measured_points, resample_evenly
-from .rajagopal import compute_bodies, coordinates, find_first_values, in_ground, orientations
+from .rajagopal import SPANS, coordinates, in_ground, orientations
 
 _TRC_KEYS = (
     *("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"),
     *("OrigDataRate", "OrigDataStartFrame", "OrigNumFrames"),
 )
+GENERIC_MODEL = "Rajagopal_2015.osim"  # of OpenSense's example
 MOST_MISSED = np.deg2rad(1.0)  # [rad] rms of a body of the model, whose elbows and wrists have two axes
 
 
@@ -107,20 +109,21 @@ class OpenSenseFiles:
     Parameters
     ----------
     orientations : the .sto
-    model, placement, placer, ik : the scaled model, and the sample and the set-ups of OpenSense's two tools
+    placement, placer, ik : the sample and the set-ups of OpenSense's two tools
+    model : name of the subject's model
     """
 
     orientations: Path
-    model: Path
     placement: Path
     placer: Path
     ik: Path
+    model: str = ""
 
     @classmethod
-    def beside(cls, sto: Path) -> OpenSenseFiles:
+    def beside(cls, sto: Path, model: str) -> OpenSenseFiles:
         """The files beside a .sto, named after it."""
-        endings = (".osim", "_placement.sto", "_placer.xml", "_ik.xml")
-        return cls(sto, *(sto.with_name(f"{sto.stem}{ending}") for ending in endings))
+        endings = ("_placement.sto", "_placer.xml", "_ik.xml")
+        return cls(sto, *(sto.with_name(f"{sto.stem}{ending}") for ending in endings), model)
 
     @property
     def placed_model(self) -> str:
@@ -151,18 +154,13 @@ def write_sto(path: Path, motion: Motion) -> list[Diagnostic]:
 
 def write_placement(path: Path, motion: Motion) -> list[Diagnostic]:
     """One sample for OpenSense's IMU Placer: the same sensors while all coordinates of the model are zero."""
-    _write_sample(path, motion, dict.fromkeys(_bodies(motion), Rotation.identity()))
+    upright = np.array([[0.0, 0.0, 0.0, 1.0]])
+    _write_quaternions(path, motion, np.zeros(1), dict.fromkeys(_bodies(motion), upright))
     return []
 
 
-def _write_sample(path: Path, motion: Motion, pose: Mapping[str, Rotation]) -> None:
-    _write_quaternions(path, motion, np.zeros(1), {body: R_GB.as_quat()[None] for body, R_GB in pose.items()})
-
-
-def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion) -> list[Diagnostic]:
-    """Write all that OpenSense needs beside the .sto: a scaled model, set-ups of IMU Placer and IK.
-
-    The sample for the placer has the sensors as they are in the default pose of the model, that of the first sample.
+def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion) -> None:
+    """Write what OpenSense needs beside the .sto and the subject's model: the set-ups of IMU Placer and IK.
 
     Parameters
     ----------
@@ -175,11 +173,9 @@ def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion)
     BadData
         No segment is a body of the model.
     """
-    bodies = _bodies(motion)
-    pose = compute_bodies(find_first_values(bodies))
-    _write_sample(written.placement, motion, {body: pose[body] for body in bodies})
+    write_placement(written.placement, motion)
     placer = {
-        "model_file": files.model.name,
+        "model_file": files.model,
         "sensor_to_opensim_rotations": "0 0 0",
         "orientation_file_for_calibration": files.placement.name,
         "output_model_file": files.placed_model,
@@ -196,13 +192,70 @@ def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion)
         "output_motion_file": files.solution,
     }
     _write_setup(written.ik, "IMUInverseKinematicsTool", solver)
-    return []
 
 
-def _write_setup(path: Path, tool: str, properties: Mapping[str, str]) -> None:
-    lines = [f"\t\t<{name}>{escape(text)}</{name}>" for name, text in properties.items()]
-    top = f'<?xml version="1.0" encoding="UTF-8" ?>\n<OpenSimDocument Version="40000">\n\t<{tool} name="{tool}">'
-    path.write_text("\n".join((top, *lines, f"\t</{tool}>", "</OpenSimDocument>", "")), encoding="utf-8")
+def _write_setup(path: Path, tool: str, properties: Mapping[str, Any], name: str = "") -> None:
+    document = Element("OpenSimDocument", Version="40000")
+    _add_properties(SubElement(document, tool, name=name or tool), properties)
+    indent(document, "\t")
+    path.write_bytes(tostring(document, encoding="UTF-8", xml_declaration=True) + b"\n")
+
+
+def _add_properties(parent: Element, properties: Mapping[str, Any]) -> None:
+    """Add properties and what is nested in them; of a list of mappings each is an object of the same name."""
+    for name, value in properties.items():
+        for each in value if isinstance(value, list) else [value]:
+            child = SubElement(parent, name)
+            if isinstance(each, Mapping):
+                _add_properties(child, each)
+            else:
+                child.text = each
+
+
+# The model --------------------------------------------------------------------------------------------------------
+
+
+def write_scale(path: Path, motion: Motion, model: str = GENERIC_MODEL) -> list[Diagnostic]:
+    """Write the set-up of OpenSim's Scale Tool that gives the generic model the subject's lengths; give the factors.
+
+    The factors are over the lengths of Rajagopal's model. Masses stay. No markers are placed, so
+    the tool's part for them is left out.
+
+    Parameters
+    ----------
+    model : name of the generic model
+
+    Raises
+    ------
+    BadData
+        The subject has no length that the model has.
+    """
+    factors: dict[str, dict[str, float]] = {}
+    words = []
+    for length, span in SPANS.items():
+        if length not in motion.model.lengths:
+            continue
+        factor = motion.model.lengths[length] / span.generic
+        words.append(f"{', '.join(span.bodies)} by {factor:.4f} along {span.axes} ({length})")
+        for body in span.bodies:
+            factors.setdefault(body, dict.fromkeys("xyz", 1.0)).update(dict.fromkeys(span.axes, factor))
+    if not factors:
+        raise BadData(f"{motion.where}: the body has no length that OpenSim's model of a person has")
+    scales = [
+        {"scales": " ".join(f"{value:.9f}" for value in of.values()), "segment": body, "apply": "true"}
+        for body, of in factors.items()
+    ]
+    scaler = {
+        "apply": "true",
+        "scaling_order": "manualScale",
+        "ScaleSet": {"objects": {"Scale": scales}},
+        "preserve_mass_distribution": "true",
+        "output_model_file": f"{path.name.removeprefix('.').removesuffix('.partial').removesuffix('.xml')}.osim",
+    }
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "_", motion.name) or "subject"
+    tool = {"GenericModelMaker": {"model_file": model}, "ModelScaler": scaler}
+    _write_setup(path, "ScaleTool", {"mass": "-1", **tool}, name)
+    return [Diagnostic("osim-scaled", INFO, facts={"scales": "; ".join(words)})]
 
 
 def _bodies(motion: Motion) -> dict[str, np.ndarray]:

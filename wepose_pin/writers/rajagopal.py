@@ -42,6 +42,35 @@ ELBOW = (np.array([0.22604696, 0.022269, 0.97386183]), PRONATION)
 WRIST = (_Z, _X)
 
 
+class Span(NamedTuple):
+    """A length of the subject in the model: between joint centres, all coordinates at zero."""
+
+    generic: float  # [m] in the generic model
+    bodies: tuple[str, ...]  # those that scale with it
+    axes: str = "xyz"  # along which they do
+
+
+def _limb_spans(side: str, s: str) -> dict[str, Span]:
+    return {
+        f"{side}_upper_arm": Span(0.2867352, (f"humerus_{s}",)),  # humerus to ulna
+        f"{side}_forearm": Span(0.2524715, (f"ulna_{s}", f"radius_{s}")),  # ulna to hand
+        f"{side}_hand": Span(0.0680950, (f"hand_{s}",)),  # wrist to the hand's mass centre, taken for the palm
+        f"{side}_thigh": Span(0.4080495, (f"femur_{s}", f"patella_{s}")),  # femur to tibia
+        f"{side}_shank": Span(0.3964726, (f"tibia_{s}",)),  # tibia to talus
+        f"{side}_foot": Span(0.1375515, (f"talus_{s}", f"calcn_{s}", f"toes_{s}")),  # talus to toes
+    }
+
+
+# Length → where it is in the model.
+SPANS = {
+    "trunk": Span(0.5330898, ("pelvis", "torso"), "xy"),  # middle of the femora to middle of the humeri
+    "shoulder_width": Span(0.34, ("torso",), "z"),
+    "hip_width": Span(0.15452, ("pelvis",), "z"),
+    **_limb_spans("left", "l"),
+    **_limb_spans("right", "r"),
+}
+
+
 class Joint(NamedTuple):
     """A joint of the model."""
 
@@ -129,22 +158,6 @@ def coordinates(quat_GB: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray
             columns |= _solve_three_axes(shoulder, JOINTS[f"humerus_{side}"].coordinates)
         columns |= below
     return columns, residuals
-
-
-def find_first_values(quat_GB: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Coordinate → its value [rad] in the first sample."""
-    first, _ = coordinates({body: quat[:1] for body, quat in quat_GB.items()})
-    return {name: float(values[0]) for name, values in first.items()}
-
-
-def compute_bodies(values: Mapping[str, float]) -> dict[str, Rotation]:
-    """Body → its rotation to G with the coordinates at `values` [rad], 0 where not named; legs stand."""
-    turned = {"ground": Rotation.identity()}
-    for body, joint in JOINTS.items():
-        turned[body] = turned[joint.parent]
-        for name, axis in zip(joint.coordinates, joint.axes, strict=True):
-            turned[body] = turned[body] * Rotation.from_rotvec(values.get(name, 0.0) * axis / np.linalg.norm(axis))
-    return {body: turned.get(body, turned["ground"]) for body in BODIES.values()}
 
 
 def _solve_three_axes(quat: np.ndarray, names: Sequence[str]) -> dict[str, np.ndarray]:
