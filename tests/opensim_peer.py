@@ -139,68 +139,26 @@ def opensense(folder: Path) -> dict[str, Any]:
     return read(next((folder / "ik").glob("*.mot")))
 
 
-def joint_centres(file: Path) -> dict[str, np.ndarray]:
-    """Body → where the joint that moves it is (3,) [m] in ground, coordinates at their defaults; marker → its place."""
-    model = osim.Model(str(file))
-    state = model.initSystem()
-    model.realizePosition(state)
-    joints = model.getJointSet()
-    centres = {}
-    for k in range(joints.getSize()):
-        child = joints.get(k).getChildFrame()
-        centres[child.findBaseFrame().getName()] = child.getPositionInGround(state).to_numpy()
-    for k in range(model.getMarkerSet().getSize()):
-        marker = model.getMarkerSet().get(k)
-        centres[marker.getName()] = marker.getLocationInGround(state).to_numpy()
-    return centres
-
-
-def zero_pose(file: Path, out: Path) -> None:
-    """The same model with all joints at zero by default; the pelvis keeps its place."""
-    model = osim.Model(str(file))
-    coordinates = model.updCoordinateSet()
+def run_scale_tool(setup: Path, model: str) -> dict[str, np.ndarray]:
+    """Body → where the joint that moves it is (3,) [m] in ground, all joints at zero, in the model that is written."""
+    here = Path.cwd()
+    os.chdir(setup.parent)
+    try:
+        assert osim.ScaleTool(setup.name).run()
+        scaled = osim.Model(model)
+    finally:
+        os.chdir(here)
+    coordinates = scaled.updCoordinateSet()
     for k in range(coordinates.getSize()):
         if not coordinates.get(k).getName().startswith("pelvis_t"):
             coordinates.get(k).setDefaultValue(0.0)
-    model.printToXML(str(out))
-
-
-def scale(file: Path, factors: Mapping[str, tuple[float, float, float]], out: Path) -> None:
-    """OpenSim's own scaling of a model by factors a body along x, y, z; masses stay."""
-    model = osim.Model(str(file))
-    scales = osim.ScaleSet()
-    for body, factor in factors.items():
-        each = osim.Scale()
-        each.setSegmentName(body)
-        each.setScaleFactors(osim.Vec3(*factor))
-        each.setApply(True)
-        scales.cloneAndAppend(each)
-    model.scale(model.initSystem(), scales, True, -1.0)
-    model.printToXML(str(out))
-
-
-def mass_properties(file: Path) -> dict[str, tuple[float, np.ndarray, np.ndarray]]:
-    """Body → mass [kg], mass centre (3,) [m], inertia (6,) [kg m²]."""
-    model = osim.Model(str(file))
-    properties = {}
-    for k in range(model.getBodySet().getSize()):
-        body = model.getBodySet().get(k)
-        inertia = body.get_inertia()
-        moments = np.array([inertia.get(i) for i in range(6)])
-        properties[body.getName()] = (body.getMass(), body.getMassCenter().to_numpy(), moments)
-    return properties
-
-
-def run_setups(folder: Path, stem: str) -> dict[str, Any]:
-    """What the IMU Placer and the inverse kinematics make of their set-up files, as the tutorial runs them."""
-    here = Path.cwd()
-    os.chdir(folder)
-    try:
-        osim.IMUPlacer(f"{stem}_placer.xml").run(False)
-        osim.IMUInverseKinematicsTool(f"{stem}_ik.xml").run(False)
-    finally:
-        os.chdir(here)
-    return read(folder / f"{stem}_ik.mot")
+    state = scaled.initSystem()
+    scaled.realizePosition(state)
+    centres = {}
+    for k in range(scaled.getJointSet().getSize()):
+        child = scaled.getJointSet().get(k).getChildFrame()
+        centres[child.findBaseFrame().getName()] = child.getPositionInGround(state).to_numpy()
+    return centres
 
 
 def play(file: Path, labels: list[str]) -> np.ndarray:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import polars as pl
@@ -15,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from test_export import LENGTHS, POINTS, a_pose, smooth, with_gap, write_folder
 
 from wepose_pin.angles import joint_angles
+from wepose_pin.errors import BadOption
 from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
@@ -166,6 +169,55 @@ def test_shoulders_and_thorax_are_the_isbs_of_zxy() -> None:
     assert missed == {}
 
 
+# The set-ups of OpenSim's tools -----------------------------------------------------------------------------------
+
+
+def test_the_scale_tool_is_told_the_subjects_lengths(result: Path, tmp_path: Path) -> None:
+    assert [each.code for each in export(result, tmp_path / "anna.xml", "scale").diagnostics] == ["osim-scaled"]
+    tool = ElementTree.parse(tmp_path / "anna.xml").getroot()[0]
+    assert tool.tag == "ScaleTool"
+    assert tool.findtext("GenericModelMaker/model_file") == "Rajagopal_2015.osim"
+    assert tool.findtext("ModelScaler/output_model_file") == "anna.osim"
+    scales = {
+        each.findtext("segment"): np.array((each.findtext("scales") or "").split(), dtype=float)
+        for each in tool.iter("Scale")
+    }
+    lengths = load_model(lengths=LENGTHS).lengths
+    trunk, width = lengths["trunk"] / 0.53309, lengths["shoulder_width"] / 0.34
+    np.testing.assert_allclose(scales["torso"], [trunk, trunk, width], rtol=1e-5)
+    np.testing.assert_allclose(scales["pelvis"], [trunk, trunk, 1.0], rtol=1e-5)
+    np.testing.assert_array_equal(scales["ulna_l"], scales["radius_l"])
+
+
+def test_the_setups_of_opensense_name_each_other(result: Path, tmp_path: Path) -> None:
+    assert export(result, tmp_path / "a.sto", osim_model="anna.osim").diagnostics == []
+    assert {path.name for path in tmp_path.iterdir()} == {"a.sto", "a_placement.sto", "a_placer.xml", "a_ik.xml"}
+    placer, ik = (ElementTree.parse(tmp_path / f"a_{tool}.xml").getroot()[0] for tool in ("placer", "ik"))
+    assert placer.findtext("model_file") == "anna.osim"
+    assert placer.findtext("orientation_file_for_calibration") == "a_placement.sto"
+    assert placer.findtext("output_model_file") == ik.findtext("model_file")
+    assert ik.findtext("orientations_file") == "a.sto"
+    begin, end = map(float, (ik.findtext("time_range") or "").split())
+    assert (begin, end) == pytest.approx((1.995, 5.005))
+
+
+@pytest.mark.parametrize(
+    ("file", "format", "instead"),
+    [
+        ("x.osim", None, "--format scale -o NAME.xml"),
+        ("x", "motion-bids", "csv has the same columns"),
+        ("x.bvh", "bvh-soma", "bvh has the person's own skeleton"),
+        ("x.npz", None, "lerobot, mcap and rosbag"),
+    ],
+)
+def test_a_format_that_went_says_what_to_do_instead(
+    result: Path, tmp_path: Path, file: str, format: str | None, instead: str
+) -> None:
+    with pytest.raises(BadOption, match=instead):
+        export(result, tmp_path / file, format)
+    assert list(tmp_path.iterdir()) == []
+
+
 # OpenSim itself ---------------------------------------------------------------------------------------------------
 
 
@@ -212,6 +264,22 @@ def test_opensense_finds_the_same_angles_from_the_sto(peer: Callable[..., Any], 
     solved, ours = peer("opensense", tmp_path), peer("read", tmp_path / "x.mot")
     theirs = solved["values"][:, [solved["labels"].index(label) for label in ours["labels"]]]
     np.testing.assert_allclose(theirs, ours["values"], atol=0.05)
+
+
+@pytest.mark.peer
+def test_the_scaled_model_has_the_subjects_lengths(
+    peer: Callable[..., Any], result: Path, data: Path, tmp_path: Path
+) -> None:
+    shutil.copy(data / "osim" / "Rajagopal_2015.osim", tmp_path)
+    export(result, tmp_path / "anna.xml", "scale")
+    centre = peer("run_scale_tool", tmp_path / "anna.xml", "anna.osim")
+    middle = {part: 0.5 * (centre[f"{part}_r"] + centre[f"{part}_l"]) for part in ("femur", "humerus")}
+    spans = {"trunk": middle["humerus"] - middle["femur"], "shoulder_width": centre["humerus_r"] - centre["humerus_l"]}
+    for side in ("left", "right"):
+        shoulder, elbow, wrist = (centre[f"{body}_{side[0]}"] for body in ("humerus", "ulna", "hand"))
+        spans |= {f"{side}_upper_arm": elbow - shoulder, f"{side}_forearm": wrist - elbow}
+    for length, span in spans.items():
+        assert np.linalg.norm(span) == pytest.approx(load_model(lengths=LENGTHS).lengths[length], abs=1e-6), length
 
 
 @pytest.mark.peer

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import subprocess
 import sys
 from collections.abc import Callable
@@ -22,8 +21,6 @@ from test_export import a_pose, write_folder
 from wepose_pin import cli
 from wepose_pin.errors import WeposeError
 from wepose_pin.kinematics import PosedBody
-from wepose_pin.model import read_urdf
-from wepose_pin.model.meshes import find_example_data
 from wepose_pin.subject import population_subject
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import (
@@ -223,131 +220,6 @@ def test_lerobot_loads_it(trajectory: Path, motion: JointMotion, tmp_path: Path)
     assert (got["ahead"], got["last_episode"]) == ([8, 3, 7], 61)
 
 
-# Humanoids --------------------------------------------------------------------------------------------------------
-
-# The order in which Isaac Lab has the joints and bodies of the G1, as published for policies of several authors.
-ISAAC_JOINTS = """left_hip_pitch right_hip_pitch waist_yaw left_hip_roll right_hip_roll waist_roll left_hip_yaw
-right_hip_yaw waist_pitch left_knee right_knee left_shoulder_pitch right_shoulder_pitch left_ankle_pitch
-right_ankle_pitch left_shoulder_roll right_shoulder_roll left_ankle_roll right_ankle_roll left_shoulder_yaw
-right_shoulder_yaw left_elbow right_elbow left_wrist_roll right_wrist_roll left_wrist_pitch right_wrist_pitch
-left_wrist_yaw right_wrist_yaw""".split()
-# That of MuJoCo and of BeyondMimic's .csv.
-LEG = ["hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll"]
-ARM = ["shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw"]
-MUJOCO_JOINTS = [
-    *(f"{side}_{part}_joint" for side in ("left", "right") for part in LEG),
-    *("waist_yaw_joint", "waist_roll_joint", "waist_pitch_joint"),
-    *(f"{side}_{part}_joint" for side in ("left", "right") for part in ARM),
-]
-
-
-@pytest.fixture(scope="module")
-def g1() -> JointMotion:
-    """The G1, each of its joints at a value of its own, standing at 0.79 m and turned by a quarter."""
-    data = find_example_data()
-    if data is None:
-        pytest.skip("example-robot-data is not installed")
-    urdf = data / "g1_description/urdf/g1_29dof_rev_1_0.urdf"
-    time, names = np.arange(40) / 50.0, MUJOCO_JOINTS[::-1]
-    position = 0.01 * np.arange(29) + 0.1 * np.sin(3.0 * time)[:, None]
-    velocity = np.repeat(0.3 * np.cos(3.0 * time)[:, None], 29, axis=1)
-    turned = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
-    text = urdf.read_text(encoding="utf-8")
-    return JointMotion(
-        "g1", "g1", read_urdf(urdf), text, tuple(names), time, position, velocity, {}, np.array([0.1, 0.2, 0.79]),
-        turned, time,
-    )  # fmt: skip
-
-
-class Moving:
-    """What `export` takes for a trajectory."""
-
-    def __init__(self, motion: JointMotion) -> None:
-        self._motion = motion
-
-    def joint_motion(self) -> JointMotion:
-        return self._motion
-
-
-def test_gmr_loads_the_pickle(g1: JointMotion, tmp_path: Path) -> None:
-    """As GMR's `load_robot_motion`, which turns xyzw into wxyz."""
-    export(Moving(g1), tmp_path / "x.pkl")
-    loaded = pickle.loads((tmp_path / "x.pkl").read_bytes())
-    assert (loaded["fps"], type(loaded["fps"])) == (50, int)
-    assert loaded["local_body_pos"] is loaded["link_body_list"] is None
-    np.testing.assert_allclose(
-        loaded["root_rot"][:, [3, 0, 1, 2]], np.tile([np.sqrt(0.5), 0, 0, np.sqrt(0.5)], (40, 1))
-    )
-    np.testing.assert_array_equal(loaded["dof_pos"], g1.position[:, ::-1])
-    np.testing.assert_array_equal(loaded["root_pos"][-1], [0.1, 0.2, 0.79])
-    export(Moving(g1), tmp_path / "x.csv", "csv-beyondmimic")
-    rows = np.loadtxt(tmp_path / "x.csv", delimiter=",")
-    assert rows.shape == (40, 36)
-    np.testing.assert_allclose(rows, np.hstack([loaded["root_pos"], loaded["root_rot"], loaded["dof_pos"]]), atol=5e-9)
-
-
-def test_beyondmimic_loads_the_npz(g1: JointMotion, tmp_path: Path) -> None:
-    """As its `MotionLoader`, which takes bodies by their place in Isaac Lab's list; velocities against differences."""
-    export(Moving(g1), tmp_path / "x.npz")
-    with np.load(tmp_path / "x.npz", allow_pickle=False) as data:
-        loaded = dict(data)
-    joints = [f"{name}_joint" for name in ISAAC_JOINTS]
-    bodies = ["pelvis", *(f"{name}_link" for name in ISAAC_JOINTS)]
-    bodies[bodies.index("waist_pitch_link")] = "torso_link"
-    assert (loaded["joint_names"].tolist(), loaded["body_names"].tolist()) == (joints, bodies)
-    assert loaded["fps"].tolist() == [50]
-    assert loaded["body_pos_w"].shape == (40, 30, 3)
-    columns = [g1.joints.index(joint) for joint in joints]
-    np.testing.assert_allclose(loaded["joint_pos"], g1.position[:, columns], atol=1e-7)
-    np.testing.assert_allclose(loaded["joint_vel"], g1.velocity[:, columns], atol=1e-7)
-    fine = resample_joints(g1, 2000.0)
-    for body, (quat, p) in compute_link_poses_W(fine).items():
-        if body in bodies:
-            k = bodies.index(body)
-            np.testing.assert_allclose(loaded["body_pos_w"][:, k], p[::40], atol=1e-6)
-            np.testing.assert_allclose(
-                np.abs(np.sum(loaded["body_quat_w"][:, k] * quat[::40, [3, 0, 1, 2]], 1)), 1, atol=1e-6
-            )
-            np.testing.assert_allclose(
-                loaded["body_lin_vel_w"][1:-1, k], np.gradient(p, fine.time, axis=0)[40:-1:40], atol=1e-4
-            )
-            turn = Rotation.from_quat(quat[41:-1:40]) * Rotation.from_quat(quat[39:-2:40]).inv()
-            np.testing.assert_allclose(loaded["body_ang_vel_w"][1:-1, k], turn.as_rotvec() * 1000.0, atol=1e-4)
-
-
-@pytest.mark.peer
-@pytest.mark.parametrize("turned", [(0.0, 0.0, 0.0), (0.4, 0.1, -0.3)])
-def test_mujoco_puts_the_bodies_there(tmp_path: Path, turned: tuple[float, float, float]) -> None:
-    """MuJoCo with the same URDF and the joints of the .pkl in its own order."""
-    mujoco = pytest.importorskip("mujoco")
-    folder = write_trajectory_folder(tmp_path / "arm", seconds=0.5)
-    (tmp_path / "other").mkdir()
-    write_arm(tmp_path / "other", turned=turned).replace(folder / "robot.urdf")
-    for suffix in ("pkl", "npz"):
-        export(folder, tmp_path / f"x.{suffix}")
-    motion, bodies = pickle.loads((tmp_path / "x.pkl").read_bytes()), np.load(tmp_path / "x.npz")
-    # Massless bodies that move, as in this URDF, are refused; mass does not matter to where they are.
-    text = (
-        (folder / "robot.urdf")
-        .read_text()
-        .replace(
-            '<robot name="arm">',
-            '<robot name="arm"><mujoco><compiler balanceinertia="true" boundmass="0.1" boundinertia="0.1"/></mujoco>',
-        )
-    )
-    model = mujoco.MjModel.from_xml_string(text)
-    data = mujoco.MjData(model)
-    assert [model.joint(k).name for k in range(model.njnt)] == list(JOINTS)
-    R_WB, p_WB = Rotation.from_quat(motion["root_rot"][0]), motion["root_pos"][0]
-    worst = 0.0
-    for k in range(len(motion["dof_pos"])):
-        data.qpos[:] = motion["dof_pos"][k]
-        mujoco.mj_kinematics(model, data)
-        for name, p in zip(bodies["body_names"].tolist()[1:], bodies["body_pos_w"][k, 1:], strict=True):
-            worst = max(worst, np.abs(R_WB.apply(data.body(name).xpos) + p_WB - p).max())
-    assert worst < 1e-6
-
-
 # What is wrong ----------------------------------------------------------------------------------------------------
 
 
@@ -389,8 +261,7 @@ def test_a_spoiled_trajectory_takes_one_line(
 ) -> None:
     folder = write_trajectory_folder(tmp_path / "arm", seconds=3.0)
     spoil(folder)
-    for name, format in (("data", "lerobot"), ("x.npz", "npz"), ("x.pkl", "pkl")):
-        assert_refused(capsys, [str(folder), "-o", str(tmp_path / name), "--format", format], said)
+    assert_refused(capsys, [str(folder), "-o", str(tmp_path / "data"), "--format", "lerobot"], said)
     assert [path.name for path in tmp_path.iterdir()] == ["arm"]
 
 
@@ -411,12 +282,13 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
         (["-o", "d", "--format", "lerobot", "--rate-hz", "33.3"], "33.3 samples a second"),
         (["-o", "d", "--format", "lerobot", "--interval", "50", "60"], "the recording runs from 1.5 to"),
         (["-o", "x.mcap", "--episodes", "reach"], "--episodes reach: only of format lerobot, and the format is mcap"),
-        (["-o", "x.npz", "--instruction", "go"], "--instruction go: only of format lerobot, and the format is npz"),
+        (["-o", "x.mcap", "--instruction", "go"], "--instruction go: only of format lerobot, and the format is mcap"),
         (
             ["-o", "x.trc"],
             "--format trc: is of a person's motion, and this is a robot's trajectory; of that there is: urdf",
         ),
-        (["-o", "x.pickle", "--format", "pkl"], "name it x.pkl"),
+        (["-o", "x.bin", "--format", "mcap"], "name it x.mcap"),
+        (["-o", "x.pkl"], "--format pkl: no longer written; trajectory.csv of `wepose retarget` has the joints"),
         (["-o", "x.bag", "--format", "rosbag"], "-o x.bag: format rosbag is a folder; name it x"),
         (["-o", "d"], "-o d: '' is no format's suffix"),
         (["{arm}", "-o", "x.mcap"], "--format mcap: a file of 2 results; only lerobot takes several, as episodes"),
@@ -443,12 +315,10 @@ def test_a_wrong_export_of_a_robot_takes_one_line(
 
 def test_a_person_is_no_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "r", a_pose(n=5))
-    for arguments in (["-o", str(tmp_path / "d"), "--format", "lerobot"], ["-o", str(tmp_path / "x.npz")]):
-        assert_refused(
-            capsys, [str(folder), *arguments], "no trajectory.parquet in it; a folder that `wepose retarget`"
-        )
+    arguments = [str(folder), "-o", str(tmp_path / "d"), "--format", "lerobot"]
+    assert_refused(capsys, arguments, "no trajectory.parquet in it; a folder that `wepose retarget`")
     with pytest.raises(WeposeError, match="is of robots, and this is a person's motion; `wepose retarget` makes one"):
-        export(load_result_of(folder), tmp_path / "x.pkl")
+        export(load_result_of(folder), tmp_path / "d", "lerobot")
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
 
 

@@ -33,8 +33,6 @@ ALLOWED = {
     "readers/mvnx.py": "the names of a format",
     "readers/opensim.py": "the names of a format",
     "writers/bvh.py": "the names of a format",
-    "writers/gmr.py": "the names of a format",
-    "writers/osim.py": "the names of a format",
     "writers/rajagopal.py": "the names of a format",
     "writers/standing.py": "the figure of formats that have a person",
     "retargeting/maps.py": "the keys of a robot's map",

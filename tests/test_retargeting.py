@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from wepose_pin.retargeting import (
 from wepose_pin.retargeting.checks import AT_REST, SelfCollisions
 from wepose_pin.retargeting.collision import CollisionModel
 from wepose_pin.retargeting.controller import ControllerParams, HandTarget, JointState, QpController
-from wepose_pin.retargeting.error_attribution import assess_reachability, attribute_errors
+from wepose_pin.retargeting.error_attribution import MissedTarget, assess_reachability, attribute_errors
 from wepose_pin.retargeting.limits import compute_acceleration_bounds, read_joint_limits, reduce_acceleration_limits
 from wepose_pin.retargeting.maps import KEYS, read_map
 from wepose_pin.retargeting.targets import CLAMP_FROM, CLAMP_TO, clamp_to_reach
@@ -745,6 +746,32 @@ def test_the_exit_code_says_that_no_robot_should_run_it(
     assert code == 3
     assert "touch each other in 3 samples, first hand_0 and base_0 at 2.00 s" in " ".join(text.split())
     assert (tmp_path / "out" / "trajectory.parquet").is_file()
+
+
+def test_a_hand_that_stays_off_a_target_within_reach_ends_in_exit_code_3(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missed = [MissedTarget("right", 3.0, 5.5, 0.4)]
+    monkeypatch.setattr("wepose_pin.retargeting.files.find_missed_targets", lambda _: missed)
+    code, _ = run(capsys, "retarget", str(result), "--robot", str(write_arm(tmp_path)), "-o", str(tmp_path / "out"))
+    assert code == 3
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [each["code"] for each in summary["diagnostics"] if each["severity"] == "error"] == [
+        "reachable-target-missed"
+    ]
+    assert summary["missed_targets"] == [{"side": "right", "begin": 3.0, "end": 5.5, "error": 0.4}]
+
+
+def test_a_robot_without_shapes_is_said_to_be_unchecked(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    urdf = write_arm(tmp_path)
+    urdf.write_text(re.sub("<collision>.*?</collision>", "", urdf.read_text()))
+    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"), "--no-view")
+    assert code == 0
+    assert "No self-collision" not in text
+    diagnostics = json.loads((tmp_path / "out" / "summary.json").read_text())["diagnostics"]
+    assert "robot-self-collision-unchecked" in [each["code"] for each in diagnostics]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import FORE, HAND, UPPER, person
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import NoSolution
@@ -27,7 +29,9 @@ from wepose_pin.retargeting import (
 )
 from wepose_pin.retargeting.checks import AT_REST
 from wepose_pin.retargeting.collision import CollisionModel
+from wepose_pin.retargeting.error_attribution import find_missed_targets
 from wepose_pin.retargeting.files import place_root
+from wepose_pin.retargeting.reconfiguration import Planner
 from wepose_pin.retargeting.targets import compute_target_reach
 
 pytest.importorskip("daqp")
@@ -179,3 +183,40 @@ def test_the_real_recording(tracked: Pose, name: str) -> None:
     trajectory = retarget(pose, robot)
     is_sound(trajectory)
     assert trajectory.counts.stopping == 0
+
+
+def wandering(seed: int, seconds: float) -> Pose:
+    """A right arm whose joints go from one random angle to another every two seconds, up to the ends of their range."""
+    time = np.arange(0.0, seconds, 0.01)
+    rng, knots = np.random.default_rng(seed), np.arange(0.0, time[-1] + 8.0, 2.0)
+
+    def wander(low: float, high: float) -> np.ndarray:
+        angle = PchipInterpolator(knots, rng.uniform(low, high, len(knots)))(time)
+        return np.radians(gaussian_filter1d(angle, 12.0))
+
+    flexion, abduction, turn, elbow, roll = (
+        wander(*ends) for ends in ((-40, 175), (-30, 120), (-80, 80), (3, 145), (-90, 90))
+    )
+    upper = Rotation.from_euler("YXZ", np.column_stack([-flexion, -abduction, turn]))
+    fore = upper * Rotation.from_euler("YZ", np.column_stack([-elbow, roll]))
+    points = {"right_shoulder": np.tile([0.0, -0.19, 0.45], (len(time), 1))}
+    points["right_elbow"] = points["right_shoulder"] + upper.apply([0.0, 0.0, -UPPER])
+    points["right_wrist"] = points["right_elbow"] + fore.apply([0.0, 0.0, -FORE])
+    points["right_palm"] = points["right_wrist"] + fore.apply([0.0, 0.0, -HAND])
+    torso = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
+    return Pose(time, {"torso": torso, "right_upper_arm": upper.as_quat(), "right_forearm": fore.as_quat()}, points)
+
+
+def test_an_arm_does_not_stay_away_from_targets_that_it_can_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the rest posture the first axis winds up until its limit of a turn stops it."""
+    pose = wandering(5, 40.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(Planner, "plan", lambda planner, path, *_: (planner.motion, path, planner.approach_samples))
+        missed = find_missed_targets(retarget(pose, "ur5"))
+    assert max(target.error for target in missed) > 0.3  # what is said where no other posture is found
+    trajectory = retarget(pose, "ur5")
+    is_sound(trajectory)
+    far = np.linalg.norm(trajectory.run.hand[0] - trajectory.targets[0].position, axis=1)[trajectory.approach_samples :]
+    assert np.quantile(far, 0.9) < 0.005
+    assert far.max() < 0.02
+    assert find_missed_targets(trajectory) == []

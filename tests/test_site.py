@@ -47,7 +47,6 @@ ELSEWHERE = {
     r"before after|session.toml --model whole_body": "two sessions, legs: tests/test_repetitions.py, test_legs.py",
     r"take_2|study|plan\.toml": "takes and plans: tests/test_live_terminal.py, test_batch_plan.py",
     r"--activity tasks --seconds 600": "ten minutes: tests/test_people.py",
-    r"export other": "a second result: tests/test_motion_bids.py",
     r"panda_2": "several trajectories: tests/test_export_robot.py",
     r"\.rrd": "an extra of 170 MB and its viewer: tests/test_export_ros.py",
     r"scripts/bvh_to_robot": "another program: tests/test_export_robot.py",

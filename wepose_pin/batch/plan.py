@@ -198,14 +198,16 @@ def _read_option(keys: TomlTable, step: str, name: str, default: Any, folder: Pa
 
 
 def _read_formats(keys: TomlTable, value: Any) -> tuple[str, ...]:
-    from ..writers.export import FORMATS, ROBOTS_ALONE
+    from ..writers.export import FORMATS, LEROBOT, REMOVED
 
     if not isinstance(value, list) or not value:
         raise BadPlan(f'{keys.at(_FORMATS)} = {value!r} is not a list of formats, such as ["trc", "mot"]')
     for each in value:
+        if each in REMOVED:
+            raise BadPlan(f"{keys.at(_FORMATS)}: '{each}' is no longer written; {REMOVED[each]}")
         if each not in FORMATS:
             raise BadPlan(f"{keys.at(_FORMATS)}: '{each}' is no format; {one_of(FORMATS, str(each))}")
-        if each in ROBOTS_ALONE:
+        if each == LEROBOT:
             raise BadPlan(f"{keys.at(_FORMATS)}: '{each}' is of robots, and this step writes the person's motion")
     return tuple(dict.fromkeys(value))
 

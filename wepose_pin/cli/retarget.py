@@ -63,7 +63,9 @@ def _print_checks(summary: Mapping[str, Any]) -> None:
         f"velocity {100 * margins['velocity_share']:.1f} %, "
         f"acceleration {100 * margins['acceleration_share']:.1f} %, jerk {100 * margins['jerk_share']:.1f} % to spare"
     )
-    if not collisions["samples"]:
+    if not collisions["pairs"]:
+        say("Self-collision NOT CHECKED: no two shapes of the robot can meet, as its URDF has them")
+    elif not collisions["samples"]:
         closest = collisions["min_hull_distance_mm"]
         say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
     braked = summary["steps"]["stopping_share"]
@@ -77,6 +79,7 @@ COMMAND = Command(
     run,
     example="retarget result --robot panda_table -o panda",
     arguments=("result",),
-    exit_codes="0 the trajectory keeps the robot's limits and has no self-collision (checked on what is written); 3 it "
-    "does not: the files are written, but no robot may run them; 2 invalid input, nothing is written.",
+    exit_codes="0 the trajectory keeps the robot's limits, has no self-collision (checked on what is written), and "
+    "no hand stays off a target that it can reach; 3 one of these does not hold: the files are written, but no robot "
+    "may run them; 2 invalid input, nothing is written.",
 )

@@ -105,8 +105,11 @@ class RetargetOutcome(NamedTuple):
 
     @property
     def runnable(self) -> bool:
-        """Whether a robot can run it: within its limits and without self-collision."""
-        return bool(self.summary["within_limits"]) and not self.summary["self_collisions"]["samples"]
+        """Whether a robot may run it: limits kept, no self-collision, no hand off a target that it can reach."""
+        summary = self.summary
+        return bool(summary["within_limits"]) and not (
+            summary["self_collisions"]["samples"] or summary["missed_targets"]
+        )
 
 
 def run_retarget(

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
-from scipy.spatial.transform import Rotation
 
-from .controller import HandTarget, JointState, QpController
+from .controller import HandTarget
+from .reconfiguration import LOST_M, LOST_S, PostureSearch, find_lasting, find_lost
 from .trajectory import Trajectory
 
 FAR = 0.02  # [m] off the target: above it the error is attributed
 CLAMPED = 1e-3  # [m] by which a target was moved: it was outside the reach
 AT_LIMIT = 0.01  # [rad or m] from a position limit: there an active joint is at its position limit
 CATCH_UP_S = 0.3  # [s] after a joint was too slow in which its error is attributed to that
-CAUSES = ("not measured", "beyond the reach", "self-collision", "joint limit", "too fast", "conflicting tasks")
-_SAMPLES, _RANDOM_POSTURES, _STEPS = 40, 3, 25  # of the reachability: samples, start postures of each, steps from each
-_PENETRATION = 4e-3  # [m] into the clearance, above which a posture does not count as reached
+CAUSES = (
+    *("not measured", "change of posture", "beyond the reach", "self-collision", "joint limit", "too fast"),
+    "conflicting tasks",
+)
+_SAMPLES, _RANDOM_POSTURES = 40, 3  # of the reachability: samples, random start postures of each
+_MISSED_SHARES = (0.25, 0.5, 0.75)  # of the time of a lasting error, at which its target has to be reachable
 
 
 def attribute_errors(trajectory: Trajectory, arm: int) -> dict[str, float]:
@@ -29,9 +32,9 @@ def attribute_errors(trajectory: Trajectory, arm: int) -> dict[str, float]:
 def find_error_causes(trajectory: Trajectory, arm: int) -> np.ndarray:
     """Return the cause (n,) of the error of a hand, its place in `CAUSES`; -1 where the hand is less than `FAR` off.
 
-    The first that applies: a sensor was lost; the target is beyond the reach; links close to each other stop the arm; a
-    joint is at its position limit; a joint is at a limit of velocity, acceleration or jerk, or was so shortly before;
-    none of these: position, orientation and swivel cannot be met together.
+    The first that applies: a sensor was lost; the arm changes its posture; the target is beyond the reach; links close
+    to each other stop the arm; a joint is at its position limit; a joint is at a limit of velocity, acceleration or
+    jerk, or was so shortly before; none of these: position, orientation and swivel cannot be met together.
     """
     robot, run = trajectory.robot, trajectory.run
     joints, target = robot.arms[arm].joints, trajectory.targets[arm]
@@ -41,6 +44,7 @@ def find_error_causes(trajectory: Trajectory, arm: int) -> np.ndarray:
     holds = np.stack(
         [
             target.lost,
+            trajectory.find_changes()[:, arm],
             np.linalg.norm(target.position - target.unclamped, axis=1) > CLAMPED,
             run.active.arms_near_contact[:, arm],
             (active & at_limit).any(axis=1),
@@ -59,38 +63,54 @@ def assess_reachability(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]
     robot rests, from several postures: its own at the sample, the rest posture, random ones. The search is local: the
     distance is an upper bound.
     """
-    robot = trajectory.robot
-    n, rng = len(robot.names), np.random.default_rng(0)
-    params = replace(
-        trajectory.params,
-        task_gain=40.0,
-        max_correction_deceleration=1e9,
-        joint_velocity_change=0.0,
-        posture=1e-5,
-        joint_velocity=1e-4,
-    )
-    controller = QpController(robot, trajectory.collision, 0.01, params, limit_factor=1e4, guarded=False)
+    rng = np.random.default_rng(0)
+    search = PostureSearch(trajectory.robot, trajectory.collision, trajectory.params)
     samples = np.linspace(trajectory.approach_samples, len(trajectory.time) - 1, _SAMPLES).astype(int)
-    distance = np.full((len(samples), len(robot.arms)), np.inf)
-    for k, sample in enumerate(samples.tolist()):
-        targets = tuple(
-            HandTarget(path.position[sample], np.zeros(3), path.rotation[sample], np.zeros(3), path.swivel[sample], 1.0)
-            for path in trajectory.targets
-        )
-        best = np.full(len(robot.arms), np.inf)
-        for u in (trajectory.joint_position[sample], robot.rest, *rng.uniform(*robot.bounds, (_RANDOM_POSTURES, n))):
-            state = JointState.at_rest(u)
-            for _ in range(_STEPS):
-                state = controller.step(state, targets)
-            controller.update_kinematics(state.position)
-            near = trajectory.collision.find_near_pairs(controller.data)
-            if (near.distance < near.clearance - _PENETRATION).any():
-                continue
-            for i, target in enumerate(targets):
-                pose = controller.get_arm_pose(i)
-                far = float(np.linalg.norm(pose.hand - target.position))
-                angle = Rotation.from_matrix(pose.rotation.T @ target.rotation).magnitude()
-                cost = params.position * far**2 + params.orientation * angle**2
-                if cost < best[i]:
-                    best[i], distance[k, i] = cost, far
-    return samples, distance
+    return samples, np.array([_find_distance(trajectory, search, k, rng) for k in samples.tolist()])
+
+
+class MissedTarget(NamedTuple):
+    """A time in which a hand stays off a target that its arm can reach."""
+
+    side: str
+    begin: float  # [s] of the recording
+    end: float
+    error: float  # [m] largest
+
+
+def find_missed_targets(trajectory: Trajectory) -> list[MissedTarget]:
+    """Return when a hand is off by more than `LOST_M`, rotation included, for longer than `LOST_S`, without need.
+
+    That is where its target can be reached, as in `assess_reachability`, and the arm is not on its way to another
+    posture.
+    """
+    begin, run, rng = trajectory.approach_samples, trajectory.run, np.random.default_rng(0)
+    lost = find_lost(trajectory.params, trajectory.targets, run.hand, run.rotation, LOST_M)
+    search = PostureSearch(trajectory.robot, trajectory.collision, trajectory.params)
+    missed = []
+    for i, arm in enumerate(trajectory.robot.arms):
+        for span in find_lasting(lost[begin:, i], round(LOST_S / float(trajectory.time[1]))):
+            first, last = begin + span[0], begin + span[1] - 1
+            moments = [first + int(share * (last - first)) for share in _MISSED_SHARES]
+            if all(_find_distance(trajectory, search, k, rng)[i] < FAR for k in moments):
+                error = np.linalg.norm(run.hand[i] - trajectory.targets[i].position, axis=1)[first : last + 1]
+                begin_s, end_s = trajectory.recorded_time[[first, last]].tolist()
+                missed.append(MissedTarget(arm.side, begin_s, end_s, float(error.max())))
+    return missed
+
+
+def _find_distance(trajectory: Trajectory, search: PostureSearch, k: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the distance (arms,) [m] that the best posture found at sample `k` leaves; inf where none is clear."""
+    robot = trajectory.robot
+    targets = tuple(
+        HandTarget(path.position[k], np.zeros(3), path.rotation[k], np.zeros(3), path.swivel[k], 1.0)
+        for path in trajectory.targets
+    )
+    best, distance = np.full(len(robot.arms), np.inf), np.full(len(robot.arms), np.inf)
+    others = rng.uniform(*robot.bounds, (_RANDOM_POSTURES, len(robot.names)))
+    for start in (trajectory.joint_position[k], robot.rest, *others):
+        posture = search.search(targets, start)
+        if posture is not None:
+            distance = np.where(posture.cost < best, posture.distance, distance)
+            best = np.minimum(best, posture.cost)
+    return distance

@@ -12,14 +12,15 @@ import pinocchio as pin
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..diagnostics import ERROR, INFO, Diagnostic, as_json
+from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
 from ..model import read_urdf
-from ..recording import format_time
+from ..recording import format_span, format_time
 from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY, JointMotion
 from ..writers.result import write_table
 from .checks import AT_REST, LimitCheck, SelfCollisions
 from .collision import CLEARANCE, list_corners
-from .error_attribution import CLAMPED, FAR, assess_reachability, attribute_errors
+from .error_attribution import CLAMPED, FAR, MissedTarget, assess_reachability, attribute_errors, find_missed_targets
+from .reconfiguration import LOST_M
 from .robot import Robot
 from .targets import compute_target_reach
 from .trajectory import Trajectory
@@ -138,6 +139,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
     slowdown = shown_s / recorded_s if recorded_s else None
     nearest = float(run.hull_distance.min())
     jerk = np.abs(np.diff(run.joint_acceleration, axis=0)) / dt
+    missed = find_missed_targets(trajectory)
     return {
         "robot": robot.map.name,
         "urdf": robot.map.urdf.name,
@@ -152,6 +154,8 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "slowdown": None if slowdown is None else round(slowdown, 3),
         "slowest": None if limiting is None else limiting._asdict(),
         "contact_times_s": list(trajectory.contact_times),
+        "posture_change_times_s": _list_change_times(trajectory),
+        "missed_targets": [target._asdict() for target in missed],
         "arms": arms,
         "within_limits": limits.passed,
         "speed_scale": robot.margins.speed_scale,
@@ -180,7 +184,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
         "diagnostics": [
-            as_json(diagnostic) for diagnostic in diagnose_trajectory(trajectory, limits, collisions, slowdown)
+            as_json(diagnostic) for diagnostic in diagnose_trajectory(trajectory, limits, collisions, missed, slowdown)
         ],
     }
 
@@ -211,8 +215,20 @@ def _summarize_arm(trajectory: Trajectory, i: int, frames: np.ndarray, reached: 
     }
 
 
+def _list_change_times(trajectory: Trajectory) -> list[float]:
+    """When [s] of the recording an arm leaves its path for another posture."""
+    begin = trajectory.approach_samples
+    changes = trajectory.find_changes()[begin:].any(axis=1)
+    starts = begin + np.flatnonzero(np.diff(changes, prepend=False) & changes)
+    return np.round(trajectory.recorded_time[starts], 2).tolist()
+
+
 def diagnose_trajectory(
-    trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions, slowdown: float | None = None
+    trajectory: Trajectory,
+    limits: LimitCheck,
+    collisions: SelfCollisions,
+    missed: list[MissedTarget],
+    slowdown: float | None = None,
 ) -> list[Diagnostic]:
     """Diagnostics of a trajectory; `slowdown`: its duration over that of the recording."""
     name = trajectory.robot.map.name
@@ -227,6 +243,18 @@ def diagnose_trajectory(
     if collisions.samples:
         first = {"first": collisions.first}
         diagnostics.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
+    if not collisions.pairs:
+        diagnostics.append(Diagnostic("robot-self-collision-unchecked", WARNING, name))
+    for side in dict.fromkeys(target.side for target in missed):
+        spans = [format_span((target.begin, target.end)) for target in missed if target.side == side]
+        error = max(target.error for target in missed if target.side == side)
+        moments = ", ".join(spans[:MAX_MOMENTS])
+        diagnostics.append(
+            Diagnostic("reachable-target-missed", ERROR, f"{side}_hand", error, LOST_M, {"moments": moments})
+        )
+    if changes := _list_change_times(trajectory):
+        facts = {"moments": f"{', '.join(map(format_time, changes[:MAX_MOMENTS]))} s"}
+        diagnostics.append(Diagnostic("robot-posture-changed", WARNING, name, len(changes), facts=facts))
     limiting = trajectory.limiting_joint
     if limiting is not None and slowdown is not None:
         moment: dict[str, float | str] = {

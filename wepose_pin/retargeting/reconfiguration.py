@@ -227,7 +227,7 @@ class Planner:
         if not spans:
             return None
         first, last = (begin + k for k in min(spans))
-        return _Failure(first, last, run.lost[first - run.first : last - run.first].any(axis=0))
+        return _Failure(first, last, np.any(run.lost[first - run.first : last - run.first], axis=0))
 
     def _choose(
         self, k: int, start: np.ndarray, arms: np.ndarray, lost: np.ndarray, error_m: float = LOST_M
@@ -237,17 +237,18 @@ class Planner:
         `lost` (m, arms) are the samples from `k` on that it has to better, by as long as the way there takes the hand
         off its path. The approach is needed anyhow.
         """
-        best, least = None, lost.any(axis=1).sum() - self._lasting
+        best: np.ndarray | None = None
+        least = lost.any(axis=1).sum() - self._lasting
         for posture in self._find_postures(k, start, arms):
             way = self._find_way(start, posture)
             if way is None:
                 continue
-            followed = self._follow(posture, k, k + len(lost), error_m, least).lost.any(axis=1)
+            followed = np.any(self._follow(posture, k, k + len(lost), error_m, least).lost, axis=1)
             count = followed.sum() + (0 if k == self.approach_samples else len(way))
             if followed[: self._lasting].any() or count > least:
                 continue
-            alike = best is not None and count > least - round(ALIKE_S / self.controller.dt)
-            if not alike or len(way) < len(best):
+            alike = count > least - round(ALIKE_S / self.controller.dt)
+            if best is None or not alike or len(way) < len(best):
                 best, least = way, min(count, least)
         return best
 
@@ -301,7 +302,7 @@ class Planner:
         hands = []
         for i, hand in enumerate(self.motion.hands):
             changing = np.concatenate([np.full(len(part.samples), part.changing[i]) for part in parts])
-            path = hand._make(values[samples] for values in hand)
+            path = HandPath(*(values[samples] for values in hand))
             path = path._replace(weight=np.where(changing, 0.0, path.weight))
             hands.append(differentiate(path, np.arange(len(samples)) * self.controller.dt))
         motion = self.motion

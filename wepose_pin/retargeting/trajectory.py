@@ -40,6 +40,7 @@ from .reconfiguration import Planner
 from .robot import LimitMargins, Robot, load_robot
 from .targets import (
     SMOOTHING_HZ,
+    WEIGHT_POOR,
     ArmTargets,
     HandPath,
     compute_arm_targets,
@@ -136,6 +137,10 @@ class Trajectory:
     def joint_position(self) -> np.ndarray:
         """(n, joints) [rad or m]."""
         return self.run.joint_position
+
+    def find_changes(self) -> np.ndarray:
+        """Return (n, arms) bool: the arm is on its way to another posture, off the hand's path."""
+        return np.stack([target.weight < 0.5 * WEIGHT_POOR for target in self.targets], axis=1)
 
     @property
     def hand(self) -> dict[str, np.ndarray]:

@@ -202,10 +202,10 @@ def export(
                 write = functools.partial(write_scale, model=str(osim_model))
             diagnostics = write(partial, motion)
             if format == "sto" and osim_model is not None:
-                beside = OpenSenseFiles.beside(file, str(osim_model))
+                beside = OpenSenseFiles.beside(file)
                 others = (beside.placement, beside.placer, beside.ik)
                 written = OpenSenseFiles(partial, *(files.enter_context(whole_file(path, force)) for path in others))
-                write_setups(beside, written, motion)
+                write_setups(beside, written, motion, str(osim_model))
             return Exported(format, diagnostics)
         motions = [_read_joint_motion(each, format, interval, phase) for each in results]
         if rate_hz is not None:

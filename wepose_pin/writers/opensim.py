@@ -110,20 +110,18 @@ class OpenSenseFiles:
     ----------
     orientations : the .sto
     placement, placer, ik : the sample and the set-ups of OpenSense's two tools
-    model : name of the subject's model
     """
 
     orientations: Path
     placement: Path
     placer: Path
     ik: Path
-    model: str = ""
 
     @classmethod
-    def beside(cls, sto: Path, model: str) -> OpenSenseFiles:
+    def beside(cls, sto: Path) -> OpenSenseFiles:
         """The files beside a .sto, named after it."""
         endings = ("_placement.sto", "_placer.xml", "_ik.xml")
-        return cls(sto, *(sto.with_name(f"{sto.stem}{ending}") for ending in endings), model)
+        return cls(sto, *(sto.with_name(f"{sto.stem}{ending}") for ending in endings))
 
     @property
     def placed_model(self) -> str:
@@ -159,7 +157,7 @@ def write_placement(path: Path, motion: Motion) -> list[Diagnostic]:
     return []
 
 
-def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion) -> None:
+def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion, model: str) -> None:
     """Write what OpenSense needs beside the .sto and the subject's model: the set-ups of IMU Placer and IK.
 
     Parameters
@@ -167,6 +165,7 @@ def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion)
     files : names that the set-ups mention; all in one folder, from which OpenSim reads them
     written : where to write them now
     motion : whose .sto it is
+    model : name of the subject's model
 
     Raises
     ------
@@ -175,7 +174,7 @@ def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion)
     """
     write_placement(written.placement, motion)
     placer = {
-        "model_file": files.model,
+        "model_file": model,
         "sensor_to_opensim_rotations": "0 0 0",
         "orientation_file_for_calibration": files.placement.name,
         "output_model_file": files.placed_model,
