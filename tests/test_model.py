@@ -539,6 +539,14 @@ def test_light_links_between_the_axes_do_not_keep_a_triple_apart(tmp_path: Path)
     assert worst < 1e-12
 
 
+def test_a_body_whose_meshes_are_not_there_is_written_without_a_word(
+    data: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    urdf = load_model(data / "human_urdf" / GAZEBO["spine"]).urdf()
+    assert "package://human-gazebo/meshesSpinalCord/T8_SpinalCord.stl" in urdf
+    assert caplog.records == []
+
+
 def test_a_torso_on_light_links_follows_exactly(data: Path) -> None:
     """As hinges its joints miss one that is turned about the vertical by 170 degrees by 70."""
     body = load_model(data / "human_urdf" / GAZEBO["spine"])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+import trimesh
 from arms import HAND, JOINTS, UPPER, person, write_arm
 from scipy.spatial.transform import Rotation
 
@@ -796,3 +797,29 @@ def test_wrong_usage_is_one_line_and_writes_nothing(
     assert text in said
     assert len(said.strip().splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_meshes_are_found_in_the_written_robot_and_a_missing_one_is_left_out_of_the_view(
+    result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "arm" / "meshes").mkdir(parents=True)
+    urdf = write_arm(tmp_path / "arm")
+    trimesh.creation.box((0.1, 0.1, 0.2)).export(tmp_path / "arm" / "meshes" / "hand.stl")
+    drawn, lost = (
+        f'<visual><geometry><mesh filename="meshes/{name}.stl"/></geometry></visual></link>'
+        for name in ("hand", "lost")
+    )
+    links = re.split("(?<=</link>)", urdf.read_text())
+    links[-2] = links[-2].replace("</link>", drawn)
+    links[1] = links[1].replace("</link>", lost)
+    urdf.write_text("".join(links))
+    out = tmp_path / "out"
+    code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(out))
+    assert code == 0, text
+    assert (out / "view.html").is_file()
+    codes = [each["code"] for each in json.loads((out / "summary.json").read_text())["diagnostics"]]
+    assert "visual-mesh-missing" in codes
+    export(out, tmp_path / "robot.urdf")
+    for file in (out / "robot.urdf", tmp_path / "robot.urdf"):
+        meshes = re.findall('filename="(.*?)"', file.read_text())
+        assert sorted(meshes) == sorted([str(tmp_path / "arm" / "meshes" / "hand.stl"), "meshes/lost.stl"])

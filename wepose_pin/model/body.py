@@ -21,6 +21,7 @@ from . import visuals as _visuals
 from .anthropometry import compute_population_lengths
 from .chains import Chain, find_chains, find_parents
 from .girdle import PARAMETERS
+from .meshes import find_mesh
 from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
 from .table import DEFAULT_BODY, BodyTable, HingeJoint, Segment
@@ -167,7 +168,14 @@ class BodyModel:
         """This body as the text of a URDF that any tool reads."""
         from lxml import etree
 
-        tree = import_yourdfpy().URDF(self.robot, build_scene_graph=False, load_meshes=False).write_xml()
+        library = import_yourdfpy()
+        urdf = library.URDF(
+            self.robot,
+            build_scene_graph=False,
+            load_meshes=False,
+            filename_handler=library.urdf.filename_handler_null,  # paths stay: `read_urdf` has resolved them
+        )
+        tree = urdf.write_xml()
         return etree.tostring(tree, pretty_print=True, xml_declaration=True, encoding="utf-8").decode()
 
 
@@ -375,6 +383,10 @@ def read_urdf(path: Path) -> Any:
         if isinstance(error, KeyError):
             reason = f"an element lacks the attribute {reason}"
         raise BadModel(f"{path}: cannot be read as a URDF: {reason}") from error
+    for shape in (shape for link in robot.links for shape in (*link.visuals, *link.collisions)):
+        mesh = None if shape.geometry is None else shape.geometry.mesh
+        if mesh is not None and mesh.filename and (file := find_mesh(mesh.filename, path)) is not None:
+            mesh.filename = str(file)
     materials = [visual.material for link in robot.links for visual in link.visuals if visual.material is not None]
     for material in [*robot.materials, *materials]:
         if material.texture is not None and material.texture.filename is None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import escape, unescape
 
 import numpy as np
 
@@ -20,6 +22,26 @@ def package_folders(urdf: Path) -> list[str]:
     folders = [str(folder) for folder in urdf.absolute().parents]
     data = find_example_data()
     return folders if data is None else [*folders, str(data), str(data.parent), str(data.parent.parent)]
+
+
+def find_mesh(name: str, urdf: Path) -> Path | None:
+    """The file of a mesh as a URDF names it; None where there is none."""
+    path = name.removeprefix("file://").removeprefix("package://")
+    for folder in package_folders(urdf):
+        if (Path(folder) / path).is_file():
+            return (Path(folder) / path).resolve()
+    return None
+
+
+def resolve_meshes(urdf: Path) -> str:
+    """The text of a URDF in which meshes that are found have absolute paths: it stays whole in another folder."""
+
+    def resolve(match: re.Match[str]) -> str:
+        mesh = find_mesh(unescape(match[2]), urdf)
+        return match[0] if mesh is None else f"{match[1]}{escape(str(mesh), {chr(34): '&quot;'})}{match[3]}"
+
+    text = urdf.read_text(encoding="utf-8", errors="replace")
+    return re.sub(r'(<mesh\b[^>]*?\bfilename\s*=\s*["\'])(.*?)(["\'])', resolve, text)
 
 
 def find_example_data() -> Path | None:

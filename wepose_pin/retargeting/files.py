@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
 from ..model import read_urdf
+from ..model.meshes import resolve_meshes
 from ..recording import format_span, format_time
 from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY, JointMotion
 from ..writers.result import write_table
@@ -24,7 +24,7 @@ from .reconfiguration import LOST_M
 from .robot import Robot
 from .targets import compute_target_reach
 from .trajectory import Trajectory
-from .visuals import STANDING_HEIGHT
+from .visuals import STANDING_HEIGHT, find_missing_visuals
 
 DIGITS = 8  # of angles in text
 MAX_MOMENTS = 6  # that a diagnostic names
@@ -47,7 +47,7 @@ def build_table(trajectory: Trajectory) -> pl.DataFrame:
 def write_trajectory(folder: Path, trajectory: Trajectory) -> None:
     """Write ``trajectory.parquet``, ``.csv``, ``joint_trajectory.json`` and ``.yaml``, and ``robot.urdf``."""
     table = build_table(trajectory)
-    shutil.copyfile(trajectory.robot.map.urdf, folder / ROBOT_URDF)
+    (folder / ROBOT_URDF).write_text(resolve_meshes(trajectory.robot.map.urdf), encoding="utf-8")
     write_table(folder / TRAJECTORY, table)
     table.write_csv(folder / "trajectory.csv", float_precision=DIGITS)
     text = _format_joint_trajectory(trajectory)
@@ -84,7 +84,7 @@ def build_joint_motion(trajectory: Trajectory) -> JointMotion:
         name=robot.map.name,
         where=robot.map.name,
         robot=read_urdf(urdf),
-        urdf=urdf.read_text(encoding="utf-8", errors="replace"),
+        urdf=resolve_meshes(urdf),
         joints=robot.names,
         time=trajectory.time,
         position=trajectory.joint_position,
@@ -245,6 +245,8 @@ def diagnose_trajectory(
         diagnostics.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
     if not collisions.pairs:
         diagnostics.append(Diagnostic("robot-self-collision-unchecked", WARNING, name))
+    if missing := find_missing_visuals(trajectory.robot):
+        diagnostics.append(Diagnostic("visual-mesh-missing", WARNING, name, len(missing), facts={"first": missing[0]}))
     for side in dict.fromkeys(target.side for target in missed):
         spans = [format_span((target.begin, target.end)) for target in missed if target.side == side]
         error = max(target.error for target in missed if target.side == side)

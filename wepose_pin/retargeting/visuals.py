@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from ..model.meshes import package_folders, reduce_triangles, triangulate
+from ..model.meshes import find_mesh, package_folders, reduce_triangles, triangulate
 from .robot import Robot
 from .trajectory import Trajectory
 
@@ -28,8 +29,15 @@ class MeshPart(NamedTuple):
 
 def build_parts(robot: Robot) -> list[MeshPart]:
     """Parts to draw; empty where the URDF has no visual shapes."""
-    folders = package_folders(robot.map.urdf)
-    whole = pin.buildGeomFromUrdf(robot.full, str(robot.map.urdf), pin.GeometryType.VISUAL, package_dirs=folders)
+    root = ElementTree.fromstring(robot.map.urdf.read_bytes())
+    missing = find_missing_visuals(robot)
+    for link in root.iter("link"):
+        for visual in link.findall("visual"):
+            mesh = visual.find("geometry/mesh")
+            if mesh is not None and mesh.get("filename") in missing:
+                link.remove(visual)
+    text, folders = ElementTree.tostring(root, encoding="unicode"), package_folders(robot.map.urdf)
+    whole = pin.buildGeomFromUrdfString(robot.full, text, pin.GeometryType.VISUAL, package_dirs=folders)
     moving = set(robot.model.names[1:])
     locked = [robot.full.getJointId(name) for name in robot.full.names[1:] if name not in moving]
     _, shapes = pin.buildReducedModel(robot.full, whole, locked, robot.rest_full)
@@ -44,6 +52,13 @@ def build_parts(robot: Robot) -> list[MeshPart]:
         MeshPart(joint, *_join([mesh for own, mesh in reduced if own == joint]), _choose_colour(robot, joint))
         for joint in sorted(set(joints))
     ]
+
+
+def find_missing_visuals(robot: Robot) -> list[str]:
+    """The meshes of visual shapes of which there is no file, as the URDF names them: these shapes are not drawn."""
+    urdf = robot.map.urdf
+    meshes = ElementTree.fromstring(urdf.read_bytes()).iterfind("link/visual/geometry/mesh")
+    return list(dict.fromkeys(name for mesh in meshes if find_mesh(name := mesh.get("filename", ""), urdf) is None))
 
 
 def place_beside_person(
