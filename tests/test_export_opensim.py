@@ -156,6 +156,21 @@ def test_mot_with_the_isbs_angles(result: Path, tmp_path: Path) -> None:
     assert both.select(model.columns).equals(model)
 
 
+def test_an_ordinary_arm_is_no_warning_and_one_with_a_wrong_heading_is(tmp_path: Path) -> None:
+    """A forearm that bends about the lateral axis, as ordinary people's nearly do; the model's axis is oblique."""
+    time = np.arange(0.0, 5.0, 0.01)
+    bend, swing = np.radians(60.0 - 50.0 * np.cos(time)), np.radians(30.0 * np.sin(2.0 * time))
+    upper = Rotation.from_rotvec(-swing[:, None] * [0.0, 1.0, 0.0])
+    fore = upper * Rotation.from_rotvec(-bend[:, None] * [0.0, 1.0, 0.0])
+    turned = Rotation.from_euler("z", 50.0, degrees=True) * fore
+    for name, forearm, codes in (("right", fore, set()), ("wrong", turned, {"opensim-axes-too-few"})):
+        quat_WL = {"torso": np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)), "left_upper_arm": upper.as_quat()}
+        quat_WL["left_forearm"] = forearm.as_quat()
+        folder = write_folder(tmp_path / name, compute_pose(load_model(lengths=LENGTHS), time, quat_WL))
+        exported = export(folder, tmp_path / f"{name}.mot", names="opensim")
+        assert {each.code for each in exported.diagnostics} == codes
+
+
 def test_shoulders_and_thorax_are_the_isbs_of_zxy() -> None:
     pose = a_pose(tuple(name for name in SEGMENT_OF.values() if name.endswith(("torso", "upper_arm"))))
     angles, missed = coordinates(orientations(pose.quat_WL))

@@ -34,7 +34,6 @@ ALLOWED = {
     "readers/opensim.py": "the names of a format",
     "writers/bvh.py": "the names of a format",
     "writers/rajagopal.py": "the names of a format",
-    "writers/standing.py": "the figure of formats that have a person",
     "retargeting/maps.py": "the keys of a robot's map",
     "simulation/": "simulated people and activities",
 }
@@ -46,7 +45,6 @@ TABLES_ALONE = (
     "live/sources/slimevr.py",
     "readers/mvnx.py",
     "writers/bvh.py",
-    "writers/standing.py",
 )
 
 

@@ -251,9 +251,7 @@ def diagnose_trajectory(
         spans = [format_span((target.begin, target.end)) for target in missed if target.side == side]
         error = max(target.error for target in missed if target.side == side)
         moments = ", ".join(spans[:MAX_MOMENTS])
-        diagnostics.append(
-            Diagnostic("reachable-target-missed", ERROR, f"{side}_hand", error, LOST_M, {"moments": moments})
-        )
+        diagnostics.append(Diagnostic("reachable-target-missed", ERROR, side, error, LOST_M, {"moments": moments}))
     if changes := _list_change_times(trajectory):
         facts = {"moments": f"{', '.join(map(format_time, changes[:MAX_MOMENTS]))} s"}
         diagnostics.append(Diagnostic("robot-posture-changed", WARNING, name, len(changes), facts=facts))

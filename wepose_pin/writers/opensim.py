@@ -38,7 +38,9 @@ _TRC_KEYS = (
     *("OrigDataRate", "OrigDataStartFrame", "OrigNumFrames"),
 )
 GENERIC_MODEL = "Rajagopal_2015.osim"  # of OpenSense's example
-MOST_MISSED = np.deg2rad(1.0)  # [rad] rms of a body of the model, whose elbows and wrists have two axes
+# [rad] rms by which the model may miss a body. Its elbow turns about an axis that is 13 deg oblique: arms of simulated
+# people, whose orientations are exact, are missed by 3 to 7 deg, of a real recording by up to 9.
+MOST_MISSED = np.deg2rad(12.0)
 
 
 def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diagnostic]:
