@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ..arguments import check_arguments
 from ..diagnostics import WARNING, Diagnostic, notebook_html, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
-from ..recording.faults import find_faults, scan_sensor
+from ..recording.faults import SensorScan, find_faults
 from ..recording.limits import STANDARD_GRAVITY
 from .amekf import Amekf, AmekfParams
 from .base import AboutVertical, FilterRun, OrientationFilter
@@ -229,7 +229,7 @@ def estimate_orientation(
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
     if not np.isfinite(gyro).all() or not np.isfinite(accel).all():
         raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
-    scan = scan_sensor(np.arange(len(gyro)) / rate_hz, gyro, accel)
+    scan = SensorScan(np.arange(len(gyro)) / rate_hz, gyro, accel)
     for fault in find_faults({"": scan}).get("", []):
         raise BadData(f"{fault.describe(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
     noise, start = TYPICAL, None

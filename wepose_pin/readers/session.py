@@ -25,8 +25,8 @@ from ..recording import (
     format_span,
 )
 from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time, measure_rate
-from ..recording.faults import ROWS, Scan
-from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples
+from ..recording.faults import SensorCheck, check_sensors
+from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_neighbours, find_runs, mark_lost_samples
 from ..recording.limits import LARGEST_NUMBER
 from ..recording.plausibility import check_signals
 from ..recording.resampling import resample
@@ -54,6 +54,7 @@ SI = {"gyro": 1.0, "accel": 1.0}
 # Optional keys of [data]; a key that no sensor uses is an error.
 _FOR_SENSORS = ("file", "time", "time_unit", "rate_hz", "gyro_unit", "accel_unit", "format", "use")
 _NO_ROW = 2**31 - 1
+_BLOCK_ROWS = 1 << 16  # rows of a table that is not in memory
 _BEGINNING_S = 20.0  # [s] a person is static for a second in a beginning of this length
 
 
@@ -210,7 +211,9 @@ class SessionReader:
         check_phases(str(self.path), self.time, self._head.phases)
         self.phases, self.start_pose, self.remounted = self._head.phases, start_pose, self._head.remounted
         self._refuse_shared_columns()
-        self._scanned: Scan | None = None
+        self._check: SensorCheck | None = None
+        self._samples: dict[str, tuple[np.ndarray, ...]] = {}  # as `_read_samples`, of a recording in memory
+        self._orientations: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # times and unit quaternions
 
     def _refuse_shared_columns(self) -> None:
         """Raise an error where two sensors have a column in common."""
@@ -368,42 +371,57 @@ class SessionReader:
             wanted[time] = own.at("time")
         return file.table(wanted), named
 
-    def _scan(self) -> Scan:
-        """Scan all rows of the sensors for faults, in one pass at the first call.
+    def _check_sensors(self) -> SensorCheck:
+        """Check all samples of the sensors for faults, at the first call.
 
         Raises
         ------
         BadData
-            As `Scan.finish`, and where values are no numbers.
+            As `check_sensors`, and where values are no numbers.
         """
-        if self._scanned is not None:
-            return self._scanned
+        if self._check is None:
+            samples = self._read_samples()
+            start = next(iter(self.phases.get("start", ())), None)
+            self._check = check_sensors(str(self.path), samples, start)
+            if self._in_memory:
+                self._samples = samples
+            for segment, (time, *values) in samples.items():
+                if len(values) == 1:
+                    quat = np.clip(values[0], -LARGEST_NUMBER, LARGEST_NUMBER)
+                    norm = np.linalg.norm(quat, axis=1)
+                    good = norm > 0.0
+                    self._orientations[segment] = time[good], quat[good] / norm[good, None]
+        return self._check
+
+    def _read_samples(self) -> dict[str, tuple[np.ndarray, ...]]:
+        """Read all rows of the sensors in SI: times (n,), and gyro and accel (n, 3) or orientations (n, 4)."""
         clocks = {id(plan.clock): plan.clock for plan in self._plans.values()}
         times = {
             # Without lost rows no copy is made.
             key: clock.time if clock.row[-1] == len(clock.row) - 1 else clock.time[clock.row >= 0]
             for key, clock in clocks.items()
         }
-        scan = Scan()
-        for first in range(0, max(map(len, times.values())), ROWS):
-            rows = slice(first, first + ROWS)
-            tables = {plan.table: self._tables[plan.table][rows] for plan in self._plans.values()}
-            blocks = {}
+        rows = max(map(len, times.values()))
+        step = rows if self._in_memory else _BLOCK_ROWS
+        blocks: dict[str, list[list[np.ndarray]]] = {segment: [] for segment in self._plans}
+        for first in range(0, rows, step):
+            tables = {plan.table: self._tables[plan.table][first : first + step] for plan in self._plans.values()}
             for segment, plan in self._plans.items():
-                values = []
-                for name, names in plan.signals.items():
-                    place = f"{self.path}: {plan.place}.{name}"
-                    read = read_columns(tables[plan.table], names, str(plan.path), place, first)
-                    values.append(read * plan.units.get(name, 1.0))
-                blocks[segment] = times[id(plan.clock)][rows], np.column_stack(values)
-            scan.push(blocks)
-        scan.finish(str(self.path), next(iter(self.phases.get("start", ())), None))
-        self._scanned = scan
-        return scan
+                table = tables[plan.table]
+                blocks[segment].append([self._read_rows(plan, name, table, first) for name in plan.signals])
+        return {
+            segment: (times[id(plan.clock)], *map(np.concatenate, zip(*blocks[segment], strict=True)))
+            for segment, plan in self._plans.items()
+        }
+
+    def _read_rows(self, plan: _Plan, name: str, table: pl.DataFrame, first_row: int) -> np.ndarray:
+        """Read a signal (n, k) in SI from a part of its table that begins at this row."""
+        place = f"{self.path}: {plan.place}.{name}"
+        return plan.units.get(name, 1.0) * read_columns(table, plan.signals[name], str(plan.path), place, first_row)
 
     def recording(self, first: int, last: int) -> Recording:
         """Read and check the recording from sample `first` of the common time to before `last`."""
-        scan = self._scan()
+        check = self._check_sensors()
         time = self.time[first:last]
         windows = {segment: self._window(plan, first, last) for segment, plan in self._plans.items()}
         rows: dict[str, slice] = {}
@@ -436,7 +454,7 @@ class SessionReader:
             rate_hz=self.rate_hz,
             sensors=sensors,
             phases=self._head.phases if whole else _cut_phases(self._head.phases, time),
-            diagnostics=(*self._diagnostics, *scan.diagnostics(), *bridged),
+            diagnostics=(*self._diagnostics, *check.diagnostics, *bridged),
         )
         check_recording(recording)
         begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
@@ -458,7 +476,8 @@ class SessionReader:
         signals = {name: self._read_signal(plan, name, clock, table, first_row) for name in plan.signals}
         marks = {}
         segment = plan.place.removeprefix("sensors.")
-        faults = self._scan().faults.get(segment, [])
+        check = self._check_sensors()
+        faults = check.faults.get(segment, [])
         frozen = np.zeros(len(clock.time), dtype=bool)
         for fault in faults:
             frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
@@ -466,7 +485,7 @@ class SessionReader:
             place = f"{plan.path}: {plan.place}.{name}"
             in_gap = self.gaps and len(clock.time) < len(plan.clock.time)
             if name == "orientation":
-                in_gap &= self._scan().orientations[segment].rows > 0
+                in_gap &= len(self._orientations[segment][0]) > 0
             if not good.any() and not in_gap:
                 columns_ = ", ".join(plan.signals[name])
                 raise BadData(f"{place}: no numbers from {format_span(clock.time[[0, -1]])} in {columns_}")
@@ -482,21 +501,23 @@ class SessionReader:
         all_marks = np.max(list(marks.values()), axis=0)
         gap = all_marks == LONG if self.gaps or faults else None
         if "orientation" in signals:
-            edges = self._scan().orientations[segment].find_neighbours(clock, marks["orientation"])
+            edges = find_neighbours(*self._orientations[segment], clock, marks["orientation"])
             quat = bridge_quat(signals["orientation"][0], marks["orientation"], clock, *edges)
             return OrientationSensor(quat, plan.mount, gap, plan.aligned), all_marks
         gyro_S = bridge(signals["gyro"][0], marks["gyro"], clock, rate=True)
         accel_S = bridge(signals["accel"][0], marks["accel"], clock)
         gap_marks = np.where(frozen, GOOD, all_marks)  # frozen samples have a diagnostic of their own
-        gyro_range = self._scan().sensors[segment].gyro_range
-        return ImuSensor(gyro_S, accel_S, plan.mount, gap, gyro_range), gap_marks
+        return ImuSensor(gyro_S, accel_S, plan.mount, gap, check.gyro_range[segment]), gap_marks
 
     def _read_signal(
         self, plan: _Plan, name: str, clock: Clock, table: pl.DataFrame, first_row: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Read the values (n, k) in SI on the clock, and a mask (n,) of the samples that exist."""
-        place = f"{self.path}: {plan.place}.{name}"
-        rows = read_columns(table, plan.signals[name], str(plan.path), place, first_row)
+        if self._samples:
+            whole = self._samples[plan.place.removeprefix("sensors.")][1 + list(plan.signals).index(name)]
+            rows = whole[first_row : first_row + table.height]
+        else:
+            rows = self._read_rows(plan, name, table, first_row)
         exists = clock.row >= 0
         if exists.all() and len(rows) == len(clock.row):
             values = rows
@@ -507,11 +528,12 @@ class SessionReader:
         too_large = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
         if too_large.size:
             raise BadData(
-                f"{plan.path}: {plan.place}.{name} holds {np.nanmax(np.abs(values[too_large[0]])):.3g} in row "
+                f"{plan.path}: {plan.place}.{name} holds "
+                f"{np.nanmax(np.abs(values[too_large[0]])) / plan.units.get(name, 1.0):.3g} in row "
                 f"{clock.row[too_large[0]] + 1}; no sensor measures as much, leave cells of lost samples empty"
             )
         if name != "orientation":
-            return plan.units[name] * values, good
+            return values, good
         norm = np.linalg.norm(values, axis=1)
         good &= norm > 0.0  # many exports write zeros for a lost sample
         not_unit = np.flatnonzero(good & (np.abs(norm - 1.0) > NORM_ERROR))

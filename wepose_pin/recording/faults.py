@@ -16,15 +16,13 @@ A single axis may be constant during motion about another axis. It is a fault wh
 
 - the noise of the other axes makes so many repetitions improbable; or
 - the mean specific force over some seconds, rotated by the gyroscope, does not point up, since an axis is missing.
-
-The scan works block by block, so that a recording in chunks has the same faults as the whole.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from itertools import combinations, product
+from collections.abc import Mapping
+from functools import cached_property
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -32,10 +30,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from .. import rotations
+from ..compilation import compiled
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
-from .clocks import LONGEST_GAP_S, Clock
-from .gaps import GOOD, find_runs
 from .intervals import format_time
 from .limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE, STANDARD_GRAVITY
 from .plausibility import ROUNDING, find_cut_off
@@ -70,18 +67,24 @@ UP_FORCE = 0.3  # allowed relative error of its norm against gravity
 # Rows that repeat for so long [s], and so many times longer than any others, are reported without proof of a fault.
 REPEATED_S, REPEATED_TIMES = 2.0, 10
 
-ROWS = 1 << 16  # rows in a block
+NOISE_ROWS = 1 << 16  # rows whose noise is evaluated at a time
 SAME_RANGE = 0.1  # relative difference between the ranges of a sensor's axes, which have different scales
 COPIED = 0.5  # share of a sensor's changing rows from which equal rows in another sensor prove a copy
-AT_RANGE = (
-    0.02  # relative distance below the range at which a sample counts as saturated, since resampling mixes samples
-)
+# Relative distance below the range at which a sample counts as saturated, since resampling mixes samples.
+AT_RANGE = 0.02
+
+BOTH, GYRO, ACCEL = "gyro and accel", "gyro", "accel"
+AXES = ("gyro x", "gyro y", "gyro z", "accel x", "accel y", "accel z")
+SIGNALS = (BOTH, GYRO, ACCEL, *AXES)
+COLUMNS = {BOTH: slice(0, 6), GYRO: slice(0, 3), ACCEL: slice(3, 6)} | {a: slice(k, k + 1) for k, a in enumerate(AXES)}
+_MASKS = np.array([sum(1 << axis for axis in range(6)[COLUMNS[signals]]) for signals in SIGNALS])  # a bit for each axis
+_LEAST_S = (1.0 - 1e-6) * np.array([FROZEN_S] + [STUCK_S] * 8)  # [s] of a run of each of `SIGNALS`
 
 
 class Fault(NamedTuple):
     """An interval in which a sensor repeated one value and did not measure."""
 
-    signals: str  # "gyro", "accel", "gyro and accel", or an axis, "gyro x"
+    signals: str  # of `SIGNALS`
     first: float  # [s] the last measured sample
     last: float  # [s] the last faulty sample
     value: tuple[float, ...]  # the repeated value, SI
@@ -94,253 +97,221 @@ class Fault(NamedTuple):
         return f"{self.signals} {stands} at {value} {unit} from {format_time(since)} to {format_time(self.last)} s"
 
 
-@dataclass
-class _Run:
-    """Consecutive rows with equal values of a signal, and the other signals meanwhile."""
+class Run(NamedTuple):
+    """Consecutive rows with equal values of a signal."""
 
-    rows: int
-    first: float  # [s]
-    last: float  # [s]
-    value: np.ndarray  # (6,) gyro and accel of the first row
-    low: np.ndarray  # (3,) of accel
-    high: np.ndarray  # (3,)
-    mean_low: np.ndarray  # (3,) of accel's means over `REST_WINDOW_S`
-    mean_high: np.ndarray  # (3,)
-    tipped: float  # [rad], ∫ |gyro × up|
-    up_off: float  # [rad] change of up by the whole sensor; 0: not computed
-    distinct: int  # rows in which other axes of the signal differ from the row before
-    first_row: bool  # the run begins with the recording
-
-    def join(self, after: _Run) -> _Run:
-        """Join this run and the one after it, which have one row in common."""
-        return replace(
-            self,
-            rows=self.rows + after.rows - 1,
-            last=after.last,
-            low=np.minimum(self.low, after.low),
-            high=np.maximum(self.high, after.high),
-            mean_low=np.minimum(self.mean_low, after.mean_low),
-            mean_high=np.maximum(self.mean_high, after.mean_high),
-            tipped=self.tipped + after.tipped,
-            up_off=max(self.up_off, after.up_off),
-            distinct=self.distinct + after.distinct,
-        )
-
-    @property
-    def seconds(self) -> float:
-        return self.last - self.first
-
-    def rests(self, name: str) -> bool:
-        """Return whether gyro, or this axis of it, reports zero while accel shows no motion."""
-        zero = np.abs(self.value[_SIGNALS[name]]).max() < ZERO_RATE
-        return bool(name.startswith("gyro") and zero and 0.0 <= np.max(self.mean_high - self.mean_low) < REST_FORCE)
-
-    @property
-    def tips(self) -> float:
-        """Mean rate [rad/s] at which gyro tilts accel."""
-        return self.tipped / max(self.seconds, 1e-9)
+    signals: str  # of `SIGNALS`
+    first: int  # row
+    last: int
 
 
-_Sample = tuple[float, np.ndarray]  # time [s], value
-_LONGEST = 1000  # longest run in the histogram of lengths [rows]
-_AXES = {f"{name} {axis}": slice(k, k + 1) for k, (name, axis) in enumerate(product(("gyro", "accel"), "xyz"))}
-_SIGNALS = {"gyro and accel": slice(0, 6), "gyro": slice(0, 3), "accel": slice(3, 6), **_AXES}
+@compiled
+def _find_runs(time, gyro_S, accel_S, runs):  # type: ignore[no-untyped-def]
+    """Fill `runs` with the long runs of equal rows: index of `SIGNALS`, first and last row. Return their number."""
+    count, n, repeats = 0, len(time), 0
+    begin = np.full(len(_MASKS), -1)
+    for k in range(1, n + 1):
+        equal = 0
+        if k < n:
+            for axis in range(3):
+                equal |= (gyro_S[k, axis] == gyro_S[k - 1, axis]) << axis
+                equal |= (accel_S[k, axis] == accel_S[k - 1, axis]) << (3 + axis)
+        if equal == 0 and repeats == 0:
+            continue
+        repeats = equal
+        for signals in range(len(_MASKS)):
+            first = begin[signals]
+            if equal & _MASKS[signals] == _MASKS[signals]:
+                begin[signals] = k - 1 if first < 0 else first
+            elif first >= 0:
+                begin[signals] = -1
+                if k - first >= FROZEN_SAMPLES and time[k - 1] - time[first] >= _LEAST_S[signals]:
+                    runs[count, 0], runs[count, 1], runs[count, 2] = signals, first, k - 1
+                    count += 1
+    return count
 
 
-@dataclass
 class SensorScan:
-    """Statistics of a sensor's rows that prove faults, from blocks in SI and in the order of time."""
+    """The long runs of equal values of one sensor, and what its other samples say about them.
 
-    rows: int = 0
-    first: float = 0.0  # [s]
-    last: float = 0.0  # [s]
-    _before: np.ndarray | None = None  # (7,) time and values of the last row
-    _long: dict[str, list[_Run]] = field(default_factory=lambda: {name: [] for name in _SIGNALS})
-    _open: dict[str, _Run | None] = field(default_factory=lambda: dict.fromkeys(_SIGNALS))
-    _lengths: np.ndarray = field(default_factory=lambda: np.zeros(_LONGEST + 1, dtype=np.int64))  # rows → runs
-    _noisy_s: float = 0.0  # [s] with reversals as in noise
-    _noise_steps: np.ndarray = field(default_factory=lambda: np.zeros(6))  # number of steps of each axis in that time
-    _wide_steps: np.ndarray = field(default_factory=lambda: np.zeros(6))  # number of these steps wider than a digit
-    _peak: float = 0.0  # [rad/s] largest rate of all axes
-    _levels: list[float] = field(default_factory=list)  # [rad/s] levels at which an axis seems saturated
+    Parameters
+    ----------
+    time, gyro_S, accel_S : (n,) [s], (n, 3) [rad/s], (n, 3) [m/s²], numbers
+    """
 
-    def push(self, time: np.ndarray, values: np.ndarray) -> None:
-        """Add the next rows: times (n,) [s], gyro and accel (n, 6)."""
-        if not len(time):
-            return
-        block = np.column_stack([time, values])
-        first_row = self._before is None
-        if self._before is None:
-            self.first = float(time[0])
-        else:
-            block = np.concatenate([self._before[None], block])
-        self.rows += len(time)
-        self.last, self._before = float(time[-1]), block[-1].copy()
-        if len(block) < 2:
-            return
-        equal = np.stack([axis[1:] == axis[:-1] for axis in block[:, 1:].T])
-        for name, axes in _SIGNALS.items():
-            self._collect_runs(name, block, np.logical_and.reduce(equal[axes]), first_row)
-        changing = block[np.concatenate([[True], ~np.logical_and.reduce(equal)])]
-        if self._noisy_s < ENOUGH_NOISE_S:
-            self._count_noise(changing)
-        self._find_levels(changing[:, 1:])
+    def __init__(self, time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> None:
+        self.time, self.gyro_S, self.accel_S = (np.ascontiguousarray(each) for each in (time, gyro_S, accel_S))
+        runs = np.empty((len(SIGNALS) * (len(time) // (FROZEN_SAMPLES - 1) + 1), 3), dtype=np.int64)
+        count = _find_runs(self.time, self.gyro_S, self.accel_S, runs)
+        self.runs = [Run(SIGNALS[index], first, last) for index, first, last in runs[:count].tolist()]
 
-    def _collect_runs(self, name: str, block: np.ndarray, same: np.ndarray, first_row: bool) -> None:
-        spans = np.array(find_runs(same), dtype=np.int64).reshape(-1, 2)
-        length = spans[:, 1] - spans[:, 0] + 1
-        if name == "gyro and accel":
-            length = np.minimum(length, _LONGEST)
-            self._lengths += np.bincount(length, minlength=_LONGEST + 1)
-            self._lengths[1] += int(len(same) - same.sum()) - len(spans)
-        edge = (spans[:, 0] == 0) | (spans[:, 1] == len(same))
-        seconds = block[spans[:, 1], 0] - block[spans[:, 0], 0]
-        open_, self._open[name] = self._open[name], None
-        if open_ is not None and not same[0]:
-            self._close(name, open_)
-            open_ = None
-        for a, b in spans[((length >= FROZEN_SAMPLES) & (seconds >= _least_s(name))) | edge]:
-            run = _make_run(block[a : b + 1], name, first_row and a == 0)
-            if open_ is not None and a == 0:
-                run, open_ = open_.join(run), None
-            if b == len(same):
-                self._open[name] = run
-            else:
-                self._close(name, run)
+    def long_runs(self, signals: str) -> list[Run]:
+        """Return the long runs of equal rows of a signal."""
+        return [run for run in self.runs if run.signals == signals]
 
-    def _close(self, name: str, run: _Run) -> None:
-        if run.rows >= FROZEN_SAMPLES and run.seconds >= _least_s(name):
-            self._long[name].append(run)
+    def is_constant(self, signals: str) -> bool:
+        """Return whether the signal has one value in all rows."""
+        return any(run.last - run.first == len(self.time) - 1 for run in self.long_runs(signals))
 
-    def _count_noise(self, distinct: np.ndarray) -> None:
-        """Count the seconds in which all axes reverse as in noise, which happens with little motion."""
-        if len(distinct) < 2 * FROZEN_SAMPLES:
-            return
-        usual = max(float(np.median(np.diff(distinct[:, 0]))), 1e-9)
-        size = min(len(distinct) - 2, max(FROZEN_SAMPLES, round(1.0 / usual)))
-        steps = np.diff(distinct[:, 1:], axis=0)
-        steps[np.abs(steps) < ROUNDING * np.abs(distinct[1:, 1:]).max(axis=0)] = 0.0
-        count = (len(steps) - 1) // size
-        turns = (np.sign(steps[1:]) * np.sign(steps[:-1]) < 0.0)[: count * size].reshape(count, size, 6).mean(axis=1)
-        varies = (steps[1:] != 0.0)[: count * size].reshape(count, size, 6).any(axis=1)
-        share = np.where(varies, turns, np.inf).min(axis=1)  # least of all axes: in motion some do not reverse
-        share[~varies.any(axis=1)] = 0.0
-        noise = share > min(TURNS_BACK, TURNS_BACK_HZ * usual)
-        self._noisy_s += float(np.count_nonzero(noise)) * size * usual
-        self._count_wide_steps(np.abs(steps[1:])[: count * size].reshape(count, size, 6)[noise])
+    def seconds(self, run: Run) -> float:
+        """Return the duration [s] of a run."""
+        return float(self.time[run.last] - self.time[run.first])
 
-    def _count_wide_steps(self, steps: np.ndarray) -> None:
-        """Count steps (m, size, 6) of noise, and those wider than a digit, the smallest step of their second."""
-        digit = np.where(steps > 0.0, steps, np.inf).min(axis=1)  # (m, 6)
-        fine = digit < COARSEST
-        for signal in (_SIGNALS["gyro"], _SIGNALS["accel"]):
-            measured = (steps[:, :, signal] > 0.0).any(axis=2).sum(axis=1)  # a signal may have a lower rate
-            self._noise_steps[signal] += measured @ fine[:, signal]
-        self._wide_steps += ((steps > WIDE * digit[:, None]) & fine[:, None]).sum(axis=(0, 1))
+    @cached_property
+    def _changing(self) -> np.ndarray:
+        """The rows that differ from the one before, (m,)."""
+        return np.flatnonzero(_find_changes(self.gyro_S, self.accel_S))
 
-    def repeats(self, axis: int) -> float:
-        """Return a bound on the probability that this axis repeats a sample, from the noise of the signal's other axes.
+    @cached_property
+    def gyro_range(self) -> float:
+        """Rate [rad/s] from which an axis counts as saturated; infinite: none is. A sensor's axes have one range."""
+        peak = max(self.gyro_S.max(initial=0.0), -self.gyro_S.min(initial=0.0))
+        if peak < NARROWEST_GYRO_RANGE or not find_cut_off(self.gyro_S, NARROWEST_GYRO_RANGE).any():
+            return np.inf
+        gyro, accel = self.gyro_S[self._changing], self.accel_S[self._changing]
+        cut = find_cut_off(gyro, NARROWEST_GYRO_RANGE)
+        # It is constant there while another signal changes.
+        values = np.hstack([gyro, accel])
+        changes = (np.abs(np.diff(values, axis=0)) > ROUNDING * np.abs(values).max(axis=0)).any(axis=1)
+        levels = np.abs(gyro[1:][cut[1:] & cut[:-1] & changes[:, None]])
+        return float((1.0 - AT_RANGE) * levels[levels > (1.0 - SAME_RANGE) * peak].min(initial=np.inf))
+
+    @cached_property
+    def _noise(self) -> tuple[float, np.ndarray, np.ndarray]:
+        """Seconds in which all axes reverse as in noise; steps there, (6,); those wider than a digit, (6,)."""
+        seconds, steps, wide_steps = 0.0, np.zeros(6), np.zeros(6)
+        for first in range(0, len(self._changing), NOISE_ROWS):
+            rows = self._changing[first : first + NOISE_ROWS]
+            if len(rows) < 2 * FROZEN_SAMPLES or seconds >= ENOUGH_NOISE_S:
+                break
+            usual = max(float(np.median(np.diff(self.time[rows]))), 1e-9)
+            noise = _find_noise(np.hstack([self.gyro_S[rows], self.accel_S[rows]]), usual)
+            seconds += noise.shape[0] * noise.shape[1] * usual
+            # A digit is the smallest step of a second.
+            digit = np.where(noise > 0.0, noise, np.inf).min(axis=1)  # (m, 6)
+            fine = digit < COARSEST
+            for signals in (GYRO, ACCEL):
+                columns = COLUMNS[signals]
+                measured = (noise[:, :, columns] > 0.0).any(axis=2).sum(axis=1)  # a signal may have a lower rate
+                steps[columns] += measured @ fine[:, columns]
+            wide_steps += ((noise > WIDE * digit[:, None]) & fine[:, None]).sum(axis=(0, 1))
+        return seconds, steps, wide_steps
+
+    @cached_property
+    def repeat_surprisal(self) -> dict[str, float]:
+        """−log of a bound on the probability that a row repeats a signal's value.
+
+        For gyro and accel the bound comes from their own noise, for an axis from that of the other axes of its signal.
+        """
+        _, steps, _ = self._noise
+        bounds = {BOTH: 1.0}
+        for signals in (GYRO, ACCEL):
+            axes = range(6)[COLUMNS[signals]]
+            # The rows are those of the faster signal: the other one repeats between its samples.
+            fresh = min(1.0, steps[axes[0]] / max(float(steps.max()), 1.0))
+            bounds[signals] = float(np.prod([self._bound_repeats([k]) ** fresh for k in axes]))
+            bounds |= {AXES[axis]: self._bound_repeats([k for k in axes if k != axis]) for axis in axes}
+        return {signals: -float(np.log(max(bound, 1e-300))) for signals, bound in bounds.items()}
+
+    def _bound_repeats(self, axes: list[int]) -> float:
+        """Return the bound on the probability that an axis with at least the noise of these repeats a sample.
 
         A step wider than a digit is a change of the noise by more than a digit, whatever the value between two digits.
         The share of such steps gives a lower bound on the noise, and so an upper bound on repetitions.
         """
-        first = 3 * (axis // 3)
-        return self._bound_repeats([k for k in range(first, first + 3) if k != axis])
-
-    def repeats_of(self, name: str) -> float:
-        """Return a bound on the probability that all axes of gyro or accel repeat a row, from their own noise.
-
-        The rows are those of the faster signal: the other one repeats between its samples.
-        """
-        axes = range(6)[_SIGNALS[name]]
-        fresh = min(1.0, self._noise_steps[axes[0]] / max(float(self._noise_steps.max()), 1.0))
-        return float(np.prod([self._bound_repeats([k]) ** fresh for k in axes]))
-
-    def _bound_repeats(self, axes: list[int]) -> float:
-        """Return the bound on the probability that an axis with at least the noise of these repeats a sample."""
-        others = [k for k in axes if self._noise_steps[k] > 0]
-        if not others:
-            return 1.0
-        wide = min((self._wide_steps[k] - 3.0 * np.sqrt(self._wide_steps[k])) / self._noise_steps[k] for k in others)
-        if wide * min(self._noise_steps[k] for k in others) < FEWEST_WIDE:
+        _, steps, wide_steps = self._noise
+        known = [k for k in axes if steps[k] > 0]
+        wide = min(((wide_steps[k] - 3.0 * np.sqrt(wide_steps[k])) / steps[k] for k in known), default=0.0)
+        if wide * min((steps[k] for k in known), default=0.0) < FEWEST_WIDE:
             return 1.0
         std = -1.0 / (np.sqrt(2.0) * float(ndtri(min(wide, 1.0) / 2.0)))  # [digits]
         return float(2.0 * ndtr(0.5 / std) - 1.0)
 
-    def _find_levels(self, values: np.ndarray) -> None:
-        """Find the levels at which an axis of gyro is constant while another signal changes."""
-        gyro = values[:, :3]
-        self._peak = max(self._peak, float(np.abs(gyro).max()))
-        cut = find_cut_off(gyro, NARROWEST_GYRO_RANGE)
-        if cut.any():
-            changes = (np.abs(np.diff(values, axis=0)) > ROUNDING * np.abs(values).max(axis=0)).any(axis=1)
-            stays = cut[1:] & cut[:-1] & changes[:, None]
-            if stays.any():
-                self._levels.append(float(np.abs(gyro[1:][stays]).min()))
+    @cached_property
+    def is_noisy(self) -> bool:
+        """Whether only a fault makes two samples in a row equal: the noise is larger than the digits."""
+        lengths, long_ = np.sort(self._lengths), len(self.long_runs(BOTH))
+        usual = lengths[(len(lengths) - 1) // 2]
+        longer = np.count_nonzero(lengths > 2 * usual) - long_
+        return bool(self._noise[0] >= NOISY_S and longer <= 2 * long_ + COARSE * len(lengths))
 
     @property
-    def gyro_range(self) -> float:
-        """Rate [rad/s] from which an axis counts as saturated; infinite: none is. A sensor's axes have one range."""
-        return (1.0 - AT_RANGE) * min((v for v in self._levels if v > (1.0 - SAME_RANGE) * self._peak), default=np.inf)
+    def _lengths(self) -> np.ndarray:
+        """The lengths [rows] of all runs of equal rows, those of one row as well."""
+        return np.diff(self._changing, append=len(self.time))
 
-    def long_runs(self, name: str) -> list[_Run]:
-        """Return the runs of equal rows of a signal so far."""
-        open_, known = self._open[name], self._long[name]
-        if open_ is None or open_.rows < FROZEN_SAMPLES or open_.seconds < _least_s(name):
-            return known
-        return [*known, open_]
-
-    def noisy(self) -> bool:
-        """Return whether only a fault makes two samples in a row equal: the noise is larger than the digits."""
-        if self._noisy_s < NOISY_S:
-            return False
-        long_ = sum(run.rows >= FROZEN_SAMPLES for run in self.long_runs("gyro and accel"))
-        short = self._lengths.copy()
-        usual = int(np.searchsorted(np.cumsum(short), 0.5 * short.sum()))
-        longer = int(short[2 * usual + 1 :].sum()) - long_
-        return longer <= 2 * long_ + COARSE * short.sum()
-
-    def long_repeats(self) -> list[_Run]:
-        """Return the runs of equal rows that are much longer than all others of the sensor."""
-        counts = self._lengths.copy()
-        runs_ = [run for run in self.long_runs("gyro and accel") if run.seconds >= REPEATED_S]
-        for run in runs_:
-            counts[min(run.rows, _LONGEST)] -= 1
-        usual = int(np.flatnonzero(counts > 0).max(initial=1))
-        return [run for run in runs_ if run.rows > REPEATED_TIMES * usual]
-
-    def constant(self, name: str) -> bool:
-        """Return whether the signal has one value in all rows."""
-        return any(run.rows == self.rows for run in self.long_runs(name))
+    def find_long_repeats(self) -> list[Run]:
+        """Find the runs of equal rows that are much longer than all others of the sensor."""
+        seconds = self.time[self._changing + self._lengths - 1] - self.time[self._changing]
+        most = REPEATED_TIMES * self._lengths[seconds < REPEATED_S].max(initial=1)
+        runs = (run for run in self.long_runs(BOTH) if self.seconds(run) >= REPEATED_S)
+        return [run for run in runs if run.last - run.first + 1 > most]
 
 
-def scan_sensor(time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> SensorScan:
-    """Scan the rows of one sensor for faults: times (n,) [s], (n, 3) [rad/s], (n, 3) [m/s²]."""
-    scan = SensorScan()
-    for first in range(0, len(time), ROWS):
-        rows = slice(first, first + ROWS)
-        scan.push(time[rows], np.column_stack([gyro_S[rows], accel_S[rows]]))
-    return scan
+def _find_changes(*signals: np.ndarray) -> np.ndarray:
+    """Find the rows (n,) in which any of the signals (n, k) differs from the row before; the first one does."""
+    changes = np.any([(signal[1:] != signal[:-1]).any(axis=1) for signal in signals], axis=0)
+    return np.concatenate([[True], changes])
 
 
-def _least_s(name: str) -> float:
-    """Return the shortest duration [s] of a run of equal samples of the signal."""
-    return (FROZEN_S if name == "gyro and accel" else STUCK_S) * (1.0 - 1e-6)
+def _find_noise(values: np.ndarray, usual: float) -> np.ndarray:
+    """Find the seconds in which all axes of `values` (n, 6) reverse as in noise, which happens with little motion.
+
+    Return the sizes of the steps in them, (seconds, samples, 6); `usual` [s] is the step of time.
+    """
+    size = min(len(values) - 2, max(FROZEN_SAMPLES, round(1.0 / usual)))
+    steps = np.diff(values, axis=0)
+    steps[np.abs(steps) < ROUNDING * np.abs(values[1:]).max(axis=0)] = 0.0
+    count = (len(steps) - 1) // size
+    turns = (np.sign(steps[1:]) * np.sign(steps[:-1]) < 0.0)[: count * size].reshape(count, size, 6).mean(axis=1)
+    steps = np.abs(steps[1 : count * size + 1]).reshape(count, size, 6)
+    varies = (steps != 0.0).any(axis=1)
+    share = np.where(varies, turns, np.inf).min(axis=1)  # least of all axes: in motion some do not reverse
+    return steps[varies.any(axis=1) & (share > min(TURNS_BACK, TURNS_BACK_HZ * usual))]
 
 
-def _make_run(rows: np.ndarray, name: str, first_row: bool) -> _Run:
-    time, gyro, accel = rows[:, 0], rows[1:, 1:4], rows[1:, 4:]
-    up = accel / np.maximum(np.linalg.norm(accel, axis=1), 1e-9)[:, None]
-    tipped = float(np.sum(np.linalg.norm(np.cross(gyro, up), axis=1) * np.diff(time)))
-    low, high = rows[:, 4:].min(axis=0), rows[:, 4:].max(axis=0)
-    up_off, distinct = 0.0, 0
-    if name in _AXES:
-        signal = rows[:, 1:4] if name.startswith("gyro") else rows[:, 4:]
-        up_off, distinct = _compute_up_change(rows), int(np.count_nonzero((np.diff(signal, axis=0) != 0.0).any(axis=1)))
-    value, means = rows[0, 1:].copy(), _average_force(time[1:], accel)
-    mean_low, mean_high = means.min(axis=0, initial=np.inf), means.max(axis=0, initial=-np.inf)
-    ends = float(time[0]), float(time[-1])
-    return _Run(len(rows), *ends, value, low, high, mean_low, mean_high, tipped, up_off, distinct, first_row)
+def find_faults(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
+    """Find the intervals in which sensors were frozen or stuck: sensor → faults in the order of time."""
+    faults = {}
+    for name, scan in scans.items():
+        others = [other for other in scans.values() if other is not scan]
+        stuck: list[Run] = []
+        for group in ((BOTH,), (GYRO, ACCEL), AXES):
+            runs = [run for run in scan.runs if run.signals in group and not _is_within(run, stuck)]
+            stuck += [run for run in runs if _is_stuck(run, scan, others)]
+        if stuck:
+            stuck.sort(key=lambda run: (run.first, SIGNALS.index(run.signals)))
+            faults[name] = [_make_fault(run, scan) for run in stuck]
+    return faults
+
+
+def _is_stuck(run: Run, scan: SensorScan, others: list[SensorScan]) -> bool:
+    """Return whether physics or noise contradict that the sensor measured in a run."""
+    time, gyro, accel = (each[run.first : run.last + 1] for each in (scan.time, scan.gyro_S, scan.accel_S))
+    count = len(time)
+    if run.signals in (BOTH, ACCEL):
+        up = accel[1:] / np.maximum(np.linalg.norm(accel[1:], axis=1), 1e-9)[:, None]
+        tipped = float(np.sum(np.linalg.norm(np.cross(gyro[1:], up), axis=1) * np.diff(time)))
+        tips = tipped > TIPS * scan.seconds(run)
+        if run.signals == BOTH:
+            # A sensor that is constant from the beginning shows no noise; the others are of the same kind.
+            return tips or (any(other.is_noisy for other in others) if count == len(scan.time) else scan.is_noisy)
+        contradicts = tips and tipped > TIPPED
+    elif run.signals == GYRO:
+        dead = count == len(scan.time) and not scan.is_constant(ACCEL) and not all(o.is_constant(GYRO) for o in others)
+        contradicts = float(np.ptp(accel, axis=0).max()) > MOVES or (dead and scan.is_noisy)
+    else:
+        axes = gyro if run.signals in AXES[:3] else accel
+        count = int(np.count_nonzero((np.diff(axes, axis=0) != 0.0).any(axis=1)))
+        contradicts = _compute_up_change(time, gyro, accel) > UP_OFF
+    contradicts = contradicts or count * scan.repeat_surprisal[run.signals] > IMPROBABLE
+    value = np.abs(_find_value(run, scan)).max()
+    if run.signals in AXES:  # a constant value at the end of the range is saturation
+        contradicts &= bool(value < (scan.gyro_range if run.signals in AXES[:3] else NARROWEST_ACCEL_RANGE))
+    if run.signals.startswith("gyro") and value < ZERO_RATE:
+        means = _average_force(time[1:], accel[1:])
+        contradicts &= not (len(means) and float(np.ptp(means, axis=0).max()) < REST_FORCE)
+    return contradicts
 
 
 def _average_force(time: np.ndarray, accel: np.ndarray) -> np.ndarray:
@@ -350,17 +321,14 @@ def _average_force(time: np.ndarray, accel: np.ndarray) -> np.ndarray:
     return np.add.reduceat(accel, edges)[:-1] / np.diff(edges)[:, None]
 
 
-def _compute_up_change(rows: np.ndarray) -> float:
+def _compute_up_change(time: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> float:
     """Compute the largest angle [rad] between mean specific forces over `UP_S` two windows apart, in the world."""
-    time, gyro, accel = rows[:, 0], rows[1:, 1:4], rows[:, 4:]
     window = np.floor((time - time[0]) / UP_S).astype(int)
     count = int(window[-1])  # complete windows
-    if count < 3:
-        return 0.0
-    force = Rotation.from_quat(rotations.integrate(gyro * np.diff(time)[:, None])).apply(accel)
     edges = np.searchsorted(window, np.arange(count + 1))
-    if (np.diff(edges) == 0).any():
+    if count < 3 or (np.diff(edges) == 0).any():
         return 0.0
+    force = Rotation.from_quat(rotations.integrate(gyro[1:] * np.diff(time)[:, None])).apply(accel)
     mean = np.add.reduceat(force, edges[:-1])[:count] / np.diff(edges)[:, None]
     size = np.linalg.norm(mean, axis=1)
     known = np.abs(size / STANDARD_GRAVITY - 1.0) < UP_FORCE
@@ -369,191 +337,111 @@ def _compute_up_change(rows: np.ndarray) -> float:
     return float(np.max(off * (known[2:] & known[:-2]), initial=0.0))
 
 
-def find_faults(scans: Mapping[str, SensorScan]) -> dict[str, list[Fault]]:
-    """Find the intervals in which sensors were frozen or stuck: sensor → faults in the order of time."""
-    noisy = {name: scan.noisy() for name, scan in scans.items()}
-    all_faults = {}
-    for name, scan in scans.items():
-        others = [other for other in scans if other != name]
-        faults = []
-        for run in scan.long_runs("gyro and accel"):
-            # A sensor that is constant from the beginning shows no noise; the others are of the same kind.
-            fine = any(noisy[other] for other in others) if run.rows == scan.rows else noisy[name]
-            if fine or run.tips > TIPS:
-                faults.append(_make_fault("gyro and accel", run))
-        whole = [(fault.first, fault.last) for fault in faults]
-        improbable = {signal: -np.log(max(scan.repeats_of(signal), 1e-300)) for signal in ("gyro", "accel")}
-        for run in scan.long_runs("gyro"):
-            dead = scan.constant("gyro") and not scan.constant("accel") and noisy[name]
-            dead &= any(not scans[other].constant("gyro") for other in others)
-            stuck = dead or np.max(run.high - run.low) > MOVES or run.rows * improbable["gyro"] > IMPROBABLE
-            if stuck and not run.rests("gyro") and not _is_within(run, whole):
-                faults.append(_make_fault("gyro", run))
-        for run in scan.long_runs("accel"):
-            stuck = (run.tipped > TIPPED and run.tips > TIPS) or run.rows * improbable["accel"] > IMPROBABLE
-            if stuck and not _is_within(run, whole):
-                faults.append(_make_fault("accel", run))
-        whole = [(fault.first, fault.last) for fault in faults]
-        for axis, signals in enumerate(_AXES):
-            repeats = -np.log(max(scan.repeats(axis), 1e-300))
-            limit = scan.gyro_range if axis < 3 else NARROWEST_ACCEL_RANGE
-            for run in scan.long_runs(signals):
-                stuck = run.distinct * repeats > IMPROBABLE or run.up_off > UP_OFF
-                # A constant value at the end of the range is saturation.
-                saturated = abs(run.value[axis]) >= limit
-                if stuck and not saturated and not run.rests(signals) and not _is_within(run, whole):
-                    faults.append(_make_fault(signals, run))
-        if faults:
-            all_faults[name] = sorted(faults, key=lambda fault: fault.first)
-    return all_faults
+def _is_within(run: Run, others: list[Run]) -> bool:
+    return any(other.first <= run.first and run.last <= other.last for other in others)
 
 
-def _is_within(run: _Run, spans: list[tuple[float, float]]) -> bool:
-    return any(first <= run.first and run.last <= last for first, last in spans)
+def _find_value(run: Run, scan: SensorScan) -> np.ndarray:
+    return np.concatenate([scan.gyro_S[run.first], scan.accel_S[run.first]])[COLUMNS[run.signals]]
 
 
-def _make_fault(signals: str, run: _Run) -> Fault:
-    # At the beginning of the recording the first sample is faulty, too.
-    first = float(np.nextafter(run.first, -np.inf)) if run.first_row else run.first
-    return Fault(signals, first, run.last, tuple(run.value[_SIGNALS[signals]].tolist()))
+def _make_fault(run: Run, scan: SensorScan) -> Fault:
+    first = scan.time[run.first]
+    if run.first == 0:  # at the beginning of the recording the first sample is faulty, too
+        first = np.nextafter(first, -np.inf)
+    return Fault(run.signals, float(first), float(scan.time[run.last]), tuple(_find_value(run, scan).tolist()))
 
 
-@dataclass
-class Scan:
-    """Scan of all sensors of a recording, from blocks of rows, for faults and copies."""
+class SensorCheck(NamedTuple):
+    """What the samples of a recording say about its sensors."""
 
-    sensors: dict[str, SensorScan] = field(default_factory=dict)  # sensors with gyro and accel
-    orientations: dict[str, OrientationScan] = field(default_factory=dict)
-    _equal: dict[tuple[str, str], int] = field(default_factory=dict)  # changing rows that are equal in both sensors
-    _changes: dict[str, int] = field(default_factory=dict)  # rows that change
-    faults: dict[str, list[Fault]] = field(default_factory=dict)  # set by `finish`
+    faults: dict[str, list[Fault]]  # sensor → faults in the order of time
+    gyro_range: dict[str, float]  # [rad/s] as `SensorScan.gyro_range`
+    diagnostics: list[Diagnostic]
 
-    def push(self, blocks: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> None:
-        """Add the next rows of each sensor: times (n,) [s], and gyro and accel (n, 6) or orientations (n, 4)."""
-        changed = {}
-        for name, (time, values) in blocks.items():
-            changed[name] = np.concatenate([[True], (np.diff(values, axis=0) != 0.0).any(axis=1)])[: len(values)]
-            self._changes[name] = self._changes.get(name, 0) + int(changed[name].sum())
-            good = np.isfinite(values).all(axis=1)
-            values = np.clip(values, -LARGEST, LARGEST)
-            if values.shape[1] == 4:
-                norm = np.linalg.norm(values, axis=1)
-                good &= norm > 0.0  # zeros mark a lost sample
-                quat_WS = values[good] / norm[good, None]
-                self.orientations.setdefault(name, OrientationScan()).push(time[good], quat_WS)
-            else:
-                self.sensors.setdefault(name, SensorScan()).push(time[good], values[good])
-        for name, other in combinations(blocks, 2):
-            a, b = blocks[name][1], blocks[other][1]
-            if a.shape == b.shape:
-                equal = int(((a == b).all(axis=1) & changed[name]).sum())
-                self._equal[name, other] = self._equal.get((name, other), 0) + equal
 
-    def finish(self, where: str, start: tuple[float, float] | None) -> None:
-        """Find the faults after the last block; `start` [s] is the stated start pose.
+def check_sensors(
+    where: str, samples: Mapping[str, tuple[np.ndarray, ...]], start: tuple[float, float] | None
+) -> SensorCheck:
+    """Check that the sensors measure, and find where they do not.
 
-        Raises
-        ------
-        BadData
-            Two sensors have the same values, or one is dead in the whole recording or in the start pose.
-        """
-        for name, other in self._find_copies(self.sensors):
+    Parameters
+    ----------
+    where : the file, for messages
+    samples : sensor → times (n,) [s], and gyro and accel (n, 3) in SI or orientations (n, 4); NaN: lost
+    start : [s] the stated start pose
+
+    Raises
+    ------
+    BadData
+        Two sensors have the same values, or one is dead in the whole recording or in the start pose.
+    """
+    scans = {name: SensorScan(*_take_numbers(*each)) for name, each in samples.items() if len(each) == 3}
+    diagnostics = []
+    for name, other, rows in _find_copies(samples):
+        if name in scans:
             raise BadData(
-                f"{where}: sensors.{name} and sensors.{other} hold the same values in {self._equal[name, other]} rows: "
+                f"{where}: sensors.{name} and sensors.{other} hold the same values in {rows} rows: "
                 f"one is a copy of the other; name the file and columns in which each was recorded"
             )
-        self.faults = find_faults(self.sensors)
-        for name, faults in self.faults.items():
-            scan = self.sensors[name]
-            for fault in faults:
-                first, last = max(fault.first, scan.first), fault.last
-                whole = fault.first < scan.first and last >= scan.last
-                if whole or (start is not None and first <= start[0] and last >= start[1]):
-                    when = "all along" if whole else "through the start pose"
-                    raise BadData(
-                        f"{where}: sensors.{name}: {fault.describe(first)}, {when}: it does not measure; take "
-                        f"[sensors.{name}] out to track the others" + ("" if whole else ", or name another start pose")
-                    )
-
-    def _find_copies(self, names: Iterable[str]) -> list[tuple[str, str]]:
-        return [
-            pair
-            for pair, equal in self._equal.items()
-            if pair[0] in names and equal >= FROZEN_SAMPLES and equal > COPIED * self._changes[pair[0]]
-        ]
-
-    def diagnostics(self) -> list[Diagnostic]:
-        """Return the diagnostics of the faults that `finish` accepted."""
-        diagnostics = []
-        for name, faults in self.faults.items():
-            begin = max(faults[0].first, self.sensors[name].first)
-            lost_s = sum(fault.last - max(fault.first, self.sensors[name].first) for fault in faults)
-            facts: dict[str, float | str] = {"signals": faults[0].signals, "intervals": len(faults)}
-            facts |= {"start": begin, "end": faults[0].last}
-            diagnostics.append(Diagnostic("sensor-frozen", WARNING, name, lost_s, facts=facts))
-        diagnostics += self._find_repeats()
-        for name, scan in self.orientations.items():
-            if scan.rows >= FROZEN_SAMPLES and scan.constant:
-                diagnostics.append(Diagnostic("orientation-constant", WARNING, name, scan.rows))
-        for name, other in self._find_copies(self.orientations):
-            diagnostics.append(Diagnostic("orientations-copied", WARNING, name, facts={"other": other}))
-        return diagnostics
-
-    def _find_repeats(self) -> list[Diagnostic]:
-        """Find sensors that repeat their values for seconds while others change: static on a table, or faulty."""
-        repeats = {name: scan.long_runs("gyro and accel") for name, scan in self.sensors.items()}
-        diagnostics = []
-        for name, scan in self.sensors.items():
-            faults = [(fault.first, fault.last) for fault in self.faults.get(name, [])]
-            for run in scan.long_repeats():
-                moving = [
-                    other
-                    for other, runs_ in repeats.items()
-                    if sum(max(0.0, min(run.last, r.last) - max(run.first, r.first)) for r in runs_) < 0.5 * run.seconds
-                ]
-                if moving and not _is_within(run, faults):
-                    facts: dict[str, float | str] = {"start": run.first, "end": run.last}
-                    diagnostics.append(Diagnostic("sensor-repeats", WARNING, name, run.seconds, facts=facts))
-        return diagnostics
+        diagnostics.append(Diagnostic("orientations-copied", WARNING, name, facts={"other": other}))
+    faults = find_faults(scans)
+    for name, each in faults.items():
+        begin, end = (float(scans[name].time[k]) for k in (0, -1))
+        for fault in each:
+            first = max(fault.first, begin)
+            whole = fault.first < begin and fault.last >= end
+            if whole or (start is not None and first <= start[0] and fault.last >= start[1]):
+                when = "all along" if whole else "through the start pose"
+                raise BadData(
+                    f"{where}: sensors.{name}: {fault.describe(first)}, {when}: it does not measure; take "
+                    f"[sensors.{name}] out to track the others" + ("" if whole else ", or name another start pose")
+                )
+        lost_s = sum(fault.last - max(fault.first, begin) for fault in each)
+        facts: dict[str, float | str] = {"signals": each[0].signals, "intervals": len(each)}
+        facts |= {"start": max(each[0].first, begin), "end": each[0].last}
+        diagnostics.append(Diagnostic("sensor-frozen", WARNING, name, lost_s, facts=facts))
+    diagnostics += _find_repeats(scans, faults)
+    for name, (_, *values) in samples.items():
+        known = values[0][np.isfinite(values[0]).all(axis=1) & values[0].any(axis=1)]  # zeros mark a lost sample
+        if name not in scans and len(known) >= FROZEN_SAMPLES and (known == known[0]).all():
+            diagnostics.append(Diagnostic("orientation-constant", WARNING, name, len(known)))
+    return SensorCheck(faults, {name: scan.gyro_range for name, scan in scans.items()}, diagnostics)
 
 
-@dataclass
-class OrientationScan:
-    """Statistics of measured orientations, and the long gaps between them."""
+def _take_numbers(*values: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Take the rows that are numbers, each at most `LARGEST`."""
+    good = np.all([np.isfinite(each[:, None] if each.ndim == 1 else each).all(axis=1) for each in values], axis=0)
+    time, *signals = values if good.all() else (each[good] for each in values)
+    return time, *(np.clip(signal, -LARGEST, LARGEST) for signal in signals)
 
-    rows: int = 0
-    constant: bool = True
-    _first: np.ndarray | None = None
-    _last: _Sample | None = None
-    _gaps: list[tuple[_Sample | None, _Sample | None]] = field(default_factory=list)  # last before, first after
 
-    def push(self, time: np.ndarray, quat_WS: np.ndarray) -> None:
-        """Add the next rows: times (n,) [s], orientations (n, 4) xyzw."""
-        if not len(time):
-            return
-        if self._first is None:
-            self._first = quat_WS[0].copy()
-            self._gaps.append((None, (float(time[0]), quat_WS[0].copy())))
-        elif self._last is not None and time[0] - self._last[0] > LONGEST_GAP_S:
-            self._gaps.append((self._last, (float(time[0]), quat_WS[0].copy())))
-        for k in np.flatnonzero(np.diff(time) > LONGEST_GAP_S):
-            ends = [(float(time[i]), quat_WS[i].copy()) for i in (k, k + 1)]
-            self._gaps.append((ends[0], ends[1]))
-        self.rows += len(time)
-        self.constant &= bool((quat_WS == self._first).all())
-        self._last = float(time[-1]), quat_WS[-1].copy()
+def _find_copies(samples: Mapping[str, tuple[np.ndarray, ...]]) -> list[tuple[str, str, int]]:
+    """Find pairs of sensors of one kind with the same values, and the number of equal rows that change."""
+    copies = []
+    for (name, (_, *a)), (other, (_, *b)) in combinations(samples.items(), 2):
+        if len(a) == len(b) and len(a[0]) == len(b[0]):
+            alike = np.flatnonzero(a[0][:, 0] == b[0][:, 0])  # few, unless it is a copy
+            if len(alike) < FROZEN_SAMPLES:
+                continue
+            changes = _find_changes(*a)
+            equal = np.all([(x[alike] == y[alike]).all(axis=1) for x, y in zip(a, b, strict=True)], axis=0)
+            rows = int(np.count_nonzero(equal & changes[alike]))
+            if rows >= FROZEN_SAMPLES and rows > COPIED * np.count_nonzero(changes):
+                copies.append((name, other, rows))
+    return copies
 
-    def find_neighbours(self, clock: Clock, marks: np.ndarray) -> tuple[_Sample | None, _Sample | None]:
-        """Find the last sample before a span of the clock and the next one after it, where its ends are lost."""
-        before, after = (
-            next(
-                (
-                    gap
-                    for gap in [*self._gaps, (self._last, None)]
-                    if (gap[0] is None or gap[0][0] < time) and (gap[1] is None or gap[1][0] > time)
-                ),
-                (None, None),
-            )
-            for time in clock.time[[0, -1]]
-        )
-        return before[0] if marks[0] != GOOD else None, after[1] if marks[-1] != GOOD else None
+
+def _find_repeats(scans: Mapping[str, SensorScan], faults: Mapping[str, list[Fault]]) -> list[Diagnostic]:
+    """Find sensors that repeat their values for seconds while others change: static on a table, or faulty."""
+    spans = {name: [scan.time[[run.first, run.last]] for run in scan.long_runs(BOTH)] for name, scan in scans.items()}
+    diagnostics = []
+    for name, scan in scans.items():
+        for run in scan.find_long_repeats():
+            first, last = (float(scan.time[k]) for k in run[1:])
+            repeated_s = [sum(max(0.0, min(last, b) - max(first, a)) for a, b in each) for each in spans.values()]
+            explained = any(fault.first <= first and last <= fault.last for fault in faults.get(name, []))
+            if min(repeated_s) < 0.5 * (last - first) and not explained:
+                facts: dict[str, float | str] = {"start": first, "end": last}
+                diagnostics.append(Diagnostic("sensor-repeats", WARNING, name, last - first, facts=facts))
+    return diagnostics

@@ -85,6 +85,18 @@ def bridge_quat(
     return filled
 
 
+def find_neighbours(
+    time: np.ndarray, quat: np.ndarray, clock: Clock, marks: np.ndarray
+) -> tuple[tuple[float, np.ndarray] | None, tuple[float, np.ndarray] | None]:
+    """Find the last of the measurements (n,), (n, 4) before a span of a clock and the next after it.
+
+    None: there is none, or that end of the span is not lost.
+    """
+    first, last = int(np.searchsorted(time, clock.time[0])), int(np.searchsorted(time, clock.time[-1], side="right"))
+    before = (float(time[first - 1]), quat[first - 1]) if marks[0] != GOOD and first > 0 else None
+    return before, (float(time[last]), quat[last]) if marks[-1] != GOOD and last < len(time) else None
+
+
 def _estimate_static_rate(gyro_S: np.ndarray, good: np.ndarray, clock: Clock) -> np.ndarray:
     """Estimate the static sensor's rate (3,): the mean of the complete second with least variance; zero without one."""
     size = max(2, round(1.0 / clock.step))
