@@ -17,7 +17,7 @@ from ..arguments import check_arguments
 from ..diagnostics import WARNING, Diagnostic, notebook_html, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
 from ..recording.faults import SensorScan, find_faults
-from ..recording.limits import STANDARD_GRAVITY
+from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE, STANDARD_GRAVITY
 from .amekf import Amekf, AmekfParams
 from .base import AboutVertical, FilterRun, OrientationFilter
 from .gdc import Gdc, GdcParams
@@ -227,8 +227,12 @@ def estimate_orientation(
         raise BadOption(f"rate_hz = {rate_hz} and static = {static}: finite numbers, samples a second and seconds")
     if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
-    if not np.isfinite(gyro).all() or not np.isfinite(accel).all():
-        raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
+    for name, values, most, unit in (
+        ("gyro_S", gyro, HIGHEST_RATE, "rad/s"),
+        ("accel_S", accel, HIGHEST_ACCEL, "m/s^2"),
+    ):
+        if not max(values.max(initial=0.0), -values.min(initial=0.0)) <= most:  # NaN is not, either
+            _refuse_value(name, values, most, unit)
     scan = SensorScan(np.arange(len(gyro)) / rate_hz, gyro, accel)
     for fault in find_faults({"": scan}).get("", []):
         raise BadData(f"{fault.describe(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
@@ -247,6 +251,23 @@ def estimate_orientation(
     settings = FilterSettings(method, params, static_test or StaticTest(), start=start, gyro_range=scan.gyro_range)
     run = SensorRun(rate_hz, noise, settings)
     return (run.push(gyro, accel) or run.finish())._replace(diagnostics=diagnostics)
+
+
+def _refuse_value(name: str, values: np.ndarray, most: float, unit: str) -> None:
+    """Raise an error that names the first value that is not finite, or else the largest.
+
+    Raises
+    ------
+    BadData
+        Always.
+    """
+    if not np.isfinite(values).all():
+        raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
+    k, axis = np.unravel_index(int(np.argmax(np.abs(values))), values.shape)
+    raise BadData(
+        f"{name}[{k}, {axis}] = {values[k, axis]:.6g}: no sensor measures above {most:g} {unit}; check the unit, and fill "
+        f"or cut what is no measurement"
+    )
 
 
 def add_range(method: str, params: Any, gyro_range: float) -> Any:
@@ -310,28 +331,34 @@ class SensorRun:
             self._test = replace(self._test, rate_stds=np.inf)
         self._detector = StaticDetector(noise, rate_hz, self._test)
         self._filter: Any = None
-        self._before: Orientation | None = None  # before the start phase, until it is returned
+        self._before_cov: np.ndarray | None = None  # attitude_cov before the start phase, until it is returned
         self._static = np.zeros(0, dtype=np.bool_)  # of the smoother's chunk
 
     def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation | None:
         """Take a chunk (n, 3) [rad/s], (n, 3) [m/s²]; return it filtered, or the one before it smoothed, first None."""
-        if self._filter is None:
-            first = self._begin(gyro_S, accel_S)
-            gyro_S, accel_S = gyro_S[first:], accel_S[first:]
-        static = self._detector.run(gyro_S, accel_S)
+        before = self._begin(gyro_S, accel_S) if self._filter is None else None
         if self._method in OFFLINE:
-            smoothed, self._static, before = self._filter.push(gyro_S, accel_S, static), static, self._static
-            return None if smoothed is None else self._orientation(smoothed, before)
-        return self._orientation(self._filter.run(gyro_S, accel_S, static), static)
+            static = self._detector.run(gyro_S, accel_S)
+            smoothed, self._static, static = self._filter.push(gyro_S, accel_S, static), static, self._static
+            return None if smoothed is None else self._orientation(smoothed, static)
+        if before is None:
+            static = self._detector.run(gyro_S, accel_S)
+            return self._orientation(self._filter.run(gyro_S, accel_S, static), static)
+        backward, static_before = before
+        rest = slice(len(static_before), None)
+        static = self._detector.run(gyro_S[rest], accel_S[rest])
+        run = backward.extended(len(gyro_S))
+        self._filter.run(gyro_S[rest], accel_S[rest], static, run.part(rest))
+        return self._orientation(run, np.concatenate([static_before, static]))
 
     def finish(self) -> Orientation:
         """Return the smoother's last chunk; other filters have returned all in `push`."""
         return self._orientation(self._filter.finish(), self._static)
 
-    def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> int:
-        """Create the filter, and filter the samples before the start phase; return the filter's first sample."""
+    def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> tuple[FilterRun, np.ndarray] | None:
+        """Create the filter; return the samples before its first one filtered, and whether they are static."""
         phase = self._settings.start or slice(0, self._test.samples(self._rate_hz))
-        first = phase.start
+        first, before = phase.start, None
         start = estimate_start_tilt(gyro_S[phase], accel_S[phase], self._noise, self._rate_hz)
         if self._settings.start is None:  # the sensor may move there
             static = StaticDetector(self._noise, self._rate_hz, self._test).run(gyro_S[phase], accel_S[phase])
@@ -339,16 +366,17 @@ class SensorRun:
                 start = start._replace(tilt_std=MOVING_TILT_STD)
         if first > 0:
             before = self._run_backward(start, gyro_S[: first + 1], accel_S[:first])
+            run, _ = before
             if self._method in OFFLINE:  # forward over all samples, from the end of the backward run
-                turn = np.nan_to_num(gyro_S[0] - before.gyro_bias[0]) / self._rate_hz
-                quat_WS = (Rotation.from_quat(before.quat_WS[0]) * Rotation.from_rotvec(-turn)).as_quat()
-                start, first = StartTilt(quat_WS, MOVING_TILT_STD), 0  # the forward run alone uses these samples
-            self._before = before
+                turn = np.nan_to_num(gyro_S[0] - run.gyro_bias[0]) / self._rate_hz
+                quat_WS = (Rotation.from_quat(run.quat_WS[0]) * Rotation.from_rotvec(-turn)).as_quat()
+                start = StartTilt(quat_WS, MOVING_TILT_STD)  # the forward run alone uses these samples
+                self._before_cov = run.attitude_cov
         self._filter = self._create_filter(self._method, self._noise, start)
-        return first
+        return before
 
-    def _run_backward(self, start: StartTilt, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation:
-        """Return the orientations (n,) before the start phase: `accel_S` (n, 3), `gyro_S` (n + 1, 3).
+    def _run_backward(self, start: StartTilt, gyro_S: np.ndarray, accel_S: np.ndarray) -> tuple[FilterRun, np.ndarray]:
+        """Filter the samples (n,) before the start phase: `accel_S` (n, 3), `gyro_S` (n + 1, 3).
 
         `gyro_S` has the first sample of the phase as well, whose rate leads back to the sample before. Rates and bias
         change their sign backward in time; specific forces do not.
@@ -364,9 +392,7 @@ class SensorRun:
         cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
         # What the backward run has corrected is no correction of the forward run.
         vertical = None if run.about_vertical is None else np.zeros_like(run.about_vertical)
-        return Orientation(
-            run.quat_WS[::-1], -run.gyro_bias[::-1], static[::-1], cov, self._noise, about_vertical=vertical
-        )
+        return FilterRun(run.quat_WS[::-1], -run.gyro_bias[::-1], cov, vertical), static[::-1]
 
     def _create_filter(self, method: str, noise: SensorNoise, start: StartTilt) -> Any:
         params = self._settings.params
@@ -379,13 +405,13 @@ class SensorRun:
         return METHODS[method](noise, self._rate_hz, start.quat_WS, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
-        """Return a run as orientations, joined to those before the start phase where it is the first."""
-        before, self._before = self._before, None
+        """Return a run as orientations."""
         filter_, detector = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
-        if before is not None and self._method in OFFLINE and run.attitude_cov is not None:
+        if self._before_cov is not None and run.attitude_cov is not None:
             # The smoother's heading is exact where the recording begins; the headings are aligned in the start phase.
-            run.attitude_cov[: len(before.static)] = before.attitude_cov
-        orientation = Orientation(
+            run.attitude_cov[: len(self._before_cov)] = self._before_cov
+            self._before_cov = None
+        return Orientation(
             run.quat_WS,
             run.gyro_bias,
             static,
@@ -395,7 +421,6 @@ class SensorRun:
             detector,
             about_vertical=run.about_vertical,
         )
-        return orientation if before is None or self._method in OFFLINE else join_orientations([before, orientation])
 
 
 def run_filter(

@@ -39,6 +39,7 @@ from .base import (
     OneSample,
     add_correction,
     integrate_corrections,
+    make_run,
     prepare_samples,
 )
 from .covariance import fill_symmetric, into_sensor
@@ -270,17 +271,23 @@ class Amekf:
         """The kernel that steps many sensors at a time (`bank.LiveBank`)."""
         return _step_bank
 
-    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
+    def run(
+        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
+    ) -> FilterRun:
         """Filter samples (n, 3), (n, 3), (n,); the state continues from the run before."""
-        return self.run_with_blocks(gyro_S, accel_S, static, _NO_BLOCKS)
+        return self.run_with_blocks(gyro_S, accel_S, static, _NO_BLOCKS, out)
 
     def run_with_blocks(
-        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, blocks: np.ndarray
+        self,
+        gyro_S: np.ndarray,
+        accel_S: np.ndarray,
+        static: np.ndarray | bool,
+        blocks: np.ndarray,
+        out: FilterRun | None = None,
     ) -> FilterRun:
         """Filter as `run`, and fill one of `blocks`, an array of `BLOCK`, at the end of each block."""
         gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
-        n = len(gyro)
-        out = FilterRun(np.empty((n, 4)), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, VERTICAL_COLUMNS)))
+        out = out or make_run(len(gyro))
         _run(self.state.record, self.model, gyro, accel, is_static, blocks, *out)
         return out
 

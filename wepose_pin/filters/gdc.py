@@ -14,7 +14,7 @@ import numpy as np
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import derivative, up_in_sensor
-from .base import FilterRun, OneSample, prepare_samples
+from .base import FilterRun, OneSample, make_run, prepare_samples
 from .noise import SensorNoise
 
 
@@ -42,11 +42,14 @@ class Gdc:
         self.state = GdcState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
         self._one = OneSample()
 
-    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
+    def run(
+        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
+    ) -> FilterRun:
         gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
-        quat = np.empty((len(gyro), 4))
-        _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, self.params.gain, quat)
-        return FilterRun(quat, np.tile(self.state.gyro_bias, (len(gyro), 1)), None)
+        out = out or make_run(len(gyro), covariance=False)
+        out.gyro_bias[:] = self.state.gyro_bias
+        _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, self.params.gain, out.quat_WS)
+        return out
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
         one = self._one

@@ -13,7 +13,7 @@ import numpy as np
 from ..compilation import kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, up_in_sensor
-from .base import FilterRun, OneSample, prepare_samples
+from .base import FilterRun, OneSample, make_run, prepare_samples
 from .noise import SensorNoise
 
 
@@ -42,11 +42,13 @@ class Ncf:
         self.state = NcfState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
         self._one = OneSample()
 
-    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
+    def run(
+        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
+    ) -> FilterRun:
         gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
-        quat, bias = np.empty((len(gyro), 4)), np.empty((len(gyro), 3))
-        self._go(gyro, accel, quat, bias)
-        return FilterRun(quat, bias, None)
+        out = out or make_run(len(gyro), covariance=False)
+        self._go(gyro, accel, out.quat_WS, out.gyro_bias)
+        return out
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
         one = self._one

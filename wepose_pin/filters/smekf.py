@@ -30,6 +30,7 @@ from .base import (
     OneSample,
     add_correction,
     integrate_corrections,
+    make_run,
     prepare_samples,
 )
 from .covariance import fill_symmetric, symmetric
@@ -175,10 +176,11 @@ class Smekf:
         """The kernel that steps many sensors at a time (`bank.LiveBank`)."""
         return _step_bank
 
-    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
+    def run(
+        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
+    ) -> FilterRun:
         gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
-        n = len(gyro)
-        out = FilterRun(np.empty((n, 4)), np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, VERTICAL_COLUMNS)))
+        out = out or make_run(len(gyro))
         _run(self.state.record, self.model, gyro, accel, is_static, *out)
         return out
 

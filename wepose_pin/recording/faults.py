@@ -30,12 +30,12 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from .. import rotations
-from ..compilation import compiled
+from ..compilation import compiled, inlined
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from .intervals import format_time
 from .limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE, STANDARD_GRAVITY
-from .plausibility import ROUNDING, find_cut_off
+from .plausibility import ROUNDING, find_cut_off, has_plateaus
 
 # Shortest constant rate and force [s], [samples] of a frozen sensor: longer than gaps that are bridged silently.
 FROZEN_S, FROZEN_SAMPLES = 0.2, 5
@@ -105,21 +105,29 @@ class Run(NamedTuple):
     last: int
 
 
+@inlined
+def _find_equal_axes(gyro_S, accel_S, k):  # type: ignore[no-untyped-def]
+    """Find the axes on which row k repeats the one before, a bit each."""
+    equal = 0
+    for axis in range(3):
+        equal |= (gyro_S[k, axis] == gyro_S[k - 1, axis]) << axis
+        equal |= (accel_S[k, axis] == accel_S[k - 1, axis]) << (3 + axis)
+    return equal
+
+
 @compiled
 def _find_runs(time, gyro_S, accel_S, runs):  # type: ignore[no-untyped-def]
     """Fill `runs` with the long runs of equal rows: index of `SIGNALS`, first and last row. Return their number."""
-    count, n, repeats = 0, len(time), 0
+    count, n, k, equal = 0, len(time), 1, 0
     begin = np.full(len(_MASKS), -1)
-    for k in range(1, n + 1):
-        equal = 0
-        if k < n:
-            for axis in range(3):
-                equal |= (gyro_S[k, axis] == gyro_S[k - 1, axis]) << axis
-                equal |= (accel_S[k, axis] == accel_S[k - 1, axis]) << (3 + axis)
-        if equal == 0 and repeats == 0:
+    while k <= n:
+        # Of so few rows, a long run repeats a value in the last one too.
+        last = k + FROZEN_SAMPLES - 2
+        if equal == 0 and last < n and _find_equal_axes(gyro_S, accel_S, last) == 0:
+            k = last + 1
             continue
-        repeats = equal
-        for signals in range(len(_MASKS)):
+        before, equal = equal, _find_equal_axes(gyro_S, accel_S, k) if k < n else 0
+        for signals in range(len(_MASKS) if before | equal else 0):
             first = begin[signals]
             if equal & _MASKS[signals] == _MASKS[signals]:
                 begin[signals] = k - 1 if first < 0 else first
@@ -128,6 +136,7 @@ def _find_runs(time, gyro_S, accel_S, runs):  # type: ignore[no-untyped-def]
                 if k - first >= FROZEN_SAMPLES and time[k - 1] - time[first] >= _LEAST_S[signals]:
                     runs[count, 0], runs[count, 1], runs[count, 2] = signals, first, k - 1
                     count += 1
+        k += 1
     return count
 
 
@@ -158,23 +167,22 @@ class SensorScan:
         return float(self.time[run.last] - self.time[run.first])
 
     @cached_property
+    def gyro_range(self) -> float:
+        """Rate [rad/s] from which an axis counts as saturated; infinite: none is. A sensor's axes have one range."""
+        gyro = self.gyro_S
+        if not has_plateaus(gyro, NARROWEST_GYRO_RANGE):
+            return np.inf
+        # It is constant there while another signal changes.
+        values = np.hstack([gyro[self._changing], self.accel_S[self._changing]])
+        cut = find_cut_off(values[:, :3], NARROWEST_GYRO_RANGE)
+        moves = (np.abs(np.diff(values, axis=0)) > ROUNDING * np.abs(values).max(axis=0)).any(axis=1)
+        levels = np.abs(values[1:, :3][cut[1:] & cut[:-1] & moves[:, None]])
+        return float((1.0 - AT_RANGE) * levels[levels > (1.0 - SAME_RANGE) * np.abs(gyro).max()].min(initial=np.inf))
+
+    @cached_property
     def _changing(self) -> np.ndarray:
         """The rows that differ from the one before, (m,)."""
         return np.flatnonzero(_find_changes(self.gyro_S, self.accel_S))
-
-    @cached_property
-    def gyro_range(self) -> float:
-        """Rate [rad/s] from which an axis counts as saturated; infinite: none is. A sensor's axes have one range."""
-        peak = max(self.gyro_S.max(initial=0.0), -self.gyro_S.min(initial=0.0))
-        if peak < NARROWEST_GYRO_RANGE or not find_cut_off(self.gyro_S, NARROWEST_GYRO_RANGE).any():
-            return np.inf
-        gyro, accel = self.gyro_S[self._changing], self.accel_S[self._changing]
-        cut = find_cut_off(gyro, NARROWEST_GYRO_RANGE)
-        # It is constant there while another signal changes.
-        values = np.hstack([gyro, accel])
-        changes = (np.abs(np.diff(values, axis=0)) > ROUNDING * np.abs(values).max(axis=0)).any(axis=1)
-        levels = np.abs(gyro[1:][cut[1:] & cut[:-1] & changes[:, None]])
-        return float((1.0 - AT_RANGE) * levels[levels > (1.0 - SAME_RANGE) * peak].min(initial=np.inf))
 
     @cached_property
     def _noise(self) -> tuple[float, np.ndarray, np.ndarray]:

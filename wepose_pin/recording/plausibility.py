@@ -279,6 +279,8 @@ def find_cut_off(values: np.ndarray, least: float) -> np.ndarray:
     the plateau.
     """
     cut = np.zeros(values.shape, dtype=bool)
+    if not has_plateaus(values, least):
+        return cut
     for axis, x in enumerate(values.T):
         for extreme in (float(x.max()), float(x.min())):
             if abs(extreme) < least:
@@ -293,6 +295,17 @@ def find_cut_off(values: np.ndarray, least: float) -> np.ndarray:
                 for a, b in plateaus:
                     cut[a:b, axis] = True
     return cut
+
+
+def has_plateaus(values: np.ndarray, least: float) -> bool:
+    """Return whether an axis of `values` (n, 3) is at an extreme, `least` or more, so often that it may be cut off."""
+    if max(values.max(initial=0.0), -values.min(initial=0.0)) < least:
+        return False
+    for x in np.ascontiguousarray(values.T):
+        for extreme, reached in ((x.max(), np.greater_equal), (x.min(), np.less_equal)):
+            if abs(extreme) >= least and np.count_nonzero(reached(x, (1.0 - 2.0 * ROUNDING) * extreme)) >= PLATEAU:
+                return True
+    return False
 
 
 def _leads_beyond(x: np.ndarray, first: int, last: int, digit: float) -> bool:
