@@ -95,7 +95,7 @@ def make_run(n: int, *, covariance: bool = True) -> FilterRun:
     ends = np.cumsum([0, *map(math.prod, shapes)])
     memory = np.empty(ends[-1])
     arrays = [memory[ends[k] : ends[k + 1]].reshape(shape) for k, shape in enumerate(shapes)]
-    return FilterRun(*arrays, *([] if covariance else [None]))  # type: ignore[arg-type]
+    return FilterRun(*arrays, *([] if covariance else [None]))
 
 
 class OrientationFilter(Protocol):
