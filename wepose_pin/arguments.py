@@ -34,7 +34,7 @@ class Range:
 
     def __str__(self) -> str:
         up_to = "" if math.isinf(self.high) else f", up to {self.high:g}"
-        return f"a finite number {'at least' if self.closed else 'above'} {self.low:g}{up_to}"
+        return f"{'at least' if self.closed else 'above'} {self.low:g}{up_to}"
 
     def __contains__(self, value: float) -> bool:
         return (self.low <= value if self.closed else self.low < value) and value <= self.high and value < math.inf
@@ -79,7 +79,7 @@ def check_value(place: str, value: Any, hint: Any) -> None:
     parts = get_args(hint)
     if get_origin(hint) is Annotated:
         if value not in parts[1]:
-            raise BadOption(f"{place} = {_format_value(value)}: {parts[1]} is needed")
+            raise BadOption(f"{place} = {_format_value(value)}: {_describe_hint(hint)} is needed")
     elif get_origin(hint) is Literal:
         if value not in parts:
             raise BadOption(f"{place} = {_format_value(value)} is not known; {one_of(parts, value)}")
@@ -205,7 +205,8 @@ def _describe_hint(hint: Any) -> str:
     if len(_list_options(hint)) > 1:
         return ", or ".join(dict.fromkeys(_describe_hint(option) for option in _list_options(hint)))
     if get_origin(hint) is Annotated:
-        return str(get_args(hint)[1])
+        kind, limits = get_args(hint)[:2]
+        return f"a {'whole' if kind is int else 'finite'} number {limits}"
     words = {
         bool: "True or False",
         float: "a number",

@@ -9,8 +9,11 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from difflib import SequenceMatcher, get_close_matches
+from typing import TypeVar
+
+T = TypeVar("T")
 
 LONGEST = 2000  # letters of an error's text
 _END = 500  # of these, what is kept of the end, where it says what would be right
@@ -42,6 +45,22 @@ class BadSession(WeposeError):
 
 class UnknownKey(WeposeError, KeyError):
     """A result has nothing of this name."""
+
+
+class Named(dict[str, T]):
+    """Values by name; an unknown name raises `UnknownKey`, which lists the known ones.
+
+    Parameters
+    ----------
+    kind : what the names are, such as "point"
+    """
+
+    def __init__(self, kind: str, values: Mapping[str, T]) -> None:
+        super().__init__(values)
+        self.kind = kind
+
+    def __missing__(self, name: str) -> T:
+        raise UnknownKey(f"no {self.kind} '{name}'; {one_of(self, name)}")
 
 
 class UnknownColumn(WeposeError):

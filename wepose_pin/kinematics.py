@@ -23,7 +23,7 @@ from .arguments import (
     format_object,
 )
 from .compilation import kernel
-from .errors import BadData, BadModel, one_of
+from .errors import BadData, BadModel, Named, one_of
 from .model import BodyModel
 from .model.configurations import find_determined_frames, joint_values
 from .model.fit import Fit
@@ -153,17 +153,17 @@ class PosedBody:
     @property
     def quat_WL(self) -> Mapping[str, np.ndarray]:
         """Segment → (n, 4) xyzw."""
-        return self.pose.quat_WL
+        return Named("segment", self.pose.quat_WL)
 
     @property
     def points(self) -> Mapping[str, np.ndarray]:
         """Point → (n, 3) [m] in W."""
-        return self.pose.points
+        return Named("point", self.pose.points)
 
     @property
     def joints(self) -> Mapping[str, np.ndarray]:
         """Joint of one axis → its values (n,) [rad or m]; of a mechanism."""
-        return self.pose.joints
+        return Named("joint", self.pose.joints)
 
     @cached_property
     def q(self) -> np.ndarray:

@@ -227,7 +227,7 @@ def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float
     BadOption
         An unknown sequence; `near_lock` below 2° or above 45°.
     BadData
-        No joint has both of its segments in the pose.
+        No joint has both of its segments in the pose, or all of their orientations are NaN.
 
     Examples
     --------
@@ -257,6 +257,8 @@ def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float
             f"no joint has its segments in the pose: torso, or two segments that one joint connects, are needed; "
             f"{one_of(pose.quat_WL)}"
         )
+    if not any(np.isfinite(joint.quat).all(axis=1).any() for joint in joints.values()):
+        raise BadData("the pose holds no numbers for a joint: the orientations of its segments are NaN in all samples")
     return Angles(pose.time, joints)
 
 

@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -81,6 +81,8 @@ def calibrate(
     *,
     measured: Mapping[str, float] | None = None,
     prior: Subject | None = None,
+    stature: Positive | None = None,
+    sex: Literal["f", "m"] | None = None,
     model: BodyModel | str | Path | None = None,
     protocol: str | Path | Protocol | None = None,
     method: str = BEST,
@@ -100,9 +102,12 @@ def calibrate(
         Name → [m] that was measured on the person: a length of the body such as "shoulder_width"; the breadth
         "biacromial", from which a length follows. Without any the scale is the prior's.
     prior : Subject, optional
-        Lengths with covariance, and mounts, as known before; None: `population_subject()`, which the person's stature
-        and sex narrow, as in ``population_subject(1.78, "f")``. The subject of an earlier calibration is combined with
-        what this recording shows.
+        Lengths with covariance, and mounts, as known before: the subject of an earlier calibration is combined with
+        what this recording shows. None: `population_subject(stature, sex)`.
+    stature : float, optional
+        [m] the person's body height, which narrows the population prior.
+    sex : str, optional
+        "f" or "m", which narrows the population prior.
     model : BodyModel, str or Path, optional
         The body, or its file or name as for `load_model`; None: that which the recording states, else the upper body.
     protocol : str, Path or Protocol, optional
@@ -165,7 +170,9 @@ def calibrate(
                 f"{recording.where()}: no sensor on {segment}; protocol '{protocol.name}' needs one each on "
                 f"{', '.join(protocol.needs)}"
             )
-    prior = prior or population_subject(body=model)
+    if prior is not None and (stature is not None or sex is not None):
+        raise BadOption("prior has the lengths of a person; stature and sex narrow those of the population")
+    prior = prior or population_subject(stature, sex, model)
     prior.check_body(table)
     if formulation == "paper":
         check_paper_formulation(protocol, model, with_std, recording.sensors, recording.start_pose)

@@ -177,7 +177,7 @@ def evaluate(
         finite = np.isfinite(truth.quat_WL[segment]).all(axis=1)
         if finite.sum() < 2:
             continue
-        known = _is_near(time, truth.time[finite])
+        known = _is_near(time, truth.time[finite]) & np.isfinite(pose.quat_WL[segment][inside]).all(axis=1)
         reference = Slerp(truth.time[finite], Rotation.from_quat(truth.quat_WL[segment][finite]))
         clipped = np.clip(time[known], truth.time[finite][0], truth.time[finite][-1])
         if known.any():
@@ -193,7 +193,7 @@ def evaluate(
     on_limb = {}
     for point in [p for p in pose.points if p in truth.points]:
         finite = np.isfinite(truth.points[point]).all(axis=1)
-        known = _is_near(time, truth.time[finite])
+        known = _is_near(time, truth.time[finite]) & np.isfinite(pose.points[point][inside]).all(axis=1)
         if not known.any():
             continue
         difference = pose.points[point][inside][known] - _interpolate(
@@ -210,6 +210,15 @@ def evaluate(
             shift = middle[0][inside][known] - _interpolate(time[known], truth.time, middle[1], known_middle)
             if both.any():
                 on_limb[point] = position_error((difference - shift)[both])
+    for kind, common, errors in (
+        ("orientation of a segment", pose.quat_WL.keys() & truth.quat_WL.keys(), attitude),
+        ("position of a point", pose.points.keys() & truth.points.keys(), position),
+    ):
+        if common and not errors:
+            raise BadData(
+                f"pose and reference have no {kind} at the same time: of {', '.join(sorted(common))} one of the two is "
+                f"NaN; leave out what was not measured"
+            )
     if not attitude and not position:
         raise BadData(
             "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"

@@ -227,12 +227,8 @@ def estimate_orientation(
         raise BadOption(f"rate_hz = {rate_hz} and static = {static}: finite numbers, samples a second and seconds")
     if gyro.ndim != 2 or gyro.shape[1] != 3 or accel.shape != gyro.shape:
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
-    for name, values, most, unit in (
-        ("gyro_S", gyro, HIGHEST_RATE, "rad/s"),
-        ("accel_S", accel, HIGHEST_ACCEL, "m/s^2"),
-    ):
-        if not max(values.max(initial=0.0), -values.min(initial=0.0)) <= most:  # NaN is not, either
-            _refuse_value(name, values, most, unit)
+    _check_values("gyro_S", gyro, HIGHEST_RATE, "rad/s")
+    _check_values("accel_S", accel, HIGHEST_ACCEL, "m/s^2")
     scan = SensorScan(np.arange(len(gyro)) / rate_hz, gyro, accel)
     for fault in find_faults({"": scan}).get("", []):
         raise BadData(f"{fault.describe(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
@@ -253,20 +249,16 @@ def estimate_orientation(
     return (run.push(gyro, accel) or run.finish())._replace(diagnostics=diagnostics)
 
 
-def _refuse_value(name: str, values: np.ndarray, most: float, unit: str) -> None:
-    """Raise an error that names the first value that is not finite, or else the largest.
-
-    Raises
-    ------
-    BadData
-        Always.
-    """
+def _check_values(name: str, values: np.ndarray, most: float, unit: str) -> None:
+    """Raise `BadData` where values are not finite, or larger than a sensor measures."""
+    if max(values.max(initial=0.0), -values.min(initial=0.0)) <= most:  # false for NaN
+        return
     if not np.isfinite(values).all():
         raise BadData("gyro_S and accel_S must be finite numbers; fill or cut gaps first")
     k, axis = np.unravel_index(int(np.argmax(np.abs(values))), values.shape)
     raise BadData(
-        f"{name}[{k}, {axis}] = {values[k, axis]:.6g}: no sensor measures above {most:g} {unit}; check the unit, and fill "
-        f"or cut what is no measurement"
+        f"{name}[{k}, {axis}] = {values[k, axis]:.6g}: no sensor measures above {most:g} {unit}; check the unit, and "
+        f"fill or cut what is no measurement"
     )
 
 
