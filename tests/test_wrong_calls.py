@@ -23,7 +23,9 @@ from arms import write_arm
 
 import wepose_pin as wp
 from wepose_pin.diagnostics import WARNING, Diagnostic
+from wepose_pin.errors import BadData, BadOption
 from wepose_pin.filters import AmekfParams
+from wepose_pin.kinematics import PosedBody
 from wepose_pin.retargeting import ControllerParams
 from wepose_pin.simulation import Imperfections, ImuNoise
 from wepose_pin.subject import HeadingDrift, Hinge, StartPoseOffset
@@ -171,6 +173,8 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "recording": (*THING, None),
         "measured": LENGTHS,
         "prior": THING,
+        "stature": (*POSITIVE, 175.0),
+        "sex": NAME,
         "protocol": NAME,
         "method": (*NAME, None),
         "measured_std": (*POSITIVE, None),
@@ -489,6 +493,37 @@ def test_right_calls_go_through() -> None:
                 getattr(wp, function)(**arguments)
         elif function != "calibrate":  # see test_python_calls
             assert getattr(wp, function)(**arguments) is not None
+
+
+def test_numbers_beyond_any_sensor_are_refused_with_their_unit() -> None:
+    rng = np.random.default_rng(0)
+    gyro, accel = rng.normal(scale=1e-3, size=(900, 3)), rng.normal(scale=1e-2, size=(900, 3)) + [0.0, 0.0, 9.81]
+    for wrong, match in (((1e200 * gyro, accel), r"^gyro_S\[.* rad/s"), ((gyro, 1e3 * accel), r"^accel_S\[.* m/s\^2")):
+        with pytest.raises(BadData, match=match):
+            wp.estimate_orientation(*wrong, 100.0, static=(0.5, 4.5))
+
+
+def test_a_seed_is_a_whole_number() -> None:
+    with pytest.raises(BadOption, match=r"^seed = 1.5: a whole number at least 0 is needed$"):
+        wp.simulate(wp.population_subject(1.75).lengths, seed=1.5)  # type: ignore[arg-type]
+
+
+def test_an_unknown_point_lists_the_known_ones() -> None:
+    pose = right()["evaluate"]["pose"]
+    motion = PosedBody("x", pose, wp.load_model(), wp.population_subject())
+    with pytest.raises(KeyError, match=r"no point 'hand'; .*right_palm") as raised:
+        motion.points["hand"]
+    assert isinstance(raised.value, wp.WeposeError)
+
+
+def test_a_pose_or_a_truth_of_nan_is_refused() -> None:
+    pose = right()["evaluate"]["pose"]
+    unknown = replace(pose, quat_WL={name: np.full_like(quat, NAN) for name, quat in pose.quat_WL.items()})
+    with pytest.raises(BadData, match="NaN in all samples"):
+        wp.joint_angles(unknown)
+    for pair in ((pose, unknown), (unknown, pose)):
+        with pytest.raises(BadData, match=r"no orientation of a segment .* NaN"):
+            wp.evaluate(*pair)
 
 
 if __name__ == "__main__":

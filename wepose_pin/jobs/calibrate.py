@@ -147,7 +147,6 @@ def run_calibrate(
     from ..readers import load_session
     from ..readers.subject import read_subject
     from ..report import write_calibration_page
-    from ..subject import population_subject
     from ..writers.calibration import write_calibration
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance
@@ -161,12 +160,13 @@ def run_calibrate(
         model = load_sensed_model(job.model or recording.model or None, recording.sensors, recording.where())
         _check_measured(job, model)
         prior = read_subject(job.prior) if job.prior is not None else None
-        prior = prior or population_subject(job.stature, job.sex, model)
         progress("calibrating", 1 / 3)
         calibration = calibrate(
             recording,
             measured=dict(job.measured),
             prior=prior,
+            stature=job.stature,
+            sex=job.sex,
             model=model,
             protocol=job.protocol,
             method=job.method,
@@ -183,4 +183,4 @@ def run_calibrate(
         failures = write_calibration_page(
             job.out, calibration, recording, method=job.method, protocol=protocol, quality=quality
         )
-    return CalibrateOutcome(calibration, quality, protocol, prior, failures)
+    return CalibrateOutcome(calibration, quality, protocol, prior or calibration.prior, failures)
