@@ -28,8 +28,7 @@ class SimulateJob:
 
     The person stands in the start pose, does the motion of the protocol, then draws circles with the right hand.
     The sensors have the noise and bias of an Xsens MTi-3. Continue with `wepose calibrate DIR --measured ...` and
-    `wepose track DIR`; after walk, sit, run or throw with `wepose track DIR --model
-    whole_body`.
+    `wepose track DIR`; after an activity of the whole body with `wepose track DIR --model whole_body`.
 
     Parameters
     ----------
