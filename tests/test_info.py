@@ -415,12 +415,15 @@ def test_a_twitch_does_not_end_a_static_interval(twitch: int, expected: list[tup
 # What is guessed ---------------------------------------------------------------------------------------------------
 
 
-def write_swing(path: Path, scale: float, names: str = "torso_gyr_{}", deg: float = 60.0) -> Path:
+def write_swing(
+    path: Path, scale: float, names: str = "torso_gyr_{}", deg: float = 60.0, seconds: float = 20.0
+) -> Path:
     """A sensor that swings slowly about x by `deg`, rates [rad/s] times `scale`; without a unit in the names."""
-    time = np.arange(2000) / 100.0
+    n = round(100 * seconds)
+    time = np.arange(n) / 100.0
     angle = np.radians(deg) * np.sin(0.5 * time)
     accel = 9.81 * np.column_stack([0.0 * time, np.sin(angle), np.cos(angle)])
-    noise = np.random.default_rng(0).normal(0.0, 0.01, (2000, 6))
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (n, 6))
     gyro = np.column_stack([np.gradient(angle, time), 0.0 * time, 0.0 * time]) + 0.1 * noise[:, :3]
     columns = {"time": time} | {names.format(axis): scale * gyro[:, k] for k, axis in enumerate("xyz")}
     columns |= {names.replace("gyr", "acc").format(axis): (accel + noise[:, 3:])[:, k] for k, axis in enumerate("xyz")}
@@ -432,8 +435,8 @@ def write_swing(path: Path, scale: float, names: str = "torso_gyr_{}", deg: floa
 def test_the_unit_of_rates_is_told_by_gravity(
     scale: float, unit: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """6 deg/s at most: a person may as well turn by 6 rad/s."""
-    session = info(capsys, write_swing(tmp_path / "a.csv", scale, deg=12.0))
+    """In five seconds, by 6 deg/s at most: a person may as well turn by 6 rad/s."""
+    session = info(capsys, write_swing(tmp_path / "a.csv", scale, deg=12.0, seconds=5.0))
     assert f'gyro_unit = "{unit}"\n' in session
 
 
