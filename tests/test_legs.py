@@ -303,7 +303,16 @@ def test_legs_on_the_upper_body_are_refused_with_the_body_that_has_them(
     assert run("track", made, "-o", tmp_path / "result") == 2
     error = capsys.readouterr().err
     assert "sensors.left_thigh is no segment of upper_body; the body whole_body has it" in error
+    assert "ignore = true in [sensors.left_thigh]" in error
     assert run("simulate", "-o", made, "--activity", "sit", "--protocol", "clasp", "--force") == 2
     assert "--activity sit with --protocol clasp" in capsys.readouterr().err
     assert run("track", made, "--model", "half_body", "-o", tmp_path / "result") == 2
     assert "no body 'half_body' comes with the package; did you mean 'whole_body'" in capsys.readouterr().err
+    session = made / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    for side in SIDES:
+        for segment in ("thigh", "shank", "foot"):
+            text = text.replace(f"[sensors.{side}_{segment}]\n", f"[sensors.{side}_{segment}]\nignore = true\n")
+    session.write_text(text, encoding="utf-8")
+    assert run("track", made, "-o", tmp_path / "result") == 0
+    assert "left_thigh_qx" not in pl.read_parquet_schema(tmp_path / "result" / "pose.parquet")

@@ -322,6 +322,8 @@ class BodyTable:
             if name not in self.segments:
                 others = list_bodies_with(name)
                 known = f"the body {others[0]} has it" if others else one_of(self.segments, name)
+                if others and where.endswith("sensors."):
+                    known += f"; to do without that sensor, write ignore = true in [sensors.{name}]"
                 raise error(f"{where}{name} is no segment of {self.name}; {known}")
 
     def guess_segment(self, label: str) -> str | None:

@@ -159,7 +159,7 @@ class SessionReader:
         self._used: set[str] = set()  # keys of `_FOR_SENSORS` that a sensor uses
         start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
         # Whether the names are segments, and the start pose one of theirs, is checked where the body is known.
-        tables = {name: sensors.table(name) for name in sensors.values}
+        tables = {name: table for name in sensors.values if not (table := sensors.table(name)).flag("ignore")}
         if not tables:
             raise BadSession(f"{self.path}: no sensors; one [sensors.<segment>] table each, without # before its lines")
         self._head = Recording(

@@ -70,7 +70,7 @@ def read_sensor_keys(keys: TomlTable) -> SensorKeys:
         )
     keys.allow(
         *("gyro", "accel", "orientation", "mount", "file", "time", "time_unit", "rate_hz", "offset_s"),
-        *("format", "label", "aligned"),
+        *("format", "label", "aligned", "ignore"),
     )
     mount = _read_mount(keys.table("mount")) if "mount" in keys else None
     aligned = keys.flag("aligned") if "aligned" in keys else None
