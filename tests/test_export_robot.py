@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from test_export import a_pose, write_folder
 
 from wepose_pin import cli
-from wepose_pin.errors import WeposeError
+from wepose_pin.errors import WeposeError, WrongOption
 from wepose_pin.kinematics import PosedBody
 from wepose_pin.subject import population_subject
 from wepose_pin.writers.export import export
@@ -162,6 +162,20 @@ def test_an_episode_that_the_trajectory_cuts_is_named(trajectory: Path, tmp_path
     assert (diagnostic.code, diagnostic.place, diagnostic.value) == ("episode-shortened", "reach", 1.0)
     assert diagnostic.facts["span"] == "3 to 4.2 s"
     assert whole.diagnostics == []
+
+
+def test_an_interval_outside_is_left_out_and_the_others_are_episodes(trajectory: Path, tmp_path: Path) -> None:
+    exported = export(trajectory, tmp_path / "data", "lerobot", episodes="reach", interval=(1.5, 2.6))
+    assert [(each.code, each.value) for each in exported.diagnostics] == [("episode-outside", 1.0)]
+    assert json.loads((tmp_path / "data" / "meta" / "info.json").read_text())["total_episodes"] == 1
+
+
+def test_a_movement_that_does_not_repeat_says_why(tmp_path: Path) -> None:
+    folder = write_trajectory_folder(tmp_path / "arm")
+    reason = "5 of its 13 excursions are unlike the others"
+    change_summary(folder, repetitions={"source": "right_elbow_flexion", "spans": [], "reason": reason})
+    with pytest.raises(WrongOption, match=f"no repetitions were found in it: {reason}; .*reach"):
+        export(folder, tmp_path / "data", "lerobot", episodes="repetitions")
 
 
 def test_an_earlier_data_set_goes_as_a_whole(trajectory: Path, tmp_path: Path) -> None:

@@ -50,6 +50,7 @@ class JointMotion:
     phases : of the recording; `REPETITIONS` among them are the repetitions of the movement
     begin : the first sample after the robot's approach
     source : name of the recording that a robot follows
+    no_repetitions : why the recording has none
     """
 
     name: str
@@ -67,6 +68,7 @@ class JointMotion:
     phases: Mapping[str, Intervals] = field(default_factory=dict)
     begin: int = 0
     source: str = ""
+    no_repetitions: str = ""
 
     @property
     def rate_hz(self) -> float:
@@ -224,10 +226,11 @@ def read_joint_motion(folder: Path) -> JointMotion:
     if unknown := [joint for joint in joints if joint not in known]:
         raise BadData(f"{folder / ROBOT_URDF}: no joint '{unknown[0]}'; summary.json beside it names that one")
     phases = read_phases(summary)
-    repetitions = summary.get(REPETITIONS)
+    repetitions, reason = summary.get(REPETITIONS), ""
     if isinstance(repetitions, dict):
         with contextlib.suppress(TypeError, ValueError):
             phases[REPETITIONS] = tuple((float(begin), float(end)) for begin, end in repetitions["spans"])
+            reason = str(repetitions.get("reason") or "")
     return JointMotion(
         name=name,
         where=str(folder),
@@ -244,6 +247,7 @@ def read_joint_motion(folder: Path) -> JointMotion:
         phases=phases,
         begin=int(np.searchsorted(time, approach_s - SLACK_S)),
         source=source,
+        no_repetitions=reason,
     )
 
 
@@ -260,6 +264,12 @@ def select_motion(motion: JointMotion, interval: tuple[float, float] | None, pha
     return motion if selected is None else cut_interval(motion, selected)
 
 
+def is_followed(motion: JointMotion, interval: tuple[float, float]) -> bool:
+    """Whether at least two samples follow an interval [s] of the recording."""
+    samples = motion.samples(interval)
+    return samples.stop - samples.start >= 2
+
+
 def cut_interval(motion: JointMotion, interval: tuple[float, float]) -> JointMotion:
     """Return the part of a motion that follows an interval [s] of the recording.
 
@@ -269,7 +279,7 @@ def cut_interval(motion: JointMotion, interval: tuple[float, float]) -> JointMot
         Fewer than two samples follow it.
     """
     samples = motion.samples(interval)
-    if samples.stop - samples.start < 2:
+    if not is_followed(motion, interval):
         recorded = motion.recorded_time[[motion.begin, -1]]
         raise BadData(
             f"{motion.where}: {samples.stop - samples.start} samples follow {interval[0]:g} to {interval[1]:g} s of "

@@ -19,7 +19,7 @@ import polars as pl
 from .. import __version__
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongOption, one_of
-from .joint_motion import REPETITIONS, SLACK_S, JointMotion, cut_interval, find_whole_rate
+from .joint_motion import REPETITIONS, SLACK_S, JointMotion, cut_interval, find_whole_rate, is_followed
 from .result import write_table
 
 VERSION = "v3.0"
@@ -54,31 +54,41 @@ def list_episodes(motion: JointMotion, by: str | None, instruction: str | None) 
         return [Episode(motion, motion.position[-1], instruction or f"follow {motion.source or motion.name}")]
     if not motion.phases.get(by):
         known = [name for name, spans in motion.phases.items() if spans]
-        reason = "no repetitions were found in it" if by == REPETITIONS else "it has no such phase"
+        reason = "it has no such phase"
+        if by == REPETITIONS:
+            reason = ": ".join(["no repetitions were found in it", *filter(None, [motion.no_repetitions])])
         choices = one_of(known, by) if known else "leave --episodes out"
         raise WrongOption("episodes", by, f"{motion.where}: {reason}; {choices}")
     following = [] if by == REPETITIONS else [by]
     text = instruction or ", ".join([f"follow {motion.source or motion.name}", *following])
     episodes = []
-    for interval in motion.phases[by]:
+    intervals = [each for each in motion.phases[by] if is_followed(motion, each)] or motion.phases[by]
+    for interval in intervals:
         end = motion.samples(interval).stop
         episodes.append(Episode(cut_interval(motion, interval), motion.position[min(end, len(motion.time) - 1)], text))
     return episodes
 
 
 def diagnose_episodes(motion: JointMotion, by: str | None) -> list[Diagnostic]:
-    """Return what `list_episodes` cuts off the intervals of a phase, or off the repetitions."""
+    """Return what `list_episodes` cuts off the intervals of a phase, or the repetitions, and which it leaves out."""
     spans = motion.phases.get(by, ()) if by is not None else ()
+    outside = [each for each in spans if not is_followed(motion, each)]
+    diagnostics = []
     first, last = motion.recorded_time[[motion.begin, -1]].tolist()
-    shortened = [(a, b) for a, b in spans if max(first - a, b - last) > 1.0 / motion.rate_hz + SLACK_S]
+    if outside and by is not None:
+        facts: dict[str, float | str] = {"count": float(len(spans)), "span": "{:g} to {:g} s".format(*outside[0])}
+        facts["recorded"] = f"{first:g} to {last:g} s"
+        diagnostics.append(Diagnostic("episode-outside", WARNING, by, float(len(outside)), facts=facts))
+    inside = [each for each in spans if each not in outside]
+    shortened = [(a, b) for a, b in inside if max(first - a, b - last) > 1.0 / motion.rate_hz + SLACK_S]
     if not shortened or by is None:
-        return []
-    facts: dict[str, float | str] = {
+        return diagnostics
+    facts = {
         "count": float(len(spans)),
         "span": "{:g} to {:g} s".format(*shortened[0]),
         "recorded": f"{first:g} to {last:g} s",
     }
-    return [Diagnostic("episode-shortened", WARNING, by, float(len(shortened)), facts=facts)]
+    return [*diagnostics, Diagnostic("episode-shortened", WARNING, by, float(len(shortened)), facts=facts)]
 
 
 def write_lerobot(folder: Path, episodes: Sequence[Episode]) -> None:
