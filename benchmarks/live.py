@@ -92,21 +92,21 @@ def live_session(seconds: float) -> Table:
         ),
     )
     with tempfile.TemporaryDirectory() as folder:
-        table.rows["poses and file"] = _measure(recording, Path(folder) / "a.wepose", [])
+        table.rows["poses and file"] = _measure(recording, Path(folder) / "a.mcap", [])
         from wepose_pin.live.page import LivePage
         from wepose_pin.model import load_model
 
         page = LivePage(load_model())
         page.open()
         with _reader(page.url):
-            table.rows["and page, with a browser"] = _measure(recording, Path(folder) / "b.wepose", [page])
+            table.rows["and page, with a browser"] = _measure(recording, Path(folder) / "b.mcap", [page])
             robot = _connect_robot(recording, Path(folder))
             page = LivePage(load_model())
             page.open()
             with _reader(page.url):
                 outputs = [page, UdpOutput("9"), robot]
                 row = "and a robot's arm, UDP"
-                table.rows[row] = _measure(recording, Path(folder) / "c.wepose", outputs)
+                table.rows[row] = _measure(recording, Path(folder) / "c.mcap", outputs)
     table.notes.append(
         "Latency is from the moment at which the newest sample was due to its pose. Limits: p50 under "
         f"{LATENCY_MS:g} ms, p99 {LATENCY_99_MS:g} ms, under {SHARE:g} % of one core, no sample lost, memory flat."
@@ -153,7 +153,7 @@ def live_samples(seconds: float) -> Table:
         source = _OneByOne(recording)
         with tempfile.TemporaryDirectory() as folder:
             setup = SensorSetup.from_recording(recording)
-            run_session(source, setup, record=Path(folder) / "a.wepose", outputs=outputs)
+            run_session(source, setup, record=Path(folder) / "a.mcap", outputs=outputs)
         busy_ms = 1e3 * np.array(source.busy_s[round(10.0 * RATE_HZ) :])  # after the start pose
         table.rows[row] = {column.key: float(np.percentile(busy_ms, float(column.key[1:]))) for column in columns[:3]}
         table.rows[row]["longest"] = float(busy_ms.max())

@@ -460,7 +460,7 @@ def test_a_mechanism_live(urdf: Path, tmp_path: Path, data: Path) -> None:
 
     setup = SensorSetup.from_recording(recording.cut(slice(0, 1200)))
     source = ReplaySource(recording.cut(slice(0, 1200)), np.inf)
-    file = tmp_path / "live.wepose"
+    file = tmp_path / "live.mcap"
     summary = run_session(source, setup, record=file, outputs=[Shown()])
     log = read_live_log(file)
     assert (log.recording.start_pose, log.recording.model) == (CONFIGURATION, str(urdf))

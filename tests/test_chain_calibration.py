@@ -193,7 +193,7 @@ def test_a_chain_by_option_has_its_report_and_its_live_recording(
             main([str(word) for word in words])
         assert stopped.value.code in (None, 0, 3, 4), capsys.readouterr().err
 
-    session, cal, log = tmp_path / "session", tmp_path / "cal", tmp_path / "a.wepose"
+    session, cal, log = tmp_path / "session", tmp_path / "cal", tmp_path / "a.mcap"
     run("calibrate", session, "--model", model, "--protocol", tmp_path / "pivot.toml", "-o", cal)
     page = re.sub(
         "<script.*?</script>|<[^>]+>", " ", (cal / "report.html").read_text(encoding="utf-8"), flags=re.DOTALL

@@ -157,7 +157,7 @@ def seconds_at_most(seconds: int) -> Iterator[None]:
 
 
 READS = [
-    *("track ODD.toml -o OUT", "track ODD.wepose -o OUT", "track SESSION --subject ODD.toml -o OUT"),
+    *("track ODD.toml -o OUT", "track ODD.mcap -o OUT", "track SESSION --subject ODD.toml -o OUT"),
     *("track SESSION --model ODD.urdf -o OUT", "track SESSION --model ODD.toml -o OUT", "evaluate ODD SESSION"),
     *("calibrate SESSION --protocol ODD.toml -o OUT", "evaluate RESULT ODD.parquet", "evaluate RESULT ODD.csv"),
     *("evaluate RESULT ODD.toml", "export ODD -o OUT.csv", "view ODD --no-open"),

@@ -150,7 +150,7 @@ def test_from_sensors_of_any_name_to_the_calibration_of_their_recording(tmp_path
     ]  # fmt: skip
     assert session.guide.accepted is not None
     live = session.guide.accepted.calibration
-    file = tmp_path / "calibration-1.wepose"
+    file = tmp_path / "calibration-1.mcap"
     again, quality = calibrate_recording(load_session(file), MEASURED)
     assert again.subject.lengths == live.subject.lengths
     assert np.array_equal(again.subject.covariance, live.subject.covariance)
@@ -183,7 +183,7 @@ def test_sensors_that_measure_orientations_are_shaken_and_calibrated_too(tmp_pat
     subject = session.guide.accepted.calibration.subject
     for name, length in perform(*PERSON).lengths.items():
         assert abs(subject.lengths[name] - length) < 3.0 * subject.std(name), name
-    recording = load_session(tmp_path / "calibration-1.wepose")
+    recording = load_session(tmp_path / "calibration-1.mcap")
     assert not recording.imus
     assert set(recording.phases) == {"start", "clasp"}
 
@@ -313,7 +313,7 @@ def test_sensors_that_were_mistaken_are_exchanged_without_another_motion(tmp_pat
     said = next(m.view for m in moments if m.view.quality == "fail")
     assert said.sentence == "Some sensors sit on other segments than assigned. The same motion will do."
     assert "left forearm and right forearm seem to be exchanged" in said.reasons[0]
-    recording = load_session(tmp_path / "calibration-1.wepose")
+    recording = load_session(tmp_path / "calibration-1.mcap")
     assert calibrate_recording(recording, MEASURED)[1].quality == "pass"
 
 

@@ -127,9 +127,9 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
         run.terminate()
         out, err = run.communicate(timeout=60)
     assert run.returncode == 0, err
-    assert "anna/session-1.wepose" in out
+    assert "anna/session-1.mcap" in out
     # The subject that tracking used is that of the offline calibration of the same samples.
-    recording = load_session(tmp_path / "anna" / "calibration-1.wepose")
+    recording = load_session(tmp_path / "anna" / "calibration-1.mcap")
     offline = calibrate(recording, measured={"shoulder_width": LENGTHS["shoulder_width"]}).subject
     saved = load_subject(tmp_path / "anna")
     for name, metres in offline.lengths.items():
@@ -138,7 +138,7 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
     # No sample was lost while the motion was evaluated.
     assert not any(sensor.gap is not None and sensor.gap.any() for sensor in recording.sensors.values())
     # The take is a phase of the recording, which tracks as it was.
-    track = [sys.executable, "-m", "wepose_pin.cli", "track", "anna/session-1.wepose", "-o", "result", "--no-report"]
+    track = [sys.executable, "-m", "wepose_pin.cli", "track", "anna/session-1.mcap", "-o", "result", "--no-report"]
     subprocess.run([*track, "--no-view"], check=True, cwd=tmp_path, env=environment, capture_output=True)
     export = [sys.executable, "-m", "wepose_pin.cli", "export", "result", "--phase", "take_1", "-o", "take.parquet"]
     subprocess.run(export, check=True, cwd=tmp_path, env=environment, capture_output=True)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from bodies import LENGTHS
+from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 from test_causal import first
 
@@ -22,7 +25,8 @@ from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, Output, Status, StreamInfo
 from wepose_pin.model import load_model
-from wepose_pin.readers.live_log import SAMPLES, read_blocks, read_live_log
+from wepose_pin.readers import load_session
+from wepose_pin.readers.live_log import read_live_log, read_messages
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.recording.limits import STANDARD_GRAVITY
@@ -171,7 +175,7 @@ def test_rates_in_deg_s_are_said_while_the_person_waits(
 
 
 def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Recording, tmp_path: Path) -> None:
-    file = tmp_path / "a.wepose"
+    file = tmp_path / "a.mcap"
     keys = [(9.0, "take"), (12.0, "mark trial 3"), (15.0, "take"), (16.0, "begin clasp"), (17.0, "begin clasp")]
     keys += [(18.0, "end clasp"), (19.0, "end clasp"), (20.0, "take"), (21.0, "mark "), (22.0, "nonsense")]
     names = tuple(recording.sensors)
@@ -192,7 +196,7 @@ def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Record
     assert watcher.statuses[0].open_phases == ()
     assert watcher.statuses[-1].open_phases == ("take_2",)
     # Without a recording the first take begins one, which is as one from the beginning.
-    late = tmp_path / "late.wepose"
+    late = tmp_path / "late.mcap"
     setup = SensorSetup.from_recording(recording)
     header = setup.header(tuple(recording.sensors)) | {"method": "amekf"}
     source = Chaos(recording, arrivals)
@@ -210,8 +214,8 @@ def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Record
     assert np.array_equal(poses[first_row : first_row + len(again.quat_WL)], again.quat_WL)
     assert 9.5 < again.recording.time[again.first] < 10.5
     # They change no pose, but for the clasp, which corrects headings.
-    live(recording, tmp_path / "b.wepose")
-    unmarked = read_live_log(tmp_path / "b.wepose").quat_WL
+    live(recording, tmp_path / "b.mcap")
+    unmarked = read_live_log(tmp_path / "b.mcap").quat_WL
     before = round((phases["clasp"][0][0] - recording.time[log.first]) * recording.rate_hz)
     assert np.array_equal(log.quat_WL[:before], unmarked[:before])
     assert not np.array_equal(log.quat_WL, unmarked)
@@ -221,8 +225,8 @@ def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Record
 def test_live_its_file_and_causal_tracking_give_the_same_bits(
     recording: Recording, tmp_path: Path, method: str
 ) -> None:
-    ended = live(recording, tmp_path / "a.wepose", method=method)
-    log = read_live_log(tmp_path / "a.wepose")
+    ended = live(recording, tmp_path / "a.mcap", method=method)
+    log = read_live_log(tmp_path / "a.mcap")
     causal, again = track(recording, method=method, causal=True), track(log.recording, method=method, causal=True)
     assert not log.recording.diagnostics
     assert log.first == len(recording) - len(causal.time)
@@ -246,16 +250,16 @@ def test_measured_orientations_and_a_marked_clasp_give_the_same_bits(
         sensors[name] = OrientationSensor(quat_WS, mount, lost)
     phases = {**recording.phases, "clasp": ((12.0, 14.0), (20.5, 22.5))}
     mixed = replace(recording, sensors=sensors, phases=phases)
-    live(mixed, tmp_path / "a.wepose")
-    log = read_live_log(tmp_path / "a.wepose")
+    live(mixed, tmp_path / "a.mcap")
+    log = read_live_log(tmp_path / "a.mcap")
     causal, again = track(mixed, causal=True), track(log.recording, causal=True)
     without = track(replace(mixed, phases=recording.phases), causal=True)
     for i, name in enumerate(sensors):
         assert np.array_equal(log.quat_WL[:, i], causal.quat_WL[name])
         assert np.array_equal(log.quat_WL[:, i], again.quat_WL[name])
     assert not np.array_equal(causal.quat_WL["right_forearm"], without.quat_WL["right_forearm"])
-    live(mixed.cut(slice(0, 2100)), tmp_path / "b.wepose")  # ended within the second clasp
-    ended = read_live_log(tmp_path / "b.wepose")
+    live(mixed.cut(slice(0, 2100)), tmp_path / "b.mcap")  # ended within the second clasp
+    ended = read_live_log(tmp_path / "b.mcap")
     assert ended.recording.phases["clasp"] == ((12.0, 14.0), (20.5, float(ended.recording.time[-1])))
     cut = track(ended.recording, causal=True)
     assert np.array_equal(ended.quat_WL[:, 0], cut.quat_WL[next(iter(sensors))])
@@ -276,8 +280,8 @@ def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: S
         covariance=np.diag([1e-4 / 3.0] * len(LENGTHS) + [np.deg2rad(1.0 / 3.0) ** 2] * len(order)),
     )
     source = ReplaySource(recording, math.inf)
-    run_session(source, SensorSetup.from_recording(recording, subject), record=tmp_path / "a.wepose")
-    log = read_live_log(tmp_path / "a.wepose")
+    run_session(source, SensorSetup.from_recording(recording, subject), record=tmp_path / "a.mcap")
+    log = read_live_log(tmp_path / "a.mcap")
     again = track(log.recording, parse_subject(log.header["subject"], tmp_path), causal=True)
     assert all(np.array_equal(log.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
     assert len(log.quat_WL) > 2000
@@ -288,8 +292,8 @@ def test_a_marked_gap_is_silence_live_and_causally(recording: Recording, tmp_pat
     gap[1500:1700] = True
     sensors = {**recording.sensors, "torso": replace(recording.sensors["torso"], gap=gap)}
     recording = replace(recording, sensors=sensors)
-    live(recording, tmp_path / "a.wepose")
-    log = read_live_log(tmp_path / "a.wepose")
+    live(recording, tmp_path / "a.mcap")
+    log = read_live_log(tmp_path / "a.mcap")
     causal = track(recording, causal=True)
     assert all(np.array_equal(log.quat_WL[:, i], causal.quat_WL[n]) for i, n in enumerate(recording.sensors))
     lost = log.recording.sensors["torso"].gap
@@ -304,8 +308,8 @@ def test_a_gap_in_a_named_start_pose(recording: Recording, tmp_path: Path, begin
     gap[begin:end] = True
     sensors = {**recording.sensors, "torso": replace(recording.sensors["torso"], gap=gap)}
     recording = replace(recording, sensors=sensors)
-    live(recording, tmp_path / "a.wepose")
-    log = read_live_log(tmp_path / "a.wepose")
+    live(recording, tmp_path / "a.mcap")
+    log = read_live_log(tmp_path / "a.mcap")
     for again in (track(log.recording, causal=True), track(recording, causal=True)):
         assert all(np.array_equal(log.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
 
@@ -313,8 +317,8 @@ def test_a_gap_in_a_named_start_pose(recording: Recording, tmp_path: Path, begin
 def test_heading_resets_are_in_the_file(recording: Recording, tmp_path: Path) -> None:
     watcher = Watcher([(12.0, "r"), (20.0, "r"), (28.0, "q")])
     watcher.said = "arm: hold."
-    ended = live(recording, tmp_path / "a.wepose", watcher=watcher)
-    log = read_live_log(tmp_path / "a.wepose")
+    ended = live(recording, tmp_path / "a.mcap", watcher=watcher)
+    log = read_live_log(tmp_path / "a.mcap")
     assert len(log.recording.resets) == watcher.resumed == 2
     assert "Tracking. arm: hold." in {status.message for status in watcher.statuses}
     again = track(log.recording, causal=True)
@@ -332,7 +336,7 @@ def test_heading_resets_are_in_the_file(recording: Recording, tmp_path: Path) ->
 
 def test_outputs_get_the_newest_pose_with_its_points(recording: Recording, tmp_path: Path) -> None:
     watcher = Watcher()
-    live(recording, tmp_path / "a.wepose", watcher=watcher)
+    live(recording, tmp_path / "a.mcap", watcher=watcher)
     causal = track(recording, causal=True)
     assert watcher.info is not None
     assert watcher.info.segments == tuple(recording.sensors)
@@ -401,8 +405,8 @@ def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recordin
     hurt = list(recording.sensors)[seed + 1]
     came, count = chaos(recording, seed, hurt)
     watcher = Watcher()
-    live(recording, tmp_path / "a.wepose", Chaos(recording, came), watcher)
-    log = read_live_log(tmp_path / "a.wepose")
+    live(recording, tmp_path / "a.mcap", Chaos(recording, came), watcher)
+    log = read_live_log(tmp_path / "a.mcap")
     clean, again = track(recording, causal=True), track(log.recording, causal=True)
     n = len(log.quat_WL)
     assert n >= len(clean.time) - 40
@@ -426,8 +430,8 @@ def test_chaos_hurts_nobody_else_and_the_hurt_one_comes_back(recording: Recordin
     assert not any(lost[j] for _, lost in shown for j in range(len(recording.sensors)) if j != i)
     assert watcher.statuses[-2].problems == {}
     # All that was received is in the file.
-    of_samples = [payload for tag, payload in read_blocks(tmp_path / "a.wepose") if tag == SAMPLES]
-    assert sum(int.from_bytes(payload[:4], "little") for payload in of_samples) == count
+    topics = [topic for topic, _ in read_messages(tmp_path / "a.mcap")]
+    assert sum(topic.startswith("/sensors/") for topic in topics) == count
 
 
 @pytest.mark.parametrize("method", ["amekf", pytest.param("smekf", marks=pytest.mark.slow)])
@@ -449,7 +453,7 @@ def test_a_sensor_that_freezes_is_lost_and_said_to_be(
         (float(t) + 0.001, single(stopped, name, k)) for name in stopped.sensors for k, t in enumerate(stopped.time)
     ]
     watcher = Watcher()
-    ended = live(recording, tmp_path / "a.wepose", Chaos(recording, came), watcher, method=method)
+    ended = live(recording, tmp_path / "a.mcap", Chaos(recording, came), watcher, method=method)
     assert ended.counts[hurt]["frozen"] == pytest.approx(end - begin, abs=10)
     assert all(of["frozen"] == 0 for name, of in ended.counts.items() if name != hurt)
     i = list(recording.sensors).index(hurt)
@@ -460,7 +464,7 @@ def test_a_sensor_that_freezes_is_lost_and_said_to_be(
     assert watcher.statuses[-2].message == "Tracking."
     assert all(lost[i] for t, lost in ((pose.time, pose.lost) for pose in watcher.poses) if 12.4 < t < 14.9)
 
-    log = read_live_log(tmp_path / "a.wepose")
+    log = read_live_log(tmp_path / "a.mcap")
     again, whole = (track(each, causal=True, method=method) for each in (log.recording, recording))
     for k, name in enumerate(recording.sensors):
         assert np.array_equal(log.quat_WL[:, k], again.quat_WL[name])
@@ -481,11 +485,11 @@ def test_what_turned_beyond_its_range_is_uncertain(recording: Recording, tmp_pat
     assert gyro_S is not None
     assert np.abs(gyro_S).max() > 1.5 * level
     cut = replace(recording.sensors[hurt], gyro_S=np.clip(gyro_S, -level, level))
-    ended = live(replace(recording, sensors={**recording.sensors, hurt: cut}), tmp_path / "a.wepose", method=method)
+    ended = live(replace(recording, sensors={**recording.sensors, hurt: cut}), tmp_path / "a.mcap", method=method)
     beyond = int(np.count_nonzero(np.abs(gyro_S).max(axis=1) > level))
     assert ended.counts[hurt]["cut_off"] > 0.8 * beyond > 20
     assert all(of["cut_off"] == 0 for name, of in ended.counts.items() if name != hurt)
-    log = read_live_log(tmp_path / "a.wepose")
+    log = read_live_log(tmp_path / "a.mcap")
     again, whole = (track(each, causal=True, method=method) for each in (log.recording, recording))
     assert np.array_equal(log.quat_WL[:, list(recording.sensors).index(hurt)], again.quat_WL[hurt])
     off = (Rotation.from_quat(whole.quat_WL[hurt]).inv() * Rotation.from_quat(again.quat_WL[hurt])).magnitude()
@@ -495,14 +499,14 @@ def test_what_turned_beyond_its_range_is_uncertain(recording: Recording, tmp_pat
 
 
 def test_a_file_that_breaks_off_anywhere_is_read_up_to_there(recording: Recording, tmp_path: Path) -> None:
-    whole, recording = tmp_path / "a.wepose", first(recording, 1500)
+    whole, recording = tmp_path / "a.mcap", first(recording, 1500)
     live(recording, whole)
     full = read_live_log(whole)
     data = whole.read_bytes()
     rng = np.random.default_rng(0)
     lengths = []
     for size in [len(data) - 1, *rng.integers(len(data) // 2, len(data), 4).tolist()]:
-        part = tmp_path / "part.wepose"
+        part = tmp_path / "part.mcap"
         part.write_bytes(data[:size])
         log = read_live_log(part)
         lengths.append(len(log.quat_WL))
@@ -518,20 +522,48 @@ def test_a_file_that_breaks_off_anywhere_is_read_up_to_there(recording: Recordin
     damaged[len(data) // 2] ^= 0xFF
     part.write_bytes(damaged)
     (killed,) = read_live_log(part).recording.diagnostics
-    assert (killed.code, killed.place) == ("live-recording-incomplete", "part.wepose")
+    assert (killed.code, killed.place) == ("live-recording-incomplete", "part.mcap")
+
+
+def test_other_programs_read_the_recording(recording: Recording, tmp_path: Path) -> None:
+    """By the index that MCAP's own reader needs: JSON that its schema describes, with all bits of each sample."""
+    file, recording = tmp_path / "a.mcap", first(recording, 600)
+    live(recording, file)
+    with file.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert {schema.encoding for schema in summary.schemas.values()} == {"jsonschema"}
+        rows: dict[str, list[dict[str, Any]]] = {}
+        for _, channel, message in reader.iter_messages():
+            assert channel.message_encoding == "json"
+            rows.setdefault(channel.topic, []).append(json.loads(message.data))
+    for name, sensor in recording.imus.items():
+        assert np.array_equal([row["gyro"] for row in rows[f"/sensors/{name}"]], sensor.gyro_S)
+        assert np.array_equal([row["accel"] for row in rows[f"/sensors/{name}"]], sensor.accel_S)
+    log = read_live_log(file)
+    shown = [[row["quat_WL"][name] for name in recording.sensors] for row in rows["/pose"]]
+    assert np.array_equal(shown, log.quat_WL)
+    assert [row["kind"] for row in rows["/events"]] == ["clock", "start"]
 
 
 def test_files_that_are_none_are_said_to_be(recording: Recording, tmp_path: Path) -> None:
     with pytest.raises(MissingFile, match="no such file"):
-        read_live_log(tmp_path / "none.wepose")
-    other = tmp_path / "other.wepose"
+        read_live_log(tmp_path / "none.mcap")
+    other = tmp_path / "other.mcap"
     other.write_bytes(b"something else")
     with pytest.raises(BadData, match="is not the recording of a live session"):
         read_live_log(other)
+    other.write_bytes(b"WEPOSE-LIVE-1\nHEAD")
+    for read in (read_live_log, load_session):
+        with pytest.raises(
+            BadData, match=r"other\.mcap: recorded by an earlier version, whose files are no longer read"
+        ):
+            read(other)
     with pytest.raises(ExistingOutput, match="exists; --force"):
         live(recording, other)
     with pytest.raises(ExistingOutput, match="cannot be written"):
-        live(recording, tmp_path / "no" / "folder.wepose")
+        live(recording, tmp_path / "no" / "folder.mcap")
 
 
 def test_the_person_is_told_what_to_do(recording: Recording, tmp_path: Path) -> None:
@@ -545,13 +577,13 @@ def test_the_person_is_told_what_to_do(recording: Recording, tmp_path: Path) -> 
         if name != late or k >= 100
     ]
     watcher = Watcher()
-    live(recording, tmp_path / "a.wepose", Chaos(recording, came), watcher)
+    live(recording, tmp_path / "a.mcap", Chaos(recording, came), watcher)
     states = [status.state for status in watcher.statuses]
     assert states[0] == "waiting"
     assert states[-1] == "ended"
     assert watcher.info is not None
     assert "right forearm" in watcher.statuses[0].message
-    log = read_live_log(tmp_path / "a.wepose")
+    log = read_live_log(tmp_path / "a.mcap")
     again = track(log.recording, causal=True)
     assert all(np.array_equal(log.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
 

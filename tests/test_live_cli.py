@@ -44,7 +44,7 @@ def run(*arguments: str, code: int = 0) -> None:
 @pytest.mark.kill
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_ended_at_any_moment_the_file_holds_what_was_shown(session: Path, tmp_path: Path, number: int) -> None:
-    file = tmp_path / "a.wepose"
+    file = tmp_path / "a.mcap"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
         listening.bind(("127.0.0.1", 0))
         listening.settimeout(120.0)
@@ -76,7 +76,7 @@ def test_ended_at_any_moment_the_file_holds_what_was_shown(session: Path, tmp_pa
 
 
 def test_a_replay_and_causal_tracking_give_the_same_table(session: Path, tmp_path: Path) -> None:
-    file = tmp_path / "a.wepose"
+    file = tmp_path / "a.mcap"
     run("live", "--source", f"replay:{session}", "--speed", "max", "--record", str(file), "--no-page")
     run("track", str(file), "-o", str(tmp_path / "a"), "--no-report")
     run("track", str(session), "--causal", "-o", str(tmp_path / "b"), "--no-report")
@@ -90,15 +90,15 @@ def test_a_replay_and_causal_tracking_give_the_same_table(session: Path, tmp_pat
 
 
 def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "there.wepose"
+    file = tmp_path / "there.mcap"
     file.write_bytes(b"something")
     replay = f"replay:{session}"
     for arguments, said in (
         (["--source", "telepathy:9"], "source 'telepathy:9' is none; there is: replay:PATH"),
         (["--source", "replay:nowhere"], "nowhere: no such file"),
         (["--source", replay, "--speed", "-1"], "speed: '-1'; a positive number"),
-        (["--source", replay, "--record", str(file)], "there.wepose: exists; --force replaces it"),
-        (["--source", replay, "--record", str(tmp_path / "no" / "a.wepose")], "a.wepose: cannot be written"),
+        (["--source", replay, "--record", str(file)], "there.mcap: exists; --force replaces it"),
+        (["--source", replay, "--record", str(tmp_path / "no" / "a.mcap")], "a.mcap: cannot be written"),
         (["--source", replay, "--subject", str(tmp_path / "none")], "none: no such file"),
         (["--source", replay, "--udp", "somewhere"], "--udp somewhere: a port or HOST:PORT is needed"),
         (["--source", replay, "--port", "70000"], "the live page: port 70000; a number from 1 to 65535"),
@@ -117,14 +117,14 @@ def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest
 def test_a_live_recording_is_described_and_gets_its_phases_by_a_session(
     session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = tmp_path / "a.wepose"
+    file = tmp_path / "a.mcap"
     run("live", "--source", f"replay:{session}", "--speed", "max", "--record", str(file), "--no-page")
     before = load_session(file)
     capsys.readouterr()
     run("calibrate", str(file), "-o", str(tmp_path / "s"), code=2)
     err = capsys.readouterr().err.strip()
     assert "phases.clasp is needed" in err
-    assert "wepose info a.wepose --write" in err
+    assert "wepose info a.mcap --write" in err
     assert len(err.splitlines()) == 1
     run("info", str(file), "--write")
     out = capsys.readouterr().out
@@ -202,7 +202,7 @@ def test_a_session_without_a_start_pose_promises_no_poses(
     recording = load_session(session)
     (tmp_path / "short").mkdir()
     write_session(tmp_path / "short", replace(first(recording, 250), phases={}))
-    record = ["--record", str(tmp_path / "a.wepose")]
+    record = ["--record", str(tmp_path / "a.mcap")]
     run("live", "--source", f"replay:{tmp_path / 'short'}", "--speed", "max", "--no-page", *record)
     out = capsys.readouterr().out
     assert "no poses: the start pose was not held" in out

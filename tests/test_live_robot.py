@@ -610,10 +610,10 @@ def test_the_same_recording_gives_the_same_commands(
         run_session(source, SensorSetup.from_recording(recording), method=METHOD, record=record, outputs=[out])
         return list(sent)
 
-    once = commands(recording, tmp_path / "a.wepose")
+    once = commands(recording, tmp_path / "a.mcap")
     assert len(once) > 500
     assert commands(recording) == once
-    again = commands(load_session(tmp_path / "a.wepose"))
+    again = commands(load_session(tmp_path / "a.mcap"))
     strip: Callable[[bytes], dict[str, Any]] = lambda line: json.loads(line) | {"t": None}  # noqa: E731
     assert [strip(line) for line in again] == [strip(line) for line in once]
     states = {json.loads(line)["state"] for line in once}

@@ -145,7 +145,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "wepose calibrate session.toml --measured biacromial=0.41 --stature 1.78 --sex f -o anna",
         "wepose track session.toml --subject anna -o result",
         "wepose export result -o circles.c3d && wepose export result -o circles.trc",
-        "wepose live --source replay:session.toml --subject anna --record morning.wepose --speed max --no-page",
+        "wepose live --source replay:session.toml --subject anna --record morning.mcap --speed max --no-page",
     ):
         assert run(line, folder, folder).returncode in (0, 3), line
     (folder / "made").symlink_to(folder)
@@ -243,7 +243,7 @@ def test_the_live_session_of_python_runs(workplace: Path, tmp_path: Path) -> Non
     done = run(f"{sys.executable} -W error block.py", tmp_path, workplace)
     assert done.returncode == 0, done.stdout
     assert "'right_palm': array" in done.stdout
-    assert (tmp_path / "morning.wepose").is_file()
+    assert (tmp_path / "morning.mcap").is_file()
 
 
 @pytest.mark.slow

@@ -210,7 +210,7 @@ def _batch(places: Places) -> Arrays:
 
 def _live(method: str) -> Callable[[Places], Arrays]:
     def run(places: Places) -> Arrays:
-        file, result = places.work / "a.wepose", places.work / "result"
+        file, result = places.work / "a.mcap", places.work / "result"
         command(adapter.live(places.session("mild"), file, method=method, subject=None))
         found = values_of(adapter.recording_values(file), f"live/mild/{method}/read")
         command(adapter.track_live_recording(file, result))

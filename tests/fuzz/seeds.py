@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from mcap.writer import Writer
 from scipy.io import savemat
 
 from wepose_pin.assets import asset
 from wepose_pin.live.sources import xbus
 from wepose_pin.live.sources.packets import CRC, HEADER, MAGIC, SAMPLE
-from wepose_pin.readers.live_log import BLOCK, EVENT, HEAD, POSES, SAMPLES
-from wepose_pin.readers.live_log import MAGIC as LIVE_MAGIC
 from wepose_pin.subject import population_subject, subject_toml
 
 N = 12
@@ -269,27 +268,29 @@ def opensim() -> bytes:
 
 
 def live_log() -> bytes:
-    """A live session of one sensor: a start pose of half a second, and as much after it."""
-
-    def block(tag: bytes, payload: bytes) -> bytes:
-        return BLOCK.pack(tag, len(payload), zlib.crc32(payload, zlib.crc32(tag))) + payload
-
-    n = 100
+    """A live session of one sensor: a start pose of half a second, and as much after it; without chunks."""
+    stream = io.BytesIO()
+    writer = Writer(stream, use_chunking=False)
     header = {
-        **{"format": 2, "name": "live", "sensors": ["torso"], "mounts": {"torso": [0.0, 0.0, 0.0, 1.0]}, "phases": {}},
+        **{"format": 3, "name": "live", "sensors": ["torso"], "mounts": {"torso": [0.0, 0.0, 0.0, 1.0]}, "phases": {}},
         **{"start_pose": "n_pose", "remounted": False, "subject": None, "method": "amekf"},
     }
-    time, gyro, accel = np.arange(n) / 100.0, np.zeros((n, 3)), np.tile([0.0, 0.0, 9.8], (n, 1))
-    samples = struct.pack("<I", n) + bytes(n) + time.tobytes() + gyro.tobytes() + accel.tobytes()
-    poses = struct.pack("<QI", 51, 2) + np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)).tobytes()
-    events = (
-        {"kind": "clock", "rate_hz": 100.0, "begin": 0.0, "wait_s": 0.5},
-        {"kind": "start", "begin": 0, "end": 50},
-    )
-    clock, start = (block(EVENT, json.dumps(event).encode()) for event in events)
-    reset = block(EVENT, json.dumps({"kind": "reset", "tick": 60}).encode())
-    head = block(HEAD, json.dumps(header).encode())
-    return LIVE_MAGIC + head + clock + block(SAMPLES, samples) + start + block(POSES, poses) + reset
+    writer.start("wepose-live", "seeds")
+    writer.add_metadata("wepose", {"json": json.dumps(header)})
+    channels = {topic: writer.register_channel(topic, "json", 0) for topic in ("/sensors/torso", "/events", "/pose")}
+
+    def add(topic: str, **values: object) -> None:
+        writer.add_message(channels[topic], 0, json.dumps(values).encode(), 0)
+
+    add("/events", kind="clock", rate_hz=100.0, begin=0.0, wait_s=0.5)
+    for k in range(100):
+        add("/sensors/torso", t=k / 100.0, gyro=[0.0, 0.0, 0.0], accel=[0.0, 0.0, 9.8])
+    add("/events", kind="start", begin=0, end=50)
+    for tick in (51, 52):
+        add("/pose", tick=tick, quat_WL={"torso": [0.0, 0.0, 0.0, 1.0]})
+    add("/events", kind="reset", tick=60)
+    writer.finish()
+    return stream.getvalue()
 
 
 def datagrams() -> list[bytes]:

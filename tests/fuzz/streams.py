@@ -208,7 +208,7 @@ def loop(folder: Path, data: bytes) -> object:
     from wepose_pin.readers import read_live_log
     from wepose_pin.writers.live_log import LiveLog
 
-    file = folder / "a.wepose"
+    file = folder / "a.mcap"
     file.unlink(missing_ok=True)
     upright = np.array([0.0, 0.0, 0.0, 1.0])
     setup = SensorSetup(mounts=dict.fromkeys(TORSO_HEAD, upright), phases={"start": ((0.1, 1.2),)})

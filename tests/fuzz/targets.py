@@ -5,7 +5,6 @@ Parquet, MATLAB, HDF5 and C3D are not here: libraries parse them, and some of th
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from .target import NotOneLine, Target, file, try_one
 __all__ = ["NUMBERS", "TARGETS", "NotOneLine", "Target", "try_one"]
 
 
-KINDS = (".csv", ".txt", ".sto", ".mvnx", ".xml", ".toml", ".wepose")
+KINDS = (".csv", ".txt", ".sto", ".mvnx", ".xml", ".toml", ".mcap")
 
 
 def _described(folder: Path, data: bytes) -> object:
@@ -153,27 +152,13 @@ def _robot(path: Path) -> object:
 
 
 def _live(path: Path) -> object:
-    """With checksums that are right: else nothing but checksums would be tested."""
     from wepose_pin.readers import read_live_log
     from wepose_pin.subject import parse_subject
 
-    path.write_bytes(_checked(path.read_bytes()))
     log = read_live_log(path)
     if log.header["subject"]:
         parse_subject(log.header["subject"], path)
     return log
-
-
-def _checked(data: bytes) -> bytes:
-    from wepose_pin.readers.live_log import BLOCK, MAGIC
-
-    made, at = data[: len(MAGIC)], len(MAGIC)
-    while at + BLOCK.size <= len(data):
-        tag, size, _ = BLOCK.unpack_from(data, at)
-        payload = data[at + BLOCK.size : at + BLOCK.size + size]
-        made += BLOCK.pack(tag, len(payload), zlib.crc32(payload, zlib.crc32(tag))) + payload
-        at += BLOCK.size + size
-    return made
 
 
 def _pose(path: Path) -> object:
@@ -287,7 +272,7 @@ TARGETS = (
     Target("lsl_samples", lambda: [seeds.lsl_rows()], streams.lsl_samples, (), "live.sources.lsl"),
     Target("live_loop", lambda: [seeds.wild()], streams.loop, (), "live.loop"),
     Target("live_page", seeds.requests, streams.page, HTTP, "live.server"),
-    Target("live_log", lambda: [seeds.live_log()], file("a.wepose", _live), JSON, "readers.live_log"),
+    Target("live_log", lambda: [seeds.live_log()], file("a.mcap", _live), JSON, "readers.live_log"),
     Target("pose", lambda: [seeds.pose_csv()], file("pose.csv", _pose), (), "kinematics"),
     Target("result", lambda: [seeds.pose_csv()], records.result, LINES, "writers.motion"),
     Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON, "writers.result"),

@@ -85,6 +85,6 @@ ON_YOUR_OWN = "--udp sends each pose as JSON, from which examples/live_consumer.
 COMMAND = Command(
     LiveJob,
     run,
-    example="live --source udp:9000 --subject anna --record morning.wepose",
+    example="live --source udp:9000 --subject anna --record morning.mcap",
     removed={"--mvn": ON_YOUR_OWN, "--vmc": ON_YOUR_OWN},
 )

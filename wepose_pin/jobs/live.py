@@ -321,5 +321,5 @@ def _open_senders(job: LiveJob) -> list[Output]:
 
 def _name_recording(folder: Path) -> Path:
     """A file in the folder that is not there yet."""
-    number = next(n for n in itertools.count(1) if not (folder / f"session-{n}.wepose").exists())
-    return folder / f"session-{number}.wepose"
+    number = next(n for n in itertools.count(1) if not (folder / f"session-{n}.mcap").exists())
+    return folder / f"session-{number}.mcap"

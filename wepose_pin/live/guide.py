@@ -188,7 +188,7 @@ class Guide:
         """Begin to record, unless a recording of these sensors runs."""
         if self.attempt is None:
             self.attempts += 1
-            while (path := self.options.folder / f"calibration-{self.attempts}.wepose").exists():
+            while (path := self.options.folder / f"calibration-{self.attempts}.mcap").exists():
                 self.attempts += 1
             source = self.assigned()
             header = self.options.setup.header(source.sensors, source.orientations) | {"method": self.options.method}

@@ -81,7 +81,7 @@ def run_session(
             method=method,
             model=model,
             log=log,
-            open_log=lambda: LiveLog(Path(time.strftime("wepose-%Y%m%d-%H%M%S.wepose")), header),
+            open_log=lambda: LiveLog(Path(time.strftime("wepose-%Y%m%d-%H%M%S.mcap")), header),
             outputs=outputs,
             begin=begin,
         )

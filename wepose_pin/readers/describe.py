@@ -172,7 +172,7 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         return _propose_session(path, folder, proposal, wearer)
     known = (
         ".toml, .csv, .parquet, .tsv and .txt (tables with tabs, semicolons or commas; MT Manager), .mvnx, .sto, .h5, "
-        ".hdf5, .mat, .wepose, .xdf, .db3, .mcap, .bag, .c3d, .trc, .zip and .json of phones; folders of a result, an "
+        ".hdf5, .mat, .xdf, .db3, .mcap, .bag, .c3d, .trc, .zip and .json of phones; folders of a result, an "
         "x-IMU3, a phone, a ROS bag"
     )
     raise BadData(f"{path}: is nothing that is known here; there is: {known}")

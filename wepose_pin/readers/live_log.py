@@ -1,24 +1,24 @@
-"""The recording of a live session: its inputs and its poses, in a file that is readable when it ends early.
+"""The recording of a live session: its inputs and its poses, as MCAP, which Foxglove and others open.
 
-A file is the magic `MAGIC` and blocks: a tag of four bytes, the payload's length and its CRC-32 (both u32), payload.
-All little-endian. An incomplete last block is left out, so that the recording of a killed session is readable.
+The profile is `PROFILE`. Messages are JSON with JSON schemas (`SCHEMAS`); their log time is that of the newest sample,
+on the source's clock. The file is in chunks, so that what was written before a session was killed is readable.
 
-- ``HEAD``: JSON, the settings before the first sample: sensors, stated mounts, subject, method, and the sensors with
-  measured `orientations`, each with whether it is the segment's own; their samples hold qx qy qz qw 0 0
-- ``SMPL``: samples in the order of arrival: u32 m, then sensor u8 (m), time f64 (m), gyro f64 (m, 3), accel f64 (m, 3)
-- ``EVNT``: JSON, ``{"kind": "clock", …}`` when ticks began, ``{"kind": "start", "begin": tick, "end": tick}`` the start
+- metadata ``wepose``: the settings before the first sample, as JSON: sensors, stated mounts, subject, method, and the
+  sensors with measured `orientations`, each with whether it is the segment's own
+- ``/sensors/NAME``: a sample: ``t`` [s], ``gyro`` [rad/s] and ``accel`` [m/s²], or ``orientation`` xyzw. The messages
+  of all sensors are in the order of arrival
+- ``/events``: ``{"kind": "clock", …}`` when ticks began, ``{"kind": "start", "begin": tick, "end": tick}`` the start
   pose of tracking, ``{"kind": "reset", "tick": tick}`` headings anew before that tick; and what was marked, with times
   in seconds: ``{"kind": "begin", "phase": name, "time": t}`` and ``"end"`` of a phase, ``{"kind": "discard", "phase":
   name}`` what was marked of it so far, ``{"kind": "mark", "text": …, "time": t}`` a text, ``{"kind": "assign",
   "segments": {sensor: segment}}`` segments that differ from the names in the header
-- ``POSE``: the live poses: u64 first tick, u32 m, quat_WL f64 (m, k, 4) xyzw
+- ``/pose``: a live pose: ``tick``, and ``quat_WL``, sensor → xyzw
 """
 
 from __future__ import annotations
 
 import json
-import struct
-import zlib
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -36,12 +36,13 @@ from ..recording.gaps import GOOD, LONG, bridge, bridge_quat
 from .device import Device, make_table
 from .session_file import read_phases
 
-MAGIC = b"WEPOSE-LIVE-1\n"
-FORMAT = 2  # of the header
-BLOCK = struct.Struct("<4sII")
-HEAD, SAMPLES, EVENT, POSES = b"HEAD", b"SMPL", b"EVNT", b"POSE"
-_NUMBERS = ((1, 1), (3, 9), (3, 33))  # of a block of samples: numbers a sample, bytes a sample before them
-LONGEST_BLOCK = 1 << 28  # [bytes] longer than any block that we write
+EARLIER = b"WEPOSE-LIVE-1\n"  # a file of an earlier version begins so
+MAGIC = b"\x89MCAP0\r\n"
+PROFILE = "wepose-live"
+HEADER, SENSORS, EVENTS, POSES = "wepose", "/sensors/", "/events", "/pose"  # name of the metadata, and topics
+FORMAT = 3  # of the header
+LONGEST_RECORD = 1 << 28  # [bytes] longer than any that we write
+SAMPLE_BYTES = 57  # of a sample in the file, at least
 # Ticks without a sample: with more than in eight hours at 100 Hz, times of samples are wrong.
 MOST_SILENT = 3_000_000
 MOST_RATE, MOST_WAIT_S = 10_000.0, 10.0
@@ -55,6 +56,16 @@ _EVENTS = {
     "discard": ("phase",),
     "mark": ("text", "time"),
     "assign": ("segments",),
+}
+_VECTOR = {"type": "array", "items": {"type": "number"}}
+SCHEMAS: dict[str, dict[str, Any]] = {
+    name: {"type": "object", "properties": properties}
+    for name, properties in {
+        "sample": {"t": {"type": "number"}, "gyro": _VECTOR, "accel": _VECTOR},
+        "orientation": {"t": {"type": "number"}, "orientation": _VECTOR},
+        "pose": {"tick": {"type": "integer"}, "quat_WL": {"type": "object", "additionalProperties": _VECTOR}},
+        "event": {"kind": {"type": "string"}},
+    }.items()
 }
 
 
@@ -107,14 +118,26 @@ class LiveRecording(NamedTuple):
 
 
 def is_live_log(path: Path) -> bool:
-    """Return whether the file is the recording of a live session."""
+    """Return whether the file is the recording of a live session.
+
+    Raises
+    ------
+    BadData
+        It is one of an earlier version.
+    """
     if not path.is_file():  # a pipe would block
         return False
     try:
         with path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
+            start = file.read(64)
     except OSError:
         return False
+    if start.startswith(EARLIER):
+        raise BadData(
+            f"{path}: recorded by an earlier version, whose files are no longer read; record again, to an .mcap"
+        )
+    # The magic, opcode and length of the header, then the profile with its length.
+    return start.startswith(MAGIC) and start[17:].startswith(len(PROFILE).to_bytes(4, "little") + PROFILE.encode())
 
 
 def read_live_log(path: Path) -> LiveRecording:
@@ -129,47 +152,23 @@ def read_live_log(path: Path) -> LiveRecording:
         raise MissingFile(f"{path}: no such file; `wepose live --record FILE` writes one")
     if not is_live_log(path):
         raise BadData(f"{path}: is not the recording of a live session")
-    header: dict[str, Any] | None = None
+    content = _read_content(path)
+    header, markers = content.header, Markers()
     synchronizer: StreamSynchronizer | None = None
-    waiting: list[Arrivals] = []
-    ticks: list[Ticks] = []
     start: tuple[int, int] | None = None
-    markers = Markers()
-    resets, poses = [], []
-    end_s, late = 0.0, 0
-    broken_off = True
-    for tag, payload in read_blocks(path):
-        if tag == b"":
-            broken_off = False
-        elif tag == HEAD:
-            header = _header(path, payload)
-        elif header is None:
-            raise BadData(f"{path}: begins without a header; the file is damaged")
-        elif tag == SAMPLES:
-            waiting.append(_arrivals(path, payload, len(header["sensors"])))
-        elif tag == EVENT:
-            kind, event = _event(path, payload)
-            if kind == "clock":
-                clock = event["rate_hz"], event["begin"], event["wait_s"]
-                synchronizer = StreamSynchronizer(header["sensors"], *clock, header["orientations"])
-                end_s = synchronizer.begin + (MOST_SILENT + path.stat().st_size / 57) / synchronizer.rate_hz
-            elif kind == "start":
-                start = int(event["begin"]), int(event["end"])
-            elif kind == "reset":
-                resets.append(int(event["tick"]))
-            else:
-                markers.add(kind, event)
-        elif tag == POSES:
-            poses.append(_poses(path, payload, len(header["sensors"])))
-        while synchronizer is not None and waiting:
-            arrivals, far = waiting[0], waiting.pop(0).time > end_s
-            late += int(far.sum())
-            if late > 3:  # as many in a row are a clock that jumped
-                raise BadData(
-                    f"{path}: samples at {arrivals.time[far][0]:g} s, where the file holds no as long recording"
-                )
-            ticks.append(synchronizer.push(Arrivals(*(column[~far] for column in arrivals)) if far.any() else arrivals))
-    if header is None or synchronizer is None or synchronizer.next_tick < 2:
+    resets = []
+    for kind, event in content.events:
+        if kind == "clock":
+            clock = event["rate_hz"], event["begin"], event["wait_s"]
+            synchronizer = StreamSynchronizer(header["sensors"], *clock, header["orientations"])
+        elif kind == "start":
+            start = int(event["begin"]), int(event["end"])
+        elif kind == "reset":
+            resets.append(int(event["tick"]))
+        else:
+            markers.add(kind, event)
+    ticks = [] if synchronizer is None else [_make_ticks(path, synchronizer, content.arrivals)]
+    if synchronizer is None or synchronizer.next_tick < 2:
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     resets = [tick for tick in resets if tick < synchronizer.next_tick]
     if start is not None and synchronizer.next_tick <= start[1] + 1:
@@ -181,12 +180,20 @@ def read_live_log(path: Path) -> LiveRecording:
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     recording = check_recording(build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets)))
     recording = replace(recording, marks=tuple(markers.texts))
-    if broken_off:
+    if not content.is_complete:
         killed = Diagnostic("live-recording-incomplete", WARNING, path.name, facts={"variant": "killed"})
         recording = replace(recording, diagnostics=(killed,))
-    quat_WL = np.concatenate([quat for _, quat in poses]) if poses else np.empty((0, len(header["sensors"]), 4))
-    first = poses[0][0] if poses else start[1] + 1 if start is not None else 0
-    return LiveRecording(recording, header, first, quat_WL)
+    first = content.first if len(content.quat_WL) else start[1] + 1 if start is not None else 0
+    return LiveRecording(recording, header, first, content.quat_WL)
+
+
+def _make_ticks(path: Path, synchronizer: StreamSynchronizer, arrivals: Arrivals) -> Ticks:
+    """The ticks of all arrivals, without those whose time is far beyond what the file can hold."""
+    end_s = synchronizer.begin + (MOST_SILENT + path.stat().st_size / SAMPLE_BYTES) / synchronizer.rate_hz
+    far = arrivals.time > end_s
+    if np.count_nonzero(far) > 3:  # as many are a clock that jumped
+        raise BadData(f"{path}: samples at {arrivals.time[far][0]:g} s, where the file holds no as long recording")
+    return synchronizer.push(Arrivals(*(column[~far] for column in arrivals)) if far.any() else arrivals)
 
 
 def _assign_segments(path: Path, sensors: Sequence[str], segments: Mapping[str, str]) -> list[str]:
@@ -242,22 +249,89 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     )
 
 
-def read_blocks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Iterate over tag and payload of each complete block; an empty one ends a file without remaining bytes."""
+class _Content(NamedTuple):
+    """The messages of a file, in their order."""
+
+    header: dict[str, Any]
+    arrivals: Arrivals
+    events: list[tuple[str, dict[str, Any]]]
+    first: int  # tick of the first pose
+    quat_WL: np.ndarray  # (n, k, 4) xyzw
+    is_complete: bool  # nothing is missing at its end
+
+
+def read_messages(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Iterate over topic and content of each message, the header first; an empty topic ends a file that is complete."""
+    from mcap.records import Channel, Footer, Message, Metadata
+    from mcap.stream_reader import StreamReader
+
+    topics: dict[int, str] = {}
     with path.open("rb") as file:
-        file.seek(len(MAGIC))
+        records = iter(StreamReader(file, validate_crcs=True, record_size_limit=LONGEST_RECORD).records)
         while True:
-            head = file.read(BLOCK.size)
-            if not head:
-                yield b"", b""
+            try:
+                record = next(records)
+            except Exception:  # cut off or damaged: the library raises errors of many kinds
                 return
-            if len(head) < BLOCK.size:
+            if isinstance(record, Message):
+                yield topics.get(record.channel_id, HEADER), record.data
+            elif isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Metadata) and record.name == HEADER:
+                yield HEADER, record.metadata.get("json", "").encode()
+            elif isinstance(record, Footer):
+                yield "", b""
                 return
-            tag, size, crc = BLOCK.unpack(head)
-            payload = file.read(size) if size <= LONGEST_BLOCK else b""
-            if len(payload) < size or zlib.crc32(payload, zlib.crc32(tag)) != crc:
-                return
-            yield tag, payload
+
+
+def _read_content(path: Path) -> _Content:
+    header: dict[str, Any] | None = None
+    events, is_complete = [], False
+    samples, poses = array("d"), array("d")  # eight numbers a sample, and a tick with four numbers a sensor
+    for topic, text in read_messages(path):
+        if not topic:
+            is_complete = True
+        elif topic == HEADER:
+            header = header or _header(path, text)
+        elif header is None:
+            raise BadData(f"{path}: begins without a header; the file is damaged")
+        elif topic == EVENTS:
+            events.append(_event(path, text))
+        else:
+            message = _json(path, text)
+            try:
+                if topic == POSES:
+                    poses.extend(_list_pose(message, header["sensors"]))
+                else:
+                    samples.extend(_list_sample(message, header["sensors"].index(topic.removeprefix(SENSORS))))
+            except (ValueError, TypeError, KeyError, OverflowError) as error:
+                raise BadData(f"{path}: a message {text[:80]!r} of {topic}: {error!r}; the file is damaged") from None
+    if header is None:
+        raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
+    which, time, gyro, accel = np.split(np.array(samples).reshape(-1, 8), [1, 2, 5], axis=1)
+    arrivals = Arrivals(which[:, 0].astype(np.uint8), time[:, 0].copy(), gyro.copy(), accel.copy())
+    count = len(header["sensors"])
+    rows = np.array(poses).reshape(-1, 1 + 4 * count)
+    first = int(rows[0, 0]) if len(rows) else 0
+    return _Content(header, arrivals, events, first, rows[:, 1:].reshape(-1, count, 4).copy(), is_complete)
+
+
+def _list_sample(message: Mapping[str, Any], sensor: int) -> tuple[float, ...]:
+    """The sensor's number, the time and six numbers of a sample, an orientation packed."""
+    if "orientation" in message:
+        x, y, z, w = message["orientation"]
+        return sensor, message["t"], x, y, z, w, 0.0, 0.0
+    (gx, gy, gz), (ax, ay, az) = message["gyro"], message["accel"]
+    return sensor, message["t"], gx, gy, gz, ax, ay, az
+
+
+def _list_pose(message: Mapping[str, Any], sensors: Sequence[str]) -> list[float]:
+    """The tick, and four numbers of each sensor."""
+    row = [float(int(message["tick"]))]
+    for name in sensors:
+        x, y, z, w = message["quat_WL"][name]
+        row += x, y, z, w
+    return row
 
 
 def _header(path: Path, payload: bytes) -> dict[str, Any]:
@@ -327,25 +401,6 @@ def _is_event(kind: str, values: Mapping[str, Any]) -> bool:
         ticks = [int(value) for value in numbers if value == int(value)]
         return len(ticks) == len(numbers) and ticks == sorted(set(ticks)) and min(ticks, default=0) >= 0
     return True
-
-
-def _poses(path: Path, payload: bytes, sensors: int) -> tuple[int, np.ndarray]:
-    """Read the tick of the first pose, and the poses (m, k, 4) xyzw."""
-    first, count = struct.unpack_from("<QI", payload) if len(payload) >= 12 else (0, 0)
-    if len(payload) != 12 + 32 * count * sensors:
-        raise BadData(f"{path}: a block of {count} poses has {len(payload)} bytes; the file is damaged")
-    return first, np.frombuffer(payload, "<f8", offset=12).reshape(count, sensors, 4)
-
-
-def _arrivals(path: Path, payload: bytes, sensors: int) -> Arrivals:
-    (count,) = struct.unpack_from("<I", payload) if len(payload) >= 4 else (0,)
-    if len(payload) != 4 + count * 57:
-        raise BadData(f"{path}: a block of {count} samples has {len(payload)} bytes; the file is damaged")
-    which = np.frombuffer(payload, "u1", count, 4)
-    if count and which.max() >= sensors:
-        raise BadData(f"{path}: samples of sensor {which.max()} of {sensors}; the file is damaged")
-    time, gyro, accel = (np.frombuffer(payload, "<f8", k * count, 4 + at * count).astype(float) for k, at in _NUMBERS)
-    return Arrivals(which, time, gyro.reshape(count, 3), accel.reshape(count, 3))
 
 
 def _cut_spans(phase: str, spans: Sequence[Sequence[float]], time: np.ndarray) -> Intervals:

@@ -16,7 +16,7 @@ from .device import Device
 
 # Suffixes of data files.
 DATA = (
-    *(".csv", ".tsv", ".txt", ".parquet", ".mat", ".h5", ".hdf5", ".mvnx", ".sto", ".wepose"),
+    *(".csv", ".tsv", ".txt", ".parquet", ".mat", ".h5", ".hdf5", ".mvnx", ".sto"),
     *(".xdf", ".db3", ".mcap", ".bag", ".zip", ".json", ".c3d", ".trc"),
 )
 SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "sensors", "joints")

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
-import struct
 import threading
 import time
-import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from mcap.writer import CompressionType, Writer
 
 from ..errors import ExistingOutput
-from ..readers.live_log import BLOCK, EVENT, FORMAT, HEAD, MAGIC, POSES, SAMPLES
+from ..readers.live_log import EVENTS, FORMAT, HEADER, POSES, PROFILE, SCHEMAS, SENSORS
 from ..recording.arrivals import Arrivals
 
 FLUSH_S = 0.25  # [s] what a kill may cost at most
-FLUSH_SAMPLES = 4096  # or as many, of a replay that goes faster
+CHUNK_BYTES = 1 << 16  # or as much, of a replay that goes faster
 SYNC_S = 1.0  # [s] what a power cut may cost at most
+LATEST_S = 1e10  # [s] of the clock of messages
+_encode = json.JSONEncoder(separators=(",", ":")).encode
 
 
 class LiveLog:
@@ -47,55 +49,42 @@ class LiveLog:
         except OSError as error:
             raise ExistingOutput(f"{path}: cannot be written: {error.strerror}") from error
         self.path, self.problem = path, ""
-        self._samples: list[Arrivals] = []
-        self._poses: list[np.ndarray] = []
-        self._first = self._waiting = 0
+        self._sensors = list(header["sensors"])
+        self._measured = [name in header["orientations"] for name in self._sensors]
+        self._time_ns = 0  # of the newest sample
         self._flushed = time.monotonic()
         self._closing = threading.Event()
-        self._write(MAGIC)
-        self._block(HEAD, json.dumps({"format": FORMAT, **header}).encode())
-        self.flush()
+        self._writer: Any = Writer(self._file, CHUNK_BYTES, CompressionType.NONE)
+        self._write(lambda: self._begin(header))
         self._syncer = threading.Thread(target=self._sync, name="sync of the recording", daemon=True)
         self._syncer.start()
 
     def samples(self, came: Arrivals) -> None:
         """What arrived, in the order of arrival."""
-        self._samples.append(came)
-        self._waiting += len(came.time)
+        rows = zip(*(column.tolist() for column in came), strict=True)
+        for sensor, time_s, gyro, accel in rows:
+            signals = {"orientation": [*gyro, accel[0]]} if self._measured[sensor] else {"gyro": gyro, "accel": accel}
+            if math.isfinite(time_s):
+                self._time_ns = int(1e9 * min(max(time_s, 0.0), LATEST_S))
+            self._put(self._channels[sensor], {"t": time_s, **signals})
 
     def pose(self, tick: int, quat_WL: np.ndarray) -> None:
         """The pose (k, 4) xyzw of a tick; ticks follow each other."""
-        if not self._poses:
-            self._first = tick
-        self._poses.append(quat_WL.copy())
+        self._put(self._poses, {"tick": tick, "quat_WL": dict(zip(self._sensors, quat_WL.tolist(), strict=True))})
 
     def event(self, kind: str, **values: Any) -> None:
         """Something that decides the poses from here on."""
-        self._put_samples()
-        self._block(EVENT, json.dumps({"kind": kind, **values}).encode())
+        self._put(self._events, {"kind": kind, **values})
 
     def flush_if_due(self) -> None:
-        """Write what waits, if it is much or has waited for long."""
-        if (
-            self._waiting >= FLUSH_SAMPLES
-            or len(self._poses) >= FLUSH_SAMPLES
-            or time.monotonic() - self._flushed > FLUSH_S
-        ):
+        """Write what waits, if it has waited for long."""
+        if time.monotonic() - self._flushed > FLUSH_S:
             self.flush()
 
     def flush(self) -> None:
         """Hand all to the system: a kill costs nothing of it."""
         self._flushed = time.monotonic()
-        self._put_samples()
-        if self._poses:
-            quat = np.ascontiguousarray(self._poses, dtype="<f8")
-            self._poses = []
-            self._block(POSES, struct.pack("<QI", self._first, len(quat)) + quat.tobytes())
-        if self._file is not None:
-            try:
-                self._file.flush()
-            except OSError as error:
-                self._give_up(error)
+        self._write(self._writer.flush)
 
     def discard(self) -> None:
         """Close and remove the file: nothing in it can be tracked."""
@@ -105,29 +94,42 @@ class LiveLog:
 
     def close(self) -> None:
         """Write the rest; may be called twice."""
-        self.flush()
         self._closing.set()
         self._syncer.join()
+        self._write(self._finish)
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
+
+    def _finish(self) -> None:
+        self._writer.finish()
         if self._file is not None:
-            self._file.close()
-            self._file = None
+            self._file.flush()
 
-    def _put_samples(self) -> None:
-        if not self._samples:
-            return
-        samples, self._samples, self._waiting = self._samples, [], 0
-        which, *numbers = (np.concatenate(column) for column in zip(*samples, strict=True))
-        parts = [which.astype("u1").tobytes(), *(part.astype("<f8").tobytes() for part in numbers)]
-        payload = struct.pack("<I", len(which)) + b"".join(parts)
-        self._block(SAMPLES, payload)
+    def _begin(self, header: Mapping[str, Any]) -> None:
+        self._writer.start(PROFILE, "wepose-pin")
+        self._writer.add_metadata(HEADER, {"json": json.dumps({"format": FORMAT, **header})})
+        schemas = {
+            name: self._writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
+            for name, schema in SCHEMAS.items()
+        }
+        self._channels = [
+            self._writer.register_channel(SENSORS + name, "json", schemas["orientation" if measured else "sample"])
+            for name, measured in zip(self._sensors, self._measured, strict=True)
+        ]
+        self._poses = self._writer.register_channel(POSES, "json", schemas["pose"])
+        self._events = self._writer.register_channel(EVENTS, "json", schemas["event"])
+        self._writer.flush()
 
-    def _block(self, tag: bytes, payload: bytes) -> None:
-        self._write(BLOCK.pack(tag, len(payload), zlib.crc32(payload, zlib.crc32(tag))) + payload)
+    def _put(self, channel: int, message: Mapping[str, Any]) -> None:
+        data = _encode(message).encode()
+        self._write(lambda: self._writer.add_message(channel, self._time_ns, data, self._time_ns))
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, write: Callable[[], None]) -> None:
+        """Write, unless the recording has ended; it ends where that fails."""
         if self._file is not None:
             try:
-                self._file.write(data)
+                write()
             except OSError as error:
                 self._give_up(error)
 
