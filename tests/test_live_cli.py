@@ -206,5 +206,7 @@ def test_a_session_without_a_start_pose_promises_no_poses(
     run("live", "--source", f"replay:{tmp_path / 'short'}", "--speed", "max", "--no-page", *record)
     out = capsys.readouterr().out
     assert "no poses: the start pose was not held" in out
+    assert f"Nothing was recorded to {tmp_path / 'a.mcap'}" in out
+    assert not (tmp_path / "a.mcap").exists()
     assert "nan" not in out
     assert "gives these poses again" not in out

@@ -34,8 +34,10 @@ def run(job: LiveJob) -> int:
         reason = {"reason": session.problem}
         print_diagnostics([Diagnostic("live-recording-incomplete", WARNING, str(session.record), facts=reason)])
     elif session.record is not None:
-        again = f"  (wepose track {session.record} -o DIR gives these poses again)" if session.poses else ""
+        again = f"  (wepose track {session.record} -o DIR gives these poses again)"
         say(f"Recorded: {session.record}{again}")
+    elif job.record is not None:
+        say(f"Nothing was recorded to {job.record}: without the start pose there is nothing to track.")
     return 0
 
 

@@ -218,10 +218,12 @@ class LiveLoop:
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> SessionSummary:
         """Run until the source ends, the user presses q, or `should_stop` returns True.
 
+        Without a start pose there is nothing to track, and no recording remains.
+
         Raises
         ------
         BadData
-            The start pose shows that a sensor sends another unit. Nothing is recorded then.
+            The start pose shows that a sensor sends another unit.
         """
         next_status, switch_interval = 0.0, sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -243,8 +245,6 @@ class LiveLoop:
             self._send_status()
         except WeposeError as error:
             self._end_message = f"The session has ended: {error}"
-            if self.log is not None and self._segment_estimator is None:
-                self.log.discard()
             self._send_status()
             raise
         finally:
@@ -253,6 +253,9 @@ class LiveLoop:
             self.source.close()
             if self.log is not None:
                 self.log.close()
+                if self._segment_estimator is None:
+                    self.log.path.unlink(missing_ok=True)  # nothing in it can be tracked
+                    self.log = None
             for output in self.outputs:
                 output.close()
         return self._summarize()

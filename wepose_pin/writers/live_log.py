@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from ..errors import ExistingOutput
 from ..readers.live_log import EVENTS, FORMAT, HEADER, POSES, PROFILE, SCHEMAS, SENSORS
@@ -54,7 +54,7 @@ class LiveLog:
         self._time_ns = 0  # of the newest sample
         self._flushed = time.monotonic()
         self._closing = threading.Event()
-        self._writer: Any = Writer(self._file, CHUNK_BYTES, CompressionType.NONE)
+        self._writer: Any = Writer(self._file, CHUNK_BYTES)
         self._write(lambda: self._begin(header))
         self._syncer = threading.Thread(target=self._sync, name="sync of the recording", daemon=True)
         self._syncer.start()
@@ -85,12 +85,6 @@ class LiveLog:
         """Hand all to the system: a kill costs nothing of it."""
         self._flushed = time.monotonic()
         self._write(self._writer.flush)
-
-    def discard(self) -> None:
-        """Close and remove the file: nothing in it can be tracked."""
-        self.close()
-        with contextlib.suppress(OSError):
-            self.path.unlink()
 
     def close(self) -> None:
         """Write the rest; may be called twice."""
