@@ -253,7 +253,7 @@ class LiveLoop:
             self.source.close()
             if self.log is not None:
                 self.log.close()
-                if self._segment_estimator is None:
+                if not self._poses:
                     self.log.path.unlink(missing_ok=True)  # nothing in it can be tracked
                     self.log = None
             for output in self.outputs:
