@@ -45,8 +45,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         nargs="*",
         metavar="KIND",
         help="filters: speed and accuracy beside VQF and imufusion, two minutes; calibration: nlpsol beside "
-        "others; live: five sensors at 1 kHz for five minutes, and again with the page; batch: a study of 500 "
-        "sessions on one worker, two, and two of which one is killed (stopped, the same command goes on from there); "
+        "others; live: five sensors at 1 kHz for five minutes, and again with the page; batch: a study of 50 "
+        "sessions on one process and on two; "
         "long: recordings of up to 24 hours in chunks; headings: relative headings of simulated people with and "
         "without their correction, half an hour; with --live an hour of one person who clasps the hands every ten "
         "minutes; protocols: what each "
@@ -56,7 +56,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "a bare loop of Pinocchio; validation: the paper's experiments and real recordings, hours, into its page. "
         f"Without any: {' and '.join(DEFAULT)}",
     )
-    add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 12 sessions, up to one hour")
+    add("--quick", action="store_true", help="less of each: shorter data, fewer rounds, 8 sessions, up to one hour")
     add("--live", action="store_true", help="with headings: live, over a long time, with and without correction")
     add("--minutes", type=float, metavar="MIN", help="with headings --live: minutes of motion; without it 60")
     add("--sessions", type=int, metavar="N", help="number of sessions of batch")

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from wepose_pin.batch import Item
-from wepose_pin.batch.plan import step_options
 from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
 
-QUICK = {"track": {**step_options("track"), "view": False, "report": False}, "evaluate": {"interval": None}}
 PLAN = """
 [sessions]
 files = ["data/*/session.toml"]
@@ -40,10 +36,6 @@ def sessions_and_plan(recorded: Path, tmp_path: Path) -> Path:
     shutil.copytree(recorded, tmp_path / "data")
     (tmp_path / "plan.toml").write_text(PLAN)
     return tmp_path
-
-
-def item(study: Path, name: str = "one", **changes: Any) -> Item:
-    return Item(**{"name": name, "session": str(study / "data" / name), "steps": QUICK} | changes)
 
 
 def files(folder: Path) -> dict[str, int]:

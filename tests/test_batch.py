@@ -1,4 +1,4 @@
-"""`wepose batch`: each item by itself, whole or not at all, once; the page over them; on S3."""
+"""`wepose batch`: each item by itself, whole or not at all, once; on processes here, on a scheduler, below a URL."""
 
 from __future__ import annotations
 
@@ -6,324 +6,228 @@ import contextlib
 import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import polars as pl
 import pytest
-from studies import PLAN, QUICK, files, item, sessions_and_plan, three_sessions  # noqa: F401
+from studies import PLAN, files, sessions_and_plan, three_sessions  # noqa: F401
 
-from wepose_pin.batch import Item, items, read_plan, run_batch
-from wepose_pin.batch.comparison import find_differences
-from wepose_pin.batch.items import run_items
-from wepose_pin.batch.page import build_study_page, find_outliers
-from wepose_pin.batch.plan import step_options
-from wepose_pin.batch.storage import DONE_FILE, create_folder, lock_folder
-from wepose_pin.batch.study import STUDY, _claim_folder, build_table
-from wepose_pin.errors import BadData, ExistingOutput
+from wepose_pin.batch import run_batch
+from wepose_pin.cli import main
+from wepose_pin.errors import BadOption, ExistingOutput, LostWorker
 from wepose_pin.jobs.batch import BatchJob
 
-
-@pytest.fixture(autouse=True)
-def _one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As workers have it, who set it for themselves."""
-    monkeypatch.setenv("WEPOSE_THREADS", "1")
+WEPOSE = [sys.executable, "-m", "wepose_pin.cli"]
+NAMES = ["data-one", "data-three", "data-two"]
 
 
-# One item ------------------------------------------------------------------------------------------------------------
+def run(study: Path, *, force: bool = False, plan: str | None = None, out: str = "out") -> pl.DataFrame:
+    if plan is not None:
+        (study / "plan.toml").write_text(plan)
+    return run_batch(BatchJob(study / "plan.toml", str(study / out), workers=1, force=force)).table
 
 
-def test_an_item_is_made_once_and_kept(study: Path) -> None:
-    (row,) = run_items([item(study)], str(study / "items"))
-    assert (row["status"], row["reused"]) == ("done", False)
-    assert row["right_palm_error_mm"] < 100.0
-    before = files(study / "items")
-    (again,) = run_items([item(study)], str(study / "items"))
-    assert again["reused"] is True
-    assert {key: again[key] for key in row if key != "reused"} == {key: row[key] for key in row if key != "reused"}
-    assert files(study / "items") == before
+def command(*words: object) -> int:
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in words])
+    return int(stop.value.code or 0)
 
 
-def test_a_file_that_was_only_touched_is_the_same(study: Path) -> None:
-    run_items([item(study)], str(study / "items"))
-    os.utime(study / "data" / "one" / "recording.parquet")
-    assert run_items([item(study)], str(study / "items"))[0]["reused"] is True
+def test_a_study_is_made_once_and_what_fails_is_named(study: Path) -> None:
+    (study / "data" / "bad").mkdir()
+    (study / "data" / "bad" / "session.toml").write_text("[data]\nfile = 3\n")
+    (study / "data" / "two" / "truth.parquet").unlink()
+    calls: list[tuple[int, int, int]] = []
+    outcome = run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=2), lambda *now: calls.append(now))
+    table = outcome.table
+    assert table.equals(pl.read_parquet(study / "out" / "results.parquet"))
+    assert table["item"].to_list() == ["data-bad", *NAMES]
+    assert table["status"].to_list() == ["failed", "done", "done", "failed"]
+    assert table["error"].to_list() == ["BadSession", None, None, "MissingFile"]
+    assert all(str(study) in text and "\n" not in text for text in table["message"].drop_nulls())
+    assert table["right_palm_error_mm"].drop_nulls().max() < 100.0  # type: ignore[operator]
+    assert (calls[0], calls[-1]) == ((0, 0, 4), (4, 2, 4))
+    assert sorted(path.name for path in (study / "out" / "items").iterdir()) == ["data-one", "data-three"]
+    before = files(study / "out" / "items")
+    (study / "data" / "bad" / "session.toml").unlink()
+    os.utime(study / "data" / "one" / "recording.parquet")  # only touched
+    again = run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1))
+    assert (again.reused, files(study / "out" / "items")) == (2, before)
 
 
-@pytest.mark.parametrize(
-    "change", ["recording", pytest.param("truth", marks=pytest.mark.slow), "options", "code", "subject"]
-)
-def test_what_has_changed_is_made_again_by_force_only(
-    study: Path, change: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place, changed = str(study / "items"), item(study)
-    run_items([changed], place)
-    before = files(study / "items")
-    if change in ("recording", "truth"):
-        file = study / "data" / "one" / f"{change}.parquet"
+@pytest.mark.parametrize("change", ["recording", "options", "code"])
+def test_what_has_changed_is_made_again_by_force_only(study: Path, change: str) -> None:
+    for name in ("two", "three"):
+        shutil.rmtree(study / "data" / name)
+    run(study)
+    before, plan = files(study / "out" / "items"), PLAN
+    if change == "recording":
+        file = study / "data" / "one" / "recording.parquet"
         table = pl.read_parquet(file)
         table.head(table.height - 5).write_parquet(file)
-        reason = "another session"
     elif change == "options":
-        changed = item(study, steps=QUICK | {"evaluate": {"interval": (6.0, 10.0)}})
-        reason = "other options"
-    elif change == "subject":
-        shutil.copy(study / "items" / "one" / "track" / "subject.toml", study)
-        changed = item(study, subject_file=str(study / "subject.toml"))
-        reason = "other inputs"
+        plan += "interval = [6.0, 10.0]\n"
     else:
-        now = items.code() | {"code": "0" * 64, "version": "0.2.0"}
-        monkeypatch.setattr(items, "code", lambda: now)
-        reason = "other code, version 0.1.0"
-    (row,) = run_items([changed], place)
-    assert (row["status"], row["error"]) == ("changed", "ExistingOutput")
-    assert reason in row["message"]
-    assert "--force" in row["message"]
-    assert row["samples"] > 0, "its figures stay in the table, as its folder does"
-    assert files(study / "items") == before
-    (row,) = run_items([changed], place, force=True)
-    assert (row["status"], row["reused"]) == ("done", False)
+        done = study / "out" / "items" / "data-one" / "done.json"
+        done.write_text(done.read_text().replace('"code": "', '"code": "0'))
+        before = files(study / "out" / "items")
+    table = run(study, plan=plan)
+    assert (table["status"][0], table["error"][0]) == ("changed", "ExistingOutput")
+    assert f"has other {'input session' if change == 'recording' else change}; --force" in table["message"][0]
+    assert table["samples"][0] > 0, "its figures stay in the table, as its folder does"
+    assert files(study / "out" / "items") == before
+    assert run(study, force=True, plan=plan)["status"].to_list() == ["done"]
 
 
-def test_what_changes_while_an_item_is_made_is_seen_the_next_time(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run_steps = items.run_steps
-
-    def meanwhile(folder: Path, one: Item) -> object:
-        result = run_steps(folder, one)
-        with (study / "data" / "one" / "session.toml").open("a") as file:
-            file.write("# changed\n")
-        return result
-
-    monkeypatch.setattr(items, "run_steps", meanwhile)
-    assert run_items([item(study)], str(study / "items"))[0]["status"] == "done"
-    (row,) = run_items([item(study)], str(study / "items"))
-    assert (row["status"], "another session" in row["message"]) == ("changed", True)
-
-
-def test_of_a_plan_that_changes_only_what_it_concerns_is_made_again(study: Path) -> None:
-    steps = {name: item(study, name) for name in ("one", "two", "three")}
-    run_items(list(steps.values()), str(study / "items"))
-    before = files(study / "items")
-    with (study / "data" / "two" / "session.toml").open("a") as file:
-        file.write("# changed\n")
-    rows = run_items(list(steps.values()), str(study / "items"), force=True)
-    assert [row["reused"] for row in rows] == [True, False, True]
-    after = files(study / "items")
-    assert {path for path in before if after[path] != before[path]} == {
-        path for path in before if "/items/two/" in path
-    }
-
-
-def test_a_task_ends_when_its_time_is_up_and_gives_what_it_has(study: Path) -> None:
-    some = [item(study, name) for name in ("one", "two", "three")]
-    assert [row["item"] for row in run_items(some, str(study / "items"), until=0.0)] == ["one"]
-
-
-def test_one_that_fails_is_named_and_the_others_go_on(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (study / "data" / "one" / "session.toml").write_text("[data]\nfile = 3\n")
-    (study / "data" / "two" / "truth.parquet").unlink()
-    rows = run_items([item(study, name) for name in ("one", "two", "three", "four")], str(study / "items"))
-    assert [row["status"] for row in rows] == ["failed", "failed", "done", "failed"]
-    assert [row.get("error") for row in rows] == ["BadSession", "MissingFile", None, "MissingFile"]
-    assert all(str(study) in row["message"] and "\n" not in row["message"] for row in rows if row["status"] != "done")
-    assert sorted(path.name for path in (study / "items").iterdir()) == ["three"]
-
-    def wrong(*_: object, **__: object) -> None:
-        raise ZeroDivisionError("of ours\nand more")
-
-    monkeypatch.setattr("wepose_pin.batch.steps.run_track", wrong)
-    (row,) = run_items([item(study, session=str(study / "data" / "three"))], str(study / "items"))
-    assert row["error"] == "ZeroDivisionError"
-    assert row["message"].startswith("of ours and more (test_batch.py:")
-
-
-def test_a_folder_appears_whole_or_not_at_all(tmp_path: Path) -> None:
-    with contextlib.suppress(ZeroDivisionError), create_folder(str(tmp_path / "items" / "a")) as folder:
-        (folder / "half").write_text("")
-        raise ZeroDivisionError
-    assert list((tmp_path / "items").iterdir()) == []
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ExistingOutput, match="cannot be written"), create_folder(str(tmp_path / "file" / "a")):
-        pass
-
-
-def test_a_done_file_cut_off_is_no_done_file(study: Path) -> None:
-    run_items([item(study)], str(study / "items"))
-    done = study / "items" / "one" / DONE_FILE
-    done.write_text(done.read_text()[:100])
-    assert run_items([item(study)], str(study / "items"))[0]["reused"] is False
-    assert json.loads(done.read_text())["row"]["samples"] > 0
-
-
+@pytest.mark.slow
 def test_steps_give_what_the_commands_give(study: Path) -> None:
-    """The same bits, where the same BLAS threads are used: here one process."""
-    from wepose_pin.cli import main
-
-    steps = {
-        "calibrate": step_options("calibrate"),
-        **QUICK,
-        "export": {"formats": ("trc",), "names": None, "rate_hz": None},
-    }
+    """The same bits. The subject is calibrated once, for all sessions; where that fails, they fail too."""
+    subject = '[subjects.x]\ncalibration = "data/one"\n[steps.calibrate]\nreport = false\n'
+    plan = (
+        f'[sessions]\nfiles = "data/*"\nsubject = "x"\n{subject}'
+        '[steps.track]\nreport = false\nview = false\n[steps.export]\nformats = ["trc"]\n'
+    )
+    table = run(study, plan=plan)
+    assert table["item"].to_list() == ["subject-x", *NAMES]
+    assert table["status"].to_list() == ["done"] * 4, table["message"].to_list()
     session = study / "data" / "one"
-    (row,) = run_items([item(study, steps=steps)], str(study / "items"))
-    for words in (
-        ["calibrate", session, "-o", study / "s"],
-        ["track", session, "--subject", study / "s", "-o", study / "r", "--no-report"],
-        ["export", study / "r", "-o", study / "motion.trc"],
-    ):
-        with pytest.raises(SystemExit):
-            main([str(word) for word in words])
-    place = study / "items" / "one"
-    assert pl.read_parquet(place / "track" / "pose.parquet").equals(pl.read_parquet(study / "r" / "pose.parquet"))
-    for made_so, made_there in (("s", "calibrate"), ("r", "track")):
-        for name in ("subject.toml", "subject.urdf"):
-            assert (study / made_so / name).read_bytes() == (place / made_there / name).read_bytes()
-    assert (study / "motion.trc").read_bytes() == (place / "export" / "motion.trc").read_bytes()
-    assert row["quality"] in ("pass", "poor", "fail")
-    assert row["page"] == "calibrate/report.html"
-
-
-def test_a_pipe_in_place_of_a_session_holds_nobody_up(study: Path) -> None:
-    (study / "data" / "one" / "session.toml").unlink()
-    os.mkfifo(study / "data" / "one" / "session.toml")
-    (row,) = run_items([item(study, session=str(study / "data" / "one" / "session.toml"))], str(study / "items"))
-    assert (row["status"], row["error"]) == ("failed", "MissingFile")
+    assert command("calibrate", session, "-o", study / "s", "--no-report") in (0, 3, 4)
+    assert command("track", session, "--subject", study / "s", "-o", study / "r", "--no-report", "--no-view") == 0
+    assert command("export", study / "r", "-o", study / "motion.trc") == 0
+    items = study / "out" / "items"
+    pose = pl.read_parquet(items / "data-one" / "track" / "pose.parquet")
+    assert pose.equals(pl.read_parquet(study / "r" / "pose.parquet"))
+    assert (study / "s" / "subject.toml").read_bytes() == (items / "subject-x/calibrate/subject.toml").read_bytes()
+    assert (study / "motion.trc").read_bytes() == (items / "data-one" / "export" / "motion.trc").read_bytes()
+    (session / "session.toml").write_text("")
+    shutil.rmtree(items / "subject-x")
+    assert set(run(study, plan=plan)["status"]) == {"failed"}
 
 
 def test_where_a_study_may_not_go(study: Path) -> None:
-    with pytest.raises(ExistingOutput, match="no study of wepose batch"):
-        run_batch(BatchJob(study / "plan.toml", str(study / "data")))
+    with pytest.raises(ExistingOutput, match="is there and no study of wepose batch"):
+        run(study, out="data")
+    (study / "file").write_text("")
     with pytest.raises(ExistingOutput, match="is there and no study"):
-        run_batch(BatchJob(study / "plan.toml", str(study / "plan.toml")))
-    _claim_folder(str(study / "killed"), study / "plan.toml")
-    (study / "killed" / STUDY).rename(study / "killed" / f".{STUDY}.partial")  # by a kill at its very beginning
-    _claim_folder(str(study / "killed"), study / "plan.toml")
-    assert (study / "killed" / STUDY).is_file()
-    with (
-        lock_folder(str(study)),
-        pytest.raises(ExistingOutput, match="another wepose batch writes there"),
-        lock_folder(str(study)),
-    ):
-        pass
+        run(study, out="file")
 
 
-def test_a_worker_with_another_version_is_refused(study: Path) -> None:
-    with pytest.raises(BadData, match="another wepose-pin"):
-        run_items([item(study)], str(study / "items"), same_code="0" * 64)
-
-
-# The page ------------------------------------------------------------------------------------------------------------
-
-
-def test_figures_that_stand_apart() -> None:
-    rows = [{"item": f"i{k}", "status": "done", "gap_mm": 10.0 + 0.1 * (k % 7), "same": 1.0} for k in range(40)]
-    rows[7]["gap_mm"], rows[9]["gap_mm"] = 30.0, float("nan")
-    outliers = find_outliers(build_table(rows), ["gap_mm", "same"])
-    assert [(each.item, each.column) for each in outliers] == [("i7", "gap_mm")]
-    assert outliers[0].deviations == pytest.approx((30.0 - outliers[0].median) / (1.4826 * 0.2), rel=0.3)
-
-
-def test_the_page_escapes_what_comes_from_files(study: Path) -> None:
-    plan = read_plan(study / "plan.toml", "items")
-    row = {"item": "a", "status": "failed", "error": "BadData", "message": "<script>x</script> [y](javascript:z)"}
-    page = build_study_page(
-        plan, build_table([row, {"item": "b", "status": "done", "page": "track/report.html", "seconds": 1.0}])
+def test_an_item_that_kills_its_process_is_named_and_the_others_go_on(study: Path, tmp_path: Path) -> None:
+    """A module of the user's place that ends the process where one of the sessions is read."""
+    (tmp_path / "hook").mkdir()
+    (tmp_path / "hook" / "sitecustomize.py").write_text(
+        "import os, sys\n"
+        "def end(event, arguments):\n"
+        "    if event == 'open' and str(arguments[0]).endswith('two/session.toml') and 'spawn' in str(sys.orig_argv):\n"
+        "        os._exit(9)\n"
+        "sys.addaudithook(end)\n"
     )
-    assert "<script>" not in page
-    assert 'href="javascript' not in page
-    assert '<a href="items/b/track/report.html">b</a>' in page
+    path = f"{tmp_path / 'hook'}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+    words = [*WEPOSE, "batch", study / "plan.toml", "-o", study / "out", "--workers", "1"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": path})
+    assert (done.returncode, done.stderr) == (3, "")
+    table = pl.read_parquet(study / "out" / "results.parquet")
+    assert table["status"].to_list() == ["done", "done", "failed"]
+    assert table["error"].to_list() == [None, None, "LostWorker"]
 
 
-# S3 ------------------------------------------------------------------------------------------------------------------
+@pytest.mark.kill
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_a_run_that_was_stopped_goes_on_where_it_stopped(study: Path, number: signal.Signals) -> None:
+    words = [*WEPOSE, "batch", study / "plan.toml", "-o", study / "out", "--workers", "1"]
+    process = subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    until = time.monotonic() + 120.0
+    while not list((study / "out" / "items").glob("[!.]*/done.json")) and time.monotonic() < until:
+        time.sleep(0.01)
+    if number == signal.SIGINT:
+        os.killpg(process.pid, number)  # as a terminal does
+        out, err = process.communicate(timeout=30.0)
+        assert (process.returncode, out) == (130, "")
+        assert err == "wepose: stopped; what is done stays, and the same command goes on from there\n"
+    else:
+        process.kill()
+        process.communicate(timeout=30.0)
+    left, until = True, time.monotonic() + 10.0
+    while left and time.monotonic() < until:  # soon nobody is left of its group
+        time.sleep(0.1)
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            left = False
+    assert not left
+    before = {path: time for path, time in files(study / "out" / "items").items() if "/." not in path}
+    done = sum(path.endswith("done.json") for path in before)
+    again = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (again.returncode, again.stderr) == (0, "")
+    assert f"3 of 3 items done, {done} of them before" in again.stdout
+    after = files(study / "out" / "items")
+    assert {path: after[path] for path in before} == before
+    assert [path.name for path in (study / "out" / "items").glob(".*")] == []
 
 
-@pytest.fixture(scope="module")
-def bucket(recorded: Path) -> Iterator[str]:
-    """s3://lab on a server of this machine, with the sessions in data/."""
-    moto = pytest.importorskip("moto.server")
-    s3fs = pytest.importorskip("s3fs")
-    server = moto.ThreadedMotoServer("127.0.0.1", 0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
-        for name, value in {"ACCESS_KEY_ID": "a", "SECRET_ACCESS_KEY": "b", "DEFAULT_REGION": "us-east-1"}.items():
-            patch.setenv(f"AWS_{name}", value)
-        s3fs.S3FileSystem.clear_instance_cache()
-        system = s3fs.S3FileSystem()
-        system.mkdir("lab")
-        system.put(str(recorded), "lab/data", recursive=True)
-        yield "s3://lab"
-    s3fs.S3FileSystem.clear_instance_cache()
-    server.stop()
+# A scheduler, a URL ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.cluster
-def test_a_study_on_s3(bucket: str, tmp_path: Path, recorded: Path) -> None:
-    (tmp_path / "plan.toml").write_text(PLAN.replace("data/*", f"{bucket}/data/*"))
-    done = run_batch(BatchJob(tmp_path / "plan.toml", f"{bucket}/out", workers=2))
-    assert done.table["item"].to_list() == ["data-one", "data-three", "data-two"]
-    assert done.table["status"].to_list() == ["done"] * 3, done.table["message"].to_list()
-    import s3fs
-
-    system = s3fs.S3FileSystem()
-    assert {path.rpartition("/")[2] for path in system.ls("lab/out")} == {
-        *("items", "study.json", "results.parquet", "report.html")
-    }
-    with system.open("lab/out/results.parquet") as file:
-        assert pl.read_parquet(file.read()).equals(done.table)
-    here = Item("one", str(recorded / "one"), QUICK)
-    run_items([here], str(tmp_path / "items"))
-    system.get_file("lab/out/items/data-one/track/pose.parquet", str(tmp_path / "pose.parquet"))
-    local = pl.read_parquet(tmp_path / "items" / "one" / "track" / "pose.parquet")
-    assert pl.read_parquet(tmp_path / "pose.parquet").equals(local)
-    assert run_batch(BatchJob(tmp_path / "plan.toml", f"{bucket}/out", workers=1)).reused == 3
-    # Without its done.json an item is not whole, and a changed recording is another one.
-    system.rm_file("lab/out/items/data-one/done.json")
-    system.pipe_file("lab/data/two/recording.parquet", b"nothing")
-    table = run_batch(BatchJob(tmp_path / "plan.toml", f"{bucket}/out", workers=1)).table
-    assert table["status"].to_list() == ["done", "done", "changed"]
-    assert "another session" in table["message"][2]
-
-
-@pytest.mark.cluster
-def test_a_study_on_s3_is_that_of_a_local_folder(bucket: str, study: Path) -> None:
-    import s3fs
-
-    system = s3fs.S3FileSystem(use_listings_cache=False)
-    system.mkdir("other")
-    system.put(str(study / "data"), "other/data", recursive=True)
-    (study / "there.toml").write_text(PLAN.replace("data/*", f"{bucket.replace('lab', 'other')}/data/*"))
-    here = run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1)).table
-    there = run_batch(BatchJob(study / "there.toml", f"{bucket}/same", workers=1)).table
-    differ = {name for name in here.columns if not here[name].equals(there[name])}
-    assert differ <= {"session", "seconds", "memory_mb", "track_s", "evaluate_s"}
-    system.get("lab/same/items", str(study / "fetched"), recursive=True)
-    assert find_differences(study / "out" / "items", study / "fetched") == []
-
-
-@pytest.mark.cluster
-def test_a_long_lived_worker_sees_what_changes_on_s3(bucket: str) -> None:
-    import s3fs
-
-    system = s3fs.S3FileSystem(use_listings_cache=False)
-    system.copy("lab/data/one", "lab/changing/one", recursive=True)
-    one = Item("one", f"{bucket}/changing/one/session.toml", QUICK)
-    place = f"{bucket}/changing-out/items"
-    assert [row["reused"] for _ in range(2) for row in run_items([one], place)] == [False, True]
-    system.pipe_file("lab/changing/one/session.toml", system.cat_file("lab/changing/one/session.toml") + b"# changed\n")
-    (row,) = run_items([one], place)
-    assert (row["status"], "another session" in row["message"]) == ("changed", True)
+@contextlib.contextmanager
+def scheduler(folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """A Dask scheduler with a worker, in processes of their own."""
+    pytest.importorskip("distributed")
+    here = ["--host", "127.0.0.1", "--no-dashboard", "--dashboard-address", "127.0.0.1:0"]
+    file = folder / "scheduler.json"
+    first = [sys.executable, "-m", "distributed.cli.dask_scheduler", *here, "--port", "0", "--scheduler-file", file]
+    second = [sys.executable, "-m", "distributed.cli.dask_worker", *here, "--scheduler-file", file, "--nthreads", "1"]
+    with (folder / "log").open("wb") as log:
+        started = [subprocess.Popen(words, stdout=log, stderr=log, start_new_session=True) for words in (first, second)]
+    try:
+        until = time.monotonic() + 60.0
+        while not file.exists() and time.monotonic() < until:
+            time.sleep(0.1)
+        yield json.loads(file.read_text())["address"], started[0]
+    finally:
+        for process in started:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
 
 
 @pytest.mark.cluster
-def test_what_is_not_there_on_s3_is_named(bucket: str, tmp_path: Path) -> None:
-    lost = Item("lost", f"{bucket}/nobody/session.toml", QUICK)
-    (row,) = run_items([lost], str(tmp_path / "items"))
-    assert (row["error"], row["message"]) == ("MissingFile", f"{bucket}/nobody/session.toml: no such file")
-    (tmp_path / "session.toml").write_text('[data]\nfile = "../secret.csv"\n')
-    import s3fs
+def test_the_workers_of_a_scheduler_give_the_same(study: Path) -> None:
+    here = run(study).drop("seconds")
+    with scheduler(study) as (address, process):
+        job = BatchJob(study / "plan.toml", str(study / "there"), scheduler=address)
+        assert run_batch(job).table.drop("seconds").equals(here)
+        assert run_batch(job).reused == 3
+        os.killpg(process.pid, signal.SIGKILL)
+        with pytest.raises((LostWorker, BadOption), match="scheduler"):
+            run_batch(job)
 
-    s3fs.S3FileSystem().put_file(str(tmp_path / "session.toml"), "lab/out/session.toml")
-    (row,) = run_items([Item("out", f"{bucket}/out", QUICK)], str(tmp_path / "items"))
-    assert (row["error"], "outside its own folder" in row["message"]) == ("BadData", True)
+
+def test_no_scheduler_at_an_address(study: Path) -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(BadOption, match="--scheduler nonsense: no scheduler there, as in tcp://HOST:8786"):
+        run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler="nonsense"))
+
+
+def test_a_study_below_a_url(study: Path) -> None:
+    """fsspec's own scheme for local files stands for a store."""
+    pytest.importorskip("fsspec")
+    here = run(study).drop("seconds", "session")
+    (study / "plan.toml").write_text(PLAN.replace("data/*", f"file://{study}/data/*"))
+    job = BatchJob(study / "plan.toml", f"file://{study}/there", workers=1)
+    there = run_batch(job).table
+    assert there["status"].to_list() == ["done"] * 3, there["message"].to_list()
+    ours = pl.read_parquet(study / "out" / "items" / "data-one" / "track" / "pose.parquet")
+    (theirs,) = (study / "there" / "items").glob("*data-one/track/pose.parquet")
+    assert pl.read_parquet(theirs).equals(ours)
+    assert there.drop("seconds", "session", "item").equals(here.drop("item"))
+    assert run_batch(job).reused == 3
+    next((study / "there" / "items").glob("*data-one/done.json")).unlink()  # without it an item is not whole
+    assert run_batch(job).reused == 2

@@ -8,7 +8,6 @@ import polars as pl
 import pytest
 
 from wepose_pin.batch import Plan, read_plan
-from wepose_pin.batch.plan import Anthropometrics, step_options
 from wepose_pin.errors import BadPlan, MissingFile, WeposeError
 
 STEPS = "[steps.calibrate]\n[steps.track]\n"
@@ -32,8 +31,6 @@ def test_globs_give_items_named_by_their_folders(folder: Path) -> None:
     assert [item.name for item in plan.items] == ["anna-one", "ben-one", "anna-two"]
     assert [Path(item.session).is_absolute() for item in plan.items] == [True] * 3
     assert list(plan.items[0].steps) == ["calibrate", "track"]
-    assert plan.items[0].steps["calibrate"]["method"] == "amekf"
-    assert plan.name == "plan"
     assert plan.calibrations == ()
 
 
@@ -44,22 +41,18 @@ def test_steps_run_in_their_order_however_they_are_written(folder: Path) -> None
         "rate_hz = 50\n[steps.track]\ncovariance = true\n",
     )
     assert list(plan.items[0].steps) == ["track", "export", "evaluate"]
-    exports = {**step_options("export"), "formats": ("trc", "mot"), "rate_hz": 50.0}
-    assert plan.items[0].steps["export"] == exports
-    assert plan.items[0].steps["evaluate"] == {**step_options("evaluate"), "interval": (1.0, 2.0)}
+    exports, evaluates = plan.items[0].steps["export"], plan.items[0].steps["evaluate"]
+    assert (exports, evaluates) == ({"formats": ["trc", "mot"], "rate_hz": 50}, {"interval": [1, 2]})
     assert plan.items[0].steps["track"]["covariance"] is True
 
 
 def test_a_subject_calibrated_once_goes_first_and_its_sessions_are_not_calibrated(folder: Path) -> None:
+    (folder / "sessions.csv").write_text("session,subject\nanna/two,anna\nben/one,ben\n")
     plan = planned(
         folder,
         f"""
-        [[sessions]]
-        files = ["anna/two"]
-        subject = "anna"
-        [[sessions]]
-        files = ["ben/*"]
-        subject = "ben"
+        [sessions]
+        table = "sessions.csv"
         [subjects.anna]
         calibration = "anna/one"
         stature = 1.7
@@ -69,26 +62,23 @@ def test_a_subject_calibrated_once_goes_first_and_its_sessions_are_not_calibrate
         {STEPS}""",
     )
     (first,) = plan.calibrations
-    assert (first.name, list(first.steps), first.anthropometrics) == (
-        "subject-anna",
-        ["calibrate"],
-        Anthropometrics(1.7, None, {"shoulder_width": 0.36}),
-    )
+    person = {"stature": 1.7, "measured": {"shoulder_width": 0.36}}
+    assert (first.name, list(first.steps), first.person) == ("subject-anna", ["calibrate"], person)
     anna, ben = plan.items
     assert list(anna.steps) == ["track"]
     assert anna.subject_file == "OUT/items/subject-anna/calibrate/subject.toml"
     assert list(ben.steps) == ["calibrate", "track"]
-    assert (ben.subject_file, ben.anthropometrics) == (None, Anthropometrics(sex="m"))
+    assert (ben.subject_file, ben.person) == (None, {"sex": "m"})
 
 
 def test_a_table_ties_sessions_to_subjects_and_lengths(folder: Path) -> None:
-    table = {"session": ["anna/one", "ben/one"], "name": ["a", None], "truth": [None, "t.parquet"]}
+    table = {"session": ["anna/one", "ben/one"], "name": ["a", None]}
     table |= {"stature": [1.7, None], "sex": ["f", None], "measured.trunk": [0.5, None]}
     pl.DataFrame(table).write_csv(folder / "sessions.csv")
     plan = planned(folder, f'[sessions]\ntable = "sessions.csv"\n{STEPS}')
     assert [item.name for item in plan.items] == ["a", "ben-one"]
-    assert plan.items[0].anthropometrics == Anthropometrics(1.7, "f", {"trunk": 0.5})
-    assert plan.items[1].truth == str(folder / "t.parquet")
+    assert plan.items[0].person == {"stature": 1.7, "sex": "f", "measured": {"trunk": 0.5}}
+    assert plan.items[1].person == {}
 
 
 def test_items_keep_their_names_when_others_join(folder: Path) -> None:
@@ -100,7 +90,12 @@ def test_items_keep_their_names_when_others_join(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (STEPS, "sessions: a table [sessions]"),
+        (STEPS, "sessions is missing"),
+        (
+            f'[[sessions]]\nfiles = "anna/*"\n{STEPS}',
+            "several [[sessions]] are one [sessions] with a table",
+        ),
+        (f'name = "study"\n[sessions]\nfiles = "anna/*"\n{STEPS}', "name was for the page of a study, which is gone"),
         (f"[sessions]\n{STEPS}", "either files (globs) or table is needed"),
         (f'[sessions]\nfiles = ["nobody/*"]\n{STEPS}', "'nobody/*' finds nothing"),
         (f"[sessions]\nfiles = [3]\n{STEPS}", "is not a list of globs"),
@@ -111,8 +106,14 @@ def test_items_keep_their_names_when_others_join(folder: Path) -> None:
         ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\nmethod = "amek"\n', "did you mean 'amekf'?"),
         ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\ngaps = 1\n', "gaps = 1: True or False is needed"),
         ('[sessions]\nfiles = ["anna/*"]\n[steps.evaluate]\n', "needs the step [steps.track]"),
-        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\n[steps.export]\n', "steps.export.formats is missing"),
-        ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.export]\nformats = ["trx"]', "'trx' is no format"),
+        (
+            '[sessions]\nfiles = ["anna/*"]\n[steps.track]\n[steps.export]\n',
+            "formats = None is not a list of formats",
+        ),
+        (
+            '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.export]\nformats = ["trx"]',
+            "'trx' is no format of a",
+        ),
         (
             '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.evaluate]\ninterval = [2, 1]',
             "interval = 2 1: two times in seconds are needed",
@@ -160,12 +161,13 @@ def test_a_mistake_gets_one_line_that_names_it(folder: Path, text: str, said: st
     ("table", "said"),
     [
         ("sesion\na", "no column 'session'; did you mean 'sesion'?"),
-        ("session,age\na,3", "column 'age' is not known"),
-        ("session,stature\na,178", "row 1: stature = '178' is not a length in metres"),
+        ("session,age\na,3", "row 1: age is not a known key"),
+        ("session,stature\na,178", "row 1: stature 178 is not a body height"),
+        ("session,stature\na,tall", "row 1: stature = 'tall' is not a number"),
         ("session,stature\na,0.5", "row 1: stature 0.5 is not a body height"),
         ("session,sex\na,x", "row 1: sex = 'x'"),
-        ("session,name\na,x\nb,x", "row 1: name 'x' is there twice"),
-        ("session\na\na", "is there twice"),
+        ("session,name\na,x\nb,x", "row 2: 'x' names two items"),
+        ("session\na\na", "row 2: 'a' names two items"),
         ("session,name\n,x", "row 1: session is empty"),
     ],
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import FrozenInstanceError, fields
+from dataclasses import FrozenInstanceError
 from pathlib import Path
 from typing import Any, get_args
 
@@ -11,7 +11,6 @@ import pytest
 
 from benchmarks.results import adapter
 from wepose_pin import calibration
-from wepose_pin.batch.plan import STEPS, step_options
 from wepose_pin.calibration import PROTOCOLS
 from wepose_pin.cli import COMMANDS, find_command
 from wepose_pin.cli.parser import parse
@@ -23,7 +22,7 @@ from wepose_pin.jobs.calibrate import CalibrateJob
 from wepose_pin.jobs.demo import DemoJob
 from wepose_pin.jobs.evaluate import EvaluateJob
 from wepose_pin.jobs.export import ExportJob
-from wepose_pin.jobs.fields import REQUIRED, build_job
+from wepose_pin.jobs.fields import build_job
 from wepose_pin.jobs.retarget import RetargetJob
 from wepose_pin.jobs.simulate import SimulateJob, run_simulate
 from wepose_pin.jobs.track import TrackJob, run_track
@@ -102,22 +101,6 @@ def test_words_and_defaults_become_the_fields() -> None:
     assert parse("track", find_command("track"), words.split()) == JOBS["track"]
     words = "-o out --seed 3 --rate-hz 50 --preset mild --imperfection bits=12 --imperfection mount=any"
     assert parse("simulate", find_command("simulate"), words.split()) == JOBS["simulate"]
-
-
-@pytest.mark.parametrize("step", STEPS)
-def test_a_step_of_a_plan_has_the_options_of_its_command(step: str) -> None:
-    """What a plan may say of a step, and what its item fills in, are all fields of the job."""
-    options = step_options(step)
-    formats = {"format"} if "formats" in options else set()
-    filled = {"session", "out", "subject", "result", "truth", "measured", "stature", "sex", "force", "further",
-              "episodes", "instruction"}  # fmt: skip
-    assert {field.name for field in fields(STEPS[step])} == (set(options) - {"formats"}) | formats | (
-        filled & {field.name for field in fields(STEPS[step])}
-    )
-    assert [name for name, default in options.items() if default is REQUIRED] == {
-        "retarget": ["robot"],
-        "export": ["formats"],
-    }.get(step, [])
 
 
 def test_jobs_print_nothing_and_tell_a_growing_share(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -8,13 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.batch.items import run_items
-from wepose_pin.batch.page import build_study_page
-from wepose_pin.batch.plan import Item, Plan, step_options
 from wepose_pin.cli import main
 from wepose_pin.recording import ImuSensor, Recording, check_recording, compute_mount
 from wepose_pin.report import render_track_report
@@ -125,16 +121,6 @@ def test_a_report_where_segments_are_not_known(pose: TrackedRecording, rows: sli
     assert failures == []
 
 
-def test_a_study_whose_figures_are_all_one_up_to_rounding() -> None:
-    told = {"item": "a", "session": "a", "status": "done", "seconds": 1.0, "rate_hz": 100.0}
-    rows = [told, told | {"item": "b", "rate_hz": 100.0 * (1.0 + 4e-16)}]
-    table = pl.DataFrame([{**row, **dict.fromkeys(("subject", "error", "message", "page"), None)} for row in rows])
-    table = table.with_columns(pl.col("subject", "error", "message", "page").cast(pl.String))
-    failures: list[str] = []
-    build_study_page(Plan("p", (), ()), table, failures)
-    assert failures == []
-
-
 # What fails all the same ----------------------------------------------------------------------------------------------
 
 BROKEN = {
@@ -228,11 +214,3 @@ def test_a_calibration_outlasts_its_report(
     diagnostics = json.loads((tmp_path / "anna" / "calibration.json").read_text())["diagnostics"]
     (saved,) = [each for each in diagnostics if each["code"] == "page-incomplete"]
     assert saved["text"]["what"] in line
-
-
-def test_an_item_of_a_batch_outlasts_its_pages(session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wepose_pin.report.pages.pose_html", fails)
-    steps = {"track": {**step_options("track"), "method": "ncf"}}
-    (row,) = run_items([Item(name="one", session=str(session), steps=steps)], str(tmp_path))
-    assert row["status"] == "done", row
-    assert names(tmp_path / "one" / "track") == RESULT | {"report.html"}

@@ -11,7 +11,7 @@ import pytest
 
 from wepose_pin.diagnostics import render
 from wepose_pin.report.chart import Chart, Key, Panel, Picture, category_rows, log_ticks, round_ticks
-from wepose_pin.report.page import Link, Page, PageWriter, Table, inline, load_template
+from wepose_pin.report.page import Page, PageWriter, Table, inline, load_template
 from wepose_pin.report.words import capital, slug
 
 PARTS = "report/templates/parts.html.j2"
@@ -35,7 +35,7 @@ def test_a_page_has_its_titles_menu_and_policy() -> None:
 
 
 def test_text_from_outside_stays_text() -> None:
-    table = Table([NASTY], [[NASTY], [Link(NASTY, "items/a b")]])
+    table = Table([NASTY], [[NASTY]])
     for text in (
         made("table", NASTY, of=table),
         made("facts", rows=[(NASTY, NASTY)]),
@@ -46,7 +46,7 @@ def test_text_from_outside_stays_text() -> None:
         body = text.split("<body>")[1]
         assert "<script" not in body
         assert "{{ 7 * 7 }}" in body
-        assert "href" not in re.sub(r'href="(#|items/)', "", body)
+        assert "href" not in re.sub(r'href="#', "", body)
     assert inline("a < b **`c`**") == "a &lt; b <b><code>c</code></b>"
 
 

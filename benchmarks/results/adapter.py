@@ -203,14 +203,10 @@ class Outcome:
 
 
 def solve_by_loop() -> None:
-    """Solve calibrations by the Gauss-Newton loop from now on: here, and in the workers of `batch`."""
-    from wepose_pin.batch import cluster
-
+    """Solve calibrations by the Gauss-Newton loop from now on, in this process."""
     from ..calibration import exchange_solver, solve_without_bounds
 
     exchange_solver(solve_without_bounds)
-    preload = "from benchmarks.calibration import exchange_solver, solve_without_bounds as loop; exchange_solver(loop)"
-    cluster.SETTINGS["distributed.worker.preload"].append(preload)
 
 
 def run(argv: list[str]) -> Outcome:
@@ -300,8 +296,7 @@ def write_plan(file: Path, recording: Path, known: Mapping[str, Any]) -> None:
     measured = ", ".join(f"{name} = {value!r}" for name, value in known["measured"].items())
     person = f'stature = {known["stature"]}\nsex = "{known["sex"]}"'
     file.write_text(
-        f"""name = "study"
-[sessions]
+        f"""[sessions]
 files = ["{recording}/session.toml"]
 subject = "person"
 [subjects.person]

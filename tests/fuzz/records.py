@@ -12,7 +12,6 @@ from . import seeds
 
 def plan(folder: Path, data: bytes) -> object:
     """The input is the plan; two sessions and a table lie beside it."""
-    from wepose_pin.batch.items import compute_key
     from wepose_pin.batch.plan import read_plan
 
     _beside_a_plan(folder)
@@ -22,8 +21,6 @@ def plan(folder: Path, data: bytes) -> object:
     names = [item.name for item in (*read.calibrations, *read.items)]
     assert len(set(names)) == len(names)
     assert all(name and "/" not in name and name not in (".", "..") for name in names), names
-    for item in read.items:
-        compute_key(item)
     return read
 
 

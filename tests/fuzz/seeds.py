@@ -341,8 +341,7 @@ def shipped(*names: str) -> list[bytes]:
 
 # What wepose wrote --------------------------------------------------------------------------------------------------
 
-PLAN = b"""name = "study"
-[sessions]
+PLAN = b"""[sessions]
 files = ["*/session.toml"]
 [subjects.anna]
 file = "anna.toml"
@@ -363,9 +362,9 @@ formats = ["trc", "mot"]
 [steps.evaluate]
 interval = [1.0, 2.0]
 """
-PLAN_TABLE = b"""session,name,subject,truth,stature,sex,measured.shoulder_width
-one,first,anna,truth.parquet,1.7,f,0.385
-two,second,,,,,
+PLAN_TABLE = b"""session,name,subject,stature,sex,measured.shoulder_width
+one,first,anna,1.7,f,0.385
+two,second,,,,
 """
 
 

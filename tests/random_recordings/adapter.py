@@ -229,7 +229,7 @@ def batch(plan: Path, out: Path, workers: int) -> list[str]:
 def write_plan(file: Path, sessions: str, method: str, pages: bool) -> None:
     """A plan of `batch`: all sessions of a pattern are tracked and exported."""
     shown = "true" if pages else "false"
-    lines = ['name = "soak"', "[sessions]", f'files = ["{sessions}"]', "[steps.track]", f'method = "{method}"']
+    lines = ["[sessions]", f'files = ["{sessions}"]', "[steps.track]", f'method = "{method}"']
     lines += [f"view = {shown}", f"report = {shown}", "[steps.export]", 'formats = ["trc"]']
     file.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

@@ -1,4 +1,4 @@
-"""Many recordings on Dask: a plan, its items, a table and a page of results."""
+"""Many recordings: a plan, its items on local processes or on a Dask scheduler, a table of outcomes."""
 
 from __future__ import annotations
 

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import hashlib
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from ..arguments import check_value
 from ..documents import TomlTable, read_toml
-from ..errors import BadData, BadOption, BadPlan, BadSession, WeposeError, WrongOption, one_of
+from ..errors import BadData, BadPlan, BadSession, WeposeError, one_of
 from ..jobs.calibrate import CalibrateJob
 from ..jobs.evaluate import EvaluateJob
 from ..jobs.export import ExportJob
-from ..jobs.fields import REQUIRED, build_job, convert_value, field_defaults, field_types
+from ..jobs.fields import build_job, field_types
 from ..jobs.retarget import RetargetJob
 from ..jobs.track import TrackJob
 from ..model import load_table
+from ..model.anthropometry import check_stature
 from ..readers.tables import read_table
-from ..subject import population_subject
 from .storage import find_urls, is_remote
 
-SESSION = "session.toml"
 # Step → the job of the command of the same name, whose options it has; in the order in which they run.
 STEPS: dict[str, type] = {
     "calibrate": CalibrateJob,
@@ -34,32 +31,12 @@ STEPS: dict[str, type] = {
     "evaluate": EvaluateJob,
 }
 _PATHS = ("session", "out", "result", "truth")
+_PERSON = ("stature", "sex", "measured")
 # Follow from an item's session and subject, or are not of one session.
-_ITEM_OPTIONS = (
-    *_PATHS,
-    "subject",
-    "further",
-    "episodes",
-    "instruction",
-    "measured",
-    "stature",
-    "sex",
-    "force",
-)
-_NAMES_OR_FILES = ("protocol", "robot")
-_FORMATS = "formats"  # of export: a list, in place of --format
-_COLUMNS = ("session", "name", "subject", "truth", "stature", "sex")
-_MEASURED = "measured."
-MAX_NAME = 100  # letters of an item's folder
-
-
-@dataclass(frozen=True)
-class Anthropometrics:
-    """What is known of a person before calibration: stature and lengths [m], sex "f" or "m"."""
-
-    stature: float | None = None
-    sex: str | None = None
-    measured: Mapping[str, float] = field(default_factory=dict)
+_ITEM_OPTIONS = ("subject", "further", "episodes", "instruction", *_PERSON, "force")
+_REMOVED = {"name": "was for the page of a study, which is gone; remove it"}
+_MEASURED = "measured."  # begins the columns of a table that are measured lengths
+_LONGEST_NAME = 100  # letters of an item's folder
 
 
 @dataclass(frozen=True)
@@ -69,9 +46,10 @@ class Item:
     Parameters
     ----------
     name : of its folder, unique in the plan
-    session, subject_file, truth : paths or URLs
+    session, subject_file : paths or URLs
     subject : a name of the plan
-    steps : step → all of its options
+    steps : step → the options that the plan gives
+    person : the options of `calibrate` that are known of the person: "stature", "sex", "measured"
     """
 
     name: str
@@ -79,15 +57,13 @@ class Item:
     steps: Mapping[str, Mapping[str, Any]]
     subject: str | None = None
     subject_file: str | None = None
-    truth: str | None = None
-    anthropometrics: Anthropometrics = Anthropometrics()
+    person: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Plan:
     """The items of a study, in the order of the file; `calibrations` of subjects run before `items`."""
 
-    name: str
     calibrations: tuple[Item, ...]
     items: tuple[Item, ...]
 
@@ -96,11 +72,10 @@ class Plan:
         return (*self.calibrations, *self.items)
 
 
-@dataclass(frozen=True)
-class _Subject:
+class _Subject(NamedTuple):
     calibration: str | None
     file: str | None
-    anthropometrics: Anthropometrics
+    person: dict[str, Any]
 
 
 def read_plan(path: Path, items_folder: str) -> Plan:
@@ -118,178 +93,129 @@ def read_plan(path: Path, items_folder: str) -> Plan:
 
 
 def _read_plan(path: Path, items_folder: str) -> Plan:
-    top = TomlTable(read_toml(path, "a plan"), str(path))
-    top.allow("name", "sessions", "subjects", "steps")
-    steps = _read_steps(top, path.parent)
+    top = TomlTable(read_toml(path, "a plan"), str(path), error=BadPlan)
+    top.allow("sessions", "subjects", "steps", renamed=_REMOVED)
+    steps = _read_steps(top.table("steps"), path)
     lengths = tuple(load_table().lengths)
     tables = top.table("subjects", {})
     subjects = {name: _read_subject(tables.table(name), path, lengths) for name in tables.values}
-    named = [
-        (entry, _build_item(path, entry, steps, subjects, items_folder))
-        for place, keys in _list_session_tables(top, path)
-        for entry in _read_sessions(place, keys, path, lengths)
-    ]
-    if not named:
-        raise BadPlan(f"{path}: sessions: no session at all; files or table are needed")
-    items = _make_names_unique(path, named)
-    calibrations = []
-    for name, subject in subjects.items():
-        if subject.calibration is None or not any(item.subject == name for item in items):
-            continue
-        if "calibrate" not in steps:
-            raise BadPlan(
-                f"{top.at(f'subjects.{name}')}.calibration: needs the step [steps.calibrate], which is missing"
-            )
-        only = {"calibrate": steps["calibrate"]}
-        calibrations.append(
-            Item(_subject_item_name(name), subject.calibration, only, name, anthropometrics=subject.anthropometrics)
-        )
-    if taken := {item.name for item in items} & {item.name for item in calibrations}:
-        raise BadPlan(f"{path}: '{min(taken)}' is both a session's and a subject's item; give the session a name")
-    return Plan(top.text("name", None) or path.stem, tuple(calibrations), tuple(items))
+    calibrations: dict[str, Item] = {}
+    items: dict[str, Item] = {}
+    for keys in _list_sessions(top, path):
+        item, subject = _build_item(keys, path, steps, subjects, lengths)
+        if subject is not None and subject.calibration is not None:
+            if "calibrate" not in steps:
+                raise BadPlan(f"{tables.at(str(item.subject))}.calibration: needs the step [steps.calibrate]")
+            name, only = f"subject-{_sanitize(str(item.subject))}", {"calibrate": steps["calibrate"]}
+            calibrations[name] = Item(name, subject.calibration, only, item.subject, person=subject.person)
+            item = replace(item, subject_file=f"{items_folder}/{name}/calibrate/subject.toml")
+        if item.name in items:
+            raise BadPlan(f"{keys.where}: '{item.name}' names two items; the column 'name' of a table can name them")
+        items[item.name] = item
+    if both := items.keys() & calibrations.keys():
+        raise BadPlan(f"{path}: '{min(both)}' is both a session's and a subject's item; give the session a name")
+    return Plan(tuple(calibrations.values()), tuple(items.values()))
 
 
 # Steps ---------------------------------------------------------------------------------------------------------------
 
 
-def step_options(step: str) -> dict[str, Any]:
-    """Option → default of a step in a plan; `REQUIRED` where there is none."""
-    defaults = field_defaults(STEPS[step])
-    named = {_FORMATS: REQUIRED} if "format" in defaults else {}
-    return named | {name: value for name, value in defaults.items() if name not in (*_ITEM_OPTIONS, "format")}
+def step_options(step: str) -> tuple[str, ...]:
+    """The options of a step in a plan: those of its command, but for what follows from the item."""
+    names = ("formats" if name == "format" else name for name in field_types(STEPS[step]))
+    return tuple(name for name in names if name not in (*_PATHS, *_ITEM_OPTIONS))
 
 
-def _read_steps(top: TomlTable, folder: Path) -> dict[str, dict[str, Any]]:
-    table = top.table("steps")
+def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
+    """Step → the options that are given, in the order in which the steps run; each is checked before any work."""
     table.allow(*STEPS)
-    if not table.values:
-        raise BadPlan(f"{top.at('steps')}: no step; {one_of(STEPS)}")
     steps: dict[str, dict[str, Any]] = {}
-    for step in [step for step in STEPS if step in table]:  # in the order in which they run
-        keys, options = table.table(step), step_options(step)
-        keys.allow(*options)
-        steps[step] = {name: _read_option(keys, step, name, default, folder) for name, default in options.items()}
-        _check_step(step, steps[step], keys)
-    for step in ("retarget", "export", "evaluate"):
-        if step in steps and "track" not in steps:
-            raise BadPlan(f"{top.at('steps')}.{step}: needs the step [steps.track], which is missing")
+    for step in [step for step in STEPS if step in table]:
+        keys = table.table(step)
+        keys.allow(*step_options(step))
+        steps[step] = {name: _resolve_option(value, path) for name, value in keys.values.items()}
+        if step not in ("calibrate", "track") and "track" not in steps:
+            raise BadPlan(f"{keys.where}: needs the step [steps.track], which is missing")
+        if step == "export":
+            _check_formats(keys)
+        values = {name: value for name, value in steps[step].items() if name != "formats"}
+        values |= {name: name for name in _PATHS if name in field_types(STEPS[step])}
+        try:
+            job: Any = build_job(STEPS[step], values)
+            job.check()
+        except BadSession:
+            raise
+        except WeposeError as error:
+            raise BadPlan(f"{keys.where}: {error}") from None
+    if not steps:
+        raise BadPlan(f"{table.where}: no step; {one_of(STEPS)}")
     return steps
 
 
-def _read_option(keys: TomlTable, step: str, name: str, default: Any, folder: Path) -> Any:
-    """The value of an option as JSON holds it."""
-    if name not in keys:
-        if default is REQUIRED:
-            raise BadPlan(f"{keys.at(name)} is missing")
-        return default
-    value = keys.values[name]
-    if name == _FORMATS:
-        return _read_formats(keys, value)
-    hint = field_types(STEPS[step])[name]
-    try:
-        value = convert_value(value, hint)
-        check_value(keys.at(name), value, hint)
-    except BadOption as error:
-        raise BadPlan(str(error)) from None
-    if isinstance(value, Path) or name in _NAMES_OR_FILES:
-        file = folder / value
-        return str(file.absolute()) if file.is_file() else str(value)
-    return value
+def _resolve_option(value: Any, path: Path) -> Any:
+    """An option; a text that names a file beside the plan, such as a protocol, as its path."""
+    return (
+        str((path.parent / value).absolute()) if isinstance(value, str) and (path.parent / value).is_file() else value
+    )
 
 
-def _read_formats(keys: TomlTable, value: Any) -> tuple[str, ...]:
-    from ..writers.export import FORMATS, LEROBOT, REMOVED
+def _check_formats(keys: TomlTable) -> None:
+    from ..writers.export import FORMATS, ROBOTS_ALONE
 
-    if not isinstance(value, list) or not value:
-        raise BadPlan(f'{keys.at(_FORMATS)} = {value!r} is not a list of formats, such as ["trc", "mot"]')
-    for each in value:
-        if each in REMOVED:
-            raise BadPlan(f"{keys.at(_FORMATS)}: '{each}' is no longer written; {REMOVED[each]}")
-        if each not in FORMATS:
-            raise BadPlan(f"{keys.at(_FORMATS)}: '{each}' is no format; {one_of(FORMATS, str(each))}")
-        if each == LEROBOT:
-            raise BadPlan(f"{keys.at(_FORMATS)}: '{each}' is of robots, and this step writes the person's motion")
-    return tuple(dict.fromkeys(value))
-
-
-def _check_step(step: str, options: Mapping[str, Any], keys: TomlTable) -> None:
-    """Raise `BadPlan` for what would fail at every item, before any work."""
-    values = {name: value for name, value in options.items() if name != _FORMATS}
-    values |= {name: Path(name) for name in _PATHS if name in field_types(STEPS[step])}
-    job: Any = build_job(STEPS[step], values)
-    try:
-        job.check()
-    except BadSession:
-        raise
-    except WrongOption as error:
-        key = error.name.replace("-", "_")
-        raise BadPlan(f"{keys.file}: {keys.place}{key} = {error.value}: {error.needed}") from None
-    except WeposeError as error:
-        raise BadPlan(f"{keys.file}: {keys.place.rstrip('.')}: {error}") from None
+    formats = keys.values.get("formats")
+    if not isinstance(formats, list) or not formats:
+        raise BadPlan(f'{keys.at("formats")} = {formats!r} is not a list of formats, such as ["trc", "mot"]')
+    persons = [name for name in FORMATS if name not in ROBOTS_ALONE]
+    for each in formats:
+        if each not in persons:
+            raise BadPlan(
+                f"{keys.at('formats')}: '{each}' is no format of a person's motion; {one_of(persons, str(each))}"
+            )
 
 
-# Subjects ------------------------------------------------------------------------------------------------------------
+# Subjects and sessions -----------------------------------------------------------------------------------------------
 
 
 def _read_subject(keys: TomlTable, path: Path, lengths: Sequence[str]) -> _Subject:
-    keys.allow("calibration", "file", "stature", "sex", "measured")
-    calibration, file = keys.text("calibration", None), keys.text("file", None)
+    keys.allow("calibration", "file", *_PERSON)
+    calibration, file = (_resolve(keys.text(key, None), path) for key in ("calibration", "file"))
     if calibration is not None and file is not None:
         raise BadPlan(f"{keys.at('file')}: a subject has a file or a calibration, not both")
-    for key in ("calibration", "file"):
-        place = _resolve(keys.text(key, None), path)
+    for key, place in (("calibration", calibration), ("file", file)):
         if place is not None and not is_remote(place) and not Path(place).exists():
             raise BadPlan(f"{keys.at(key)} = '{keys.values[key]}': no such file; a path from the plan's folder, or URL")
+    return _Subject(calibration, file, _read_person(keys, lengths))
+
+
+def _read_person(keys: TomlTable, lengths: Sequence[str]) -> dict[str, Any]:
+    """The options of `calibrate` that are given of a person."""
     table = keys.table("measured", {})
     table.allow(*lengths)
+    stature = keys.number("stature", None, positive=True)
+    try:
+        check_stature(stature)
+    except WeposeError as error:
+        raise BadPlan(f"{keys.where}: {error}") from None
+    sex = {"sex": keys.choice("sex", ("f", "m"))} if "sex" in keys else {}
     measured = {name: table.number(name, None, positive=True) for name in table.values}
-    sex = keys.choice("sex", ("f", "m")) if "sex" in keys else None
-    stature = keys.number("stature", None, True)
-    _check_stature(stature, keys.at("stature"))
-    person = Anthropometrics(stature, sex, {name: value for name, value in measured.items() if value is not None})
-    return _Subject(_resolve(calibration, path), _resolve(file, path), person)
+    return sex | ({"stature": stature} if stature else {}) | ({"measured": measured} if measured else {})
 
 
-# Sessions ------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A session of the plan; `place` in the plan is for errors."""
-
-    session: str
-    place: str
-    name: str | None = None
-    subject: str | None = None
-    truth: str | None = None
-    anthropometrics: Anthropometrics | None = None
-
-
-def _list_session_tables(top: TomlTable, path: Path) -> list[tuple[str, TomlTable]]:
-    """Place and table of [sessions], or of several [[sessions]]."""
-    value = top.values.get("sessions")
-    if isinstance(value, dict):
-        value = [value]
-    if not isinstance(value, list) or not value or not all(isinstance(entry, dict) for entry in value):
-        raise BadPlan(
-            f"{top.at('sessions')}: a table [sessions], or several [[sessions]], with files or table is needed"
-        )
-    places = [f"sessions[{k}]" if len(value) > 1 else "sessions" for k in range(len(value))]
-    return [(place, TomlTable(entry, str(path), f"{place}.")) for place, entry in zip(places, value, strict=True)]
-
-
-def _read_sessions(place: str, keys: TomlTable, path: Path, lengths: Sequence[str]) -> list[_Entry]:
+def _list_sessions(top: TomlTable, path: Path) -> list[TomlTable]:
+    """A table a session: `session` (a resolved path or URL), and what a table's row has besides."""
+    if isinstance(top.values.get("sessions"), list):
+        raise BadPlan(f"{top.at('sessions')}: several [[sessions]] are one [sessions] with a table of them now")
+    keys = top.table("sessions")
     keys.allow("files", "table", "subject")
     if ("files" in keys) == ("table" in keys):
-        raise BadPlan(f"{path}: {place}: either files (globs) or table is needed")
-    subject = keys.text("subject", None)
+        raise BadPlan(f"{keys.where}: either files (globs) or table is needed")
     if "table" in keys:
-        if subject is not None:
+        if "subject" in keys:
             raise BadPlan(f"{keys.at('subject')}: a table has a column for it")
-        return _read_table(str(keys.text("table", None)), path, lengths)
+        return _read_table(path.parent / str(keys.text("table", None)))
     patterns = keys.values["files"]
     patterns = [patterns] if isinstance(patterns, str) else patterns
-    if not isinstance(patterns, list) or not all(isinstance(pattern, str) and pattern for pattern in patterns):
+    if not isinstance(patterns, list) or not patterns or not all(isinstance(each, str) and each for each in patterns):
         raise BadPlan(f'{keys.at("files")} = {patterns!r} is not a list of globs, such as ["data/*/session.toml"]')
     urls: dict[str, None] = {}
     for pattern in patterns:
@@ -297,128 +223,66 @@ def _read_sessions(place: str, keys: TomlTable, path: Path, lengths: Sequence[st
         if not matches:
             raise BadPlan(f"{keys.at('files')}: '{pattern}' finds nothing; it is a path or glob from the plan's folder")
         urls |= dict.fromkeys(matches)
-    return [_Entry(url, f"{path}: {place}: {url}", subject=subject) for url in urls]
+    own = {"subject": keys.values["subject"]} if "subject" in keys else {}
+    return [TomlTable({"session": url, **own}, f"{keys.where}: {url}", error=BadPlan) for url in urls]
 
 
-def _read_table(name: str, path: Path, lengths: Sequence[str]) -> list[_Entry]:
-    file = path.parent / name
+def _read_table(file: Path) -> list[TomlTable]:
     table = read_table(file)
     if "session" not in table.columns:
         raise BadPlan(f"{file}: no column 'session'; {one_of(table.columns, 'session')}")
-    for column in table.columns:
-        if column not in _COLUMNS and not (column.startswith(_MEASURED) and column.removeprefix(_MEASURED) in lengths):
-            known = (*_COLUMNS, *(f"{_MEASURED}{length}" for length in lengths))
-            raise BadPlan(f"{file}: column '{column}' is not known; {one_of(known, column, len(known))}")
-    entries = []
-    for k, row in enumerate(table.iter_rows(named=True), 1):
-        where = f"{file}: row {k}"
-        cells = {column: value for column, value in row.items() if value is not None and value != ""}
-        if "session" not in cells:
-            raise BadPlan(f"{where}: session is empty")
-        metres = {c: _read_length(where, c, v) for c, v in cells.items() if c == "stature" or c.startswith(_MEASURED)}
-        sex = cells.get("sex")
-        if sex not in (None, "f", "m"):
-            raise BadPlan(f"{where}: sex = '{sex}'; f, m or nothing")
-        measured = {c.removeprefix(_MEASURED): value for c, value in metres.items() if c != "stature"}
-        person = Anthropometrics(metres.get("stature"), sex, measured) if metres or sex else None
-        _check_stature(metres.get("stature"), where)
-        text = {key: str(cells[key]) for key in ("name", "subject") if key in cells}
-        session, truth = (_resolve(str(cells[key]), file) if key in cells else None for key in ("session", "truth"))
-        entries.append(_Entry(str(session), where, truth=truth, anthropometrics=person, **text))
-    return entries
-
-
-def _check_stature(stature: float | None, where: str) -> None:
-    if problem := _find_stature_problem(stature):
-        raise BadPlan(f"{where}: {problem}")
-
-
-@lru_cache
-def _find_stature_problem(stature: float | None) -> str | None:
-    try:
-        population_subject(stature)
-    except WeposeError as error:
-        return str(error)
-    return None
-
-
-def _read_length(where: str, column: str, value: Any) -> float:
-    try:
-        metres = float(value)
-    except (TypeError, ValueError):
-        metres = -1.0
-    if not 0.0 < metres < 3.0:
-        raise BadPlan(f"{where}: {column} = '{value}' is not a length in metres")
-    return metres
+    sessions = []
+    for k, cells in enumerate(table.iter_rows(named=True), 1):
+        row = {name: value for name, value in cells.items() if value is not None and value != ""}
+        row |= {name: str(row[name]) for name in ("session", "name", "subject") if name in row}
+        if "session" not in row:
+            raise BadPlan(f"{file}: row {k}: session is empty")
+        row["session"] = _resolve(row["session"], file)
+        measured = {name.removeprefix(_MEASURED): row.pop(name) for name in list(row) if name.startswith(_MEASURED)}
+        sessions.append(
+            TomlTable(row | ({"measured": measured} if measured else {}), f"{file}: row {k}", error=BadPlan)
+        )
+    return sessions
 
 
 def _build_item(
-    path: Path, entry: _Entry, steps: dict[str, dict[str, Any]], subjects: Mapping[str, _Subject], items_folder: str
-) -> Item:
-    """The item of a session: calibrated by itself, or tracked with the calibration of its subject."""
-    own, person, file = dict(steps), entry.anthropometrics or Anthropometrics(), None
-    if entry.subject is not None and (subjects or "calibrate" not in steps):
-        if entry.subject not in subjects:
-            raise BadPlan(
-                f"{entry.place}: subject '{entry.subject}' is not in the plan; {one_of(subjects, entry.subject)}"
-            )
-        subject = subjects[entry.subject]
-        if entry.anthropometrics is None:
-            person = subject.anthropometrics
-        file = subject.file
-        if subject.calibration is not None:
-            file = f"{items_folder}/{_subject_item_name(entry.subject)}/calibrate/subject.toml"
-        if file is not None:
-            own.pop("calibrate", None)
+    keys: TomlTable,
+    path: Path,
+    steps: Mapping[str, Mapping[str, Any]],
+    subjects: Mapping[str, _Subject],
+    lengths: Sequence[str],
+) -> tuple[Item, _Subject | None]:
+    """The item of a session, calibrated by itself or tracked with the calibration of its subject; that subject."""
+    keys.allow("session", "name", "subject", *_PERSON)
+    person, subject, name = _read_person(keys, lengths), None, keys.text("subject", None)
+    if name is not None and (subjects or "calibrate" not in steps):
+        if name not in subjects:
+            raise BadPlan(f"{keys.where}: subject '{name}' is not in the plan; {one_of(subjects, name)}")
+        subject = subjects[name]
+        person = person or subject.person
+    elsewhere = subject is not None and (subject.file or subject.calibration)
+    own = {step: options for step, options in steps.items() if not (step == "calibrate" and elsewhere)}
     if not own:
-        raise BadPlan(
-            f"{entry.place}: nothing to do: its subject is calibrated elsewhere, and there is no step but that"
-        )
-    name = _sanitize(entry.name) if entry.name else _derive_name(entry.session, path)
-    if not name:
-        raise BadPlan(f"{entry.place}: name '{entry.name}' has no letter or digit; an item's folder has that name")
-    return Item(name, entry.session, own, entry.subject, file, entry.truth, person)
-
-
-def _subject_item_name(subject: str) -> str:
-    return f"subject-{_sanitize(subject)}"
-
-
-def _make_names_unique(path: Path, named: Sequence[tuple[_Entry, Item]]) -> list[Item]:
-    """The items; those of equal name get the hash of their session, which does not depend on other items."""
-    by_name: dict[str, list[str]] = {}
-    for _, item in named:
-        by_name.setdefault(item.name, []).append(item.session)
-    items = []
-    for entry, item in named:
-        if len(by_name[item.name]) > 1:
-            if entry.name or by_name[item.name].count(item.session) > 1:
-                source = f"name '{entry.name}'" if entry.name else f"session {item.session}"
-                raise BadPlan(f"{entry.place}: {source} is there twice in {path.name}; each item needs one of its own")
-            item = replace(item, name=f"{item.name}-{hashlib.sha256(item.session.encode()).hexdigest()[:6]}")
-        items.append(item)
-    return items
+        raise BadPlan(f"{keys.where}: nothing to do: its subject is calibrated elsewhere, and there is no other step")
+    session = str(keys.values["session"])
+    item_name = _sanitize(given) if (given := keys.text("name", None)) else _derive_name(session, path)
+    if not item_name:
+        raise BadPlan(f"{keys.where}: name '{given}' has no letter or digit; an item's folder has that name")
+    file = subject.file if subject is not None else None
+    return Item(item_name, session, own, name, file, person), subject
 
 
 def _derive_name(session: str, path: Path) -> str:
     """A name from the path of a session: its folders below the plan's, or below the bucket."""
-    if is_remote(session):
-        parts = session.partition("://")[2].split("/")[1:]
-    else:
-        place, base = Path(session).absolute(), path.parent.absolute()
-        while base not in place.parents:
-            base = base.parent
-        parts = list(place.relative_to(base).parts)
-    if parts and parts[-1] == SESSION:
-        parts = parts[:-1]
-    elif parts and parts[-1].endswith(".toml"):
-        parts = [*parts[:-1], parts[-1].removesuffix(".toml")]
-    return _sanitize("-".join(parts)) or "session"
+    place = (
+        session.partition("://")[2].partition("/")[2] if is_remote(session) else os.path.relpath(session, path.parent)
+    )
+    return _sanitize(re.sub(r"/?session\.toml$|\.toml$", "", place).replace("/", "-").lstrip(".-")) or "session"
 
 
 def _sanitize(text: str) -> str:
     """A text as the name of a folder."""
-    return re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII).lstrip(".")[:MAX_NAME]
+    return re.sub(r"[^\w.-]+", "_", text, flags=re.ASCII).lstrip(".")[:_LONGEST_NAME]
 
 
 def _resolve(text: str | None, path: Path) -> str | None:

@@ -1,34 +1,37 @@
-"""A study: the items of a plan on workers, the table of results, the page."""
+"""A study: the items of a plan on local processes or on a Dask scheduler, and the table of outcomes."""
 
 from __future__ import annotations
 
+import contextlib
 import io
-import json
-from collections.abc import Callable
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import polars as pl
 
-from ..diagnostics import Diagnostic
-from ..errors import ExistingOutput, reason
+from ..errors import BadOption, LostWorker, how_to_install
+from ..filters.base import count_processors
 from ..jobs.batch import BatchJob
-from ..report.page import page_incomplete
-from ..writers.provenance import code, collect_provenance
-from .cluster import connect, run_on_cluster
-from .items import DONE, FAILED, build_failed_row
-from .page import build_study_page
+from ..writers.provenance import code
+from .items import DONE, build_failed_row, run_item
 from .plan import Item, Plan, read_plan
 from .steps import Row
-from .storage import is_remote, lock_folder, read_bytes, remove_leftovers, write_bytes
+from .storage import is_remote, open_study, write_bytes
 
-ITEMS, RESULTS, REPORT, STUDY = "items", "results.parquet", "report.html", "study.json"
+RESULTS = "results.parquet"
+CONNECT_S = 10.0  # for which a scheduler is waited for
 # Columns of every row, before those of its steps.
-_COMMON = {
-    **dict.fromkeys(("item", "session", "subject", "status", "error", "message", "page"), pl.String),
-    "seconds": pl.Float64,
-}
-
+_COMMON = dict.fromkeys(("item", "session", "subject", "status", "error", "message"), pl.String)
+# Processes share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
+_ONE_THREAD = "WEPOSE_THREADS NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
 
 # Called with the number of items that have a row, of those that are not done, and of all.
 ItemProgress = Callable[[int, int, int], None]
@@ -40,13 +43,12 @@ class Study(NamedTuple):
     plan: Plan
     table: pl.DataFrame  # a row an item, in the order of the plan
     reused: int  # items that were done before
-    diagnostics: list[Diagnostic]  # of the page
 
 
 def run_batch(job: BatchJob, progress: ItemProgress = lambda *_: None) -> Study:
-    """Run all items of a plan and write ``results.parquet`` and ``report.html``, in a folder or below a URL.
+    """Run all items of a plan and write ``results.parquet``, in a folder or below a URL.
 
-    Items that were done before, by the same plan or another, are reused where nothing has changed.
+    Items that were done before are reused where nothing has changed.
 
     Raises
     ------
@@ -54,79 +56,129 @@ def run_batch(job: BatchJob, progress: ItemProgress = lambda *_: None) -> Study:
         Of the plan or the place. The errors of an item are in its row.
     """
     job.check()
-    path, out = job.plan, job.out.rstrip("/")
-    place = f"{out}/{ITEMS}" if is_remote(out) else str(Path(out).absolute() / ITEMS)
-    plan = read_plan(path, place)
-    _claim_folder(out, path)
-    with lock_folder(out):
-        names = [item.name for item in plan.all_items]
-        remove_leftovers(place, names)
+    out = job.out.rstrip("/")
+    place = f"{out}/items" if is_remote(out) else str(Path(out).absolute() / "items")
+    plan = read_plan(job.plan, place)
+    with open_study(out):
         rows = _run_items(plan, place, job, progress)
-        remove_leftovers(place, names)
-        table = build_table([rows[name] for name in names])
+        table = build_table([rows[item.name] for item in plan.all_items])
         content = io.BytesIO()
         table.write_parquet(content)
         write_bytes(f"{out}/{RESULTS}", content.getvalue())
-        failures: list[str] = []
-        try:
-            write_bytes(f"{out}/{REPORT}", build_study_page(plan, table, failures).encode())
-        except Exception as error:
-            failures.append(f"cannot be made: {reason(error)}")
-    reused = sum(bool(row.get("reused")) and row["status"] == DONE for row in rows.values())
-    return Study(plan, table, reused, [page_incomplete(REPORT, failure) for failure in failures])
-
-
-def _claim_folder(out: str, path: Path) -> None:
-    """Mark the place as a study; raise `ExistingOutput` where it holds something else."""
-    if read_bytes(f"{out}/{STUDY}") is None:
-        here, partial = Path(out), f".{STUDY}.partial"  # of a run that was killed at its very beginning
-        if not is_remote(out) and here.exists() and (not here.is_dir() or {p.name for p in here.iterdir()} - {partial}):
-            raise ExistingOutput(f"{out}: is there and no study of wepose batch; name another folder")
-    try:
-        text = json.dumps(collect_provenance("batch", {"plan": path}), indent=1, ensure_ascii=False)
-        write_bytes(f"{out}/{STUDY}", text.encode())
-    except OSError as error:
-        raise ExistingOutput(f"{out}: cannot be written: {error.strerror}") from error
+    return Study(plan, table, sum(bool(row.get("reused")) and row["status"] == DONE for row in rows.values()))
 
 
 def _run_items(plan: Plan, place: str, job: BatchJob, progress: ItemProgress) -> dict[str, Row]:
     """Item → its row; calibrations of subjects first, since sessions need them."""
-    total = len(plan.all_items)
     rows: dict[str, Row] = {}
+    total = len(plan.all_items)
     progress(0, 0, total)
-    with connect(job.scheduler, job.workers) as client:
-        for items in (plan.calibrations, plan.items):
-            ready = []
-            for item in items:
-                failed = _find_failed_calibration(item, plan, rows)
-                if failed is None:
-                    ready.append(item)
-                else:
-                    rows[item.name] = failed
-            for some in run_on_cluster(client, ready, place, force=job.force, code=code()["code"]):
-                rows |= {row["item"]: row for row in some}
-                progress(len(rows), sum(row["status"] != DONE for row in rows.values()), total)
+    run = _run_on_scheduler if job.scheduler is not None else _run_here
+    for items in (plan.calibrations, plan.items):
+        with contextlib.closing(run(items, place, job)) as done:
+            for row in done:
+                rows[row["item"]] = row
+                progress(len(rows), sum(each["status"] != DONE for each in rows.values()), total)
     return rows
 
 
-def _find_failed_calibration(item: Item, plan: Plan, rows: dict[str, Row]) -> Row | None:
-    """The row of a session whose subject's calibration has failed; None where it has not."""
-    rows_of = {calibration.subject: rows.get(calibration.name) for calibration in plan.calibrations}
-    row = rows_of.get(item.subject) if "calibrate" not in item.steps else None
-    if row is None or row["status"] != FAILED:
-        return None
-    message = f"{item.session}: its subject '{item.subject}' has no calibration, see item {row['item']}"
-    return build_failed_row(item, row["error"], message)
+def _run_here(items: Sequence[Item], place: str, job: BatchJob) -> Generator[Row]:
+    """Rows of the items, in the order in which they are done, from processes of this machine.
+
+    A process that dies takes those beside it along: their items fail, and the others go on in new processes.
+    """
+    todo, count = deque(items), min(job.workers or count_processors(), max(len(items), 1))
+    before = set(active_children())
+    with _one_thread():
+        while todo:
+            pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_prepare_process)
+            try:
+                yield from _run_in_turn(pool, todo, count, place, job)
+            except BrokenProcessPool:
+                continue
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
+                for process in set(active_children()) - before:  # when stopped, an item may have minutes to go
+                    process.terminate()
+
+
+def _run_on_scheduler(items: Sequence[Item], place: str, job: BatchJob) -> Generator[Row]:
+    """The same by the workers of a running Dask scheduler; `LostWorker` where it goes meanwhile."""
+    try:
+        from distributed import Client
+    except ImportError as error:
+        remedy = how_to_install("dask", "distributed")
+        raise BadOption(f"wepose batch --scheduler: {error}: {remedy}") from None
+    try:
+        client = Client(job.scheduler, timeout=CONNECT_S)
+    except (OSError, ValueError, TypeError) as error:
+        reason = " ".join(str(error).split())
+        raise BadOption(f"--scheduler {job.scheduler}: no scheduler there, as in tcp://HOST:8786: {reason}") from None
+    with client, client.get_executor(pure=False) as executor:
+        try:
+            yield from _run_in_turn(executor, deque(items), len(items), place, job)
+        except CancelledError:
+            raise LostWorker(
+                f"{job.scheduler}: the scheduler is gone; the same command goes on where it stopped"
+            ) from None
+
+
+def _run_in_turn(executor: Executor, todo: deque[Item], most: int, place: str, job: BatchJob) -> Iterator[Row]:
+    """Rows of the items, at most so many at a time; those whose process died are `LostWorker`.
+
+    Processes that die end it with `BrokenProcessPool`; `todo` has the items that were not begun.
+    """
+    running: dict[Future[Row], Item] = {}
+    broken: BrokenProcessPool | None = None
+    while running or (todo and broken is None):
+        while todo and len(running) < most and broken is None:
+            try:
+                running[executor.submit(run_item, todo[0], place, job.force, code()["code"])] = todo[0]
+                todo.popleft()
+            except BrokenProcessPool as died:
+                broken = died
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            item, error = running.pop(future), future.exception()
+            if error is None:
+                yield future.result()
+                continue
+            if isinstance(error, BrokenProcessPool):
+                broken = error
+            elif type(error).__name__ != "KilledWorker":  # Dask's, after several workers died at it
+                raise error
+            message = f"{item.session}: the process of this item, or of one beside it, died; it may lack memory"
+            yield build_failed_row(item, LostWorker.__name__, message)
+    if broken is not None:
+        raise broken
+
+
+def _prepare_process() -> None:
+    """Ctrl-C in the terminal is for the parent; a process whose parent was killed ends itself."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+
+
+def _exit_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+    os._exit(1)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread a process, for those that are started meanwhile."""
+    before = {name: os.environ.get(name) for name in _ONE_THREAD.split()}
+    os.environ.update(dict.fromkeys(before, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name)
+            os.environ.update({} if value is None else {name: value})
 
 
 def build_table(rows: list[Row]) -> pl.DataFrame:
-    """The table of results: a row an item; null where an item lacks a value."""
-    names = dict.fromkeys(name for row in rows for name in row if name not in (*_COMMON, "reused"))
-    schema: dict[str, Any] = _COMMON | {
-        name: pl.String if any(isinstance(row.get(name), str) for row in rows) else pl.Float64 for name in names
-    }
-    return pl.DataFrame({name: [_cell(row.get(name)) for row in rows] for name in schema}, schema=schema, strict=False)
-
-
-def _cell(value: Any) -> Any:
-    return float(value) if isinstance(value, int) else value
+    """The table of outcomes: a row an item; null where an item lacks a value."""
+    named = [dict.fromkeys(_COMMON) | {name: value for name, value in row.items() if name != "reused"} for row in rows]
+    return pl.DataFrame(named, schema_overrides=_COMMON, infer_schema_length=None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from ..jobs.batch import BatchJob
-from .output import print_diagnostics, print_table, progress_bar, say
+from .output import print_table, progress_bar, say
 from .parser import Command
 
 
@@ -31,12 +31,9 @@ def run(job: BatchJob) -> int:
         first = failed.unique("error", keep="first", maintain_order=True)
         for item, message in first.select("item", "message").iter_rows():
             say(f"  {item}: {message}")
-    print_diagnostics(study.diagnostics)
     reused = f", {study.reused} of them before" if study.reused else ""
     say(f"{study.table.height - failed.height} of {study.table.height} items done{reused}")
-    place = job.out.rstrip("/")
-    say(f"Report: {place}/report.html")
-    say(f"Table: {place}/results.parquet")
+    say(f"Table: {job.out.rstrip('/')}/results.parquet")
     return 3 if failed.height else 0
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic
 from . import Progress, no_progress
@@ -89,14 +88,8 @@ class AnglesOutcome(NamedTuple):
     page_failures: list[Diagnostic]
 
 
-def run_angles(
-    job: AnglesJob, progress: Progress = no_progress, provenance: Mapping[str, Any] | None = None
-) -> AnglesOutcome:
+def run_angles(job: AnglesJob, progress: Progress = no_progress) -> AnglesOutcome:
     """Write the folder, whole or not at all; its page follows.
-
-    Parameters
-    ----------
-    provenance : what the folder says made it; None: this job
 
     Raises
     ------
@@ -133,9 +126,7 @@ def run_angles(
         for picture in pictures:
             (folder / f"{picture.stem}.svg").write_text(render_standalone(picture), encoding="utf-8")
         files = sorted(path.name for path in folder.iterdir())
-        if provenance is None:
-            provenance = collect_provenance("angles", field_values(job))
-        write_provenance(folder, provenance)
+        write_provenance(folder, collect_provenance("angles", field_values(job)))
     progress("making the page", 0.9)
     writer = PageWriter(job.out, [PAGE])
     writer.write(PAGE, lambda failures: render_angles_page(movements, pictures, files, failures))

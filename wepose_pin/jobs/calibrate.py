@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic
 from ..errors import WrongOption, one_of
@@ -127,14 +127,8 @@ class CalibrateOutcome(NamedTuple):
     page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
 
 
-def run_calibrate(
-    job: CalibrateJob, progress: Progress = no_progress, provenance: Mapping[str, Any] | None = None
-) -> CalibrateOutcome:
+def run_calibrate(job: CalibrateJob, progress: Progress = no_progress) -> CalibrateOutcome:
     """Calibrate a subject and write its folder, whole or not at all; its page follows.
-
-    Parameters
-    ----------
-    provenance : what the result says made it; None: this job
 
     Raises
     ------
@@ -174,9 +168,7 @@ def run_calibrate(
         )
         quality = assess(calibration)
         write_subject(folder, calibration.subject, calibration.body)
-        if provenance is None:
-            provenance = collect_provenance("calibrate", field_values(job))
-        write_calibration(folder, calibration, quality, provenance)
+        write_calibration(folder, calibration, quality, collect_provenance("calibrate", field_values(job)))
     failures: list[Diagnostic] = []
     if job.report:
         progress("writing the report", 2 / 3)

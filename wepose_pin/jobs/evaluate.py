@@ -11,7 +11,6 @@ from . import Progress, no_progress
 
 if TYPE_CHECKING:
     from ..evaluation import Evaluation
-    from ..tracking import TrackedRecording
 
 
 @dataclass(frozen=True)
@@ -68,14 +67,8 @@ class EvaluateJob:
         check_selection(self.interval, self.phase)
 
 
-def run_evaluate(
-    job: EvaluateJob, progress: Progress = no_progress, tracked: TrackedRecording | None = None
-) -> Evaluation:
+def run_evaluate(job: EvaluateJob, progress: Progress = no_progress) -> Evaluation:
     """The errors of a result; nothing is written.
-
-    Parameters
-    ----------
-    tracked : the result with its covariances, where it is at hand; None: as the folder holds it
 
     Raises
     ------
@@ -93,12 +86,8 @@ def run_evaluate(
 
     job.check()
     progress("reading", 0.0)
-    if tracked is not None:
-        pose, table, phases = tracked.pose, tracked.model.table, tracked.recording.phases
-    else:
-        pose, model, summary = read_result(job.result)
-        table, phases = model.table, read_phases(summary)
-    selected = select_interval(pose.time, phases, job.interval, job.phase)
+    pose, model, summary = read_result(job.result)
+    selected = select_interval(pose.time, read_phases(summary), job.interval, job.phase)
     truth: Path | None = job.truth
     if job.truth.suffix == ".toml" or job.truth.is_dir():
         truth = load_session(job.truth, gaps=True).truth
@@ -117,7 +106,7 @@ def run_evaluate(
     if not job.align or fit is None:
         if job.time_offset:
             reference = replace(reference, time=reference.time + job.time_offset)
-        return evaluate(pose, reference, selected, table)
+        return evaluate(pose, reference, selected, model.table)
     reference, registration = register(pose, reference, up=up, frames=fit == "segments", offset_s=job.time_offset)
     first, last = registration.scored
     interval = selected or registration.scored
@@ -128,5 +117,5 @@ def run_evaluate(
             f"{interval[0]:g} {interval[1]:g}",
             f"seconds after {first:.1f}, as those before align the reference; or --no-align",
         )
-    errors = evaluate(pose, reference, scored, table)
+    errors = evaluate(pose, reference, scored, model.table)
     return replace(errors, registration=replace(registration, scored=scored))

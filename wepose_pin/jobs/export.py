@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from . import Progress, no_progress
 from .fields import field_values
@@ -81,14 +80,8 @@ class ExportJob:
             check_rate(self.rate_hz)
 
 
-def run_export(
-    job: ExportJob, progress: Progress = no_progress, provenance: Mapping[str, Any] | None = None
-) -> Exported:
+def run_export(job: ExportJob, progress: Progress = no_progress) -> Exported:
     """Write a file, whole or not at all, and its provenance beside it.
-
-    Parameters
-    ----------
-    provenance : what the file says made it; None: this job; empty: it says nothing
 
     Raises
     ------
@@ -100,8 +93,6 @@ def run_export(
 
     job.check()
     progress("writing", 0.0)
-    if provenance is None:
-        provenance = collect_provenance("export", field_values(job))
     return export(
         [job.result, *job.further],
         job.out,
@@ -114,5 +105,5 @@ def run_export(
         instruction=job.instruction,
         osim_model=job.osim_model,
         force=job.force,
-        provenance=provenance or None,
+        provenance=collect_provenance("export", field_values(job)),
     )

@@ -112,14 +112,8 @@ class RetargetOutcome(NamedTuple):
         )
 
 
-def run_retarget(
-    job: RetargetJob, progress: Progress = no_progress, provenance: Mapping[str, Any] | None = None
-) -> RetargetOutcome:
+def run_retarget(job: RetargetJob, progress: Progress = no_progress) -> RetargetOutcome:
     """Compute a trajectory, check it and write its folder, whole or not at all; its page follows.
-
-    Parameters
-    ----------
-    provenance : what the result says made it; None: this job
 
     Raises
     ------
@@ -169,9 +163,7 @@ def run_retarget(
             "recorded_phases": {name: list(map(list, spans)) for name, spans in read_phases(about).items()},
             REPETITIONS: _find_repetitions(pose, tuple(arm.side for arm in robot.arms)),
         }
-        if provenance is None:
-            provenance = collect_provenance("retarget", field_values(job))
-        text = json.dumps({**summary, "provenance": provenance}, indent=2)
+        text = json.dumps({**summary, "provenance": collect_provenance("retarget", field_values(job))}, indent=2)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
     progress("making the pages", 0.99)
     title = f"{about.get('recording') or job.result.name} on {robot.map.name}"

@@ -120,14 +120,8 @@ class TrackOutcome(NamedTuple):
     tracked: TrackedRecording | None = None  # where it was tracked as a whole
 
 
-def run_track(
-    job: TrackJob, progress: Progress = no_progress, provenance: Mapping[str, Any] | None = None
-) -> TrackOutcome:
+def run_track(job: TrackJob, progress: Progress = no_progress) -> TrackOutcome:
     """Track a recording and write its result folder, whole or not at all; its pages follow.
-
-    Parameters
-    ----------
-    provenance : of the result; None: this job
 
     Raises
     ------
@@ -146,11 +140,11 @@ def run_track(
     if job.chunk_seconds and as_whole:
         raise BadOption(f"--chunk-seconds {job.chunk_seconds:g}: {as_whole} is tracked as a whole; leave it out")
     if job.chunk_seconds or (job.chunk_seconds is None and not as_whole and estimate_data_bytes(job.session) >= LARGE):
-        return _track_in_chunks(job, progress, provenance)
-    return _track_as_whole(job, progress, provenance)
+        return _track_in_chunks(job, progress)
+    return _track_as_whole(job, progress)
 
 
-def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
+def _track_as_whole(job: TrackJob, progress: Progress) -> TrackOutcome:
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
     from ..report import write_track_pages
@@ -186,7 +180,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
             from ..angles.torques import pose_torques
 
             torques = pose_torques(tracked)
-        stated = _collect_provenance(job, provenance)
+        stated = _collect_provenance(job)
         write_result(folder, tracked, summary, job.covariance, recording.phases, torques, stated)
     failures: list[Diagnostic] = []
     if job.view or job.report:
@@ -195,7 +189,7 @@ def _track_as_whole(job: TrackJob, progress: Progress, provenance: Mapping[str, 
     return TrackOutcome(summary.content, failures, tracked=tracked)
 
 
-def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str, Any] | None) -> TrackOutcome:
+def _track_in_chunks(job: TrackJob, progress: Progress) -> TrackOutcome:
     """Track in chunks: the memory does not grow with the recording."""
     from ..filters import BEST
     from ..readers.session import SessionReader
@@ -216,7 +210,7 @@ def _track_in_chunks(job: TrackJob, progress: Progress, provenance: Mapping[str,
         ):
             writer.add(chunk)
         progress("writing the result", 1.0)
-        summary = writer.finish(reader.phases, _collect_provenance(job, provenance))
+        summary = writer.finish(reader.phases, _collect_provenance(job))
     view_rate_hz = min(30.0, MOST_FRAMES / max(summary.content["duration_s"], 1e-3))
     failures: list[Diagnostic] = []
     if job.view or job.report:
@@ -236,8 +230,8 @@ def _load_subject(job: TrackJob) -> Subject | None:
     return subject
 
 
-def _collect_provenance(job: TrackJob, stated: Mapping[str, Any] | None) -> Mapping[str, Any]:
+def _collect_provenance(job: TrackJob) -> Mapping[str, Any]:
     """The provenance of the result. Collected last, so that an input that is wrong is reported by its reader."""
     from ..writers.provenance import collect_provenance
 
-    return collect_provenance("track", field_values(job)) if stated is None else stated
+    return collect_provenance("track", field_values(job))

@@ -23,20 +23,15 @@ PACKAGE = Path(__file__).parent.parent  # templates are named by their path belo
 
 
 class Table(NamedTuple):
-    """A table; a cell may hold `code` and **bold**, or be a link."""
+    """A table; a cell may hold `code` and **bold**."""
 
     header: Sequence[str]
-    rows: Sequence[Sequence[str | Link]]
+    rows: Sequence[Sequence[str]]
 
     @property
     def wordy(self) -> bool:
         """Whether cells are sentences: those are set to the left, and may break their lines."""
-        return any(len(cell) > 40 for row in self.rows for cell in row if isinstance(cell, str))
-
-
-class Link(NamedTuple):
-    text: str
-    href: str
+        return any(len(cell) > 40 for row in self.rows for cell in row)
 
 
 class Section(NamedTuple):
