@@ -163,7 +163,7 @@ def test_kinematics_beside_a_bare_loop() -> None:
 
 
 def test_every_kind_names_its_sections() -> None:
-    assert list(batch.sections(True, 3)) == ["scheduler", "study"]
+    assert list(batch.sections(True, 3)) == ["study"]
     assert "calibration" in calibration.sections(True)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..documents import TomlTable, read_toml
-from ..errors import BadData, BadPlan, BadSession, WeposeError, one_of
+from ..errors import BadData, BadPlan, BadSession, WeposeError, WrongOption, one_of
 from ..jobs.calibrate import CalibrateJob
 from ..jobs.evaluate import EvaluateJob
 from ..jobs.export import ExportJob
@@ -145,6 +145,8 @@ def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
             job.check()
         except BadSession:
             raise
+        except WrongOption as error:
+            raise BadPlan(f"{keys.at(error.name.replace('-', '_'))} = {error.value}: {error.needed}") from None
         except WeposeError as error:
             raise BadPlan(f"{keys.where}: {error}") from None
     if not steps:
@@ -224,7 +226,7 @@ def _list_sessions(top: TomlTable, path: Path) -> list[TomlTable]:
             raise BadPlan(f"{keys.at('files')}: '{pattern}' finds nothing; it is a path or glob from the plan's folder")
         urls |= dict.fromkeys(matches)
     own = {"subject": keys.values["subject"]} if "subject" in keys else {}
-    return [TomlTable({"session": url, **own}, f"{keys.where}: {url}", error=BadPlan) for url in urls]
+    return [TomlTable({"session": url, **own}, str(path), f"sessions: {url}.", BadPlan) for url in urls]
 
 
 def _read_table(file: Path) -> list[TomlTable]:
@@ -239,9 +241,7 @@ def _read_table(file: Path) -> list[TomlTable]:
             raise BadPlan(f"{file}: row {k}: session is empty")
         row["session"] = _resolve(row["session"], file)
         measured = {name.removeprefix(_MEASURED): row.pop(name) for name in list(row) if name.startswith(_MEASURED)}
-        sessions.append(
-            TomlTable(row | ({"measured": measured} if measured else {}), f"{file}: row {k}", error=BadPlan)
-        )
+        sessions.append(TomlTable(row | ({"measured": measured} if measured else {}), str(file), f"row {k}.", BadPlan))
     return sessions
 
 
