@@ -156,19 +156,20 @@ def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
 
 def _resolve_option(value: Any, path: Path) -> Any:
     """An option; a text that names a file beside the plan, such as a protocol, as its path."""
-    return (
-        str((path.parent / value).absolute()) if isinstance(value, str) and (path.parent / value).is_file() else value
-    )
+    file = path.parent / value if isinstance(value, str) else path
+    return str(file.absolute()) if isinstance(value, str) and file.is_file() else value
 
 
 def _check_formats(keys: TomlTable) -> None:
-    from ..writers.export import FORMATS, ROBOTS_ALONE
+    from ..writers.export import FORMATS, LEROBOT, REMOVED
 
     formats = keys.values.get("formats")
     if not isinstance(formats, list) or not formats:
         raise BadPlan(f'{keys.at("formats")} = {formats!r} is not a list of formats, such as ["trc", "mot"]')
-    persons = [name for name in FORMATS if name not in ROBOTS_ALONE]
+    persons = [name for name in FORMATS if name != LEROBOT]  # a robot's alone
     for each in formats:
+        if each in REMOVED:
+            raise BadPlan(f"{keys.at('formats')}: '{each}' is no longer written; {REMOVED[each]}")
         if each not in persons:
             raise BadPlan(
                 f"{keys.at('formats')}: '{each}' is no format of a person's motion; {one_of(persons, str(each))}"
