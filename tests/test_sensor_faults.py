@@ -296,6 +296,31 @@ def test_a_dead_zone_is_no_fault(zone_deg_s: float, by_axis: bool, made: Simulat
     assert found(stopped(recording, "gyro", 9.0, value=0.0)) == {BROKEN: [("gyro", 9.0)]}
 
 
+def write_turning(folder: Path, heading: np.ndarray) -> Path:
+    """A session whose arms turn about the vertical by `heading` (n,) [rad] at 100 Hz; the torso's gyroscope is dead."""
+    rng, time = np.random.default_rng(0), np.arange(len(heading)) / 100.0
+    sensors = {}
+    for name in ("torso", "left_upper_arm", "right_upper_arm"):
+        gyro_S, accel_S = rng.normal(0.0, [[0.005], [0.05]], (len(time), 2, 3)).transpose(1, 0, 2)
+        gyro_S[:, 2] += np.gradient(heading, time)
+        sensors[name] = ImuSensor(np.zeros_like(gyro_S) if name == "torso" else gyro_S, accel_S + [0.0, 0.0, 9.81])
+    return written(folder, Recording("turning", time, 100.0, sensors, {"start": ((0.5, 2.5),)}))
+
+
+@pytest.mark.parametrize("turns", [5.0, -2.0])
+def test_a_dead_gyroscope_of_a_torso_that_turns_with_the_arms_is_refused(turns: float, tmp_path: Path) -> None:
+    """No accelerometer shows a turn about the vertical, and a dead zone would show zeros too."""
+    heading = 2.0 * np.pi * turns * np.clip(np.linspace(-3.0, 17.0, 2000) / 15.0, 0.0, 1.0)
+    with pytest.raises(BadData, match=r"sensors\.torso: gyro stands still at 0, 0, 0 rad/s .* it does not measure"):
+        load_session(write_turning(tmp_path, heading))
+
+
+def test_a_torso_at_rest_beside_arms_that_swing_measures(tmp_path: Path) -> None:
+    """From one side to the other, by 180 deg; its gyroscope has a dead zone."""
+    heading = 0.5 * np.pi * np.sin(np.clip(np.linspace(-3.0, 17.0, 2000), 0.0, None))
+    assert "torso" in load_session(write_turning(tmp_path, heading)).sensors
+
+
 def test_a_sensor_with_a_dead_zone_that_lies_still_beside_one_that_moves_measures(made: Simulation) -> None:
     recording = gated(made.recording(), 0.3, False)
     rows = np.random.default_rng(0).standard_normal((len(recording), 3))

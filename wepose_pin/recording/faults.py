@@ -10,7 +10,7 @@ a fault where it contradicts physics, or where the sensor is noisy whenever it d
   improbable.
 
 Some gyroscopes report exactly zero at rest: their firmware has a dead zone. Zeros while the specific force shows no
-motion are therefore no fault.
+motion are therefore no fault, unless all other sensors turn on about the vertical, which specific force does not show.
 
 A single axis may be constant during motion about another axis. It is a fault where
 
@@ -47,6 +47,9 @@ MOVES = 2.0  # [m/s²] change of accel on an axis that proves motion
 # a degree of tilt. Noise is some 0.05 m/s² a sample.
 ZERO_RATE = 1e-4
 REST_WINDOW_S, REST_FORCE = 0.5, 0.2
+# Arms that all turn about the vertical by so much [rad] in some time [s], the same way, turn with the trunk: without
+# it they turn by 180 deg from one side to the other, and by 90 deg stirring.
+TURN_ON_S, TURNED_ON = 10.0, np.deg2rad(270.0)
 # Noise reverses at two of three samples or, filtered, dozens of times a second; smooth motion hardly does.
 TURNS_BACK, TURNS_BACK_HZ = 0.3, 15.0
 NOISY_S = 1.5  # [s] of noise that prove a sensor to be noisy
@@ -319,7 +322,20 @@ def _is_stuck(run: Run, scan: SensorScan, others: list[SensorScan]) -> bool:
     if run.signals.startswith("gyro") and value < ZERO_RATE:
         means = _average_force(time[1:], accel[1:])
         contradicts &= not (len(means) and float(np.ptp(means, axis=0).max()) < REST_FORCE)
+        contradicts |= run.signals == GYRO and _turn_together(scan.time[run.first], scan.time[run.last], others)
     return contradicts
+
+
+def _turn_together(begin: float, end: float, scans: list[SensorScan]) -> bool:
+    """Return whether all sensors that measure turn on about the vertical, the same way, in some `TURN_ON_S`."""
+    at, turns = np.arange(begin, end - TURN_ON_S, 1.0), []
+    for scan in scans:
+        if not scan.is_constant(GYRO):
+            up = scan.accel_S / np.maximum(np.linalg.norm(scan.accel_S, axis=1), 1e-9)[:, None]
+            steps = np.sum(scan.gyro_S * up, axis=1) * np.diff(scan.time, prepend=scan.time[0])
+            turned = np.interp([at, at + TURN_ON_S], scan.time, np.cumsum(steps))
+            turns.append(turned[1] - turned[0])
+    return bool(turns) and bool((np.min(turns, axis=0) > TURNED_ON).any() or (np.max(turns, axis=0) < -TURNED_ON).any())
 
 
 def _average_force(time: np.ndarray, accel: np.ndarray) -> np.ndarray:
