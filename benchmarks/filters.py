@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -20,18 +20,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import wepose_pin as wp
 from wepose_pin import rotations
 from wepose_pin.errors import how_to_install
 from wepose_pin.filters import METHODS, OFFLINE, FilterSettings, Smekf, run_filter
 from wepose_pin.filters.bank import LiveBank
-from wepose_pin.filters.base import count_processors, run_in_parallel
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
-from wepose_pin.simulation import simulate_paper_dynamic
+from wepose_pin.simulation import simulate, simulate_paper_dynamic, simulate_person
 
 from .tables import Column, Section, Table, is_installed, time_in_turn
+from .trials import read_broad
 
 NO_PEERS = f"No ratios, they need VQF: {how_to_install('vqf', 'imufusion')}."
+TIMED = ("01", "16", "25")  # recordings of BROAD: slow rotation, fast translation, tapping
+STATIC_S = (0.5, 4.5)  # [s] in which the sensor is static, in BROAD and in the simulated trial
 STANDARD_GRAVITY = 9.80665  # [m/s²] in which imufusion wants its accelerations
 
 
@@ -49,9 +52,9 @@ class Effort:
     """How much is measured."""
 
     rounds: int = 15
-    seconds: float = 1200.0  # [s] of data at 100 Hz, batch
+    seconds: float = 1200.0  # [s] of data at 100 Hz, one call
     live_seconds: float = 60.0  # [s] of data at 100 Hz, sample by sample
-    lengths: tuple[int, ...] = (10_000, 100_000, 1_000_000, 10_000_000)  # of a recording, samples
+    recording_s: float = 90.0  # [s] of joined hands of a simulated person
     counts: tuple[int, ...] = (1, 2, 4, 5, 8, 16)  # of sensors
     trials: int = 12  # simulated
     recordings: int = 1000  # of BROAD
@@ -59,7 +62,7 @@ class Effort:
 
 
 FULL = Effort()
-QUICK = Effort(7, 300.0, 20.0, (10_000, 100_000, 1_000_000), (1, 2, 5, 16), 3, 2, False)
+QUICK = Effort(7, 300.0, 20.0, 40.0, (1, 2, 5, 16), 3, 2, False)
 
 
 def sections(effort: Effort = FULL, data: Path | None = None) -> dict[str, Section]:
@@ -72,16 +75,17 @@ def sections(effort: Effort = FULL, data: Path | None = None) -> dict[str, Secti
     """
     from . import accuracy
 
+    paths = accuracy.recordings(data, effort.recordings) if data is not None else {}
+    timed = sorted(path for path in data.glob("broad/*.mat") if path.stem[:2] in TIMED) if data is not None else []
     found: dict[str, Section] = {
-        "filters": partial(filters, effort),
+        "filters": partial(filters, effort, timed),
+        "recordings": partial(recordings, effort),
+        "live": partial(live, effort),
         "bank": partial(bank, effort),
-        "samples": partial(samples, effort),
-        "sensors": partial(sensors, effort),
         "accuracy": partial(accuracy.simulated_accuracy, effort.trials),
     }
-    if data is not None:
-        paths = accuracy.recordings(data, effort.recordings)
-        found["recordings"] = partial(accuracy.recorded_accuracy, paths)
+    if paths:
+        found["recorded_accuracy"] = partial(accuracy.recorded_accuracy, paths)
     if effort.compiling:
         found["first_use"] = first_use
     return found
@@ -98,11 +102,6 @@ def repeated_trial(seconds: float, rate_hz: float = 100.0, seed: int = 1) -> Sam
     noise = estimate_noise(trial.gyro_S[rest], trial.accel_S[rest], rate_hz)
     gyro, accel = (np.resize(signal, (n, 3)) for signal in (trial.gyro_S, trial.accel_S))
     return Sample(gyro, accel, rate_hz, noise)
-
-
-def _batch_filters(data: Sample) -> dict[str, Callable[[], Any]]:
-    """Batch runs of our methods, each with its static detector."""
-    return {name: partial(run_filter, *data, FilterSettings(name)) for name in METHODS}
 
 
 def _batch_peers(data: Sample) -> dict[str, Callable[[], Any]]:
@@ -171,38 +170,67 @@ def imufusion_filter(rate_hz: float) -> Any:
     return filter_
 
 
-def filters(effort: Effort) -> Table:
-    """Batch and sample by sample, one sensor."""
-    data, rounds = repeated_trial(effort.seconds), effort.rounds
-    n = len(data.gyro_S)
-    detector = {"static detector": lambda: StaticDetector(data.noise, data.rate_hz).run(data.gyro_S, data.accel_S)}
-    batch = time_in_turn(_batch_peers(data) | _batch_filters(data) | detector, rounds, "VQF")
-    short = repeated_trial(effort.live_seconds)
-    lives = time_in_turn(_live_filters(short), rounds, "VQF")
-    static = StaticDetector(data.noise, data.rate_hz).run(data.gyro_S, data.accel_S).mean()
+def filters(effort: Effort, paths: Sequence[Path] = ()) -> Table:
+    """`wp.estimate_orientation` as a user calls it, and the run inside it, on recordings or a simulated trial."""
+    trials = [read_sample(path) for path in paths] or [repeated_trial(effort.seconds)]
     table = Table(
-        f"One sensor, one thread: {n} samples at 100 Hz, {100 * static:.0f} % static; medians of {rounds} rounds",
+        f"One call a recording, one thread: {', '.join(path.stem for path in paths) or 'simulated'}; medians of "
+        f"{effort.rounds} rounds",
         (
-            Column("batch_ns", "batch [ns]"),
-            Column("batch_spread_ns", "± [ns]"),
-            Column("batch_ratio", "ratio to VQF", 2, True),
-            Column("live_ns", "live [ns]", 0),
-            Column("live_spread_ns", "± [ns]", 0),
-            Column("live_ratio", "ratio to VQF", 2, True),
+            Column("ns", "a sample [ns]"),
+            Column("ratio", "ratio to VQF", 2, True),
+            Column("offline_ratio", "ratio to offline VQF", 2, True),
         ),
-        notes=[
-            "Processor time of one sample, ours with the static detector; ± between the quartiles. Live: a Python call",
-            "a sample for the filter and one for its detector; LiveBank, below, makes one call for all sensors.",
-        ],
+        notes=["Processor time. Of several recordings the mean time and the largest ratios."],
     )
-    for name in [*METHODS, "static detector", "VQF", "offline VQF", "imufusion"]:
-        row: dict[str, float] = {}
-        for kind, timing, count in (("batch", batch.get(name), n), ("live", lives.get(name), len(short.gyro_S))):
-            if timing is not None:
-                row |= {f"{kind}_ns": 1e9 * timing.median / count, f"{kind}_spread_ns": 1e9 * timing.spread / count}
-                row |= {f"{kind}_ratio": timing.ratio}
-        if row:
-            table.rows[name] = row
+    for data in trials:
+        cases = _batch_peers(data)
+        for name in METHODS:
+            call = partial(wp.estimate_orientation, *data[:3], method=name, static=STATIC_S)
+            cases |= {name: call, f"{name}, inner run": partial(run_filter, *data, FilterSettings(name))}
+        timings = time_in_turn(cases, effort.rounds, "VQF")
+        offline = timings["offline VQF"].median if "offline VQF" in timings else float("nan")
+        for name, timing in timings.items():
+            row = table.rows.setdefault(name, {"ns": 0.0, "ratio": 0.0, "offline_ratio": 0.0})
+            row["ns"] += 1e9 * timing.median / len(data.gyro_S) / len(trials)
+            row["ratio"] = float(np.maximum(row["ratio"], timing.ratio))
+            row["offline_ratio"] = float(np.maximum(row["offline_ratio"], timing.median / offline))
+    return _noted(table)
+
+
+def read_sample(path: Path) -> Sample:
+    """Read a recording of BROAD."""
+    trial = read_broad(path)
+    rest = slice(*(round(time * trial.rate_hz) for time in STATIC_S))
+    noise = estimate_noise(trial.gyro_S[rest], trial.accel_S[rest], trial.rate_hz)
+    return Sample(np.ascontiguousarray(trial.gyro_S), np.ascontiguousarray(trial.accel_S), trial.rate_hz, noise)
+
+
+def recordings(effort: Effort) -> Table:
+    """`wp.track` and `wp.calibrate` of a simulated person with five sensors."""
+    person = simulate_person(1)
+    recording = simulate(person.lengths, seed=1, clasp_s=effort.recording_s, circles=0).recording("simulated")
+    measured = {"shoulder_width": person.lengths["shoulder_width"]}
+    cases: dict[str, Callable[[], Any]] = {
+        "track": partial(wp.track, recording),
+        "calibrate": partial(wp.calibrate, recording, measured=measured),
+    }
+    table = Table("Whole calls: five sensors at 100 Hz", (Column("seconds", "for 100 s of recording [s]", 3),))
+    for name, timing in time_in_turn(cases, 3, "track", time.process_time).items():
+        table.rows[name] = {"seconds": timing.median * 100.0 / (recording.time[-1] - recording.time[0])}
+    return table
+
+
+def live(effort: Effort) -> Table:
+    """Sample by sample, one sensor: a Python call a sample for the filter and one for its detector."""
+    data = repeated_trial(effort.live_seconds)
+    table = Table(
+        "Live: one sensor, a call a sample for the filter and one for its detector",
+        (Column("ns", "a sample [ns]", 0), Column("ratio", "ratio to VQF", 2, True)),
+        notes=["LiveBank, below, makes one call for all sensors."],
+    )
+    for name, timing in time_in_turn(_live_filters(data), effort.rounds, "VQF").items():
+        table.rows[name] = {"ns": 1e9 * timing.median / len(data.gyro_S), "ratio": timing.ratio}
     return _noted(table)
 
 
@@ -251,63 +279,6 @@ def _each(update: Callable[..., Any], gyro: list[np.ndarray], accel: list[np.nda
         update(rate, force)
         times[k] = 1e-3 * (time.perf_counter_ns() - begin)
     return times
-
-
-def samples(effort: Effort) -> Table:
-    """How the time grows with the length of the recording."""
-    table = Table(
-        "Length of a recording: smekf with the static detector, one sensor, one call",
-        (
-            Column("ns", "a sample [ns]"),
-            Column("spread_ns", "± [ns]"),
-            Column("ratio", "ratio to VQF", 2, True),
-            Column("seconds", "in all [s]", 3),
-        ),
-    )
-    for n in effort.lengths:
-        if n * 400 > _free_memory():  # bytes a sample of input and output
-            table.notes.append(f"{n:.0e} samples: left out, not enough free memory.")
-            continue
-        data = repeated_trial(n / 100.0)
-        every = _batch_peers(data) | _batch_filters(data)
-        cases = {name: run for name, run in every.items() if name in ("VQF", "smekf")}
-        timing = time_in_turn(cases, int(np.clip(3e6 / n, min(effort.rounds, 3), effort.rounds)), "VQF")["smekf"]
-        row = {"ns": 1e9 * timing.median / n, "spread_ns": 1e9 * timing.spread / n, "seconds": timing.median}
-        table.rows[f"{n:.0e} samples".replace("e+0", "e")] = row | {"ratio": timing.ratio}
-    return _noted(table)
-
-
-def _free_memory() -> float:
-    """[bytes], or infinite where it is not known."""
-    try:
-        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (ValueError, OSError):
-        return float("inf")
-
-
-def sensors(effort: Effort) -> Table:
-    """Several sensors at a time in threads."""
-    data = repeated_trial(effort.seconds)
-    n = len(data.gyro_S)
-    table = Table(
-        f"Sensors in parallel: {n} samples each, smekf with the static detector, a thread a processor",
-        (
-            Column("seconds", "in all [s]", 4),
-            Column("ns", "a sample [ns]"),
-            Column("speedup", "× one thread", 2),
-        ),
-        notes=[f"{count_processors()} processors."],
-    )
-    for count in effort.counts:
-        columns = list(zip(*[(*data, FilterSettings("smekf"))] * count, strict=True))
-        cases = {
-            "one": partial(run_in_parallel, run_filter, *columns, threads=1),
-            "all": partial(run_in_parallel, run_filter, *columns),
-        }
-        timing = time_in_turn(cases, effort.rounds, "one", time.perf_counter)["all"]
-        row = {"seconds": timing.median, "ns": 1e9 * timing.median / n / count, "speedup": 1.0 / timing.ratio}
-        table.rows[f"{count} sensor{'s' * (count > 1)}"] = row
-    return table
 
 
 _FIRST_USE = """
