@@ -204,6 +204,8 @@ class PublishedSmekf(Smekf):
 def _matrix(cov: float | np.ndarray) -> np.ndarray:
     """A covariance (3, 3) that may be given as one variance."""
     array = np.asarray(cov, dtype=float)
+    if array.ndim == 0 and 0.0 <= array < np.inf:
+        return array * np.eye(3)
     matrix = array if array.ndim == 2 else array * np.eye(3)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] < -1e-15:
         raise BadOption(f"covariance {cov!r}: a variance from 0 on is needed, or a positive semidefinite (3, 3)")
@@ -363,13 +365,40 @@ def propagate(state, wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-de
     P_aa, P_ab, P_bb = full(state.P_aa), nine(state.P_ab), full(state.P_bb)
     new_ab = products(A, P_ab, B, P_bb)
     new_aa = products(products(A, P_aa, B, transposed(P_ab)), transposed(A), new_ab, transposed(B))
-    upper, ab = state.P_aa, state.P_ab
-    upper[0], upper[1], upper[2], upper[3], upper[4], upper[5] = (
-        new_aa[0], new_aa[1], new_aa[2], new_aa[4], new_aa[5], new_aa[8],
-    )  # fmt: skip
-    ab[0, 0], ab[0, 1], ab[0, 2] = new_ab[0], new_ab[1], new_ab[2]
-    ab[1, 0], ab[1, 1], ab[1, 2] = new_ab[3], new_ab[4], new_ab[5]
-    ab[2, 0], ab[2, 1], ab[2, 2] = new_ab[6], new_ab[7], new_ab[8]
+    fill_blocks(state, new_aa, new_ab)
+
+
+@inlined
+def product(A, X):  # type: ignore[no-untyped-def]
+    """A X."""
+    return (
+        A[0] * X[0] + A[1] * X[3] + A[2] * X[6],
+        A[0] * X[1] + A[1] * X[4] + A[2] * X[7],
+        A[0] * X[2] + A[1] * X[5] + A[2] * X[8],
+        A[3] * X[0] + A[4] * X[3] + A[5] * X[6],
+        A[3] * X[1] + A[4] * X[4] + A[5] * X[7],
+        A[3] * X[2] + A[4] * X[5] + A[5] * X[8],
+        A[6] * X[0] + A[7] * X[3] + A[8] * X[6],
+        A[6] * X[1] + A[7] * X[4] + A[8] * X[7],
+        A[6] * X[2] + A[7] * X[5] + A[8] * X[8],
+    )
+
+
+@inlined
+def rotate_covariance(state, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """P ← F P Fᵀ over the turn w [rad] in no time: B is zero."""
+    A, _ = transition(wx, wy, wz, 0.0, False)
+    fill_blocks(state, product(product(A, full(state.P_aa)), transposed(A)), product(A, nine(state.P_ab)))
+
+
+@inlined
+def fill_blocks(state, aa, ab):  # type: ignore[no-untyped-def]
+    """Set P_aa and P_ab to matrices of nine numbers."""
+    upper, across = state.P_aa, state.P_ab
+    upper[0], upper[1], upper[2], upper[3], upper[4], upper[5] = aa[0], aa[1], aa[2], aa[4], aa[5], aa[8]
+    across[0, 0], across[0, 1], across[0, 2] = ab[0], ab[1], ab[2]
+    across[1, 0], across[1, 1], across[1, 2] = ab[3], ab[4], ab[5]
+    across[2, 0], across[2, 1], across[2, 2] = ab[6], ab[7], ab[8]
 
 
 @inlined
@@ -420,7 +449,7 @@ def correct(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-de
     if not model.first_order:
         # The direction of the vertical in S changes with the correction. The long axis of P, the heading, has to follow
         # it: otherwise it would have a horizontal part, which the next sample of accel would correct.
-        propagate(state, turn[0], turn[1], turn[2], 0.0, False)
+        rotate_covariance(state, turn[0], turn[1], turn[2])
     for i in range(3):
         bias[i] += d[3 + i] + e[3 + i]
     heading, rate = (
