@@ -22,7 +22,15 @@ from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, INFO, WARNING, from_json, render
 from wepose_pin.errors import BadSubject
 from wepose_pin.recording import Recording
-from wepose_pin.simulation import MILD_PRESET, Imperfections, Person, Simulation, simulate, simulate_person
+from wepose_pin.simulation import (
+    IDEAL_PRESET,
+    MILD_PRESET,
+    Imperfections,
+    Person,
+    Simulation,
+    simulate,
+    simulate_person,
+)
 from wepose_pin.simulation import motion as motions
 from wepose_pin.simulation.sequence import TASKS
 from wepose_pin.writers import write_session
@@ -379,3 +387,32 @@ def test_the_page_has_the_limits_of_the_code() -> None:
     assert quality.LONE_HEADING == quality.HAND_HEADING
     assert f"above {quality.ENOUGH_SAMPLES:g}" in page
     assert f"below {1e3 * quality.GAP.passes:g} mm" in page
+
+
+def test_a_clasp_without_motion_is_said_and_no_exchange_of_sensors() -> None:
+    class Still(motions.Motion):
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, **options)
+            self.wander = {name: lambda t: 0.0 * t for name in self.wander}
+
+    person = simulate_person(2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(TASKS, "clasp", Still)
+        still = simulate(
+            person.lengths, seed=2, imperfections=replace(IDEAL_PRESET, mount="any"), circles=0, clasp_s=20.0
+        )
+    measured = {"shoulder_width": person.measured["shoulder_width"]}
+    quality = calibrate(still.recording(), measured=measured, prior=person.prior).quality
+    assert quality.quality == "fail"
+    assert [reason.code for reason in quality.reasons] == ["motion-too-small"]
+
+
+def test_a_measured_length_that_is_right_to_a_centimetre_is_not_contradicted() -> None:
+    """The estimate of the upper arm is off by as much on people, whatever its residuals say."""
+    person = simulate_person(3)
+    recording = simulate(person.lengths, seed=3, circles=0, clasp_s=40.0).recording()
+    for error, contradicted in ((0.012, False), (0.060, True)):
+        measured = {name: person.lengths[name] for name in ("shoulder_width", "right_upper_arm")}
+        measured["left_upper_arm"] = person.lengths["left_upper_arm"] + error
+        calibration = calibrate(recording, measured=measured, prior=person.prior)
+        assert ("measured-length-contradicted" in codes(assess(calibration))) == contradicted

@@ -241,3 +241,13 @@ def test_what_is_written_can_be_read(case: str, tmp_path: Path) -> None:
         assert again.heading_drift[name].rate == pytest.approx(drift.rate, rel=1e-4)
     np.testing.assert_allclose(again.covariance, subject.covariance, rtol=1e-8, atol=1e-12)
     assert subject_toml(again) == subject_toml(replace(subject, name=again.name))
+
+
+def test_a_body_without_girdles_has_its_own_shoulders() -> None:
+    """As human URDFs of others: a calibrated subject fits them, without what it knows of shoulders."""
+    body = load_model()
+    bare = replace(body, table=replace(body.table, girdles={}))
+    subject = replace(population_subject(), girdles={name: np.ones(7) for name in body.table.girdles})
+    subject.check_body(bare.table)
+    assert not subject.shape(bare).girdles
+    assert set(subject.shape(body).girdles) == set(body.table.girdles)

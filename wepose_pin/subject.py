@@ -214,14 +214,15 @@ class Subject:
             for name in ("start_pose_offset", "heading_drift"):
                 check_names(f"{where}{name}", getattr(self, name), table.segments)
             check_names(f"{where}hinges", self.hinges, table.hinges)
-            check_names(f"{where}girdles", self.girdles, table.girdles)
+            if table.girdles:  # a body without any, as those of others, has its own shoulders
+                check_names(f"{where}girdles", self.girdles, table.girdles)
         except BadOption as error:
             raise BadSubject(str(error)) from None
 
     def shape(self, body: BodyModel) -> BodyModel:
         """Return the body with this person's lengths and shoulder girdles."""
         body = body.with_lengths({name: self.lengths[name] for name in body.lengths if name in self.lengths})
-        return replace(body, girdles=self.girdles)
+        return replace(body, girdles={name: own for name, own in self.girdles.items() if name in body.table.girdles})
 
     def fix_girdles(self, table: BodyTable) -> Subject:
         """Return the subject with shoulders fixed on the trunk: its girdles move nothing."""

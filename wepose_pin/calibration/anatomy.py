@@ -29,6 +29,9 @@ SIDEWAYS_DEG = 14.0  # rms of a segment off the plane in which it bends
 BEHIND = 0.3  # share of samples with a point further than `BACK` [m] behind its limb's beginning
 BACK = 0.1
 OPEN = 0.06  # [m] rms of the gap
+# [rad] by which segments turn at least, `measure_rotation`. Soft tissue alone gives people 4 deg, a minute of joined
+# hands 36 to 39 deg.
+LEAST_ROTATION = np.deg2rad(8.0)
 BETTER = 0.6  # times the doubt of the stated labels, below which another labelling is the true one
 
 
@@ -103,6 +106,12 @@ class LabelCheck:
             if pairs == set(self.pairs.items()):
                 variant = {"variant": "sides"}
         return Diagnostic("sensors-exchanged", severity, place, self.doubt, 1.0, variant)
+
+
+def measure_rotation(quat_WL: Mapping[str, np.ndarray]) -> float:
+    """How far the segments turned [rad]: the rms angle from their mean orientation, median over the segments."""
+    R = [Rotation.from_quat(quat) for quat in quat_WL.values()]
+    return float(np.median([np.sqrt(np.mean((each.mean().inv() * each).magnitude() ** 2)) for each in R]))
 
 
 def measure_limbs(calibration: Calibration, quat_WL: Mapping[str, np.ndarray], gap: float) -> LimbMotion:

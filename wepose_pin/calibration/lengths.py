@@ -43,7 +43,7 @@ from ..model.girdle import PARAMETERS
 from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
-from .anatomy import BETTER, LabelCheck, check_labels
+from .anatomy import BETTER, LEAST_ROTATION, LabelCheck, check_labels
 from .conditions import Level, Pointing, find_hinges, group_lengths, is_scale_observed
 from .contact import find_initial_guess
 from .fusion import fuse_calibrations, separate_mounts
@@ -59,6 +59,7 @@ from .result import Calibration
 from .solver import MIN_LENGTH
 from .weights import (
     CONTRADICTED,
+    LEAST_LENGTH_STD,
     MIN_CONTACT,
     SUSPECT,
     WeightedFit,
@@ -219,7 +220,8 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
             unused += [_diagnose_unused_mount(n, angle, MOUNT_WARNING_DEG, "motion") for n, angle in wrong.items()]
             problem = problem.remove_mounts(wrong)
             doubt = 0.0 if wrong else doubt
-    if doubt > 1.0 and problem.protocol.closures:  # other labels close other chains
+    # Other labels close other chains; hands that hardly move do not show which.
+    if doubt > 1.0 and stated.rotation > LEAST_ROTATION:
         labels = check_labels(
             stated.limbs(),
             lambda moved: solve_calibration(problem.relabel(moved), quick=True).limbs(),
@@ -231,7 +233,10 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
     try:
         best = solve_calibration(problem)
     except NoSolution as error:
-        raise NoSolution(f"{problem.recording.where()}: {error}") from error
+        turned_deg, hint = np.degrees(stated.rotation), ""
+        if turned_deg < np.degrees(LEAST_ROTATION):
+            hint = f"; the segments turned by {turned_deg:.1f} deg only: move for a minute through the whole reach"
+        raise NoSolution(f"{problem.recording.where()}: {error}{hint}") from error
     posed = {phase: deviation for phase, deviation in best.posed.items() if phase not in problem.loose}
     phase = max(posed, key=lambda name: posed[name], default="")
     if phase and posed[phase] > SUSPECT and problem.protocol.closures:
@@ -427,7 +432,9 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
         protocol=protocol.name,
         closure=next((closure.kind for closure in protocol.closures), ""),
         measured_example=problem.measured_example,
-        measured_lengths=compare_measured(fit, layout, problem.measured),
+        measured_lengths=compare_measured(
+            fit, layout, problem.measured, 0.0 if problem.model.table.is_mechanism else LEAST_LENGTH_STD
+        ),
         posed=compare_posed(
             observations,
             solution.result,

@@ -19,6 +19,7 @@ from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, as_json
 from ..errors import BadSession
 from ..model.table import MECHANISM, ROOT
 from ..subject import Quality
+from .anatomy import LEAST_ROTATION
 from .conditions import find_parts, group_lengths, is_scale_observed
 from .observability import MOST_OPEN, find_intervals, format_longest
 from .result import Calibration
@@ -51,6 +52,7 @@ ARM_HEADING = Limits(np.deg2rad(4.0), np.deg2rad(7.0))  # [rad]
 TORSO_HEADING = Limits(np.deg2rad(5.0), np.deg2rad(7.0))  # [rad]; beyond, soft tissue makes it worse than stated
 HAND_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] short links, seen little
 LONE_HEADING = Limits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] by poses, or by one arm: the best that these reach
+MOST_TILT = np.deg2rad(2.0)  # [rad] of a link that turns about the vertical alone, as its sensor measures it
 # Relative. It may move a hand, 0.62 m from its shoulder, by half of what tissue and girdle do, 15 mm: 2.4 %. A taped
 # arm gives 1.2 %, shoulder breadth with stature and sex 2.1 %, stature and sex alone 2.6 %, the population prior 5 %.
 SCALE = Limits(0.024, 0.08)
@@ -66,6 +68,7 @@ UNUSUAL = Limits(4.0, 6.0)  # standard deviations of a length from the populatio
 POSED = Limits(CONTRADICTED, 8.0)  # of a pose or a bow that is used, from the estimate without it
 MEASURED = Limits(CONTRADICTED, 5.0)  # of a measured length from the estimate without it
 SAMPLES = Limits(6.0, 2.0)  # effective sample size, at least
+ROTATION = Limits(LEAST_ROTATION, 0.0)  # [rad] of the segments, at least
 DOUBT = Limits(1.0, 1.0)  # of anatomy, see `anatomy`
 
 # A motion smaller than this [rad] is the cause of an uncertainty.
@@ -171,7 +174,10 @@ def assess(calibration: Calibration) -> CalibrationQuality:
     """The quality of a calibration."""
     motion = _measure_motion(calibration)
     checks = _check_sensors(calibration)
-    if not calibration.labels.moved:  # with exchanged sensors all other checks are meaningless
+    hardly_moved = _check_rotation(calibration)
+    if hardly_moved is not None:  # all else follows from it
+        checks = [hardly_moved]
+    elif not calibration.labels.moved:  # with exchanged sensors all other checks are meaningless
         checks += [*_check_deviations(calibration, motion), *_check_residuals(calibration)]
     reasons = _reasons(checks)
     directions = _find_directions(calibration)
@@ -227,6 +233,13 @@ def _check_sensors(calibration: Calibration) -> list[Check]:
     return checks
 
 
+def _check_rotation(calibration: Calibration) -> Check | None:
+    """The check of a motion that is too small for anatomy to tell anything of it; None where there is no doubt."""
+    if calibration.labels.doubt <= 1.0 or not calibration.rotation < LEAST_ROTATION:
+        return None
+    return _check(Diagnostic("motion-too-small", INFO, value=calibration.rotation), ROTATION, quality="fail")
+
+
 def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
     """Checks of the standard deviations."""
     subject, closure = calibration.subject, calibration.closure
@@ -269,6 +282,8 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
         )
         checks.append(_check(uncertain, LENGTH, cause))
     for segment in (s for s in subject.mounts if s in table.segments and f"mounts.{s}.z" in subject.order):
+        if table.is_mechanism and _turns_about_vertical(calibration, segment):
+            continue  # the heading of its mount moves no point
         reference = segment == table.reference
         causes = ("lean", "twist", "sideways") if reference else ("sideways", "elevation", "bend")
         cause = _find_cause(calibration, motion, causes, table.side(segment))
@@ -281,7 +296,7 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
         )
         if len(calibration.hinge_rms) < 2:
             limits = LONE_HEADING
-        if table.is_mechanism:  # a link that turns about the vertical alone needs no heading of its mount
+        if table.is_mechanism:
             limits = limits._replace(poor=np.pi)
         uncertain = Diagnostic(
             "mount-heading-uncertain",
@@ -301,6 +316,13 @@ def _check_deviations(calibration: Calibration, motion: Motion) -> list[Check]:
         facts |= {"prior": prior.note or prior.name, "protocol": calibration.protocol}
         scale = Diagnostic("scale-from-prior", INFO, value=calibration.scale_std, facts=facts)
     return [*checks, _check(scale, SCALE)]
+
+
+def _turns_about_vertical(calibration: Calibration, segment: str) -> bool:
+    """Whether a segment turned about the vertical alone."""
+    R_WL, R_start = Rotation.from_quat(calibration.quat_WL[segment]), calibration.start_pose.R_WK[segment]
+    up = (R_WL * Rotation.from_matrix(R_start).inv()).apply([0.0, 0.0, 1.0])
+    return bool(np.all(up[:, 2] > np.cos(MOST_TILT)))
 
 
 def _starts_limb(calibration: Calibration, segment: str) -> bool:

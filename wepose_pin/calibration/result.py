@@ -12,7 +12,7 @@ import numpy as np
 from ..diagnostics import Diagnostic, notebook_html, render
 from ..model import BodyModel
 from ..subject import Subject
-from .anatomy import LabelCheck, LimbMotion, measure_limbs
+from .anatomy import LabelCheck, LimbMotion, measure_limbs, measure_rotation
 from .conditions import Constraint, Loop, StartPose, choose_variant
 from .weights import MIN_CONTACT, MeasuredLength
 
@@ -131,6 +131,12 @@ class Calibration:
     def body(self) -> BodyModel:
         """The body with the estimated lengths."""
         return self.subject.shape(self.model)
+
+    @property
+    def rotation(self) -> float:
+        """How far the segments turned [rad] while the closure held; NaN without one."""
+        closed = np.isfinite(self.gap)
+        return measure_rotation({name: quat[closed] for name, quat in self.quat_WL.items()}) if closed.any() else np.nan
 
     def limbs(self) -> LimbMotion:
         """Return how the limbs moved while the closure held; without a closure, in all samples."""

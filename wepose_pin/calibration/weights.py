@@ -35,6 +35,9 @@ MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about rig
 ELBOW_STD = np.deg2rad(4.0)
 LEAST_BEND = 0.2  # sine of the angle by which a segment must bend to show its axis
 CONTRADICTED = 3.0  # standard deviations between a measured length, or a pose, and what is known without it
+# [m] rms by which the estimated lengths of simulated people are off after a minute (docs/protocols.md): soft tissue and
+# shoulders, which the residuals show in part.
+LEAST_LENGTH_STD = 0.010
 SUSPECT = 1.5  # the same of a pose from which on it is compared with a solution without it
 
 
@@ -194,16 +197,19 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
 
 
 def compare_measured(
-    fit: Fit, layout: Layout, measured: Mapping[str, tuple[float, float]]
+    fit: Fit, layout: Layout, measured: Mapping[str, tuple[float, float]], least_std: float
 ) -> dict[str, MeasuredLength]:
-    """Each measured length, name → ([m], its standard deviation [m]), beside the solution without it."""
+    """Each measured length, name → ([m], its standard deviation [m]), beside the solution without it.
+
+    `least_std` [m] is that of any estimate of a length.
+    """
     C, compared = np.linalg.inv(fit.information), {}
     rows = {name: row for row, name in enumerate(layout.lengths)}
     for name, (metres, std) in measured.items():
         variance = C[rows[name], rows[name]]
         rest = 1.0 / variance - 1.0 / std**2  # information without that of the measured length
         expected = metres + (fit.x[rows[name]] - metres) / (variance * rest)
-        compared[name] = MeasuredLength(metres, float(expected), float(rest**-0.5), std)
+        compared[name] = MeasuredLength(metres, float(expected), max(float(rest**-0.5), least_std), std)
     return compared
 
 

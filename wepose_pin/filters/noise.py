@@ -184,10 +184,13 @@ def find_static_window(recording: Recording) -> tuple[float, float]:
         motion += len(vertical_rate) * vertical_rate.mean(axis=0) ** 2
     if not np.isfinite(motion).any():
         lost = [name for name, sensor in recording.sensors.items() if sensor.gap is not None and sensor.gap[:n].any()]
+        if 2 * len(lost) > len(recording.sensors):
+            which, remedy = f"{len(lost)} of {len(recording.sensors)} sensors", "record again"
+        else:
+            which, remedy = ", ".join(f"sensors.{name}" for name in lost), "take them out"
         raise BadPhase(
             f"{recording.where()}: no {WINDOW_S:g} s in the first {BEGINNING_S:g} s in which all sensors measure: "
-            f"{', '.join(f'sensors.{name}' for name in lost)} are lost there; take them out, or name the start pose, "
-            f"[phases] start = [[from, to]]"
+            f"{which} are lost there; {remedy}, or name the start pose, [phases] start = [[from, to]]"
         )
     first = int(np.argmin(motion)) * stride
     return float(time[first]), float(time[first + window - 1])
