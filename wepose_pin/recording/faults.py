@@ -435,8 +435,10 @@ def check_sensors(
 
 def _take_numbers(*values: np.ndarray) -> tuple[np.ndarray, ...]:
     """Take the rows that are numbers, each at most `LARGEST`."""
-    good = np.all([np.isfinite(each[:, None] if each.ndim == 1 else each).all(axis=1) for each in values], axis=0)
-    time, *signals = values if good.all() else (each[good] for each in values)
+    if not all(np.isfinite(each).all() for each in values):  # far faster than row by row
+        good = np.all([np.isfinite(each[:, None] if each.ndim == 1 else each).all(axis=1) for each in values], axis=0)
+        values = tuple(each[good] for each in values)
+    time, *signals = values
     return time, *(np.clip(signal, -LARGEST, LARGEST) for signal in signals)
 
 
