@@ -1,25 +1,38 @@
-"""Pages: Jinja2 templates filled section by section; each page is one HTML file that opens offline and prints."""
+"""Pages: one Jinja2 template, filled section by section; each page is one HTML file that opens offline and prints."""
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template, select_autoescape
 from markupsafe import Markup, escape
 
-from ..diagnostics import WARNING, Diagnostic, as_json
+from ..diagnostics import INFO, WARNING, Diagnostic, as_json, lines
 from ..documents import whole_file
 from ..errors import WeposeError, reason
 from . import words
-from .chart import Picture, resolve_style
+
+if TYPE_CHECKING:
+    from .figures import ReportFigure
 
 PACKAGE = Path(__file__).parent.parent  # templates are named by their path below it
+MOST_FIGURES = 5  # of a page; tables have the rest
+
+
+class Banner(NamedTuple):
+    """What a reader must see first; `kind`: "pass", "poor", "fail" or "info"."""
+
+    kind: str
+    text: str
+    entries: Sequence[tuple[str, str]] = ()  # severity and text
+    macro: str = "banner"
 
 
 class Table(NamedTuple):
@@ -27,6 +40,8 @@ class Table(NamedTuple):
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
+    title: str = ""
+    macro: str = "table"
 
     @property
     def wordy(self) -> bool:
@@ -34,11 +49,36 @@ class Table(NamedTuple):
         return any(len(cell) > 40 for row in self.rows for cell in row)
 
 
-class Section(NamedTuple):
-    """A part of a page, made; `title` is empty where it has no heading."""
+class Bullets(NamedTuple):
+    items: Sequence[str]
+    macro: str = "bullets"
+
+
+class Facts(NamedTuple):
+    """Names and values."""
+
+    rows: Sequence[tuple[str, str]]
+    macro: str = "facts"
+
+
+class Frame(NamedTuple):
+    """A page in the page, for screens only."""
 
     title: str
-    html: str
+    caption: str
+    page: str
+    macro: str = "frame"
+
+
+class _Picture(NamedTuple):
+    """A figure as the address of an image, which no style of the page touches."""
+
+    caption: str
+    address: str
+    macro: str = "picture"
+
+
+Item: TypeAlias = "str | Banner | Table | Bullets | Facts | Frame | ReportFigure"  # a text is a paragraph
 
 
 class Page:
@@ -46,46 +86,59 @@ class Page:
 
     Parameters
     ----------
-    template : holds a macro for each section
     title : the heading
     failures : takes a line for each section that cannot be made
     """
 
-    def __init__(self, template: str, title: str, failures: list[str] | None = None) -> None:
-        self._macros = load_template(template).module
+    def __init__(self, title: str, failures: list[str] | None = None) -> None:
         self._title = title
         self._failures = failures if failures is not None else []
-        self._sections: list[Section] = []
+        self._sections: list[tuple[str, list[object]]] = []
 
-    def add(self, macro: str, make: Callable[[], Mapping[str, Any] | None], title: str = "", name: str = "") -> None:
-        """Append what a macro of the template makes of the values that `make` gives; nothing where it gives None.
+    def add(self, title: str, make: Callable[[], Iterable[Item] | None], heading: bool = True) -> None:
+        """Append the items that `make` gives, in order; nothing where it gives None or none.
 
         Parameters
         ----------
-        title : the section's heading; without one the section stands in the menu of the page under none
-        name : of the section in a failure, where it has no title
+        title : of the section
+        heading : whether the page shows the title, and has it in its menu
         """
         try:
-            values = make()
-            if values is not None:
-                self._sections.append(Section(title, getattr(self._macros, macro)(**values)))
+            items = [_prepare(item) for item in make() or ()]
         except Exception as error:
-            failure = f"the section '{title or name}' cannot be made: {reason(error)}"
+            failure = f"the section '{title}' cannot be made: {reason(error)}"
             self._failures.append(failure)
-            parts: Any = load_template("report/templates/parts.html.j2").module
-            self._sections.append(Section("", parts.failure(words.capital(failure))))
+            text = f"**{words.capital(failure)}.** The rest of the page is complete."
+            items, heading = [Banner("poor", text)], False
+        if items:
+            self._sections.append((title if heading else "", items))
 
-    def html(self, window_title: str) -> str:
-        """The whole page; the same sections give the same text."""
-        scripts = any("<iframe" in section.html for section in self._sections)
-        page = load_template("report/templates/page.html.j2")
-        return page.render(title=self._title, window_title=window_title, sections=self._sections, scripts=scripts)
+    def html(self) -> str:
+        """Return the whole page; the same sections give the same text."""
+        scripts = any(isinstance(item, Frame) for _, items in self._sections for item in items)
+        template = load_template("report/templates/page.html.j2")
+        return template.render(title=self._title, sections=self._sections, scripts=scripts)
 
 
-def render_standalone(picture: Picture) -> str:
-    """The text of an SVG file of a chart, for any program that draws SVG."""
-    chart: Any = load_template("report/templates/chart.svg.j2").module
-    return resolve_style(str(chart.svg(picture, standalone=True)).strip()) + "\n"
+def _prepare(item: Item) -> object:
+    if not hasattr(item, "svg"):
+        return item
+    address = base64.b64encode(item.svg().encode()).decode("ascii")
+    return _Picture(item.caption, f"data:image/svg+xml;base64,{address}")
+
+
+def show_diagnostics(diagnostics: Sequence[Diagnostic], reliable: str, *, unusable: bool = False) -> Banner:
+    """Return the banner of a page's diagnostics.
+
+    Parameters
+    ----------
+    reliable : what it says where there are none
+    unusable : whether it warns even without a diagnostic that does
+    """
+    entries = lines(diagnostics, titled=True)
+    if unusable or any(diagnostic.severity != INFO for diagnostic in diagnostics):
+        return Banner("poor", "**Read this first,** before you use the numbers below", entries)
+    return Banner("info", "What to know", entries) if entries else Banner("pass", reliable)
 
 
 def load_template(name: str) -> Template:
@@ -100,15 +153,10 @@ def _environment() -> Environment:
         autoescape=select_autoescape(disabled_extensions=("md.j2",), default=True),
         undefined=StrictUndefined,
         lstrip_blocks=True,
+        trim_blocks=True,
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    environment.filters |= {
-        "inline": inline,
-        "slug": words.slug,
-        "plain": words.plain,
-        "listed": words.listed,
-        "capital": words.capital,
-    }
+    environment.filters |= {"inline": inline, "slug": words.slug}
     environment.globals["file"] = lambda name: Markup((PACKAGE / name).read_text(encoding="utf-8"))
     return environment
 

@@ -1,16 +1,19 @@
-"""The report of a tracked recording: the recording, the uncertainty of the result, the motion."""
+"""The report of a tracked recording: what can be relied on, the recording, headings, hands, joint angles."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..diagnostics import INFO, Diagnostic, lines
-from ..kinematics import compute_axis_std, compute_orientation_residuals
-from ..model import BodyTable
-from ..recording import Recording, Sensor
+from ..angles import Angles, JointAngles, group_sides, joint_angles, summary
+from ..diagnostics import Diagnostic
+from ..errors import BadData
+from ..kinematics import compute_orientation_residuals
+from ..model import ROOT, BodyTable
 from ..tracking import TrackedRecording, TrackSummary
 from ..tracking.error_budget import ErrorBudget, group_by_source
 from ..tracking.measures import (
@@ -26,25 +29,58 @@ from ..tracking.measures import (
     longest_run_s,
 )
 from ..tracking.pose_diagnostics import GRAVITY_OFF, describe_heading_remedy
-from .joints import build_joint_angles_section
-from .page import Page, Table
-from .track_figures import (
-    draw_headings,
-    draw_noise,
-    draw_paths,
-    draw_reach,
-    draw_timeline,
-    find_sides,
-    group_tips,
+from .figures import (
+    COLOURS,
+    SOFT,
+    ReportFigure,
+    draw_over_time,
+    envelope,
+    find_spans,
     line_style,
+    set_up_views,
+    shade,
+    styled,
 )
+from .page import Facts, Frame, Item, Page, PageWriter, Table, show_diagnostics
 from .viewer import pose_html
 from .words import capital, degrees, intervals, listed, plain, plural, versions, whole
 
-TEMPLATE = "report/templates/track.html.j2"
+PAGES = ("view.html", "report.html")
 FRAMES_A_SECOND = 20.0  # of the 3D view
 MOST_FRAMES = 5000  # of the 3D view
 LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
+PATH_POINTS = 1000
+FULL_TURN = 2.0 * np.pi - 1e-9
+METHODS_WITH_COVARIANCE = "amekf, smoother, smekf and smekf_published"
+
+
+def write_track_pages(
+    folder: Path, summary: TrackSummary, *, view: bool = True, report: bool = True, fps: float = 30.0
+) -> list[Diagnostic]:
+    """Write ``view.html`` and ``report.html`` beside a result that is there already.
+
+    Parameters
+    ----------
+    view, report : which of them
+    fps : of ``view.html``
+
+    Returns
+    -------
+    list of Diagnostic
+        Pages, or parts of them, that cannot be made; they stand in ``summary.json`` too.
+    """
+    writer = PageWriter(folder, [name for name, wanted in zip(PAGES, (view, report), strict=True) if wanted])
+
+    def render_view(_: list[str]) -> str:
+        tracked, _measures = summary.decimator.decimated
+        recording = tracked.recording
+        return pose_html(tracked.model, tracked.pose, phases=recording.phases, title=recording.name, fps=fps)
+
+    page = writer.write("view.html", render_view) if view else None
+    if report:
+        writer.write("report.html", lambda failures: render_track_report(summary, view=page, failures=failures))
+    writer.save_diagnostics("summary.json")
+    return writer.diagnostics
 
 
 def render_track_report(summary: TrackSummary, *, view: str | None = None, failures: list[str] | None = None) -> str:
@@ -59,134 +95,180 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
     failures : gets a line for each section that cannot be made; the page has the line in place of the section
     """
     tracked, measures = summary.decimator.decimated
-    table, signals, budgets = tracked.model.table, measures.signals, measures.budgets
-    page = Page(TEMPLATE, f"Motion of {tracked.recording.name or 'a recording'}", failures)
-    page.add("first", lambda: _build_diagnostics_section(summary.diagnostics, table), name="Diagnostics")
-    page.add("short", lambda: _build_summary_section(tracked, measures), name="In short")
-    page.add("recorded", lambda: _build_recorded_section(tracked.recording, measures, table), "What was recorded")
-    page.add("noise", lambda: _build_noise_section(signals), "Noise and bias")
-    page.add("drift", lambda: _build_drift_section(tracked, budgets), "Drift of the headings")
-    page.add("tips", lambda: _build_tips_section(tracked, measures.tips), f"The {_name_tips(table)}")
-    page.add("budget", lambda: _build_error_budget_section(tracked), "What the ± of the points is made of")
-    page.add("angles", lambda: build_joint_angles_section(tracked), "Joint angles")
-    page.add("view", lambda: _build_view_section(tracked, view), "The motion in 3D")
-    page.add("run", lambda: _build_run_section(tracked), "What was run")
-    return page.html(f"Motion of {tracked.recording.name}" if tracked.recording.name else "Motion")
+    table = tracked.model.table
+    find_angles = cache(lambda: _find_joint_angles(tracked))
+    page = Page(f"Motion of {tracked.recording.name or 'a recording'}", failures)
+    page.add("What can be relied on", lambda: _list_reliance(tracked, measures, find_angles()), heading=False)
+    page.add("Diagnostics", lambda: _list_diagnostics(summary.diagnostics, table), heading=False)
+    page.add("In short", lambda: _list_facts(tracked, measures), heading=False)
+    page.add("What was recorded", lambda: _list_recorded(tracked, measures))
+    page.add("Drift of the headings", lambda: _list_drift(tracked, measures.budgets))
+    page.add(f"The {_name_tips(table)}", lambda: _list_tips(tracked, measures.tips))
+    page.add("What the ± of the points is made of", lambda: _list_error_budget(tracked))
+    page.add("Joint angles", lambda: _list_angles(tracked, find_angles()))
+    page.add("The motion in 3D", lambda: _list_view(tracked, view))
+    page.add("What was run", lambda: _list_run(tracked))
+    return page.html()
 
 
-# The sections: the values that the macros of the template take --------------------------------------------------------
+# Sections -------------------------------------------------------------------------------------------------------------
 
 
-def _build_diagnostics_section(diagnostics: Sequence[Diagnostic], table: BodyTable) -> dict[str, Any]:
-    has_warning = any(diagnostic.severity != INFO for diagnostic in diagnostics)
-    checked = listed(["Rates", "ranges", "static phases", "headings", *_name_hinges(table)])
-    return {"has_warning": has_warning, "entries": lines(diagnostics, titled=True), "checked": checked}
-
-
-def _build_summary_section(tracked: TrackedRecording, measures: Measures) -> dict[str, Any]:
-    recording = tracked.recording
+def _list_reliance(tracked: TrackedRecording, measures: Measures, angles: Angles | None) -> list[Item]:
+    """Two sentences: the usual uncertainty of angles and positions, and the worst of the headings."""
     after_start = find_samples_after_start(tracked)
-    headings = {
-        plain(joint): float(np.degrees(finite_max(std[after_start])))
-        for joint, std in compute_joint_heading_stds(measures.budgets, tracked.model).items()
-    }
-    stds = {name: compute_axis_std(cov[after_start]) for name, cov in tracked.pose.point_cov.items()}
-    return {
-        "duration": _format_duration(float(recording.time[-1] - recording.time[0])),
-        "rate_hz": measures.rate_hz,
-        "sensors": len(measures.signals),
-        "worst": max(headings.items(), key=lambda item: item[1]) if headings else None,
-        "tips": {name: 1e3 * finite_median(stds[name]) for name in tracked.model.table.paths if name in stds},
-        "root": _name_root(tracked.model.table),
-        "lengths": plain(tracked.subject.note or tracked.subject.name),
-        "shown_samples": len(recording),
-        "samples": measures.samples,
-    }
+    stds = _find_angle_stds(angles, after_start) if angles is not None else {}
+    tips = [finite_median(tip.std[after_start]) for tip in measures.tips.values() if tip.std is not None]
+    best, worst = (pick(stds, key=stds.__getitem__, default=None) for pick in (min, max))
+    hinges = {plain(tracked.model.table.shared_name(hinge)) for hinge in tracked.model.table.hinges}
+    best = next((name for name in stds if name.removesuffix(" flexion") in hinges), best)
+    usual = [f"{best} ± {stds[best]:.0f}°"] if best is not None else []
+    if tips and np.isfinite(tips).any():
+        table = tracked.model.table
+        usual.append(f"{_name_tips(table)} ± {1e3 * np.nanmax(tips):.0f} mm from {_name_root(table)}")
+    if not usual:
+        return [_explain_no_covariance(tracked)]
+    least = f"; least certain: {worst}, ± {stds[worst]:.0f}°" if worst not in (best, None) else ""
+    sentences = [f"Typical uncertainty: {', '.join(usual)}{least}."]
+    largest = _find_largest_heading(tracked, measures.budgets)
+    if largest is not None:
+        name, std, at = largest
+        sentences.append(f"At worst, at {at:.1f} s, the heading of the {plain(name)} is uncertain by ± {std:.1f}°.")
+    return [" ".join(sentences)]
 
 
-def _build_recorded_section(recording: Recording, measures: Measures, table: BodyTable) -> dict[str, Any]:
-    rows = [
-        [
-            plain(name),
-            f"{np.degrees(signal.rate.max()):.0f} °/s",
-            f"{signal.peak_accel:.0f} m/s²" if np.isfinite(signal.peak_accel) else "",
-            _format_seconds(signal.cut, recording.rate_hz),
-            _format_lost(recording.sensors[name], signal, recording.rate_hz),
-            f"{100 * float(signal.static.mean()):.0f} %" if signal.static is not None else "not measured",
-            f"{longest_run_s(~signal.static, recording.rate_hz):.0f} s" if signal.static is not None else "",
-        ]
-        for name, signal in measures.signals.items()
-    ]
-    header = [
-        "sensor",
-        "fastest rotation",
-        "largest acceleration",
-        "saturated",
-        "lost",
-        "static",
-        "longest motion without static phase",
-    ]
-    low, high = (f"{step:.2f}" for step in measures.steps_ms)
-    return {
-        "samples": measures.samples,
-        "rate_hz": measures.rate_hz,
-        "begin": recording.time[0],
-        "end": recording.time[-1],
-        "step": low if low == high else f"{low} to {high}",
-        "phases": [f"{name} {intervals(spans)}" for name, spans in recording.phases.items()],
-        "picture": draw_timeline(
-            recording.time,
-            measures.signals,
-            recording.phases,
-            {name: line_style(name, table) for name in measures.signals},
-        ),
-        "sensors": Table(header, rows),
-    }
+def _find_angle_stds(angles: Angles, samples: np.ndarray) -> dict[str, float]:
+    """Angle, as "elbow flexion" → its median ± [deg] where it is determined, of the side where that is larger."""
+    stds = {}
+    for group, members in group_sides(angles.joints).items():
+        for k, name in enumerate(angles[next(iter(members.values()))].names):
+            each = [
+                float(np.degrees(finite_median(joint.std[samples & ~joint.hidden(k), k])))
+                for joint in (angles[member] for member in members.values())
+                if joint.std is not None
+            ]
+            if np.isfinite(each).any():
+                stds[f"{plain(group)} {plain(name)}"] = float(np.nanmax(each))
+    return stds
 
 
-def _build_noise_section(signals: Mapping[str, Signal]) -> dict[str, Any] | None:
-    rows = []
-    for name, signal in signals.items():
-        if signal.bias is not None:
-            begin, end = (np.degrees(bias) for bias in signal.bias)
-            rows.append([plain(name), _format_axes(begin), _format_axes(end), f"{signal.gravity:.3f} m/s²"])
-    if not rows:
-        return None
-    header = ["sensor", "bias in the static phase, x / y / z [°/s]", "bias at the end [°/s]", "gravity"]
-    return {"percent": 100 * GRAVITY_OFF, "picture": draw_noise(signals), "sensors": Table(header, rows)}
-
-
-def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, Any]:
-    recording = tracked.recording
-    if not budgets:
-        return {"method": tracked.options.method if recording.imus else None, "has_covariance": False}
+def _find_largest_heading(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> tuple[str, float, float] | None:
+    """Segment, ± [deg] and time [s] of the largest uncertainty of a heading after the start pose."""
     after_start = find_samples_after_start(tracked)
     stds = {name: np.nan_to_num(np.where(after_start, budget.std, 0.0)) for name, budget in budgets.items()}
+    if not stds:
+        return None
     worst = max(stds, key=lambda name: float(stds[name].max()))
-    worst_sample = int(np.argmax(stds[worst]))
+    sample = int(np.argmax(stds[worst]))
+    return worst, float(np.degrees(stds[worst][sample])), float(tracked.time[sample])
+
+
+def _explain_no_covariance(tracked: TrackedRecording) -> str:
+    source = f"The filter {tracked.options.method}" if tracked.recording.imus else "The device"
+    return (
+        f"{source} states no uncertainty, so that this page cannot say how far angles and positions may be off. "
+        f"The methods {METHODS_WITH_COVARIANCE} state it."
+    )
+
+
+def _list_diagnostics(diagnostics: Sequence[Diagnostic], table: BodyTable) -> list[Item]:
+    checked = listed(["Rates", "ranges", "static phases", "headings", *_name_hinges(table)])
+    return [show_diagnostics(diagnostics, f"**No warnings.** {checked} are within their limits.")]
+
+
+def _list_facts(tracked: TrackedRecording, measures: Measures) -> list[Item]:
+    recording = tracked.recording
+    text = (
+        f"{_format_duration(float(recording.time[-1] - recording.time[0]))} at {measures.rate_hz:g} Hz from "
+        f"{len(measures.signals)} sensors. Lengths: {plain(tracked.subject.note or tracked.subject.name)}. ± is one "
+        "standard deviation throughout: two times out of three the truth lies within."
+    )
+    if measures.samples > len(recording):
+        text += (
+            f" Angles and positions are shown for {len(recording)} samples, one in "
+            f"{measures.samples / len(recording):.0f}; extremes, static phases and losses include all samples."
+        )
+    before = _find_time_before(tracked)
+    if before >= 1.0:
+        text += (
+            f" Each ± is of the time after the start pose: the {_format_duration(before)} before its end are left out."
+        )
+    return [text]
+
+
+def _list_recorded(tracked: TrackedRecording, measures: Measures) -> list[Item]:
+    recording = tracked.recording
+    rows, noise = [], []
+    for name, signal in measures.signals.items():
+        lost = signal.gap if recording.sensors[name].gap is not None else np.zeros(1, bool)
+        rows.append(
+            [
+                plain(name),
+                f"{np.degrees(signal.rate.max()):.0f} °/s",
+                f"{signal.peak_accel:.0f} m/s²" if np.isfinite(signal.peak_accel) else "",
+                _format_seconds(signal.cut, recording.rate_hz),
+                _format_seconds(lost, recording.rate_hz),
+                f"{100 * float(signal.static.mean()):.0f} %" if signal.static is not None else "not measured",
+                f"{longest_run_s(~signal.static, recording.rate_hz):.0f} s" if signal.static is not None else "",
+            ]
+        )
+        if signal.bias is not None:
+            begin, end = (_format_axes(np.degrees(bias)) for bias in signal.bias)
+            noises = [f"{np.degrees(signal.gyro_noise):.3f}", f"{signal.accel_noise:.3f}"]
+            noise.append([plain(name), begin, end, *noises, f"{signal.gravity:.3f} m/s²"])
+    header = ["sensor", "fastest rotation", "largest acceleration", "saturated", "lost", "static"]
+    recorded = Table([*header, "longest motion without static phase"], rows)
+    header = ["sensor", "bias in the static phase, x / y / z [°/s]", "bias at the end [°/s]"]
+    noises = ["gyroscope's noise [°/s]", "accelerometer's noise [m/s²]", "gravity"]
+    low, high = (f"{step:.2f}" for step in measures.steps_ms)
+    phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())
+    items: list[Item] = [
+        f"{measures.samples} samples at {measures.rate_hz:g} Hz, one every {low if low == high else f'{low} to {high}'} "
+        f"ms.{f' Phases: {phases}.' if phases else ''}",
+        draw_timeline(tracked, measures.signals),
+        recorded,
+        "Acceleration includes gravity. Saturated: an axis was at the end of its range, and the orientation lacks the "
+        "rotation beyond it. While a sensor is static its gyroscope measures its bias, and the heading does not drift.",
+    ]
+    if noise:
+        items += [
+            Table([*header, *noises], noise),
+            "From the static phase, noise of one axis. An error of 0.1 °/s in the bias rotates the heading by 6° in a "
+            f"minute. Gravity should measure 9.81 m/s², to {100 * GRAVITY_OFF:.0f} %.",
+        ]
+    return items
+
+
+def _list_drift(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> list[Item]:
+    if not budgets:
+        return [_explain_no_covariance(tracked)]
+    recording, correction = tracked.recording, tracked.correction
+    after_start = find_samples_after_start(tracked)
+    text = (
+        "Gravity corrects the tilt all the time. No sensor measures the heading, the rotation about the vertical: it is "
+        "set in the start pose and then drifts with the sum of the gyroscope's errors."
+    )
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
-    fastest = max(growth, key=growth.__getitem__) if growth else None
-    correction = tracked.correction
+    if growth:
+        fastest = max(growth, key=growth.__getitem__)
+        text += (
+            f" By drift alone its uncertainty grows by up to {np.degrees(growth[fastest]):.1f}° in a minute of motion "
+            f"(the {plain(fastest)}); in a static phase it hardly grows. {describe_heading_remedy(tracked)}"
+        )
     has_clasp = correction is not None and (correction.gap_rms_mm is not None or bool(correction.found_clasps))
-    has_accelerations = correction is not None and bool(correction.joint_accelerations)
-    segments = [
-        [
-            plain(name),
-            degrees(float(np.degrees(finite_max(budget.std[after_start])))),
-            degrees(float(np.degrees(budget.std[-1]))),
-            degrees(float(np.degrees(budget.filter_end))),
-            f"{np.degrees(budget.growth):.2f} °/min" if np.isfinite(budget.growth) else "never in motion",
-        ]
-        for name, budget in budgets.items()
-    ]
-    joints = [
-        [
-            plain(joint),
-            degrees(float(np.degrees(finite_median(std[after_start])))),
-            degrees(float(np.degrees(finite_max(std[after_start])))),
-        ]
-        for joint, std in compute_joint_heading_stds(budgets, tracked.model).items()
-    ]
+    if correction is not None:
+        sources = ["accelerations of the joints"] * bool(correction.joint_accelerations)
+        sources += [f"{name}' hinges" for name in _name_hinges(tracked.model.table)] + ["the joined hands"] * has_clasp
+        if sources:
+            text += (
+                f" The {listed(sources)} corrected the headings, by up to "
+                f"{max(correction.max_correction_deg.values(), default=0.0):.1f}°. This does not correct errors that "
+                "all segments share, such as the heading of the whole person."
+            )
+    unknown = [plain(name) for name in recording.sensors if name not in budgets]
+    text += f" The filter states no uncertainty: {listed(unknown)}." if unknown else ""
+    if has_stated_mounts(tracked):
+        text += " A mount that is stated and not calibrated is as uncertain as people are off the start pose."
     header = [
         "segment, ±",
         "largest",
@@ -194,133 +276,309 @@ def _build_drift_section(tracked: TrackedRecording, budgets: Mapping[str, Budget
         "at the end, filter alone",
         "growth per minute of motion, filter alone",
     ]
-    return {
-        "method": tracked.options.method,
-        "has_covariance": True,
-        "worst": (
-            worst,
-            float(np.degrees(stds[worst][worst_sample])),
-            _format_duration(float(tracked.time[worst_sample] - tracked.time[0])),
-        ),
-        "fastest": (fastest, float(np.degrees(growth[fastest]))) if fastest else None,
-        "remedy": describe_heading_remedy(tracked),
-        "corrected": max(tracked.correction.max_correction_deg.values(), default=0.0)
-        if tracked.correction is not None
-        else None,
-        "correctors": listed(
-            [
-                *["accelerations of the joints"] * has_accelerations,
-                *(f"{name}' hinges" for name in _name_hinges(tracked.model.table)),
-                *["the joined hands"] * has_clasp,
-            ]
-        ),
-        "segments_without_covariance": [plain(name) for name in recording.sensors if name not in budgets],
-        "time_before_start": _format_time_before(tracked),
-        "has_stated_mounts": has_stated_mounts(tracked),
-        "picture": draw_headings(
-            recording.time,
-            {name: np.degrees(budget.std) for name, budget in budgets.items()},
-            recording.phases.get("clasp", ()) if has_clasp else (),
-            {name: line_style(name, tracked.model.table) for name in budgets},
-        ),
-        "segments": Table(header, segments),
-        "joints": Table(["joint, ±", "median", "largest"], joints) if joints else None,
-    }
+    segments = [
+        [
+            plain(name),
+            *(
+                degrees(float(np.degrees(v)))
+                for v in (finite_max(each.std[after_start]), each.std[-1], each.filter_end)
+            ),
+            f"{np.degrees(each.growth):.2f} °/min" if np.isfinite(each.growth) else "never in motion",
+        ]
+        for name, each in budgets.items()
+    ]
+    joints = [
+        [plain(joint), *(degrees(float(np.degrees(pick(std[after_start])))) for pick in (finite_median, finite_max))]
+        for joint, std in compute_joint_heading_stds(budgets, tracked.model).items()
+    ]
+    figure = draw_over_time(
+        tracked.time,
+        {"heading, ± [°]": {name: np.degrees(budget.std) for name, budget in budgets.items()}},
+        "Uncertainty of each segment's heading over time: one standard deviation, with mounts, start pose and soft tissue.",
+        _style_segments(budgets, tracked.model.table),
+        spans=("hands joined", recording.phases.get("clasp", ()) if has_clasp else ()),
+    )
+    items: list[Item] = [text, figure, Table(header, segments)]
+    if joints:
+        items += ["The angles of a joint have the errors of both segments, here taken as independent:"]
+        items += [Table(["joint, ±", "median", "largest"], joints)]
+    return items
 
 
-def _build_tips_section(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> dict[str, Any] | None:
-    if not tips:
-        return None
+def _list_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> list[Item]:
     table, after_start = tracked.model.table, find_samples_after_start(tracked)
-    sides, limbs = find_sides(tips, table), table.drawn_limbs
-    header = ["", "forwards [cm]", "to the left [cm]"]
-    groups, rigid = [], dict[str, list[str]]()
-    for k, group in enumerate(group_tips(tips, table, tracked.subject.lengths)):
+    groups = group_tips(tips, table, tracked.subject.lengths)
+    if not groups:
+        return []
+    items: list[Item] = list(draw_tips(tracked.time, groups, table).values())
+    rigid = dict[str, list[str]]()
+    for group in groups:
         rows = []
         for name, tip in group.tips.items():
             low, high = np.nanpercentile(100 * tip.reach, [1.0, 99.0], axis=0)
-            usual, largest = ("not known", "not known")
-            if tip.std is not None:
-                usual, largest = (
-                    f"± {whole(1e3 * statistic(tip.std[after_start]))} mm" for statistic in (finite_median, finite_max)
-                )
+            stds = [
+                pick(tip.std[after_start]) if tip.std is not None else np.nan for pick in (finite_median, finite_max)
+            ]
             ranges = [f"{whole(a)} to {whole(b)}" for a, b in zip(low, high, strict=True)]
-            rows.append([plain(name), *ranges, f"{tip.peak_speed:.1f} m/s", usual, largest])
-            segments = limbs[name].segments
+            known = [f"± {whole(1e3 * std)} mm" if np.isfinite(std) else "not known" for std in stds]
+            rows.append([plain(name), *ranges, f"{tip.peak_speed:.1f} m/s", *known])
+            segments = table.drawn_limbs[name].segments
             if len(segments) > 1 and segments[-1] not in tracked.quat_WL:
                 end, above = (plain(table.shared_name(segment)) for segment in (segments[-1], segments[-2]))
                 rigid.setdefault(f"A {end} without a sensor is assumed rigid with its {above}", []).append(plain(name))
-        number = f"-{k + 1}" if k else ""
-        groups.append(
-            {
-                "points": capital(listed([plain(name) for name in group.tips])),
-                "start": group.start,
-                "frame": group.frame,
-                "paths": draw_paths(group, sides, f"paths{number}"),
-                "reach": draw_reach(tracked.time, group, sides, f"reach{number}"),
-                "ranges": Table(
-                    [*header, f"above {group.origin} [cm]", "highest speed", "median ±", "largest ±"], rows
-                ),
-            }
-        )
-    return {
-        "groups": groups,
-        "rigid": [f"{text}: {listed(names)}." for text, names in rigid.items()],
-        "root": _name_root(table),
-        "time_before_start": _format_time_before(tracked),
-    }
+        points = capital(listed([plain(name) for name in group.tips]))
+        items.append(f"{points}, from {group.start} along {group.frame}:")
+        header = ["", "forwards [cm]", "to the left [cm]", f"above {group.origin} [cm]"]
+        items.append(Table([*header, "highest speed", "median ±", "largest ±"], rows))
+    assumed = "".join(f" {text}: {listed(names)}." for text, names in rigid.items())
+    return [
+        *items,
+        "Ranges hold 98 % of the time; the highest speed is the mean of a tenth of a second. The ± is of one axis, "
+        f"relative to {_name_root(table)}, and includes the lean and the lengths of all that lies between.{assumed}",
+    ]
 
 
-def _build_error_budget_section(tracked: TrackedRecording) -> dict[str, Any] | None:
+def _list_error_budget(tracked: TrackedRecording) -> list[Item]:
     budget = ErrorBudget()
     budget.add(tracked)
     rows = {point: group_by_source(parts) for point, parts in budget.summarize().items()}
     if not rows:
-        return None
+        return []
     header = ["", *(f"{source} [mm]" for source in next(iter(rows.values())))]
-    return {
-        "points": Table(
-            header, [[plain(point), *(whole(1e3 * v) for v in row.values())] for point, row in rows.items()]
-        )
-    }
+    return [
+        "One standard deviation of an axis, root mean square over the recording; the parts add up in squares. The sizes of "
+        "soft tissue, start poses and the shoulder girdle are those of the literature, not measured on this person.",
+        Table(header, [[plain(point), *(whole(1e3 * v) for v in row.values())] for point, row in rows.items()]),
+    ]
 
 
-def _build_view_section(tracked: TrackedRecording, view: str | None) -> dict[str, Any]:
-    if view is not None and len(view) <= LARGEST_VIEW:
-        return {"page": view, "fps": None}
-    fps = min(FRAMES_A_SECOND, MOST_FRAMES / max(float(tracked.time[-1] - tracked.time[0]), 1e-3))
-    page = pose_html(
-        tracked.model, tracked.pose, phases=tracked.recording.phases, title=tracked.recording.name, fps=fps
+def _list_angles(tracked: TrackedRecording, angles: Angles | None) -> list[Item]:
+    if angles is None:
+        return []
+    rows = []
+    for joint, ranges in summary(angles).items():
+        stds = angles[joint].std
+        for k, name in enumerate(angles[joint].names):
+            std = np.degrees(finite_median(stds[:, k])) if stds is not None else np.nan
+            ends = [f"{whole(np.degrees(value))}°" for value in (ranges.lowest[k], ranges.highest[k], ranges.range[k])]
+            if not np.isfinite(ranges.range[k]):
+                ends = ["", "", ""]  # every sample is in a gap or near the lock, as of an arm that hangs
+            elif ranges.range[k] >= FULL_TURN and ranges.near_lock:
+                ends = ["", "", "all round"]
+            rows.append(
+                [
+                    f"{plain(joint)}, {plain(name)}",
+                    *ends,
+                    f"{np.degrees(ranges.peak_rate[k]):.0f} °/s" if np.isfinite(ranges.peak_rate[k]) else "",
+                    f"± {std:.1f}°" if np.isfinite(std) else "not known",
+                    f"{100 * ranges.near_lock:.0f} %" if k != 1 else "",
+                ]
+            )
+    stated = (
+        " The start pose counts as the exact N-pose: elbows that were bent by 10° in it read 10° too little."
+        if has_stated_mounts(tracked)
+        else ""
     )
-    return {"page": page, "fps": fps if fps < FRAMES_A_SECOND else None}
+    return [
+        "After the recommendations of the International Society of Biomechanics (Wu et al. 2005), left and right with the "
+        "same signs. A name says which way is positive; elevation alone is negative where the arm is raised, and pronation "
+        f"is 90° with the palms at the thighs.{stated}",
+        draw_joint_angles(angles),
+        Table(["angle", "lowest", "highest", "range", "peak rate", "median ±", "near gimbal lock"], rows),
+        "Near gimbal lock (10°) the first and the third angle of a joint are not separable and are left out; the "
+        "quaternions in pose.parquet have no such singularity.",
+    ]
 
 
-def _build_run_section(tracked: TrackedRecording) -> dict[str, Any]:
+def _list_view(tracked: TrackedRecording, view: str | None) -> list[Item]:
+    fps = min(FRAMES_A_SECOND, MOST_FRAMES / max(float(tracked.time[-1] - tracked.time[0]), 1e-3))
+    rate = ""
+    if view is None or len(view) > LARGEST_VIEW:
+        phases = tracked.recording.phases
+        view = pose_html(tracked.model, tracked.pose, phases=phases, title=tracked.recording.name, fps=fps)
+        rate = f" Here at {fps:.1f} frames a second." if fps < FRAMES_A_SECOND else ""
+    caption = "Drag to rotate, scroll to zoom, space to pause. `view.html` beside this page shows it larger."
+    return [Frame("The motion in 3D", caption + rate, view)]
+
+
+def _list_run(tracked: TrackedRecording) -> list[Item]:
     recording, subject = tracked.recording, tracked.subject
-    lengths = ", ".join(f"{plain(name)} {1e3 * value:.0f} mm" for name, value in subject.lengths.items())
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
         ("filter", tracked.options.method if tracked.segments.orientation else "none: measured orientations"),
         ("start pose", f"{recording.start_pose.replace('_', '-')}, {intervals([tracked.segments.start])}"),
         ("static phase", intervals([tracked.segments.static_phase])),
         ("person", f"{subject.name}; {subject.note}" if subject.note else subject.name),
-        ("lengths", lengths),
+        ("lengths", ", ".join(f"{plain(name)} {1e3 * value:.0f} mm" for name, value in subject.lengths.items())),
         ("mounts", "as the session states them" if has_stated_mounts(tracked) else "as calibrated"),
         ("body model", tracked.model.robot.name),
     ]
     if tracked.q is not None:
+        residuals = compute_orientation_residuals(tracked.model, tracked.q, tracked.quat_WL)
+        why = "(the joints have too few axes, or reach their limits)"
         rows += [
-            (
-                f"{plain(name)}, orientation residual",
-                f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° (the joints have too few axes, or reach their limits)",
-            )
-            for name, angle in compute_orientation_residuals(tracked.model, tracked.q, tracked.quat_WL).items()
+            (f"{plain(name)}, orientation residual", f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° {why}")
+            for name, angle in residuals.items()
         ]
-    rows += [
-        ("points", listed([plain(name) for name in tracked.points]) or "none"),
-        ("made with", versions()),
-    ]
-    return {"rows": rows}
+    rows += [("points", listed([plain(name) for name in tracked.points]) or "none"), ("made with", versions())]
+    return [Facts(rows)]
+
+
+# Figures --------------------------------------------------------------------------------------------------------------
+
+
+@styled
+def draw_timeline(tracked: TrackedRecording, signals: Mapping[str, Signal]) -> ReportFigure:
+    """Each sensor over time: how fast it rotated, where it was static, lost, or cut off by its range."""
+    time, table = tracked.time, tracked.model.table
+    most = max(1.0, max(float(np.degrees(signal.rate.max())) for signal in signals.values()))
+    figure = ReportFigure(
+        f"How fast each sensor rotated, on one scale: a row is {most:.0f} °/s high. "
+        "Black bars under a row: static by the filter's test.",
+        0.42 * len(signals) + 0.2,
+    )
+    ax = figure.grid(left_in=1.15)[0, 0]
+    ax.set_xlim(time[0], max(time[-1], time[0] + 1e-3))
+    ax.set_ylim(-len(signals) + 0.8, 1.2)
+    ax.set_yticks(-np.arange(len(signals)), [plain(name) for name in signals])
+    ax.set_xlabel("time [s]")
+    ax.grid(axis="y", visible=False)
+    for name, spans in tracked.recording.phases.items():
+        shade(ax, spans, "phase")
+        for begin, end in spans:
+            if 110.0 * (end - begin) / (time[-1] - time[0]) > len(name):  # as many letters are as wide as the plot
+                ax.text(begin, 1.02, f" {name}", fontsize=8)
+    labels = {"static": "static", "gap": "lost and interpolated", "cut": "saturated"}
+    for row, (name, signal) in enumerate(signals.items()):
+        at, rate = envelope(time, np.degrees(signal.rate))
+        ax.fill_between(at, -row, 0.85 * rate / most - row, color=COLOURS[table.side(name) or "other"], linewidth=0)
+        if signal.static is not None and signal.static.any():
+            begin, end = find_spans(time, signal.static).T
+            ax.hlines(
+                np.full(len(begin), -row - 0.06), begin, end, "black", linewidth=2.5, label=labels.pop("static", None)
+            )
+        if signal.gap.any():
+            spans = [(a, b - a) for a, b in find_spans(time, signal.gap)]
+            label = labels.pop("gap", None)
+            ax.broken_barh(
+                spans, (-row, 0.85), facecolor="none", edgecolor=SOFT, hatch="////", linewidth=0, label=label
+            )
+        if signal.cut.any():
+            first = find_spans(time, signal.cut)[:, 0]
+            ax.plot(
+                first, np.full(len(first), 0.85 - row), "v", color="black", markersize=4, label=labels.pop("cut", None)
+            )
+    figure.add_legend()
+    return figure
+
+
+class TipGroup(NamedTuple):
+    """Points whose paths are drawn together, for their limbs hang on the same points.
+
+    Parameters
+    ----------
+    tips : point → its motion
+    nouns : what the points are on, as "hands"
+    origin, start : what the limbs hang at, as "shoulders", and where a reach begins, as "the middle of the shoulders"
+    frame : whose axes its coordinates are along, in words
+    width, trunk : [m] between the points at which they hang, and from the root to their middle; None: no such length
+    """
+
+    tips: Mapping[str, TipMotion]
+    nouns: str
+    origin: str
+    start: str
+    frame: str
+    width: float | None
+    trunk: float | None
+
+
+def group_tips(tips: Mapping[str, TipMotion], table: BodyTable, lengths: Mapping[str, float]) -> list[TipGroup]:
+    """The tips by the points at which their limbs hang; `lengths` [m] are the person's."""
+    limbs, groups = table.drawn_limbs, []
+    for origin in dict.fromkeys(limbs[name].origin for name in tips):
+        names = [name for name in tips if limbs[name].origin == origin]
+        width, trunk = (lengths.get(table.find_length(*points) or "") for points in (origin, (ROOT, *origin)))
+        nouns = (table.shared_name((limbs[name].segments or (name,))[-1]) for name in names)
+        hangs_at, start = plain(table.shared_name(origin[0])), "the "
+        if len(origin) > 1:
+            hangs_at, start = plural(hangs_at), "the middle of the "
+        base = limbs[names[0]].base
+        groups.append(
+            TipGroup(
+                {name: tips[name] for name in names},
+                listed([plural(plain(noun)) for noun in dict.fromkeys(nouns)]),
+                hangs_at,
+                start + hangs_at,
+                f"the {plain(base)}'s own axes" if base else "the axes of W",
+                width,
+                trunk,
+            )
+        )
+    return groups
+
+
+@styled
+def draw_tips(time: np.ndarray, groups: Sequence[TipGroup], table: BodyTable) -> dict[str, ReportFigure]:
+    """Draw "paths", the tips seen from the front, the right and above, and "reach", the tips over time."""
+    nouns = listed([group.nouns for group in groups])
+    paths = ReportFigure(f"Paths of the {nouns}, seen from the body; a mark shows the beginning.", 2.7 * len(groups))
+    styles: dict[str, dict[str, Any]] = {}
+    panels: dict[str, dict[str, np.ndarray]] = {}
+    for axes, group in zip(paths.grid(len(groups), 3), groups, strict=True):
+        styles |= {name: line_style(name, table.side(name)) for name in group.tips}
+        for ax, across, up in set_up_views(axes, group.width, group.trunk, group.origin):
+            for name, tip in group.tips.items():
+                at = 100.0 * tip.reach[:: max(1, len(tip.reach) // PATH_POINTS)][:, [across, up]]
+                ax.plot(at[:, 0], at[:, 1], **{**styles[name], "linewidth": 0.7})
+                ax.plot(at[:1, 0], at[:1, 1], "s" if table.side(name) == "right" else "o", color=styles[name]["color"])
+        for k, label in enumerate(("forwards [cm]", "to the left [cm]", f"above the {group.origin} [cm]")):
+            title = label if len(groups) == 1 else f"{group.nouns}: {label}"
+            panels[title] = {name: 100.0 * tip.reach[:, k] for name, tip in group.tips.items()}
+    paths.add_legend()
+    caption = "; ".join(f"the {group.nouns} from {group.start} along {group.frame}" for group in groups)
+    return {"paths": paths, "reach": draw_over_time(time, panels, capital(f"{caption}, over time."), styles)}
+
+
+def draw_joint_angles(angles: Angles) -> ReportFigure:
+    """Draw a row for each kind of joint, as the elbows, with its three angles."""
+    panels, styles = {}, {}
+    for group, members in group_sides(angles.joints).items():
+        for k, name in enumerate(angles[next(iter(members.values()))].names):
+            lines = {side: np.degrees(_break_line(angles[joint], k)) for side, joint in members.items()}
+            panels[f"{plain(group)}: {plain(name)} [°]"] = lines
+        styles |= {side: line_style(side, side) for side in members}
+    caption = "Joint angles over time."
+    if any((joint.near_lock | joint.gap).any() for joint in angles.joints.values()):
+        caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
+    return draw_over_time(angles.time, panels, caption, styles, columns=3)
+
+
+def _break_line(joint: JointAngles, k: int) -> np.ndarray:
+    """An angle with its line broken where it is not determined; within ± half a turn where it passed the lock."""
+    hidden = joint.hidden(k)
+    values = np.where(hidden, np.nan, joint.values[:, k])
+    if hidden.all() or not joint.near_lock.any() or np.nanmax(values) - np.nanmin(values) < FULL_TURN:
+        return values  # a real whole turn
+    values = (values + np.pi) % FULL_TURN - np.pi
+    values[1:][np.abs(np.diff(values)) > np.pi] = np.nan
+    return values
+
+
+def _style_segments(names: Iterable[str], table: BodyTable) -> dict[str, dict[str, Any]]:
+    """Styles of the segments' lines: colour by side, dashes by the place among the segments of that side."""
+    ranks = {
+        name: [each for each in table.segments if table.side(each) == table.side(name)].index(name) for name in names
+    }
+    return {name: line_style(name, table.side(name), rank) for name, rank in ranks.items()}
+
+
+def _find_joint_angles(tracked: TrackedRecording) -> Angles | None:
+    """The joint angles; None where no joint has both of its segments."""
+    try:
+        return joint_angles(tracked.pose)
+    except BadData:
+        return None
 
 
 # Words ----------------------------------------------------------------------------------------------------------------
@@ -350,16 +608,10 @@ def _format_seconds(mask: np.ndarray, rate_hz: float) -> str:
     return f"{np.count_nonzero(mask) / rate_hz:.2f} s" if mask.any() else "0 s"
 
 
-def _format_lost(sensor: Sensor, signal: Signal, rate_hz: float) -> str:
-    """Return the time of long gaps; 0 s where they were not allowed."""
-    return _format_seconds(signal.gap, rate_hz) if sensor.gap is not None else "0 s"
-
-
 def _format_axes(values: np.ndarray) -> str:
     return " / ".join(f"{value:+.2f}".replace("-", "−") if abs(value) >= 0.005 else "0.00" for value in values)
 
 
-def _format_time_before(tracked: TrackedRecording) -> str | None:
-    """Return the time before the end of the start pose, which the summaries leave out; None where it is below 1 s."""
-    seconds = float(tracked.time[np.argmax(find_samples_after_start(tracked))] - tracked.time[0])
-    return _format_duration(seconds) if seconds >= 1.0 else None
+def _find_time_before(tracked: TrackedRecording) -> float:
+    """The time [s] before the end of the start pose, which the summaries leave out."""
+    return float(tracked.time[np.argmax(find_samples_after_start(tracked))] - tracked.time[0])

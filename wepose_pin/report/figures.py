@@ -1,0 +1,260 @@
+"""Figures by matplotlib, as objects: no pyplot, no state that other code could see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
+
+from ..documents import whole_folder
+from ..errors import UnknownKey, one_of
+from ..recording.gaps import find_runs
+from .words import plain
+
+WIDTH_IN = 9.2
+LEFT_IN, RIGHT_IN, TOP_IN, BOTTOM_IN = 0.62, 0.12, 0.28, 0.5  # margins of a figure
+COLUMNS = 450  # of a line: its least and largest value in each
+COLOURS = {"left": "#d9772b", "right": "#24618f", "other": "#3d4a59"}
+SESSION_COLOURS = ("#24618f", "#d9772b", "#3d7a4c", "#8a5a9e")
+DASHES = {  # by the place among the lines of a side
+    "left": ("-", (0, (1, 1)), (0, (8, 2, 2, 2))),
+    "right": ((0, (4, 1.5)), (0, (5, 1, 1, 1)), (0, (10, 3))),
+    "other": ("-", (0, (2, 1)), (0, (6, 1))),
+}
+SHADE, BAND, SOFT = "#e9eef4", "#cdd9e5", "#8794a3"
+STYLE = {
+    "font.family": ["sans-serif"],
+    "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial"],
+    "font.size": 8.5,
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.titley": 1.02,  # a stated height: matplotlib searches for one by the extents of all labels
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": SOFT,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.xmargin": 0.0,
+    "grid.color": "#e3e7ec",
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.1,
+    "legend.frameon": False,
+    "hatch.linewidth": 0.6,
+    "hatch.color": SOFT,
+    "path.simplify_threshold": 0.4,  # [px]
+    "svg.fonttype": "none",
+    "svg.hashsalt": "wepose",
+}
+Spans = Iterable[Sequence[float]] | np.ndarray
+P, R = ParamSpec("P"), TypeVar("R")
+
+
+def styled(draw: Callable[P, R]) -> Callable[P, R]:
+    """Draw in the style of the reports, whatever the caller's rcParams."""
+    return mpl.rc_context(STYLE)(draw)
+
+
+class ReportFigure(Figure):
+    """A matplotlib figure with a caption; a notebook shows it.
+
+    Parameters
+    ----------
+    caption : what it shows, in a sentence or two
+    height_in : of the plots, without margins and legend
+    """
+
+    def __init__(self, caption: str, height_in: float) -> None:
+        super().__init__(figsize=(WIDTH_IN, height_in + TOP_IN + BOTTOM_IN))
+        self.caption = caption
+
+    def grid(self, rows: int = 1, columns: int = 1, left_in: float = LEFT_IN, **options: Any) -> np.ndarray:
+        """(rows, columns) axes."""
+        _, height = self.get_size_inches()
+        places = {
+            "left": left_in / WIDTH_IN,
+            "right": 1.0 - RIGHT_IN / WIDTH_IN,
+            "bottom": BOTTOM_IN / height,
+            "top": 1.0 - TOP_IN / height,
+            "wspace": 0.24,
+            "hspace": 0.2 if rows == 1 else 0.34 * rows / (height - TOP_IN - BOTTOM_IN),
+        }
+        axes: np.ndarray = self.subplots(rows, columns, squeeze=False, gridspec_kw=places, **options)
+        for ax in axes.ravel():
+            ax.xaxis.set_major_locator(MaxNLocator(8 if columns == 1 else 5))
+            ax.yaxis.set_major_locator(MaxNLocator(4 if rows > 1 else 5))
+        return axes
+
+    def add_legend(self) -> None:
+        """One legend above the plots, each label once."""
+        entries = {}
+        for ax in self.axes:
+            for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+                entries.setdefault(label, handle)
+        if not entries:
+            return
+        columns = 6
+        extra = 0.22 * -(-len(entries) // columns)
+        width, height = self.get_size_inches()
+        self.set_size_inches(width, height + extra)
+        for ax in self.axes:
+            place = ax.get_position()
+            ax.set_position((place.x0, place.y0 * height / (height + extra), place.width,
+                             place.height * height / (height + extra)))  # fmt: skip
+        self.legend(
+            list(entries.values()), list(entries), loc="upper left", ncols=columns, borderaxespad=0.1,
+            bbox_to_anchor=(0.01, 1.0), handlelength=2.2, columnspacing=1.6,
+        )  # fmt: skip
+
+    @styled
+    def svg(self) -> str:
+        """Return an SVG file as text; equal figures give equal text."""
+        file = StringIO()
+        self.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+        return file.getvalue()
+
+    def _repr_svg_(self) -> str:
+        return self.svg()
+
+
+class Figures(dict[str, ReportFigure]):
+    """matplotlib figures by name, which can be changed before they are saved; a notebook shows all of them."""
+
+    def __missing__(self, name: str) -> ReportFigure:
+        raise UnknownKey(f"no figure '{name}'; {one_of(self, name)}")
+
+    def __repr__(self) -> str:
+        return f"Figures({', '.join(self)})"
+
+    def _repr_html_(self) -> str:
+        return "\n".join(figure.svg().partition("?>")[2] for figure in self.values())
+
+    def save(self, folder: str | Path, force: bool = False) -> Path:
+        """Write each figure to ``<name>.svg`` in a folder and return the folder.
+
+        Raises
+        ------
+        ExistingOutput
+            The folder is not empty and `force` is not given, or it cannot be written.
+        """
+        with whole_folder(Path(folder), force) as partial:
+            for name, figure in self.items():
+                (partial / f"{name}.svg").write_text(figure.svg(), encoding="utf-8")
+        return Path(folder)
+
+
+def envelope(time: np.ndarray, values: np.ndarray, most: int = COLUMNS) -> tuple[np.ndarray, np.ndarray]:
+    """A line with the same picture: the least and the largest value of each of at most so many columns.
+
+    Parameters
+    ----------
+    time, values : (n,); NaN in `values` breaks the line
+    """
+    if len(time) <= 2 * most:
+        return time, values
+    size = -(-len(time) // most)
+    columns = np.full((-(-len(time) // size), size), np.nan)
+    columns.ravel()[: len(values)] = values
+    known = np.isfinite(columns)
+    low, high = np.where(known, columns, np.inf).argmin(axis=1), np.where(known, columns, -np.inf).argmax(axis=1)
+    # A column that holds anything shows it; one that holds nothing breaks the line.
+    at = size * np.arange(len(columns))[:, None] + np.sort(np.column_stack([low, high]), axis=1)
+    return time[at.ravel()], values[at.ravel()]
+
+
+def find_spans(time: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """(m, 2) [s], runs of true values; those nearer to each other than a column are one, so that m has a bound."""
+    least = max(1, len(time) // (2 * COLUMNS))
+    merged: list[list[int]] = []
+    for a, b in find_runs(which):
+        if merged and a - merged[-1][1] < least:
+            merged[-1][1] = b
+        else:
+            merged.append([a, b])
+    return np.array([(time[a], time[b - 1]) for a, b in merged]).reshape(-1, 2)
+
+
+def shade(ax: Axes, spans: Spans, label: str, colour: str = SHADE, **options: Any) -> None:
+    """Shade spans [s] over the height of a plot, or over `ymin` to `ymax` of it."""
+    for k, (begin, end) in enumerate(spans):
+        ax.axvspan(begin, end, color=colour, linewidth=0, zorder=0.5, label=label if k == 0 else None, **options)
+
+
+def line_style(label: str, side: str | None, rank: int = 0) -> dict[str, Any]:
+    """A line's style: colour by side, and dashes, so that lines differ without their colour too."""
+    side = side if side in DASHES else "other"
+    return {"color": COLOURS[side], "linestyle": DASHES[side][rank % 3], "label": plain(label)}
+
+
+@styled
+def draw_over_time(
+    time: np.ndarray,
+    panels: Mapping[str, Mapping[str, np.ndarray]],
+    caption: str,
+    styles: Mapping[str, dict[str, Any]],
+    columns: int = 1,
+    spans: tuple[str, Spans] = ("", ()),
+) -> ReportFigure:
+    """A plot for each title, row by row, with its lines by name; NaN breaks a line.
+
+    Parameters
+    ----------
+    panels : title → name of a line → values (n,)
+    styles : of each line, of `line_style`
+    spans : label and spans [s] that are shaded
+    """
+    rows = -(-len(panels) // columns)
+    figure = ReportFigure(caption, 2.2 if len(panels) == 1 else 1.25 * rows)
+    axes = figure.grid(rows, columns, sharex=True)
+    for ax, (title, lines) in zip(axes.ravel(), panels.items(), strict=False):
+        ax.set_title(title)
+        shade(ax, spans[1], spans[0])
+        for name, values in lines.items():
+            ax.plot(*envelope(time, values, COLUMNS // columns), **styles[name])
+    for ax in axes.ravel()[len(panels) :]:
+        ax.set_visible(False)
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]")
+        ax.set_xlim(time[0], max(time[-1], time[0] + 1e-3))
+    if len(styles) > 1:
+        figure.add_legend()
+    return figure
+
+
+def set_up_views(
+    axes: Iterable[Axes], width: float | None, trunk: float | None, origin: str
+) -> list[tuple[Axes, int, int]]:
+    """Plots of the body from the front, the right and above [cm], and the axes that each shows; zero is at the origin.
+
+    Parameters
+    ----------
+    width, trunk : [m] of the shoulders, or of what else the limbs hang at, and from there to the root; None: not drawn
+    origin : what the limbs hang at, as "shoulders"
+    """
+    labels = ("forwards [cm]", "to the person's left [cm]", f"above the {origin} [cm]")
+    views = []
+    for ax, (view, across, up) in zip(
+        axes, (("from the front", 1, 2), ("from the right", 0, 2), ("from above", 1, 0)), strict=True
+    ):
+        ax.set_title(view)
+        ax.set_xlabel(labels[across])
+        ax.set_ylabel(labels[up], labelpad=1)
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.margins(0.05)
+        ax.invert_xaxis() if view == "from above" else None
+        if trunk is not None:
+            ax.add_patch(Circle((0.0, 0.0 if up == 0 else 20.0), 10.0, color=BAND, zorder=0.8))
+        limb = {"color": BAND, "linewidth": 7.0, "solid_capstyle": "round", "zorder": 0.8}
+        if across == 1 and width is not None:
+            ax.plot([-50.0 * width, 50.0 * width], [0.0, 0.0], **limb)
+        if up == 2 and trunk is not None:
+            ax.plot([0.0, 0.0], [0.0, -100.0 * trunk], **limb)
+        views.append((ax, across, up))
+    return views
