@@ -27,8 +27,6 @@ def rows(page: str) -> list[list[str]]:
 
 
 def captions(page: str) -> list[tuple[str, str]]:
-    """Of each chart what it is called for who cannot see it, and its caption."""
-    pairs = re.findall(
-        r'<svg class="chart"[^>]* aria-label="([^"]+)".*?<figcaption>(.*?)</figcaption>', page, re.DOTALL
-    )
+    """Of each figure its description for those who cannot see it, and its caption."""
+    pairs = re.findall(r'<img alt="([^"]+)" src="data:image/svg[^"]*"><figcaption>(.*?)</figcaption>', page)
     return [(unescape(label), unescape(caption)) for label, caption in pairs]

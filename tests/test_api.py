@@ -16,6 +16,7 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 from xml.etree import ElementTree
 
+import matplotlib.figure
 import numpy as np
 import pytest
 from arms import write_arm
@@ -184,13 +185,25 @@ def test_a_damaged_summary_is_one_line(part: str, saved: Path, tmp_path: Path) -
 def test_figures_are_whole_files_and_a_notebook_shows_them(result: wp.TrackResult, tmp_path: Path) -> None:
     figures = result.plot()
     page = figures._repr_html_()
+    assert page.count("<svg") == len(figures) == 3
     for file in figures.save(tmp_path / "figures").iterdir():
         text = file.read_text(encoding="utf-8")
         assert ElementTree.fromstring(text).tag.endswith("svg")
         assert text == figures[file.stem]._repr_svg_()
-        assert text in page
-    with pytest.raises(KeyError, match=r"no figure 'elbow'; .* angles-elbow"):
+    with pytest.raises(KeyError, match=r"no figure 'elbow'; .* angles"):
         figures["elbow"]
+
+
+def test_a_figure_is_matplotlibs_and_can_be_changed(result: wp.TrackResult) -> None:
+    figure = result.plot()["angles"]
+    assert isinstance(figure, matplotlib.figure.Figure)
+    panels = {ax.get_title("left"): ax for ax in figure.axes if ax.get_visible()}
+    assert [line.get_label() for line in panels["elbow: flexion [°]"].lines] == ["left", "right"]
+    flexion = panels["elbow: flexion [°]"].lines[1].get_ydata()
+    assert np.nanmax(flexion) == pytest.approx(np.degrees(wp.joint_angles(result)["right_elbow"]["flexion"].max()))
+    panels["elbow: flexion [°]"].set_title("Beugung", loc="left")
+    assert "Beugung" in figure.svg()
+    assert "matplotlib.pyplot" not in sys.modules or matplotlib.pyplot.get_fignums() == []
 
 
 def test_a_motion_is_shown_in_the_browser_or_in_the_notebook(

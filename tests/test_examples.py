@@ -76,4 +76,4 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     shown = [output.get("data", {}) for cell in notebook.cells for output in cell.get("outputs", ())]
     assert any("<iframe" in data.get("text/html", "") for data in shown)
     assert any(data.get("text/plain", "").startswith("Trajectory('panda'") for data in shown)
-    assert {file.name for file in tmp_path.iterdir()} == {"circles.mot", "elbow.svg"}
+    assert {file.name for file in tmp_path.iterdir()} == {"circles.mot", "angles.svg"}

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     import pandas
 
     from .calibration import Calibration
-    from .report.notebook import Figures, ViewPage
+    from .report.figures import Figures
+    from .report.notebook import ViewPage
 
 
 @dataclass(frozen=True, repr=False)
@@ -113,15 +114,17 @@ class TrackResult(PosedBody):
         Returns
         -------
         Figures
-            Name → figure. A notebook shows them; ``figures.save(folder)`` writes an SVG each.
+            Name → `matplotlib.figure.Figure`, to be changed as you like and saved by its ``savefig``. A notebook shows
+            them; ``figures.save(folder)`` writes an SVG each.
 
         Examples
         --------
         >>> figures = result.plot()
         >>> list(figures)
-        ['paths', 'reach', 'angles-thorax', 'angles-shoulder', 'angles-elbow']
-        >>> figures["paths"].save("paths.svg")
-        PosixPath('paths.svg')
+        ['paths', 'reach', 'angles']
+        >>> figures["angles"].axes[0].set_ylim(-30.0, 30.0)
+        (-30.0, 30.0)
+        >>> figures["angles"].savefig("angles.pdf")
         """
         from .report.notebook import draw_figures
 

@@ -101,7 +101,7 @@ def run_angles(job: AnglesJob, progress: Progress = no_progress) -> AnglesOutcom
     from ..angles import movement_tables as tables
     from ..documents import whole_folder
     from ..report.angles import draw_figures, render_angles_page
-    from ..report.page import PageWriter, render_standalone
+    from ..report.page import PageWriter
     from ..writers.provenance import collect_provenance, write_provenance
     from ..writers.tables import write_table_csv
 
@@ -122,14 +122,14 @@ def run_angles(job: AnglesJob, progress: Progress = no_progress) -> AnglesOutcom
             table = build(movements)
             if len(table):
                 write_table_csv(folder / f"{name}.csv", table.with_columns(selectors.float().round(DECIMALS)))
-        pictures = draw_figures(movements)
-        for picture in pictures:
-            (folder / f"{picture.stem}.svg").write_text(render_standalone(picture), encoding="utf-8")
+        figures = draw_figures(movements)
+        for figure_name, figure in figures.items():
+            (folder / f"{figure_name}.svg").write_text(figure.svg(), encoding="utf-8")
         files = sorted(path.name for path in folder.iterdir())
         write_provenance(folder, collect_provenance("angles", field_values(job)))
     progress("making the page", 0.9)
     writer = PageWriter(job.out, [PAGE])
-    writer.write(PAGE, lambda failures: render_angles_page(movements, pictures, files, failures))
+    writer.write(PAGE, lambda failures: render_angles_page(movements, figures, files, failures))
     return AnglesOutcome(movements, writer.diagnostics)
 
 

@@ -6,8 +6,10 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from ..angles.curves import MeanCurve
+from ..angles import group_sides
+from ..angles.curves import PERCENT, MeanCurve
 from ..angles.definitions import define_angles
 from ..angles.movement import (
     MEASURES,
@@ -18,60 +20,117 @@ from ..angles.movement import (
     compute_statistics,
     measure_spans,
 )
-from .angle_figures import draw_curves, draw_repetitions
-from .chart import Picture
-from .page import Page, Table
-from .words import capital, intervals, plain, signed, versions
+from ..angles.repetitions import list_angles
+from .figures import BAND, SESSION_COLOURS, SHADE, SOFT, Figures, ReportFigure, envelope, shade, styled
+from .page import MOST_FIGURES, Bullets, Item, Page, Table
+from .words import intervals, listed, plain, signed, versions
 
-TEMPLATE = "report/templates/angles.html.j2"
 HEADINGS = ("lowest [°]", "highest [°]", "range [°]", "peak rate [°/s]")  # of MEASURES
 CLEAR = 2.0  # standard deviations that the poses state; a smaller difference may be an error that a session shares
-
-
-def draw_figures(movements: Sequence[Movement]) -> list[Picture]:
-    """All figures, in the order of the page."""
-    over_time = draw_repetitions(movements)
-    return ([over_time] if over_time is not None else []) + draw_curves(movements)
+MOST_CURVES = 60  # of single repetitions that are drawn behind their mean
 
 
 def render_angles_page(
-    movements: Sequence[Movement], pictures: Sequence[Picture], files: Sequence[str], failures: list[str] | None = None
+    movements: Sequence[Movement], figures: Figures, files: Sequence[str], failures: list[str] | None = None
 ) -> str:
     """Return the text of ``angles.html``, one page that opens offline and can be printed. It is deterministic.
 
     Parameters
     ----------
-    pictures : of `draw_figures`
+    figures : of `draw_figures`; the page shows the first of them
     files : that lie beside the page
     failures : gets a line for each section that cannot be made
     """
-    names = " and ".join(movement.name for movement in movements)
-    page = Page(TEMPLATE, f"Joint angles of {names}", failures)
-    over_time = [picture for picture in pictures if picture.stem == "repetitions"]
-    curves = [picture for picture in pictures if picture.stem != "repetitions"]
-    page.add("sessions", lambda: {"table": _tabulate_sessions(movements), **_describe(movements)}, name="Sessions")
-    if over_time or _list_reasons(movements):  # none where a phase marks them all
-        page.add("repetitions", lambda: {"pictures": over_time, "reasons": _list_reasons(movements)}, "Repetitions")
-    if curves:
-        page.add("curves", lambda: {"pictures": curves}, "Mean curves")
-        page.add("measures", lambda: {"table": _tabulate_measures(movements)}, "Means over the repetitions")
+    page = Page(f"Joint angles of {' and '.join(movement.name for movement in movements)}", failures)
+    shown = dict([*figures.items()][:MOST_FIGURES])
+    over_time = [shown.pop("repetitions")] if "repetitions" in shown else []
+    reasons = [
+        f"{movement.name}: no repetitions{_by(movement)}: {movement.repetitions.reason}."
+        for movement in movements
+        if movement.repetitions.reason
+    ]
+    repetitions: list[Item] = [Bullets(reasons), ADVICE] if reasons else []
+    repetitions += over_time
+    page.add("What can be relied on", lambda: [_describe_reliance(movements)], heading=False)
+    page.add("Sessions", lambda: [_tabulate_sessions(movements), _describe(movements)], heading=False)
+    page.add("Repetitions", lambda: repetitions)
+    if shown:
+        others = listed([f"`{name}.svg`" for name in figures if name not in shown and name != "repetitions"])
+        rest = f" Beside this page: {others}." if others else ""
+        page.add("Mean curves", lambda: [CURVES + rest, *shown.values()])
+        page.add("Means over the repetitions", lambda: [MEANS, _tabulate_measures(movements)])
     if len([movement for movement in movements if movement.curves]) > 1:
-        page.add("comparison", lambda: {"tables": _tabulate_comparisons(movements)}, "Sessions compared")
-    page.add("phases", lambda: {"tables": _tabulate_phases(movements)}, "Phases")
-    page.add("definitions", lambda: {"table": _tabulate_definitions(movements)}, "What the angles are")
-    page.add("files", lambda: {"files": files, "versions": versions()}, "Files")
-    return page.html(f"Joint angles of {names}")
+        page.add("Sessions compared", lambda: [COMPARISON, *_tabulate_comparisons(movements)])
+    page.add("All of the time", lambda: [WHOLE_TIME, *_tabulate_whole_time(movements)])
+    page.add("What the angles are", lambda: [DEFINITIONS, _tabulate_definitions(movements)])
+    page.add("Files", lambda: [Bullets(files), f"Made with {versions()}."])
+    return page.html()
 
 
-# The sections: the values that the macros of the template take --------------------------------------------------------
+ADVICE = (
+    "State another angle by `--main-angle`, a time by `--interval`, or mark repetitions as intervals of a phase and "
+    "name it by `--repetitions`."
+)
+CURVES = (
+    "Each repetition from 0 to 100 % of its own time. Where fewer than half of the repetitions are determined, as near "
+    "gimbal lock, a line is broken."
+)
+MEANS = "Mean ± standard deviation between the repetitions, in square brackets what the pose states for one."
+COMPARISON = (
+    "Differences of means, with the 95 % interval from the spread between repetitions (Welch 1947). They are of one "
+    "person: the interval says nothing of groups, nor of errors that a session shares. Bold: it excludes zero, and the "
+    "difference is more than twice what the poses state (`difference_std` in comparison.csv)."
+)
+WHOLE_TIME = (
+    "± is what the pose states. Samples in gaps count nowhere, those near gimbal lock only in the range of the second "
+    "angle. `phases.csv` has the same for each phase."
+)
+DEFINITIONS = (
+    "After the International Society of Biomechanics: Wu et al. 2005 for thorax and arm, 2002 for pelvis, hip and "
+    "ankle; the knee after Grood and Suntay 1983. Left joints are mirrored: both sides have the same signs."
+)
 
 
-def _describe(movements: Sequence[Movement]) -> dict[str, Any]:
-    return {
-        "cutoff_hz": movements[0].cutoff_hz,
-        "stated": any(joint.std is not None for movement in movements for joint in movement.angles.joints.values()),
-        "isotropic": any(movement.isotropic for movement in movements),
-    }
+# Sections -------------------------------------------------------------------------------------------------------------
+
+
+def _describe_reliance(movements: Sequence[Movement]) -> str:
+    """Two sentences: what the pose states of a range, and how far the repetitions differ."""
+    stated, between = {}, {}
+    for movement, joint, k, angle in _list_angles(movements):
+        each = compute_statistics(movement.measures[joint].values[:, k, 2], movement.measures[joint].std[:, k, 2])
+        stated[angle] = float(np.degrees(each.std))
+        between[f"{angle}{f' ({movement.name})' if len(movements) > 1 else ''}"] = float(np.degrees(each.sd))
+    stated, between = ({name: v for name, v in each.items() if np.isfinite(v)} for each in (stated, between))
+    if not between:
+        return "No repetitions were found, so that this page has no means; the table of all of the time holds."
+    worst = max(between, key=between.__getitem__)
+    spread = f"Between repetitions the range of {worst} varies most, by ± {between[worst]:.1f}°."
+    if not stated:
+        return f"The pose states no uncertainty of a single repetition. {spread}"
+    best, least = min(stated, key=stated.__getitem__), max(stated, key=stated.__getitem__)
+    known = f"{stated[best]:.1f}° ({best}) up to ± {stated[least]:.1f}° ({least})"
+    return f"The range of one repetition is known to ± {known}. {spread}"
+
+
+def _describe(movements: Sequence[Movement]) -> str:
+    cutoff = movements[0].cutoff_hz
+    text = (
+        f"Orientations were low-passed at {cutoff:g} Hz: a Butterworth filter of second order, forwards and backwards, "
+        "without delay; at the cut-off the amplitude is half (−6 dB)."
+        if cutoff
+        else "Orientations were not low-passed."
+    )
+    text += " Rates are means over 0.05 s. ± between repetitions is one standard deviation, with n − 1."
+    if any(joint.std is not None for movement in movements for joint in movement.angles.joints.values()):
+        text += (
+            " The ± that the pose states for one repetition is in square brackets, from the orientations' covariance"
+        )
+        if any(movement.isotropic for movement in movements):
+            text += ", here of one number for all axes of a segment, so that it is rough for a single angle; "
+            text += "`wepose track --covariance` writes all of it"
+        text += "."
+    return f"{text} CMC is the coefficient of multiple correlation of the curves (Kadaba et al. 1989), at most 1."
 
 
 def _tabulate_sessions(movements: Sequence[Movement]) -> Table:
@@ -92,14 +151,6 @@ def _tabulate_sessions(movements: Sequence[Movement]) -> Table:
         )
     header = ["session", "time", "repetitions by", "n", "duration", "CMC", "left out"]
     return Table(header, rows)
-
-
-def _list_reasons(movements: Sequence[Movement]) -> list[str]:
-    return [
-        f"{movement.name}: no repetitions{_by(movement)}: {movement.repetitions.reason}."
-        for movement in movements
-        if movement.repetitions.reason
-    ]
 
 
 def _by(movement: Movement) -> str:
@@ -145,8 +196,8 @@ def _pair(mean: float, sd: float, digits: int = 1) -> str:
     return f"{text} ± {sd:.{digits}f}" if np.isfinite(sd) else text
 
 
-def _tabulate_comparisons(movements: Sequence[Movement]) -> list[tuple[str, Table]]:
-    """Title and table of each further session against the first."""
+def _tabulate_comparisons(movements: Sequence[Movement]) -> list[Table]:
+    """A table of each further session against the first."""
     first, *others = [movement for movement in movements if movement.curves]
     header = ["angle", *HEADINGS, "curve, rms [°]", "curve, largest [°]"]
     tables = []
@@ -157,7 +208,7 @@ def _tabulate_comparisons(movements: Sequence[Movement]) -> list[tuple[str, Tabl
                 cells = [_difference(first, other, joint, k, m) for m in range(len(MEASURES))]
                 cells += _curve_difference(first.curves[joint][k], other.curves[joint][k])
                 rows.append([f"{plain(joint)}, {plain(angle)}", *cells])
-        tables.append((f"{other.name} less {first.name}", Table(header, rows)))
+        tables.append(Table(header, rows, f"{other.name} less {first.name}"))
     return tables
 
 
@@ -184,25 +235,17 @@ def _curve_difference(first: MeanCurve, other: MeanCurve) -> list[str]:
     return [f"{np.degrees(curve.rms):.1f}", f"{signed(float(np.degrees(curve.largest)))} at {curve.percent:.0f} %"]
 
 
-def _tabulate_phases(movements: Sequence[Movement]) -> list[tuple[str, Table]]:
-    """Title and table of the whole time and of each interval of a phase."""
+def _tabulate_whole_time(movements: Sequence[Movement]) -> list[Table]:
+    """A table of each session's whole time."""
     tables = []
     for movement in movements:
-        time = movement.angles.time
-        parts = [("all of the time", (float(time[0]), float(time[-1])))]
-        for name, spans in movement.phases.items():
-            if name != movement.repetitions.source:
-                many = len(spans) > 1
-                parts += [(f"{plain(name)}{f' {k}' if many else ''}", span) for k, span in enumerate(spans, 1)]
-        measures = measure_spans(movement.pose, movement.angles, [span for _, span in parts])
-        for row, (name, span) in enumerate(parts):
-            rows = [
-                [f"{plain(joint)}, {plain(angle)}", *_span_cells(each.values[row, k], each.std[row, k])]
-                for joint, each in measures.items()
-                for k, angle in enumerate(movement.angles[joint].names)
-            ]
-            title = f"{capital(name)}, {intervals([span])}"
-            tables.append((f"{movement.name}: {title}", Table(["angle", *HEADINGS], rows)))
+        span = (float(movement.angles.time[0]), float(movement.angles.time[-1]))
+        rows = [
+            [f"{plain(joint)}, {plain(angle)}", *_span_cells(each.values[0, k], each.std[0, k])]
+            for joint, each in measure_spans(movement.pose, movement.angles, [span]).items()
+            for k, angle in enumerate(movement.angles[joint].names)
+        ]
+        tables.append(Table(["angle", *HEADINGS], rows, f"{movement.name}, {intervals([span])}"))
     return tables
 
 
@@ -220,3 +263,85 @@ def _tabulate_definitions(movements: Sequence[Movement]) -> Table:
         ["joint", "rotation", "sequence", "axis", "angle", "positive"],
         [[plain(e.group), e.rotation, "-".join(e.sequence), e.axis, plain(e.angle), e.positive] for e in definitions],
     )
+
+
+# Figures --------------------------------------------------------------------------------------------------------------
+
+
+@styled
+def draw_figures(movements: Sequence[Movement]) -> Figures:
+    """Draw the repetitions over time, then the mean curves of each kind of joint, in the order of the page."""
+    figures = Figures()
+    found = [(k, each) for k, each in enumerate(movements) if each.repetitions.source in list_angles(each.angles)]
+    if found:  # a phase does not mark them in all
+        figures["repetitions"] = _draw_repetitions(found)
+    shown = [(k, movement) for k, movement in enumerate(movements) if movement.curves]
+    joints = dict.fromkeys(joint for _, movement in shown for joint in movement.curves)
+    for group, members in group_sides(joints).items():
+        sessions = [(k, movement) for k, movement in shown if set(members.values()) & set(movement.curves)]
+        figures[f"curves-{group}"] = _draw_curves(sessions, group, members)
+    return figures
+
+
+def _session_style(k: int) -> dict[str, Any]:
+    """The line of the k-th session."""
+    return {"color": SESSION_COLOURS[k % len(SESSION_COLOURS)], "linestyle": ("-", "--", ":", "-.")[k % 4]}
+
+
+def _draw_repetitions(found: Sequence[tuple[int, Movement]]) -> ReportFigure:
+    """The angle by which repetitions were found over time, a row a session."""
+    figure = ReportFigure("The main angle over time. Shaded, in turns: the repetitions.", 1.5 * len(found))
+    for ax, (k, movement) in zip(figure.grid(len(found))[:, 0], found, strict=True):
+        spans, source, time = movement.repetitions.spans, movement.repetitions.source, movement.angles.time
+        joint, place = list_angles(movement.angles)[source]
+        each = movement.angles[joint]
+        n = f"n = {len(spans)}" if len(spans) else "no repetitions"
+        ax.set_title(f"{movement.name}: {plain(source)} [°], {n}")
+        shade(ax, spans[::2], "", SHADE)
+        shade(ax, spans[1::2], "", BAND)
+        values = np.degrees(np.where(each.hidden(place), np.nan, each.values[:, place]))
+        ax.plot(*envelope(time, values), **_session_style(k))
+    figure.axes[-1].set_xlabel("time [s]")
+    return figure
+
+
+def _draw_curves(sessions: Sequence[tuple[int, Movement]], group: str, members: dict[str, str]) -> ReportFigure:
+    """A joint's three angles from 0 to 100 % of the repetition, left above right."""
+    first = next(each.angles[joint] for _, each in sessions for joint in members.values() if joint in each.curves)
+    cutoff = sessions[0][1].cutoff_hz
+    filtered = "not low-passed" if cutoff is None else f"low-passed at {cutoff:g} Hz (half amplitude)"
+    figure = ReportFigure(
+        f"The {plain(group)} over the repetition, sequence {'-'.join(first.sequence)}, {filtered}. Line: mean over n "
+        f"repetitions. Band: ± one standard deviation between them.{' Thin: the repetitions.' * (len(sessions) == 1)}",
+        1.7 * len(members),
+    )
+    for row, (side, joint) in zip(
+        figure.grid(len(members), 3, sharex=True, sharey="col"), members.items(), strict=True
+    ):
+        for place, ax in enumerate(row):
+            ax.set_title(f"{'' if side == joint else f'{side} '}{plain(first.names[place])} [°]")
+            ax.set_xlim(0.0, 100.0)
+            for k, movement in sessions:
+                if joint in movement.curves:
+                    label = f"{movement.name}, n = {len(movement.repetitions.spans)}"
+                    _draw_curve(ax, movement.curves[joint][place], k, label, alone=len(sessions) == 1)
+    for ax in row:
+        ax.set_xlabel("repetition [%]")
+        low, high = ax.get_ylim()
+        room = max(0.5 * (10.0 - (high - low)), 0.0)  # at least 10° high
+        ax.set_ylim(low - room, high + room)
+    figure.add_legend()
+    return figure
+
+
+def _draw_curve(ax: Axes, curve: MeanCurve, k: int, label: str, *, alone: bool) -> None:
+    mean, sd = np.degrees(curve.mean), np.degrees(curve.sd)
+    if not np.isfinite(mean).any():
+        ax.text(50.0, 0.0, "not determined (near gimbal lock)", ha="center", color=SOFT)
+        return
+    style = _session_style(k)
+    ax.fill_between(PERCENT, mean - sd, mean + sd, color=style["color"], alpha=0.2, linewidth=0)
+    if alone:
+        each = np.where(np.isfinite(mean), np.degrees(curve.curves[:MOST_CURVES]), np.nan)
+        ax.plot(PERCENT, each.T, color=SOFT, linewidth=0.3)
+    ax.plot(PERCENT, mean, **style, linewidth=1.8, label=label)

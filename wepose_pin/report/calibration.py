@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..calibration import Calibration, CalibrationQuality
-from ..calibration.conditions import find_measured_lengths, group_lengths, is_scale_observed
+from ..calibration.conditions import find_measured_lengths, group_lengths
 from ..calibration.observability import find_intervals
-from ..calibration.priors import DRIFT_STD
 from ..calibration.protocols import Protocol, load_protocol
 from ..calibration.quality import Check
 from ..calibration.weights import MIN_CONTACT
@@ -25,27 +23,19 @@ from ..model import ROOT, BodyTable
 from ..recording import Recording, compute_mount, find_mount_axes
 from ..subject import Subject, mount_rows
 from ..tracking import TrackedRecording, Tracker, TrackOptions
-from .calibration_figures import (
-    Length,
-    Places,
-    Sensor,
-    direction,
-    draw_gap,
-    draw_lengths,
-    draw_places,
-    draw_posture,
-    draw_sensors,
-    smoothed,
-)
-from .page import Page, PageWriter, Table
+from .figures import BAND, COLOURS, SOFT, ReportFigure, draw_over_time, styled
+from .page import Banner, Facts, Frame, Item, Page, PageWriter, Table
 from .viewer import pose_html
 from .words import capital, degrees, intervals, listed, plain, plural, plus_minus, signed, versions
 
-TEMPLATE = "report/templates/calibration.html.j2"
 FRAMES_A_SECOND = 20.0  # of the 3D view
 UNOBSERVED = 0.97  # of the start pose's standard deviation, above which the motion showed nothing
-# Zones of the joined hands, seen from the middle of the shoulders [m], and of their distance over the limb's length.
-LOW, ASIDE, BENT, STRETCHED = -0.25, 0.10, 0.60, 0.80
+SMOOTHED_S = 2.0  # [s] of the information over time
+QUALITIES = {
+    "pass": "**Pass:** the calibration is good to use.",
+    "poor": "**Poor:** usable, with larger errors than usual.",
+    "fail": "**Fail:** do not use this calibration.",
+}
 
 
 def write_calibration_page(
@@ -99,24 +89,19 @@ def render_calibration_report(
             untracked = [Diagnostic("motion-not-shown", WARNING, facts={"reason": str(error)})]
             if not isinstance(error, WeposeError) and failures is not None:
                 failures.append(f"the motion cannot be tracked: {reason(error)}")
-    page = Page(TEMPLATE, f"Calibration of {recording.name or 'a recording'}", failures)
-    page.add("first", lambda: _build_diagnostics_section(calibration, quality, untracked), name="The quality")
-    page.add("short", lambda: _build_summary_section(calibration, contact), name="In short")
-    page.add("lengths", lambda: _build_lengths_section(calibration, contact), "Lengths")
-    page.add("sensors", lambda: _build_sensors_section(calibration, recording), "Sensors")
-    page.add("gap", lambda: _build_gap_section(calibration, contact), f"{capital(contact.gap)} over time")
-    page.add(
-        "places",
-        lambda: _build_places_section(calibration, contact, None if tracked is None else tracked.pose),
-        "Where the motion was informative",
-    )
-    page.add("posture", lambda: _build_posture_section(calibration), "The start pose")
+    page = Page(f"Calibration of {recording.name or 'a recording'}", failures)
+    page.add("What can be relied on", lambda: [_describe_reliance(calibration, contact)], heading=False)
+    page.add("The quality", lambda: _list_diagnostics(calibration, quality, untracked), heading=False)
+    page.add("Lengths", lambda: _list_lengths(calibration, contact))
+    page.add("Sensors", lambda: _list_sensors(calibration, recording))
+    page.add(f"{capital(contact.gap)} over time", lambda: _list_gap(calibration, contact))
+    page.add("The start pose", lambda: _list_posture(calibration))
     joints = dict.fromkeys(plural(plain(calibration.model.table.shared_name(name))) for name in calibration.hinge_axes)
-    page.add("hinges", lambda: _build_hinges_section(calibration), f"The {listed([*joints])} as hinges")
-    page.add("view", lambda: _build_view_section(calibration, recording, tracked), "The motion in 3D")
-    page.add("checks", lambda: _build_checks_section(quality, contact), "Behind the quality")
-    page.add("run", lambda: _build_run_section(calibration, recording, contact, method), "What was run")
-    return page.html(f"Calibration of {recording.name}" if recording.name else "Calibration")
+    page.add(f"The {listed([*joints])} as hinges", lambda: _list_hinges(calibration))
+    page.add("The motion in 3D", lambda: _list_view(calibration, recording, tracked))
+    page.add("Behind the quality", lambda: _list_checks(quality, contact))
+    page.add("What was run", lambda: _list_run(calibration, recording, contact, method))
+    return page.html()
 
 
 class _Contact(NamedTuple):
@@ -148,50 +133,50 @@ def _describe_contact(protocol: Protocol, calibration: Calibration) -> _Contact:
     return _Contact(protocol.name, points, noun, gap, chain)
 
 
-# The sections: the values that the macros of the template take --------------------------------------------------------
+# Sections -------------------------------------------------------------------------------------------------------------
 
 
-def _build_diagnostics_section(
-    calibration: Calibration, quality: CalibrationQuality | None, untracked: Sequence[Diagnostic]
-) -> dict[str, Any]:
-    further = calibration.remarks if quality is None else quality.further
-    return {
-        "quality": "" if quality is None else quality.quality,
-        "reasons": [] if quality is None else lines(quality.reasons, titled=True),
-        "further": lines([*further, *untracked], titled=True),
-    }
-
-
-def _build_summary_section(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
+def _describe_reliance(calibration: Calibration, contact: _Contact) -> str:
+    """Two sentences: how well the lengths are known, and the mounts."""
     subject = calibration.subject
-    scaling = [name for name in calibration.measured if name in contact.chain or name not in subject.lengths]
-    tilts = {name: _mount_stds(subject, name) for name in subject.mounts}
-    known = {name: std for name, std in tilts.items() if np.isfinite(std).all()}
-    worst = [max(known, key=lambda name, k=k: known[name][k]) for k in (0, 1)] if known else []  # type: ignore[misc]
-    return {
-        "chain": bool(contact.chain),
-        "closed": is_scale_observed(calibration.conditions),
-        "scaling": [plain(name) for name in scaling],
-        "scale_percent": 100 * calibration.scale_std,
-        "gap": contact.gap if np.isfinite(calibration.rms_gap) else None,
-        "gap_mm": 1e3 * calibration.rms_gap,
-        "prior_gap_mm": 1e3 * calibration.prior_rms_gap,
-        "mounts": [(known[name][k], plain(name)) for k, name in enumerate(worst)],
-    }
+    stds = {name: 1e3 * subject.std(name) for name in contact.chain or subject.lengths}
+    stds = {name: std for name, std in stds.items() if np.isfinite(std)}
+    text = "The uncertainty of the lengths is not known."
+    if stds:
+        worst = max(stds, key=stds.__getitem__)
+        text = f"Lengths are known to ± {stds[worst]:.0f} mm or better ({plain(worst)})"
+        text += f", their common scale to ± {100 * calibration.scale_std:.1f} %." if contact.chain else "."
+    mounts = {name: _mount_stds(subject, name) for name in subject.mounts}
+    mounts = {name: std for name, std in mounts.items() if np.isfinite(std).all()}
+    if mounts:
+        worst = max(mounts, key=lambda name: max(mounts[name]))
+        tilt, heading = mounts[worst]
+        text += f" The mount known least is that of the {plain(worst)}: tilt ± {tilt:.1f}°, heading ± {heading:.1f}°."
+    return text
 
 
-def _build_lengths_section(calibration: Calibration, contact: _Contact) -> dict[str, Any]:
-    subject, prior = calibration.subject, calibration.prior
-    rows, lines, table = [], [], calibration.model.table
-    for parts in _list_lengths(table):
-        weights = np.ones(len(parts))
+def _list_diagnostics(
+    calibration: Calibration, quality: CalibrationQuality | None, untracked: Sequence[Diagnostic]
+) -> list[Item]:
+    items: list[Item] = []
+    further = calibration.remarks if quality is None else quality.further
+    if quality is not None:
+        items.append(Banner(quality.quality, QUALITIES[quality.quality], lines(quality.reasons, titled=True)))
+    entries = lines([*further, *untracked], titled=True)
+    return items + ([Banner("info", "What to know", entries)] if entries else [])
+
+
+def _list_lengths(calibration: Calibration, contact: _Contact) -> list[Item]:
+    subject, prior, table = calibration.subject, calibration.prior, calibration.model.table
+    rows, cells = [], []
+    for parts in _group_rigid_lengths(table):
         value, before = (sum(person.lengths.get(part, np.nan) for part in parts) for person in (subject, prior))
-        std, before_std = (_std(person, parts, weights) for person in (subject, prior))
+        std, before_std = (_std(person, parts) for person in (subject, prior))
         measured = calibration.measured.get(parts[0], np.nan) if len(parts) == 1 else np.nan
         label = " + ".join(plain(table.shared_name(part) if k else part) for k, part in enumerate(parts))
-        rows.append(Length(label, value, std, before, before_std, measured))
+        rows.append(LengthRow(label, value, std, before, before_std, measured))
         learned = calibration.information_shares.get(" + ".join(parts))
-        lines.append(
+        cells.append(
             [
                 label,
                 f"**{plus_minus(1e3 * value, 1e3 * std, 'mm')}**",
@@ -200,175 +185,104 @@ def _build_lengths_section(calibration: Calibration, contact: _Contact) -> dict[
                 f"{100 * float(np.sum(learned)):.0f} %" if learned is not None else "",
             ]
         )
-    header = ["length", "estimated", "prior", "measured", "learned from the motion"]
-    return {
-        "rigid": [
-            [plain(table.shared_name(part)) for part in reversed(parts)]
-            for parts in _list_lengths(table)
-            if len(parts) > 1 and set(parts) <= set(contact.chain) and table.side(parts[0]) != "right"
-        ],
-        "outside": [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.measured],
-        "learned": bool(calibration.information_shares),
-        "picture": draw_lengths(rows),
-        "lengths": Table(header, lines),
-    }
+    outside = [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.measured]
+    text = "± is one standard deviation throughout: two times out of three the truth lies within."
+    if calibration.information_shares:
+        text += " Learned from the motion: its fraction of the information; the rest is of prior and measured lengths."
+    if any(len(parts) > 1 and set(parts) <= set(contact.chain) for parts in _group_rigid_lengths(table)):
+        text += (
+            " Of a segment without a sensor and the one above it, the motion determines the sum; the prior splits it."
+        )
+    if outside:
+        text += f" Not in the chain, known by the prior's proportions alone: {', '.join(outside)}."
+    return [
+        draw_lengths(rows),
+        text,
+        Table(["length", "estimated", "prior", "measured", "learned from the motion"], cells),
+    ]
 
 
-def _build_sensors_section(calibration: Calibration, recording: Recording) -> dict[str, Any] | None:
-    subject = calibration.subject
-    rows, lines = [], []
-    for name, quat_LS in subject.mounts.items():
-        tilt, heading = _mount_stds(subject, name)
+def _list_sensors(calibration: Calibration, recording: Recording) -> list[Item]:
+    rows = []
+    for name, quat_LS in calibration.subject.mounts.items():
         drift = np.degrees(calibration.heading_drift.get(name, np.nan)) * 60.0
-        rows.append(Sensor(plain(name), tilt, heading, drift))
         up, forward = find_mount_axes(quat_LS)
         nearest = Rotation.from_quat(compute_mount(up, forward))
         off = np.degrees((nearest.inv() * Rotation.from_quat(quat_LS)).magnitude())
         sensor = recording.sensors.get(name)
-        stated = sensor is not None and sensor.stated_quat_LS is not None
-        lines.append(
+        rows.append(
             [
                 plain(name),
-                f"{_minus_sign(up)} up, {_minus_sign(forward)} forward, turned {off:.0f}°",
-                "yes" if stated else "no",
-                degrees(tilt),
-                degrees(heading),
+                f"{up} up, {forward} forward, turned {off:.0f}°".replace("-", "−"),
+                "yes" if sensor is not None and sensor.stated_quat_LS is not None else "no",
+                *map(degrees, _mount_stds(calibration.subject, name)),
                 f"{signed(drift)} °/min" if np.isfinite(drift) else "",
             ]
         )
     if not rows:
-        return None
+        return []
     header = ["sensor", "nearest axes in the start pose", "stated before", "tilt ±", "heading ±", "heading drift"]
-    starts = [calibration.model.table.segments[name].start_std[:2] for name in calibration.start_pose_offset]
-    picture = draw_sensors(rows, float(np.degrees(_rms(np.array(starts)))), float(np.degrees(DRIFT_STD)) * 60.0)
-    return {"picture": picture, "sensors": Table(header, lines)}
+    return [
+        "Which axes of each sensor point up and forward, and the angle from there; `subject.toml` has the "
+        "exact rotations. Without a magnetometer a heading drifts; the drift during the calibration was estimated "
+        "and removed.",
+        Table(header, rows),
+    ]
 
 
-def _build_gap_section(calibration: Calibration, contact: _Contact) -> dict[str, Any] | None:
+def _list_gap(calibration: Calibration, contact: _Contact) -> list[Item]:
     order = _closure_order(calibration)
     if len(order) < 2:
-        return None
+        return []
     time = calibration.time[order]
-    learned = {
-        label: smoothed(time, np.mean([calibration.information_shares[name] for name in names], axis=0)[order])
-        for label, names in _group_shares(calibration, contact).items()
-    }
-    step = float(np.median(np.diff(time)))
-    half = {}
-    for label, values in learned.items():
-        share = np.cumsum(np.sort(values)[::-1]) / max(float(np.sum(values)), 1e-12)
-        half[label] = (int(np.searchsorted(share, 0.5)) + 1) * step
-    gap, prior_gap = calibration.gap[order], calibration.prior_gap[order]
-    apart = _open_spans(time, calibration.contact[order])
-    return {
-        "picture": draw_gap(time, gap, prior_gap, apart, learned, contact.gap),
-        "gap": contact.gap,
-        "before_mm": 1e3 * calibration.prior_rms_gap,
-        "after_mm": 1e3 * calibration.rms_gap,
-        "half": half,
-        "seconds": len(time) * step,
-        "samples": calibration.effective_sample_size,
-    }
-
-
-def _build_places_section(calibration: Calibration, contact: _Contact, pose: Pose | None) -> dict[str, Any] | None:
-    """Where the motion was informative."""
-    if pose is None:
-        return None
-    shares = [
-        calibration.information_shares[name] for names in _group_shares(calibration, contact).values() for name in names
-    ]
-    order = _closure_order(calibration)
-    table, lengths = calibration.model.table, calibration.subject.lengths
-    limbs = [limb for point in contact.points if (limb := table.find_limb(point)) is not None]
-    starts = [limb.points[0] for limb in limbs]
-    if not (shares and len(order) and limbs) or not {*contact.points, *starts} <= set(pose.points):
-        return None
-    base = limbs[0].base or ""
-    if len(limbs) < len(contact.points) or base not in pose.quat_WL or {limb.base or "" for limb in limbs} != {base}:
-        return None
-    at = np.clip(np.searchsorted(pose.time, calibration.time[order] - 1e-6), 0, len(pose.time) - 1)
-    reach = np.mean([pose.points[name][at] for name in contact.points], axis=0)
-    reach = reach - np.mean([pose.points[name][at] for name in starts], axis=0)
-    reach = Rotation.from_quat(pose.quat_WL[base][at]).inv().apply(reach)
-    share = np.mean(shares, axis=0)[order]
-    touched = (calibration.contact[order] >= MIN_CONTACT) & np.isfinite(reach).all(axis=1)
-    if not touched.any():
-        return None
-    parts = [[table.find_length(*ends) for ends in pairwise(limb.points)] for limb in limbs]
-    straight = float(np.mean([sum(lengths[name] for name in names if name is not None) for names in parts]))
-    far = np.linalg.norm(reach, axis=1) / straight
-    width, trunk = (
-        lengths.get(table.find_length(*points) or "") for points in (limbs[0].origin, (ROOT, *limbs[0].origin))
+    text = (
+        f"{capital(contact.gap)}, root mean square while touching: {1e3 * calibration.prior_rms_gap:.1f} mm before, "
+        f"{1e3 * calibration.rms_gap:.1f} mm after. The effective sample size is "
+        f"{calibration.effective_sample_size:.0f}: neighbouring samples repeat the same information."
     )
-    sides = [{"left": 0.5, "right": -0.5}.get(table.side(name), 0.0) for name in contact.points]
-    reach = reach + [0.0, (width or 0.0) * float(np.mean(sides)), 0.0]
-    origin = plain(table.shared_name(starts[0]))
-    origins = plural(origin) if len(limbs[0].origin) > 1 else origin
-    places = Places(reach, 100 * share, touched, width, trunk, origins, plain(base))
-    zones = {
-        f"above the {origins}": reach[:, 2] > 0.0,
-        f"from the {origins} to {-100 * LOW:.0f} cm below": (reach[:, 2] <= 0.0) & (reach[:, 2] > LOW),
-        "lower": reach[:, 2] <= LOW,
-        f"to the left by over {100 * ASIDE:.0f} cm": reach[:, 1] > ASIDE,
-        f"in front of the {plain(base)}": np.abs(reach[:, 1]) <= ASIDE,
-        f"to the right by over {100 * ASIDE:.0f} cm": reach[:, 1] < -ASIDE,
-        f"near: under {100 * BENT:.0f} % of the limb's length": far < BENT,
-        "half stretched": (far >= BENT) & (far < STRETCHED),
-        f"stretched: over {100 * STRETCHED:.0f} %": far >= STRETCHED,
+    learned, step = {}, float(np.median(np.diff(time)))
+    for label, names in _group_shares(calibration, contact).items():
+        share = np.mean([calibration.information_shares[name] for name in names], axis=0)[order]
+        learned[f"learned about {label}"] = smooth_shares(time, share)
+        part = np.cumsum(np.sort(share)[::-1]) / max(float(np.sum(share)), 1e-12)
+        half = (int(np.searchsorted(part, 0.5)) + 1) * step
+        text += f" {half:.0f} s of {len(time) * step:.0f} s showed half of what the motion showed about {label}."
+    gaps = {
+        "with the prior's lengths": calibration.prior_gap[order],
+        "with the estimated lengths": calibration.gap[order],
     }
-    total = max(float(share[touched].sum()), 1e-12)
-    lines, rare = [], []
-    for name, inside in zones.items():
-        spent, learned = float(np.mean(inside[touched])), float(share[touched & inside].sum()) / total
-        rate = f"{learned / spent:.1f} × the mean" if spent > 0.005 else ""
-        lines.append([name, f"{100 * spent:.0f} %", f"{100 * learned:.0f} %", rate])
-        if spent < 0.05:
-            rare.append(name.split(":")[0])
-    low, high = np.percentile(reach[touched], [2.0, 98.0], axis=0) * 100
-    near, away = np.percentile(far[touched], [2.0, 98.0]) * 100
-    both = len(starts) > 1
-    header = [f"{contact.noun} {'were' if both else 'was'}", "of the time", "of what was learned", "per second"]
-    return {
-        "noun": contact.noun,
-        "origin": origins if both else origin,
-        "across": [_format_side(end[1], "right", "left") for end in (low, high)],
-        "up": [_format_side(end[2], "below", "above") for end in (low, high)],
-        "stretch": [near, away],
-        "rare": rare if both else [],
-        "picture": draw_places(places, contact.noun),
-        "zones": Table(header, lines),
-    }
+    return [draw_gap(time, gaps, calibration.contact[order], learned, contact.gap), text]
 
 
-def _build_posture_section(calibration: Calibration) -> dict[str, Any] | None:
+def _list_posture(calibration: Calibration) -> list[Item]:
     tilt = {name: np.asarray(t, dtype=float) for name, t in calibration.start_pose_offset.items()}
     tilt = {name: t for name, t in tilt.items() if np.isfinite(t).all()}
     if not tilt:
-        return None
-    lines, observed, table = [], {}, calibration.model.table
+        return []
+    rows, table = [], calibration.model.table
     for name, (x, y) in tilt.items():
         std = np.degrees([calibration.subject.std(row) for row in mount_rows(name)[:2]])
-        observed[name] = (~(std > UNOBSERVED * np.degrees(table.segments[name].start_std[:2]))).tolist()
-        tilts = ((1, x, std[0], observed[name][0]), (0, y, std[1], observed[name][1]))
-        lines.append([plain(name), *(_format_tilt(table, name, *about) for about in tilts)])
-    hinges = {}
+        observed = ~(std > UNOBSERVED * np.degrees(table.segments[name].start_std[:2]))
+        tilts = ((1, x, std[0], observed[0]), (0, y, std[1], observed[1]))
+        rows.append([plain(name), *(_format_tilt(table, name, *about) for about in tilts)])
+    bends = []
     for name, hinge in table.hinges.items():
         if hinge.on in tilt and hinge.moves in tilt:
             along = [
                 Rotation.from_rotvec([*tilt[segment], 0.0]).apply(table.segments[segment].along)
                 for segment in (hinge.on, hinge.moves)
             ]
-            hinges[plain(name)] = float(np.degrees(np.arccos(np.clip(along[0] @ along[1], -1.0, 1.0))))
-    return {
-        "hinges": hinges,
-        "picture": None if table.is_mechanism else draw_posture(tilt, observed, calibration.body),
-        "tilts": Table(["segment", "sideways", "forwards or backwards"], lines),
-    }
+            bend = float(np.degrees(np.arccos(np.clip(along[0] @ along[1], -1.0, 1.0))))
+            bends.append(f"{plain(name)} bent by {bend:.1f}°")
+    text = "Nobody stands exactly in the start pose. The offset of each segment was estimated with the lengths"
+    return [
+        f"{text}{': ' if bends else ''}{', '.join(bends)}.",
+        Table(["segment", "sideways", "forwards or backwards"], rows),
+    ]
 
 
-def _build_hinges_section(calibration: Calibration) -> dict[str, Any] | None:
-    lines, table = [], calibration.model.table
+def _list_hinges(calibration: Calibration) -> list[Item]:
+    rows, table = [], calibration.model.table
     for joint, axis in calibration.hinge_axes.items():
         x, y, z = np.asarray(axis, dtype=float)
         if table.side(joint) == "right":  # seen along its outer end
@@ -378,20 +292,23 @@ def _build_hinges_section(calibration: Calibration) -> dict[str, Any] | None:
         if not np.isfinite([forward, up]).all():
             continue
         ends = f"{abs(forward):.1f}° {'forwards' if forward > 0 else 'backwards'}", f"{abs(up):.1f}° "
-        lines.append([plain(joint), ends[0], ends[1] + ("up" if up > 0 else "down"), degrees(softness)])
-    header = ["joint", "axis turned", "axis raised", "softness"]
-    return {"hinges": Table(header, lines)} if lines else None
+        rows.append([plain(joint), ends[0], ends[1] + ("up" if up > 0 else "down"), degrees(softness)])
+    if not rows:
+        return []
+    return [
+        "In the N-pose the axes point sideways; their outer ends are turned as stated. Softness: how far the segment "
+        "below leaves the plane of the hinge, root mean square; over 5° a sensor slides, or soft tissue moves.",
+        Table(["joint", "axis turned", "axis raised", "softness"], rows),
+    ]
 
 
-def _build_view_section(
-    calibration: Calibration, recording: Recording, tracked: TrackedRecording | None
-) -> dict[str, Any] | None:
+def _list_view(calibration: Calibration, recording: Recording, tracked: TrackedRecording | None) -> list[Item]:
     if tracked is None or not len(calibration.time):
-        return None
+        return []
     begin, end = float(calibration.time.min()), float(calibration.time.max())
     samples = slice(*np.searchsorted(tracked.time, [begin - 1e-6, end + 1e-6]))
     if samples.stop - samples.start < 2:
-        return None
+        return []
     cut = Pose(
         tracked.time[samples],
         {name: quat[samples] for name, quat in tracked.quat_WL.items()},
@@ -402,12 +319,14 @@ def _build_view_section(
         for name, spans in recording.phases.items()
     }
     phases: Mapping[str, Sequence[tuple[float, float]]] = {name: spans for name, spans in visible.items() if spans}
-    return {"page": pose_html(tracked.model, cut, phases=phases, title=recording.name, fps=FRAMES_A_SECOND)}
+    page = pose_html(tracked.model, cut, phases=phases, title=recording.name, fps=FRAMES_A_SECOND)
+    caption = (
+        "The calibration motion as tracked with the calibrated subject. Drag to turn, scroll to zoom, space to pause."
+    )
+    return [Frame("The motion in 3D", caption, page)]
 
 
-def _build_run_section(
-    calibration: Calibration, recording: Recording, contact: _Contact, method: str
-) -> dict[str, Any]:
+def _list_run(calibration: Calibration, recording: Recording, contact: _Contact, method: str) -> list[Item]:
     lengths = {name: calibration.measured_lengths[name] for name in calibration.measured}
     measured = [f"{plain(n)} {1e3 * v.metres:.0f} ± {1e3 * v.measured_std:.0f} mm" for n, v in lengths.items()]
     imu, fused = len(recording.imus), len(recording.sensors) - len(recording.imus)
@@ -424,12 +343,12 @@ def _build_run_section(
         ("sensors mounted again", "yes" if recording.remounted else "no"),
         ("made with", versions()),
     ]
-    return {"rows": rows}
+    return [Facts(rows)]
 
 
-def _build_checks_section(quality: CalibrationQuality | None, contact: _Contact) -> dict[str, Any] | None:
+def _list_checks(quality: CalibrationQuality | None, contact: _Contact) -> list[Item]:
     if quality is None:
-        return None
+        return []
     rows = []
     for check in quality.checks:
         if np.isfinite(check.value):
@@ -438,14 +357,108 @@ def _build_checks_section(quality: CalibrationQuality | None, contact: _Contact)
             limits = [f"{bound} {quantity(limit, unit)}" for limit in check.limits]
             rows.append([quantity_name, quantity(check.value, unit), *limits, check.quality])
     header = ["checked", "value", "passes", "poor", "quality"]
-    unknowns = {"unknowns": quality.unknowns, "rank": quality.rank, "determined": quality.determined}
-    return {**unknowns, "checks": Table(header, rows)} if rows else None
+    if not rows:
+        return []
+    return [
+        f"The motion showed {quality.rank} of {quality.unknowns} independent combinations of lengths and mounts, and "
+        f"determined {quality.determined} of them better than the prior.",
+        Table(header, rows),
+    ]
+
+
+# Figures --------------------------------------------------------------------------------------------------------------
+
+
+class LengthRow(NamedTuple):
+    """A row of the lengths, all in m; NaN where something is not known."""
+
+    label: str
+    value: float
+    std: float
+    prior: float
+    prior_std: float
+    measured: float
+
+
+@styled
+def draw_lengths(rows: Sequence[LengthRow]) -> ReportFigure:
+    """Each length against the prior's, with intervals."""
+    figure = ReportFigure(
+        "Lengths against the prior's; bars are one, thin lines two standard deviations.", 0.28 * len(rows) + 0.1
+    )
+    ax = figure.grid(left_in=1.7)[0, 0]
+    at = -np.arange(len(rows), dtype=float)
+    off, std, before = (
+        1e3 * np.array(values)
+        for values in ([r.value - r.prior for r in rows], [r.std for r in rows], [r.prior_std for r in rows])
+    )
+    measured = 1e3 * np.array([row.measured - row.prior for row in rows])
+    ax.barh(at, 2 * before, left=-before, height=0.62, color=BAND, label="prior, ± 1 standard deviation")
+    ax.errorbar(off, at, xerr=2 * std, fmt="none", color=COLOURS["right"], elinewidth=0.9)
+    ax.errorbar(off, at, xerr=std, fmt="o", color=COLOURS["right"], elinewidth=3, markersize=5, label="estimated")
+    if np.isfinite(measured).any():
+        ax.plot(measured, at + 0.3, "v", color="black", markerfacecolor="white", label="measured")
+    ax.axvline(0.0, color=SOFT, linewidth=0.8)
+    ax.set_yticks(at, [row.label for row in rows])
+    ax.set_xlabel("longer than the prior [mm]")
+    ax.grid(axis="y", visible=False)
+    ax.margins(x=0.04)
+    figure.add_legend()
+    return figure
+
+
+@styled
+def draw_gap(
+    time: np.ndarray, gaps: Mapping[str, np.ndarray], contact: np.ndarray, learned: Mapping[str, np.ndarray], label: str
+) -> ReportFigure:
+    """The gap before and after over time, and below how much each second showed.
+
+    Parameters
+    ----------
+    gaps, learned : label → (n,) [m] and [%/s]
+    contact : (n,) weight, below `MIN_CONTACT` where the points were apart
+    label : what the gap is
+    """
+    panels = {f"{label} [mm]": {name: 1e3 * gap for name, gap in gaps.items()}}
+    caption = capital(f"{label} over time, before and after.")
+    if learned:
+        panels["learned [% per second]"] = dict(learned)
+        caption += f" Below: the share of the information that each second gave, over {SMOOTHED_S:g} s."
+    at = insert_breaks(time, time)
+    panels = {title: {n: insert_breaks(time, v) for n, v in each.items()} for title, each in panels.items()}
+    looks = [(COLOURS["left"], "--"), (COLOURS["right"], "-"), (COLOURS["other"], "-"), (SOFT, "-.")]
+    names = [*gaps, *learned]
+    styles = {name: {"color": c, "linestyle": d, "label": name} for name, (c, d) in zip(names, looks, strict=False)}
+    half = 0.5 * float(np.median(np.diff(time)))
+    apart = [(begin - half, end + half) for begin, end in find_intervals(time, contact < MIN_CONTACT)]
+    figure = draw_over_time(at, panels, caption, styles, spans=("apart, left out", apart))
+    touched = contact >= MIN_CONTACT
+    usual = 1e3 * np.concatenate([gap[touched] if touched.any() else gap for gap in gaps.values()])
+    figure.axes[0].set_ylim(
+        0.0, 1.12 * max(float(np.nanmax(usual, initial=1.0)), 1.0)
+    )  # lines may leave it while apart
+    return figure
+
+
+def smooth_shares(time: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Smooth shares (n,) of the samples over `SMOOTHED_S`, to [%/s]."""
+    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    half = SMOOTHED_S / 2.0
+    total = np.concatenate(([0.0], np.cumsum(np.nan_to_num(share))))
+    first, last = np.searchsorted(time, time - half), np.searchsorted(time, time + half, "right")
+    return 100.0 * (total[last] - total[first]) / ((last - first) * step)
+
+
+def insert_breaks(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (n,) with a NaN inserted wherever time jumps, so that a line breaks there."""
+    jumps = np.flatnonzero(np.diff(time) > 3.0 * np.median(np.diff(time))) + 1
+    return np.insert(values.astype(float), jumps, time[jumps] if values is time else np.nan)
 
 
 # Words and small sums -------------------------------------------------------------------------------------------------
 
 
-def _list_lengths(table: BodyTable) -> list[tuple[str, ...]]:
+def _group_rigid_lengths(table: BodyTable) -> list[tuple[str, ...]]:
     """The lengths of the page, those from the root last, each in a tuple.
 
     A segment that lies rigidly along the one above where it has no sensor is followed by the sum of both lengths.
@@ -488,26 +501,16 @@ def _closure_order(calibration: Calibration) -> np.ndarray:
     return order[np.isfinite(calibration.gap[order])]
 
 
-def _open_spans(time: np.ndarray, contact: np.ndarray) -> list[tuple[float, float]]:
-    """Spans [s] in which the palms were apart."""
-    half = 0.5 * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    return [(begin - half, end + half) for begin, end in find_intervals(time, contact < MIN_CONTACT)]
-
-
 def _mount_stds(subject: Subject, segment: str) -> tuple[float, float]:
     """Standard deviations [deg] of a mount's tilt, root mean square of both axes, and of its heading."""
     x, y, z = np.degrees([subject.std(row) for row in mount_rows(segment)])
     return float(np.sqrt(0.5 * (x**2 + y**2))), float(z)
 
 
-def _std(subject: Subject, names: Sequence[str], weights: np.ndarray) -> float:
+def _std(subject: Subject, names: Sequence[str]) -> float:
     if not set(names) <= set(subject.order):
         return float("nan")
-    return float(np.sqrt(weights @ subject.lengths_covariance(names) @ weights))
-
-
-def _minus_sign(axis: str) -> str:
-    return axis.replace("-", "−")
+    return float(np.sqrt(subject.lengths_covariance(names).sum()))
 
 
 def _describe_check(check: Check, contact: _Contact) -> tuple[str, str]:
@@ -535,12 +538,23 @@ def _format_tilt(table: BodyTable, name: str, across: int, angle: float, std: fl
     deg = float(np.degrees(angle))
     if not observed:
         return f"not seen, ± {std:.1f}° assumed"
-    return f"{plus_minus(abs(deg), std, '°')} {direction(table, name, across, deg)}".replace(" °", "°")
+    return f"{plus_minus(abs(deg), std, '°')} {describe_direction(table, name, across, deg)}".replace(" °", "°")
 
 
-def _format_side(value: float, negative: str, positive: str) -> str:
-    return f"{abs(value):.0f} cm {positive if value >= 0.0 else negative}"
+def describe_direction(table: BodyTable, segment: str, across: int, angle: float) -> str:
+    """Where a tilt takes the free end of a segment: a torso's upper one, an arm's lower one, a foot's front one.
 
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else float("nan")
+    `across` 0: from the side, 1: from the front.
+    """
+    positive, own = angle > 0.0, table.segments[segment]
+    if abs(own.along[2]) < 0.5 and across == 0:
+        return "downwards" if positive else "upwards"
+    if own.spine or abs(own.along[2]) < 0.5:
+        if across == 0:
+            return "forwards" if positive else "backwards"
+        return "to the right" if positive else "to the left"
+    if across == 0:
+        return "backwards" if positive else "forwards"
+    if not table.side(segment):
+        return "to the left" if positive else "to the right"
+    return "outwards" if positive == (table.side(segment) == "left") else "inwards"

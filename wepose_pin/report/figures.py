@@ -30,7 +30,7 @@ DASHES = {  # by the place among the lines of a side
     "other": ("-", (0, (2, 1)), (0, (6, 1))),
 }
 SHADE, BAND, SOFT = "#e9eef4", "#cdd9e5", "#8794a3"
-STYLE = {
+STYLE: Any = {
     "font.family": ["sans-serif"],
     "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial"],
     "font.size": 8.5,
@@ -54,7 +54,8 @@ STYLE = {
     "svg.hashsalt": "wepose",
 }
 Spans = Iterable[Sequence[float]] | np.ndarray
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def styled(draw: Callable[P, R]) -> Callable[P, R]:
@@ -84,7 +85,7 @@ class ReportFigure(Figure):
             "bottom": BOTTOM_IN / height,
             "top": 1.0 - TOP_IN / height,
             "wspace": 0.24,
-            "hspace": 0.2 if rows == 1 else 0.34 * rows / (height - TOP_IN - BOTTOM_IN),
+            "hspace": (0.34 if "sharex" in options else 0.6) * rows / (height - TOP_IN - BOTTOM_IN),
         }
         axes: np.ndarray = self.subplots(rows, columns, squeeze=False, gridspec_kw=places, **options)
         for ax in axes.ravel():
@@ -94,7 +95,7 @@ class ReportFigure(Figure):
 
     def add_legend(self) -> None:
         """One legend above the plots, each label once."""
-        entries = {}
+        entries: dict[str, Any] = {}
         for ax in self.axes:
             for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
                 entries.setdefault(label, handle)
@@ -109,7 +110,8 @@ class ReportFigure(Figure):
             ax.set_position((place.x0, place.y0 * height / (height + extra), place.width,
                              place.height * height / (height + extra)))  # fmt: skip
         self.legend(
-            list(entries.values()), list(entries), loc="upper left", ncols=columns, borderaxespad=0.1,
+            list(entries.values()),
+            list(entries), loc="upper left", ncols=columns, borderaxespad=0.1,
             bbox_to_anchor=(0.01, 1.0), handlelength=2.2, columnspacing=1.6,
         )  # fmt: skip
 
@@ -251,7 +253,7 @@ def set_up_views(
         ax.invert_xaxis() if view == "from above" else None
         if trunk is not None:
             ax.add_patch(Circle((0.0, 0.0 if up == 0 else 20.0), 10.0, color=BAND, zorder=0.8))
-        limb = {"color": BAND, "linewidth": 7.0, "solid_capstyle": "round", "zorder": 0.8}
+        limb: dict[str, Any] = {"color": BAND, "linewidth": 7.0, "solid_capstyle": "round", "zorder": 0.8}
         if across == 1 and width is not None:
             ax.plot([-50.0 * width, 50.0 * width], [0.0, 0.0], **limb)
         if up == 2 and trunk is not None:

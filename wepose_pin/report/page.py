@@ -121,7 +121,9 @@ class Page:
 
 
 def _prepare(item: Item) -> object:
-    if not hasattr(item, "svg"):
+    from .figures import ReportFigure
+
+    if not isinstance(item, ReportFigure):
         return item
     address = base64.b64encode(item.svg().encode()).decode("ascii")
     return _Picture(item.caption, f"data:image/svg+xml;base64,{address}")

@@ -191,7 +191,7 @@ def _list_facts(tracked: TrackedRecording, measures: Measures) -> list[Item]:
     before = _find_time_before(tracked)
     if before >= 1.0:
         text += (
-            f" Each ± is of the time after the start pose: the {_format_duration(before)} before its end are left out."
+            f" Each ± is of the time after the start pose; the {_format_duration(before)} before its end are left out."
         )
     return [text]
 
@@ -223,8 +223,8 @@ def _list_recorded(tracked: TrackedRecording, measures: Measures) -> list[Item]:
     low, high = (f"{step:.2f}" for step in measures.steps_ms)
     phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())
     items: list[Item] = [
-        f"{measures.samples} samples at {measures.rate_hz:g} Hz, one every {low if low == high else f'{low} to {high}'} "
-        f"ms.{f' Phases: {phases}.' if phases else ''}",
+        f"{measures.samples} samples at {measures.rate_hz:g} Hz, one every {low if low == high else f'{low} to {high}'}"
+        f" ms.{f' Phases: {phases}.' if phases else ''}",
         draw_timeline(tracked, measures.signals),
         recorded,
         "Acceleration includes gravity. Saturated: an axis was at the end of its range, and the orientation lacks the "
@@ -245,15 +245,15 @@ def _list_drift(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> lis
     recording, correction = tracked.recording, tracked.correction
     after_start = find_samples_after_start(tracked)
     text = (
-        "Gravity corrects the tilt all the time. No sensor measures the heading, the rotation about the vertical: it is "
-        "set in the start pose and then drifts with the sum of the gyroscope's errors."
+        "Gravity corrects the tilt. No sensor measures the heading, the rotation about the vertical: it is set in the "
+        "start pose and then drifts with the gyroscope's errors."
     )
     growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
     if growth:
         fastest = max(growth, key=growth.__getitem__)
         text += (
             f" By drift alone its uncertainty grows by up to {np.degrees(growth[fastest]):.1f}° in a minute of motion "
-            f"(the {plain(fastest)}); in a static phase it hardly grows. {describe_heading_remedy(tracked)}"
+            f"(the {plain(fastest)}). {describe_heading_remedy(tracked)}"
         )
     has_clasp = correction is not None and (correction.gap_rms_mm is not None or bool(correction.found_clasps))
     if correction is not None:
@@ -294,7 +294,7 @@ def _list_drift(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> lis
     figure = draw_over_time(
         tracked.time,
         {"heading, ± [°]": {name: np.degrees(budget.std) for name, budget in budgets.items()}},
-        "Uncertainty of each segment's heading over time: one standard deviation, with mounts, start pose and soft tissue.",
+        "Uncertainty of each heading: one standard deviation, with mounts, start pose and soft tissue.",
         _style_segments(budgets, tracked.model.table),
         spans=("hands joined", recording.phases.get("clasp", ()) if has_clasp else ()),
     )
@@ -346,8 +346,8 @@ def _list_error_budget(tracked: TrackedRecording) -> list[Item]:
         return []
     header = ["", *(f"{source} [mm]" for source in next(iter(rows.values())))]
     return [
-        "One standard deviation of an axis, root mean square over the recording; the parts add up in squares. The sizes of "
-        "soft tissue, start poses and the shoulder girdle are those of the literature, not measured on this person.",
+        "Root mean square over the recording; the parts add up in squares. Soft tissue, start poses and the "
+        "shoulder girdle are as in the literature, not measured on this person.",
         Table(header, [[plain(point), *(whole(1e3 * v) for v in row.values())] for point, row in rows.items()]),
     ]
 
@@ -380,9 +380,8 @@ def _list_angles(tracked: TrackedRecording, angles: Angles | None) -> list[Item]
         else ""
     )
     return [
-        "After the recommendations of the International Society of Biomechanics (Wu et al. 2005), left and right with the "
-        "same signs. A name says which way is positive; elevation alone is negative where the arm is raised, and pronation "
-        f"is 90° with the palms at the thighs.{stated}",
+        "After the International Society of Biomechanics (Wu 2005), left and right with the same signs. Elevation "
+        f"is negative where the arm is raised, and pronation is 90° with the palms at the thighs.{stated}",
         draw_joint_angles(angles),
         Table(["angle", "lowest", "highest", "range", "peak rate", "median ±", "near gimbal lock"], rows),
         "Near gimbal lock (10°) the first and the third angle of a joint are not separable and are left out; the "
@@ -458,11 +457,9 @@ def draw_timeline(tracked: TrackedRecording, signals: Mapping[str, Signal]) -> R
                 np.full(len(begin), -row - 0.06), begin, end, "black", linewidth=2.5, label=labels.pop("static", None)
             )
         if signal.gap.any():
-            spans = [(a, b - a) for a, b in find_spans(time, signal.gap)]
-            label = labels.pop("gap", None)
-            ax.broken_barh(
-                spans, (-row, 0.85), facecolor="none", edgecolor=SOFT, hatch="////", linewidth=0, label=label
-            )
+            bars = [(a, b - a) for a, b in find_spans(time, signal.gap)]
+            hatched: dict[str, Any] = {"facecolor": "none", "edgecolor": SOFT, "hatch": "////", "linewidth": 0}
+            ax.broken_barh(bars, (-row, 0.85), label=labels.pop("gap", None), **hatched)
         if signal.cut.any():
             first = find_spans(time, signal.cut)[:, 0]
             ax.plot(
@@ -542,7 +539,8 @@ def draw_tips(time: np.ndarray, groups: Sequence[TipGroup], table: BodyTable) ->
 
 def draw_joint_angles(angles: Angles) -> ReportFigure:
     """Draw a row for each kind of joint, as the elbows, with its three angles."""
-    panels, styles = {}, {}
+    panels: dict[str, dict[str, np.ndarray]] = {}
+    styles: dict[str, dict[str, Any]] = {}
     for group, members in group_sides(angles.joints).items():
         for k, name in enumerate(angles[next(iter(members.values()))].names):
             lines = {side: np.degrees(_break_line(angles[joint], k)) for side, joint in members.items()}
