@@ -122,8 +122,7 @@ class TrackResult(PosedBody):
         >>> figures = result.plot()
         >>> list(figures)
         ['paths', 'reach', 'angles']
-        >>> figures["angles"].axes[0].set_ylim(-30.0, 30.0)
-        (-30.0, 30.0)
+        >>> figures["angles"].set_size_inches(7.0, 4.0)
         >>> figures["angles"].savefig("angles.pdf")
         """
         from .report.notebook import draw_figures

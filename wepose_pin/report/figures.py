@@ -85,7 +85,7 @@ class ReportFigure(Figure):
             "bottom": BOTTOM_IN / height,
             "top": 1.0 - TOP_IN / height,
             "wspace": 0.24,
-            "hspace": (0.34 if "sharex" in options else 0.6) * rows / (height - TOP_IN - BOTTOM_IN),
+            "hspace": (0.42 if "sharex" in options else 0.6) * rows / (height - TOP_IN - BOTTOM_IN),
         }
         axes: np.ndarray = self.subplots(rows, columns, squeeze=False, gridspec_kw=places, **options)
         for ax in axes.ravel():
