@@ -49,7 +49,8 @@ def test_help_loads_no_heavy_room() -> None:
     code = (
         "import sys, wepose_pin.cli as c\n"
         "try:\n    c.main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print(sorted(set(sys.modules) & {'numpy', 'pinocchio', 'numba', 'yourdfpy', 'casadi', 'polars', 'meshcat', 'matplotlib'}))"
+        "heavy = {'numpy', 'pinocchio', 'numba', 'yourdfpy', 'casadi', 'polars', 'meshcat', 'matplotlib'}\n"
+        "print(sorted(set(sys.modules) & heavy))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.splitlines()[-1] == "[]"
