@@ -22,7 +22,7 @@ import wepose_pin as wp
 from wepose_pin.cli import main
 from wepose_pin.errors import BadData, WeposeError
 from wepose_pin.readers.device import join_signals, spread_equal_times
-from wepose_pin.readers.formats import detect_format, read_device
+from wepose_pin.readers.registry import detect_format, read_device
 
 G = 9.80665
 US0 = 1_700_000_000_000_000  # µs since 1970
@@ -509,10 +509,10 @@ def test_a_damaged_file_is_one_line(
     ("format", "change", "says"),
     [
         ("shimmer", (b"deg/s", b"furl"), r"'Shimmer_8665_Gyro_X_CAL' is in 'furl'; there is: rad/s, deg/s"),
-        ("shimmer", (b"Gyro", b"Gxxx"), "no device has Quat in it"),
-        ("noraxon", (b"Gyroscope", b"Gxxx"), "no segment has both Gyroscope and Acceleration"),
+        ("shimmer", (b"Gyro", b"Gxxx"), "no sensor in it has Gyro and Accel_LN or Accel_WR, nor Quat"),
+        ("noraxon", (b"Gyroscope", b"Gxxx"), "no sensor in it has both Gyroscope and Acceleration"),
         ("noraxon", (b"(mG)", b"(V)"), "is in 'V'; there is: m/s"),
-        ("delsys", (b"GYRO Z (deg/s)", b"EMG 2 (mV)"), "no sensor has three channels of ACC and three of GYRO"),
+        ("delsys", (b"GYRO Z (deg/s)", b"EMG 2 (mV)"), "no sensor in it has three channels of ACC and three of GYRO"),
         ("delsys", (b"ACC X Time Series (s)", b"ACC W"), "no time in common|no column of times"),
         ("sensor_logger", (b"time,seconds", b"tame,seconds"), "no column 'time' in Gyroscope.csv"),
         ("phyphox", (b"rad/s", b"m"), "is in 'm'; there is: rad/s, deg/s"),

@@ -35,10 +35,10 @@ from ..recording.limits import LONGEST_STEP_S, STANDARD_GRAVITY
 from ..recording.sensors import compute_rate
 from .arrays import ArrayFile, is_array_file
 from .device import GYRO_UNITS, Device, read_first_lines
-from .formats import FOLDERS, TITLES, WHOLE, detect_format, read_device
 from .guess import Guess, guess_arrays, guess_columns
 from .live_log import read_live_log
 from .reference import read_reference
+from .registry import detect_format, find_title, is_whole, may_be_folder, read_device
 from .session import SessionReader
 from .tables import FORMATS as TABLES
 from .tables import Rows, read_columns, read_table
@@ -387,14 +387,13 @@ def _session_text(
 def _propose_from_device(path: Path, folder: Path, format: str, table: BodyTable) -> _Proposal:
     """Propose a session for a file of a known format, with the files beside it where each sensor has one."""
     device, rate = _read(path, format, table)
-    title = (
-        f"{TITLES[format]}, {'gyroscope and accelerometer' if device.kind == 'raw' else 'orientations, no raw data'}"
-    )
+    signals = "gyroscope and accelerometer" if device.kind == "raw" else "orientations, no raw data"
+    title = f"{find_title(format)}, {signals}"
     if format == "wepose_live":
         facts, phases = _describe_live(path)
         worn = {str(segment): list[str]() for segment in device.labels.values()}
         return _Proposal(title, [f"file = {_relative(path, folder)}"], worn, facts=facts, phases=phases)
-    if len(device.labels) > 1 or format in WHOLE:
+    if len(device.labels) > 1 or is_whole(format):
         tables: dict[str, list[str]] = {}
         for label, segment in device.labels.items():
             where = segment if segment and segment not in tables else f"?{label}"
@@ -424,7 +423,8 @@ def _propose_from_device(path: Path, folder: Path, format: str, table: BodyTable
     if len(tables) - len(unknown) > 1:
         title += f", {len(tables) - len(unknown)} files"
     diagnostics += _unknown_segments(path.parent, unknown)
-    return _Proposal(title, [f'format = "{format}"', *rate], tables, labels, diagnostics=diagnostics)
+    stated = _relative(Path(format), folder) if format.endswith(".toml") else toml_string(format)
+    return _Proposal(title, [f"format = {stated}", *rate], tables, labels, diagnostics=diagnostics)
 
 
 def _unknown_segments(path: Path, sensors: Sequence[str]) -> list[Diagnostic]:
@@ -480,7 +480,7 @@ def _write_example(begin: float, end: float) -> str:
 
 def _siblings(path: Path, format: str) -> list[Path]:
     """List the file and those of the same format beside it: the files of one recording are in one folder."""
-    if path.is_dir() or (format in FOLDERS and path.suffix.lower() == ".csv"):
+    if path.is_dir() or (may_be_folder(format) and path.suffix.lower() == ".csv"):
         own = path if path.is_dir() else path.parent
         beside = [folder for folder in sorted(own.absolute().parent.iterdir()) if folder.is_dir()]
         same = [own if folder == own.absolute() else folder for folder in beside]

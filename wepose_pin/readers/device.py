@@ -17,11 +17,7 @@ from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData, MissingFile, one_of
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from .guess import guess_unit
-from .tables import NO_VALUE, read_columns
 
-# A table begins within this many lines of a file; the lines before it describe the device.
-PREAMBLE_LINES = 100
-SEPARATORS = "\t,; "
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}
@@ -37,7 +33,7 @@ class Device:
 
     Parameters
     ----------
-    format : its name, a key of `wepose_pin.readers.formats.FORMATS`
+    format : its name, as `wepose_pin.readers.registry` knows it
     table : `time` [s] on the device's clock, and the columns of `name_columns`
     own_tables : label → such a table, of the sensors that have clocks of their own; these all begin at one moment
     labels : the file's name of each sensor or segment → our segment, None where the name is not clear
@@ -115,13 +111,6 @@ def convert(path: Path, signal: str, values: np.ndarray, unit: str, column: str)
         stated = f"'{unit}'" if unit else "no unit that it states"
         raise BadData(f"{path}: '{column}' is in {stated}; {one_of(known, unit)}")
     return known[guess] * values
-
-
-def read_converted(path: Path, table: pl.DataFrame, signal: str, columns: Sequence[str], unit: str) -> np.ndarray:
-    """Read the columns of a signal in SI, orientations (w, x, y, z in the file) as xyzw."""
-    values = read_columns(table, columns, str(path), str(path))
-    check_measured(path, values, ", ".join(columns))
-    return values[:, [1, 2, 3, 0]] if signal == "orientation" else convert(path, signal, values, unit, columns[0])
 
 
 def spread_equal_times(time: np.ndarray) -> np.ndarray:
@@ -216,7 +205,7 @@ def check_measured(path: Path, values: np.ndarray, what: str) -> None:
         raise BadData(f"{path}: {what} holds {largest:.3g} in row {too_large[0] + 1}; no device measures as much")
 
 
-def read_first_lines(path: Path, most: int = PREAMBLE_LINES) -> list[str]:
+def read_first_lines(path: Path, most: int = 100) -> list[str]:
     """Read the first lines of a text file; bytes that are not UTF-8 are replaced.
 
     Raises
@@ -232,127 +221,3 @@ def read_first_lines(path: Path, most: int = PREAMBLE_LINES) -> list[str]:
         raise MissingFile(f"{path}: no such file") from None
     except OSError as error:
         raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
-
-
-@dataclass(frozen=True)
-class Text:
-    """A text file of a device: the lines before its table, and the table, all cells text.
-
-    Parameters
-    ----------
-    path : the file
-    about : name → value of the lines `name: value` before the table
-    cells : the table, without an incomplete last line
-    """
-
-    path: Path
-    about: Mapping[str, str]
-    cells: pl.DataFrame
-
-    def __contains__(self, names: Sequence[str]) -> bool:
-        return all(name in self.cells.columns and self.cells[name].is_not_null().any() for name in names)
-
-    def numbers(self, names: Sequence[str]) -> np.ndarray:
-        """Return columns (n, k); empty cells are NaN."""
-        values = read_columns(self.cells, names, str(self.path), str(self.path))
-        check_measured(self.path, values, ", ".join(names))
-        return values
-
-
-def read_text(path: Path, first: str, what: str) -> Text:
-    """Read the table whose header has the column `first`, separated by tabs, commas, semicolons or single spaces.
-
-    Raises
-    ------
-    MissingFile, BadData
-        The file is missing, or has no such header, or no line of numbers after it.
-    """
-    lines = read_first_lines(path)
-    head, separator = _find_header(lines, first)
-    if head is None:
-        raise BadData(f"{path}: no line of names with '{first}' in its first {PREAMBLE_LINES} lines; {what} has one")
-    about = {}
-    for line in lines[:head]:
-        name, colon, value = line.strip("/ ").partition(":")
-        if colon:
-            about[name.strip()] = value.strip(f" {SEPARATORS}")
-    with path.open("rb") as file:
-        for _ in range(head):
-            file.readline()
-        rest = file.read()
-    rest = rest.removeprefix(b"\xef\xbb\xbf")
-    header, _, body = rest.partition(b"\n")
-    names = [cell.strip(' "\r') for cell in header.decode("utf-8", errors="replace").split(separator)]
-    while names and not names[-1]:
-        names.pop()
-    return Text(path, about, parse_rows(path, body, names, separator, head + 1, what))
-
-
-def parse_rows(
-    path: Path, body: bytes, names: Sequence[str], separator: str, names_line: int, what: str
-) -> pl.DataFrame:
-    """Parse the rows after the header in line `names_line` of the file: cells are text, null without a value.
-
-    Raises
-    ------
-    BadData
-        Two columns of one name; zero bytes; no rows.
-    """
-    if len(set(names)) < len([name for name in names if name]) or b"\0" in body:
-        reason = "zero bytes in it" if b"\0" in body else "two columns of one name"
-        raise BadData(f"{path}: is no {what}: there are {reason}")
-    if not body.strip():
-        raise BadData(
-            f"{path}: has no line of numbers after its names in line {names_line}; the export is empty or cut off"
-        )
-    schema = {name or f"column {k}": pl.String for k, name in enumerate(names)}
-    try:
-        cells = pl.read_csv(
-            body,
-            has_header=False,
-            separator=separator,
-            schema=schema,
-            truncate_ragged_lines=True,
-            encoding="utf8-lossy",
-            quote_char=None,
-        )
-    except pl.exceptions.PolarsError as error:
-        raise BadData(f"{path}: cannot be read as {what}: {' '.join(str(error).split())[:120]}") from error
-    cells = cells.with_columns(pl.all().str.strip_chars(' "\r'))
-    cells = cells.with_columns(pl.when(~pl.all().is_in(NO_VALUE)).then(pl.all()).name.keep())
-    if separator != ",":
-        cells = cells.with_columns(pl.all().str.replace(",", ".", literal=True))
-    filled = cells.select(pl.any_horizontal(pl.all().is_not_null()))[:, 0]
-    cells = cells.filter(filled)
-    if cells.height and not body.endswith(b"\n") and cells[-1, cells.width - 1] is None:
-        cells = cells.head(-1)  # the last line is incomplete
-    return cells
-
-
-def _find_header(lines: Sequence[str], first: str) -> tuple[int | None, str]:
-    """Find the line of column names that has `first`, and its separator."""
-    for k, line in enumerate(lines):
-        if line.startswith("//"):
-            continue
-        for separator in SEPARATORS:
-            if first in (cell.strip(' "') for cell in line.split(separator)):
-                return k, separator
-    return None, ""
-
-
-def compute_counted_time(counter: np.ndarray, rate_hz: float, wraps: float) -> tuple[np.ndarray, float]:
-    """Compute times (n,) [s] from a packet counter, and the time [s] after which the counter wraps."""
-    packets = unwrap_counter(counter, wraps)
-    usual = max(1.0, float(np.median(np.diff(packets)))) if len(packets) > 1 else 1.0
-    return packets / (usual * rate_hz), wraps / (usual * rate_hz)
-
-
-def unwrap_counter(counter: np.ndarray, wraps: float) -> np.ndarray:
-    """Unwrap a counter (n,) that starts again at `wraps`; NaN stay."""
-    filled = np.where(np.isfinite(counter), counter, 0.0)
-    good = np.isfinite(counter)
-    steps = np.diff(filled[good])
-    count = np.cumsum(np.concatenate([[0], np.where(steps < -wraps / 2, 1, 0)]))
-    result = np.full(len(counter), np.nan)
-    result[good] = filled[good] + wraps * count
-    return result

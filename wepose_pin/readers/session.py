@@ -32,7 +32,7 @@ from ..recording.plausibility import check_signals
 from ..recording.resampling import resample
 from .arrays import ArrayFile, is_array_file
 from .device import ACCEL_UNITS, GYRO_UNITS, Device
-from .formats import FORMATS, USES, detect_format, read_device
+from .registry import USES, detect_format, find_format, read_device
 from .session_file import (
     WIDTHS,
     SensorKeys,
@@ -244,7 +244,11 @@ class SessionReader:
                 f"{own.at('format')} = 'apdm_hdf5' is no longer known; name each sensor's arrays, as `wepose info "
                 f"{path.name}` proposes"
             )
-        format = own.choice("format", FORMATS) if "format" in own else detect_format(path) if path.exists() else None
+        stated = own.text("format", None)
+        if stated is not None:
+            format: str | None = find_format(stated, self.path.parent, own.at("format"))
+        else:
+            format = detect_format(path) if path.exists() else None
         self._used |= {"format", "use"} if own is data else {"use"}
         if format is None:
             if not path.exists():

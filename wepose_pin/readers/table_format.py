@@ -1,0 +1,683 @@
+"""Tables of devices: a TOML describes how a vendor writes them, and one engine reads them all.
+
+A description (`formats/*.toml`, or a user's own, docs/formats/devices.md) says how a file is recognised, which lines
+belong to the names of its columns, which columns are whose gyroscope, accelerometer or orientation, their units, and
+the clock.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+from scipy.spatial.transform import Rotation
+
+from ..diagnostics import WARNING, Diagnostic
+from ..documents import TomlTable, read_toml
+from ..errors import BadData, BadSession, MissingFile, MissingRate, WeposeError
+from ..model import load_table
+from .device import Device, check_measured, convert, join_signals, make_device, open_folder, read_first_lines
+from .device import spread_equal_times as spread
+from .tables import NO_VALUE, read_columns
+
+FOLDER = Path(__file__).parent / "formats"
+SEPARATORS = "\t,; "
+MOST_LINES = 2000  # before the names; some exports have a line for each channel
+MOST_AFTER = 4  # lines of text between the names and the numbers
+MOST_FILES = 50  # of a folder
+FEWEST = 3  # samples that show a rate
+NEEDED = {"raw": ("gyro", "accel"), "orientation": ("orientation",)}
+AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "wxyz"}
+_NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)(e[-+]?\d+)?|\d{4}[/-]\d.*", re.IGNORECASE)
+_STATED_RATE = re.compile(r"\d+(\.\d*)?(?![\d.])")
+
+
+# What a TOML says --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Columns of a signal.
+
+    Parameters
+    ----------
+    names : of the columns in their order, of a file with one sensor; x, y, z of vectors. An orientation has w, x, y, z,
+        or the nine cells of a matrix by rows, or roll, pitch and yaw [deg]
+    pattern : of such names instead, with a group `axis`, and `sensor`, `side` (a further part of its name), `unit`
+    unit : where neither the name nor a line of units has it
+    limit : [SI] where a value is beyond, the next columns of the format are taken if they are there
+    increments : the values are increments over a sample: a quaternion of the rotation, m/s
+    """
+
+    names: tuple[str, ...] = ()
+    pattern: re.Pattern[str] | None = None
+    unit: str = ""
+    limit: float = np.inf
+    increments: bool = False
+
+    def match(self, name: str, axes: str) -> tuple[str, int, str] | None:
+        """Return sensor, index among the columns, and unit of a column; None: it is none of these."""
+        if self.pattern is None:
+            return ("", self.names.index(name), "") if name in self.names else None
+        match = self.pattern.fullmatch(name)
+        if match is None:
+            return None
+        groups = match.groupdict()
+        sensor = f"{(groups.get('sensor') or '').strip()} {(groups.get('side') or '').strip()}".strip()
+        axis = match["axis"][:1].lower().replace("s", "w")  # APDM calls the w of a quaternion its scalar
+        return (sensor, axes.index(axis), groups.get("unit") or "") if axis in axes else None
+
+
+@dataclass(frozen=True)
+class ClockColumn:
+    """A column that gives the time.
+
+    Parameters
+    ----------
+    column : pattern of its name; a group `sensor` says whose it is
+    unit_s : [s]
+    wraps : value at which it begins again at 0
+    rate : pattern of the line before the table that states the rate of which the column counts the samples
+    date : how it is written where it is no number
+    spread : equal times are those of a packet, and are spread up to the next
+    """
+
+    column: re.Pattern[str]
+    unit_s: float
+    wraps: float | None
+    rate: re.Pattern[str] | None
+    date: str | None
+    spread: bool
+
+
+@dataclass(frozen=True)
+class TableFormat:
+    """A description of tables; keys as in docs/formats/devices.md."""
+
+    name: str
+    title: str
+    needs: str
+    detect: tuple[re.Pattern[str], ...]
+    suffixes: tuple[str, ...]
+    whole: bool
+    files: Mapping[str, str]
+    clocks: tuple[ClockColumn, ...]
+    signals: Mapping[str, tuple[Columns, ...]]
+    times_before: bool
+    sensors_line: int
+    sensor_begins: re.Pattern[str] | None
+    axes_line: int
+    units_line: int
+    units_before: re.Pattern[str] | None
+    label_line: str | None
+    label_in_name: re.Pattern[str] | None
+    sync_line: str | None
+
+
+def load_format(path: Path) -> TableFormat:
+    """Load a description.
+
+    Raises
+    ------
+    WeposeError
+        The file is missing or no description: an unknown or wrong key, a pattern that is none.
+    """
+    keys = TomlTable(read_toml(path, "a description of tables"), str(path))
+    keys.allow(
+        *("title", "needs", "source", "detect", "suffixes", "whole", "files", "clock", *AXES, "times_before"),
+        *("sensors_line", "sensor_begins", "axes_line", "units_line", "units_before", "label_line"),
+        *("label_in_name", "sync_line"),
+    )
+    signals = {signal: tuple(_read_signal(table, signal) for table in _tables(keys, signal)) for signal in AXES}
+    clocks = tuple(_read_clock(table) for table in _tables(keys, "clock"))
+    if not ((signals["gyro"] and signals["accel"]) or signals["orientation"]):
+        raise BadSession(f"{keys.at('gyro')} is missing; [[gyro]] and [[accel]], or [[orientation]] are needed")
+    if not clocks:
+        raise BadSession(f"{keys.at('clock')} is missing; a table [[clock]] with its column is needed")
+    files = keys.table("files", {})
+    files.allow(*NEEDED)
+    return TableFormat(
+        name=path.stem,
+        title=keys.text("title", path.stem) or path.stem,
+        needs=keys.text("needs", "what its description names") or "",
+        detect=tuple(_compile(keys.at("detect"), text, re.DOTALL | re.MULTILINE) for text in _texts(keys, "detect")),
+        suffixes=tuple(_texts(keys, "suffixes")),
+        whole=keys.flag("whole"),
+        files={kind: files.text(kind, None) or "" for kind in files.values},
+        clocks=clocks,
+        signals=signals,
+        times_before=keys.flag("times_before"),
+        sensors_line=_read_line(keys, "sensors_line"),
+        sensor_begins=_pattern(keys, "sensor_begins"),
+        axes_line=_read_line(keys, "axes_line"),
+        units_line=_read_line(keys, "units_line"),
+        units_before=_pattern(keys, "units_before", "name", "unit"),
+        label_line=keys.text("label_line", None),
+        label_in_name=_pattern(keys, "label_in_name", "label"),
+        sync_line=keys.text("sync_line", None),
+    )
+
+
+@cache
+def load_formats() -> Mapping[str, TableFormat]:
+    """Load the descriptions in the package: name → description."""
+    return {path.stem: load_format(path) for path in sorted(FOLDER.glob("*.toml"))}
+
+
+def _tables(keys: TomlTable, key: str) -> list[TomlTable]:
+    value = keys.values.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
+        raise BadSession(f"{keys.at(key)} is no list of tables; write [[{key}]]")
+    return [replace(keys, values=each, place=f"{key}[{k}].") for k, each in enumerate(value)]
+
+
+def _texts(keys: TomlTable, key: str) -> list[str]:
+    value = keys.values.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(each, str) and each for each in value):
+        raise BadSession(f"{keys.at(key)} = {value!r} is no list of texts")
+    return value
+
+
+def _read_line(keys: TomlTable, key: str) -> int:
+    """Read the place of a line, counted from the line of names; 0: there is none."""
+    line = keys.number(key, 0.0) or 0.0
+    if line != round(line) or abs(line) > MOST_AFTER:
+        raise BadSession(f"{keys.at(key)} = {line:g}; a number of lines from that of the names is needed, such as -1")
+    return int(line)
+
+
+def _compile(place: str, text: str, flags: int = re.IGNORECASE) -> re.Pattern[str]:
+    try:
+        return re.compile(text, flags)
+    except (re.error, RecursionError, OverflowError) as error:
+        raise BadSession(f"{place} = '{text}' is no regular expression: {error}") from None
+
+
+def _pattern(keys: TomlTable, key: str, *groups: str) -> re.Pattern[str] | None:
+    text = keys.text(key, None)
+    if text is None:
+        return None
+    pattern = _compile(keys.at(key), text)
+    lacking = [group for group in groups if group not in pattern.groupindex]
+    if lacking:
+        raise BadSession(f"{keys.at(key)} = '{text}' has no group (?P<{lacking[0]}>…)")
+    return pattern
+
+
+def _read_signal(keys: TomlTable, signal: str) -> Columns:
+    keys.allow("columns", "unit", "limit", "increments")
+    unit, increments = keys.text("unit", None) or "", keys.flag("increments")
+    limit = keys.number("limit", np.inf) if "limit" in keys else np.inf
+    if isinstance(keys.values.get("columns"), str):
+        pattern = _pattern(keys, "columns", "axis")
+        return Columns((), pattern, unit, limit or 0.0, increments)
+    counts = {"gyro": (4,) if increments else (3,), "accel": (3,), "orientation": (3, 4, 9)}[signal]
+    names = keys.values.get("columns")
+    count = len(names) if isinstance(names, list) and len(names) in counts else counts[0]
+    return Columns(tuple(keys.names("columns", count)), None, unit, limit or 0.0, increments)
+
+
+def _read_clock(keys: TomlTable) -> ClockColumn:
+    keys.allow("column", "unit_s", "wraps", "rate", "date", "spread")
+    column = _pattern(keys, "column")
+    if column is None:
+        raise BadSession(f"{keys.at('column')} is missing; a pattern of the name of the column is needed")
+    unit_s = keys.number("unit_s", 1.0, positive=True) or 1.0
+    wraps, date = keys.number("wraps", None, positive=True), keys.text("date", None)
+    return ClockColumn(column, unit_s, wraps, _pattern(keys, "rate"), date, keys.flag("spread"))
+
+
+# Detection ---------------------------------------------------------------------------------------------------------
+
+
+def detects(format: TableFormat, path: Path, start: str) -> bool:
+    """Return whether a file that starts with this text, a folder, or a zip is of the format."""
+    if path.is_file() and path.suffix.lower() != ".zip":
+        if format.suffixes and path.suffix.lower() not in format.suffixes:
+            return False
+        matches = [bool(pattern.search(start)) for pattern in format.detect]
+        # A table with all signals is one that needs no folder.
+        return any(matches) and (len(matches) == 1 or (not all(matches) and detects(format, path.parent, "")))
+    if not format.files:
+        return False
+    try:
+        with open_folder(path, format.title) as files:
+            named = [file for pattern in format.files.values() for file in _select(files, pattern)]
+            starts = ["\n".join(read_first_lines(file, 3)) for file in dict.fromkeys(named)]
+    except (WeposeError, OSError):
+        return False
+    found = [any(pattern.search(text) for text in starts) for pattern in format.detect]
+    return bool(found) and all(found)
+
+
+def _select(files: Mapping[str, Path], pattern: str) -> list[Path]:
+    return [file for name, file in files.items() if fnmatch.fnmatch(name, pattern)][:MOST_FILES]
+
+
+# Tables ------------------------------------------------------------------------------------------------------------
+
+
+class Header(NamedTuple):
+    """The names of the columns, and what stands before and after them."""
+
+    line: int
+    separator: str
+    names: list[str]
+    units: list[str]
+    first_row: int  # line of the first row
+
+
+@dataclass(frozen=True)
+class DeviceTable:
+    """A table as text.
+
+    Parameters
+    ----------
+    path : the file
+    names, units : of the columns
+    about : name → value of the lines `name: value` before the names
+    cells : columns "0", "1", …, without an incomplete last line
+    """
+
+    path: Path
+    names: Sequence[str]
+    units: Sequence[str]
+    about: Mapping[str, str]
+    cells: pl.DataFrame
+
+    def has_values(self, column: int) -> bool:
+        """Whether any cell of a column has a value."""
+        return column < self.cells.width and bool(self.cells[str(column)].is_not_null().any())
+
+    def numbers(self, columns: Sequence[int]) -> np.ndarray:
+        """Return columns (n, k); empty cells are NaN."""
+        names = [self.names[k] for k in columns]
+        table = self.cells.select(pl.col(str(k)).alias(self.names[k]) for k in columns)
+        values = read_columns(table, names, str(self.path), str(self.path))
+        check_measured(self.path, values, ", ".join(names))
+        return values
+
+
+def _split(line: str, separator: str) -> list[str]:
+    return [cell.strip(' "\r') for cell in line.split(separator)]
+
+
+def _find_header(format: TableFormat, lines: Sequence[str]) -> Header | None:
+    """Find the first line with a column of time and one of a signal."""
+    patterns = [(columns, AXES[signal]) for signal, each in format.signals.items() for columns in each]
+    for k, line in enumerate(lines):
+        for separator in () if line.startswith(("//", "#")) else SEPARATORS:
+            if line.count(separator) < 3:
+                continue
+            names, units = _name_columns(format, lines, k, separator)
+            if any(clock.column.fullmatch(name) for clock in format.clocks for name in names) and any(
+                columns.match(name, axes) for columns, axes in patterns for name in names
+            ):
+                first = k + 1 + max(format.axes_line, format.units_line, 0)
+                for cells in (_split(row, separator) for row in lines[first : first + MOST_AFTER]):
+                    if any(map(_NUMBER.fullmatch, cells)) and (cells[0] or not format.times_before):
+                        break
+                    first += 1
+                return Header(k, separator, names, units, first)
+    return None
+
+
+def _name_columns(format: TableFormat, lines: Sequence[str], k: int, separator: str) -> tuple[list[str], list[str]]:
+    """Name the columns of line k, as ``sensor/name/axis`` where these stand in lines of their own; and their units."""
+
+    def read(offset: int) -> list[str]:
+        row = _split(lines[k + offset], separator) if offset and 0 <= k + offset < len(lines) else []
+        return [*row, *[""] * len(own)][: max(len(own), len(row))]
+
+    own = _split(lines[k], separator)
+    owners, axes, units = read(format.sensors_line), read(format.axes_line), read(format.units_line)
+    width = max(len(own), len(axes))
+    own, owners, axes, units = ([*row, *[""] * width][:width] for row in (own, owners, axes, units))
+    begins = [k for k in range(width) if own[k] and format.sensor_begins and format.sensor_begins.fullmatch(own[k])]
+    if format.sensor_begins is None:
+        begins = [k for k, owner in enumerate(owners) if owner]
+    full, short, name = [""] * width, [""] * width, ""
+    for count, (first, last) in enumerate(zip(begins, [*begins, width][1:], strict=True), 1):
+        *numbers, title = [cell for cell in owners[first:last] if cell] or [f"sensor {count}"]
+        full[first:last] = [" ".join([title, *numbers])] * (last - first)
+        short[first:last] = [re.sub(r" *\(\d+\)$", "", title)] * (last - first)
+    titles = [title for _, title in set(zip(full, short, strict=True))]  # of different sensors
+    names = []
+    for column in range(width):
+        name = own[column] or (name if format.axes_line and axes[column] else "")
+        owner = short[column] if titles.count(short[column]) == 1 else full[column]
+        names.append("/".join(filter(None, (owner, name, axes[column]))))
+    if format.units_before:
+        stated = {match["name"]: match["unit"] for match in map(format.units_before.match, lines[:k]) if match}
+        units = [stated.get(name, "") for name in own]
+    return names, units
+
+
+def parse_table(format: TableFormat, path: Path) -> DeviceTable | None:
+    """Parse a table; None: it has no line of names as described.
+
+    Raises
+    ------
+    MissingFile, BadData
+        The file is not readable; no rows; zero bytes in it.
+    """
+    lines = read_first_lines(path, MOST_LINES)
+    header = _find_header(format, lines)
+    if header is None:
+        return None
+    about = {}
+    for line in lines[: header.line]:
+        name, colon, value = line.strip("/ ").partition(":")
+        if colon:
+            about[name.strip()] = value.strip(f" {SEPARATORS}")
+    with path.open("rb") as file:
+        for _ in range(header.first_row):
+            file.readline()
+        body = file.read()
+    if b"\0" in body:
+        raise BadData(f"{path}: is no {format.title}: there are zero bytes in it")
+    if not body.strip():
+        raise BadData(
+            f"{path}: has no line of numbers after its names in line {header.line + 1}; the export is empty or cut off"
+        )
+    width = max(len(header.names), body.partition(b"\n")[0].count(header.separator.encode()) + 1)
+    last = max(k for k, name in enumerate(header.names) if name)
+    cells = _parse_rows(path, body, width, header.separator, format.title)
+    if cells.height and not body.endswith(b"\n") and cells[-1, last] is None:
+        cells = cells.head(-1)  # the last line is incomplete
+    return DeviceTable(path, header.names, header.units, about, cells)
+
+
+def _parse_rows(path: Path, body: bytes, width: int, separator: str, what: str) -> pl.DataFrame:
+    """Parse rows: cells are text, null without a value."""
+    try:
+        cells = pl.read_csv(
+            body,
+            has_header=False,
+            separator=separator,
+            schema={str(k): pl.String for k in range(width)},
+            truncate_ragged_lines=True,
+            encoding="utf8-lossy",
+            quote_char=None,
+        )
+    except pl.exceptions.PolarsError as error:
+        raise BadData(f"{path}: cannot be read as {what}: {' '.join(str(error).split())[:120]}") from error
+    cells = cells.with_columns(pl.all().str.strip_chars(' "\r'))
+    cells = cells.with_columns(pl.when(~pl.all().is_in(NO_VALUE)).then(pl.all()).name.keep())
+    if separator != ",":
+        cells = cells.with_columns(pl.all().str.replace(",", ".", literal=True))
+    return cells.filter(cells.select(pl.any_horizontal(pl.all().is_not_null()))[:, 0])
+
+
+# Sensors -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Source:
+    """Columns of a sensor's signal in a table, by index among those of `columns`."""
+
+    table: DeviceTable
+    columns: Columns
+    places: dict[int, int] = field(default_factory=dict)
+    unit: str = ""
+
+    def is_complete(self, axes: str) -> bool:
+        """Whether each column is there, with values."""
+        count = len(self.columns.names) or len(axes)
+        return len(self.places) == count and all(map(self.table.has_values, self.places.values()))
+
+    def list_columns(self) -> list[int]:
+        """List the columns in their order."""
+        return [self.places[k] for k in sorted(self.places)]
+
+
+_Sensors = dict[str, dict[str, list[_Source]]]  # sensor → signal → its columns, those to prefer first
+
+
+def read_table_format(format: TableFormat, path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
+    """Read the sensors' raw data where they are there, else their orientations; `use` selects one of the two.
+
+    `rate_hz` replaces the file's own times, or is the rate of its counter.
+
+    Raises
+    ------
+    MissingFile, BadData
+        Not there; no such table; no times; an unknown unit; not what `use` asks for.
+    """
+    if use == "orientation" and not format.signals["orientation"]:
+        raise BadData(f"{path}: orientations of a {format.title} are not read; leave out data.use")
+    tables = _open_tables(format, path, use)
+    sensors = _find_sensors(format, tables)
+    kinds = [use] if use else list(NEEDED)
+    kind = next((kind for kind in kinds if any(_has(signals, kind) for signals in sensors.values())), None)
+    if kind is None:
+        instead = "; leave out data.use" if use and format.signals["orientation"] else ""
+        names = ", ".join(filter(None, tables[0].names[:12]))
+        raise BadData(f"{path}: no sensor in it has {format.needs}{instead}; it has: {names}")
+    clocks: dict[str, np.ndarray] = {}
+    values: dict[str, dict[str, np.ndarray]] = {}
+    labels: dict[str, str | None] = {}
+    diagnostics, wraps_s = list[Diagnostic](), None
+    chosen = {sensor: signals for sensor, signals in sensors.items() if _has(signals, kind)}
+    for sensor, signals in chosen.items():
+        label = sensor or tables[0].about.get(format.label_line or "") or _name_alone(format, path)
+        place = f"{path.name} {label}" if sensor else path.name
+        clocks[label], values[label], joined, wraps_s = _read_sensor(format, place, sensor, signals, kind, rate_hz)
+        if len(clocks[label]) < FEWEST:
+            raise BadData(f"{path}: holds {len(clocks[label])} samples of {label}; the export is empty or cut off")
+        diagnostics += joined
+        labels[label] = load_table().guess_segment(label)
+        if len(chosen) == 1:
+            labels[label] = labels[label] or load_table().guess_segment(path.absolute().stem)
+    left_out = [sensor for sensor in sensors if sensor not in chosen]
+    if left_out:
+        facts = {"devices": ", ".join(left_out), "signals": " and ".join(NEEDED[kind])}
+        diagnostics.append(Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts))
+    # Clocks of devices that were not synchronized start at power-on.
+    if format.sync_line and not tables[0].about.get(format.sync_line, "synced").lower().startswith("synced"):
+        diagnostics.append(Diagnostic("device-not-synchronized", WARNING, path.name))
+    device = make_device(format.name, kind, clocks, values, labels, diagnostics)
+    return replace(device, wraps_s=wraps_s)
+
+
+def _open_tables(format: TableFormat, path: Path, use: str | None) -> list[DeviceTable]:
+    """Parse the file, or those of a folder or zip that hold what is wanted."""
+    kinds = [use] if use else list(NEEDED)
+    if path.is_file() and path.suffix.lower() != ".zip":
+        table = parse_table(format, path)
+        alone = table and any(_has(each, kind) for each in _find_sensors(format, [table]).values() for kind in kinds)
+        if table and (alone or not format.files):
+            return [table]
+        if not format.files:
+            raise _no_names(format, path)
+    with open_folder(path, format.title) as files:
+        for pattern in (format.files[kind] for kind in kinds if kind in format.files):
+            selected = _select(files, pattern)
+            tables = [table for file in selected if (table := parse_table(format, file)) is not None]
+            if tables:
+                return tables
+            if selected and len(selected) == 1:
+                raise _no_names(format, path if path.is_file() else selected[0])
+        wanted = " or ".join(dict.fromkeys(format.files[kind] for kind in kinds if kind in format.files))
+    raise MissingFile(f"{path}: no {wanted} in it with {format.needs}")
+
+
+def _no_names(format: TableFormat, path: Path) -> BadData:
+    clock = " or ".join(f"'{clock.column.pattern}'" for clock in format.clocks)
+    return BadData(
+        f"{path}: no line of names with {clock} and columns of a signal in its first {MOST_LINES} lines, which a "
+        f"{format.title} has; {format.needs} are needed"
+    )
+
+
+def _has(signals: Mapping[str, Sequence[_Source]], kind: str) -> bool:
+    return all(any(source.is_complete(AXES[name]) for source in signals.get(name, ())) for name in NEEDED[kind])
+
+
+def _find_sensors(format: TableFormat, tables: Sequence[DeviceTable]) -> _Sensors:
+    sensors: _Sensors = {}
+    for signal, each in format.signals.items():
+        for columns in each:
+            for table in tables:
+                own: dict[str, _Source] = {}
+                for k, name in enumerate(table.names):
+                    match = columns.match(name, AXES[signal])
+                    if match is None:
+                        continue
+                    sensor, axis, unit = match
+                    source = own.setdefault(sensor, _Source(table, columns))
+                    if axis in source.places:
+                        raise BadData(f"{table.path}: '{name}' and '{table.names[source.places[axis]]}' are one axis")
+                    source.places[axis] = k
+                    source.unit = source.unit or unit or (table.units[k] if k < len(table.units) else "")
+                    source.unit = source.unit or columns.unit
+                for sensor, source in own.items():
+                    sensors.setdefault(sensor, {}).setdefault(signal, []).append(source)
+    return sensors
+
+
+def _name_alone(format: TableFormat, path: Path) -> str:
+    """Name the only sensor of a file or folder."""
+    path = path.absolute()
+    if path.is_dir() or any(fnmatch.fnmatch(path.name, pattern) for pattern in format.files.values()):
+        return path.name if path.is_dir() else path.parent.name
+    match = format.label_in_name.fullmatch(path.stem) if format.label_in_name else None
+    return match["label"] if match else path.stem
+
+
+def _read_sensor(
+    format: TableFormat,
+    place: str,
+    sensor: str,
+    signals: Mapping[str, Sequence[_Source]],
+    kind: str,
+    rate_hz: float | None,
+) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Diagnostic, ...], float | None]:
+    """Read times [s], values in SI, what was done, and the time [s] after which the clock wraps."""
+    first = {name: next(s for s in signals[name] if s.is_complete(AXES[name])) for name in NEEDED[kind]}
+    joins = format.times_before or len({id(source.table) for source in first.values()}) > 1
+    values, times, wraps_s = {}, {}, None
+    for name in NEEDED[kind]:
+        source = first[name]
+        time, wraps_s = _read_time(format, source, sensor, None if joins else rate_hz)
+        values[name] = _read_values(name, source, time)
+        complete = [each for each in signals[name] if each.is_complete(AXES[name])]
+        if len(complete) > 1 and (np.abs(values[name]) > source.columns.limit).any():
+            values[name] = _read_values(name, complete[1], time)
+        times[name] = time
+    if not joins:
+        return times[NEEDED[kind][0]], values, (), wraps_s
+    time, values, joined = join_signals(place, (times["gyro"], values["gyro"]), (times["accel"], values["accel"]))
+    return np.arange(len(time)) / rate_hz if rate_hz else time, values, joined, None
+
+
+def _read_values(signal: str, source: _Source, time: np.ndarray) -> np.ndarray:
+    """Read values in SI, quaternions as xyzw."""
+    table, columns = source.table, source.list_columns()
+    values = table.numbers(columns)
+    if signal == "orientation":
+        return _read_quat(table, values)
+    if source.columns.increments:
+        steps = np.diff(time)
+        step = float(np.median(steps[np.isfinite(steps)])) if np.isfinite(steps).any() else 0.0
+        if not step > 0.0:
+            raise BadData(f"{table.path}: its time does not grow from row to row, so that increments give no rate")
+        return (_read_turns(values) if signal == "gyro" else values) / step
+    return convert(table.path, signal, values, source.unit, table.names[columns[0]])
+
+
+def _read_turns(quat_wxyz: np.ndarray) -> np.ndarray:
+    """Return rotation vectors (n, 3) of quaternions (n, 4); NaN where there is none."""
+    turns = np.full((len(quat_wxyz), 3), np.nan)
+    good = np.isfinite(quat_wxyz).all(axis=1) & (np.linalg.norm(quat_wxyz, axis=1) > 0.5)
+    if good.any():
+        turns[good] = Rotation.from_quat(quat_wxyz[good][:, [1, 2, 3, 0]]).as_rotvec()
+    return turns
+
+
+def _read_quat(table: DeviceTable, values: np.ndarray) -> np.ndarray:
+    """Return quaternions (n, 4) xyzw of wxyz, matrices by rows, or roll, pitch, yaw [deg]; NaN where there is none."""
+    if values.shape[1] == 4:
+        return values[:, [1, 2, 3, 0]]
+    quat = np.full((len(values), 4), np.nan)
+    good = np.isfinite(values).all(axis=1)
+    if not good.any():
+        return quat
+    if values.shape[1] == 3:
+        quat[good] = Rotation.from_euler("ZYX", values[good][:, ::-1], degrees=True).as_quat()
+        return quat
+    matrices = values[good].reshape(-1, 3, 3)
+    off = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(initial=0.0)
+    if off > 1e-2:
+        raise BadData(f"{table.path}: its matrices are no rotations, off by {off:.2g}; export them again")
+    quat[good] = Rotation.from_matrix(matrices).as_quat()
+    return quat
+
+
+def _read_time(
+    format: TableFormat, source: _Source, sensor: str, rate_hz: float | None
+) -> tuple[np.ndarray, float | None]:
+    """Read times (n,) [s] on the device's clock, and the time [s] after which it wraps."""
+    table = source.table
+    for clock in format.clocks:
+        column = _find_time(format, clock, source, sensor)
+        if column is None or not table.has_values(column):
+            continue
+        if clock.rate:
+            stated = next((value for name, value in table.about.items() if clock.rate.fullmatch(name)), "")
+            number = _STATED_RATE.match(stated)
+            rate = rate_hz or (float(number[0]) if number else 0.0)
+            counter = table.numbers([column])[:, 0]
+            if rate > 0.0 and np.isfinite(counter).all() and len(counter) > 1:
+                packets = unwrap_counter(counter, clock.wraps)
+                a_second = max(1.0, float(np.median(np.diff(packets)))) * rate
+                return packets / a_second, clock.wraps / a_second if clock.wraps else None
+        elif not rate_hz:
+            time = _read_stamps(clock, table, column)
+            return spread(time) if clock.spread else time, clock.unit_s * clock.wraps if clock.wraps else None
+    if rate_hz:
+        return np.arange(table.cells.height) / rate_hz, None
+    names = " or ".join(f"'{clock.column.pattern}'" for clock in format.clocks)
+    raise MissingRate(
+        f"{table.path}: no times are known from {names}, or a rate in a line before the table; state the update "
+        f"rate as rate_hz in [data], or export one of them"
+    )
+
+
+def _find_time(format: TableFormat, clock: ClockColumn, source: _Source, sensor: str) -> int | None:
+    """Find the column of a signal's times."""
+    table, first = source.table, source.list_columns()[0]
+    if format.times_before:
+        if first == 0 or not clock.column.fullmatch(table.names[first - 1]):
+            raise BadData(f"{table.path}: no column of times right before '{table.names[first]}'; export them too")
+        return first - 1
+    matches = [(k, match) for k, name in enumerate(table.names) if (match := clock.column.fullmatch(name))]
+    own = [k for k, match in matches if match.groupdict().get("sensor") == sensor]  # else the times may be shared
+    return next(iter([*own, *(k for k, _ in matches)]), None)
+
+
+def _read_stamps(clock: ClockColumn, table: DeviceTable, column: int) -> np.ndarray:
+    """Read a column of times [s], of numbers or dates."""
+    if clock.date:
+        dates = table.cells[str(column)].str.to_datetime(clock.date, time_unit="us", strict=False)
+        if dates.null_count() < len(dates):
+            return 1e-6 * dates.to_physical().cast(pl.Float64).fill_null(np.nan).to_numpy()
+    return clock.unit_s * unwrap_counter(table.numbers([column])[:, 0], clock.wraps)
+
+
+def unwrap_counter(counter: np.ndarray, wraps: float | None) -> np.ndarray:
+    """Unwrap a counter (n,) that starts again at `wraps`; NaN stay."""
+    if wraps is None:
+        return counter
+    good = np.isfinite(counter)
+    count = np.cumsum(np.diff(counter[good], prepend=counter[good][:1]) < -wraps / 2)
+    result = np.full(len(counter), np.nan)
+    result[good] = counter[good] + wraps * count
+    return result
