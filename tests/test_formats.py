@@ -654,6 +654,57 @@ def test_a_session_in_pieces_is_the_session(tmp_path: Path) -> None:
     )
 
 
+# A description of one's own ----------------------------------------------------------------------------------------
+
+
+def own_format(folder: Path) -> str:
+    """Write the description and the table of the page, with the known motion of two sensors, and return the former."""
+    page = (Path(__file__).parent.parent / "docs" / "formats" / "devices.md").read_text(encoding="utf-8")
+    text = page.partition("## A device of your own")[2].partition("```toml\n")[2].partition("```")[0]
+    head, names, *_ = page.partition("```text\n")[2].splitlines()
+    names = ";".join([names, *(name.replace("chest", "left_wrist") for name in names.split(";")[1:])])
+    sensor = [*np.degrees(GYRO).T, *(1e3 / 9.80665 * ACCEL).T]
+    other = [*np.degrees(GYRO).T, *(1e3 / 9.80665 * own(ACCEL, Path("other"))).T]
+    table = rows([5e3 + 1e3 * TIME, *sensor, *other], ";")
+    (folder / "walk.csv").write_text(f"{head}\n{names}\n{table}")
+    return text
+
+
+@pytest.mark.parametrize("stated", ["", 'format = "lab.toml"\n'])
+def test_a_description_beside_the_session_is_read(stated: str, tmp_path: Path) -> None:
+    (tmp_path / "lab.toml").write_text(own_format(tmp_path))
+    recording = load(tmp_path, f'[data]\nfile = "walk.csv"\n{stated}[sensors.torso]\n[sensors.left_forearm]')
+    check_raw(recording)
+    check_raw(recording, "left_forearm")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("[xyz]", "[xyz"), r"lab\.toml: gyro\[0\]\.columns = .* is no regular expression"),
+        (("(?P<axis>[xyz])", "[xyz]"), r"gyro\[0\]\.columns = .* has no group \(\?P<axis>…\)"),
+        (("unit_s", "unit"), r"clock\[0\]\.unit is not a known key; did you mean 'unit_s'"),
+        (("[[clock]]", "[[accel]]"), "is not a known key|clock is missing"),
+        (("[[gyro]]", "[[orientation]]"), r"lab\.toml: gyro is missing"),
+        (('"mg"', '"furlong"'), r"'chest fx' is in 'furlong'; there is: m/s\^2, g, mg"),
+        (('"t_ms"', '"t_s"'), r"walk\.csv: no line of names with 't_s' and columns of a signal"),
+        (("title", "[title"), r"lab\.toml: not valid TOML"),
+    ],
+)
+def test_a_description_that_is_wrong_is_one_line(change: tuple[str, str], says: str, tmp_path: Path) -> None:
+    (tmp_path / "lab.toml").write_text(own_format(tmp_path).replace(*change))
+    with pytest.raises(WeposeError, match=says) as error:
+        load(tmp_path, '[data]\nfile = "walk.csv"\nformat = "lab.toml"\n[sensors.torso]\nlabel = "chest"')
+    assert "\n" not in str(error.value)
+
+
+def test_a_format_that_is_not_known_names_the_choices(tmp_path: Path) -> None:
+    own_format(tmp_path)
+    for name, says in (("dott", "did you mean 'dot'"), ("lab.toml", r"lab\.toml: no such file")):
+        with pytest.raises(WeposeError, match=says):
+            load(tmp_path, f'[data]\nfile = "walk.csv"\nformat = "{name}"\n[sensors.torso]')
+
+
 def test_a_counter_that_begins_anew_goes_on() -> None:
     counter = np.array([65534.0, 65535.0, np.nan, 1.0, 2.0])
     np.testing.assert_array_equal(unwrap_counter(counter, 65536.0), [65534.0, 65535.0, np.nan, 65537.0, 65538.0])
@@ -706,7 +757,7 @@ PAGES = sorted((Path(__file__).parent.parent / "docs" / "formats").glob("[!e]*.m
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_pages_examples_are_sessions_that_lack_their_data_alone(page: Path, tmp_path: Path) -> None:
-    blocks = page.read_text(encoding="utf-8").split("```toml\n")[1:]
+    blocks = page.read_text(encoding="utf-8").partition("## A device of your own")[0].split("```toml\n")[1:]
     assert len(blocks) == (page.stem != "README")
     for block in blocks:
         with pytest.raises(MissingFile):

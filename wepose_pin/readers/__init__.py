@@ -1,4 +1,4 @@
-"""Readers: one file a format, each gives a checked `Recording`."""
+"""Readers: a session and the files it names give a checked `Recording`; `formats/` describes tables of devices."""
 
 from __future__ import annotations
 

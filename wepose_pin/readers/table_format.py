@@ -131,14 +131,15 @@ def load_format(path: Path) -> TableFormat:
     """
     keys = TomlTable(read_toml(path, "a description of tables"), str(path))
     keys.allow(
-        *("title", "needs", "source", "detect", "suffixes", "whole", "files", "clock", *AXES, "times_before"),
+        *("title", "needs", "detect", "suffixes", "whole", "files", "clock", *AXES, "times_before"),
         *("sensors_line", "sensor_begins", "axes_line", "units_line", "units_before", "label_line"),
         *("label_in_name", "sync_line"),
     )
     signals = {signal: tuple(_read_signal(table, signal) for table in _tables(keys, signal)) for signal in AXES}
     clocks = tuple(_read_clock(table) for table in _tables(keys, "clock"))
-    if not ((signals["gyro"] and signals["accel"]) or signals["orientation"]):
-        raise BadSession(f"{keys.at('gyro')} is missing; [[gyro]] and [[accel]], or [[orientation]] are needed")
+    lacking = next((signal for signal in NEEDED["raw"] if not signals[signal]), None)
+    if lacking and (any(signals[signal] for signal in NEEDED["raw"]) or not signals["orientation"]):
+        raise BadSession(f"{keys.at(lacking)} is missing; [[gyro]] and [[accel]], or [[orientation]] alone are needed")
     if not clocks:
         raise BadSession(f"{keys.at('clock')} is missing; a table [[clock]] with its column is needed")
     files = keys.table("files", {})
@@ -146,7 +147,7 @@ def load_format(path: Path) -> TableFormat:
     return TableFormat(
         name=path.stem,
         title=keys.text("title", path.stem) or path.stem,
-        needs=keys.text("needs", "what its description names") or "",
+        needs=keys.text("needs", " and ".join(signal for signal in AXES if signals[signal])) or "",
         detect=tuple(_compile(keys.at("detect"), text, re.DOTALL | re.MULTILINE) for text in _texts(keys, "detect")),
         suffixes=tuple(_texts(keys, "suffixes")),
         whole=keys.flag("whole"),
