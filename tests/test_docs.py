@@ -22,6 +22,7 @@ from wepose_pin.calibration import load_protocol
 from wepose_pin.cli import COMMANDS, find_command
 from wepose_pin.filters import TYPICAL
 from wepose_pin.jobs.fields import field_types
+from wepose_pin.readers.registry import read_device
 from wepose_pin.retargeting.maps import read_map
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -189,15 +190,15 @@ def test_the_filter_of_the_recipe_follows_a_tilt(tmp_path: Path) -> None:
     np.testing.assert_allclose(Rotation.from_quat(run.quat_WS[-1]).as_rotvec(), [0.5, 0.0, 0.0], atol=2e-3)
 
 
-def test_the_reader_of_the_recipe_reads(tmp_path: Path) -> None:
-    module = example_module("wepose_pin/readers/acme.py", tmp_path)
+def test_the_description_of_the_recipe_is_read(tmp_path: Path) -> None:
     file = tmp_path / "torso.csv"
-    file.write_text("serial: A17\nt_ms;wx;wy;wz;fx;fy;fz\n0;180;0;0;0;0;1000\n10;0;0;90;0;0;1000\n", encoding="utf-8")
-    device = module.read_acme(file)
+    rows = "0;180;0;0;0;0;1000\n10;0;0;90;0;0;1000\n20;0;0;90;0;0;1000\n"
+    file.write_text(f"serial: A17\nt_ms;wx;wy;wz;fx;fy;fz\n{rows}", encoding="utf-8")
+    device = read_device(file, str(example("wepose_pin/readers/formats/acme.toml", tmp_path)))
     assert dict(device.labels) == {"A17": "torso"}
-    assert device.table["time"].to_list() == [0.0, 0.01]
+    assert device.table["time"].to_list() == [0.0, 0.01, 0.02]
     np.testing.assert_allclose(
-        device.table[device.signals("A17")["gyro"]].to_numpy(), [[np.pi, 0, 0], [0, 0, np.pi / 2]]
+        device.table[device.signals("A17")["gyro"]].to_numpy()[:2], [[np.pi, 0, 0], [0, 0, np.pi / 2]]
     )
     np.testing.assert_allclose(device.table[device.signals("A17")["accel"]].to_numpy()[:, 2], 9.80665)
 

@@ -135,7 +135,7 @@ def test_a_dot_whose_time_stands_still(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rate", [".", "1.2.3", "..5Hz", "", "0"])
 def test_an_mt_manager_export_whose_rate_is_none(rate: str, tmp_path: Path) -> None:
     text = seeds.mt_manager()[1].replace(b"Update Rate: 100.0Hz", f"Update Rate: {rate}".encode())
-    assert "no line '// Update Rate: …' and no SampleTimeFine" in told("mt_manager", tmp_path, text, BadData)
+    assert "no times are known from 'PacketCounter' or 'SampleTimeFine'" in told("mt_manager", tmp_path, text, BadData)
 
 
 def test_a_summary_that_is_none(tmp_path: Path) -> None:

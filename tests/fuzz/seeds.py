@@ -13,6 +13,7 @@ import polars as pl
 from mcap.writer import Writer
 from scipy.io import savemat
 
+import wepose_pin
 from wepose_pin.assets import asset
 from wepose_pin.live.sources import xbus
 from wepose_pin.live.sources.packets import CRC, HEADER, MAGIC, SAMPLE
@@ -215,6 +216,11 @@ def delsys() -> list[bytes]:
     labels = labels.replace("GYRO1.X  Sampling frequency: 100 Unit: g", "GYRO1.X  Sampling frequency: 100 Unit: deg/s")
     names = ",".join(f"X[s],{kind}1.{a}" for kind in ("ACC", "GYRO") for a in "XYZ")
     return [text.encode(), f"{labels}\n{names}\n{rows(*columns)}".encode()]
+
+
+def descriptions() -> list[bytes]:
+    folder = Path(wepose_pin.__file__).parent / "readers" / "formats"
+    return [(folder / "delsys.toml").read_bytes()]
 
 
 def sensor_logger() -> bytes:

@@ -105,6 +105,13 @@ def _table(path: Path) -> object:
     return load_model(path)
 
 
+def _description(path: Path) -> object:
+    from wepose_pin.readers.table_format import load_format, read_table_format
+
+    (path.parent / "a.csv").write_bytes(seeds.delsys()[0])
+    return read_table_format(load_format(path), path.parent / "a.csv")
+
+
 def _robot_map(path: Path) -> object:
     from wepose_pin.retargeting.maps import read_map
 
@@ -246,6 +253,7 @@ TARGETS = (
     Target("shimmer", lambda: [seeds.shimmer()], _device("a.csv", "shimmer"), LINES, "readers.table_format"),
     Target("noraxon", lambda: [seeds.noraxon()], _device("a.csv", "noraxon"), LINES, "readers.table_format"),
     Target("delsys", seeds.delsys, _device("a.csv", "delsys"), LINES, "readers.table_format"),
+    Target("description", seeds.descriptions, file("lab.toml", _description), TOML, "readers.table_format"),
     Target("phone", lambda: [seeds.sensor_logger()], _device("a.json", "sensor_logger"), JSON, "readers.sensor_logger"),
     Target("xdf", lambda: [seeds.xdf()], _device("a.xdf", "xdf"), (), "readers.xdf"),
     Target("trc", lambda: [seeds.trc()], file("a.trc", _reference), LINES, "readers.trc"),
