@@ -108,29 +108,20 @@ class _Contact(NamedTuple):
     """The words for a protocol's closure."""
 
     protocol: str
-    points: tuple[str, ...]
-    noun: str
     gap: str
     chain: tuple[str, ...]  # lengths in it
 
 
 def _describe_contact(protocol: Protocol, calibration: Calibration) -> _Contact:
     chain, table = find_measured_lengths(protocol, calibration.model), calibration.model.table
-    points = tuple(dict.fromkeys(point for closure in protocol.closures for point in closure.points))
+    points = dict.fromkeys(point for closure in protocol.closures for point in closure.points)
     if not points:
-        return _Contact(protocol.name, (), "the limbs", "gap", chain)
-    closure, limbs = protocol.closures[0], table.drawn_limbs
-    ends = (limbs[point].segments[-1] if point in limbs and limbs[point].segments else point for point in points)
-    nouns = listed([plural(name) for name in dict.fromkeys(plain(table.shared_name(end)) for end in ends)])
+        return _Contact(protocol.name, "gap", chain)
     each = [plain(table.shared_name(point)) for point in points]
     several = listed([plural(name) for name in dict.fromkeys(each)])
-    if len(points) < 2:
-        return _Contact(protocol.name, points, f"the {plain(points[0])}", f"{each[0]} to its point", chain)
-    noun, gap = {
-        "coincide": (f"the joined {nouns}", " to ".join(each)),
-        "plane": (f"the {nouns}", f"{several} against the plane"),
-    }.get(closure.kind, (f"the {nouns}", f"{several} to their points"))
-    return _Contact(protocol.name, points, noun, gap, chain)
+    gaps = {"coincide": " to ".join(each), "plane": f"{several} against the plane"}
+    gap = gaps.get(protocol.closures[0].kind, f"{several} to their points")
+    return _Contact(protocol.name, gap if len(each) > 1 else f"{each[0]} to its point", chain)
 
 
 # Sections -------------------------------------------------------------------------------------------------------------
