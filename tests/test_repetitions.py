@@ -11,7 +11,7 @@ from scipy.signal import butter, sosfiltfilt
 import wepose_pin as wp
 from wepose_pin.angles import JOINTS, Angles, JointAngles, joint_angles
 from wepose_pin.angles.curves import compute_cmc, compute_mean_curves, normalize_time
-from wepose_pin.angles.repetitions import MIN_RANGE, Repetitions, find_main_angle, find_repetitions
+from wepose_pin.angles.repetitions import MIN_RANGE, Repetitions, find_main_angle, find_movements, find_repetitions
 from wepose_pin.errors import WrongOption
 from wepose_pin.model import load_model
 from wepose_pin.recording import ImuSensor
@@ -314,3 +314,24 @@ def test_the_strides_of_a_simulated_walk_are_those_of_the_walk() -> None:
     repetitions = find(knee, cycles=True)
     np.testing.assert_allclose(np.diff(repetitions.spans, axis=1), motion.stride_s, atol=0.021)
     assert len(repetitions.spans) >= int(15.0 / motion.stride_s) - 4
+
+
+def test_movements_between_rests_are_found_where_no_angle_repeats() -> None:
+    """Circles in random planes, and a long and a short movement of another kind."""
+    rng = np.random.default_rng(4)
+    rate_hz, at = 50.0, [1.0]
+    durations = [12.0, 4.0, 4.4, 3.8, 1.0, 4.2]
+    for duration in durations:
+        at.append(at[-1] + duration + 1.5)
+    time = np.arange(0.0, at[-1], 1.0 / rate_hz)
+    hand = rng.normal(scale=1e-4, size=(len(time), 3))
+    for begin, duration in zip(at, durations, strict=False):
+        share = np.clip((time - begin) / duration, 0.0, 1.0)
+        angle = 2.0 * np.pi * (share - np.sin(2.0 * np.pi * share) / (2.0 * np.pi))
+        axes = np.linalg.qr(rng.normal(size=(3, 2)))[0]
+        hand += 0.2 * ((np.cos(angle) - 1.0)[:, None] * axes[:, 0] + np.sin(angle)[:, None] * axes[:, 1])
+    spans = find_movements(time, hand, np.zeros_like(hand))
+    expected = [(begin, begin + duration) for begin, duration in zip(at, durations, strict=False)][1:]
+    expected = [span for span in expected if span[1] - span[0] > 2.0]
+    np.testing.assert_allclose(spans, expected, atol=0.6)
+    assert len(find_movements(time[: round(20.0 * rate_hz)], hand[: round(20.0 * rate_hz)])) == 0

@@ -32,6 +32,10 @@ MIN_CMC = 0.85
 _REST_SHARE = 0.15  # of the range; nearer than this to an end of it the angle dwells there
 _CLEARLY_LONGER = 1.5  # times as long at one end: the angle rests there
 _NO_SPANS = np.empty((0, 2))
+# A hand moves above this speed [m/s]; a sway of the trunk is slower. Shorter stops than this [s] are part of a movement.
+MOVE_SPEED, REST_S = 0.08, 0.8
+MIN_MOVE_S = 0.5  # [s]; what is shorter is no movement
+LEAST_SHARE = 0.6  # of the median duration of the movements, the shorter of two against the longer
 MAX_GAP = 0.2  # of the samples of a main angle
 MAX_HIDDEN = 0.1  # of the samples of a repetition, which the main angle is not determined for
 
@@ -147,6 +151,36 @@ def _share_within(time: np.ndarray, which: np.ndarray, spans: np.ndarray) -> np.
     first, last = np.searchsorted(time, [spans[:, 0] - 1e-9, spans[:, 1] + 1e-9])
     count = np.concatenate([[0], np.cumsum(which)])
     return np.asarray((count[last] - count[first]) / (last - first))
+
+
+def find_movements(time: np.ndarray, *points: np.ndarray) -> np.ndarray:
+    """Find the movements between rests, spans (r, 2) [s], of hands that begin and end each one at rest.
+
+    Those whose duration differs much from the median one are other movements and left out. None where fewer than three
+    are left.
+
+    Parameters
+    ----------
+    time : (n,) [s], even
+    points : (n, 3) [m] each
+    """
+    rate_hz = (len(time) - 1) / (time[-1] - time[0])
+    moving = np.zeros(len(time), dtype=bool)
+    for point in points:
+        smoothed = np.column_stack([_smooth(time, axis) for axis in np.nan_to_num(point).T])
+        moving |= np.linalg.norm(np.gradient(smoothed, axis=0), axis=1) * rate_hz > MOVE_SPEED
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], moving, [False])).astype(int))).reshape(-1, 2)
+    spans: list[list[int]] = []
+    for begin, end in edges:
+        if spans and begin - spans[-1][1] < REST_S * rate_hz:
+            spans[-1][1] = end
+        else:
+            spans.append([begin, end])
+    found = np.array([(time[a], time[b - 1]) for a, b in spans if time[b - 1] - time[a] >= MIN_MOVE_S]).reshape(-1, 2)
+    seconds = found[:, 1] - found[:, 0]
+    usual = np.median(seconds) if len(seconds) else 0.0
+    found = found[(seconds >= LEAST_SHARE * usual) & (seconds <= usual / LEAST_SHARE)]
+    return found if len(found) >= MIN_REPETITIONS else _NO_SPANS
 
 
 def _smooth(time: np.ndarray, values: np.ndarray) -> np.ndarray:

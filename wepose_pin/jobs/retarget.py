@@ -181,13 +181,21 @@ def run_retarget(job: RetargetJob, progress: Progress = no_progress) -> Retarget
 
 
 def _find_repetitions(pose: Pose, sides: tuple[str, ...]) -> dict[str, Any]:
-    """The repetitions of the arms that a robot follows, as `wepose angles` finds them: by which angle, when [s]."""
+    """The repetitions of the arms that a robot follows, by which angle, when [s].
+
+    They are those that `wepose angles` finds; where no angle repeats, the movements of the hands between rests.
+    """
     from dataclasses import replace
 
     from ..angles import joint_angles
-    from ..angles.repetitions import find_repetitions
+    from ..angles.repetitions import find_movements, find_repetitions
 
     angles = joint_angles(pose)
     of_arms = {name: each for name, each in angles.joints.items() if name.startswith(sides)}
     repetitions = find_repetitions(replace(angles, joints=of_arms))
-    return {"source": repetitions.source, "spans": repetitions.spans.tolist(), "reason": repetitions.reason}
+    source, spans, reason = repetitions.source, repetitions.spans, repetitions.reason
+    if not len(spans):
+        hands = [pose.points[f"{side}_palm"] for side in sides if f"{side}_palm" in pose.points]
+        spans = find_movements(pose.time, *hands)
+        source, reason = ("hands between rests", "") if len(spans) else (source, reason)
+    return {"source": source, "spans": spans.tolist(), "reason": reason}
