@@ -169,7 +169,7 @@ def test_every_kind_names_its_sections() -> None:
 
 @pytest.mark.usefixtures("without_peers")
 def test_real_recordings_when_at_hand(data: Path) -> None:
-    table = filters.sections(TINY, data)["recordings"]()
+    table = filters.sections(TINY, data)["recorded_accuracy"]()
     assert "1 of BROAD and the authors' trial" in table.title
     assert 0.5 < table.rows["smekf"]["total_rmse"] < 10.0
 

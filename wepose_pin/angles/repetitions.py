@@ -32,7 +32,7 @@ MIN_CMC = 0.85
 _REST_SHARE = 0.15  # of the range; nearer than this to an end of it the angle dwells there
 _CLEARLY_LONGER = 1.5  # times as long at one end: the angle rests there
 _NO_SPANS = np.empty((0, 2))
-# A hand moves above this speed [m/s]; a sway of the trunk is slower. Shorter stops than this [s] are part of a movement.
+# A hand moves above this speed [m/s]; the trunk sways more slowly. Stops below this time [s] are part of a movement.
 MOVE_SPEED, REST_S = 0.08, 0.8
 MIN_MOVE_S = 0.5  # [s]; what is shorter is no movement
 LEAST_SHARE = 0.6  # of the median duration of the movements, the shorter of two against the longer

@@ -242,6 +242,8 @@ class SensorScan:
     def is_noisy(self) -> bool:
         """Whether only a fault makes two samples in a row equal: the noise is larger than the digits."""
         lengths, long_ = np.sort(self._lengths), len(self.long_runs(BOTH))
+        if not len(lengths):
+            return False
         usual = lengths[(len(lengths) - 1) // 2]
         longer = np.count_nonzero(lengths > 2 * usual) - long_
         return bool(self._noise[0] >= NOISY_S and longer <= 2 * long_ + COARSE * len(lengths))
