@@ -264,7 +264,7 @@ class SensorScan:
 def _find_changes(*signals: np.ndarray) -> np.ndarray:
     """Find the rows (n,) in which any of the signals (n, k) differs from the row before; the first one does."""
     changes = np.any([(signal[1:] != signal[:-1]).any(axis=1) for signal in signals], axis=0)
-    return np.concatenate([[True], changes])
+    return np.concatenate([[True], changes])[: len(signals[0])]
 
 
 def _find_noise(values: np.ndarray, usual: float) -> np.ndarray:
