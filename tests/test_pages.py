@@ -127,7 +127,7 @@ def test_a_report_where_segments_are_not_known(pose: TrackedRecording, rows: sli
 BROKEN = {
     "wepose_pin.report.track.draw_timeline": ("report.html", {"view.html", "report.html"}),
     "wepose_pin.report.track.render_track_report": ("report.html", {"view.html"}),
-    "wepose_pin.report.track.pose_html": ("view.html", {"report.html"}),
+    "wepose_pin.report.pages.pose_html": ("view.html", {"report.html"}),
 }
 
 
@@ -184,7 +184,7 @@ def test_the_result_is_there_when_the_page_is_stopped(
         assert names(tmp_path / "out") == RESULT
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("wepose_pin.report.track.pose_html", stopped)
+    monkeypatch.setattr("wepose_pin.report.pages.pose_html", stopped)
     assert run("track", session, "-o", tmp_path / "out") == 130
     assert names(tmp_path / "out") == RESULT
     assert f"{tmp_path / 'out'} was written before" in capsys.readouterr().err

@@ -10,7 +10,7 @@ _WHERE = {
     "render_calibration_report": "calibration",
     "render_track_report": "track",
     "write_calibration_page": "calibration",
-    "write_track_pages": "track",
+    "write_track_pages": "pages",
 }
 __all__ = [
     "render_calibration_report",

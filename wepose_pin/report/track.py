@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,46 +40,16 @@ from .figures import (
     shade,
     styled,
 )
-from .page import Facts, Frame, Item, Page, PageWriter, Table, show_diagnostics
+from .page import Facts, Frame, Item, Page, Table, show_diagnostics
 from .viewer import pose_html
 from .words import capital, degrees, intervals, listed, plain, plural, versions, whole
 
-PAGES = ("view.html", "report.html")
 FRAMES_A_SECOND = 20.0  # of the 3D view
 MOST_FRAMES = 5000  # of the 3D view
 LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 PATH_POINTS = 1000
 FULL_TURN = 2.0 * np.pi - 1e-9
 METHODS_WITH_COVARIANCE = "amekf, smoother, smekf and smekf_published"
-
-
-def write_track_pages(
-    folder: Path, summary: TrackSummary, *, view: bool = True, report: bool = True, fps: float = 30.0
-) -> list[Diagnostic]:
-    """Write ``view.html`` and ``report.html`` beside a result that is there already.
-
-    Parameters
-    ----------
-    view, report : which of them
-    fps : of ``view.html``
-
-    Returns
-    -------
-    list of Diagnostic
-        Pages, or parts of them, that cannot be made; they stand in ``summary.json`` too.
-    """
-    writer = PageWriter(folder, [name for name, wanted in zip(PAGES, (view, report), strict=True) if wanted])
-
-    def render_view(_: list[str]) -> str:
-        tracked, _measures = summary.decimator.decimated
-        recording = tracked.recording
-        return pose_html(tracked.model, tracked.pose, phases=recording.phases, title=recording.name, fps=fps)
-
-    page = writer.write("view.html", render_view) if view else None
-    if report:
-        writer.write("report.html", lambda failures: render_track_report(summary, view=page, failures=failures))
-    writer.save_diagnostics("summary.json")
-    return writer.diagnostics
 
 
 def render_track_report(summary: TrackSummary, *, view: str | None = None, failures: list[str] | None = None) -> str:
