@@ -7,6 +7,7 @@ the clock.
 
 from __future__ import annotations
 
+import contextlib
 import fnmatch
 import re
 from collections.abc import Mapping, Sequence
@@ -277,14 +278,14 @@ class Header(NamedTuple):
 
 @dataclass(frozen=True)
 class DeviceTable:
-    """A table as text.
+    """A table.
 
     Parameters
     ----------
     path : the file
     names, units : of the columns
     about : name → value of the lines `name: value` before the names
-    cells : columns "0", "1", …, without an incomplete last line
+    cells : columns "0", "1", … that the description names, without an incomplete last line
     """
 
     path: Path
@@ -295,7 +296,7 @@ class DeviceTable:
 
     def has_values(self, column: int) -> bool:
         """Whether any cell of a column has a value."""
-        return column < self.cells.width and bool(self.cells[str(column)].is_not_null().any())
+        return bool(self.cells[str(column)].is_not_null().any())
 
     def numbers(self, columns: Sequence[int]) -> np.ndarray:
         """Return columns (n, k); empty cells are NaN."""
@@ -390,30 +391,50 @@ def parse_table(format: TableFormat, path: Path) -> DeviceTable | None:
         )
     width = max(len(header.names), body.partition(b"\n")[0].count(header.separator.encode()) + 1)
     last = max(k for k, name in enumerate(header.names) if name)
-    cells = _parse_rows(path, body, width, header.separator, format.title)
-    if cells.height and not body.endswith(b"\n") and cells[-1, last] is None:
+    wanted = [k for k, name in enumerate(header.names) if k == last or _is_used(format, name)]
+    cells = _parse_rows(path, body, width, wanted, header.separator, format.title)
+    if cells.height and not body.endswith(b"\n") and cells[str(last)][-1] is None:
         cells = cells.head(-1)  # the last line is incomplete
     return DeviceTable(path, header.names, header.units, about, cells)
 
 
-def _parse_rows(path: Path, body: bytes, width: int, separator: str, what: str) -> pl.DataFrame:
-    """Parse rows: cells are text, null without a value."""
-    try:
-        cells = pl.read_csv(
+def _is_used(format: TableFormat, name: str) -> bool:
+    return any(clock.column.fullmatch(name) for clock in format.clocks) or any(
+        columns.match(name, AXES[signal]) for signal, each in format.signals.items() for columns in each
+    )
+
+
+def _parse_rows(path: Path, body: bytes, width: int, wanted: Sequence[int], separator: str, what: str) -> pl.DataFrame:
+    """Parse the wanted columns: cells are numbers, or text where one of them is none; null without a value."""
+
+    def parse(kind: type[pl.DataType]) -> pl.DataFrame:
+        return pl.read_csv(
             body,
             has_header=False,
             separator=separator,
-            schema={str(k): pl.String for k in range(width)},
+            schema={str(k): kind if k in chosen else pl.String for k in range(width)},
+            columns=list(wanted),
+            null_values=NO_VALUE,
             truncate_ragged_lines=True,
             encoding="utf8-lossy",
             quote_char=None,
         )
+
+    chosen = set(wanted)
+    try:
+        with contextlib.suppress(pl.exceptions.PolarsError):  # most tables have numbers alone
+            return _drop_empty(parse(pl.Float64))
+        cells = parse(pl.String)
     except pl.exceptions.PolarsError as error:
         raise BadData(f"{path}: cannot be read as {what}: {' '.join(str(error).split())[:120]}") from error
     cells = cells.with_columns(pl.all().str.strip_chars(' "\r'))
     cells = cells.with_columns(pl.when(~pl.all().is_in(NO_VALUE)).then(pl.all()).name.keep())
     if separator != ",":
         cells = cells.with_columns(pl.all().str.replace(",", ".", literal=True))
+    return _drop_empty(cells)
+
+
+def _drop_empty(cells: pl.DataFrame) -> pl.DataFrame:
     return cells.filter(cells.select(pl.any_horizontal(pl.all().is_not_null()))[:, 0])
 
 
@@ -666,7 +687,7 @@ def _find_time(format: TableFormat, clock: ClockColumn, source: _Source, sensor:
 
 def _read_stamps(clock: ClockColumn, table: DeviceTable, column: int) -> np.ndarray:
     """Read a column of times [s], of numbers or dates."""
-    if clock.date:
+    if clock.date and table.cells[str(column)].dtype == pl.String:
         dates = table.cells[str(column)].str.to_datetime(clock.date, time_unit="us", strict=False)
         if dates.null_count() < len(dates):
             return 1e-6 * dates.to_physical().cast(pl.Float64).fill_null(np.nan).to_numpy()
