@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from bodies import SEGMENTS, TABLE
 from scipy.spatial.transform import Rotation
@@ -18,15 +17,10 @@ from wepose_pin.alignment import (
     check_mounts,
     compute_heading_offset,
     compute_soft_tissue_covariances,
-    suggest_mounts,
 )
-from wepose_pin.calibration import load_protocol
-from wepose_pin.calibration.conditions import Loop, StartPose, resolve_conditions
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
 from wepose_pin.filters.phases import COMMON_RATE
-from wepose_pin.model import load_model
-from wepose_pin.model.start_pose import orient_links
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, compute_mount, find_mount_axes
 from wepose_pin.simulation import Person, Simulation, simulate_paper_dynamic
 from wepose_pin.subject import StartPoseOffset, Subject, mount_rows, population_subject
@@ -202,19 +196,6 @@ def test_ready_orientations_need_no_mount() -> None:
     assert not segments.orientation
 
 
-def test_heading_is_the_nearest_turn() -> None:
-    rng = np.random.default_rng(1)
-    for _ in range(10):
-        R_WS = Rotation.random(random_state=rng)
-        tilted = Rotation.from_rotvec([0.1, -0.2, 0.0]) * R_WS
-        psi = compute_heading_offset(Rotation.from_rotvec([0, 0, -0.7]) * tilted, R_WS)
-        others = [
-            (Rotation.from_rotvec([0, 0, p - 0.7]) * tilted * R_WS.inv()).magnitude() for p in np.arange(0, 6.28, 0.01)
-        ]
-        mine = (Rotation.from_rotvec([0, 0, psi - 0.7]) * tilted * R_WS.inv()).magnitude()
-        assert mine <= min(others) + 1e-12
-
-
 def test_a_mount_that_contradicts_gravity_and_one_that_is_missing(simulation: Simulation) -> None:
     recording = simulation.recording()
     wrong = replace(recording.sensors["torso"], stated_quat_LS=compute_mount("-x", "+z"))
@@ -254,19 +235,6 @@ def test_what_is_bridged_is_uncertain(method: str) -> None:
         nees.append(uncertainty(error, segments.covariance_W["torso"][2050:2600]).nees)
     print(method, "NEES after the gap:", np.round(nees, 2))
     assert np.mean(nees) < 6.0
-
-
-def test_it_says_which_calibration_finds_a_mount() -> None:
-    """Those of segments that are between the points of some protocol's closures."""
-    body = load_model()
-    start = StartPose(orient_links(body, pin.neutral(body.pin)))
-    loops = resolve_conditions(load_protocol("clasp"), body, start, SEGMENTS)
-    calibrated = {part.sensor for loop in loops if isinstance(loop, Loop) for part in loop.parts}
-    for segment in SEGMENTS:
-        advice = suggest_mounts([segment], TABLE)
-        assert 'mount = { up = "+x"' in advice
-        assert ("by `wepose calibrate`" in advice) == (segment in calibrated)
-        assert ("no calibration finds" in advice) == (segment not in calibrated)
 
 
 @pytest.mark.parametrize("segment", ["head", "pelvis", "left_forearm"])
@@ -336,13 +304,6 @@ def test_soft_tissue_turns_a_sensor_the_more_the_further_the_segment_is_off_the_
     # A bow by 50 deg: 0.12 of it about y of the torso.
     bow = soft_tissue_deg("torso", **dict.fromkeys(SEGMENTS, (0.0, 50.0, 0.0)))
     np.testing.assert_allclose(bow, [1.5, np.hypot(1.5, 0.12 * 50.0), 1.5], rtol=1e-9)
-
-
-def test_soft_tissue_without_the_segment_that_it_is_relative_to() -> None:
-    """No sensor on the torso: nobody knows how far the arm is turned about its length against it."""
-    quat_WL = {"left_upper_arm": Rotation.from_rotvec([0.0, 0.0, 40.0], degrees=True).as_quat()[None]}
-    cov = compute_soft_tissue_covariances(TABLE, quat_WL)["left_upper_arm"][0]
-    np.testing.assert_allclose(np.degrees(np.sqrt(np.diag(cov))), [2.0, 2.0, 2.5], rtol=1e-9)
 
 
 def with_start(recording: Recording, begin: float, end: float) -> Recording:

@@ -103,22 +103,6 @@ def test_angles_give_the_rotation_back_near_the_lock_and_in_it(name: str) -> Non
     assert decomposed.gimbal.max() > 0.5
 
 
-@pytest.mark.parametrize("name", SHOULDER_SEQUENCES)
-def test_in_the_lock_the_first_angle_is_held(name: str) -> None:
-    lock = 0.0 if name[0] == name[2] else np.pi / 2.0
-    first = np.radians(np.concatenate([np.linspace(20.0, 30.0, 11), np.full(20, 30.0)]))
-    third = np.radians(np.concatenate([np.zeros(11), np.linspace(0.0, 40.0, 20)]))
-    second = lock - np.radians(np.concatenate([np.linspace(40.0, 10.0, 11), np.zeros(20)]))
-    angles = np.column_stack([first, second, third])
-    shoulder = joint_angles(pose_with(arm_of("right", Rotation.from_euler(name, angles).as_matrix())), name)[
-        "right_shoulder"
-    ]
-    np.testing.assert_allclose(shoulder.values, angles, atol=1e-8)
-    assert np.all(shoulder.near_lock[-20:])
-    later = decompose(compose(angles[::-1], name), name).values  # begins in the lock: the first angle that there is
-    same_angles(later[:20, 0], np.full(20, later[20, 0]), 1e-12)
-
-
 # Closed forms over time -------------------------------------------------------------------------------------------
 
 

@@ -9,7 +9,7 @@ import re
 import sys
 import types
 import webbrowser
-from dataclasses import fields, replace
+from dataclasses import replace
 from html import escape, unescape
 from pathlib import Path
 from typing import Any
@@ -25,10 +25,8 @@ import wepose_pin as wp
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import example
 from wepose_pin.errors import how_to_install
-from wepose_pin.jobs.retarget import RetargetJob
 from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.kinematics import PosedBody
-from wepose_pin.retargeting import LimitMargins
 from wepose_pin.simulation import Imperfections, ImuNoise, Simulation
 from wepose_pin.subject import subject_toml
 from wepose_pin.writers import write_session
@@ -263,15 +261,6 @@ def test_a_result_is_retargeted_as_object_and_as_folder(result: wp.TrackResult, 
         wp.retarget(result, moved.robot, speed_scale=0.9)
     with pytest.raises(wp.WeposeError, match="--arm left: arm has no left arm"):
         wp.retarget(result, urdf, arm="left")
-
-
-def test_a_robot_is_moved_by_the_options_of_the_command() -> None:
-    by_command = {field.name: field.default for field in fields(RetargetJob)}
-    in_python = inspect.signature(wp.retarget).parameters
-    margins = LimitMargins()
-    for name in by_command.keys() - {"result", "robot", "out", "view", "report", "force"}:
-        default = in_python[name].default
-        assert by_command[name] == (getattr(margins, name) if hasattr(margins, name) else default), name
 
 
 def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult) -> None:

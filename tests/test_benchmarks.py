@@ -6,12 +6,11 @@ import importlib.util
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, batch, bodies, calibration, filters, kinematics, tables
+from benchmarks import accuracy, bodies, calibration, filters, tables
 from benchmarks.__main__ import main
 from wepose_pin.filters import METHODS
 
@@ -129,13 +128,6 @@ def test_save_and_compare(tmp_path: Path, capsys: pytest.CaptureFixture[str], mo
     assert saved["date"] in text
 
 
-def test_a_ratio_of_an_earlier_run() -> None:
-    before: dict[str, Any] = {"sections": {"filters": {"rows": {"smekf": {"batch_ratio": 2.0}}}}}
-    assert tables.ratio_before(before, "filters", "smekf", "batch_ratio") == 2.0
-    for place in (("bank", "smekf", "ratio"), ("filters", "amekf", "x"), ("filters", "smekf", "live_ratio")):
-        assert np.isnan(tables.ratio_before(before, *place))
-
-
 def test_what_cannot_be_measured_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "wrong.json").write_text('{"sections": 3}')
     for words in (
@@ -155,30 +147,11 @@ def test_what_cannot_be_measured_is_one_line(tmp_path: Path, capsys: pytest.Capt
     assert stop.value.code == 2
 
 
-def test_kinematics_beside_a_bare_loop() -> None:
-    rows = kinematics.measure_kinematics(0.02).rows
-    assert rows[kinematics.BARE]["ratio"] == 1.0
-    assert len(rows) == 3
-    assert all(row["ratio"] > 0.0 for row in rows.values())
-
-
-def test_every_kind_names_its_sections() -> None:
-    assert list(batch.sections(True, 3)) == ["study"]
-    assert "calibration" in calibration.sections(True)
-
-
 @pytest.mark.usefixtures("without_peers")
 def test_real_recordings_when_at_hand(data: Path) -> None:
     table = filters.sections(TINY, data)["recorded_accuracy"]()
     assert "1 of BROAD and the authors' trial" in table.title
     assert 0.5 < table.rows["smekf"]["total_rmse"] < 10.0
-
-
-def test_nan_is_left_out_of_the_file() -> None:
-    columns = (tables.Column("a", "a"), tables.Column("b", "b"))
-    table = tables.Table("title", columns, {"row": {"a": 1.5, "b": float("nan")}})
-    text = json.dumps(tables.document({"of": table}, False), allow_nan=False)
-    assert json.loads(text)["sections"]["of"]["rows"] == {"row": {"a": 1.5}}
 
 
 def test_bodies_need_their_recordings_and_measure_a_simulated_arm(

@@ -15,7 +15,6 @@ from benchmarks.four_bar import LENGTHS, PROTOCOL, move_four_bar, write_four_bar
 from benchmarks.ur5_arm import MOVE_S, TRUE, Moved, move_arm, write_table
 from wepose_pin.calibration import Calibration, Protocol, assess, calibrate
 from wepose_pin.calibration.protocols import Closure
-from wepose_pin.calibration.recorded import interpolate_places
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import render_all
 from wepose_pin.errors import WeposeError
@@ -119,15 +118,6 @@ def test_recorded_places_of_the_tip_close_the_chain(arm: BodyModel, tmp_path: Pa
     assert seen.min() == 1.0
     assert len(calibration.time) < 0.9 * 8.0 * (moved.recording.phases["tip"][0][1] - MOVE_S - 2.0)
     assert "scale" not in {check.diagnostic.code.partition("-")[0] for check in assess(calibration).checks}
-
-
-def test_places_are_interpolated_between_rows_that_have_them() -> None:
-    known_time, lost = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 1.0, 1.1]), np.nan
-    places = np.array([0.0, 1.0, 2.0, lost, 4.0, 10.0, 11.0])[:, None] * [1.0, 2.0, -1.0]
-    time = np.array([-0.05, 0.0, 0.05, 0.2, 0.25, 0.35, 0.4, 0.7, 1.05, 1.1, 1.15])
-    expected = np.array([lost, 0.0, 0.5, 2.0, lost, lost, 4.0, lost, 10.5, 11.0, lost])  # 0.4 to 1.0: rows are missing
-    interpolated = interpolate_places(time, known_time, places)
-    np.testing.assert_allclose(interpolated, expected[:, None] * [1.0, 2.0, -1.0], atol=1e-9)
 
 
 def test_a_chain_whose_limb_is_drawn_is_assessed(urdf: Path) -> None:  # noqa: F811

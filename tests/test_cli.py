@@ -7,26 +7,21 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from commands import run
 
 from wepose_pin import __version__
-from wepose_pin.cli import COMMANDS, find_command, main
+from wepose_pin.cli import COMMANDS, find_command
 from wepose_pin.jobs.fields import field_types
 from wepose_pin.recording import Recording
-from wepose_pin.simulation import Imperfections, Simulation, simulate
+from wepose_pin.simulation import Simulation, simulate
 from wepose_pin.writers import write_session
-
-
-def run(*words: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    return int(stop.value.code or 0)
 
 
 @pytest.fixture
@@ -67,13 +62,6 @@ def test_help_reads_like_a_manual(capsys: pytest.CaptureFixture[str], monkeypatc
             assert switch in text or field in find_command(name).arguments, (name, switch)
             if switch.startswith("--no-"):
                 assert f"{switch} Do not " in " ".join(text.split()), (name, switch)
-
-
-def test_help_names_each_imperfection(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("simulate", "--help") == 0
-    text = capsys.readouterr().out
-    for field in fields(Imperfections):
-        assert field.name in text
 
 
 @pytest.mark.slow
@@ -128,14 +116,6 @@ def test_without_a_gauge_it_says_whose_scale_it_is(
     assert "Quality: poor" in captured.out
     assert "No length was measured." in captured.out
     assert "No length was measured." not in captured.err  # not twice
-
-
-def test_simulate_is_seeded(tmp_path: Path) -> None:
-    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
-        assert run("simulate", "-o", tmp_path / name, "--seed", seed, "--seconds", 5) == 0
-    a, b, c = (pl.read_parquet(tmp_path / name / "recording.parquet") for name in "abc")
-    assert a.equals(b)
-    assert not a.equals(c)
 
 
 def test_simulate_with_mounts_anywhere_is_tracked_with_its_subject(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import calibrate
 from wepose_pin.cli import main
-from wepose_pin.kinematics import build_pose_table, compute_axis_std, compute_point_covariances, compute_pose
+from wepose_pin.kinematics import compute_axis_std, compute_point_covariances, compute_pose
 from wepose_pin.model import load_model
 from wepose_pin.model.girdle import PARAMETERS
 from wepose_pin.simulation import MTI_3, PEOPLE_MEASURED_STD, PEOPLE_PRESET, simulate, simulate_person
@@ -153,16 +153,6 @@ def test_the_columns_of_the_result(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sqrt(trace / 3), full["left_palm_std"])
     assert not [name for name in without.columns if name.endswith("_std")]  # NCF has no covariance
     assert plain["torso_std"].is_finite().all()
-
-
-def test_a_hand_that_is_segment_and_point_has_a_column_each() -> None:
-    still = {name: np.array([[0.0, 0.0, 0.0, 1.0]]) for name in ("torso", *ARMS, "left_hand")}
-    pose = compute_pose(load_model(), np.zeros(1), still)
-    cov = {name: np.eye(3)[None] * 1e-4 for name in still}
-    points = compute_point_covariances(load_model(), still, cov, EXACT)
-    table = build_pose_table(replace(pose, segment_cov=cov, point_cov=points))
-    assert table["left_hand_std"][0] == pytest.approx(0.01)
-    assert table["left_palm_std"][0] == pytest.approx(compute_axis_std(points["left_palm"])[0])
 
 
 def test_the_parts_of_the_error_budget_add_up_in_variance() -> None:

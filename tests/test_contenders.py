@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation import gains as tuning
-from benchmarks.validation.contenders import DEFAULT_GAINS, PUBLISHED, Contender, list_contenders
+from benchmarks.validation.contenders import DEFAULT_GAINS, Contender, list_contenders
 from benchmarks.validation.experiment import align_rotation
-from benchmarks.validation.gains import STATED, compute_rmse, list_trials, make_gains
+from benchmarks.validation.gains import STATED, compute_rmse, list_trials
 from wepose_pin.evaluation import attitude_error
-from wepose_pin.filters import METHODS, GdcParams, NcfParams
+from wepose_pin.filters import GdcParams, NcfParams
 from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.simulation import SingleSensor, simulate_paper_dynamic
 
@@ -31,20 +31,6 @@ def sensor() -> SingleSensor:
 
 def at_rest(sensor: SingleSensor) -> np.ndarray:
     return (sensor.time >= 0.5) & (sensor.time <= 4.5)
-
-
-def test_who_takes_part() -> None:
-    others = ["ncf", "gdc", "ncf, default gains", "gdc, default gains"]
-    ours = [method for method in METHODS if method not in (*others, PUBLISHED)]
-    assert NAMES[: len(ours) + 5] == [*ours, PUBLISHED, *others]
-    assert {contender.label for contender in ALL if contender.method} == set(ours)
-
-
-def test_peers_take_part_where_they_are_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.validation.contenders.find_spec", lambda name: name == "vqf" or None)
-    labels = [contender.label for contender in list_contenders(SETTING)]
-    assert labels[-2:] == ["vqf", "offline vqf"]
-    assert "imufusion" not in labels
 
 
 @pytest.mark.parametrize("contender", ALL, ids=NAMES)
@@ -75,29 +61,6 @@ def test_the_bias_is_removed_for_all_but_as_it_comes(contender: Contender, senso
         assert apart > 20.0
     else:
         assert apart < (0.05 if contender.label == "imufusion" else 1e-4)  # that one counts in single precision
-
-
-def test_a_tuning_trial_is_scored_as_the_experiments_do() -> None:
-    trial = tuning._make_dynamic_trial(tuning.DYNAMIC_SEEDS[0], 100.0)
-    sensor = simulate_paper_dynamic(tuning.DYNAMIC_SEEDS[0], 100.0)
-    true, rest = Rotation.from_quat(sensor.quat_WS), at_rest(sensor)
-    moving = (sensor.time >= sensor.moving[0]) & (sensor.time <= sensor.moving[1])
-    for contender in ALL:
-        if contender.label in ("ncf", "gdc"):
-            quat = contender.orient(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, trial.noise)
-            R_WS = align_rotation(Rotation.from_quat(quat), true, rest)
-            expected = attitude_error(R_WS[moving], true[moving], sensor.time[moving]).total_rmse
-            params = getattr(make_gains(SETTING), contender.label)
-            assert compute_rmse(trial, params) == pytest.approx(expected, rel=0.02)
-
-
-def test_tuning_trials_are_scored_nowhere_else() -> None:
-    assert min(tuning.DYNAMIC_SEEDS) > 11
-    assert min(tuning.PERSON_SEEDS) > 9
-    assert not tuning.HALVES[0] & tuning.HALVES[1]
-    assert make_gains("real", "01_undisturbed_slow_rotation_A") is STATED["BROAD, second half"]
-    assert make_gains("real", "03_undisturbed_slow_rotation_C") is STATED["BROAD, first half"]
-    assert make_gains("real", "prova_HR") is make_gains("real") is STATED["BROAD"]
 
 
 @pytest.mark.peer

@@ -129,25 +129,6 @@ def test_what_stands_in_backticks_exists(page: str) -> None:
     assert [span for span in map(missing, spans) if span] == []
 
 
-@pytest.mark.parametrize(
-    "span",
-    [
-        "make tests",
-        "wepose trakc",
-        "wepose track --subjects",
-        "--gauges",
-        "docs/architektur.md",
-        "tracking.Trakker",
-        "tracking.Tracker.pushed",
-        "NoSuchClass",
-        "no_such_name",
-        "diagnostic.toml",
-    ],
-)
-def test_what_does_not_exist_is_noticed(span: str) -> None:
-    assert missing(span)
-
-
 def test_every_room_is_in_the_architecture_and_its_picture() -> None:
     rows = re.findall(r"^\| `(\w+)` \|", text_of("docs/architecture.md"), re.MULTILINE)
     assert rows == LAYERS[::-1], "the rooms from the ground up, as the contract in pyproject.toml has them"
@@ -248,8 +229,3 @@ def test_links_lead_somewhere(page: str) -> None:
     # What the build of the site makes is named by what makes it.
     making = "".join(path.read_text(encoding="utf-8") for path in ROOT.glob("docs/**/*.py"))
     assert [file for file in missing if not file.startswith("generated/") or Path(file).name not in making] == []
-
-
-def test_the_readme_leads_to_the_pages_for_contributors() -> None:
-    for page in ("CONTRIBUTING.md", "docs/architecture.md", "docs/glossary.md", "docs/recipes.md"):
-        assert f"]({page})" in text_of("README.md"), page

@@ -195,26 +195,6 @@ def test_what_is_no_file_is_refused_wherever_one_is_read(
 # Recordings of nothing ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rows", [0, 1, 2])
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_a_recording_of_hardly_a_sample(
-    rows: int, suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    files = Files(tmp_path, good_table().head(rows))
-    if suffix == ".parquet":
-        files.parquet()
-    line = refused(["track", str(files.write()), "-o", str(tmp_path / "out")], capsys)
-    assert f"arm{suffix}" in line or "session.toml" in line
-
-
-@pytest.mark.parametrize("rate", ["1e12", "1e-300", "1e308", "1" + "0" * 400, "nan", "-inf"])
-def test_a_rate_that_no_sensor_has(rate: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = Files(tmp_path, good_table())
-    files.say('time = "time"', f"rate_hz = {rate}")
-    line = refused(["track", str(files.write()), "-o", str(tmp_path / "out")], capsys)
-    assert "session.toml" in line or "1e+300" in line
-
-
 # Paths -------------------------------------------------------------------------------------------------------------
 
 

@@ -29,7 +29,6 @@ from wepose_pin.filters import (
 from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.base import run_in_parallel
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
-from wepose_pin.filters.smekf import starting_params
 from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.rotations import quat_from_gravity
 from wepose_pin.simulation import simulate_paper_dynamic
@@ -118,18 +117,6 @@ def heading_error_deg(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
 # sMEKF -------------------------------------------------------------------------------------------------------------
 
 
-def test_smekf_is_algorithm_1() -> None:
-    gyro, accel, _, rest = measured(np.random.default_rng(0), 30.0, bias=(0.01, -0.02, 0.005))
-    noise = estimate_noise(gyro[:180], accel[:180], RATE)
-    start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
-    quat, bias, cov = smekf_by_the_book(noise, start, gyro, accel, rest, 1 / RATE)
-    run = PublishedSmekf(noise, RATE, start).run(gyro, accel, rest)
-    turned = (Rotation.from_quat(run.quat_WS).inv() * Rotation.from_quat(quat)).magnitude()
-    assert turned.max() < 1e-10
-    np.testing.assert_allclose(run.gyro_bias, bias, atol=1e-12)
-    np.testing.assert_allclose(run.attitude_cov, cov, rtol=1e-7, atol=1e-15)
-
-
 def test_smekf_published_is_algorithm_1_with_the_papers_static_test() -> None:
     """A slow steady turn from 12 s on passes the paper's four conditions; smekf itself takes it for motion."""
     rng = np.random.default_rng(2)
@@ -204,21 +191,6 @@ def without_noise() -> SensorNoise:
     return SensorNoise(np.zeros(3), zero, zero, zero, zero, GRAVITY)
 
 
-def test_H_is_the_derivative_of_the_measurement() -> None:
-    eps = 1e-6
-    quat, bias = Rotation.from_rotvec([0.2, 1.1, -0.7]).as_quat(), np.array([0.01, 0.02, -0.03])
-
-    def predicted(error: np.ndarray) -> np.ndarray:
-        """[accel/g; gyro] at rest."""
-        R = matrix(quat_product(quat, quat_exp(error[:3])))
-        return np.concatenate([R.T @ [0, 0, 1], bias + error[3:]])
-
-    numeric = np.column_stack([(predicted(eps * e) - predicted(-eps * e)) / (2 * eps) for e in np.eye(6)])
-    up = matrix(quat).T @ [0, 0, 1]
-    H = np.block([[cross_matrix(up), np.zeros((3, 3))], [np.zeros((3, 3)), np.eye(3)]])
-    np.testing.assert_allclose(numeric, H, atol=1e-9)
-
-
 def test_correction_brings_the_bias_home_and_stops_the_heading() -> None:
     """Recordings hardly show it: 60 s, a rest of 2 s in every 10 s, the bias at the start wrong by 0.3 deg/s."""
     rows = []
@@ -261,10 +233,6 @@ def test_the_exact_covariance_keeps_the_heading_through_wild_motion() -> None:
     assert mean["smekf"] < 0.6 * mean["smekf_published"]
 
 
-def true_vertical(quat: np.ndarray) -> np.ndarray:
-    return matrix(quat).T @ [0, 0, 1]
-
-
 @pytest.mark.slow
 def test_nees_is_right_when_the_filter_is_told_the_truth() -> None:
     """Data from the filter's own model, P₀ as drawn: the normalised attitude error averages to its three states."""
@@ -303,33 +271,6 @@ def test_nees_is_right_when_the_filter_is_told_the_truth() -> None:
     average = float(np.mean(nees))
     print(f"NEES {average:.3f} (3 is right)")
     assert abs(average - 3) < 0.3
-
-
-@pytest.mark.slow
-def test_where_the_papers_start_and_bias_noise_are_wrong() -> None:
-    """The figures in the docstring of `SmekfParams`."""
-    # A bias that drifts by 10 deg/h over 100 s, as a random walk: δt² Σ_b = 2 σ² δt / 100 s.
-    real_step = np.eye(3) * (np.deg2rad(10.0 / 3600.0)) ** 2 * 2.0 * RATE / 100.0
-    rows: dict[str, list[tuple[float, float]]] = {"paper": [], "measured P0": [], "measured P0, real bias": []}
-    for seed in range(16):
-        gyro, accel, true, _ = measured(np.random.default_rng(seed), 120.0, bias=(0.01, -0.02, 0.015), tilt=0.8)
-        noise = estimate_noise(gyro[:180], accel[:180], RATE)
-        for name, figures in rows.items():
-            method = "smekf_published" if name == "paper" else "smekf"
-            stated_noise = replace(noise, bias_step_cov=real_step) if name.endswith("bias") else noise
-            out = run_filter(gyro, accel, RATE, stated_noise, FilterSettings(method, measured_start=True))
-            heading = heading_error_deg(out.quat_WS, true)
-            aligned = Rotation.from_rotvec([0, 0, np.deg2rad(heading[100])]) * Rotation.from_quat(true)
-            error = (Rotation.from_quat(out.quat_WS).inv() * aligned).as_rotvec()
-            assert out.attitude_cov is not None
-            nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(out.attitude_cov), error)
-            figures.append((nees[3000:].mean(), np.sqrt(np.mean((heading[3000:] - heading[100]) ** 2))))
-    mean = {name: np.mean(figures, axis=0) for name, figures in rows.items()}
-    for name, (nees, rms) in mean.items():
-        print(f"{name:24s} NEES {nees:.1f}, heading {rms:.2f} deg rms")
-    np.testing.assert_allclose(mean["paper"], (1.9, 0.57), rtol=0.1)
-    np.testing.assert_allclose(mean["measured P0"], (0.45, 0.10), rtol=0.1)
-    np.testing.assert_allclose(mean["measured P0, real bias"], (0.69, 0.08), rtol=0.1)
 
 
 def test_the_heading_of_a_sensor_that_turns_round_and_round_is_as_uncertain_as_its_scale() -> None:
@@ -567,21 +508,6 @@ def test_wrong_input_is_named() -> None:
         estimate_orientation(gyro, gyro, RATE, static=(0, 0.9))
 
 
-def test_starting_params_trust_tilt_and_heading_as_far_as_known() -> None:
-    gyro, accel, _, _ = measured(np.random.default_rng(8), 2.0)
-    noise = estimate_noise(gyro, accel, RATE)
-    quat = Rotation.from_rotvec([0.3, -0.5, 0.0]).as_quat()
-    up_S = true_vertical(quat)
-    still, moving = (starting_params(noise, RATE, quat, std).attitude_cov0 for std in (0.004, 0.2))
-    assert isinstance(still, np.ndarray)
-    assert isinstance(moving, np.ndarray)
-    for params in (still, moving):
-        assert np.sqrt(up_S @ params @ up_S) < 1e-4  # the heading is zero by definition
-    across = np.linalg.svd(np.eye(3) - np.outer(up_S, up_S))[0][:, 0]
-    assert 0.003 < np.sqrt(across @ still @ across) < 0.02
-    assert np.sqrt(across @ moving @ across) > 0.1
-
-
 # Live, in threads, and with samples missing ---------------------------------------------------------------------------
 
 
@@ -619,26 +545,6 @@ def test_a_create_bank_sensors_gives_the_bits_of_each_alone() -> None:
         np.testing.assert_array_equal(bank.gyro_bias, [run.gyro_bias[-1] for run in alone])
         np.testing.assert_array_equal(bank.attitude_cov, [run.attitude_cov[-1] for run in alone])  # type: ignore[index]
         np.testing.assert_array_equal(filters[0].state.record, before)  # on copies
-
-
-def test_a_bank_takes_any_array_and_names_what_does_not_fit() -> None:
-    gyro, accel, _, noises, starts = sensors(3, 2.0)
-    filters = [Smekf(noise, RATE, start) for noise, start in zip(noises, starts, strict=True)]
-    detectors = [StaticDetector(noise, RATE) for noise in noises]
-    bank, other = LiveBank(filters, detectors), LiveBank(filters, detectors)
-    np.testing.assert_array_equal(
-        bank.update(gyro[0].tolist(), accel[0].tolist()), other.update(np.asfortranarray(gyro[0]), accel[0])
-    )
-    with pytest.raises(BadData, match="each of 3 sensors"):
-        bank.update(gyro[0, :2], accel[0])
-    with pytest.raises(BadOption, match="3 filters and 2 detectors"):
-        LiveBank(filters, detectors[:2])
-    with pytest.raises(BadOption, match=r"windows of \[20, 50\]"):
-        LiveBank(filters, [StaticDetector(noises[0], RATE, StaticTest(window_s=0.2)), *detectors[1:]])
-    with pytest.raises(BadOption, match="kind Gdc, Smekf"):
-        LiveBank([*filters[:2], Gdc(noises[2], RATE, starts[2])], detectors)
-    with pytest.raises(BadOption, match="kind none"):
-        LiveBank([], [])
 
 
 def test_runs_in_threads_are_the_runs_one_after_the_other() -> None:

@@ -10,25 +10,21 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from arms import write_arm
-from guided_person import RATE_HZ, TRACKERS, GuidedPerson, PersonSource, TrackerPerson, perform
+from guided_person import TRACKERS, GuidedPerson, PersonSource, TrackerPerson, perform
 
 from wepose_pin.assets import asset
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, load_protocol
-from wepose_pin.calibration.observability import format_longest
-from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadSession
 from wepose_pin.jobs.guide import choose_parts, choose_protocol
 from wepose_pin.jobs.live import LiveJob, run_live
 from wepose_pin.live import open_source
-from wepose_pin.live.assignment import AssignedSource, ShakeDetector, read_segments, write_segments
+from wepose_pin.live.assignment import read_segments, write_segments
 from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
-from wepose_pin.live.guide_motion import count_from_begin
 from wepose_pin.live.guided import make_steps
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.state import GuideView, Output, Status
@@ -36,7 +32,6 @@ from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.recording import Recording
-from wepose_pin.recording.arrivals import Samples
 from wepose_pin.recording.limits import STANDARD_GRAVITY
 from wepose_pin.simulation import simulate_person
 from wepose_pin.subject import load_subject
@@ -288,20 +283,6 @@ def test_a_length_that_cannot_be_is_refused_and_the_result_stays(tmp_path: Path)
     guide.close()
 
 
-def test_seconds_of_a_reason_count_from_the_begin_of_the_motion() -> None:
-    """On a source's clock that began with the machine, a day before; apart from 2 to 4 s after the begin."""
-    time_s = np.arange(0.0, 40.0, 0.125)
-    gap = np.where(time_s < 10.0, np.nan, 0.01)
-    contact = np.where((time_s >= 12.0) & (time_s <= 14.0), 0.0, 1.0)
-    calibration = cast("Calibration", SimpleNamespace(time=87_200.0 + time_s, gap=gap, contact=contact))
-    apart = Diagnostic("closure-open", WARNING, "", 0.2, 0.1, {"intervals": format_longest([(87_212.0, 87_214.0)])})
-    other = Diagnostic("closure-gap-large", WARNING, "", 0.05, 0.03)
-    (shown, same) = count_from_begin([apart, other], calibration)
-    assert shown == replace(apart, facts={"intervals": format_longest([(2.0, 4.0)])})
-    assert same is other
-    assert count_from_begin([other], calibration) == [other]
-
-
 @pytest.mark.slow
 def test_sensors_that_were_mistaken_are_exchanged_without_another_motion(tmp_path: Path) -> None:
     session = Session(tmp_path)
@@ -408,39 +389,6 @@ def test_a_setup_with_a_wrong_segment_is_refused(tmp_path: Path) -> None:
         (tmp_path / "setup.toml").write_text(text)
         with pytest.raises(BadSession, match=said):
             read_segments(tmp_path, ("torso",))
-
-
-def test_the_battery_of_a_sensor_goes_with_its_segment() -> None:
-    class Charged(PersonSource):
-        @property
-        def batteries(self) -> dict[str, float]:
-            return {"a7": 0.4, "zz": 0.1}
-
-    person = GuidedPerson(perform(*PERSON))
-    assert AssignedSource(Charged(person), person.worn, ("torso",)).batteries == {"torso": 0.4}
-    assert AssignedSource(PersonSource(person), person.worn, ("torso",)).batteries == {}
-
-
-def test_a_shake_is_found_among_sensors_that_move_with_it() -> None:
-    detector, t = ShakeDetector(), np.arange(0.0, 1.0, 1.0 / RATE_HZ)
-    wave = 8.0 * np.sin(2.0 * np.pi * 3.0 * t)[:, None] * [1.0, 0.0, 0.0]
-    still = 1e-3 * np.ones((len(t), 3))
-
-    def push(begin: float, **rates: np.ndarray) -> None:
-        for k in range(0, len(t), 5):
-            part = slice(k, k + 5)
-            detector.push([Samples(name, begin + t[part], rate[part], rate[part]) for name, rate in rates.items()])
-
-    push(0.0, a=still, b=still)
-    assert detector.find(["a", "b"]) is None
-    push(1.0, a=wave, b=0.5 * wave)
-    assert detector.find(["a", "b"]) == "a"
-    assert detector.find(["b"]) is None  # not before all have come to rest
-    push(2.0, a=still, b=still)
-    assert detector.find(["b"]) is None
-    push(3.0, a=wave, b=0.9 * wave)
-    assert detector.find(["a", "b"]) is None  # either of them
-    assert detector.find(["b"]) == "b"
 
 
 class Follower(Output):

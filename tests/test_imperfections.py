@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
-from simulated import SIDES, SUBJECT, G, check_accel, check_gyro, check_lengths, in_torso, multiply, within
+from simulated import SIDES, SUBJECT, G, check_gyro, in_torso, multiply, within
 
 from wepose_pin.errors import BadSession
 from wepose_pin.readers import load_session
@@ -22,7 +22,6 @@ from wepose_pin.simulation import (
     SEGMENTS,
     Device,
     Imperfections,
-    ImuNoise,
     Simulation,
     SingleSensor,
     simulate,
@@ -30,7 +29,6 @@ from wepose_pin.simulation import (
     simulate_paper_dynamic,
     simulate_person,
 )
-from wepose_pin.simulation.imu import draw_lost
 from wepose_pin.simulation.motion import Flaws, Sway
 from wepose_pin.simulation.subject import _STREAMS
 from wepose_pin.subject import population_subject
@@ -58,11 +56,6 @@ def body() -> Simulation:
 
 
 @pytest.fixture(scope="module")
-def fast() -> Simulation:
-    return simulate(SUBJECT, seed=4, rate_hz=1000.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=10.0, circles=1)
-
-
-@pytest.fixture(scope="module")
 def realistic() -> Simulation:
     return simulate(SUBJECT, seed=5, imperfections=MILD_PRESET, **SHORTER)
 
@@ -72,34 +65,6 @@ def rms(vectors: np.ndarray) -> float:
 
 
 # Presets and the perfect world -----------------------------------------------------------------------------------
-
-
-def test_presets() -> None:
-    assert Imperfections() == IDEAL_PRESET
-    for field in fields(Imperfections):
-        if field.name != "mount":
-            assert getattr(IDEAL_PRESET, field.name) in (0, np.inf), field.name
-            assert 0 <= getattr(MILD_PRESET, field.name) < np.inf, field.name
-    assert len(IN_MILD) == 16
-    assert MILD_PRESET.mount == IDEAL_PRESET.mount == "stated"
-
-
-def test_the_perfect_world_is_the_default_and_what_it_was() -> None:
-    one, same = (simulate(SUBJECT, seed=1, clasp_s=5.0, circles=1, **k) for k in ({}, {"imperfections": IDEAL_PRESET}))
-    for segment in SEGMENTS:
-        assert np.array_equal(one.gyro_S[segment], same.gyro_S[segment])
-        assert not one.soft_tissue[segment].any()
-        assert np.array_equal(one.sample_time[segment], one.time)
-    # Figures of the version before there were imperfections.
-    np.testing.assert_allclose(
-        one.gyro_S["left_forearm"][1000], [-2.5231894176101046, -0.03430702840236642, -0.5154195102494267], rtol=1e-9
-    )
-    np.testing.assert_allclose(
-        one.accel_S["left_forearm"][1000], [-9.588895243009967, 1.2926217306950627, -0.23232891197459637], rtol=1e-8
-    )
-    np.testing.assert_allclose(
-        one.points["right_palm"][1000], [0.22785801289839924, 0.12204711584032252, 0.6425385723237393], rtol=1e-12
-    )
 
 
 @pytest.mark.parametrize(
@@ -134,25 +99,6 @@ def test_gyro_integrates_to_the_sensors_own_orientation(body: Simulation, segmen
     assert np.rad2deg((truth.inv() * skeleton).magnitude()).max() > 2.5  # which is not the segment's
     # The first rate is that of the sway as well, not a step.
     assert rms(body.gyro_S[segment][:1] - body.gyro_S[segment][1:2]) < np.deg2rad(0.05)
-
-
-@pytest.mark.parametrize("segment", SEGMENTS)
-def test_accel_integrates_to_the_position(fast: Simulation, segment: str) -> None:
-    assert check_accel(fast, segment, Rotation.from_quat(fast.quat_WS[segment]), 4.5, 14.5).max() > 0.1
-
-
-def test_segments_keep_their_length(body: Simulation) -> None:
-    check_lengths(body, rigid_hands=True)
-
-
-@pytest.mark.parametrize("scale", [0.6, 0.85, 1.2])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_arms_reach_also_when_imperfect(seed: int, scale: float) -> None:
-    lengths = {k: scale * v for k, v in SUBJECT.items()}
-    sim = simulate(lengths, seed=seed, rate_hz=50.0, noise=NOISE_FREE, imperfections=BODY, clasp_s=30.0, circles=2)
-    for segment in SEGMENTS:  # of human size still
-        assert np.linalg.norm(sim.gyro_S[segment], axis=1).max() < 15
-        assert np.linalg.norm(sim.accel_S[segment], axis=1).max() < 40
 
 
 # Sizes as documented ---------------------------------------------------------------------------------------------
@@ -341,21 +287,6 @@ def test_clocks_shift_the_samples_in_the_data() -> None:
     assert np.array_equal(recorded.sensors["torso"].gyro_S, sim.gyro_S["torso"])
 
 
-def runs_of(mask: np.ndarray) -> Iterator[int]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int))).reshape(-1, 2)
-    yield from (int(b - a) for a, b in edges)
-
-
-@pytest.mark.parametrize("rate_hz", [10.0, 100.0, 1000.0])
-@pytest.mark.parametrize("share", [0.002, 0.05])
-def test_lost_samples(rate_hz: float, share: float) -> None:
-    masks = [draw_lost(np.random.default_rng(seed), 200000, rate_hz, share) for seed in range(5)]
-    assert np.mean(masks) == pytest.approx(share, rel=0.15)
-    longest = max(max(runs_of(mask)) for mask in masks)
-    assert longest == max(1, round(0.05 * rate_hz))
-    assert not any(mask[[0, -1]].any() for mask in masks)
-
-
 def test_lost_samples_are_bridged_as_in_a_users_file(realistic: Simulation, tmp_path: Path) -> None:
     recorded = realistic.recording()
     raw = {
@@ -390,22 +321,6 @@ def test_mounts_at_any_rotation_need_a_subject() -> None:
 
 
 # Noise -----------------------------------------------------------------------------------------------------------
-
-
-def allan_deviation(rates: np.ndarray, rate_hz: float, m: int) -> np.ndarray:
-    """Overlapping Allan deviation of rates (n, k) at clusters of m samples (IEEE Std 952, annex C)."""
-    theta = np.vstack((np.zeros(rates.shape[1]), np.cumsum(rates, axis=0))) / rate_hz
-    second = theta[2 * m :] - 2.0 * theta[m:-m] + theta[: -2 * m]
-    return np.sqrt(np.mean(second**2, axis=0) / 2.0) * rate_hz / m
-
-
-def test_allan_deviation_gives_the_densities_back() -> None:
-    noisy, clean = (simulate(SUBJECT, seed=2, noise=noise) for noise in (ImuNoise(), NOISE_FREE))
-    for name, density in (("gyro_S", np.deg2rad(0.007)), ("accel_S", 120e-6 * G)):
-        noise = np.hstack([getattr(noisy, name)[s] - getattr(clean, name)[s] for s in SEGMENTS])
-        for tau in (0.05, 0.2, 1.0):
-            deviation = allan_deviation(noise, 100.0, round(tau * 100.0)) * np.sqrt(tau)
-            assert np.sqrt(np.mean(deviation**2)) == pytest.approx(density, rel=0.1)
 
 
 # Switches --------------------------------------------------------------------------------------------------------

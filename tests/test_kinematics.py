@@ -20,12 +20,10 @@ from wepose_pin.kinematics import (
     compute_orientation_residuals,
     compute_pose,
     find_known_links,
-    find_known_points,
     solve_configuration,
 )
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.girdle import displace
-from wepose_pin.model.orientation_ik import OrientationIk
 from wepose_pin.recording import Recording
 from wepose_pin.tracking import summarize, track
 
@@ -184,25 +182,6 @@ def test_a_single_frame_and_one_segment() -> None:
     assert pose.points["left_shoulder"][0, 1] < 0.0  # turned round
 
 
-def test_what_is_known() -> None:
-    body = load_model()
-    every = [f"{side}_{p}" for side in ("left", "right") for p in ("shoulder", "elbow", "wrist", "palm")]
-    assert find_known_points(body, CORE) == find_known_points(body, SEGMENTS) == every
-    assert find_known_points(body, ["torso", "left_upper_arm"]) == [
-        "left_shoulder",
-        "left_elbow",
-        "right_shoulder",
-    ]
-    assert find_known_points(body, ["left_upper_arm", "left_forearm"]) == []
-
-    body = load_model()
-    assert {"head", "pelvis", "left_palm", "right_hand"} <= set(find_known_links(body, CORE))
-    known = set(find_known_links(body, ["torso", "left_upper_arm", "right_forearm"]))
-    assert {"root", "torso", "head", "left_upper_arm"} <= known
-    assert not known & {"left_forearm", "left_hand", "left_palm", "right_upper_arm", "right_forearm", "right_hand"}
-    assert find_known_links(body, []) == ["root"]
-
-
 def test_a_segment_that_the_model_lacks() -> None:
     with pytest.raises(BadModel, match="left_foot is no segment of upper_body"):
         solve_configuration(load_model(), orientations(["torso", "left_foot"]))
@@ -246,44 +225,6 @@ def test_our_n_pose_hangs_its_arms(data: Path, dof: int) -> None:
         drop = pose.points[f"{side}_wrist"] - pose.points[f"{side}_shoulder"]
         length = body.lengths[f"{side}_upper_arm"] + body.lengths[f"{side}_forearm"]
         np.testing.assert_allclose(drop, [[0.0, 0.0, -length]], atol=1e-3)
-
-
-def test_two_axes_come_as_near_as_they_can(data: Path) -> None:
-    """Beside a search over both angles of the elbow and the wrist."""
-    body = gazebo(data, 48)
-    rng = np.random.default_rng(5)
-    quat_WL = orientations(SEGMENTS, 5, n=12)
-    q, _ = OrientationIk(body, quat_WL).stepwise(quat_WL, {})
-    missed = compute_orientation_residuals(body, q, quat_WL)
-    grid = np.linspace(-np.pi, np.pi, 61)
-    for segment, joints in (
-        ("left_forearm", ("jLeftElbow_roty", "jLeftElbow_rotz")),
-        ("right_hand", ("jRightWrist_rotx", "jRightWrist_rotz")),
-    ):
-        at = [body.pin.idx_qs[body.pin.getJointId(name)] for name in joints]
-        for k in range(4):
-            tried = np.repeat(q[k : k + 1], len(grid) ** 2 + 500, axis=0)
-            tried[: len(grid) ** 2, at] = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-            tried[len(grid) ** 2 :, at] += rng.normal(scale=0.02, size=(500, 2))  # and close by
-            R, _ = compute_link_poses(body, tried, [segment])
-            left = (Rotation.from_matrix(R[:, 0]).inv() * Rotation.from_quat(quat_WL[segment][k])).magnitude()
-            assert left.min() > missed[segment][k] - 1e-9
-            assert left.min() < missed[segment][k] + 0.1
-
-
-def test_what_two_axes_can_do_they_do_exactly(data: Path) -> None:
-    body = gazebo(data, 48)
-    rng = np.random.default_rng(6)
-    q = np.tile(pin.neutral(body.pin), (N, 1))
-    names = [f"j{side}{joint}" for side in ("Left", "Right") for joint in ("Elbow_roty", "Elbow_rotz", "Wrist_rotx")]
-    for name in names:
-        q[:, body.pin.idx_qs[body.pin.getJointId(name)]] = rng.uniform(-3.0, 3.0, N)
-    at = compute_link_placements(body, q, SEGMENTS)
-    quat_WL = {segment: at[segment][0] for segment in SEGMENTS}
-    solution = solve_configuration(body, quat_WL, limits=False)
-    assert max(missed.max() for missed in compute_orientation_residuals(body, solution, quat_WL).values()) < 1e-7
-    at_hinges = [body.pin.idx_qs[body.pin.getJointId(name)] for name in names]
-    np.testing.assert_allclose(solution[:, at_hinges], q[:, at_hinges], atol=1e-7)
 
 
 def test_a_spine_bends_evenly_and_does_not_twist_when_the_person_turns_round(data: Path) -> None:

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from commands import run
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin.angles import joint_angles
-from wepose_pin.cli import main
 from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import evaluate
 from wepose_pin.jobs.evaluate import EvaluateJob, run_evaluate
@@ -229,12 +229,6 @@ def test_an_activity_that_is_none_or_too_short_is_named() -> None:
 
 SHORT = ("--seconds", "15")
 LEG_JOINTS = [f"{side}_{joint}" for side in SIDES for joint in ("hip", "knee", "ankle")]
-
-
-def run(*arguments: str | Path) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main([str(argument) for argument in arguments])
-    return int(ended.value.code or 0)
 
 
 @pytest.mark.parametrize(

@@ -17,14 +17,12 @@ from scipy.spatial.transform import Rotation
 from test_causal import first
 
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
-from wepose_pin.kinematics import LiveKinematics, compute_pose
-from wepose_pin.live.loop import Latencies, LiveLoop, SessionSummary
+from wepose_pin.live.loop import LiveLoop, SessionSummary
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, Output, Status, StreamInfo
-from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log, read_messages
 from wepose_pin.recording import OrientationSensor, Recording
@@ -349,22 +347,6 @@ def test_outputs_get_the_newest_pose_with_its_points(recording: Recording, tmp_p
             np.testing.assert_allclose(pose.points[i], causal.points[name][k], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "segments",
-    [("torso", "left_upper_arm", "right_forearm", "right_upper_arm"), ("right_upper_arm", "torso"), ("torso",)],
-)
-def test_shoulders_move_live_as_in_a_recording(segments: tuple[str, ...]) -> None:
-    """Pose after pose the law is computed of numbers, in a recording of arrays."""
-    rng, body = np.random.default_rng(4), load_model()
-    body = replace(body, girdles={name: 0.02 * rng.standard_normal(7) for name in body.table.girdles})
-    quat = Rotation.random(50 * len(segments), rng).as_quat().reshape(50, -1, 4)
-    whole = compute_pose(body, np.arange(50.0), {name: quat[:, i] for i, name in enumerate(segments)})
-    live = LiveKinematics(body, segments)
-    points = np.stack([live.compute_points(row) for row in quat])
-    for i, name in enumerate(live.points):
-        np.testing.assert_allclose(points[:, i], whole.points[name], rtol=0, atol=1e-13)
-
-
 def is_told_by_a_neighbour(quat_WL: np.ndarray, clean: TrackedRecording, name: str) -> bool:
     """Whether orientations (n, 4) have the tilt of the clean ones, and a heading within three of its deviations.
 
@@ -600,14 +582,3 @@ def test_a_full_disk_ends_the_recording_and_not_the_session(recording: Recording
     ended = LiveLoop(source, setup, log=log, begin=float(recording.time[0])).run()
     assert ended.poses > 2000
     assert "the recording ended: No space left" in ended.problem
-
-
-def test_latencies_keep_their_quantiles() -> None:
-    rng = np.random.default_rng(0)
-    values = rng.lognormal(-7.0, 1.0, 20000)
-    kept = Latencies()
-    assert math.isnan(kept.quantile(0.5))
-    for value in values:
-        kept.add(float(value))
-    for share in (0.5, 0.9, 0.99):
-        assert kept.quantile(share) == pytest.approx(np.quantile(values, share), rel=0.03)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_ind
 from test_export import LENGTHS, write_folder
 
-from wepose_pin.angles import SHOULDER_SEQUENCES, Angles, group_sides, joint_angles
+from wepose_pin.angles import SHOULDER_SEQUENCES, group_sides, joint_angles
 from wepose_pin.angles.definitions import POSITIVE, ROTATIONS
 from wepose_pin.angles.joints import JOINTS
 from wepose_pin.angles.movement import (
@@ -25,7 +25,6 @@ from wepose_pin.angles.movement import (
     compare_curves,
     compare_statistics,
     compute_statistics,
-    measure_spans,
 )
 from wepose_pin.angles.movement_tables import build_comparison_table
 from wepose_pin.angles.smoothing import smooth_pose
@@ -177,13 +176,6 @@ def test_a_heading_that_is_off_for_all_of_the_time_changes_no_range_of_the_trunk
     np.testing.assert_allclose(stated[0, 2], [0.1, 0.1, 0.0, 0.0], atol=1e-9)
 
 
-def test_without_covariances_nothing_is_stated() -> None:
-    pose = pose_about(np.sin(np.arange(200) / 30.0))
-    joint = joint_angles(pose)["thorax"]
-    stated = compute_summary_std(pose, "thorax", joint, summarize_joint(pose.time, joint).samples[None])
-    assert np.isnan(stated).all()
-
-
 # Comparison -------------------------------------------------------------------------------------------------------
 
 
@@ -211,17 +203,6 @@ def test_curves_are_compared_after_the_full_turns_between_them() -> None:
     assert difference.rms == pytest.approx(0.1 / np.sqrt(2.0), rel=0.01)
     lost = curve._replace(mean=np.full(101, np.nan))
     assert np.isnan(compare_curves(curve, lost)).all()
-
-
-def test_what_is_measured_is_within_half_a_turn_of_zero() -> None:
-    """Angles are continuous: an arm that went about the lock hangs a full turn later, and it is the same posture."""
-    pose, spans = pose_of(1), [(0.0, 14.0), (0.0, 1.0), (2.0, 4.0), (6.0, 8.0)]
-    angles = joint_angles(pose)
-    joint = angles["right_elbow"]
-    later = (np.arange(len(pose.time)) >= 500)[:, None] * [2.0 * np.pi, 0.0, -2.0 * np.pi]
-    moved = Angles(angles.time, {"right_elbow": replace(joint, values=joint.values + 2.0 * np.pi + later)})
-    measured, expected = (measure_spans(pose, each, spans)["right_elbow"].values for each in (moved, angles))
-    np.testing.assert_allclose(measured[1:, :, :2], expected[1:, :, :2], atol=1e-9)
 
 
 def test_sessions_are_compared_after_the_full_turns_between_them() -> None:

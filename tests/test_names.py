@@ -111,32 +111,3 @@ def test_names_of_formats_stand_in_tables(file: str) -> None:
 @pytest.mark.parametrize("allowed", ALLOWED)
 def test_what_is_allowed_still_needs_it(allowed: str) -> None:
     assert any(find_names(path.read_text(encoding="utf-8")) for name, path in FILES.items() if covers(allowed, name))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        '"torso"',
-        '"shoulder_width"',
-        '"left_palm_x"',
-        'f"{side}_forearm"',
-        'side + "_hand"',
-        '("upper_arm",)',
-        'f"left_{x}"',
-        'f"{side}_hand_x"',
-        '"%s_palm" % side',
-        '"mounts.torso"',
-        '"lengths[trunk]"',
-        "dict(shoulder_width=0.4)",
-        "lengths.left_forearm",
-    ],
-)
-def test_it_finds(text: str) -> None:
-    assert find_names(f"x = {text}")
-
-
-@pytest.mark.parametrize(
-    "text", ['"left"', '"on_the_other_hand"', '"handle"', '"the torso leans"', '"torso-fixed"', '"a hand: x"']
-)
-def test_it_leaves(text: str) -> None:
-    assert not find_names(f'"""torso"""\nx = {text}')

@@ -20,7 +20,6 @@ from wepose_pin.model.table_file import format_table
 from wepose_pin.readers.describe import Wearer, describe_file
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report import render_track_report
-from wepose_pin.report.calibration import describe_direction
 from wepose_pin.report.viewer import FLOOR_Z, find_floor, pose_html
 from wepose_pin.tracking import TrackedRecording, summarize, track
 from wepose_pin.tracking.measures import measure_hinge, measure_tips
@@ -184,14 +183,6 @@ def test_its_report_has_its_words(tracked: TrackedRecording) -> None:
     assert not re.search(
         r"elbow|forearm|shoulder|palm|\bhands\b", text.split("What was run")[0].split("Joint angles")[0]
     )
-
-
-@pytest.mark.parametrize("angle", [0.1, -0.1])
-def test_tilts_of_legs_are_named_by_where_the_free_end_goes(body: BodyModel, angle: float) -> None:
-    toe = Rotation.from_euler("y", angle).apply([1.0, 0.0, 0.0])
-    assert describe_direction(body.table, "left_foot", 0, angle) == ("downwards" if toe[2] < 0.0 else "upwards")
-    knee = Rotation.from_euler("x", angle).apply([0.0, 0.0, -1.0])
-    assert describe_direction(body.table, "right_thigh", 1, angle) == ("inwards" if knee[1] > 0.0 else "outwards")
 
 
 def test_its_page_draws_trails_of_the_toes(tracked: TrackedRecording) -> None:

@@ -13,20 +13,16 @@ import numpy as np
 import polars as pl
 import pytest
 from bodies import LENGTHS, SEGMENTS
+from commands import run
 from scipy.spatial.transform import Rotation
 from test_calibration import with_rigid_shoulders
 
 from benchmarks.validation import simulated
 from benchmarks.validation.contenders import list_contenders
 from benchmarks.validation.experiment import run_experiment
-from wepose_pin.calibration import Calibration, assess, calibrate, load_protocol
-from wepose_pin.calibration.paper import _Constraints, _minimise, check_paper_formulation
-from wepose_pin.calibration.solver import MIN_LENGTH
-from wepose_pin.cli import main
+from wepose_pin.calibration import Calibration, assess, calibrate
 from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadOption, BadSession, NoSolution
-from wepose_pin.model import load_model
-from wepose_pin.model.table import NEUTRAL_POSE
 from wepose_pin.recording import CONFIGURATION, OrientationSensor, Recording
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.subject import load_subject, population_subject
@@ -50,12 +46,6 @@ def estimated(made: tuple[Person, Simulation, Recording]) -> Calibration:
     person, _, recording = made
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
     return calibrate(recording, measured=measured, prior=person.prior, method="smekf", formulation="paper")
-
-
-def run(*words: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    return int(stop.value.code or 0)
 
 
 def gap_by_length(made: tuple[Person, Simulation, Recording], time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -238,15 +228,6 @@ def test_another_start_pose_is_refused(start_pose: str, made: tuple[Person, Simu
         calibrate(recording, measured={"shoulder_width": 0.4}, formulation="paper")
 
 
-def test_a_hand_with_a_sensor_fixes_the_scale_and_one_without_does_not() -> None:
-    clasp = load_protocol("clasp")
-    check_paper_formulation(clasp, load_model(), ["left_hand"], [*SENSORS, "left_hand"], NEUTRAL_POSE)
-    check_paper_formulation(clasp, load_model(), ["left_forearm", "left_hand"], SENSORS, NEUTRAL_POSE)
-    for measured in (["left_hand"], ["left_forearm", "right_hand"], ["trunk"]):
-        with pytest.raises(BadOption, match="fixes the scale"):
-            check_paper_formulation(clasp, load_model(), measured, SENSORS, NEUTRAL_POSE)
-
-
 def test_every_mount_must_be_stated(made: tuple[Person, Simulation, Recording]) -> None:
     _, _, recording = made
     torso = replace(recording.sensors["torso"], stated_quat_LS=None)
@@ -386,13 +367,3 @@ def test_the_validation_has_rows_of_the_papers_protocol(monkeypatch: pytest.Monk
     hand = {method: row["hand from shoulders [mm]"][0] or 0.0 for method, row in rows.items()}
     assert len({hand[method] for method in hand if method != trunk}) == 4
     assert hand["smekf"] < hand[protocol]
-
-
-def test_a_quadratic_program_without_a_solution_is_an_error_and_prints_nothing(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    """A stated length below the bound of all lengths."""
-    constraints = _Constraints(np.array([[1.0, 0.0]]), np.array([0.5 * MIN_LENGTH]), np.eye(1))
-    with pytest.raises(NoSolution, match="no solution"):
-        _minimise(np.eye(2)[None], constraints, ("left_forearm", "left_hand"))
-    assert capfd.readouterr() == ("", "")

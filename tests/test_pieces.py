@@ -5,21 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from commands import run
 from reading import text_of
 from scipy.spatial.transform import Rotation
 
 from benchmarks.long_recordings import there_and_back
 from wepose_pin.calibration import calibrate
-from wepose_pin.cli import main
 from wepose_pin.errors import BadData, BadOption
-from wepose_pin.filters import METHODS, FilterSettings, SensorRun, chunk_multiple, run_filter
-from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.kinematics import build_pose_table
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
@@ -31,8 +28,6 @@ from wepose_pin.tracking import SummaryAccumulator, TrackedRecording, TrackOptio
 from wepose_pin.tracking.measures import measure
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import write_subject
-
-RATE = 100.0
 
 
 @pytest.fixture(scope="module")
@@ -132,52 +127,7 @@ def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation, tmp_pa
     assert joined(pieces).equals(build_pose_table(whole.pose, covariance=True))
 
 
-@pytest.mark.slow
-def test_a_body_whose_joints_are_too_few(made: Simulation, tmp_path: Path, data: Path) -> None:
-    """Its elbows are fitted from frame to frame: the next piece begins where the last one ended."""
-    from test_kinematics import gazebo
-
-    recording = made.recording()
-    first = {
-        name: replace(s, gyro_S=s.gyro_S[:1500], accel_S=s.accel_S[:1500]) for name, s in recording.sensors.items()
-    }  # type: ignore[index]
-    recording = replace(recording, time=recording.time[:1500], sensors=first, phases={"start": ((0.5, 4.5),)})
-    session, body = written(tmp_path / "short", recording), gazebo(data, 48)
-    whole = track(load_session(session), model=body)
-    pieces = list(track_session(session, model=body, seconds=4.0))
-    assert joined(pieces).equals(build_pose_table(whole.pose, covariance=True))
-    missed = summarize(whole).content["orientation_residual_rms_deg"]
-    assert max(missed.values()) > 1.0
-    assert summary_of(pieces)["orientation_residual_rms_deg"] == missed
-
-
 # The smoother ---------------------------------------------------------------------------------------------------------
-
-
-def one_sensor(made: Simulation) -> tuple[np.ndarray, np.ndarray]:
-    sensor = made.recording().sensors["right_forearm"]
-    return sensor.gyro_S, sensor.accel_S
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_filters_in_pieces(made: Simulation, method: str) -> None:
-    """The last two pieces of the smoother have seen all that lies behind them."""
-    gyro, accel = one_sensor(made)
-    noise = estimate_noise(gyro[50:450], accel[50:450], RATE)
-    whole = run_filter(gyro, accel, RATE, noise, FilterSettings(method))
-    size = 40 * chunk_multiple(method, RATE)
-    edges = [*range(0, len(gyro) - size, size), len(gyro)] if size > 40 else [0, 60, 1000, 1001, 3000, len(gyro)]
-    run, parts = SensorRun(RATE, noise, FilterSettings(method)), []
-    for first, last in pairwise(edges):
-        if (of := run.push(gyro[first:last], accel[first:last])) is not None:
-            parts.append(of)
-    if method == "smoother":
-        parts.append(run.finish())
-    quat = np.concatenate([of.quat_WS for of in parts])
-    same = slice(edges[-3], None) if method == "smoother" else slice(None)
-    np.testing.assert_array_equal(quat[same], whole.quat_WS[same])
-    np.testing.assert_array_equal(np.concatenate([of.gyro_bias for of in parts])[same], whole.gyro_bias[same])
-    np.testing.assert_array_equal(np.concatenate([of.static for of in parts]), whole.static)
 
 
 @pytest.mark.slow
@@ -202,12 +152,6 @@ def test_the_smoother_looks_one_piece_ahead(session: Path) -> None:
 
 
 # The command ----------------------------------------------------------------------------------------------------------
-
-
-def run(*words: object) -> int:
-    with pytest.raises(SystemExit) as stopped:
-        main([str(word) for word in words])
-    return int(stopped.value.code or 0)
 
 
 @pytest.fixture

@@ -17,7 +17,6 @@ from wepose_pin.calibration.conditions import (
     StartPose,
     find_girdles,
     find_hinges,
-    find_measured_lengths,
     find_segments,
     resolve_conditions,
 )
@@ -75,25 +74,11 @@ def mount_errors(calibration: Calibration, simulation: Simulation) -> tuple[np.n
     return np.array(error), np.array(std)
 
 
-def length_errors(calibration: Calibration, person: Person, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of lengths [m], and their standard deviations."""
-    return (
-        np.array([calibration.subject.lengths[name] - person.lengths[name] for name in names]),
-        np.array([calibration.subject.std(name) for name in names]),
-    )
-
-
 # --------------------------------------------------------------------------------------------------------------- data
 
 
 def codes(calibration: Calibration) -> set[str]:
     return {diagnostic.code for diagnostic in calibration.diagnostics}
-
-
-def measured_instead(calibration: Calibration) -> set[tuple[str, str]]:
-    """What is said of the scale, and which length to measure."""
-    scale = [d for d in calibration.diagnostics if "scale" in d.code]
-    return {(d.code, str(d.facts["measured"]).partition("=")[0]) for d in scale}
 
 
 def test_every_protocol_file_is_known_and_says_what_to_do() -> None:
@@ -107,15 +92,6 @@ def test_every_protocol_file_is_known_and_says_what_to_do() -> None:
         assert {segment.replace("hand", "forearm") for segment in find_segments(protocol, load_model())} == set(
             protocol.needs
         )
-
-
-def test_what_is_in_the_chain_follows_from_the_points() -> None:
-    def chain(name: str) -> tuple[str, ...]:
-        return find_measured_lengths(load_protocol(name), load_model())
-
-    assert set(chain("clasp")) == set(LENGTHS) - {"trunk"}  # the trunk cancels
-    assert set(chain("table")) == set(LENGTHS)
-    assert chain("t_pose+bow") == ()
 
 
 # Conditions that a protocol of one's own may have, with the sensors of one arm.
@@ -221,15 +197,6 @@ def test_poses_tell_headings_and_no_length() -> None:
         assert np.hypot(t_pose, 5.0) < std < np.linalg.norm([t_pose, n_pose, torso])
     measured = calibrate(recording, prior=person.prior, protocol="t_pose+bow", measured={"trunk": 0.47})
     assert measured.subject.lengths["trunk"] == pytest.approx(0.47, abs=2e-3)
-
-
-def test_a_longer_phase_makes_no_better_pose() -> None:
-    _, simulation = made("t_pose+bow", 4, real=True)
-    recording = simulation.recording()
-    ((first, last),) = recording.phases["t_pose"]
-    short = replace(recording, phases={**recording.phases, "t_pose": ((first, 0.5 * (first + last)),)})
-    both = [mount_errors(calibrate(r, protocol="t_pose+bow"), simulation)[1] for r in (short, recording)]
-    np.testing.assert_allclose(both[0], both[1], rtol=0.05)
 
 
 # ------------------------------------------------------------------------------------------------------ wrong requests

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import LENGTHS, TABLE
+from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, quality
-from wepose_pin.calibration.anatomy import LimbMotion, check_labels
 from wepose_pin.calibration.quality import OPEN_SHARE, QUALITIES
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import ERROR, INFO, WARNING, from_json, render
@@ -314,27 +313,6 @@ def test_a_mount_that_faces_elsewhere_is_said_and_solved(person: Person, stated:
     assert (unused.code, unused.place) == ("mount-not-used", "right_upper_arm")
     assert unused.facts == {"variant": "motion"}
     assert assess(solved(stated.recording(), person)).quality == "pass"
-
-
-def test_labels_are_searched_only_where_a_person_cannot_move_so() -> None:
-    def arms(doubt: float) -> LimbMotion:
-        return LimbMotion({}, {"left_elbow": 0.15 * doubt}, {"left_elbow": 0.0}, 0.0, 0.01)
-
-    tried: list[Mapping[str, str]] = []
-
-    def solve(moved: Mapping[str, str]) -> LimbMotion:
-        tried.append(moved)
-        return arms(0.2 if moved == {"torso": "left_forearm", "left_forearm": "torso"} else 3.0)
-
-    places = ("torso", "left_upper_arm", "left_forearm")
-    assert check_labels(arms(0.9), solve, places, TABLE).contradiction is None
-    assert tried == []
-    exchanged = check_labels(arms(3.0), solve, places, TABLE).diagnostic()
-    assert (exchanged.code, exchanged.place) == ("sensors-exchanged", "torso and left_forearm")
-    none = check_labels(arms(3.0), lambda _: arms(3.0), places, TABLE)
-    assert none.diagnostic().code == "limb-motion-implausible"
-    assert none.contradiction is not None
-    assert (none.contradiction.code, none.contradiction.place) == ("calibration-hinge-backward", "left_elbow")
 
 
 def test_exit_code_and_file_carry_the_quality(

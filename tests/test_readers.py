@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from contextlib import suppress
 from pathlib import Path
@@ -18,10 +17,10 @@ from wepose_pin.cli import main
 from wepose_pin.diagnostics import Diagnostic, as_json, render
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.readers import iter_session
-from wepose_pin.readers.tables import Rows, read_column, read_table
+from wepose_pin.readers.tables import read_table
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, Sensor, check_recording
-from wepose_pin.recording.clocks import build_clock, find_common_time, measure_rate
-from wepose_pin.recording.gaps import BRIDGED, LONG, bridge, bridge_quat, mark_lost_samples
+from wepose_pin.recording.clocks import build_clock, measure_rate
+from wepose_pin.recording.gaps import bridge, mark_lost_samples
 from wepose_pin.recording.limits import GRAVITY_ERROR_NOTED
 from wepose_pin.recording.plausibility import check_signals, find_cut_off
 from wepose_pin.recording.resampling import resample
@@ -166,22 +165,6 @@ def test_csv_as_programs_write_it(change, tmp_path: Path) -> None:
     assert sum(len(piece) for piece in iter_session(path, 1.7)) == 800
 
 
-def test_rows_of_a_csv_are_those_of_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wepose_pin.readers.tables.BLOCK_ROWS", 7)
-    lines = [[k, k if k < 40 else k + 0.5, "" if k % 9 == 0 else -k] for k in range(100)]
-    with (tmp_path / "t.csv").open("w", newline="") as file:
-        csv.writer(file).writerows([["a", "b", "c"], *lines, *([["", "", ""]] * 20)])
-    whole = read_table(tmp_path / "t.csv")
-    assert whole.height == 100
-    rows = Rows(tmp_path / "t.csv")
-    for first, last in ((0, 3), (2, 20), (20, 21), (60, 100)):
-        part = rows[first:last]
-        assert part.cast(pl.Float64).equals(whole[first:last].cast(pl.Float64))
-    values, height = read_column(tmp_path / "t.csv", "b", "t.csv", "x")
-    assert height == 100
-    np.testing.assert_array_equal(values, whole["b"])
-
-
 # Lost samples ------------------------------------------------------------------------------------------------------
 
 
@@ -225,28 +208,6 @@ def test_ready_orientations_are_bridged_along_the_rotation(tmp_path: Path) -> No
     assert quat is not None
     np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-12)
     assert np.degrees((Rotation.from_quat(quat).inv() * true_orientation(time)).magnitude()).max() < 0.3
-
-
-def test_gaps_at_both_ends_keep_the_nearest_value() -> None:
-    clock = build_clock(np.arange(10) / 100.0, "x")
-    values = np.arange(10.0)[:, None]
-    good = np.ones(10, dtype=bool)
-    good[[0, 1, 9]] = False
-    marks = mark_lost_samples(clock, good)
-    assert marks.tolist() == [BRIDGED] * 2 + [0] * 7 + [BRIDGED]
-    assert bridge(values, marks, clock)[:, 0].tolist() == [2.0, 2.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 8.0]
-    quat = rotations.exp(values * [0.0, 0.0, 0.1])
-    np.testing.assert_array_equal(bridge_quat(quat, marks, clock)[[0, 1, 9]], quat[[2, 2, 8]])
-
-
-@pytest.mark.parametrize("step", [0.001, 0.01, 0.1])
-def test_fifty_milliseconds_are_bridged_and_one_sample_more_is_not(step: float) -> None:
-    clock = build_clock(np.arange(1000) * step, "x")
-    most = max(1, round(0.05 / step))
-    for count, mark in ((most, BRIDGED), (most + 1, LONG)):
-        good = np.ones(1000, dtype=bool)
-        good[200 : 200 + count] = False
-        assert set(mark_lost_samples(clock, good)[~good]) == {mark}
 
 
 def test_in_a_long_gap_the_rate_falls_to_the_bias() -> None:
@@ -397,16 +358,6 @@ def test_a_gap_is_marked_on_the_common_time(tmp_path: Path) -> None:
     assert not recording.sensors["torso"].gap.any()
 
 
-def test_lost_rows_are_put_back_at_their_times() -> None:
-    time = np.delete(np.arange(20) / 100.0, [3, 10, 11, 12])
-    clock = build_clock(time, "x")
-    np.testing.assert_allclose(clock.time, np.arange(20) / 100.0)
-    assert clock.row.tolist() == [0, 1, 2, -1, 3, 4, 5, 6, 7, 8, -1, -1, -1, *range(9, 16)]
-    base, diagnostics = find_common_time("x", {"torso": clock})
-    assert base is clock.time
-    assert diagnostics == ()
-
-
 # Pieces ------------------------------------------------------------------------------------------------------------
 
 
@@ -487,19 +438,6 @@ def test_a_slow_peak_of_a_coarse_sensor_is_no_saturation() -> None:
     quat = rotations.integrate(gyro_S[1:] / 1000.0)
     sensor = ImuSensor(gyro_S=gyro_S, accel_S=Rotation.from_quat(quat).inv().apply([0.0, 0.0, 9.81]))
     assert check_signals(Recording("r", time, 1000.0, {"torso": sensor})) == ()
-
-
-# A simulated forearm's largest rate, in digits of 2000 deg/s at 16 bits: noise of 1.1 digits has made three alike.
-NOISY_PEAK = """-1521 -1583 -1645 -1704 -1764 -1818 -1877 -1926 -1974 -2022 -2067 -2108 -2149 -2181 -2211 -2240 -2264
--2283 -2297 -2312 -2320 -2320 -2320 -2313 -2305 -2289 -2273 -2249 -2221 -2194 -2156 -2122 -2081 -2040 -1997 -1948 -1901
--1852 -1803 -1754 -1697 -1651 -1599 -1550"""
-
-
-def test_noise_that_levels_a_peak_is_no_saturation() -> None:
-    rate = np.array(NOISY_PEAK.split(), dtype=float) * np.deg2rad(2000.0) / 2**15
-    gyro_S = np.column_stack([rate, rate, rate])
-    assert not find_cut_off(gyro_S, 2.0).any()
-    assert find_cut_off(np.clip(gyro_S, -2.3, 2.3), 2.0).all(axis=1).sum() == np.count_nonzero(rate < -2.3)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3, 1.0, 1.6, 3.0, 30.0])

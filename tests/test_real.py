@@ -88,14 +88,6 @@ def test_what_cannot_be_registered_is_said(moving: SingleSensor) -> None:
         register_sensors([apart._replace(time=apart.time + 0.31)], (6.0, 16.0))
 
 
-def test_links_are_fitted_from_orientations_and_tip() -> None:
-    R_W2, R_W4 = Rotation.random(50, random_state=1), Rotation.random(50, random_state=2)
-    R_W3 = R_W2 * Rotation.from_rotvec(np.linspace(0.0, 2.0, 50)[:, None] * [1.0, 0.0, 0.0])  # about the link itself
-    along = np.array([1.0, 0.0, 0.0])
-    tip_W = 0.5 * R_W2.apply(along) + 0.3 * R_W4.apply(along)
-    np.testing.assert_allclose(real.fit_links(tip_W, R_W2, R_W3, R_W4), (0.5, 0.3), atol=1e-12)
-
-
 def test_ring_is_read_as_it_is(data: Path) -> None:
     chain = read_ring(ring_files(data / "ring" / "trial1"))
     assert set(chain.sensors) == {(mount, segment) for mount in RING_MOUNTS for segment in RING_SEGMENTS}
@@ -109,16 +101,6 @@ def test_ring_is_read_as_it_is(data: Path) -> None:
     assert lengths["seg2"] == pytest.approx(0.289, abs=1.5e-3)
     assert lengths["seg3"] == pytest.approx(0.289, abs=1.5e-3)
     assert lengths["seg4"] == pytest.approx(0.2705, abs=1e-3)
-
-
-def test_optical_orientations_give_the_optical_lengths(data: Path) -> None:
-    """Shares with `fit_optical_links` only the tip: what is left is play in the joints."""
-    chain = read_ring(ring_files(data / "ring" / "trial1"))
-    links = real.fit_optical_links(chain)
-    seen = np.isfinite(links.tip_V).all(axis=1)
-    R = [Rotation.from_quat(chain.quat_VB[segment][seen]) for segment in ("seg2", "seg3", "seg4")]
-    optical = links.lengths["seg2"] + links.lengths["seg3"], links.lengths["seg4"]
-    np.testing.assert_allclose(real.fit_links(links.tip_V[seen], *R), optical, atol=1e-3)
 
 
 def test_ring_registration_is_consistent(data: Path) -> None:
@@ -233,13 +215,6 @@ def test_a_ur5_that_does_not_fit_is_said(
         path.write_text("\n".join([head, *rows]) + "\n")
     with pytest.raises(BadData, match=said):
         read_ur5(ur5_files(tmp_path, "r", "s"))
-
-
-def test_quick_takes_two_of_broad_and_one_of_the_others(data: Path) -> None:
-    quick = real.list_experiments(data, quick=True)
-    assert len(quick["BROAD"]) == 2
-    assert len(quick["RING, rigid mounts"]) == len(quick["UR5"]) == 1
-    assert len(real.list_experiments(data)["RING, loose mounts"]) == 5
 
 
 def test_files_are_found_by_their_columns_wherever_they_lie(data: Path, tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from opensim_process import start_opensim
 from scipy.spatial.transform import Rotation, Slerp
 from test_info import info
 from test_mvnx import mvnx, turning
@@ -171,42 +170,6 @@ def test_wepose_info_says_what_joints_there_are(
     assert "left_elbow" in out
 
 
-@pytest.mark.parametrize("processor", [84, 85])
-@pytest.mark.parametrize("whole", [False, True])
-def test_numbers_of_each_processor(processor: int, whole: bool, tmp_path: Path) -> None:
-    """A file of three frames and one point, byte by byte as the user guide has it; ``whole``: as scaled integers."""
-
-    def real(value: float) -> bytes:
-        if processor != 85:
-            return struct.pack("<f", value)
-        ieee = struct.unpack("<I", struct.pack("<f", 4.0 * value))[0]
-        return struct.pack("<HH", ieee >> 16, ieee & 0xFFFF)
-
-    def record(group: int, name: str, kind: int, shape: list[int], data: bytes) -> bytes:
-        rest = struct.pack("bB", kind, len(shape)) + bytes(shape) + data + b"\0"
-        return struct.pack("bb", len(name), group) + name.encode() + struct.pack("<h", len(rest) + 2) + rest
-
-    scale = 0.1 if whole else -1.0
-    parameters = struct.pack("bb", 5, -1) + b"POINT" + struct.pack("<h", 3) + b"\0"
-    parameters += record(1, "USED", 2, [], struct.pack("<h", 1)) + record(1, "RATE", 4, [], real(50.0))
-    parameters += record(1, "SCALE", 4, [], real(scale)) + record(1, "UNITS", -1, [2, 1], b"mm")
-    parameters += record(1, "LABELS", -1, [10, 1], b"A:LSHO    ")
-    head = bytes([2, 0x50]) + struct.pack("<HHHHH", 1, 0, 1, 3, 0) + real(scale)
-    head += struct.pack("<HH", 3, 0) + real(50.0)
-    data = b""
-    for x, y, z, residual in ((12.5, -30.0, 1000.0, 0.0), (0.0, 0.0, 0.0, -1.0), (-2.0, 4.5, 99.0, 1.0)):
-        if whole:
-            data += struct.pack("<hhhh", round(10 * x), round(10 * y), round(10 * z), int(residual))
-        else:
-            data += b"".join(map(real, (x, y, z, residual)))
-    raw = head.ljust(512, b"\0") + (bytes([0, 0, 1, processor]) + parameters).ljust(512, b"\0") + data
-    (tmp_path / "a.c3d").write_bytes(raw)
-    reference = read_reference(tmp_path / "a.c3d")
-    np.testing.assert_allclose(reference.time, [0.0, 0.02, 0.04])
-    wanted = [[0.0125, -0.03, 1.0], [np.nan] * 3, [-0.002, 0.0045, 0.099]]
-    np.testing.assert_allclose(reference.points["left_shoulder"], wanted, rtol=1e-6)
-
-
 def test_a_header_may_count_more_frames_than_there_are(brief: Pose, tmp_path: Path) -> None:
     """As Optotrak's, which says 1149: the points that are there count."""
     path = c3d(tmp_path / "a.c3d", brief)
@@ -299,13 +262,6 @@ def test_points_alone_are_enough(pose: Pose) -> None:
     assert registration.offset_s == pytest.approx(time[0] - 40.0, abs=1e-3)
     assert registration.heading_deg % 360.0 == pytest.approx(70.0, abs=0.2)
     assert max(e.rmse for e in evaluate(pose, truth, registration.scored).position.values()) < 2.0
-
-
-def test_a_stated_offset_is_kept(pose: Pose) -> None:
-    time, quats, points = in_laboratory(pose)
-    _, registration = register(pose, Pose(time, quats, points), offset_s=0.25)
-    assert registration.offset_s == 0.25
-    assert np.isnan(registration.correlation)
 
 
 def test_what_cannot_be_aligned_is_said(pose: Pose) -> None:
@@ -497,35 +453,6 @@ def test_a_spoiled_c3d_is_one_line(
 
 
 # Peers -------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> dict[str, np.ndarray]:
-    """The markers of the file that was read last, name → (n, 3) [m], before joints are made of them."""
-    shown: dict[str, np.ndarray] = {}
-
-    def keep(_path: Path, time: np.ndarray, markers: dict[str, np.ndarray], _table: object) -> Reference:
-        shown.clear()
-        shown.update(markers)
-        return Reference(time, {}, {})
-
-    monkeypatch.setattr("wepose_pin.readers.trc.locate", keep)
-    return shown
-
-
-@pytest.mark.peer
-def test_opensim_reads_and_writes_the_same(pose: Pose, seen: dict[str, np.ndarray], tmp_path: Path) -> None:
-    time = read_reference(trc(tmp_path / "a.trc", pose)).time
-    ours = dict(seen)
-    with start_opensim() as call:
-        table = call("read", tmp_path / "a.trc")
-        call("copy_trc", tmp_path / "a.trc", tmp_path / "b.trc")
-    np.testing.assert_allclose(table["time"], time, atol=1e-12)
-    for name in ("C7", "LELB", "RWRB"):
-        np.testing.assert_allclose(1e-3 * table["values"][:, table["labels"].index(name)], ours[name], atol=1e-15)
-    np.testing.assert_allclose(read_reference(tmp_path / "b.trc").time, time, atol=1e-9)
-    for name, p in ours.items():
-        np.testing.assert_allclose(seen[name], p, atol=1e-12)
 
 
 # Agreement ----------------------------------------------------------------------------------------------------------

@@ -258,13 +258,6 @@ def test_what_is_not_determined_breaks_a_curve() -> None:
     assert np.isfinite(second.mean[12:]).all()
 
 
-def test_a_full_turn_between_repetitions_is_none() -> None:
-    signal, spans = chain(*[reach(2.0)] * 4)
-    turns = np.repeat([0.0, 360.0, 360.0, -720.0], 200)
-    mean = compute_mean_curves(angles_of(signal + turns), spans - [0.0, 0.02])["right_elbow"][0]
-    assert np.degrees(mean.sd).max() < 1e-6
-
-
 @pytest.mark.parametrize("turn", [360.0, -720.0])
 def test_curves_are_within_half_a_turn_of_zero(turn: float) -> None:
     """Angles are continuous: an arm that circled about the lock hangs a full turn later."""

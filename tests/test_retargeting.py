@@ -35,9 +35,8 @@ from wepose_pin.retargeting.checks import AT_REST, SelfCollisions
 from wepose_pin.retargeting.collision import CollisionModel
 from wepose_pin.retargeting.controller import ControllerParams, HandTarget, JointState, QpController
 from wepose_pin.retargeting.error_attribution import MissedTarget, assess_reachability, attribute_errors
-from wepose_pin.retargeting.limits import compute_acceleration_bounds, read_joint_limits, reduce_acceleration_limits
+from wepose_pin.retargeting.limits import compute_acceleration_bounds, reduce_acceleration_limits
 from wepose_pin.retargeting.maps import KEYS, read_map
-from wepose_pin.retargeting.targets import CLAMP_FROM, CLAMP_TO, clamp_to_reach
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import compute_link_poses_W, read_joint_motion
 
@@ -192,13 +191,6 @@ def test_the_page_and_the_loader_have_the_same_keys_of_a_map() -> None:
     ]
     assert "\n".join(["| key | unit or type | without it | what |", "|---|---|---|---|", *rows, ""]) in page
     assert set(STATED) == set(KEYS)
-
-
-def test_limits_are_read_from_the_urdf_itself(tmp_path: Path) -> None:
-    said = read_joint_limits(write_arm(tmp_path, continuous="roll", mimic=True))
-    assert said["flexion"] == ("revolute", -3.0, 1.5, 3.0, None)
-    assert (said["roll"].lower, said["roll"].upper) == (-np.inf, np.inf)
-    assert said["elbow_copy"].mimic == ("elbow", 1.0, 0.0)
 
 
 def test_a_motion_leaves_the_margins_that_are_asked_for(arm, swung: Trajectory, tmp_path: Path) -> None:
@@ -370,17 +362,6 @@ def test_the_programme_is_that_of_pink(arm) -> None:
 
 
 # What goes wrong ---------------------------------------------------------------------------------------------------
-
-
-def test_the_reach_is_left_smoothly() -> None:
-    reach, far = 0.7, np.linspace(0.3, 3.0, 2000)
-    kept_to = np.linalg.norm(clamp_to_reach(far[:, None] * np.array([0.6, 0.0, -0.8]), reach), axis=1)
-    inner = far < CLAMP_FROM * reach
-    assert np.allclose(kept_to[inner], far[inner])
-    assert kept_to.max() <= CLAMP_TO * reach + 1e-12
-    slope = np.gradient(kept_to, far)
-    assert (slope > -1e-9).all()
-    assert np.abs(np.diff(slope)).max() < 0.06  # no corner
 
 
 def far_away(pose: Pose, span: tuple[float, float], by: float) -> Pose:

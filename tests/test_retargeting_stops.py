@@ -14,8 +14,7 @@ from test_live_robot import Session, keeps_its_limits, live_poses, stream_info
 from wepose_pin.errors import BadModel
 from wepose_pin.kinematics import Pose
 from wepose_pin.retargeting import Robot, find_map, find_self_collisions, load_robot, retarget
-from wepose_pin.retargeting.collision import NEAR, CollisionModel, NearPairs
-from wepose_pin.retargeting.controller import MAX_RAISES, HandTarget, JointState, QpController, integrate
+from wepose_pin.retargeting.collision import NEAR, CollisionModel
 from wepose_pin.retargeting.limits import compute_acceleration_bounds, reduce_acceleration_limits
 from wepose_pin.retargeting.stopping import StopCheck, balance_braking, compute_stop
 
@@ -84,63 +83,6 @@ def test_the_way_to_rest_is_as_clear_as_a_dense_search_finds(arm: Robot) -> None
         moved = np.abs(np.diff(np.array(rooms), axis=0))
         assert (moved <= travel @ collision.levers.T + 1e-6).all()
     assert 5 < refused < 50
-
-
-def test_near_pairs_are_all_that_are_near(arm: Robot) -> None:
-    collision, data = CollisionModel(arm), arm.model.createData()
-    rng, count = np.random.default_rng(2), 0
-    for _ in range(200):
-        pin.computeJointJacobians(arm.model, data, arm.configuration(rng.uniform(*arm.bounds)))
-        near = collision.find_near_pairs(data)
-        distances = collision.compute_distances(data, np.arange(len(collision.pairs)))
-        np.testing.assert_array_equal(near.pairs, np.flatnonzero(distances < NEAR))
-        count += len(near.pairs)
-    assert 100 < count < 500
-
-
-def moving_arm(arm: Robot, steps: int, pace: float = 1.0) -> tuple[QpController, JointState, tuple[HandTarget, ...]]:
-    """A controller on its way from rest to a hand 0.1 m above, and its state after some steps."""
-    controller = QpController(arm, CollisionModel(arm), 0.01)
-    controller.pace = pace
-    controller.update_kinematics(arm.rest)
-    pose, none = controller.get_arm_pose(0), np.zeros(3)
-    targets = (HandTarget(pose.hand + [0.0, 0.0, 0.1], none, pose.rotation, none, none, 1.0),)
-    state = JointState.at_rest(arm.rest)
-    for _ in range(steps):
-        state = controller.step(state, targets)
-    return controller, state, targets
-
-
-def test_where_no_clearance_helps_a_step_towards_the_open_stop_is_taken(
-    arm: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    controller, state, targets = moving_arm(arm, 10)
-    stop, tried, find_stop = controller._find_next_of_stop(state), [], controller._find_stop
-
-    def refuse_those_of_the_programme(now: JointState, after: JointState, near: NearPairs) -> np.ndarray | None:
-        tried.append(after.acceleration)
-        return np.zeros(len(controller.collision.pairs)) if len(tried) < 3 + MAX_RAISES else find_stop(now, after, near)
-
-    monkeypatch.setattr(controller, "_find_stop", refuse_those_of_the_programme)
-    after = controller.step(state, targets)
-    assert not controller.stopping
-    assert len(tried) == 3 + MAX_RAISES
-    np.testing.assert_allclose(after.acceleration, 0.75 * stop.acceleration + 0.25 * tried[MAX_RAISES], atol=1e-12)
-    np.testing.assert_array_equal(after.velocity, integrate(state, after.acceleration, 0.01).velocity)
-    assert np.abs(after.acceleration - stop.acceleration).max() > 0.01
-
-
-def test_corrections_are_as_slow_as_their_pace(arm: Robot) -> None:
-    """Where the motion is slowed by four, what is left of an error shrinks by as much in four times the time."""
-
-    def find_error(steps: int, pace: float) -> float:
-        controller, state, targets = moving_arm(arm, steps, pace)
-        controller.update_kinematics(state.position)
-        return float(np.linalg.norm(targets[0].position - controller.get_arm_pose(0).hand))
-
-    shrunk = find_error(40, 1.0) / find_error(25, 1.0)
-    assert 0.1 < shrunk < 0.4
-    assert find_error(160, 0.25) / find_error(100, 0.25) == pytest.approx(shrunk, abs=0.1)
 
 
 def pushed(seconds: float, hz: float) -> Pose:

@@ -109,45 +109,6 @@ def test_a_wrong_checksum_and_a_cut_frame_cost_themselves_only() -> None:
     assert frames.skipped == len(wrong) + 6
 
 
-def test_random_bytes_raise_nothing_and_end() -> None:
-    """A hundred thousand pieces: what is taken for a frame or packet, and what is not, adds up to what came."""
-    rng = random.Random(11)
-    frames, came, taken = xbus.Frames(), 0, 0
-    seeds = [whole(0x36, mtdata2(5, (0x8020, GYRO), (0x4020, ACCEL), form=form)) for form in FORMS]
-    packets = 0
-    for k in range(100_000):
-        piece = bytearray(rng.randbytes(rng.randrange(24)) if k % 3 else rng.choice(seeds))
-        if k % 3 == 0 and rng.random() < 0.5:
-            piece[rng.randrange(len(piece))] = rng.randrange(256)
-        came += len(piece)
-        for frame in frames.feed(bytes(piece)):
-            taken += len(frame.data) + (5 if len(frame.data) < 255 else 7)
-            try:
-                xbus.parse_packet(frame.data)
-                packets += 1
-            except xbus.Malformed:
-                pass
-    assert frames.skipped + taken <= came
-    assert came - frames.skipped - taken < 2048 + 7 + 24
-    assert packets > 15_000
-
-
-def test_random_data_of_packets_raise_only_malformed() -> None:
-    rng = random.Random(13)
-    joiner, outcomes = xbus.Joiner(), [0, 0]
-    data = mtdata2(5, (0x8020, GYRO), (0x4020, ACCEL))
-    for _ in range(100_000):
-        damaged = bytearray(data[: rng.randrange(1, len(data) + 1)])
-        damaged[rng.randrange(len(damaged))] = rng.randrange(256)
-        try:
-            joiner.add(xbus.parse_packet(bytes(damaged)))
-            outcomes[0] += 1
-        except xbus.Malformed:
-            outcomes[1] += 1
-        joiner.take()
-    assert min(outcomes) > 1000
-
-
 # Packets -------------------------------------------------------------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ from bodies import LENGTHS, RIGID_SHOULDERS, TABLE
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.alignment import SEGMENT_ATTITUDE_STD
-from wepose_pin.calibration import load_protocol, weights
+from wepose_pin.calibration import load_protocol
 from wepose_pin.calibration.lengths import Calibration, solve_calibration
 from wepose_pin.calibration.priors import (
     DRIFT_STD,
@@ -201,12 +201,3 @@ def test_the_spread_is_what_is_stated(motion: Motion) -> None:
     ratio_of = ratios(motion, DRAWS)
     print({name: round(value, 2) for name, value in ratio_of.items()})
     assert all(0.7 < value < 1.3 for value in ratio_of.values()), ratio_of
-
-
-def test_many_samples_start_from_few(motion: Motion, monkeypatch: pytest.MonkeyPatch) -> None:
-    at_once = next(draws(motion, 1)).calibration.subject
-    monkeypatch.setattr(weights, "MANY_SAMPLES", len(motion.time) // 2)
-    subject = next(draws(motion, 1)).calibration.subject
-    for name in LENGTHS:
-        assert subject.lengths[name] == pytest.approx(at_once.lengths[name], abs=0.15 * at_once.std(name))
-        assert subject.std(name) == pytest.approx(at_once.std(name), rel=0.1)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from bodies import LENGTHS, SEGMENTS, TABLE
 
-from wepose_pin.errors import BadOption, BadSubject, MissingFile
+from wepose_pin.errors import BadSubject
 from wepose_pin.model import load_model
 from wepose_pin.model.girdle import PARAMETERS
 from wepose_pin.subject import (
@@ -18,7 +18,6 @@ from wepose_pin.subject import (
     Hinge,
     StartPoseOffset,
     Subject,
-    compute_girdle_prior,
     girdle_rows,
     load_subject,
     mount_rows,
@@ -115,34 +114,6 @@ def test_girdles_travel_in_the_file(tmp_path: Path) -> None:
     assert not population_subject().shape(load_model()).girdle_parameters("left_shoulder").any()
 
 
-def test_the_covariance_of_a_shape_has_lengths_first_and_then_girdles() -> None:
-    subject = girdled(np.random.default_rng(3))
-    np.testing.assert_array_equal(subject.shape_covariance(TABLE), subject.covariance)
-    # In any order of the file's rows, and beside mounts.
-    rows = np.random.default_rng(4).permutation(len(subject.order))
-    mixed = replace(
-        subject,
-        order=tuple(subject.order[k] for k in rows) + tuple(mount_rows("torso")),
-        covariance=np.pad(subject.covariance[np.ix_(rows, rows)], (0, 3)),
-    )
-    np.testing.assert_array_equal(mixed.shape_covariance(TABLE), subject.covariance)
-    # A subject of lengths alone has the girdles that the table expects of people.
-    average, k = population_subject(), len(LENGTHS)
-    cov = average.shape_covariance(TABLE)
-    np.testing.assert_array_equal(cov[:k, :k], average.lengths_covariance())
-    assert not cov[:k, k:].any()
-    np.testing.assert_array_equal(cov[k:, k:], compute_girdle_prior(TABLE))
-
-
-def test_what_people_differ_by_from_the_law_is_partly_alike_on_both_sides() -> None:
-    cov, girdle = compute_girdle_prior(TABLE), TABLE.girdles["left_shoulder"]
-    n = len(PARAMETERS)
-    np.testing.assert_allclose(np.sqrt(np.diag(cov)), [*girdle.parameter_std, *girdle.parameter_std])
-    correlation = np.diag(cov[:n, n:]) / np.diag(cov)[:n]
-    np.testing.assert_allclose(correlation, [girdle.alike] * 4 + [0.0] * 3)  # the law and the place at rest
-    assert np.linalg.eigvalsh(cov)[0] > 0.0
-
-
 def test_a_hand_written_file_needs_lengths_only(tmp_path: Path) -> None:
     lines = ["format = 2", "[lengths]", *(f"{name} = 0.3" for name in LENGTHS), "[lengths_std]", "trunk = 0.02"]
     (tmp_path / "subject.toml").write_text("\n".join(lines), encoding="utf-8")
@@ -200,15 +171,6 @@ def test_what_is_wrong_is_named(tmp_path: Path, text: str, says: str) -> None:
         load_subject(tmp_path).check_body(TABLE)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_missing_files_and_people_that_are_none() -> None:
-    with pytest.raises(MissingFile, match="no such file"):
-        load_subject("nowhere/subject.toml")
-    with pytest.raises(BadOption, match="stature 175 is not a body height in metres"):
-        population_subject(175.0)
-    with pytest.raises(BadOption, match="sex 'x' is not known"):
-        population_subject(1.7, "x")
 
 
 EXTREME: dict[str, dict[str, Any]] = {

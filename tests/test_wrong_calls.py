@@ -23,7 +23,7 @@ from arms import write_arm
 
 import wepose_pin as wp
 from wepose_pin.diagnostics import WARNING, Diagnostic
-from wepose_pin.errors import BadData, BadOption
+from wepose_pin.errors import BadData
 from wepose_pin.filters import AmekfParams
 from wepose_pin.kinematics import PosedBody
 from wepose_pin.retargeting import ControllerParams
@@ -501,11 +501,6 @@ def test_numbers_beyond_any_sensor_are_refused_with_their_unit() -> None:
     for wrong, match in (((1e200 * gyro, accel), r"^gyro_S\[.* rad/s"), ((gyro, 1e3 * accel), r"^accel_S\[.* m/s\^2")):
         with pytest.raises(BadData, match=match):
             wp.estimate_orientation(*wrong, 100.0, static=(0.5, 4.5))
-
-
-def test_a_seed_is_a_whole_number() -> None:
-    with pytest.raises(BadOption, match=r"^seed = 1.5: a whole number at least 0 is needed$"):
-        wp.simulate(wp.population_subject(1.75).lengths, seed=1.5)  # type: ignore[arg-type]
 
 
 def test_an_unknown_point_lists_the_known_ones() -> None:

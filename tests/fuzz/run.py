@@ -3,27 +3,21 @@
 Each target runs in a process of its own, from the seeds and what earlier runs came upon (``.fuzz/corpus``), and goes on
 after a finding; the input of each different one is kept in ``.fuzz/found``, and the exit code is 1. With ``--runs`` and
 ``--seed`` a run is the same every time. The table says of each target how many inputs were tried, how many different
-findings there were, the edges and features that libFuzzer counts over all of wepose, and how many lines of functions of
-the target's own module the corpus has reached (what numba compiles is not seen).
+findings there were, and the edges and features that libFuzzer counts over all of wepose.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import hashlib
 import importlib
 import re
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 import traceback
-from collections.abc import Iterator
 from pathlib import Path
-from types import CodeType, FrameType
-from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
@@ -31,8 +25,7 @@ LONGEST = 1 << 16  # [bytes] of an input
 MEMORY_MB, SECONDS_EACH = 2048, 20
 MOST_FOUND = 10  # different findings of a target; then it ends
 ALL = "all"  # one process, the first byte says which target
-REPLAYED = 400  # inputs of a corpus, the smallest, by which lines are counted
-HEADER = f"{'target':<12} {'inputs':>8} {'found':>5} {'edges':>6} {'features':>8}   lines of its module"
+HEADER = f"{'target':<12} {'inputs':>8} {'found':>5} {'edges':>6} {'features':>8}"
 
 
 def compiled_modules() -> list[str]:
@@ -99,55 +92,6 @@ def _where(error: BaseException) -> str:
     return f"{type(error).__name__} {' '.join(str(error).split())[:160] if not own else ''}{' > '.join(places)}".strip()
 
 
-# Lines -------------------------------------------------------------------------------------------------------------
-
-
-def lines(name: str, corpus: Path) -> tuple[int, int]:
-    """Lines in functions of the target's module that its corpus reaches, and how many there are."""
-    from fuzz.target import try_one
-    from fuzz.targets import TARGETS
-
-    target = next(target for target in TARGETS if target.name == name)
-    module = importlib.import_module(f"wepose_pin.{target.module}")
-    assert module.__file__ is not None
-    code = compile(Path(module.__file__).read_text(encoding="utf-8"), module.__file__, "exec")
-    there = {line for function in _functions(code) for line in _lines_of(function)}
-    reached: set[int] = set()
-
-    def trace(frame: FrameType, event: str, _: Any) -> Any:
-        if frame.f_code.co_filename != module.__file__:
-            return None
-        if event == "line":
-            reached.add(frame.f_lineno)
-        return trace
-
-    inputs = sorted(corpus.iterdir(), key=lambda path: path.stat().st_size)[:REPLAYED]
-    with tempfile.TemporaryDirectory(prefix="wepose-fuzz-") as made:
-        threading.settrace(trace)
-        try:
-            for data in [*target.seeds(), *(path.read_bytes() for path in inputs)]:
-                sys.settrace(trace)  # anew: a RecursionError in `trace` itself takes it off
-                with contextlib.suppress(Exception):
-                    try_one(target, Path(made), data)
-        finally:
-            sys.settrace(None)
-            threading.settrace(None)  # type: ignore[arg-type]
-    return len(reached & there), len(there)
-
-
-def _functions(code: CodeType) -> Iterator[CodeType]:
-    """Functions and methods of a module, and what is in them; not what runs as it is imported."""
-    for inner in code.co_consts:
-        if isinstance(inner, CodeType):
-            if inner.co_flags & 0x2:  # CO_NEWLOCALS: a function, not a class's body
-                yield inner
-            yield from _functions(inner)
-
-
-def _lines_of(code: CodeType) -> set[int]:
-    return {line for _, _, line in code.co_lines() if line is not None and line != code.co_firstlineno}
-
-
 # From the command line ---------------------------------------------------------------------------------------------
 
 
@@ -192,25 +136,10 @@ def run(name: str, options: argparse.Namespace) -> int:
         if not tried or died >= MOST_FOUND or time.monotonic() > until - 2:
             break
     notes = list(dict.fromkeys(notes))
-    text = ""
-    if name != ALL and not (inputs == 0 and died):
-        code = f"{begin}; print(*run.lines({name!r}, run.Path({str(corpus)!r})))"
-        counted = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, errors="replace")
-        if counted.returncode == 0:
-            hit, there = map(int, counted.stdout.split()[-2:])
-            text = f"{hit:>4} of {there:<4} {_module(name)}"
-        else:
-            text = f"not counted: {counted.stderr.splitlines()[-1]}"
-    print(f"{name:<12} {inputs:>8} {len(notes):>5} {edges:>6} {features:>8}   {text}".rstrip(), flush=True)
+    print(f"{name:<12} {inputs:>8} {len(notes):>5} {edges:>6} {features:>8}", flush=True)
     for note in notes:
         print(f"    {note}", flush=True)
     return len(notes)
-
-
-def _module(name: str) -> str:
-    from fuzz.targets import TARGETS
-
-    return next(target.module for target in TARGETS if target.name == name)
 
 
 def main() -> int:

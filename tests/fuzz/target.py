@@ -18,7 +18,7 @@ class Target(NamedTuple):
     seeds : well-formed inputs
     run : takes a folder and an input; raises `WeposeError` on what it does not take
     words : what inputs are made of, for a fuzzer that knows nothing of the format
-    module : of the package, where its code is: its lines are counted
+    module : of the package, where its code is
     """
 
     name: str
