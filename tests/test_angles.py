@@ -15,7 +15,6 @@ import wepose_pin as wp
 from wepose_pin.angles import (
     ISB_AXES,
     JOINTS,
-    KNEE_AXES,
     NEAR_LOCK,
     RATE_WINDOW_S,
     SHOULDER_SEQUENCES,
@@ -549,12 +548,6 @@ def test_the_table_is_in_degrees_and_keeps_the_rotation() -> None:
     quat = table.select([f"right_elbow_{c}" for c in ("qx", "qy", "qz", "qw")]).to_numpy()
     values = np.radians(table.select([f"right_elbow_{a}_deg" for a in JOINTS["right_elbow"].names]).to_numpy())
     assert (Rotation.from_quat(quat).inv() * Rotation.from_euler("ZXY", values)).magnitude().max() < 1e-12
-
-
-def test_the_axes_of_a_segment_are_right_handed() -> None:
-    for axes in (*ISB_AXES.values(), KNEE_AXES):
-        X, Y, Z = ((1 if a[0] == "+" else -1) * np.eye(3)["xyz".index(a[1])] for a in axes)
-        np.testing.assert_array_equal(np.cross(X, Y), Z)
 
 
 def test_of_a_tracked_person_the_angles_are_within_their_deviations(simulation: Simulation, person: Person) -> None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from benchmarks import accuracy, bodies, calibration, filters, tables
@@ -87,26 +85,6 @@ def test_the_peers_get_the_units_and_orders_they_want() -> None:
     table = filters.filters(TINY)
     assert table.rows["VQF"]["ratio"] == filters.live(TINY).rows["VQF"]["ratio"] == 1.0
     assert not table.notes[-1].startswith("No ratios")
-
-
-def test_cases_take_turns_and_the_first_round_is_left_out() -> None:
-    order: list[str] = []
-    now = 0.0
-
-    def case(name: str, cost: Callable[[], float]) -> Callable[[], None]:
-        def spend() -> None:
-            nonlocal now
-            order.append(name)
-            now += cost()
-
-        return spend
-
-    slow = iter([100.0, 4.0, 8.0, 6.0])  # the first is the warm-up
-    times = tables.time_in_turn({"a": case("a", lambda: next(slow)), "b": case("b", lambda: 2.0)}, 3, "b", lambda: now)
-    assert order == ["a", "b"] * 4
-    assert times["a"] == (6.0, 2.0, 3.0)
-    assert times["b"].ratio == 1.0
-    assert np.isnan(tables.time_in_turn({"a": lambda: None}, 2, "b")["a"].ratio)
 
 
 @pytest.mark.usefixtures("fast")

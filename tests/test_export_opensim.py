@@ -23,7 +23,6 @@ from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.writers.export import export
-from wepose_pin.writers.rajagopal import coordinates, orientations
 
 SEGMENT_OF = {
     "pelvis": "pelvis",
@@ -169,19 +168,6 @@ def test_an_ordinary_arm_is_no_warning_and_one_with_a_wrong_heading_is(tmp_path:
         folder = write_folder(tmp_path / name, compute_pose(load_model(lengths=LENGTHS), time, quat_WL))
         exported = export(folder, tmp_path / f"{name}.mot", names="opensim")
         assert {each.code for each in exported.diagnostics} == codes
-
-
-def test_shoulders_and_thorax_are_the_isbs_of_zxy() -> None:
-    pose = a_pose(tuple(name for name in SEGMENT_OF.values() if name.endswith(("torso", "upper_arm"))))
-    angles, missed = coordinates(orientations(pose.quat_WL))
-    isb = joint_angles(pose, "ZXY")
-    names = {"thorax": ("lumbar_extension", "lumbar_bending", "lumbar_rotation")}
-    names |= {
-        f"{side}_shoulder": tuple(f"arm_{of}_{side[0]}" for of in ("flex", "add", "rot")) for side in ("left", "right")
-    }
-    for joint, of in names.items():
-        np.testing.assert_allclose(np.column_stack([angles[name] for name in of]), isb[joint].values, atol=1e-12)
-    assert missed == {}
 
 
 # The set-ups of OpenSim's tools -----------------------------------------------------------------------------------

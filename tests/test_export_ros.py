@@ -112,23 +112,6 @@ def test_a_bag_has_the_joints_and_the_links_of_the_robot(
             np.testing.assert_allclose(placed[link][:3, :3], Rotation.from_quat(quat[k]).as_matrix(), atol=1e-12)
 
 
-def test_an_mcap_is_compressed(result: Path, tmp_path: Path) -> None:
-    """Every chunk by zstd, which mcap decompresses; the messages are those of the bag with SQLite."""
-    reader = pytest.importorskip("mcap.reader")
-    export(result, tmp_path / "x.mcap")
-    export(result, tmp_path / "bag", "rosbag")
-    with (tmp_path / "x.mcap").open("rb") as file:
-        summary = reader.make_reader(file).get_summary()
-    assert summary.chunk_indexes
-    for chunk in summary.chunk_indexes:
-        assert chunk.compression == "zstd"
-        assert chunk.compressed_size < 0.5 * chunk.uncompressed_size
-    compressed, plain = read_bag(tmp_path / "x.mcap"), read_bag(tmp_path / "bag")
-    assert {topic: repr(messages) for topic, messages in compressed.items()} == {
-        topic: repr(messages) for topic, messages in plain.items()
-    }
-
-
 def test_a_person_is_a_robot_of_revolute_joints(result: Path, pose: Pose, tmp_path: Path) -> None:
     """URDF and joint states through Pinocchio, which joins nothing here, against the pose; and so is /tf."""
     export(result, tmp_path / "x.mcap")

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bodies import LENGTHS
 from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.validation.real import RING_SEGMENTS, assume_noise, register_ring
@@ -18,19 +17,15 @@ from wepose_pin.calibration import calibrate, lengths
 from wepose_pin.calibration.joints import (
     MAX_STD,
     SYSTEMATIC_STD,
-    Coupling,
     _estimate_heading,
     _joint_forces,
-    add_couplings,
     estimate_couplings,
 )
-from wepose_pin.calibration.least_squares import Gaussian, Layout
 from wepose_pin.filters import FilterSettings, run_filter
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
 
-NAMES = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 PAIRS = [
     ("torso", "left_upper_arm"),
     ("left_upper_arm", "left_forearm"),
@@ -99,35 +94,6 @@ def test_a_heading_half_a_turn_away_that_explains_as_much_makes_it_uncertain(mov
         off = abs(float(np.angle(np.exp(1j * (heading - 0.4)))))
         assert off < 3.0 * std
         assert (std < MAX_STD) == trusted
-
-
-def test_samples_that_are_missing_are_bridged(exact: tuple[Simulation, Recording, FilteredRecording]) -> None:
-    _, recording, filtered = exact
-    clasp, sensors = recording.phases["clasp"], dict(recording.sensors)
-    gyro_S = np.array(sensors["torso"].gyro_S)
-    gyro_S[2000:2004] = np.nan
-    sensors["torso"] = replace(sensors["torso"], gyro_S=gyro_S)
-    whole = estimate_couplings(recording, filtered, PAIRS, clasp)
-    for ours, theirs in zip(
-        estimate_couplings(replace(recording, sensors=sensors), filtered, PAIRS, clasp), whole, strict=True
-    ):
-        assert ours.heading == pytest.approx(theirs.heading, abs=np.deg2rad(0.2))
-
-
-def test_a_coupling_keeps_whole_turns_and_shares_with_the_drift() -> None:
-    layout = Layout(LENGTHS, ("torso", "left_upper_arm"))
-    center, start = np.zeros(layout.size), np.zeros(layout.size)
-    start[layout.heading] = [7.0, 0.3]  # the torso more than a turn on
-    information = np.eye(layout.size) * 1e-6
-    coupling = Coupling("torso", "left_upper_arm", 0.5, 0.01, 30.0)
-    prior = Gaussian(center, information)
-    moved, after = add_couplings(prior, layout, [coupling], start)
-    psi, drift = moved[layout.heading], moved[layout.drift]
-    assert psi[0] - psi[1] + 30.0 * (drift[0] - drift[1]) == pytest.approx(0.5 + 2.0 * np.pi, abs=1e-3)
-    H = np.zeros(layout.size)
-    H[layout.heading], H[layout.drift] = [1.0, -1.0], [30.0, -30.0]
-    assert H @ np.linalg.solve(after, H) == pytest.approx(coupling.std**2, rel=1e-2)
-    assert add_couplings(prior, layout, [], start) is prior
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(6, marks=pytest.mark.monte_carlo)])

@@ -32,12 +32,7 @@ from wepose_pin.errors import BadOption
 from wepose_pin.kinematics import LiveKinematics, compute_link_placements, solve_configuration
 from wepose_pin.live.encoder import AngleCurves, PoseEncoder, RobotFigure
 from wepose_pin.live.page import LivePage
-from wepose_pin.live.server import status_json
 from wepose_pin.live.state import (
-    GuideAction,
-    GuideStep,
-    GuideView,
-    LengthEstimate,
     LivePose,
     SensorStatus,
     Status,
@@ -141,36 +136,6 @@ def test_the_n_pose_before_the_start_and_only_what_is_measured_after(model: Body
         assert seen == {"torso", "pelvis", "head", "right_upper_arm"}
         assert all(np.isnan(row).all() for link, row in placed.items() if link not in seen)
     assert np.isnan(unpacked(model, encoder.encode(one_arm.pose(0.3)))[2]).all()
-
-
-def test_status_is_json_whatever_is_not_known(person: Person) -> None:
-    sent = json.loads(status_json(person.status(lost=("torso",))._replace(latency_ms=(math.nan, math.inf))))
-    assert sent["latency_ms"] == [None, None]
-    assert sent["sensors"][0] | {"bias_deg_s": 0} == {
-        "segment": "torso", "rate_hz": 99.8, "lost": True, "static": True, "bias_deg_s": 0, "heading_std": "–",
-        "heading_age_s": 3.0, "missing": 1, "late": 2, "duplicate": 3, "frozen": False,
-        "battery": None,
-    }  # fmt: skip
-    assert sent["sensors"][0]["bias_deg_s"] == [0.11459, -0.28648, 0.0]
-
-
-def test_what_the_guide_says_is_json(person: Person) -> None:
-    view = GuideView(
-        "Shake it.",
-        countdown=2.34,
-        steps=(GuideStep("sensors", "Sensors", "done"), GuideStep("assignment", "Segments", "now")),
-        actions=(GuideAction("again", "Once more", "a"),),
-        lengths=(LengthEstimate("left_forearm", 0.2512, math.nan),),
-        sample_size=(4.26, 12.0),
-    )
-    sent = json.loads(status_json(person.status("guide")._replace(guide=view, open_phases=("take_1",))))
-    assert sent["open_phases"] == ["take_1"]
-    guide = sent["guide"]
-    assert (guide["sentence"], guide["countdown"], guide["remaining"]) == ("Shake it.", 2.3, None)
-    assert guide["lengths"] == [{"name": "left_forearm", "mm": 251.0, "std_mm": None}]
-    assert guide["sample_size"] == [4.3, 12.0]
-    assert guide["actions"] == [{"name": "again", "label": "Once more", "key": "a"}]
-    assert json.loads(status_json(person.status()))["guide"] is None
 
 
 def test_joint_angles_are_those_of_the_poses(person: Person) -> None:
@@ -540,26 +505,6 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
             assert time.monotonic() < until
         assert keys == ["r"]
         assert browser.errors == []
-
-
-def test_dark_prints_light(model: BodyModel, person: Person, browser: Browser) -> None:
-    with LivePage(model, person.info) as page:
-        browser.emulate(prefers_color_scheme="dark")
-        browser.go(page.url)
-        page.status(person.status())
-        page.show(person.pose(0.5))
-        browser.wait("window.wepose.time() === 0.5 && window.wepose.state() === 'ready'")
-        browser.run("dispatchEvent(new Event('beforeprint'))")
-        browser.wait(
-            "document.querySelector('#printed').complete && document.querySelector('#printed').naturalWidth > 100"
-        )
-        browser.emulate("print", prefers_color_scheme="dark")
-        time.sleep(0.5)
-        paper = browser.picture()
-        browser.run("dispatchEvent(new Event('afterprint'))")
-        browser.emulate(prefers_color_scheme="dark")
-        assert np.median(paper) > 200
-        assert paper[-30:].mean() > 150
 
 
 def test_it_says_that_the_connection_is_lost_and_comes_back(model: BodyModel, person: Person, browser: Browser) -> None:

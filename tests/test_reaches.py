@@ -115,22 +115,11 @@ def test_bodies_of_others_have_links_between_the_segments(data: Path) -> None:
     assert any(part.constant.any() for part in way.values())
 
 
-@pytest.mark.parametrize("change", ["bend", "slide"])
-def test_a_chain_that_orientations_and_lengths_do_not_give(change: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_chain_that_orientations_and_lengths_do_not_give() -> None:
     body = load_model()
-    if change == "slide":
-        body = replace(body, pin=body.pin.copy())  # the package's body is read once for all
-        m = body.pin
-        joint = m.addJoint(m.getJointId("left_forearm"), pin.JointModelPZ(), pin.SE3.Identity(), "telescope")
-        m.frames[m.getFrameId("left_palm")].parentJoint = joint
-        with pytest.raises(BadModel, match=r"joint 'telescope' slides: orientations do not tell where left_palm is"):
-            measure_reaches(body)
-        return
-    stretch = BodyModel.with_lengths
-
-    def stretch_wrongly(model: BodyModel, lengths: dict[str, float]) -> BodyModel:
-        return stretch(model, {name: value + 0.5 * (value - 0.3) ** 2 for name, value in lengths.items()})
-
-    monkeypatch.setattr(BodyModel, "with_lengths", stretch_wrongly)
-    with pytest.raises(BadModel, match=r"link torso in the chain to left_shoulder is not affine in the lengths"):
+    body = replace(body, pin=body.pin.copy())  # the package's body is read once for all
+    m = body.pin
+    joint = m.addJoint(m.getJointId("left_forearm"), pin.JointModelPZ(), pin.SE3.Identity(), "telescope")
+    m.frames[m.getFrameId("left_palm")].parentJoint = joint
+    with pytest.raises(BadModel, match=r"joint 'telescope' slides: orientations do not tell where left_palm is"):
         measure_reaches(body)

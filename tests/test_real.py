@@ -103,24 +103,6 @@ def test_ring_is_read_as_it_is(data: Path) -> None:
     assert lengths["seg4"] == pytest.approx(0.2705, abs=1e-3)
 
 
-def test_ring_registration_is_consistent(data: Path) -> None:
-    """Ten sensors, one clock and one world: each rigid one alone finds the same."""
-    chain, registered = real.register_ring(data / "ring" / "trial1")
-    one = registered["rigid", "seg3"]
-    assert one.offset_s == pytest.approx(-0.0285, abs=2e-3)
-    assert one.tilt_deg == pytest.approx(0.9, abs=0.3)
-    for segment in RING_SEGMENTS:
-        rigid = registered["rigid", segment]
-        assert rigid.residual_deg < 0.5
-        assert rigid.residual_deg < registered["loose", segment].residual_deg
-        (alone,) = register_sensors([chain.sensors["rigid", segment]], (0.0, 10.0))
-        assert alone.offset_s == pytest.approx(rigid.offset_s, abs=2e-3)
-        mounts = Rotation.from_quat(alone.quat_BS) * Rotation.from_quat(rigid.quat_BS).inv()
-        assert np.degrees(mounts.magnitude()) < 0.3
-        up = (Rotation.from_quat(alone.quat_WV) * Rotation.from_quat(rigid.quat_WV).inv()).magnitude()
-        assert np.degrees(up) < 0.4
-
-
 def means(data: Path, experiment: str) -> dict[str, dict[str, float]]:
     summary = run_experiment(real.list_experiments(data)[experiment], workers=1)
     assert not summary.skipped
@@ -193,28 +175,6 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     (tmp_path / "omc.csv").write_text("# sampling frequency: 30\na,b\n1,2\n")
     with pytest.raises(UnknownColumn, match=r"no column 'seg1_quat_w' in .*omc\.csv"):
         read_ring(ring_files(tmp_path))
-
-
-@pytest.mark.parametrize(
-    ("imu_rows", "encoder_rows", "said"),
-    [
-        (["0.1,0,9.4,0,0,0"] * 3, ["0,1,0,0,0", "8000,1,0,0,0"], "2 lines, but 3"),
-        (["0.1,0,9.4,0,0,0"] * 2, ["8000,1,0,0,0", "0,1,0,0,0"], "TIME must grow"),
-        (["0.1,0,9.4,0,0,", "0.1,0,9.4,0,0,0"], ["0,1,0,0,0", "8000,1,0,0,0"], "some are no numbers"),
-    ],
-)
-def test_a_ur5_that_does_not_fit_is_said(
-    tmp_path: Path, imu_rows: list[str], encoder_rows: list[str], said: str
-) -> None:
-    imu, encoder = tmp_path / "imu" / "r" / "s_adx.csv", tmp_path / "encoder" / "r" / "s.csv"
-    for path, head, rows in (
-        (imu, "acc_x,acc_y,acc_z,gyr_x,gyr_y,gyr_z", imu_rows),
-        (encoder, "TIME," + ",".join(f"QUATERNION_{k}" for k in range(4)), encoder_rows),
-    ):
-        path.parent.mkdir(parents=True)
-        path.write_text("\n".join([head, *rows]) + "\n")
-    with pytest.raises(BadData, match=said):
-        read_ur5(ur5_files(tmp_path, "r", "s"))
 
 
 def test_files_are_found_by_their_columns_wherever_they_lie(data: Path, tmp_path: Path) -> None:

@@ -72,13 +72,6 @@ def test_the_body_of_an_earlier_result_does_not_stay(
     assert "left_thigh" not in load_model(tmp_path / "subject.urdf").table.segments
 
 
-def test_the_body_of_an_earlier_calibration_does_not_stay(session: Path, tmp_path: Path) -> None:
-    put_earlier_result(tmp_path, "calibration.json")
-    (tmp_path / "joints.parquet").unlink()
-    calibrate(session, tmp_path)
-    assert not (tmp_path / "model.toml").exists()
-
-
 @WRITERS
 @pytest.mark.parametrize("name", ["model.toml", "joints.parquet"])
 def test_a_file_of_the_user_is_neither_deleted_nor_replaced(

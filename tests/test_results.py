@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ import pytest
 
 from benchmarks.results import adapter, inputs, saving, tasks
 from benchmarks.results.__main__ import main
-from benchmarks.results.arrays import Arrays, file_values, folder_values, values_of
+from benchmarks.results.arrays import Arrays, file_values, folder_values
 from benchmarks.results.comparison import difference_of
 
 
@@ -31,28 +30,6 @@ def write(tmp_path: Path) -> Callable[..., Path]:
         return folder
 
     return write
-
-
-def test_numbers_of_values() -> None:
-    @dataclass
-    class Point:
-        x: float
-        name: str
-
-    values = values_of(
-        {
-            "a": Point(1.0, "text"),
-            "rows": [{"t": 1, "ok": True}, {"t": 2, "ok": False}],
-            "uneven": [[1.0], [1.0, 2.0]],
-            "none": None,
-            "versions": {"numpy": 2.0},
-            "words": ["a", "b"],
-        }
-    )
-    assert set(values) == {"a/x", "rows/t", "rows/ok", "uneven/0", "uneven/1", "none"}
-    assert values["rows/t"].tolist() == [1.0, 2.0]
-    assert values["rows/ok"].tolist() == [1.0, 0.0]
-    assert np.isnan(values["none"])
 
 
 def test_numbers_of_files(tmp_path: Path) -> None:
@@ -111,27 +88,6 @@ def test_compare_with_renames_and_reasons(
     table.write_text(table.read_text() + "[reasons]\n'^a/' = 'another a'\n")
     assert run(monkeypatch, "compare", old, new, "--renames", table) == 0
     assert "explained: 3 keys: another a" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    "text", ["[odd]\n", "[renames]\n'(' = 'a'\n", "[renames]\na = 1\n", "[", "[renames]\n'a/.*' = 'same'\n", None]
-)
-def test_a_table_that_is_none(
-    text: str | None,
-    write: Callable[..., Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    old, table = write("old", **{"a/b": [1.0], "a/c": [1.0]}), tmp_path / "renames.toml"
-    if text is not None:
-        table.write_text(text)
-    assert run(monkeypatch, "compare", old, old, "--renames", table) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert run(monkeypatch, "compare", old, tmp_path) == 2
-    assert run(monkeypatch, "save", old) == 2
-    assert run(monkeypatch, "save", tmp_path / "new", "--only", "nothing") == 2
-    assert not (tmp_path / "new").exists()
 
 
 @pytest.fixture

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, as_json
+from wepose_pin.diagnostics import INFO, Diagnostic, as_json
 from wepose_pin.evaluation import evaluate
 from wepose_pin.filters import METHODS
 from wepose_pin.readers import load_session
-from wepose_pin.recording import OrientationSensor, Recording, join_recordings
+from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import NOISE_FREE, Person, Simulation, simulate
 from wepose_pin.subject import population_subject
-from wepose_pin.tracking import SummaryAccumulator, Tracker, summarize, track
+from wepose_pin.tracking import summarize, track
 
 
 def test_a_perfect_world_is_tracked_to_a_millimetre(person: Person) -> None:
@@ -149,23 +149,3 @@ def test_what_reading_finds_reaches_the_result(half_minute: Recording) -> None:
     ]
     assert gaps in summary.diagnostics
     assert summary.content["diagnostics"] == [as_json(each) for each in summary.diagnostics]
-
-
-def test_diagnostics_of_later_chunks_are_listed_once_and_not_without_end(half_minute: Recording) -> None:
-    cut = [Diagnostic("signal-saturated", WARNING, "torso", 0.01 * k) for k in range(30)]
-    accumulator = SummaryAccumulator()
-    tracker, done = Tracker(), []
-    for k, chunk in enumerate(half_minute.chunks(1.0)):
-        done += tracker.push(replace(chunk, diagnostics=(cut[0], cut[min(k, 14)])))
-    for tracked in [*done, *tracker.finish()]:
-        accumulator.add(tracked)
-    diagnostics = accumulator.finish().diagnostics
-    assert list(diagnostics[:12]) == [cut[0], *cut[:11]]
-    assert (diagnostics[12].code, diagnostics[12].value) == ("diagnostics-omitted", 4)
-
-
-def test_joined_recordings_keep_the_diagnostics_of_both(simulation: Simulation) -> None:
-    first, second = (Diagnostic("signal-saturated", WARNING, name, 0.1) for name in ("torso", "head"))
-    begin, end, *_ = simulation.recording().chunks(30.0)
-    joined = join_recordings(replace(begin, diagnostics=(first,)), replace(end, diagnostics=(first, second)))
-    assert joined.diagnostics == (first, second)

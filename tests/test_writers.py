@@ -32,13 +32,6 @@ def test_a_folder_appears_when_all_of_it_is_there(tmp_path: Path) -> None:
     assert [path.name for path in out.parent.iterdir()] == ["out"]
 
 
-def test_nothing_is_left_of_a_failure(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), whole_folder(tmp_path / "out") as folder:  # noqa: PT012
-        (folder / "a").write_text("1")
-        raise RuntimeError
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_nothing_is_overwritten_without_force_and_nothing_else_with_it(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "a").write_text("old")
