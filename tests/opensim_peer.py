@@ -17,11 +17,6 @@ osim.Logger.setLevelString("off")
 osim.Logger.removeFileSink()  # it would leave opensim.log where the tests are run
 
 
-def copy_trc(file: Path, to: Path) -> None:
-    """Read a .trc and write it again."""
-    osim.TRCFileAdapter.write(osim.TimeSeriesTableVec3(str(file)), str(to))
-
-
 def read(file: Path) -> dict[str, Any]:
     """A .mot, a .trc, or a .sto of quaternions (wxyz): `labels`, `time` (n,), `values` (n, columns, …), `header`.
 

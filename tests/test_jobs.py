@@ -17,13 +17,9 @@ from wepose_pin.cli.parser import parse
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import METHODS, OFFLINE
 from wepose_pin.jobs import Formulation, LiveMethod, Method
-from wepose_pin.jobs.angles import AnglesJob
 from wepose_pin.jobs.calibrate import CalibrateJob
-from wepose_pin.jobs.demo import DemoJob
 from wepose_pin.jobs.evaluate import EvaluateJob
-from wepose_pin.jobs.export import ExportJob
 from wepose_pin.jobs.fields import build_job
-from wepose_pin.jobs.retarget import RetargetJob
 from wepose_pin.jobs.simulate import SimulateJob, run_simulate
 from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.simulation import simulate, simulate_person
@@ -42,10 +38,6 @@ JOBS = {
         formulation="paper",
     ),
     "simulate": SimulateJob(Path("out"), 3, 50.0, preset="mild", imperfection={"bits": 12.0, "mount": "any"}),
-    "retarget": RetargetJob(Path("result"), "panda", Path("out"), "both", scale=0.8, strict=True),
-    "demo": DemoJob(Path("out"), 4),
-    "export": ExportJob(Path("result"), Path("a.mot"), names="isb", rate_hz=50.0, interval=(1.0, 2.5)),
-    "angles": AnglesJob(Path("result"), Path("out"), phase="reach:2", low_pass_hz=6.0, shoulder="XZY", cycles=True),
 }
 
 

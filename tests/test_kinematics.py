@@ -24,7 +24,7 @@ from wepose_pin.kinematics import (
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.girdle import displace
 from wepose_pin.recording import Recording
-from wepose_pin.tracking import summarize, track
+from wepose_pin.tracking import track
 
 CORE = ["torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm"]
 SEGMENTS = [*CORE, "pelvis", "head", "left_hand", "right_hand"]
@@ -249,18 +249,6 @@ def test_a_pelvis_that_cannot_move_says_by_how_much(data: Path) -> None:
     missed = compute_orientation_residuals(body, solve_configuration(body, quat_WL), quat_WL)
     assert set(missed) == {"pelvis"}
     np.testing.assert_allclose(missed["pelvis"], 0.3)
-
-
-@pytest.mark.slow
-def test_the_summary_says_what_was_not_followed(data: Path, half_minute: Recording) -> None:
-    summary = summarize(track(half_minute, model=gazebo(data, 48))).content
-    assert summary["orientation_residual_rms_deg"]["left_forearm"] > 1.0
-    residual = {d["place"]: d["value"] for d in summary["diagnostics"] if d["code"] == "orientation-residual"}
-    rms_deg = summary["orientation_residual_rms_deg"]
-    assert set(residual) == {name for name, angle in rms_deg.items() if angle > 1.0}
-    assert np.degrees(residual["left_forearm"]) == pytest.approx(rms_deg["left_forearm"], abs=1e-3)
-    assert summarize(track(half_minute, model=gazebo(data, 66))).content["orientation_residual_rms_deg"] == {}
-    assert summarize(track(half_minute)).content["orientation_residual_rms_deg"] == {}
 
 
 def arm(elbow: list[tuple[str, str]]) -> str:

@@ -285,20 +285,6 @@ def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: S
     assert len(log.quat_WL) > 2000
 
 
-def test_a_marked_gap_is_silence_live_and_causally(recording: Recording, tmp_path: Path) -> None:
-    gap = np.zeros(len(recording), dtype=bool)
-    gap[1500:1700] = True
-    sensors = {**recording.sensors, "torso": replace(recording.sensors["torso"], gap=gap)}
-    recording = replace(recording, sensors=sensors)
-    live(recording, tmp_path / "a.mcap")
-    log = read_live_log(tmp_path / "a.mcap")
-    causal = track(recording, causal=True)
-    assert all(np.array_equal(log.quat_WL[:, i], causal.quat_WL[n]) for i, n in enumerate(recording.sensors))
-    lost = log.recording.sensors["torso"].gap
-    assert lost is not None
-    np.testing.assert_array_equal(np.flatnonzero(lost), np.flatnonzero(gap))
-
-
 @pytest.mark.parametrize(("begin", "end"), [(20, 120), (200, 300), (350, 600)])
 def test_a_gap_in_a_named_start_pose(recording: Recording, tmp_path: Path, begin: int, end: int) -> None:
     recording = first(recording, 1200)

@@ -252,20 +252,6 @@ def test_an_uncertain_hand_is_slow(arm: Robot) -> None:
     keeps_its_limits(run.messages(), arm)
 
 
-def test_a_pause_of_half_a_second_holds_and_goes_on_by_itself(arm: Robot) -> None:
-    pose = person(9.0, swing=45.0)
-    poses: list[LivePose | None] = [*live_poses(pose)]
-    poses[500:550] = [None] * 50
-    run = Session(arm, stream_info(pose)).run(poses)
-    assert run.states(4.9) == ["follow", "hold", "approach", "follow"]
-    first_hold = next(c.clock for c in run.commands if c.clock > 4.0 and c.state == "hold")
-    assert abs(first_hold - 5.1) < 0.015
-    moving = np.array([np.abs(c.v).max() for c in run.commands])
-    assert moving[505] > 0.2
-    assert moving[548] < 0.05
-    keeps_its_limits(run.messages(), arm)
-
-
 def test_a_pause_of_three_seconds_stops_it_until_somebody_says_so(arm: Robot) -> None:
     pose = person(16.0, swing=45.0)
     poses: list[LivePose | None] = [*live_poses(pose)]
@@ -448,21 +434,6 @@ def test_the_loop_never_waits_for_the_solver(robot_out, arm: Robot, receiver: Re
     assert summary.skipped > summary.commands  # two or three of four
     assert len(receiver.messages) == out.summary().commands
     keeps_its_limits(receiver.messages, arm)
-
-
-def test_nobody_receives(robot_out, arm: Robot) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        free = taken.getsockname()[1]
-    pose = person(1.0)
-    out = robot_out(CommandStream(arm), f"127.0.0.1:{free}")
-    out.start(stream_info(pose))
-    play(out, live_poses(pose)[:50])
-    out.close()
-    out.close()
-    summary = out.summary()
-    assert summary.commands > 50
-    assert summary.share["approach"] > 0.3
 
 
 def test_the_document_shows_a_message_and_the_example(arm: Robot) -> None:

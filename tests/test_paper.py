@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,6 @@ from commands import run
 from scipy.spatial.transform import Rotation
 from test_calibration import with_rigid_shoulders
 
-from benchmarks.validation import simulated
-from benchmarks.validation.contenders import list_contenders
-from benchmarks.validation.experiment import run_experiment
 from wepose_pin.calibration import Calibration, assess, calibrate
 from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadOption, BadSession, NoSolution
@@ -351,19 +347,3 @@ def test_the_commands(
 
 
 # Validation -----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_the_validation_has_rows_of_the_papers_protocol(monkeypatch: pytest.MonkeyPatch) -> None:
-    smekf = [each for each in list_contenders("upper body, mild") if each.label == "smekf"]
-    monkeypatch.setattr(simulated, "list_contenders", lambda _: smekf)
-    monkeypatch.setattr(simulated, "simulate", partial(simulate, clasp_s=30.0, circles=2))
-    rows = run_experiment(simulated.list_experiments(True)["upper body, mild"]).rows
-    trunk, alone, open_loop, protocol = (
-        f"smekf, {name}" for name in ("trunk measured", "lengths alone", "open loop", "the paper's protocol")
-    )
-    assert list(rows) == ["smekf", trunk, alone, open_loop, protocol]
-    assert rows[open_loop]["lengths rms [mm]"] == rows["smekf"]["lengths rms [mm]"]
-    hand = {method: row["hand from shoulders [mm]"][0] or 0.0 for method, row in rows.items()}
-    assert len({hand[method] for method in hand if method != trunk}) == 4
-    assert hand["smekf"] < hand[protocol]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import polars as pl
 import pytest
 from commands import run
 from reading import text_of
-from scipy.spatial.transform import Rotation
 
 from benchmarks.long_recordings import there_and_back
 from wepose_pin.calibration import calibrate
@@ -128,27 +126,6 @@ def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation, tmp_pa
 
 
 # The smoother ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_the_smoother_looks_one_piece_ahead(session: Path) -> None:
-    """It is nearer to the smoother of the whole, the longer the pieces are; and nearer than the filter by itself."""
-    whole = track(load_session(session), method="smoother")
-
-    def off(table: Mapping[str, np.ndarray]) -> float:
-        angles = [
-            (Rotation.from_quat(table[name]) * Rotation.from_quat(quat).inv()).magnitude()
-            for name, quat in whole.quat_WL.items()
-        ]
-        return float(np.degrees(np.sqrt(np.mean(np.square(angles)))))
-
-    def in_pieces(seconds: float) -> dict[str, np.ndarray]:
-        pieces = list(track_session(session, options=TrackOptions("smoother"), seconds=seconds))
-        return {name: np.concatenate([piece.quat_WL[name] for piece in pieces]) for name in whole.quat_WL}
-
-    causal = off(track(load_session(session)).quat_WL)
-    assert off(in_pieces(1000.0)) == 0.0
-    assert off(in_pieces(30.0)) < off(in_pieces(5.0)) < causal
 
 
 # The command ----------------------------------------------------------------------------------------------------------

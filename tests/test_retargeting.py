@@ -599,13 +599,6 @@ def test_of_an_arm_that_is_not_there_the_message_says_what_to_do(arm) -> None:
         retarget(person(2.0, side="left"), arm)
 
 
-def test_a_robot_is_taken_by_its_file_too(tmp_path: Path, arm) -> None:
-    urdf = write_arm(tmp_path)
-    pose = person(1.0)
-    for robot in (str(urdf), urdf):
-        np.testing.assert_array_equal(retarget(pose, robot).joint_position, retarget(pose, arm).joint_position)
-
-
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     with pytest.raises(BadModel, match="--robot pandas: not known; did you mean 'panda'"):

@@ -1,13 +1,7 @@
-"""Wrong calls of the public functions, from a table: each ends in an error that names what is wrong with it.
-
-`python tests/test_wrong_calls.py` counts them: named, raw (an error from the inside) and accepted.
-"""
+"""Wrong calls of the public functions, from a table: each ends in an error that names what is wrong with it."""
 
 from __future__ import annotations
 
-import collections
-import signal
-import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
@@ -469,8 +463,6 @@ def outcome(wrong: Wrong) -> str:
             f"'{wrong.names}'" in str(error) and "argument" in str(error)
         )
         return "named" if missing else f"raw: TypeError: {error}"
-    except KeyboardInterrupt:
-        return "accepted"
     except Exception as error:
         return f"raw: {type(error).__name__}: {error}"
     return "accepted"
@@ -519,16 +511,3 @@ def test_a_pose_or_a_truth_of_nan_is_refused() -> None:
     for pair in ((pose, unknown), (unknown, pose)):
         with pytest.raises(BadData, match=r"no orientation of a segment .* NaN"):
             wp.evaluate(*pair)
-
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGALRM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    counts: collections.Counter[str] = collections.Counter()
-    for call in wrong_calls():
-        signal.alarm(30)  # whoever calculates that long has accepted it
-        said = outcome(call)
-        signal.alarm(0)
-        counts[said.partition(":")[0]] += 1
-        if said != "named" and "-v" in sys.argv:
-            print(call, "→", said[:160])
-    print(sum(counts.values()), "wrong calls:", dict(counts))

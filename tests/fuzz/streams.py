@@ -276,13 +276,3 @@ def page(_folder: Path, data: bytes) -> object:
 
 def _connected(live: Any) -> socket.socket:
     return socket.create_connection(("127.0.0.1", int(live.url.rstrip("/").rpartition(":")[2])), timeout=10.0)
-
-
-def spec(_folder: Path, data: bytes) -> object:
-    """What a user writes after ``--source`` or ``--udp``; nothing is opened."""
-    from wepose_pin.live import open_source
-
-    text = data.decode("utf-8", errors="surrogateescape")
-    if text.startswith("replay:"):
-        return None  # a session of the user's own; target "session"
-    return open_source(text, sensors=("torso",))

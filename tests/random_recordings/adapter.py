@@ -226,19 +226,6 @@ def batch(plan: Path, out: Path, workers: int) -> list[str]:
     return ["batch", str(plan), "-o", str(out), "--workers", str(workers)]
 
 
-def write_plan(file: Path, sessions: str, method: str, pages: bool) -> None:
-    """A plan of `batch`: all sessions of a pattern are tracked and exported."""
-    shown = "true" if pages else "false"
-    lines = ["[sessions]", f'files = ["{sessions}"]', "[steps.track]", f'method = "{method}"']
-    lines += [f"view = {shown}", f"report = {shown}", "[steps.export]", 'formats = ["trc"]']
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def batch_process(plan: Path, out: Path, workers: int) -> list[str]:
-    """The command line of a process of its own."""
-    return [sys.executable, "-m", "wepose_pin.cli", *batch(plan, out, workers)]
-
-
 def codes(command: str) -> set[int]:
     """Exit codes that the documents promise."""
     return CODES.get(command, USUAL_CODES)
