@@ -9,17 +9,10 @@ import numpy as np
 import pytest
 
 from wepose_pin.recording.arrivals import (
-    BAD,
     CUT_OFF,
-    DUPLICATE,
     FROZEN,
-    JUMP_S,
     LATE,
     LONGEST_GAP_S,
-    MISSING,
-    REORDER_S,
-    TAKEN,
-    WAIT_S,
     Arrivals,
     Samples,
     StreamSynchronizer,
@@ -59,18 +52,6 @@ def in_order(gyro: np.ndarray, accel: np.ndarray) -> list[tuple[int, float, np.n
     return [(i, tick_time(k), gyro[i, k], accel[i, k]) for k in range(gyro.shape[1]) for i in range(3)]
 
 
-def test_samples_on_their_ticks_come_out_to_the_bit_and_at_once() -> None:
-    gyro, accel = signals(300)
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    ticks = fed(synchronizer, in_order(gyro, accel))
-    assert np.array_equal(ticks.gyro_S, gyro.swapaxes(0, 1))
-    assert np.array_equal(ticks.accel_S, accel.swapaxes(0, 1))
-    assert not ticks.lost.any()
-    assert synchronizer.counts[:, TAKEN].tolist() == [300] * 3
-    assert synchronizer.counts[:, [MISSING, LATE, DUPLICATE, BAD]].sum() == 0
-    np.testing.assert_allclose(ticks.time, BEGIN + np.arange(300) / RATE, atol=1e-12)
-
-
 def test_the_same_arrivals_in_blocks_give_the_same_ticks() -> None:
     gyro, accel = signals(500)
     rng = np.random.default_rng(1)
@@ -90,82 +71,6 @@ def test_the_same_arrivals_in_blocks_give_the_same_ticks() -> None:
         np.testing.assert_array_equal(whole, getattr(first, part))
     assert np.array_equal(one_by_one.counts, blocks.counts)
     assert first.lost.any() or np.isnan(first.gyro_S).any() or one_by_one.counts[:, LATE].any()  # something did happen
-
-
-def test_overtaken_samples_find_their_place_and_later_ones_are_late() -> None:
-    gyro, accel = signals(100)
-    came = in_order(gyro, accel)
-    at = came.index(next(c for c in came if c[0] == 1 and c[1] == tick_time(50)))
-    overtaken = came[:at] + came[at + 1 : at + 5] + [came[at]] + came[at + 5 :]
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    assert np.array_equal(fed(synchronizer, overtaken).gyro_S, gyro.swapaxes(0, 1))
-
-    behind = 3 * round((REORDER_S + 0.03) * RATE)
-    too_late = came[:at] + came[at + 1 : at + behind] + [came[at]] + came[at + behind :]
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    ticks = fed(synchronizer, too_late)
-    assert synchronizer.counts[1].tolist() == [0, 1, 0, 0, 99, 0, 0]
-    np.testing.assert_allclose(ticks.gyro_S[50, 1], 0.5 * (gyro[1, 49] + gyro[1, 51]))  # bridged
-    keep = np.ones((100, 3), dtype=bool)
-    keep[50, 1] = False
-    assert np.array_equal(ticks.gyro_S[keep], gyro.swapaxes(0, 1)[keep])
-
-
-def test_duplicates_and_what_is_no_measurement_are_counted_and_change_nothing() -> None:
-    gyro, accel = signals(100)
-    came = in_order(gyro, accel)
-    bad = [
-        (0, np.nan, gyro[0, 0], accel[0, 0]),
-        (0, tick_time(40), np.array([np.nan, 0.0, 0.0]), accel[0, 0]),
-        (0, tick_time(40), np.array([1e4, 0.0, 0.0]), accel[0, 0]),
-        (0, tick_time(40), gyro[0, 0], np.array([0.0, np.inf, 0.0])),
-        (0, tick_time(40) + 2.0 * JUMP_S, gyro[0, 0], accel[0, 0]),
-        (0, 1e300, gyro[0, 0], accel[0, 0]),
-    ]
-    mixed = came[:120] + bad + [came[118], came[119]] + came[120:]
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    assert np.array_equal(fed(synchronizer, mixed).gyro_S, gyro.swapaxes(0, 1))
-    assert synchronizer.counts[:, BAD].tolist() == [len(bad), 0, 0]
-    assert synchronizer.counts[:, DUPLICATE].tolist() == [0, 1, 1]
-
-
-def stopped(values: np.ndarray, first: int, last: int) -> np.ndarray:
-    """(k, n, 3) with the last sensor's samples `first` to `last` as the one before."""
-    values = values.copy()
-    values[2, first : last + 1] = values[2, first - 1]
-    return values
-
-
-@pytest.mark.parametrize("size", [1.0, 1e-3])
-@pytest.mark.parametrize("stops", [300, 700])
-def test_a_sensor_that_repeats_itself_is_lost_until_it_changes(stops: int, size: float) -> None:
-    gyro, accel = signals(900)
-    gyro, accel = stopped(size * gyro, stops, stops + 99), stopped([0.0, 0.0, 9.8] + size * accel, stops, stops + 99)
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    ticks = fed(synchronizer, in_order(gyro, accel))
-    measured = np.isfinite(ticks.gyro_S).all(axis=2)
-    noticed = stops + round(LONGEST_GAP_S * RATE)  # the first that is not taken
-    assert measured[:, :2].all()
-    assert measured[:noticed, 2].all()
-    assert not measured[noticed : stops + 100, 2].any()
-    assert measured[stops + 101 :, 2].all()
-    assert ticks.lost[noticed + 2 : stops + 99, 2].all()
-    assert not ticks.lost[:, :2].any()
-    assert synchronizer.counts[:, FROZEN].tolist() == [0, 0, stops + 100 - noticed]
-    assert not synchronizer.frozen.any()
-    for i in (0, 1):
-        assert np.array_equal(ticks.gyro_S[:, i], gyro[i])
-
-
-def test_a_sensor_that_never_changes_is_lost_where_others_have_noise() -> None:
-    gyro, accel = signals(600)
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    ticks = fed(synchronizer, in_order(stopped(gyro, 1, 599), stopped(accel, 1, 599)))
-    assert synchronizer.frozen.tolist() == [False, False, True]
-    assert not np.isfinite(ticks.gyro_S[300:, 2]).any()
-    alone = StreamSynchronizer(NAMES[2:], RATE, BEGIN)
-    of_one = [(0, t, g, a) for i, t, g, a in in_order(stopped(gyro, 1, 599), stopped(accel, 1, 599)) if i == 2]
-    assert np.isfinite(fed(alone, of_one).gyro_S).all()
 
 
 @pytest.mark.parametrize("digits", [1.0, 20.0])
@@ -236,24 +141,6 @@ def test_holes_are_bridged_up_to_a_limit_and_then_nan(lost: int, bridged: bool) 
     assert np.array_equal(ticks.gyro_S[:, :2], gyro[:2].swapaxes(0, 1))
 
 
-def test_ticks_wait_for_a_silent_sensor_once_and_not_again() -> None:
-    gyro, accel = signals(400)
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    behind = []
-    for i, t, g, a in in_order(gyro, accel):
-        if i == 1 and 100 <= round((t - BEGIN) * RATE) < 300:
-            continue
-        synchronizer.push(order_arrivals([Samples(NAMES[i], np.array([t]), g[None], a[None])], NAMES))
-        if i == 2:
-            behind.append(round((t - BEGIN) * RATE) + 1 - synchronizer.next_tick)
-    wait = round(WAIT_S * RATE)
-    assert max(behind) <= wait + 1
-    assert max(behind[:100]) == 0
-    assert max(behind[100 + wait + 1 : 300]) == 0  # lost: none waits for it
-    assert max(behind[302:]) == 0  # and back
-    assert synchronizer.counts[1].tolist() == [200, 0, 0, 0, 200, 0, 0]
-
-
 def test_clocks_that_are_off_the_ticks_lose_no_rotation() -> None:
     """A sensor 30 ppm fast and half a step off: the integral of its rate is kept."""
     n = 3000
@@ -276,17 +163,6 @@ def test_a_faster_sensor_is_averaged_over_the_step() -> None:
     ticks = fed(StreamSynchronizer(NAMES[:1], RATE, BEGIN), rows)
     means = rate[1 : 4 * ((n - 1) // 4) + 1].reshape(-1, 4, 3).mean(axis=1)
     np.testing.assert_allclose(ticks.gyro_S[1:, 0], means[: len(ticks.time) - 1], atol=1e-9)
-
-
-def test_a_clock_that_really_went_on_is_followed() -> None:
-    """All sensors sleep for a minute: the ticks between are lost ones, and it goes on."""
-    gyro, accel = signals(200)
-    came = [(i, t + (60.0 if t >= tick_time(100) else 0.0), g, a) for i, t, g, a in in_order(gyro, accel)]
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    ticks = fed(synchronizer, came)
-    assert len(ticks.time) == 6200
-    assert np.isnan(ticks.gyro_S[100:6100]).all()
-    assert np.array_equal(ticks.gyro_S[6104:], gyro.swapaxes(0, 1)[104:])
 
 
 def test_after_a_long_silence_ticks_come_in_pieces() -> None:

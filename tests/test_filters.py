@@ -22,12 +22,10 @@ from wepose_pin.filters import (
     SensorRun,
     Smekf,
     SmekfParams,
-    check_method,
     estimate_orientation,
     run_filter,
 )
 from wepose_pin.filters.bank import LiveBank
-from wepose_pin.filters.base import run_in_parallel
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.rotations import quat_from_gravity
@@ -414,31 +412,6 @@ def test_gdc_is_madgwicks_equations() -> None:
     np.testing.assert_allclose(estimate * np.sign(estimate @ q), q, atol=1e-11)
 
 
-@pytest.mark.parametrize("method", ["amekf", "smekf"])
-def test_what_is_corrected_about_the_vertical_is_stated(method: str) -> None:
-    """Of an upright sensor with a wrong first bias, static and then turning about the vertical."""
-    rng, n, bias_std = np.random.default_rng(4), 2000, 0.01
-    gyro = np.array([0.002, -0.003, 0.01]) + rng.normal(scale=0.002, size=(n, 3))
-    gyro[n // 2 :, 2] += 1.0
-    accel = np.array([0.0, 0.0, GRAVITY]) + rng.normal(scale=0.02, size=(n, 3))
-    noise = replace(estimate_noise(gyro[:180], accel[:180], RATE), gyro_bias=np.zeros(3))
-    noise = replace(noise, gyro_bias_cov=bias_std**2 * np.eye(3))
-    out = run_filter(gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 180)))
-    assert out.about_vertical is not None
-    heading, rate, drift, seconds, information, rate_var = out.about_vertical.T
-    # Without its corrections the heading is the sum of the rate less the bias that the filter had at each sample.
-    bias = out.gyro_bias[:, 2] if method == "amekf" else np.append(0.0, out.gyro_bias[:-1, 2])  # smekf states the next
-    undone = np.unwrap(2.0 * np.arctan2(*out.quat_WS[:, 2:].T), period=2.0 * np.pi) - heading
-    np.testing.assert_allclose(undone, np.cumsum(gyro[:, 2] - bias) / RATE, atol=1e-4)
-    assert np.abs(heading).max() > 1e-3
-    assert rate[-1] == pytest.approx(out.gyro_bias[-1, 2], abs=1e-5)
-    assert seconds[-1] == pytest.approx(n / RATE)
-    np.testing.assert_allclose(drift, np.cumsum(np.append(0.0, rate[:-1])) / RATE, atol=1e-9)
-    assert rate[-1] == pytest.approx(0.01, abs=1e-3)
-    # The filter has not learned less than makes its variance of the first one; a bias that walks takes some away.
-    assert bias_std**-2 + information[-1] > 0.99 / rate_var[-1] > 100.0 * bias_std**-2
-
-
 # All ---------------------------------------------------------------------------------------------------------------
 
 
@@ -545,22 +518,6 @@ def test_a_create_bank_sensors_gives_the_bits_of_each_alone() -> None:
         np.testing.assert_array_equal(bank.gyro_bias, [run.gyro_bias[-1] for run in alone])
         np.testing.assert_array_equal(bank.attitude_cov, [run.attitude_cov[-1] for run in alone])  # type: ignore[index]
         np.testing.assert_array_equal(filters[0].state.record, before)  # on copies
-
-
-def test_runs_in_threads_are_the_runs_one_after_the_other() -> None:
-    gyro, accel, _, noises, _ = sensors(7)
-
-    def run(i: int, noise: SensorNoise) -> Any:
-        return run_filter(gyro[:, i], accel[:, i], RATE, noise, FilterSettings("smekf"))
-
-    one = run_in_parallel(run, range(7), noises, threads=1)
-    for threads in (2, 5, None):
-        for parallel, single in zip(run_in_parallel(run, range(7), noises, threads=threads), one, strict=True):
-            for actual, expected in zip(parallel[:4], single[:4], strict=True):
-                np.testing.assert_array_equal(actual, expected)
-    with pytest.raises(BadOption, match="not known"):
-        run_in_parallel(check_method, ["smekf", "none"])
-    assert run_in_parallel(check_method, []) == []
 
 
 @pytest.mark.parametrize("method", ["smekf", "ncf", "gdc"])

@@ -15,14 +15,11 @@ from test_bad_input import refused
 from benchmarks.trials import read_broad
 from wepose_pin import estimate_orientation, load_session, rotations
 from wepose_pin.diagnostics import Diagnostic, render
-from wepose_pin.errors import BadData, BadPhase
-from wepose_pin.filters.noise import find_static_window
+from wepose_pin.errors import BadData
 from wepose_pin.readers import iter_session
-from wepose_pin.readers.session import SessionReader
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.recording.clocks import build_clock
 from wepose_pin.recording.faults import AXES, SensorScan, find_faults
-from wepose_pin.recording.intervals import check_phases
 from wepose_pin.recording.plausibility import check_signals
 from wepose_pin.simulation import NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.tracking import TrackOptions, track, track_session
@@ -393,19 +390,6 @@ def test_real_sensors_measure_on_every_axis(data: Path) -> None:
 # Arrays ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", ["amekf", "smoother", "smekf"])
-def test_arrays_that_are_cut_off_are_as_uncertain(method: str, made: Simulation) -> None:
-    whole, turned, _ = cut_off_swing(made)
-    sensor = whole.sensors[BROKEN]
-    run = estimate_orientation(sensor.gyro_S, sensor.accel_S, RATE, method=method, static=(0.5, 4.5))
-    R_WS = Rotation.from_quat(run.quat_WS)
-    off = (turned[300].inv() * turned).inv() * (R_WS[300].inv() * R_WS)
-    assert run.attitude_cov is not None
-    z = off.magnitude() / np.sqrt(np.linalg.eigvalsh(run.attitude_cov)[:, -1])
-    assert np.degrees(off.magnitude().max()) > 30.0
-    assert z[450:].max() < 6.0
-
-
 @pytest.mark.parametrize(("signals", "since"), [("gyro", 0.0), ("gyro accel", 9.0), ("accel", 9.0)])
 def test_arrays_of_a_sensor_that_does_not_measure_are_refused(signals: str, since: float, made: Simulation) -> None:
     sensor = stopped(made.recording("stopped"), signals, since).sensors[BROKEN]
@@ -433,26 +417,6 @@ def lost(recording: Recording, name: str, first: float, last: float) -> Recordin
         [np.interp(recording.time[gap], recording.time[ends], accel[ends, axis]) for axis in range(3)]
     )
     return with_sensor(recording, name, gyro_S=gyro, accel_S=accel, gap=gap)
-
-
-def test_the_quietest_window_is_one_that_was_measured(made: Simulation) -> None:
-    whole = replace(made.recording("gap"), phases={})
-    first, last = find_static_window(lost(whole, "torso", 1.0, 3.0))
-    assert last < 1.0 or first > 3.0
-    with pytest.raises(BadPhase, match=r"sensors\.torso"):
-        find_static_window(lost(whole, "torso", 0.0, 25.0))
-
-
-def test_gravity_and_noise_are_those_of_measured_samples(made: Simulation) -> None:
-    whole = made.recording("gap")
-    gap = lost(whole, "torso", 1.0, 2.9)
-    gap.sensors["torso"].accel_S[100:290] *= 0.7
-    for phases in (gap.phases, {}):
-        assert check_signals(replace(gap, phases=phases)) == ()
-    torso = estimate_segments(gap).orientation["torso"].noise
-    right = estimate_segments(whole).orientation["torso"].noise
-    assert torso.gravity == pytest.approx(right.gravity, rel=1e-3)
-    np.testing.assert_allclose(np.diag(torso.gyro_cov), np.diag(right.gyro_cov), rtol=0.3)
 
 
 @pytest.mark.parametrize("frozen", [False, True])
@@ -524,22 +488,6 @@ def test_arms_that_swing_fast_are_measured_in_the_unit_that_is_stated(hertz: flo
         checked(np.pi / 180.0)
 
 
-def test_a_saturated_gyroscope_is_in_the_unit_that_is_stated() -> None:
-    """It turns too little for what accel shows, and 57 times its range would be more than any sensor has."""
-    time, gyro, accel = swing(1.5, 687.0)
-    narrow = np.deg2rad(125.0)
-    sensor = ImuSensor(gyro_S=np.clip(gyro, -narrow, narrow), accel_S=accel)
-    diagnostics = check_signals(Recording("swing", time, RATE, {"torso": sensor}, {"start": ((0.5, 4.5),)}))
-    assert {each.code for each in diagnostics} == {"signal-saturated"}
-
-
-def test_a_phase_may_end_one_sample_after_the_recording() -> None:
-    time = np.arange(100) / 25.0
-    check_phases("session.toml", time, {"clasp": ((1.0, time[-1] + 0.03),)})
-    with pytest.raises(BadPhase, match="outside the recording"):
-        check_phases("session.toml", time, {"clasp": ((1.0, time[-1] + 0.06),)})
-
-
 @pytest.mark.parametrize("within", [0.0, 1e-4, 2e-3])
 @pytest.mark.parametrize("packet", [2, 4, 10])
 def test_time_stamps_of_packets_are_spread_over_their_samples(packet: int, within: float) -> None:
@@ -553,22 +501,6 @@ def test_time_stamps_of_packets_are_spread_over_their_samples(packet: int, withi
     clock = build_clock(stamps[lost], "x")
     np.testing.assert_allclose(clock.time[clock.row >= 0], true[lost], atol=1e-4 + 0.02 * within)
     assert np.count_nonzero(clock.row < 0) == packet
-
-
-def test_a_measured_orientation_that_is_lost_for_long_is_the_same_in_chunks(tmp_path: Path) -> None:
-    time = np.arange(3000) / RATE
-    quat = Rotation.from_rotvec(np.clip(time - 5.0, 0.0, 1e9)[:, None] * [0.01, 0.02, 0.03]).as_quat()
-    for first, last in ((8.0, 15.2), (12.0, 31.0), (-1.0, 12.0)):
-        cells = np.where(((time > first) & (time < last))[:, None], 0.0, quat)
-        pl.DataFrame(np.column_stack([time, cells]), schema=["time", *"xyzw"]).write_csv(tmp_path / "a.csv")
-        (tmp_path / "session.toml").write_text(
-            '[data]\nfile = "a.csv"\ntime = "time"\n[sensors.torso]\norientation = ["x", "y", "z", "w"]\n'
-        )
-        whole = load_session(tmp_path, gaps=True).sensors["torso"]
-        reader = SessionReader(tmp_path, gaps=True, in_memory=False)
-        pieces = [reader.recording(k, min(k + 250, 3000)).sensors["torso"] for k in range(0, 3000, 250)]
-        for name in ("quat_WS", "gap"):
-            np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in pieces]), getattr(whole, name))
 
 
 @pytest.mark.parametrize("options", [[], ["--causal"]])
