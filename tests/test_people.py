@@ -214,6 +214,36 @@ def test_the_rate_does_not_change_the_motion(body: Simulation) -> None:
     np.testing.assert_allclose(slow.points["right_palm"], body.points["right_palm"][::5][:n], atol=1e-9)
 
 
+@pytest.mark.monte_carlo
+def test_people_hold_the_start_pose_as_they_do() -> None:
+    """Arms outwards by 8 deg and turned inwards by 5, elbows bent by 12, each as different as people are."""
+    arms, bends = [], []
+    for seed in range(200):
+        sim = simulate(
+            SUBJECT, seed=seed, imperfections=only("start_pose"), rate_hz=20.0, clasp_s=5.0, circles=0, noise=NOISE_FREE
+        )
+        R = {name: Rotation.from_quat(quat[40]) for name, quat in sim.quat_WL.items()}
+        for side, y in SIDES.items():
+            R_TU = R["torso"].inv() * R[f"{side}_upper_arm"]
+            arms.append(R_TU.as_rotvec(degrees=True) * (y, 1.0, y))
+            along = (R[f"{side}_upper_arm"].inv() * R[f"{side}_forearm"]).apply((0.0, 0.0, -1.0))
+            bends.append(np.degrees(np.arctan2(along[0], -along[2])))
+    np.testing.assert_allclose(np.mean(arms, axis=0), (8.0, 0.0, -5.0), atol=2.0)
+    np.testing.assert_allclose(np.std(arms, axis=0), (4.0, 5.0, 12.0), rtol=0.25)
+    assert (np.mean(bends), np.std(bends)) == (pytest.approx(12.0, abs=1.5), pytest.approx(5.0, rel=0.25))
+
+
+@pytest.mark.parametrize("protocol", ["clasp", "t_pose", "bow"])
+def test_people_reach_in_every_protocol(protocol: str) -> None:
+    for seed in (2, 36):  # they came to grief once
+        lengths = simulate_person(seed).lengths
+        options = {"rate_hz": 20.0, "clasp_s": 10.0, "circles": 1, "noise": NOISE_FREE}
+        sim = simulate(lengths, seed=seed, imperfections=PEOPLE_PRESET, protocol=protocol, **options)
+        for side in SIDES:
+            speed = np.linalg.norm(np.diff(sim.points[f"{side}_palm"], axis=0), axis=1) * sim.rate_hz
+            assert speed.max() < 5.0
+
+
 # Sensors ---------------------------------------------------------------------------------------------------------
 
 
