@@ -178,6 +178,13 @@ def rotate_by_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     quat[0], quat[1], quat[2], quat[3] = rx * scale, ry * scale, rz * scale, rw * scale
 
 
+def turned(quat: np.ndarray, rotvec: np.ndarray) -> np.ndarray:
+    """``quat ⊗ exp(rotvec)`` of one quaternion (4,) xyzw and one rotation vector (3,) [rad]."""
+    result = quat.copy()
+    rotate_by_vector(result, *rotvec)
+    return result
+
+
 @inlined
 def rotate_unit_by_rate(quat, wx, wy, wz, dt):  # type: ignore[no-untyped-def]
     """In place: ``quat ← quat ⊗ exp([wx, wy, wz] dt)``, renormalised to first order: but for rounding it is unit."""

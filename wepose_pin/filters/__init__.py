@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from .. import rotations
 from ..arguments import check_arguments
 from ..diagnostics import WARNING, Diagnostic, notebook_html, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
@@ -26,7 +26,7 @@ from .noise import SensorNoise, estimate_noise
 from .smekf import PublishedSmekf, Smekf, SmekfParams, starting_params
 from .smoother import Smoother
 from .start import MOVING_TILT_STD, StartTilt, estimate_start_tilt
-from .static import StaticDetector, StaticTest
+from .static import USUAL_TEST, StaticDetector, StaticTest
 
 __all__ = [
     "BEST",
@@ -244,7 +244,7 @@ def estimate_orientation(
         if not 0 <= first < last <= len(gyro) + 1:
             raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
         noise, start = estimate_noise(gyro[first:last], accel[first:last], rate_hz), slice(first, last)
-    settings = FilterSettings(method, params, static_test or StaticTest(), start=start, gyro_range=scan.gyro_range)
+    settings = FilterSettings(method, params, static_test or USUAL_TEST, start=start, gyro_range=scan.gyro_range)
     run = SensorRun(rate_hz, noise, settings)
     return (run.push(gyro, accel) or run.finish())._replace(diagnostics=diagnostics)
 
@@ -292,7 +292,7 @@ class FilterSettings:
 
     method: str
     params: Any = None
-    static_test: StaticTest = field(default_factory=StaticTest)
+    static_test: StaticTest = USUAL_TEST
     measured_start: bool = False
     start: slice | None = None
     gyro_range: float = np.inf
@@ -361,8 +361,8 @@ class SensorRun:
             run, _ = before
             if self._method in OFFLINE:  # forward over all samples, from the end of the backward run
                 turn = np.nan_to_num(gyro_S[0] - run.gyro_bias[0]) / self._rate_hz
-                quat_WS = (Rotation.from_quat(run.quat_WS[0]) * Rotation.from_rotvec(-turn)).as_quat()
-                start = StartTilt(quat_WS, MOVING_TILT_STD)  # the forward run alone uses these samples
+                # The forward run alone uses these samples.
+                start = StartTilt(rotations.turned(run.quat_WS[0], -turn), MOVING_TILT_STD)
                 self._before_cov = run.attitude_cov
         self._filter = self._create_filter(self._method, self._noise, start)
         return before
@@ -374,12 +374,11 @@ class SensorRun:
         change their sign backward in time; specific forces do not.
         """
         turn = np.nan_to_num(gyro_S[-1] - self._noise.gyro_bias) / self._rate_hz
-        quat_WS = (Rotation.from_quat(start.quat_WS) * Rotation.from_rotvec(turn)).as_quat()
         noise = replace(self._noise, gyro_bias=-self._noise.gyro_bias)
         gyro, accel = -gyro_S[:0:-1], accel_S[::-1]
         static = StaticDetector(noise, self._rate_hz, self._test).run(gyro, accel)
         method = BEST if self._method in OFFLINE else self._method
-        filter_ = self._create_filter(method, noise, start._replace(quat_WS=quat_WS))
+        filter_ = self._create_filter(method, noise, start._replace(quat_WS=rotations.turned(start.quat_WS, turn)))
         run = filter_.run(gyro, accel, static)
         cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
         # What the backward run has corrected is no correction of the forward run.

@@ -122,6 +122,9 @@ class StaticTest:
         return max(4, round(self.window_s * rate_hz))
 
 
+USUAL_TEST = StaticTest()
+
+
 class StaticState(NamedTuple):
     """Memory of the detectors of k sensors, a row each; a window has N samples."""
 
@@ -145,7 +148,7 @@ class StaticDetector:
     """
 
     def __init__(self, noise: SensorNoise, rate_hz: float, test: StaticTest | None = None) -> None:
-        self.test = test or StaticTest()
+        self.test = test or USUAL_TEST
         self.state = _first_state(noise, rate_hz, self.test)
         self._one = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1, dtype=np.bool_)
 
