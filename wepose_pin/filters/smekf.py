@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..compilation import inlined, kernel
+from ..compilation import fma, inlined, kernel
 from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, rotation_terms, up_in_sensor
@@ -250,14 +250,15 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
         lost_var = std_after * std_after - std_before * std_before
         state.lost_s = after
     held[0], held[1], held[2] = wx, wy, wz
-    predict(state, model, wx * dt, wy * dt, wz * dt, lost_var)
+    P = predict(state, model, wx * dt, wy * dt, wz * dt, lost_var)
     if static and is_measured and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
-        correct(state, model, gx, gy, gz, ax, ay, az)
-    update_attitude_cov(state, model, wx * dt, wy * dt, wz * dt)
+        P = correct(state, model, P, gx, gy, gz, ax, ay, az)
+    store_covariance(state, P)
+    update_attitude_cov(state, model, P, wx * dt, wy * dt, wz * dt)
 
 
 @inlined
-def update_attitude_cov(state, model, wx, wy, wz):  # type: ignore[no-untyped-def]
+def update_attitude_cov(state, model, P, wx, wy, wz):  # type: ignore[no-untyped-def]
     """Set the stated attitude covariance after the rotation w [rad]: P_aa and the error of the gyroscope's scale.
 
     A scale that is wrong by s gives the heading an error of s times the rotation about the vertical. It gives the tilt
@@ -266,66 +267,63 @@ def update_attitude_cov(state, model, wx, wy, wz):  # type: ignore[no-untyped-de
     ux, uy, uz = up_in_sensor(state.quat_WS)
     state.turned += wx * ux + wy * uy + wz * uz
     heading_var = model.scale_var * state.turned * state.turned
-    cov, P_aa = state.attitude_cov, state.P_aa
-    cov[0] = P_aa[0] + heading_var * ux * ux
-    cov[1] = P_aa[1] + heading_var * ux * uy
-    cov[2] = P_aa[2] + heading_var * ux * uz
-    cov[3] = P_aa[3] + heading_var * uy * uy
-    cov[4] = P_aa[4] + heading_var * uy * uz
-    cov[5] = P_aa[5] + heading_var * uz * uz
-    state.about_vertical[RATE_VAR] = compute_variance_along(state.P_bb, ux, uy, uz)
+    P_aa, _, P_bb = P
+    cov = add_along(P_aa, heading_var, ux, uy, uz)
+    for i in range(6):
+        state.attitude_cov[i] = cov[i]
+    state.about_vertical[RATE_VAR] = compute_variance_along(P_bb, ux, uy, uz)
+
+
+# The covariance P is the tuple (P_aa, P_ab, P_bb) below: upper triangles of six numbers, and nine numbers, rows first.
+# Numbers stay in registers, the entries of an array would not.
+
+
+@inlined
+def load_covariance(state):  # type: ignore[no-untyped-def]
+    a, b, c = state.P_aa, state.P_ab, state.P_bb
+    return (
+        (a[0], a[1], a[2], a[3], a[4], a[5]),
+        (b[0, 0], b[0, 1], b[0, 2], b[1, 0], b[1, 1], b[1, 2], b[2, 0], b[2, 1], b[2, 2]),
+        (c[0], c[1], c[2], c[3], c[4], c[5]),
+    )
+
+
+@inlined
+def store_covariance(state, P):  # type: ignore[no-untyped-def]
+    P_aa, P_ab, P_bb = P
+    a, b, c = state.P_aa, state.P_ab, state.P_bb
+    a[0], a[1], a[2], a[3], a[4], a[5] = P_aa
+    b[0, 0], b[0, 1], b[0, 2], b[1, 0], b[1, 1], b[1, 2], b[2, 0], b[2, 1], b[2, 2] = P_ab
+    c[0], c[1], c[2], c[3], c[4], c[5] = P_bb
 
 
 @inlined
 def predict(state, model, wx, wy, wz, lost_var):  # type: ignore[no-untyped-def]
-    """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w), P ← F P Fᵀ + G Q Gᵀ.
+    """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w); return F P Fᵀ + G Q Gᵀ.
 
     G Q Gᵀ = δt² diag(Σ_ω, Σ_b). `lost_var` [rad²] is added on top.
     """
     rotate_by_vector(state.quat_WS, wx, wy, wz)
-    propagate(state, wx, wy, wz, model.dt, model.first_order)
-    P_aa, P_bb = state.P_aa, state.P_bb
-    for i in range(6):
-        diagonal = i == 0 or i == 3 or i == 5
-        P_aa[i] += model.attitude_step[i] + lost_var if diagonal else model.attitude_step[i]
-        P_bb[i] += model.bias_step[i]
-
-
-# 3×3 matrices in the kernels below are nine numbers, rows first, so that they stay in registers.
-
-
-@inlined
-def full(upper):  # type: ignore[no-untyped-def]
-    """The symmetric matrix of an upper triangle (6,)."""
-    return upper[0], upper[1], upper[2], upper[1], upper[3], upper[4], upper[2], upper[4], upper[5]
+    A, B = transition(wx, wy, wz, model.dt, model.first_order)
+    aa, ab, bb = propagate(load_covariance(state), A, B)
+    p, q = model.attitude_step, model.bias_step
+    aa = (
+        aa[0] + p[0] + lost_var, aa[1] + p[1], aa[2] + p[2],
+        aa[3] + p[3] + lost_var, aa[4] + p[4], aa[5] + p[5] + lost_var,
+    )  # fmt: skip
+    return aa, ab, (bb[0] + q[0], bb[1] + q[1], bb[2] + q[2], bb[3] + q[3], bb[4] + q[4], bb[5] + q[5])
 
 
 @inlined
-def nine(matrix):  # type: ignore[no-untyped-def]
-    """A matrix (3, 3)."""
-    a, b, c = matrix[0], matrix[1], matrix[2]
-    return a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]
+def dot(a, x, b, y, c, z):  # type: ignore[no-untyped-def]
+    """a x + b y + c z."""
+    return fma(a, x, fma(b, y, c * z))
 
 
 @inlined
-def transposed(A):  # type: ignore[no-untyped-def]
-    return A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]
-
-
-@inlined
-def products(A, X, B, Y):  # type: ignore[no-untyped-def]
-    """A X + B Y."""
-    return (
-        A[0] * X[0] + A[1] * X[3] + A[2] * X[6] + B[0] * Y[0] + B[1] * Y[3] + B[2] * Y[6],
-        A[0] * X[1] + A[1] * X[4] + A[2] * X[7] + B[0] * Y[1] + B[1] * Y[4] + B[2] * Y[7],
-        A[0] * X[2] + A[1] * X[5] + A[2] * X[8] + B[0] * Y[2] + B[1] * Y[5] + B[2] * Y[8],
-        A[3] * X[0] + A[4] * X[3] + A[5] * X[6] + B[3] * Y[0] + B[4] * Y[3] + B[5] * Y[6],
-        A[3] * X[1] + A[4] * X[4] + A[5] * X[7] + B[3] * Y[1] + B[4] * Y[4] + B[5] * Y[7],
-        A[3] * X[2] + A[4] * X[5] + A[5] * X[8] + B[3] * Y[2] + B[4] * Y[5] + B[5] * Y[8],
-        A[6] * X[0] + A[7] * X[3] + A[8] * X[6] + B[6] * Y[0] + B[7] * Y[3] + B[8] * Y[6],
-        A[6] * X[1] + A[7] * X[4] + A[8] * X[7] + B[6] * Y[1] + B[7] * Y[4] + B[8] * Y[7],
-        A[6] * X[2] + A[7] * X[5] + A[8] * X[8] + B[6] * Y[2] + B[7] * Y[5] + B[8] * Y[8],
-    )
+def add_dot(more, a, x, b, y, c, z):  # type: ignore[no-untyped-def]
+    """more + a x + b y + c z."""
+    return fma(a, x, fma(b, y, fma(c, z, more)))
 
 
 @inlined
@@ -339,205 +337,247 @@ def transition(wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
     if not first_order:
         cosine, s, c, d = rotation_terms(wx * wx + wy * wy + wz * wz)
         e = s
-    # A = cos θ I − s [w]× + c w wᵀ
-    xy, xz, yz = c * wx * wy, c * wx * wz, c * wy * wz
-    ux, uy, uz = s * wx, s * wy, s * wz
-    A = (
-        cosine + c * wx * wx, xy + uz, xz - uy,
-        xy - uz, cosine + c * wy * wy, yz + ux,
-        xz + uy, yz - ux, cosine + c * wz * wz,
-    )  # fmt: skip
-    # B = −δt (s I − c [w]× + d w wᵀ)
-    d, ux, uy, uz = -dt * d, -dt * c * wx, -dt * c * wy, -dt * c * wz
-    xy, xz, yz = d * wx * wy, d * wx * wz, d * wy * wz
-    B = (
-        d * wx * wx - dt * e, xy + uz, xz - uy,
-        xy - uz, d * wy * wy - dt * e, yz + ux,
-        xz + uy, yz - ux, d * wz * wz - dt * e,
-    )  # fmt: skip
-    return A, B
+    # A = cos θ I − s [w]× + c w wᵀ,  B = −δt (s I − c [w]× + d w wᵀ)
+    return sum_of_three(cosine, -s, c, wx, wy, wz), sum_of_three(-dt * e, dt * c, -dt * d, wx, wy, wz)
 
 
 @inlined
-def propagate(state, wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
-    """P ← F P Fᵀ over the turn w [rad] in δt [s], block by block."""
-    A, B = transition(wx, wy, wz, dt, first_order)
-    P_aa, P_ab, P_bb = full(state.P_aa), nine(state.P_ab), full(state.P_bb)
-    new_ab = products(A, P_ab, B, P_bb)
-    new_aa = products(products(A, P_aa, B, transposed(P_ab)), transposed(A), new_ab, transposed(B))
-    fill_blocks(state, new_aa, new_ab)
-
-
-@inlined
-def product(A, X):  # type: ignore[no-untyped-def]
-    """A X."""
+def sum_of_three(one, cross, outer, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """The matrix one I + cross [w]× + outer w wᵀ."""
+    ox, oy = outer * wx, outer * wy
+    xy, xz, yz = ox * wy, ox * wz, oy * wz
+    ux, uy, uz = cross * wx, cross * wy, cross * wz
     return (
-        A[0] * X[0] + A[1] * X[3] + A[2] * X[6],
-        A[0] * X[1] + A[1] * X[4] + A[2] * X[7],
-        A[0] * X[2] + A[1] * X[5] + A[2] * X[8],
-        A[3] * X[0] + A[4] * X[3] + A[5] * X[6],
-        A[3] * X[1] + A[4] * X[4] + A[5] * X[7],
-        A[3] * X[2] + A[4] * X[5] + A[5] * X[8],
-        A[6] * X[0] + A[7] * X[3] + A[8] * X[6],
-        A[6] * X[1] + A[7] * X[4] + A[8] * X[7],
-        A[6] * X[2] + A[7] * X[5] + A[8] * X[8],
+        fma(ox, wx, one), xy - uz, xz + uy,
+        xy + uz, fma(oy, wy, one), yz - ux,
+        xz - uy, yz + ux, fma(outer * wz, wz, one),
+    )  # fmt: skip
+
+
+@inlined
+def propagate(P, A, B):  # type: ignore[no-untyped-def]
+    """F P Fᵀ of F = [[A, B], [0, I]]."""
+    aa, ab, bb = P
+    b = times_symmetric(A, B, ab, bb)  # A P_ab + B P_bb
+    ba = ab[0], ab[3], ab[6], ab[1], ab[4], ab[7], ab[2], ab[5], ab[8]
+    a = times_symmetric(B, A, ba, aa)  # A P_aa + B P_ba
+    return (
+        (
+            add_dot(dot(a[0], A[0], a[1], A[1], a[2], A[2]), b[0], B[0], b[1], B[1], b[2], B[2]),
+            add_dot(dot(a[0], A[3], a[1], A[4], a[2], A[5]), b[0], B[3], b[1], B[4], b[2], B[5]),
+            add_dot(dot(a[0], A[6], a[1], A[7], a[2], A[8]), b[0], B[6], b[1], B[7], b[2], B[8]),
+            add_dot(dot(a[3], A[3], a[4], A[4], a[5], A[5]), b[3], B[3], b[4], B[4], b[5], B[5]),
+            add_dot(dot(a[3], A[6], a[4], A[7], a[5], A[8]), b[3], B[6], b[4], B[7], b[5], B[8]),
+            add_dot(dot(a[6], A[6], a[7], A[7], a[8], A[8]), b[6], B[6], b[7], B[7], b[8], B[8]),
+        ),
+        b,
+        bb,
     )
 
 
 @inlined
-def rotate_covariance(state, wx, wy, wz):  # type: ignore[no-untyped-def]
-    """P ← F P Fᵀ over the turn w [rad] in no time: B is zero."""
-    A, _ = transition(wx, wy, wz, 0.0, False)
-    fill_blocks(state, product(product(A, full(state.P_aa)), transposed(A)), product(A, nine(state.P_ab)))
+def times_symmetric(A, B, X, S):  # type: ignore[no-untyped-def]
+    """A X + B S of matrices and an upper triangle S."""
+    return (
+        add_dot(dot(B[0], S[0], B[1], S[1], B[2], S[2]), A[0], X[0], A[1], X[3], A[2], X[6]),
+        add_dot(dot(B[0], S[1], B[1], S[3], B[2], S[4]), A[0], X[1], A[1], X[4], A[2], X[7]),
+        add_dot(dot(B[0], S[2], B[1], S[4], B[2], S[5]), A[0], X[2], A[1], X[5], A[2], X[8]),
+        add_dot(dot(B[3], S[0], B[4], S[1], B[5], S[2]), A[3], X[0], A[4], X[3], A[5], X[6]),
+        add_dot(dot(B[3], S[1], B[4], S[3], B[5], S[4]), A[3], X[1], A[4], X[4], A[5], X[7]),
+        add_dot(dot(B[3], S[2], B[4], S[4], B[5], S[5]), A[3], X[2], A[4], X[5], A[5], X[8]),
+        add_dot(dot(B[6], S[0], B[7], S[1], B[8], S[2]), A[6], X[0], A[7], X[3], A[8], X[6]),
+        add_dot(dot(B[6], S[1], B[7], S[3], B[8], S[4]), A[6], X[1], A[7], X[4], A[8], X[7]),
+        add_dot(dot(B[6], S[2], B[7], S[4], B[8], S[5]), A[6], X[2], A[7], X[5], A[8], X[8]),
+    )
 
 
 @inlined
-def fill_blocks(state, aa, ab):  # type: ignore[no-untyped-def]
-    """Set P_aa and P_ab to matrices of nine numbers."""
-    upper, across = state.P_aa, state.P_ab
-    upper[0], upper[1], upper[2], upper[3], upper[4], upper[5] = aa[0], aa[1], aa[2], aa[4], aa[5], aa[8]
-    across[0, 0], across[0, 1], across[0, 2] = ab[0], ab[1], ab[2]
-    across[1, 0], across[1, 1], across[1, 2] = ab[3], ab[4], ab[5]
-    across[2, 0], across[2, 1], across[2, 2] = ab[6], ab[7], ab[8]
+def rotate_covariance(P, A):  # type: ignore[no-untyped-def]
+    """F P Fᵀ of F = [[A, 0], [0, I]]."""
+    s, x, bb = P
+    a = (
+        dot(A[0], s[0], A[1], s[1], A[2], s[2]),
+        dot(A[0], s[1], A[1], s[3], A[2], s[4]),
+        dot(A[0], s[2], A[1], s[4], A[2], s[5]),
+        dot(A[3], s[0], A[4], s[1], A[5], s[2]),
+        dot(A[3], s[1], A[4], s[3], A[5], s[4]),
+        dot(A[3], s[2], A[4], s[4], A[5], s[5]),
+        dot(A[6], s[0], A[7], s[1], A[8], s[2]),
+        dot(A[6], s[1], A[7], s[3], A[8], s[4]),
+        dot(A[6], s[2], A[7], s[4], A[8], s[5]),
+    )
+    return (
+        (
+            dot(a[0], A[0], a[1], A[1], a[2], A[2]),
+            dot(a[0], A[3], a[1], A[4], a[2], A[5]),
+            dot(a[0], A[6], a[1], A[7], a[2], A[8]),
+            dot(a[3], A[3], a[4], A[4], a[5], A[5]),
+            dot(a[3], A[6], a[4], A[7], a[5], A[8]),
+            dot(a[6], A[6], a[7], A[7], a[8], A[8]),
+        ),
+        (
+            dot(A[0], x[0], A[1], x[3], A[2], x[6]),
+            dot(A[0], x[1], A[1], x[4], A[2], x[7]),
+            dot(A[0], x[2], A[1], x[5], A[2], x[8]),
+            dot(A[3], x[0], A[4], x[3], A[5], x[6]),
+            dot(A[3], x[1], A[4], x[4], A[5], x[7]),
+            dot(A[3], x[2], A[4], x[5], A[5], x[8]),
+            dot(A[6], x[0], A[7], x[3], A[8], x[6]),
+            dot(A[6], x[1], A[7], x[4], A[8], x[7]),
+            dot(A[6], x[2], A[7], x[5], A[8], x[8]),
+        ),
+        bb,
+    )
 
 
 @inlined
-def correct(state, model, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
-    """Algorithm 1, correction in a static phase.
+def correct(state, model, P, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+    """Algorithm 1, correction in a static phase; return P after it.
 
     y = [accel/g; gyro], h = [R_WSᵀ e_z; b̂], H = [[[R_WSᵀ e_z]×, 0], [0, I]].
 
     The noises of the two are independent, so gyro is taken first and accel after it, which is the same correction with
     two S of (3, 3) in place of one of (6, 6).
     """
-    bias, P_aa, P_bb = state.gyro_bias, state.P_aa, state.P_bb
+    bias = state.gyro_bias
     ux, uy, uz = up_in_sensor(state.quat_WS)
-    before = compute_variance_along(P_bb, ux, uy, uz)
     # gyro: H P = [P_ba, P_bb], S = P_bb + Σ_ω
     R = model.static_gyro_cov
-    b, c = nine(state.P_ab), full(P_bb)
-    S = P_bb[0] + R[0], P_bb[1] + R[1], P_bb[2] + R[2], P_bb[3] + R[3], P_bb[4] + R[4], P_bb[5] + R[5]
+    _, b, c = P
+    before = compute_variance_along(c, ux, uy, uz)
+    S = c[0] + R[0], c[1] + R[1], c[2] + R[2], c[3] + R[3], c[4] + R[4], c[5] + R[5]
     rows = (
         (b[0], b[3], b[6], c[0], c[1], c[2]),
-        (b[1], b[4], b[7], c[3], c[4], c[5]),
-        (b[2], b[5], b[8], c[6], c[7], c[8]),
+        (b[1], b[4], b[7], c[1], c[3], c[4]),
+        (b[2], b[5], b[8], c[2], c[4], c[5]),
     )
-    d = fuse(state, rows, S, (gx - bias[0], gy - bias[1], gz - bias[2]))
+    P, d = fuse(P, rows, S, (gx - bias[0], gy - bias[1], gz - bias[2]))
     # accel: H P = [u]× [P_aa, P_ab], S = [u]× P_aa [u]×ᵀ + Σ_g; what gyro said of the attitude is off the innovation
     R = model.static_accel_cov
     g = model.inverse_gravity
     innovation = (
-        ax * g - ux - (uy * d[2] - uz * d[1]),
-        ay * g - uy - (uz * d[0] - ux * d[2]),
-        az * g - uz - (ux * d[1] - uy * d[0]),
+        fma(ax, g, -ux) - (uy * d[2] - uz * d[1]),
+        fma(ay, g, -uy) - (uz * d[0] - ux * d[2]),
+        fma(az, g, -uz) - (ux * d[1] - uy * d[0]),
     )
-    a, b = full(P_aa), nine(state.P_ab)
-    x, y = (a[0], a[1], a[2], b[0], b[1], b[2]), (a[3], a[4], a[5], b[3], b[4], b[5])
-    z = a[6], a[7], a[8], b[6], b[7], b[8]
+    a, b, _ = P
+    x, y = (a[0], a[1], a[2], b[0], b[1], b[2]), (a[1], a[3], a[4], b[3], b[4], b[5])
+    z = a[2], a[4], a[5], b[6], b[7], b[8]
     row0, row1, row2 = difference(uy, z, uz, y), difference(uz, x, ux, z), difference(ux, y, uy, x)
     S = (
-        row0[2] * uy - row0[1] * uz + R[0],
-        row0[0] * uz - row0[2] * ux + R[1],
-        row0[1] * ux - row0[0] * uy + R[2],
-        row1[0] * uz - row1[2] * ux + R[3],
-        row1[1] * ux - row1[0] * uy + R[4],
-        row2[1] * ux - row2[0] * uy + R[5],
+        fma(row0[2], uy, fma(-row0[1], uz, R[0])),
+        fma(row0[0], uz, fma(-row0[2], ux, R[1])),
+        fma(row0[1], ux, fma(-row0[0], uy, R[2])),
+        fma(row1[0], uz, fma(-row1[2], ux, R[3])),
+        fma(row1[1], ux, fma(-row1[0], uy, R[4])),
+        fma(row2[1], ux, fma(-row2[0], uy, R[5])),
     )
-    e = fuse(state, (row0, row1, row2), S, innovation)
-    turn = d[0] + e[0], d[1] + e[1], d[2] + e[2]
-    rotate_by_vector(state.quat_WS, turn[0], turn[1], turn[2])
+    P, e = fuse(P, (row0, row1, row2), S, innovation)
+    tx, ty, tz = d[0] + e[0], d[1] + e[1], d[2] + e[2]
+    rotate_by_vector(state.quat_WS, tx, ty, tz)
     if not model.first_order:
         # The direction of the vertical in S changes with the correction. The long axis of P, the heading, has to follow
         # it: otherwise it would have a horizontal part, which the next sample of accel would correct.
-        rotate_covariance(state, turn[0], turn[1], turn[2])
-    for i in range(3):
-        bias[i] += d[3 + i] + e[3 + i]
-    heading, rate = (
-        ux * turn[0] + uy * turn[1] + uz * turn[2],
-        ux * (d[3] + e[3]) + uy * (d[4] + e[4]) + uz * (d[5] + e[5]),
-    )
-    add_correction(state.about_vertical, heading, rate, before, compute_variance_along(P_bb, ux, uy, uz))
-    tx, ty, tz = model.static_turn * ux, model.static_turn * uy, model.static_turn * uz
-    P_aa[0] += tx * ux
-    P_aa[1] += tx * uy
-    P_aa[2] += tx * uz
-    P_aa[3] += ty * uy
-    P_aa[4] += ty * uz
-    P_aa[5] += tz * uz
+        A, _ = transition(tx, ty, tz, 0.0, False)
+        P = rotate_covariance(P, A)
+    bx, by, bz = d[3] + e[3], d[4] + e[4], d[5] + e[5]
+    bias[0] += bx
+    bias[1] += by
+    bias[2] += bz
+    aa, ab, bb = P
+    after = compute_variance_along(bb, ux, uy, uz)
+    add_correction(state.about_vertical, ux * tx + uy * ty + uz * tz, ux * bx + uy * by + uz * bz, before, after)
+    return add_along(aa, model.static_turn, ux, uy, uz), ab, bb
+
+
+@inlined
+def add_along(P, variance, ux, uy, uz):  # type: ignore[no-untyped-def]
+    """P + variance u uᵀ of an upper triangle."""
+    x, y, z = variance * ux, variance * uy, variance * uz
+    return fma(x, ux, P[0]), fma(x, uy, P[1]), fma(x, uz, P[2]), fma(y, uy, P[3]), fma(y, uz, P[4]), fma(z, uz, P[5])
 
 
 @inlined
 def compute_variance_along(P, ux, uy, uz):  # type: ignore[no-untyped-def]
-    """Compute uᵀ P u of an upper triangle (6,)."""
-    x, y, z = P[0] * ux + P[1] * uy + P[2] * uz, P[1] * ux + P[3] * uy + P[4] * uz, P[2] * ux + P[4] * uy + P[5] * uz
-    return x * ux + y * uy + z * uz
+    """Compute uᵀ P u of an upper triangle."""
+    x, y, z = dot(P[0], ux, P[1], uy, P[2], uz), dot(P[1], ux, P[3], uy, P[4], uz), dot(P[2], ux, P[4], uy, P[5], uz)
+    return dot(x, ux, y, uy, z, uz)
 
 
 @inlined
 def difference(a, x, b, y):  # type: ignore[no-untyped-def]
     """a x − b y of six numbers each."""
     return (
-        a * x[0] - b * y[0], a * x[1] - b * y[1], a * x[2] - b * y[2],
-        a * x[3] - b * y[3], a * x[4] - b * y[4], a * x[5] - b * y[5],
+        fma(a, x[0], -b * y[0]), fma(a, x[1], -b * y[1]), fma(a, x[2], -b * y[2]),
+        fma(a, x[3], -b * y[3]), fma(a, x[4], -b * y[4]), fma(a, x[5], -b * y[5]),
     )  # fmt: skip
 
 
 @inlined
-def fuse(state, rows, S, innovation):  # type: ignore[no-untyped-def]
-    """Correct by three measurements: P ← P − (H P)ᵀ S⁻¹ (H P); return the error state (6,) (H P)ᵀ S⁻¹ (y − h).
+def less(x, b, y):  # type: ignore[no-untyped-def]
+    """x − b y of six numbers each."""
+    return (
+        fma(-b, y[0], x[0]), fma(-b, y[1], x[1]), fma(-b, y[2], x[2]),
+        fma(-b, y[3], x[3]), fma(-b, y[4], x[4]), fma(-b, y[5], x[5]),
+    )  # fmt: skip
+
+
+@inlined
+def fuse(P, rows, S, innovation):  # type: ignore[no-untyped-def]
+    """Correct by three measurements: return P − (H P)ᵀ S⁻¹ (H P) and the error state (6,) (H P)ᵀ S⁻¹ (y − h).
 
     With S = L D Lᵀ and V = L⁻¹ H P these are P − Vᵀ D⁻¹ V and Vᵀ D⁻¹ L⁻¹ (y − h). `rows` are those of H P (3, 6), S is
     its upper triangle, `innovation` is y − h. A direction in which S is zero corrects nothing.
     """
-    i0 = 1.0 / S[0] if S[0] > 0.0 else 0.0
-    l10, l20 = S[1] * i0, S[2] * i0
-    d1, t21 = S[3] - l10 * S[1], S[4] - l20 * S[1]
-    i1 = 1.0 / d1 if d1 > 0.0 else 0.0
-    l21 = t21 * i1
-    d2 = S[5] - l20 * S[2] - l21 * t21
-    i2 = 1.0 / d2 if d2 > 0.0 else 0.0
+    # D = (p0, p1/p0, p2/(p0 p1)) of the minors p, so that no division waits for another.
+    p0 = S[0] if S[0] > 0.0 else 1.0
+    minor, across = fma(p0, S[3], -S[1] * S[1]), fma(p0, S[4], -S[1] * S[2])
+    p1 = minor if minor > 0.0 else 1.0
+    p2 = fma(fma(p0, S[5], -S[2] * S[2]), p1, -across * across)
+    r0, r1 = 1.0 / p0, 1.0 / p1
+    i0, i1 = r0 if S[0] > 0.0 else 0.0, p0 * r1 if minor > 0.0 else 0.0
+    i2 = p0 * p1 / p2 if p2 > 0.0 else 0.0
+    l10, l20, l21 = S[1] * r0, S[2] * r0, across * r1
     e0 = innovation[0]
-    e1 = innovation[1] - l10 * e0
-    e2 = innovation[2] - l20 * e0 - l21 * e1
+    e1 = fma(-l10, e0, innovation[1])
+    e2 = fma(-l20, e0, fma(-l21, e1, innovation[2]))
     a = rows[0]
-    b = difference(1.0, rows[1], l10, a)
-    c = difference(1.0, difference(1.0, rows[2], l20, a), l21, b)
-    P_aa, P_ab, P_bb = state.P_aa, state.P_ab, state.P_bb
+    b = less(rows[1], l10, a)
+    c = less(less(rows[2], l20, a), l21, b)
+    aa, ab, bb = P
 
-    p, q, r = i0 * a[0], i1 * b[0], i2 * c[0]
-    P_aa[0] -= p * a[0] + q * b[0] + r * c[0]
-    P_aa[1] -= p * a[1] + q * b[1] + r * c[1]
-    P_aa[2] -= p * a[2] + q * b[2] + r * c[2]
-    P_ab[0, 0] -= p * a[3] + q * b[3] + r * c[3]
-    P_ab[0, 1] -= p * a[4] + q * b[4] + r * c[4]
-    P_ab[0, 2] -= p * a[5] + q * b[5] + r * c[5]
-    g0 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a[1], i1 * b[1], i2 * c[1]
-    P_aa[3] -= p * a[1] + q * b[1] + r * c[1]
-    P_aa[4] -= p * a[2] + q * b[2] + r * c[2]
-    P_ab[1, 0] -= p * a[3] + q * b[3] + r * c[3]
-    P_ab[1, 1] -= p * a[4] + q * b[4] + r * c[4]
-    P_ab[1, 2] -= p * a[5] + q * b[5] + r * c[5]
-    g1 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a[2], i1 * b[2], i2 * c[2]
-    P_aa[5] -= p * a[2] + q * b[2] + r * c[2]
-    P_ab[2, 0] -= p * a[3] + q * b[3] + r * c[3]
-    P_ab[2, 1] -= p * a[4] + q * b[4] + r * c[4]
-    P_ab[2, 2] -= p * a[5] + q * b[5] + r * c[5]
-    g2 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a[3], i1 * b[3], i2 * c[3]
-    P_bb[0] -= p * a[3] + q * b[3] + r * c[3]
-    P_bb[1] -= p * a[4] + q * b[4] + r * c[4]
-    P_bb[2] -= p * a[5] + q * b[5] + r * c[5]
-    g3 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a[4], i1 * b[4], i2 * c[4]
-    P_bb[3] -= p * a[4] + q * b[4] + r * c[4]
-    P_bb[4] -= p * a[5] + q * b[5] + r * c[5]
-    g4 = p * e0 + q * e1 + r * e2
-    p, q, r = i0 * a[5], i1 * b[5], i2 * c[5]
-    P_bb[5] -= p * a[5] + q * b[5] + r * c[5]
-    g5 = p * e0 + q * e1 + r * e2
-    return g0, g1, g2, g3, g4, g5
+    p, q, r = -i0 * a[0], -i1 * b[0], -i2 * c[0]
+    aa0, aa1 = add_dot(aa[0], p, a[0], q, b[0], r, c[0]), add_dot(aa[1], p, a[1], q, b[1], r, c[1])
+    aa2 = add_dot(aa[2], p, a[2], q, b[2], r, c[2])
+    ab0, ab1 = add_dot(ab[0], p, a[3], q, b[3], r, c[3]), add_dot(ab[1], p, a[4], q, b[4], r, c[4])
+    ab2 = add_dot(ab[2], p, a[5], q, b[5], r, c[5])
+    g0 = -dot(p, e0, q, e1, r, e2)
+    p, q, r = -i0 * a[1], -i1 * b[1], -i2 * c[1]
+    aa3, aa4 = add_dot(aa[3], p, a[1], q, b[1], r, c[1]), add_dot(aa[4], p, a[2], q, b[2], r, c[2])
+    ab3, ab4 = add_dot(ab[3], p, a[3], q, b[3], r, c[3]), add_dot(ab[4], p, a[4], q, b[4], r, c[4])
+    ab5 = add_dot(ab[5], p, a[5], q, b[5], r, c[5])
+    g1 = -dot(p, e0, q, e1, r, e2)
+    p, q, r = -i0 * a[2], -i1 * b[2], -i2 * c[2]
+    aa5 = add_dot(aa[5], p, a[2], q, b[2], r, c[2])
+    ab6, ab7 = add_dot(ab[6], p, a[3], q, b[3], r, c[3]), add_dot(ab[7], p, a[4], q, b[4], r, c[4])
+    ab8 = add_dot(ab[8], p, a[5], q, b[5], r, c[5])
+    g2 = -dot(p, e0, q, e1, r, e2)
+    p, q, r = -i0 * a[3], -i1 * b[3], -i2 * c[3]
+    bb0, bb1 = add_dot(bb[0], p, a[3], q, b[3], r, c[3]), add_dot(bb[1], p, a[4], q, b[4], r, c[4])
+    bb2 = add_dot(bb[2], p, a[5], q, b[5], r, c[5])
+    g3 = -dot(p, e0, q, e1, r, e2)
+    p, q, r = -i0 * a[4], -i1 * b[4], -i2 * c[4]
+    bb3, bb4 = add_dot(bb[3], p, a[4], q, b[4], r, c[4]), add_dot(bb[4], p, a[5], q, b[5], r, c[5])
+    g4 = -dot(p, e0, q, e1, r, e2)
+    p, q, r = -i0 * a[5], -i1 * b[5], -i2 * c[5]
+    bb5 = add_dot(bb[5], p, a[5], q, b[5], r, c[5])
+    g5 = -dot(p, e0, q, e1, r, e2)
+    P = (
+        (aa0, aa1, aa2, aa3, aa4, aa5),
+        (ab0, ab1, ab2, ab3, ab4, ab5, ab6, ab7, ab8),
+        (bb0, bb1, bb2, bb3, bb4, bb5),
+    )
+    return P, (g0, g1, g2, g3, g4, g5)
 
 
 @kernel

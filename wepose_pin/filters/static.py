@@ -44,7 +44,11 @@ DETECTOR = np.dtype(
         ("samples", np.int64),  # in the current block
         ("has_block", np.bool_),  # there is a block before it
         ("anchor", float, SIGNALS),  # the last sample of the block before
-        ("sums", SUMS),  # of the current block so far
+        ("sums", SUMS),  # of the current block so far, while it does not move
+        ("least", float, 3),  # [rad/s] gyro in the current block
+        ("most", float, 3),
+        ("moves", np.bool_),  # these differ by too much for any static window
+        ("moves_until", np.int64),  # so they do from this sample of the block before to its end; `tail` begins after it
         ("inverse_gravity", float),  # [s²/m]
         # right-hand sides of conditions (1), (2), (4), each times N - 1, and of (3)
         ("gyro_limit", float, 6),
@@ -130,7 +134,7 @@ class StaticState(NamedTuple):
 
     detector: np.ndarray  # (k,) of `DETECTOR`
     block: np.ndarray  # (k, N, 7) samples of the current block, then of the one before
-    tail: np.ndarray  # (k, N) of `SUMS`: of the block before, from each of its samples to its end
+    tail: np.ndarray  # (k, N) of `SUMS`: of the block before, from each of its samples on which it does not move
 
 
 class StaticDetector:
@@ -144,6 +148,7 @@ class StaticDetector:
     those of the rest of the block before, which are made backwards once a block. Nothing is ever subtracted from a sum,
     and the differences summed are from a sample within the window, so that (mean − anchor)² is at most N − 1 variances
     of the window itself: a static window is as precise after 1e8 samples of any motion as in the first second.
+    Nothing is summed up over samples of which two differ by more than condition (1) allows in any window that has both.
     Condition (5) alone has a longer memory, the known bias.
     """
 
@@ -184,6 +189,9 @@ def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> Static
         "accel_limit": (n - 1) * test.beta * noise.accel_cov[_UPPER],
         "norm_error": test.gamma1,
         "norm_variance": (n - 1) * test.gamma2,
+        "least": np.inf,
+        "most": -np.inf,
+        "moves_until": -1,
         "newest": min(newest, n),
         "rate_change": _bound_rate_change(noise, newest, n, test.rate_stds)[_UPPER],
         "bias": noise.gyro_bias,
@@ -244,13 +252,42 @@ def _clear(sums):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _sum_up(tail, block, anchor):  # type: ignore[no-untyped-def]
-    """Fill `tail` with the sums from each sample of the block to its end."""
+def _widen(detector, gx, gy, gz):  # type: ignore[no-untyped-def]
+    """Take a sample of gyro into the range of the others; return whether the range is too wide for a static window.
+
+    Two samples that differ by d make (N − 1) S ≥ d²/2; twice the limit is beyond rounding. NaN is no motion.
+    """
+    least, most, limit = detector.least, detector.most, detector.gyro_limit
+    least[0], most[0] = gx if gx < least[0] else least[0], gx if gx > most[0] else most[0]
+    least[1], most[1] = gy if gy < least[1] else least[1], gy if gy > most[1] else most[1]
+    least[2], most[2] = gz if gz < least[2] else least[2], gz if gz > most[2] else most[2]
+    x, y, z = most[0] - least[0], most[1] - least[1], most[2] - least[2]
+    return x * x > 4.0 * limit[0] or y * y > 4.0 * limit[3] or z * z > 4.0 * limit[5]
+
+
+@inlined
+def _forget_range(detector):  # type: ignore[no-untyped-def]
+    detector.moves = False
+    for i in range(3):
+        detector.least[i], detector.most[i] = np.inf, -np.inf
+
+
+@inlined
+def _sum_up(detector, tail, block, anchor):  # type: ignore[no-untyped-def]
+    """Fill `tail` with the sums from each sample of the block to its end, back to the one before which it moved."""
     last = len(block) - 1
-    _clear(tail[last])
-    _add(tail[last], tail[last], block, last, anchor)
-    for at in range(last - 1, -1, -1):
-        _add(tail[at], tail[at + 1], block, at, anchor)
+    _forget_range(detector)
+    detector.moves_until = -1
+    for at in range(last, -1, -1):
+        if _widen(detector, block[at, 0], block[at, 1], block[at, 2]):
+            detector.moves_until = at
+            break
+        if at == last:
+            _clear(tail[last])
+            _add(tail[last], tail[last], block, last, anchor)
+        else:
+            _add(tail[at], tail[at + 1], block, at, anchor)
+    _forget_range(detector)
 
 
 @inlined
@@ -276,15 +313,13 @@ def _is_within(limit, sums, tail_sums, products, tail_products, share):  # type:
 @inlined
 def _rate_is_steady(detector, block, at, gx, gy, gz):  # type: ignore[no-untyped-def]
     """Condition (6) for a window of mean rate g that ends with sample `at` of the block."""
-    n, newest = len(block), detector.newest
-    x = y = z = 0.0
-    for back in range(newest):
-        k = at - back
-        if k < 0:
-            k += n
-        x += block[k, 0] - gx
-        y += block[k, 1] - gy
-        z += block[k, 2] - gz
+    newest = detector.newest
+    begin = at + 1 - newest
+    x, y, z = -newest * gx, -newest * gy, -newest * gz
+    for k in range(max(begin, 0), at + 1):
+        x, y, z = x + block[k, 0], y + block[k, 1], z + block[k, 2]
+    for k in range(len(block) + min(begin, 0), len(block)):  # of the block before
+        x, y, z = x + block[k, 0], y + block[k, 1], z + block[k, 2]
     M = detector.rate_change
     across = M[1] * x * y + M[2] * x * z + M[4] * y * z
     return M[0] * x * x + M[3] * y * y + M[5] * z * z + 2.0 * across <= newest * newest
@@ -312,8 +347,8 @@ def _bias_agrees(detector, window, gx, gy, gz, ax, ay, az):  # type: ignore[no-u
     if abs(off) > bound or average * average > detector.squared_stds * (known + detector.average_var):
         return False
     # A window's mean measures the bias; its samples share that, since windows overlap.
-    share, variance = 1.0 / window, detector.bias_var
-    gain = variance / (variance + detector.window_var / share) if variance > 0.0 else 0.0
+    variance = detector.bias_var
+    gain = variance / (variance + window * detector.window_var) if variance > 0.0 else 0.0
     bias[0] += gain * gx
     bias[1] += gain * gy
     bias[2] += gain * gz
@@ -333,7 +368,9 @@ def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[
     first = at + 1  # where the window begins in the block before
     if first < n:
         detector.samples = first
-        _add(head, head, block, at, anchor)
+        if not detector.moves:
+            detector.moves = _widen(detector, gx, gy, gz)
+            _add(head, head, block, at, anchor)
         if not detector.has_block:
             detector.bias_var += detector.walk_var
             return False
@@ -341,11 +378,13 @@ def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[
         if (gx + gy + gz + norm) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
             for m in range(SIGNALS):
                 anchor[m] = block[at, m]
-        _sum_up(tail, block, anchor)
+        _sum_up(detector, tail, block, anchor)
         _clear(head)
         detector.samples = 0
         detector.has_block = True
         first = 0
+    if detector.moves or first <= detector.moves_until:
+        return _bias_agrees(detector, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     rest, share = tail[first], 1.0 / n
     norm = head.norm + rest.norm
     static = (
