@@ -22,6 +22,7 @@ KINDS = (
     "batch",
     "long",
     "headings",
+    "harm",
     "protocols",
     "robots",
     "bodies",
@@ -49,7 +50,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         "sessions on one process and on two; "
         "long: recordings of up to 24 hours in chunks; headings: relative headings of simulated people with and "
         "without their correction, half an hour; with --live an hour of one person who clasps the hands every ten "
-        "minutes; protocols: what each "
+        "minutes; harm: headings with and without their correction, of people who walk, run, throw and more, with "
+        "good and poor sensors, hours, --quick ten minutes; protocols: what each "
         "calibration protocol is worth on simulated people, an hour for eight; robots: "
         "the upper-body recording of --data on every robot, offline and live, half an hour; bodies: chains, other "
         "bodies and legs by the commands, on the recordings of --data and simulated, three minutes; kinematics: beside "
@@ -117,6 +119,10 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
             from . import headings
 
             chosen |= headings.sections(options.quick)
+        elif kind == "harm":
+            from . import harm
+
+            chosen |= harm.sections(options.quick)
         elif kind == "protocols":
             from . import protocols
 

@@ -221,7 +221,7 @@ def make_filter_of(*names: str, start: FilterHeadings | None = None) -> HeadingF
     k = len(names)
     problem = HeadingProblem(
         names, load_model(), wp.population_subject(), (), (), (), PERSON_NOISE, KNOT_S, 16, np.zeros(k),
-        np.full(k, BIAS_STD), np.full(k, START_STD**2), np.full(k, np.deg2rad(6.0) ** 2), start,
+        np.full(k, BIAS_STD), np.full(k, START_STD**2), np.full(k, np.deg2rad(6.0) ** 2), 0.0, start,
     )  # fmt: skip
     return HeadingFilter(problem)
 
@@ -239,7 +239,14 @@ def say(k: int, about_vertical: tuple[float, ...], var: float = 0.0) -> FilterHe
 def go_on(state: HeadingFilter, knots: int, about_vertical: tuple[float, ...], var: float = 0.0) -> np.ndarray:
     """Step through knots at whose ends the filters say the same; return the first heading's stds [rad]."""
     k = len(state.problem.names)
-    knot = Knot(0.0, np.zeros(0), np.zeros((0, k, 4)), (), say(k, about_vertical, var), np.zeros(k, dtype=bool))
+    knot = Knot(
+        0.0,
+        np.zeros(0),
+        np.zeros((0, k, 4)),
+        np.zeros((0, k, 3, 8)),
+        say(k, about_vertical, var),
+        np.zeros(k, dtype=bool),
+    )
     variance = []
     for _ in range(knots):
         state.step(knot)
@@ -295,7 +302,14 @@ def test_a_bias_corrected_within_a_knot_has_drifted_up_to_there_alone() -> None:
             *np.array([bias * (KNOT_S + at), -bias, -bias * (KNOT_S - at), KNOT_S, LEARNED, KNOWN_STD**2])[:, None]
         )
         state.step(
-            Knot(0.0, np.zeros(0), np.zeros((0, 1, 4)), (), FilterHeadings(np.zeros(1), corrected), np.zeros(1, bool))
+            Knot(
+                0.0,
+                np.zeros(0),
+                np.zeros((0, 1, 4)),
+                np.zeros((0, 1, 3, 8)),
+                FilterHeadings(np.zeros(1), corrected),
+                np.zeros(1, bool),
+            )
         )
         errors.append(start + bias * (KNOT_S + at) + other * 2.0 * KNOT_S - state.x[0])
     std = np.sqrt(state.problem.find_segment_covariance(state.P)[0, 0])
@@ -326,7 +340,14 @@ def test_a_correction_by_far_more_than_was_learned_is_no_news_for_the_other_filt
     headings, about_vertical = say(k, (0.0, 0.0, (0.3 * BIAS_STD) ** -2, BIAS_STD**2 / 12.0))
     about_vertical.rate[1], about_vertical.rate_var[1] = np.deg2rad(0.5), KNOWN_STD**2
     state.step(
-        Knot(0.0, np.zeros(0), np.zeros((0, k, 4)), (), FilterHeadings(headings, about_vertical), np.zeros(k, bool))
+        Knot(
+            0.0,
+            np.zeros(0),
+            np.zeros((0, k, 4)),
+            np.zeros((0, k, 3, 8)),
+            FilterHeadings(headings, about_vertical),
+            np.zeros(k, bool),
+        )
     )
     assert np.abs(state.x[[0, 2]]).max() < 0.1 * KNOT_S * BIAS_STD
     assert np.abs(state.x[[k, k + 2]]).max() < 0.1 * BIAS_STD
@@ -364,7 +385,9 @@ def test_a_rate_is_unknown_again_once_another_axis_is_vertical() -> None:
     for angle, known in ((0.0, True), (0.7, True), (1.5, False)):
         filters = FilterHeadings(np.zeros(1), AboutVertical(*np.array([0.0, 0.0, 0.0, 0.0, 0.0, BIAS_STD**2])[:, None]))
         quat_WL = Rotation.from_rotvec([angle, 0.0, 0.0]).as_quat()[None, None]
-        state.predict(state.find_change(Knot(0.0, np.zeros(1), quat_WL, (), filters, np.zeros(1, dtype=bool))))
+        state.predict(
+            state.find_change(Knot(0.0, np.zeros(1), quat_WL, np.zeros((0, 1, 3, 8)), filters, np.zeros(1, dtype=bool)))
+        )
         assert (state.P[1, 1] < 2.0 * before + 1e-6) == known
 
 

@@ -19,7 +19,7 @@ from wepose_pin.tracking import TrackedRecording, summarize, track
 from wepose_pin.tracking.heading_filter import HeadingFilter
 from wepose_pin.tracking.heading_observations import linearize_hinge
 from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, HingeAxis, Knot
-from wepose_pin.tracking.joint_accelerations import JointAccelerationFilter, JointPair, _sum_products, find_pairs
+from wepose_pin.tracking.joint_accelerations import JointAccelerationFilter, JointPair, find_pairs, linearize_joint
 
 LIMB = ("torso", "right_upper_arm", "right_forearm")
 
@@ -56,23 +56,21 @@ def heading_errors(
     return {(a, b): np.degrees(np.angle(np.exp(1j * (off[a] - off[b])))) for a, b in pairwise(LIMB)}
 
 
-def test_sums_give_the_misfit_and_its_slopes() -> None:
+def test_the_jacobian_of_a_joints_misfit_is_that_of_differences() -> None:
     rng = np.random.default_rng(0)
-    near, far = rng.normal(size=(2, 50, 3, 7))
-    sums = _sum_products(near, far)
+    near_B, far_B = rng.normal(size=(2, 50, 3, 8))
 
     def misfit(values: np.ndarray) -> np.ndarray:
-        R = Rotation.from_rotvec([0.0, 0.0, values[0]]).as_matrix()
-        a, b = np.concatenate(([1.0], values[1:7])), np.concatenate(([1.0], values[7:]))
-        return (far @ b - (near @ a) @ R.T).ravel()
+        return linearize_joint(near_B, far_B, values[0], values[1:8], values[8:]).e.ravel()
 
-    at = rng.normal(size=13)
-    J = np.stack([(misfit(at + d) - misfit(at - d)) / 2e-6 for d in 1e-6 * np.eye(13)], axis=1)
-    information, gradient, cost = sums.linearize(at[0], at[1:7], at[7:])
-    np.testing.assert_allclose(information, J.T @ J, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(gradient, J.T @ misfit(at), rtol=1e-6, atol=1e-6)
-    assert cost == pytest.approx(np.sum(misfit(at) ** 2))
-    assert sums.samples == 50
+    at = rng.normal(size=15)
+    J = np.stack([(misfit(at + d) - misfit(at - d)) / 2e-6 for d in 1e-6 * np.eye(15)], axis=1)
+    residual = linearize_joint(near_B, far_B, at[0], at[1:8], at[8:])
+    np.testing.assert_allclose(residual.jacobian.reshape(J.shape), J, rtol=1e-6, atol=1e-6)
+    R = Rotation.from_rotvec([0.0, 0.0, at[0]]).as_matrix()
+    near = (near_B @ np.concatenate(([1.0], at[1:8]))) @ R.T
+    np.testing.assert_allclose(residual.force, near, rtol=1e-12)
+    np.testing.assert_allclose(residual.e, far_B @ np.concatenate(([1.0], at[8:])) - near, rtol=1e-12)
 
 
 def test_exact_motion_fits_with_the_true_levers() -> None:
@@ -82,28 +80,27 @@ def test_exact_motion_fits_with_the_true_levers() -> None:
     names = ("left_upper_arm", "left_forearm")
     R_LS = [Rotation.from_quat(simulation.quat_LS[name]) for name in names]
     levers = [R.inv().apply(lever) for R, lever in zip(R_LS, levers_L, strict=True)]
-    sides = [np.concatenate((lever, np.zeros(3))) for lever in levers]
-    pair = JointPair(*names, np.concatenate(levers), 0.1, False)
+    near, far = (np.concatenate((lever, np.zeros(4))) for lever in levers)
     R_WS = np.stack([Rotation.from_quat(simulation.quat_WS[name]).as_matrix() for name in names], axis=1)
     accel_S = np.stack([simulation.accel_S[name] for name in names], axis=1)
     n = len(simulation.time)
-    whole = JointAccelerationFilter(names, [pair], simulation.rate_hz)
-    [sums] = whole.push(R_WS, accel_S, np.arange(0, n, 12))
-    assert sums is not None
-    signal = np.sqrt(np.trace(sums.far[:1, :1]) / sums.samples)
+    whole = JointAccelerationFilter(2, simulation.rate_hz).push(R_WS, accel_S, np.arange(0, n, 12))
     for angle, least, most in ((0.0, 0.0, 0.02), (0.2, 0.05, 1.0)):
-        misfit = np.sqrt(sums.linearize(angle, *sides)[2] / sums.samples)
+        residual = linearize_joint(whole[:, 0], whole[:, 1], angle, near, far)
+        misfit, signal = np.sqrt(np.mean(residual.e**2)), np.sqrt(np.mean(residual.force**2))
         assert least * signal <= misfit < most * signal
-    # Cut into pieces it is the same, and a piece with a lost sample has no sums.
-    pieces = JointAccelerationFilter(names, [pair], simulation.rate_hz)
-    cost = 0.0
-    for begin in range(0, n - n % 12, 12):
-        [part] = pieces.push(R_WS[begin : begin + 12], accel_S[begin : begin + 12], np.array([0]))
-        assert part is not None
-        cost += part.linearize(0.2, *sides)[2]
-    assert cost == pytest.approx(sums.linearize(0.2, *sides)[2], rel=1e-2)
-    accel_S[5, 1] = np.nan
-    assert JointAccelerationFilter(names, [pair], simulation.rate_hz).push(R_WS, accel_S, np.arange(9)) == (None,)
+    # An accelerometer that is late by 5 ms, and the delay that says so.
+    late = accel_S.copy()
+    step = round(0.005 * simulation.rate_hz) or 1
+    late[step:, 1] = accel_S[:-step, 1]
+    B = JointAccelerationFilter(2, simulation.rate_hz).push(R_WS, late, np.arange(0, n, 12))
+    delay = np.concatenate((far[:6], [step / simulation.rate_hz]))
+    known, unknown = (linearize_joint(B[:, 0], B[:, 1], 0.0, near, side).e for side in (delay, far))
+    assert np.mean(known**2) < 0.1 * np.mean(unknown**2)
+    # Cut into pieces it is the same.
+    pieces = JointAccelerationFilter(2, simulation.rate_hz)
+    cut = [pieces.push(R_WS[at : at + 12], accel_S[at : at + 12], np.array([0])) for at in range(0, n - n % 12, 12)]
+    np.testing.assert_allclose(np.concatenate(cut), whole[: len(cut)], atol=1e-9)
 
 
 def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_joint() -> None:
@@ -113,12 +110,12 @@ def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_jo
     turned = np.deg2rad(90.0) / rate_hz * np.arange(25 * samples)
     spin = Rotation.from_rotvec(np.outer(turned, [0.0, 0.0, 1.0])).as_matrix()
     names = ("torso", "head")
-    pair = JointPair(*names, np.zeros(6), 0.1, False)
+    pair = JointPair(*names, np.zeros(6), 0.01, False)
     zeros = np.zeros(2)
     same = AboutVertical(*np.zeros((6, 2)))
     problem = HeadingProblem(
         names, load_model(), population_subject(), (pair,), (), (), PERSON_NOISE, knot_s, samples, zeros,
-        np.full(2, 1e-4), np.deg2rad([0.1, 20.0]) ** 2, zeros, levers_at=np.zeros((1, 6)),
+        np.full(2, 1e-4), np.deg2rad([0.1, 20.0]) ** 2, zeros, 0.0,
     )  # fmt: skip
     z = []
     for _ in range(20):
@@ -126,12 +123,12 @@ def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_jo
         off = rng.normal(scale=np.deg2rad(20.0))
         R_WS = np.stack([spin @ tilt[0], Rotation.from_rotvec([0.0, 0.0, -off]).as_matrix() @ spin @ tilt[1]], axis=1)
         accel_S = np.broadcast_to([0.0, 0.0, 9.81], (len(spin), 2, 3)) + rng.normal(scale=0.02, size=(len(spin), 2, 3))
-        accelerations, state = JointAccelerationFilter(names, [pair], rate_hz), HeadingFilter(problem)
+        accelerations, state = JointAccelerationFilter(2, rate_hz), HeadingFilter(problem)
         for begin in range(0, len(spin), samples):
             rows = slice(begin, begin + samples)
-            joints = accelerations.push(R_WS[rows], accel_S[rows], np.arange(0, samples, 5))
+            sides = accelerations.push(R_WS[rows], accel_S[rows], np.arange(0, samples, 5))
             quats = np.tile([0.0, 0.0, 0.0, 1.0], (1, 2, 1))
-            state.step(Knot(0.0, np.zeros(1), quats, joints, FilterHeadings(zeros, same), np.zeros(2, dtype=bool)))
+            state.step(Knot(0.0, np.zeros(1), quats, sides, FilterHeadings(zeros, same), np.zeros(2, dtype=bool)))
         z.append((off - state.x[1] + state.x[0]) / np.sqrt(state.P[1, 1] + state.P[0, 0] - 2.0 * state.P[0, 1]))
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 

@@ -26,6 +26,7 @@ import numpy as np
 from ..filters import AboutVertical
 from .heading_observations import OUTLIER_STDS, ClaspDetector, build_gap_rows, correct_headings, linearize_hinge
 from .heading_problem import HeadingProblem, Knot
+from .joint_accelerations import JointMisfit, linearize_joint
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
@@ -34,15 +35,13 @@ LEAST_INFORMATION = 1e-6  # relative to what a filter knew of its bias, below wh
 # The heading variance of an orientation filter leaps where a knot adds more than this many times the largest recent
 # growth; that is forgotten with a time constant [s].
 LEAP_RATIO, GROWTH_MEMORY_S = 10.0, 60.0
-MISFIT_MEMORY_S = 20.0  # time constant of the mean misfit of a joint's accelerations
+MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accelerations
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
 _DIFFERENCE = np.array([[1.0, -1.0], [-1.0, 1.0]])
-# Jacobian of the angle, levers and forces of a joint by its columns (`HeadingProblem.pair_columns`), and those columns
-# that are no levers.
-_JOINT_JACOBIAN = np.zeros((13, 15))
-_JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(12)
-_WITHOUT_LEVERS = np.array([0, 1, 2, 6, 7, 8, 12, 13, 14])
+# Jacobian of the angle and of the two sides of a joint by its columns (`HeadingProblem.pair_columns`).
+_JOINT_JACOBIAN = np.zeros((15, 17))
+_JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
 
 
 class KnotChange(NamedTuple):
@@ -93,8 +92,8 @@ class HeadingFilter:
             column = problem.find_column("joint", i)
             std[column] = noise.girdle_std if pair.travels else noise.joint_std
             decay[column] = np.exp(-problem.knot_s / noise.joint_correlation_s)
-            if problem.levers_at is None:
-                self.x[problem.find_lever_columns(i)], std[problem.find_lever_columns(i)] = pair.levers, pair.lever_std
+            self.x[problem.find_lever_columns(i)], std[problem.find_lever_columns(i)] = pair.levers, pair.lever_std
+        std[problem.find_column("delay", 0) : problem.find_column("delay", k)] = problem.delay_std
         forces = slice(problem.find_column("force", 0), problem.find_column("force", 3 * k))
         std[forces], decay[forces] = noise.force_std, np.exp(-problem.knot_s / noise.force_correlation_s)
         for i, hinge in enumerate(problem.hinges):
@@ -104,7 +103,7 @@ class HeadingFilter:
         self.P = np.diag(std**2)
         self._set_start_covariance()
         self._decay, self._process_var = decay, (1.0 - decay**2) * std**2
-        self._misfit = np.full(len(problem.pairs), noise.acceleration_std**2)  # [m²/s⁴] recent mean of each axis
+        self._misfits = [JointMisfit()] * len(problem.pairs)  # of each joint's accelerations
         self._last = problem.start
         self._last_up: np.ndarray | None = None  # (k, 3) the axis of each segment that was turned to the vertical
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
@@ -321,26 +320,28 @@ class HeadingFilter:
     def _add_joints(
         self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray, *, last: bool
     ) -> None:
-        problem = self.problem
+        problem, noise = self.problem, self.problem.noise
         rate = problem.samples_per_knot / problem.knot_s
-        for i, sums in enumerate(knot.joints):
-            if sums is None or not sums.samples:
+        correlated = max(1.0, noise.acceleration_correlation_s * rate)
+        decay = np.exp(-problem.knot_s / MISFIT_MEMORY_S)
+        for i, columns in enumerate(problem.pair_columns):
+            near, far, joint = columns[:3]
+            if knot.lost[near] or knot.lost[far] or not len(knot.sides):
                 continue
-            near, far, joint = problem.pair_columns[i][:3]
-            levers = problem.levers_at[i] if problem.levers_at is not None else x[problem.find_lever_columns(i)]
-            near_force, far_force = x[problem.find_force_columns(near)], x[problem.find_force_columns(far)]
-            near_side, far_side = np.concatenate((levers[:3], near_force)), np.concatenate((levers[3:], far_force))
-            JJ, Je, cost = sums.linearize(x[near] - x[far] + x[joint], near_side, far_side)
-            misfit = max(cost / (3.0 * sums.samples), self._misfit[i], problem.noise.acceleration_std**2)
-            weight = 1.0 / (misfit * max(1.0, problem.noise.acceleration_correlation_s * rate))
-            columns, G = problem.pair_columns[i], _JOINT_JACOBIAN
-            if problem.levers_at is not None:
-                columns, G = columns[_WITHOUT_LEVERS], G[:, _WITHOUT_LEVERS]
-            information[columns[:, None], columns] += weight * G.T @ JJ @ G
-            vector[columns] += weight * G.T @ Je
+            near_B, far_B = knot.sides[:, near], knot.sides[:, far]
+            residual = linearize_joint(near_B, far_B, x[near] - x[far] + x[joint], x[columns[3:10]], x[columns[10:]])
+            misfit = self._misfits[i].add(residual, decay)
+            J = residual.jacobian.reshape(-1, residual.jacobian.shape[2])
+            JJ, Je = J.T @ J, J.T @ residual.e.ravel()
+            now = float(np.mean(residual.e**2))
+            weight = 1.0 / (max(now, misfit.variance, noise.acceleration_std**2) * correlated)
+            # What is coherent counts as one observation over the time that is remembered.
+            knots = misfit.samples / len(residual.e)
+            weight /= 1.0 + weight * JJ[0, 0] * misfit.find_coherent_variance(correlated) * knots
+            information[columns[:, None], columns] += weight * _JOINT_JACOBIAN.T @ JJ @ _JOINT_JACOBIAN
+            vector[columns] += weight * _JOINT_JACOBIAN.T @ Je
             if last:
-                share = 1.0 - np.exp(-problem.knot_s / MISFIT_MEMORY_S)
-                self._misfit[i] += share * (cost / (3.0 * sums.samples) - self._misfit[i])
+                self._misfits[i] = misfit
 
     def _add_rows(self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Iterator[None]:
         """Add the hinges and the closures that hold; yield between them."""

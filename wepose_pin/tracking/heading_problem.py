@@ -17,7 +17,7 @@ from ..calibration.conditions import Part, StartPose
 from ..filters import AboutVertical
 from ..model import BodyModel, GirdleMotion
 from ..subject import Subject
-from .joint_accelerations import JointPair, JointSums
+from .joint_accelerations import JointPair
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ class Knot(NamedTuple):
     end: float  # [s]
     time: np.ndarray  # (m,) [s] of the samples
     quat_WL: np.ndarray  # (m, k, 4) xyzw
-    joints: tuple[JointSums | None, ...]  # of each pair
+    sides: np.ndarray  # (m, k, 3, 8) of each sensor at its joints, as `JointAccelerationFilter.push`
     filters: FilterHeadings  # at the end
     lost: np.ndarray  # (k,) bool: the sensor has lost a sample
 
@@ -202,7 +202,7 @@ class HeadingProblem:
     rate_std : (k,) [rad/s] of the gyroscopes' biases at the start
     start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
     start : what the filters know at the end of the start pose; None: as at the end of the first knot
-    levers_at : (pairs, 6) [m] known levers, as `JointPair.levers`; None: they are states
+    delay_std : [s] by which an accelerometer is late against its gyroscope
     causal : headings are corrected as samples come; a short clasp then counts as one observation
     """
 
@@ -219,8 +219,8 @@ class HeadingProblem:
     rate_std: np.ndarray
     start_var: np.ndarray
     mount_var: np.ndarray
+    delay_std: float
     start: FilterHeadings | None = None
-    levers_at: np.ndarray | None = None
     causal: bool = False
 
     @cached_property
@@ -231,12 +231,7 @@ class HeadingProblem:
     @property
     def size(self) -> int:
         """Number of states."""
-        levers = 0 if self.levers_at is not None else 6 * len(self.pairs)
-        return self.size_without_levers + levers
-
-    @property
-    def size_without_levers(self) -> int:
-        return self.find_column("force", 3 * len(self.names))
+        return self.find_column("lever", 6 * len(self.pairs))
 
     def find_segment_covariance(self, P: np.ndarray) -> np.ndarray:
         """Find the covariance (k, k) [rad²] of the segments' headings near the start pose, in that of the state.
@@ -249,7 +244,10 @@ class HeadingProblem:
         return np.asarray(P[:k, :k] + P[mounts, mounts] + P[:k, mounts] + P[mounts, :k])
 
     def find_column(self, state: str, index: int) -> int:
-        """Find the column of a state; `index` is that of its segment, joint or hinge, of a force 3 times that."""
+        """Find the column of a state; `index` is that of its segment, joint or hinge.
+
+        A force has 3 columns for each, so that `index` is 3 times that; the levers of a joint have 6.
+        """
         k, j, h = len(self.names), len(self.pairs), len(self.hinges)
         first = {
             "heading": 0,
@@ -260,6 +258,8 @@ class HeadingProblem:
             "tilt": 2 * k + j + 2 * h,
             "mount": 2 * k + j + 3 * h,
             "force": 3 * k + j + 3 * h,
+            "delay": 6 * k + j + 3 * h,
+            "lever": 7 * k + j + 3 * h,
         }
         return first[state] + index
 
@@ -273,23 +273,20 @@ class HeadingProblem:
 
     @cached_property
     def pair_columns(self) -> list[np.ndarray]:
-        """The columns (15,) of each joint: headings of its segments, joint, near lever and force, far lever and force.
-
-        Where levers are known, the columns of theirs lie beyond the state and are not used.
-        """
+        """The columns (17,) of each joint: headings of its segments, joint; lever, force and delay near and far."""
         columns = []
         for i, pair in enumerate(self.pairs):
             near, far = self.names.index(pair.near), self.names.index(pair.far)
-            levers, forces = (
-                np.arange(self.size_without_levers + 6 * i, self.size_without_levers + 6 * i + 6),
-                (self.find_force_columns(near), self.find_force_columns(far)),
-            )
-            sides = (levers[:3], forces[0], levers[3:], forces[1])
+            first = self.find_column("lever", 6 * i)
+            sides = [
+                np.concatenate((lever + np.arange(3), self.find_force_columns(at), [self.find_column("delay", at)]))
+                for at, lever in ((near, first), (far, first + 3))
+            ]
             columns.append(np.concatenate(([near, far, self.find_column("joint", i)], *sides)))
         return columns
 
     def find_lever_columns(self, pair: int) -> slice:
-        first = self.size_without_levers + 6 * pair
+        first = self.find_column("lever", 6 * pair)
         return slice(first, first + 6)
 
     def find_force_columns(self, segment: int) -> np.ndarray:

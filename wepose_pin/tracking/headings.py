@@ -2,8 +2,9 @@
 
 The filters' tilt is good and their headings drift. Time is cut into intervals of equal length, the knots, and
 `heading_filter` estimates one error of each heading a knot; an error common to all segments is unobservable. Offline a
-first forward pass estimates where the sensors sit (their levers to the joints); a second one and a Rauch-Tung-Striebel
-pass backward give the errors. Causally there is one forward pass, and what a knot shows is corrected in the next one.
+first forward pass estimates where the sensors sit (their levers to the joints); a second one begins from there, as
+uncertain as the first, and a Rauch-Tung-Striebel pass backward gives the errors. Causally there is one forward pass,
+and what a knot shows is corrected in the next one.
 """
 
 from __future__ import annotations
@@ -55,6 +56,9 @@ CAUSAL_KNOT_S, OFFLINE_KNOT_S = 0.5, 2.0
 # several gaps); over the rest its correction fades in.
 SOLVE_SHARE, SOLVE_PARTS = 0.4, 20
 SAMPLE_RATE_HZ = 8.0
+# Standard deviation of the delay of an accelerometer against its gyroscope: half a sample, over which it averages, and
+# what filters inside the chips differ by [s]; assumption.
+AVERAGED_SAMPLES, CHIP_DELAY_STD = 0.5, 0.002
 E_Z = np.array([0.0, 0.0, 1.0])
 
 
@@ -141,7 +145,7 @@ class KnotReader:
             np.zeros((self.size, k, 3)),
         )
         self.count = 0  # samples in the open knot
-        self._accelerations = JointAccelerationFilter(names, problem.pairs, rate_hz)
+        self._accelerations = JointAccelerationFilter(k, rate_hz) if problem.pairs else None
 
     @property
     def remaining(self) -> int:
@@ -169,11 +173,12 @@ class KnotReader:
         n = len(time)
         rows = np.arange(0, n, self._stride)
         R_WS = correct_headings(quat_VS, self._heading_offset).swapaxes(0, 1)
-        joints = self._accelerations.push(R_WS, accel_S, rows)
+        no_sides = np.zeros((0, accel_S.shape[1], 3, 8))
+        sides = no_sides if self._accelerations is None else self._accelerations.push(R_WS, accel_S, rows)
         quat_WS = rotations.multiply(rotations.rotation_about(E_Z, self._heading_offset), quat_VS[rows])
         quat_WL = rotations.multiply(quat_WS, self._quat_SL)
         lost = np.asarray(~np.isfinite(accel_S).all(axis=(0, 2)))
-        return Knot(float(time[n - 1]), time[rows].copy(), quat_WL, joints, filters, lost)
+        return Knot(float(time[n - 1]), time[rows].copy(), quat_WL, sides, filters, lost)
 
 
 def make_heading_problem(
@@ -220,6 +225,7 @@ def make_heading_problem(
         rate_std,
         start_var,
         mount_var,
+        AVERAGED_SAMPLES / recording.rate_hz + CHIP_DELAY_STD,
         causal=causal,
     )
 
@@ -363,12 +369,13 @@ class HeadingCorrector:
         if not self._knots:
             return False
         problem = self._problem
-        if problem.pairs:
+        if problem.pairs:  # the second pass begins with the levers of the first, as uncertain as before
             learn = HeadingFilter(problem)
             for knot in self._knots:
                 learn.step(knot)
-            levers = np.array([learn.x[problem.find_lever_columns(i)] for i in range(len(problem.pairs))])
-            problem = replace(problem, levers_at=levers)
+            levers = [learn.x[problem.find_lever_columns(i)] for i in range(len(problem.pairs))]
+            pairs = tuple(pair._replace(levers=each) for pair, each in zip(problem.pairs, levers, strict=True))
+            problem = replace(problem, pairs=pairs)
         self._smoothed = smooth(problem, self._knots)
         if self._measured.any() and not exceed_uncertainty(self._smoothed.errors, self._smoothed.covariance):
             self._smoothed.errors[:, self._measured] = 0.0

@@ -1,4 +1,4 @@
-"""Accelerations that two neighbouring sensors share at the joint between them, summed knot by knot.
+"""Accelerations that two neighbouring sensors share at the joint between them.
 
 A sensor at r from a joint measures the joint's specific force and its own about it. In W, with uncorrected headings,
 
@@ -7,13 +7,14 @@ A sensor at r from a joint measures the joint's specific force and its own about
 and both neighbours give the same, rotated about the vertical by the difference of their heading errors (Weygers and Kok
 2020, IEEE Sensors Journal 20). A linear filter keeps that: it takes gravity's constant and what tissue shakes off both
 sides. A force ε that is fixed in the sensor's frame is none of the joint's: gravity times a tilt that the orientation
-filter has wrong, or the accelerometer's bias. In an even spin it turns with the sensor, as the joint's force does. With
-a = (1, r, ε) each side is B a, so that the misfit of any heading, levers and ε follows from a few 7 × 7 sums.
+filter has wrong, or the accelerometer's bias. In an even spin it turns with the sensor, as the joint's force does. An
+accelerometer that averages over its sample is late by half of it against its gyroscope, by τ s. With a = (1, r, ε, τ)
+each side is B a.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +30,9 @@ LEAST_RATE_HZ = 20.0  # of recordings that are used
 # Where a sensor sits is known from its segment alone: in the middle, give or take this much on each axis; assumption.
 LEVER_STD = 0.08  # [m]
 LEVER_STD_OF_LENGTH = 0.3  # of the distance to the joint, on large bodies
+# A heading may be feigned by this many times the rms of the coherent misfits that no heading explains, found by
+# simulated people who walk.
+COHERENT_MARGIN = 1.5
 
 
 class JointPair(NamedTuple):
@@ -49,48 +53,88 @@ class JointPair(NamedTuple):
     travels: bool
 
 
-class JointSums(NamedTuple):
-    """Sums over samples of two sensors at a joint; x, y, z are rows of B (3, 7), n and f the near and the far one."""
+class JointResidual(NamedTuple):
+    """The misfit of m samples of a joint's specific force between its two sensors.
 
-    samples: int
-    near_xy: np.ndarray  # (7, 7) Σ nx nxᵀ + ny nyᵀ
-    near_z: np.ndarray  # Σ nz nzᵀ
-    near_turn: np.ndarray  # Σ nx nyᵀ − ny nxᵀ
-    far: np.ndarray  # Σ fᵀ f
-    cos: np.ndarray  # Σ fx nxᵀ + fy nyᵀ
-    sin: np.ndarray  # Σ fy nxᵀ − fx nyᵀ
-    up: np.ndarray  # Σ fz nzᵀ
+    Parameters
+    ----------
+    e : (m, 3) [m/s²] the far side less the near one, in the far one's W
+    jacobian : (m, 3, 15) by the angle and by (r, ε, τ) of the near and of the far sensor
+    force : (m, 3) [m/s²] of the joint by the near sensor, in the far one's W
+    """
 
-    def linearize(self, angle: float, near: np.ndarray, far: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return JᵀJ (13, 13), Jᵀe (13,) and eᵀe of the misfit e, by the angle [rad], near and far side.
+    e: np.ndarray
+    jacobian: np.ndarray
+    force: np.ndarray
 
-        Parameters
-        ----------
-        angle : turns the near side about the vertical into the far one
-        near, far : (6,) lever r [m] and force ε [m/s²] of each sensor
-        """
-        near, far = np.concatenate(([1.0], near)), np.concatenate(([1.0], far))
-        side = len(near) - 1
-        c, s = np.cos(angle), np.sin(angle)
-        cross, slope = c * self.cos + s * self.sin + self.up, c * self.sin - s * self.cos
-        all_near = self.near_xy + self.near_z
-        information = np.empty((1 + 2 * side, 1 + 2 * side))
-        nears, fars = slice(1, 1 + side), slice(1 + side, None)
-        information[0, 0] = near @ self.near_xy @ near
-        information[0, nears] = information[nears, 0] = (near @ self.near_turn)[1:]
-        information[0, fars] = information[fars, 0] = -(slope @ near)[1:]
-        information[nears, nears], information[fars, fars] = all_near[1:, 1:], self.far[1:, 1:]
-        information[fars, nears] = -cross[1:, 1:]
-        information[nears, fars] = information[fars, nears].T
-        gradient = np.concatenate(
-            (
-                [-far @ slope @ near],
-                (all_near @ near - cross.T @ far)[1:],
-                (self.far @ far - cross @ near)[1:],
-            )
+
+def linearize_joint(
+    near_B: np.ndarray, far_B: np.ndarray, angle: float, near: np.ndarray, far: np.ndarray
+) -> JointResidual:
+    """Compute the misfit of a joint and its Jacobian.
+
+    Parameters
+    ----------
+    near_B, far_B : (m, 3, 8) of the two sensors, from `JointAccelerationFilter.push`
+    angle : [rad] turns the near side about the vertical into the far one
+    near, far : (7,) lever r [m], force ε [m/s²] and delay τ [s] of each sensor
+    """
+    c, s = np.cos(angle), np.sin(angle)
+    turned_B = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ near_B
+    force = turned_B[:, :, 0] + turned_B[:, :, 1:] @ near
+    jacobian = np.empty((len(force), 3, 1 + len(near) + len(far)))
+    jacobian[:, 0, 0], jacobian[:, 1, 0], jacobian[:, 2, 0] = force[:, 1], -force[:, 0], 0.0
+    jacobian[:, :, 1 : 1 + len(near)], jacobian[:, :, 1 + len(near) :] = -turned_B[:, :, 1:], far_B[:, :, 1:]
+    return JointResidual(far_B[:, :, 0] + far_B[:, :, 1:] @ far - force, jacobian, force)
+
+
+class JointMisfit(NamedTuple):
+    """The recent misfit of a joint: sums over samples, in which older ones count less.
+
+    Some of a misfit repeats with the motion, as that of soft tissue with the gait: it is coherent with the joint's
+    force and does not average out. A heading explains one coherent misfit, which turns the force about the vertical.
+    The other ones, which stretch it or mix it with the vertical, show how large coherent misfits are in this motion.
+
+    Parameters
+    ----------
+    products : (3, 3) Σ e fᵀ of the misfit e and the force f
+    misfit, force : (3,) Σ e², Σ f²
+    samples : that count
+    """
+
+    products: np.ndarray = np.zeros((3, 3))
+    misfit: np.ndarray = np.zeros(3)
+    force: np.ndarray = np.zeros(3)
+    samples: float = 0.0
+
+    def add(self, residual: JointResidual, decay: float) -> JointMisfit:
+        """Return the sums with the samples of a residual, the former ones times `decay`."""
+        e, f = residual.e, residual.force
+        return JointMisfit(
+            decay * self.products + e.T @ f,
+            decay * self.misfit + np.sum(e**2, axis=0),
+            decay * self.force + np.sum(f**2, axis=0),
+            decay * self.samples + len(e),
         )
-        cost = far @ self.far @ far + near @ all_near @ near - 2.0 * far @ cross @ near
-        return information, gradient, max(float(cost), 0.0)
+
+    @property
+    def variance(self) -> float:
+        """[m²/s⁴] of the misfit, mean of the axes."""
+        return float(self.misfit.sum() / (3.0 * self.samples)) if self.samples else 0.0
+
+    def find_coherent_variance(self, correlated_samples: float) -> float:
+        """Return the variance [rad²] of the heading that a coherent misfit can feign.
+
+        `correlated_samples` are one observation; so many of them have coherent parts by chance.
+        """
+        horizontal = self.force[0] + self.force[1]
+        if not horizontal:
+            return 0.0
+        E = self.products / horizontal
+        mixed = E[:2, 2] * np.sqrt(horizontal / max(self.force[2], 1e-9 * horizontal))
+        parts = np.array([E[0, 0] + E[1, 1], E[0, 0] - E[1, 1], E[0, 1] + E[1, 0], *mixed, *E[2, :2]])
+        by_chance = self.variance / horizontal * correlated_samples / self.samples
+        return COHERENT_MARGIN**2 * max(float(np.mean(parts**2)) - by_chance, 0.0)
 
 
 def find_pairs(model: BodyModel, sensors: Mapping[str, np.ndarray]) -> tuple[JointPair, ...]:
@@ -144,68 +188,42 @@ def sum_reach(model: BodyModel, point: str) -> np.ndarray:
 
 
 class JointAccelerationFilter:
-    """The two sides of each joint, low-passed, from samples of all sensors; it runs on from call to call.
+    """The side B of each sensor at its joints, band-passed, from samples of all sensors; it runs on from call to call.
 
     Parameters
     ----------
-    names : segments, in the order of the samples
+    sensors : number of them
     """
 
-    def __init__(self, names: Sequence[str], pairs: Sequence[JointPair], rate_hz: float) -> None:
-        self._columns = [(names.index(pair.near), names.index(pair.far)) for pair in pairs]
-        self._used = sorted({i for columns in self._columns for i in columns})
+    def __init__(self, sensors: int, rate_hz: float) -> None:
         self._rate_hz = rate_hz
         self._band: BandPass | None = None
-        self._last: np.ndarray | None = None  # (3, k, 3, 4) the last three samples: force, rotation
-        self._force = np.zeros((len(names), 3))  # last valid one
+        self._last = np.zeros((2, sensors, 3, 4))  # specific force in S and rotation of the last two samples
+        self._force_S = np.zeros((sensors, 3))  # the last valid one
 
-    def push(self, R_WS: np.ndarray, accel_S: np.ndarray, rows: np.ndarray) -> tuple[JointSums | None, ...]:
-        """Return the sums over the chosen rows, joint by joint; None where a sensor has lost a sample.
+    def push(self, R_WS: np.ndarray, accel_S: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return B (m, k, 3, 8) of the chosen rows; where a sensor has lost samples it is of no use.
 
         Parameters
         ----------
         R_WS : (n, k, 3, 3)
         accel_S : (n, k, 3) [m/s²], NaN where lost
         """
-        if not self._columns:
-            return ()
-        used = self._used
-        force = np.einsum("nkij,nkj->nki", R_WS[:, used], accel_S[:, used])
-        lost = ~np.isfinite(force).all(axis=2)
+        force_S = accel_S.copy()
+        lost = ~np.isfinite(force_S).all(axis=2)
         for i in np.flatnonzero(lost.any(axis=0)):
-            filled = np.concatenate([self._force[used[i]][None], force[:, i]])
+            filled = np.concatenate([self._force_S[i][None], force_S[:, i]])
             last = np.maximum.accumulate(np.where(np.concatenate([[False], lost[:, i]]), 0, np.arange(len(filled))))
-            force[:, i] = filled[last][1:]
-        self._force[used] = force[-1]
-        signal = np.concatenate([force[..., None], R_WS[:, used]], axis=3)  # (n, used, 3, 4)
-        if self._last is None or self._band is None:
+            force_S[:, i] = filled[last][1:]
+        self._force_S = force_S[-1]
+        signal = np.concatenate([force_S[..., None], R_WS], axis=3)  # (n, k, 3, 4)
+        if self._band is None:
             self._last = np.repeat(signal[:1], 2, axis=0)
-            steady = np.concatenate([signal[0, ..., :1], np.zeros((len(used), 3, 3)), signal[0, ..., 1:]], axis=2)
+            steady = np.concatenate([R_WS[0] @ signal[0, ..., :1], 0.0 * R_WS[0], R_WS[0], signal[0, ..., :1] * 0.0], 2)
             self._band = BandPass(BAND_HZ, self._rate_hz, steady.ravel())
         long = np.concatenate([self._last, signal])
         self._last = long[-2:]
-        second = self._rate_hz**2 * (long[2:, ..., 1:] - 2.0 * long[1:-1, ..., 1:] + long[:-2, ..., 1:])
-        sides = np.concatenate([long[1:-1, ..., :1], -second, long[1:-1, ..., 1:]], axis=3)  # B, one sample late
-        B = self._band.push(sides.reshape(len(sides), -1)).reshape(sides.shape)[rows]
-        return tuple(
-            None
-            if lost[:, used.index(near)].any() or lost[:, used.index(far)].any()
-            else _sum_products(B[:, used.index(near)], B[:, used.index(far)])
-            for near, far in self._columns
-        )
-
-
-def _sum_products(near: np.ndarray, far: np.ndarray) -> JointSums:
-    """The sums of the sides (n, 3, 7) of a joint."""
-    (nx, ny, nz), (fx, fy, fz) = np.moveaxis(near, 1, 0), np.moveaxis(far, 1, 0)
-    turn = nx.T @ ny
-    return JointSums(
-        len(near),
-        nx.T @ nx + ny.T @ ny,
-        nz.T @ nz,
-        turn - turn.T,
-        fx.T @ fx + fy.T @ fy + fz.T @ fz,
-        fx.T @ nx + fy.T @ ny,
-        fy.T @ nx - fx.T @ ny,
-        fz.T @ nz,
-    )
+        R, change_S = long[1:-1, ..., 1:], 0.5 * self._rate_hz * (long[2:, ..., :1] - long[:-2, ..., :1])
+        second = self._rate_hz**2 * (long[2:, ..., 1:] - 2.0 * R + long[:-2, ..., 1:])
+        B = np.concatenate([R @ long[1:-1, ..., :1], -second, R, R @ change_S], axis=3)  # one sample late
+        return self._band.push(B.reshape(len(B), -1)).reshape(B.shape)[rows]
