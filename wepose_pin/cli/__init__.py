@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import sys
 import textwrap
@@ -38,6 +39,8 @@ def main(argv: list[str] | None = None) -> None:
         argv = sys.argv[1:]
         # Before numpy loads: BLAS's last bits depend on its number of threads.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        # It warns of a home where it cannot keep its list of fonts, which changes nothing but its time.
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)
         catch_signals()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
