@@ -294,7 +294,7 @@ def test_oldest_versions_are_those_of_the_package() -> None:
     assert bounds == lower_bounds((ROOT / "tests/oldest.txt").read_text(encoding="utf-8").splitlines(), "==")
     recipe = (ROOT / "conda/recipe.yaml").read_text(encoding="utf-8")
     run = re.findall(r"^ +- ([\w-]+ >=[\d.]+)$", recipe.partition("  run:")[2], re.MULTILINE)
-    names = {"pinocchio": "pin", "meshcat-python": "meshcat"}
+    names = {"pinocchio": "pin", "meshcat-python": "meshcat", "matplotlib-base": "matplotlib"}
     conda = {names.get(name, name): bound for name, bound in lower_bounds(run, ">=").items() if name != "python"}
     assert conda == bounds
     assert f'version: "{project["version"]}"' in recipe

@@ -13,6 +13,7 @@ from .fields import field_values
 
 if TYPE_CHECKING:
     from ..kinematics import Pose
+    from ..retargeting import Trajectory
 
 PAGES = {"view.html": "view", "report.html": "report"}  # page → option
 
@@ -161,7 +162,7 @@ def run_retarget(job: RetargetJob, progress: Progress = no_progress) -> Retarget
         summary |= {
             "recording": str(about.get("recording") or job.result.name),
             "recorded_phases": {name: list(map(list, spans)) for name, spans in read_phases(about).items()},
-            REPETITIONS: _find_repetitions(pose, tuple(arm.side for arm in robot.arms)),
+            REPETITIONS: _find_repetitions(pose, trajectory),
         }
         text = json.dumps({**summary, "provenance": collect_provenance("retarget", field_values(job))}, indent=2)
         (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
@@ -180,7 +181,7 @@ def run_retarget(job: RetargetJob, progress: Progress = no_progress) -> Retarget
     return RetargetOutcome(summary, writer.diagnostics, float(trajectory.time[-1]))
 
 
-def _find_repetitions(pose: Pose, sides: tuple[str, ...]) -> dict[str, Any]:
+def _find_repetitions(pose: Pose, trajectory: Trajectory) -> dict[str, Any]:
     """The repetitions of the arms that a robot follows, by which angle, when [s].
 
     They are those that `wepose angles` finds; where no angle repeats, the movements of the hands between rests.
@@ -190,12 +191,12 @@ def _find_repetitions(pose: Pose, sides: tuple[str, ...]) -> dict[str, Any]:
     from ..angles import joint_angles
     from ..angles.repetitions import find_movements, find_repetitions
 
-    angles = joint_angles(pose)
+    angles, targets = joint_angles(pose), trajectory.arm_targets
+    sides = tuple(arm.side for arm in trajectory.robot.arms)
     of_arms = {name: each for name, each in angles.joints.items() if name.startswith(sides)}
     repetitions = find_repetitions(replace(angles, joints=of_arms))
     source, spans, reason = repetitions.source, repetitions.spans, repetitions.reason
     if not len(spans):
-        hands = [pose.points[f"{side}_palm"] for side in sides if f"{side}_palm" in pose.points]
-        spans = find_movements(pose.time, *hands)
+        spans = find_movements(targets.time, *(hand.position for hand in targets.hands))
         source, reason = ("hands between rests", "") if len(spans) else (source, reason)
     return {"source": source, "spans": spans.tolist(), "reason": reason}

@@ -118,7 +118,7 @@ def _list_hands(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item
     causes = [[cause, *(f"{100.0 * arm['error_attribution'][cause]:.1f}" for arm in arms.values())] for cause in CAUSES]
     return [
         draw_hands(trajectory),
-        Table(["hand", "median [mm]", "90 %", "99 %"], errors),
+        Table(["side", "median [mm]", "90 %", "99 %"], errors),
         f"Share of the time in which a hand is over {1e3 * FAR:g} mm off, by cause; the first that applies counts:",
         Table(["cause", *(f"{side} [%]" for side in arms)], causes),
     ]
