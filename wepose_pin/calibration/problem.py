@@ -288,9 +288,10 @@ class CalibrationProblem:
 
     def _find_samples(self, condition: Condition, stride: int) -> np.ndarray:
         """Return the numbers (n,) of the samples in which a condition holds, every `stride`-th."""
-        spans = [self.recording.span(interval) for interval in self.intervals(condition)]
-        # Intervals may overlap: each sample counts once.
-        return np.unique(np.concatenate([np.arange(len(self.recording))[span] for span in spans]))[::stride]
+        holds = np.zeros(len(self.recording), dtype=bool)
+        for interval in self.intervals(condition):  # they may overlap: each sample counts once
+            holds[self.recording.span(interval)] = True
+        return np.flatnonzero(holds)[::stride]
 
     def _mask_measured(self, samples: np.ndarray) -> np.ndarray:
         """Return (n,) bool: all sensors measured these samples (n,)."""
