@@ -176,11 +176,13 @@ def find_movements(time: np.ndarray, *points: np.ndarray) -> np.ndarray:
             spans[-1][1] = end
         else:
             spans.append([begin, end])
-    found = np.array([(time[a], time[b - 1]) for a, b in spans if time[b - 1] - time[a] >= MIN_MOVE_S]).reshape(-1, 2)
-    seconds = found[:, 1] - found[:, 0]
+    movements = np.array([(time[a], time[b - 1]) for a, b in spans if time[b - 1] - time[a] >= MIN_MOVE_S]).reshape(
+        -1, 2
+    )
+    seconds = movements[:, 1] - movements[:, 0]
     usual = np.median(seconds) if len(seconds) else 0.0
-    found = found[(seconds >= LEAST_SHARE * usual) & (seconds <= usual / LEAST_SHARE)]
-    return found if len(found) >= MIN_REPETITIONS else _NO_SPANS
+    movements = movements[(seconds >= LEAST_SHARE * usual) & (seconds <= usual / LEAST_SHARE)]
+    return movements if len(movements) >= MIN_REPETITIONS else _NO_SPANS
 
 
 def _smooth(time: np.ndarray, values: np.ndarray) -> np.ndarray:

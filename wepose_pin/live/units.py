@@ -39,19 +39,19 @@ class RateWatch:
 
     def describe(self, source: Source) -> str:
         """Describe the sensors whose rates contradict gravity, and what to do; empty: there is none."""
-        found = {}
+        rates = {}
         for sensor, recent in self._recent.items():
             time_s, gyro_S, accel_S = (np.concatenate(column) for column in tuple(zip(*recent, strict=True))[1:])
             step_s = measure_step(time_s)
             if step_s and time_s[-1] - time_s[0] > LEAST_SHARE * WINDOW_S:
                 rate = find_unseen_rate(gyro_S, accel_S, 1.0 / step_s)
                 if math.isfinite(rate):
-                    found[sensor] = rate
-        if not found:
+                    rates[sensor] = rate
+        if not rates:
             return ""
         remedy = source.explain_unit("gyro_unit", "deg/s")
-        rate = max(found.values())
-        return f"{join_names(list(found))}: rates of {rate:.2g} rad/s while gravity does not turn: deg/s? {remedy}."
+        rate = max(rates.values())
+        return f"{join_names(list(rates))}: rates of {rate:.2g} rad/s while gravity does not turn: deg/s? {remedy}."
 
 
 def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:

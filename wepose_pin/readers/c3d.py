@@ -79,11 +79,11 @@ def _open(path: Path) -> _C3d:
         file = ezc3d.c3d(str(path))
         data = file["data"]
         points = data["points"][:3].transpose(2, 1, 0)
-        seen = np.isfinite(points).all(axis=2) & (data["meta_points"]["residuals"][0].T >= 0.0) & points.any(axis=2)
+        valid = np.isfinite(points).all(axis=2) & (data["meta_points"]["residuals"][0].T >= 0.0) & points.any(axis=2)
         return _C3d(
             path,
             file["parameters"],
-            np.where(seen[:, :, None], points, np.nan),
+            np.where(valid[:, :, None], points, np.nan),
             data["rotations"].transpose(3, 2, 0, 1),
         )
 

@@ -302,11 +302,13 @@ def guess_gyro_unit(recording: Recording) -> str | None:
         known = np.flatnonzero(upright[:-2] & upright[2:])
         predicted.append((0.5 * turn[:-2] + turn[1:-1] + 0.5 * turn[2:])[known])
         measured.append((force[2:] - force[:-2])[known])
-    said, seen = np.concatenate(predicted), np.concatenate(measured)
-    product = float(np.sum(said * seen))
-    if len(said) < FEWEST_TURNS or product <= TURN_CORRELATION * np.linalg.norm(said) * np.linalg.norm(seen):
+    by_rates, by_gravity = np.concatenate(predicted), np.concatenate(measured)
+    product = float(np.sum(by_rates * by_gravity))
+    if len(by_rates) < FEWEST_TURNS or product <= TURN_CORRELATION * np.linalg.norm(by_rates) * np.linalg.norm(
+        by_gravity
+    ):
         return None
-    ratio = product / float(np.sum(said**2))
+    ratio = product / float(np.sum(by_rates**2))
     return next((unit for unit, factor in GYRO_UNITS.items() if 1.0 / TURN_FACTOR < ratio / factor < TURN_FACTOR), None)
 
 

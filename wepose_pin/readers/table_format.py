@@ -255,8 +255,8 @@ def detects(format: TableFormat, path: Path, start: str) -> bool:
             starts = ["\n".join(read_first_lines(file, 3)) for file in dict.fromkeys(named)]
     except (WeposeError, OSError):
         return False
-    found = [any(pattern.search(text) for text in starts) for pattern in format.detect]
-    return bool(found) and all(found)
+    matches = [any(pattern.search(text) for text in starts) for pattern in format.detect]
+    return bool(matches) and all(matches)
 
 
 def _select(files: Mapping[str, Path], pattern: str) -> list[Path]:
@@ -391,8 +391,8 @@ def parse_table(format: TableFormat, path: Path) -> DeviceTable | None:
         )
     width = max(len(header.names), body.partition(b"\n")[0].count(header.separator.encode()) + 1)
     last = max(k for k, name in enumerate(header.names) if name)
-    wanted = [k for k, name in enumerate(header.names) if k == last or _is_used(format, name)]
-    cells = _parse_rows(path, body, width, wanted, header.separator, format.title)
+    columns = [k for k, name in enumerate(header.names) if k == last or _is_used(format, name)]
+    cells = _parse_rows(path, body, width, columns, header.separator, format.title)
     if cells.height and not body.endswith(b"\n") and cells[str(last)][-1] is None:
         cells = cells.head(-1)  # the last line is incomplete
     return DeviceTable(path, header.names, header.units, about, cells)
@@ -404,8 +404,8 @@ def _is_used(format: TableFormat, name: str) -> bool:
     )
 
 
-def _parse_rows(path: Path, body: bytes, width: int, wanted: Sequence[int], separator: str, what: str) -> pl.DataFrame:
-    """Parse the wanted columns: cells are numbers, or text where one of them is none; null without a value."""
+def _parse_rows(path: Path, body: bytes, width: int, columns: Sequence[int], separator: str, what: str) -> pl.DataFrame:
+    """Parse the chosen columns: cells are numbers, or text where one of them is none; null without a value."""
 
     def parse(kind: type[pl.DataType]) -> pl.DataFrame:
         return pl.read_csv(
@@ -413,14 +413,14 @@ def _parse_rows(path: Path, body: bytes, width: int, wanted: Sequence[int], sepa
             has_header=False,
             separator=separator,
             schema={str(k): kind if k in chosen else pl.String for k in range(width)},
-            columns=list(wanted),
+            columns=list(columns),
             null_values=NO_VALUE,
             truncate_ragged_lines=True,
             encoding="utf8-lossy",
             quote_char=None,
         )
 
-    chosen = set(wanted)
+    chosen = set(columns)
     try:
         with contextlib.suppress(pl.exceptions.PolarsError):  # most tables have numbers alone
             return _drop_empty(parse(pl.Float64))
@@ -527,8 +527,8 @@ def _open_tables(format: TableFormat, path: Path, use: str | None) -> list[Devic
                 return tables
             if selected and len(selected) == 1:
                 raise _no_names(format, path if path.is_file() else selected[0])
-        wanted = " or ".join(dict.fromkeys(format.files[kind] for kind in kinds if kind in format.files))
-    raise MissingFile(f"{path}: no {wanted} in it with {format.needs}")
+        kinds_needed = " or ".join(dict.fromkeys(format.files[kind] for kind in kinds if kind in format.files))
+    raise MissingFile(f"{path}: no {kinds_needed} in it with {format.needs}")
 
 
 def _no_names(format: TableFormat, path: Path) -> BadData:

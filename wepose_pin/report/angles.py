@@ -103,7 +103,7 @@ def _describe_reliance(movements: Sequence[Movement]) -> str:
         between[f"{angle}{f' ({movement.name})' if len(movements) > 1 else ''}"] = float(np.degrees(each.sd))
     stated, between = ({name: v for name, v in each.items() if np.isfinite(v)} for each in (stated, between))
     if not between:
-        return "No repetitions were found, so that this page has no means; the table of all of the time holds."
+        return "No repetitions were found, so this page has no mean curves. The table covers the whole recording."
     worst = max(between, key=between.__getitem__)
     spread = f"Between repetitions the range of {worst} varies most, by ± {between[worst]:.1f}°."
     if not stated:
@@ -272,9 +272,9 @@ def _tabulate_definitions(movements: Sequence[Movement]) -> Table:
 def draw_figures(movements: Sequence[Movement]) -> Figures:
     """Draw the repetitions over time, then the mean curves of each kind of joint, in the order of the page."""
     figures = Figures()
-    found = [(k, each) for k, each in enumerate(movements) if each.repetitions.source in list_angles(each.angles)]
-    if found:  # a phase does not mark them in all
-        figures["repetitions"] = _draw_repetitions(found)
+    repeating = [(k, each) for k, each in enumerate(movements) if each.repetitions.source in list_angles(each.angles)]
+    if repeating:  # a phase does not mark them in all
+        figures["repetitions"] = _draw_repetitions(repeating)
     shown = [(k, movement) for k, movement in enumerate(movements) if movement.curves]
     joints = dict.fromkeys(joint for _, movement in shown for joint in movement.curves)
     for group, members in group_sides(joints).items():
@@ -288,10 +288,10 @@ def _session_style(k: int) -> dict[str, Any]:
     return {"color": SESSION_COLOURS[k % len(SESSION_COLOURS)], "linestyle": ("-", "--", ":", "-.")[k % 4]}
 
 
-def _draw_repetitions(found: Sequence[tuple[int, Movement]]) -> ReportFigure:
+def _draw_repetitions(repeating: Sequence[tuple[int, Movement]]) -> ReportFigure:
     """The angle by which repetitions were found over time, a row a session."""
-    figure = ReportFigure("The main angle over time. Shaded, in turns: the repetitions.", 1.5 * len(found))
-    for ax, (k, movement) in zip(figure.grid(len(found))[:, 0], found, strict=True):
+    figure = ReportFigure("The main angle over time. Shaded, in turns: the repetitions.", 1.5 * len(repeating))
+    for ax, (k, movement) in zip(figure.grid(len(repeating))[:, 0], repeating, strict=True):
         spans, source, time = movement.repetitions.spans, movement.repetitions.source, movement.angles.time
         joint, place = list_angles(movement.angles)[source]
         each = movement.angles[joint]

@@ -417,9 +417,11 @@ def draw_gap(
         caption += f" Below: the share of the information that each second gave, over {SMOOTHED_S:g} s."
     at = insert_breaks(time, time)
     panels = {title: {n: insert_breaks(time, v) for n, v in each.items()} for title, each in panels.items()}
-    looks = [(COLOURS["left"], "--"), (COLOURS["right"], "-"), (COLOURS["other"], "-"), (SOFT, "-.")]
+    line_styles = [(COLOURS["left"], "--"), (COLOURS["right"], "-"), (COLOURS["other"], "-"), (SOFT, "-.")]
     names = [*gaps, *learned]
-    styles = {name: {"color": c, "linestyle": d, "label": name} for name, (c, d) in zip(names, looks, strict=False)}
+    styles = {
+        name: {"color": c, "linestyle": d, "label": name} for name, (c, d) in zip(names, line_styles, strict=False)
+    }
     half = 0.5 * float(np.median(np.diff(time)))
     apart = [(begin - half, end + half) for begin, end in find_intervals(time, contact < MIN_CONTACT)]
     figure = draw_over_time(at, panels, caption, styles, spans=("apart, left out", apart))

@@ -260,15 +260,15 @@ class Planner:
         starts = np.tile(start, (RANDOM_STARTS + 3, 1))
         others = [robot.rest, self._unwind(start), *rng.uniform(*robot.bounds, (RANDOM_STARTS, len(start)))]
         starts[1:, joints] = np.array(others)[:, joints]
-        found: list[np.ndarray] = []
+        postures: list[np.ndarray] = []
         for each in starts:
             posture = self._search.search(targets, each)
             if posture is None or (posture.cost[arms] > limit).any():
                 continue
             for position in (posture.position, self._unwind(posture.position)):
-                if all(np.abs(position - other).max() > SAME_POSTURE for other in found):
-                    found.append(position)
-        return found
+                if all(np.abs(position - other).max() > SAME_POSTURE for other in postures):
+                    postures.append(position)
+        return postures
 
     def _unwind(self, position: np.ndarray) -> np.ndarray:
         """Return joint positions (n,) with whole turns taken off, where that is the same posture nearer the middle."""
