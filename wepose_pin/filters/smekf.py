@@ -5,10 +5,13 @@ grow by √(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz to 10⁶ deg in 20
 the covariance, so that static phases seem to measure the heading. Here Φ = exp(−[ω δt]×), and a correction rotates the
 covariance too. `PublishedSmekf` is the paper's, to the first order.
 
-The state is x = [a; b]: the attitude error a [rad] on the right of `quat_WS`, in the sensor frame, and the gyroscope
-bias b [rad/s]. Measurement model: gyro = ω + b + w_ω, accel/g = R_WSᵀ e_z + w_g. In a static phase ω = 0, so gyro
-measures b. Σ_ω and Σ_g are the covariances of the white noises w_ω and w_g, Σ_b that of the bias's random walk, P₀ that
-of the state at the first sample.
+The state is x = [a; b]: the attitude error a [rad] and the gyroscope bias b [rad/s]. The paper's a is on the right of
+`quat_WS`, in S, as that of `attitude_cov`. Inside, a is on the left, in W, where it changes neither with the sensor's
+rotation nor with a correction of the attitude, so that Φ is the identity and P need not be rotated.
+
+Measurement model: gyro = ω + b + w_ω, accel/g = R_WSᵀ e_z + w_g. In a static phase ω = 0, so gyro measures b. Σ_ω and
+Σ_g are the covariances of the white noises w_ω and w_g, Σ_b that of the bias's random walk, P₀ that of the state at the
+first sample.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..compilation import fma, inlined, kernel
 from ..errors import BadOption
@@ -103,8 +107,8 @@ STATE = np.dtype(
         ("gyro_bias", float, 3),  # [rad/s]
         ("attitude_cov", float, 6),  # [rad²] upper triangle: P_aa, and what the gyroscope's scale adds to the heading
         ("turned", float),  # [rad] net rotation about the vertical since the start
-        ("P_aa", float, 6),  # [rad²] upper triangle
-        ("P_ab", float, (3, 3)),  # [rad²/s]
+        ("P_aa", float, 6),  # [rad²] upper triangle, of a in W
+        ("P_ab", float, (3, 3)),  # [rad²/s] of a in W and b in S
         ("P_bb", float, 6),  # [rad²/s²] upper triangle
         ("held_rate", float, 3),  # [rad/s] the last that was measured
         ("lost_s", float),  # [s] since then
@@ -141,10 +145,10 @@ class SmekfState:
 
     @property
     def P(self) -> np.ndarray:
-        """Covariance (6, 6) of [a; b]; a copy."""
-        record = self.record[0]
-        aa, bb = symmetric(record["P_aa"]), symmetric(record["P_bb"])
-        return np.block([[aa, record["P_ab"]], [record["P_ab"].T, bb]])
+        """Covariance (6, 6) of [a; b], both in S; a copy."""
+        record, R_WS = self.record[0], Rotation.from_quat(self.quat_WS).as_matrix()
+        ab = R_WS.T @ record["P_ab"]
+        return np.block([[R_WS.T @ symmetric(record["P_aa"]) @ R_WS, ab], [ab.T, symmetric(record["P_bb"])]])
 
 
 class Smekf:
@@ -165,7 +169,9 @@ class Smekf:
         self.model = _model(noise, 1.0 / rate_hz, self.params, self.first_order)
         record = np.zeros(1, STATE)
         record["quat_WS"], record["gyro_bias"] = quat_WS, noise.gyro_bias
-        record["P_aa"] = record["attitude_cov"] = _matrix(self.params.attitude_cov0)[_UPPER]
+        R_WS, attitude_cov = Rotation.from_quat(quat_WS).as_matrix(), _matrix(self.params.attitude_cov0)
+        record["attitude_cov"] = attitude_cov[_UPPER]
+        record["P_aa"] = (R_WS @ attitude_cov @ R_WS.T)[_UPPER]
         record["P_bb"] = _matrix(self.params.bias_cov0)[_UPPER]
         record["about_vertical"][0, RATE_VAR] = float(np.trace(_matrix(self.params.bias_cov0))) / 3.0
         self.state = SmekfState(record)
@@ -250,32 +256,32 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
         lost_var = std_after * std_after - std_before * std_before
         state.lost_s = after
     held[0], held[1], held[2] = wx, wy, wz
-    P = predict(state, model, wx * dt, wy * dt, wz * dt, lost_var)
+    wx, wy, wz = wx * dt, wy * dt, wz * dt
+    P, R = predict(state, model, wx, wy, wz, lost_var)
     if static and is_measured and ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
-        P = correct(state, model, P, gx, gy, gz, ax, ay, az)
+        P, R = correct(state, model, P, R, gx, gy, gz, ax, ay, az)
     store_covariance(state, P)
-    update_attitude_cov(state, model, P, wx * dt, wy * dt, wz * dt)
+    update_attitude_cov(state, model, P, R, wx, wy, wz)
 
 
 @inlined
-def update_attitude_cov(state, model, P, wx, wy, wz):  # type: ignore[no-untyped-def]
-    """Set the stated attitude covariance after the rotation w [rad]: P_aa and the error of the gyroscope's scale.
+def update_attitude_cov(state, model, P, R, wx, wy, wz):  # type: ignore[no-untyped-def]
+    """Set the stated attitude covariance after the rotation w [rad]: P_aa in S, and the error of the gyroscope's scale.
 
     A scale that is wrong by s gives the heading an error of s times the rotation about the vertical. It gives the tilt
     an error too, which static phases correct. The scale is no part of the filter's state, as in the paper.
     """
-    ux, uy, uz = up_in_sensor(state.quat_WS)
-    state.turned += wx * ux + wy * uy + wz * uz
+    state.turned += dot(R[6], wx, R[7], wy, R[8], wz)
+    aa, _, bb = P
     heading_var = model.scale_var * state.turned * state.turned
-    P_aa, _, P_bb = P
-    cov = add_along(P_aa, heading_var, ux, uy, uz)
+    stated = rotate_symmetric(transpose(R), (aa[0], aa[1], aa[2], aa[3], aa[4], aa[5] + heading_var))
     for i in range(6):
-        state.attitude_cov[i] = cov[i]
-    state.about_vertical[RATE_VAR] = compute_variance_along(P_bb, ux, uy, uz)
+        state.attitude_cov[i] = stated[i]
+    state.about_vertical[RATE_VAR] = compute_variance_along(bb, R[6], R[7], R[8])
 
 
-# The covariance P is the tuple (P_aa, P_ab, P_bb) below: upper triangles of six numbers, and nine numbers, rows first.
-# Numbers stay in registers, the entries of an array would not.
+# Matrices are tuples below, since numbers stay in registers and the entries of an array would not: nine numbers, rows
+# first, or the six of an upper triangle. The covariance P is (P_aa, P_ab, P_bb).
 
 
 @inlined
@@ -299,46 +305,186 @@ def store_covariance(state, P):  # type: ignore[no-untyped-def]
 
 @inlined
 def predict(state, model, wx, wy, wz, lost_var):  # type: ignore[no-untyped-def]
-    """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w); return F P Fᵀ + G Q Gᵀ.
+    """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w); return F P Fᵀ + G Q Gᵀ and R_WS.
 
-    G Q Gᵀ = δt² diag(Σ_ω, Σ_b). `lost_var` [rad²] is added on top.
+    F = [[I, B], [0, I]] of errors in W, B = −δt R_WS ∫₀¹ exp(−[w]× u) du, R_WS after the turn. G Q Gᵀ is
+    δt² diag(R_WS Σ_ω R_WSᵀ, Σ_b). `lost_var` [rad²] is added on top.
     """
+    dt, P = model.dt, load_covariance(state)
+    before = rotation_matrix(state.quat_WS)
     rotate_by_vector(state.quat_WS, wx, wy, wz)
-    A, B = transition(wx, wy, wz, model.dt, model.first_order)
-    aa, ab, bb = propagate(load_covariance(state), A, B)
-    p, q = model.attitude_step, model.bias_step
-    aa = (
-        aa[0] + p[0] + lost_var, aa[1] + p[1], aa[2] + p[2],
-        aa[3] + p[3] + lost_var, aa[4] + p[4], aa[5] + p[5] + lost_var,
-    )  # fmt: skip
-    return aa, ab, (bb[0] + q[0], bb[1] + q[1], bb[2] + q[2], bb[3] + q[3], bb[4] + q[4], bb[5] + q[5])
+    R = rotation_matrix(state.quat_WS)
+    if model.first_order:  # of errors in S, where F = [[I − [w]×, −δt I], [0, I]]
+        turn = multiply(multiply(R, sum_of_three(1.0, -1.0, 0.0, wx, wy, wz)), transpose(before))
+        P = rotate_covariance(P, turn)
+        B = multiply(R, sum_of_three(-dt, 0.0, 0.0, wx, wy, wz))
+    else:
+        _, s, c, d = rotation_terms(wx * wx + wy * wy + wz * wz)
+        B = multiply(R, sum_of_three(-dt * s, dt * c, -dt * d, wx, wy, wz))
+    aa, ab, bb = P
+    b = (
+        add_dot(ab[0], B[0], bb[0], B[1], bb[1], B[2], bb[2]),
+        add_dot(ab[1], B[0], bb[1], B[1], bb[3], B[2], bb[4]),
+        add_dot(ab[2], B[0], bb[2], B[1], bb[4], B[2], bb[5]),
+        add_dot(ab[3], B[3], bb[0], B[4], bb[1], B[5], bb[2]),
+        add_dot(ab[4], B[3], bb[1], B[4], bb[3], B[5], bb[4]),
+        add_dot(ab[5], B[3], bb[2], B[4], bb[4], B[5], bb[5]),
+        add_dot(ab[6], B[6], bb[0], B[7], bb[1], B[8], bb[2]),
+        add_dot(ab[7], B[6], bb[1], B[7], bb[3], B[8], bb[4]),
+        add_dot(ab[8], B[6], bb[2], B[7], bb[4], B[8], bb[5]),
+    )  # P_ab + B P_bb
+    p, q = rotate_symmetric(R, model.attitude_step), model.bias_step
+    # P_aa + B P_ba + (P_ab + B P_bb) Bᵀ
+    a = (
+        add_dot(
+            add_dot(aa[0] + p[0] + lost_var, B[0], ab[0], B[1], ab[1], B[2], ab[2]), b[0], B[0], b[1], B[1], b[2], B[2]
+        ),
+        add_dot(add_dot(aa[1] + p[1], B[0], ab[3], B[1], ab[4], B[2], ab[5]), b[0], B[3], b[1], B[4], b[2], B[5]),
+        add_dot(add_dot(aa[2] + p[2], B[0], ab[6], B[1], ab[7], B[2], ab[8]), b[0], B[6], b[1], B[7], b[2], B[8]),
+        add_dot(
+            add_dot(aa[3] + p[3] + lost_var, B[3], ab[3], B[4], ab[4], B[5], ab[5]), b[3], B[3], b[4], B[4], b[5], B[5]
+        ),
+        add_dot(add_dot(aa[4] + p[4], B[3], ab[6], B[4], ab[7], B[5], ab[8]), b[3], B[6], b[4], B[7], b[5], B[8]),
+        add_dot(
+            add_dot(aa[5] + p[5] + lost_var, B[6], ab[6], B[7], ab[7], B[8], ab[8]), b[6], B[6], b[7], B[7], b[8], B[8]
+        ),
+    )
+    return (a, b, (bb[0] + q[0], bb[1] + q[1], bb[2] + q[2], bb[3] + q[3], bb[4] + q[4], bb[5] + q[5])), R
 
 
 @inlined
-def dot(a, x, b, y, c, z):  # type: ignore[no-untyped-def]
-    """a x + b y + c z."""
-    return fma(a, x, fma(b, y, c * z))
+def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+    """Algorithm 1, correction in a static phase; return P and R_WS after it.
 
+    y = [R_WS accel/g; gyro], h = [e_z; b̂], H = [[[e_z]×, 0], [0, I]] of errors in W. A correction of the attitude does
+    not change e_z, so that P, whose long axis is the heading, need not follow it.
 
-@inlined
-def add_dot(more, a, x, b, y, c, z):  # type: ignore[no-untyped-def]
-    """more + a x + b y + c z."""
-    return fma(a, x, fma(b, y, fma(c, z, more)))
-
-
-@inlined
-def transition(wx, wy, wz, dt, first_order):  # type: ignore[no-untyped-def]
-    """A and B of F = [[A, B], [0, I]] over the turn w [rad] in δt [s].
-
-    A = exp(−[w]×) and B = −δt ∫₀¹ exp(−[w]× u) du; to first order, as the paper writes it, A = I − [w]×, B = −δt I.
+    The noises of the two are independent, so gyro is taken first and accel after it, which is the same correction with
+    two S of (3, 3) in place of one of (6, 6).
     """
-    cosine, s, c, d = 1.0, 1.0, 0.0, 0.0
-    e = 1.0  # B's share of I, s where A's is cos θ
-    if not first_order:
-        cosine, s, c, d = rotation_terms(wx * wx + wy * wy + wz * wz)
-        e = s
-    # A = cos θ I − s [w]× + c w wᵀ,  B = −δt (s I − c [w]× + d w wᵀ)
-    return sum_of_three(cosine, -s, c, wx, wy, wz), sum_of_three(-dt * e, dt * c, -dt * d, wx, wy, wz)
+    bias, up = state.gyro_bias, (R[6], R[7], R[8])
+    before = compute_variance_along(P[2], up[0], up[1], up[2])
+    # gyro: H P = [P_ba, P_bb], S = P_bb + Σ_ω
+    Q = model.static_gyro_cov
+    _, b, c = P
+    S = c[0] + Q[0], c[1] + Q[1], c[2] + Q[2], c[3] + Q[3], c[4] + Q[4], c[5] + Q[5]
+    x, y, z = (
+        (b[0], b[3], b[6], c[0], c[1], c[2]),
+        (b[1], b[4], b[7], c[1], c[3], c[4]),
+        (b[2], b[5], b[8], c[2], c[4], c[5]),
+    )
+    P, d = fuse(P, (x, y, z), S, (gx - bias[0], gy - bias[1], gz - bias[2]))
+    # accel: H P = [−y; x; 0] of the rows x, y of P, S = H P Hᵀ + R_WS Σ_g R_WSᵀ; what gyro said is off the innovation.
+    # Its vertical part measures nothing of the state, only the noise that it shares with the others.
+    Q, g = rotate_symmetric(R, model.static_accel_cov), model.inverse_gravity
+    ax, ay, az = ax * g, ay * g, az * g
+    share = 1.0 / Q[5] if Q[5] > 0.0 else 0.0
+    lx, ly, off = share * Q[2], share * Q[4], add_dot(-1.0, R[6], ax, R[7], ay, R[8], az)
+    a, b, _ = P
+    x, y = (a[0], a[1], a[2], b[0], b[1], b[2]), (-a[1], -a[3], -a[4], -b[3], -b[4], -b[5])
+    horizontal = fma(-lx, Q[2], Q[0] + a[3]), fma(-lx, Q[4], Q[1] - a[1]), fma(-ly, Q[4], Q[3] + a[0])
+    P, e = fuse_two(
+        P,
+        (y, x),
+        horizontal,
+        add_dot(fma(-lx, off, d[1]), R[0], ax, R[1], ay, R[2], az),
+        add_dot(fma(-ly, off, -d[0]), R[3], ax, R[4], ay, R[5], az),
+    )
+    tx, ty, tz = d[0] + e[0], d[1] + e[1], d[2] + e[2]
+    rotate_by_vector(
+        state.quat_WS,
+        dot(R[0], tx, R[3], ty, R[6], tz),
+        dot(R[1], tx, R[4], ty, R[7], tz),
+        dot(R[2], tx, R[5], ty, R[8], tz),
+    )
+    after_R = rotation_matrix(state.quat_WS)
+    if model.first_order:  # the paper leaves the covariance in S as it is
+        P = rotate_covariance(P, multiply(after_R, transpose(R)))
+    bx, by, bz = d[3] + e[3], d[4] + e[4], d[5] + e[5]
+    bias[0] += bx
+    bias[1] += by
+    bias[2] += bz
+    a, b, c = P
+    after = compute_variance_along(c, up[0], up[1], up[2])
+    add_correction(state.about_vertical, tz, dot(up[0], bx, up[1], by, up[2], bz), before, after)
+    return ((a[0], a[1], a[2], a[3], a[4], a[5] + model.static_turn), b, c), after_R
+
+
+@inlined
+def fuse(P, rows, S, innovation):  # type: ignore[no-untyped-def]
+    """Correct by three measurements: return P − (H P)ᵀ S⁻¹ (H P) and the error state (6,) (H P)ᵀ S⁻¹ (y − h).
+
+    `rows` are those of H P (3, 6), S is its upper triangle, `innovation` is y − h. A direction in which S is zero
+    corrects nothing. The first is taken by itself, the others with what is left of them.
+    """
+    x, y, z = rows
+    inverse = 1.0 / S[0] if S[0] > 0.0 else 0.0
+    k, m, e = inverse * S[1], inverse * S[2], innovation[0]
+    y, z = less(y, k, x), less(z, m, x)
+    rest = fma(-k, S[1], S[3]), fma(-k, S[2], S[4]), fma(-m, S[2], S[5])
+    P, error = fuse_two(
+        subtract_outer(P, inverse, x), (y, z), rest, fma(-k, e, innovation[1]), fma(-m, e, innovation[2])
+    )
+    return P, less(error, -inverse * e, x)
+
+
+@inlined
+def fuse_two(P, rows, S, first, second):  # type: ignore[no-untyped-def]
+    """Correct by two measurements, as `fuse`: `first` and `second` are their innovations."""
+    x, y = rows
+    inverse = 1.0 / S[0] if S[0] > 0.0 else 0.0
+    k = inverse * S[1]
+    var, y = fma(-k, S[1], S[2]), less(y, k, x)
+    other = 1.0 / var if var > 0.0 else 0.0
+    error = less(less((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), -inverse * first, x), -other * fma(-k, first, second), y)
+    return subtract_outer(subtract_outer(P, inverse, x), other, y), error
+
+
+@inlined
+def less(x, b, y):  # type: ignore[no-untyped-def]
+    """x − b y of six numbers each."""
+    return (
+        fma(-b, y[0], x[0]), fma(-b, y[1], x[1]), fma(-b, y[2], x[2]),
+        fma(-b, y[3], x[3]), fma(-b, y[4], x[4]), fma(-b, y[5], x[5]),
+    )  # fmt: skip
+
+
+@inlined
+def subtract_outer(P, share, row):  # type: ignore[no-untyped-def]
+    """P − share row rowᵀ."""
+    aa, ab, bb = P
+    x, y, z, u, v, w = row
+    p, q, r = -share * x, -share * y, -share * z
+    s, t = -share * u, -share * v
+    return (
+        (fma(p, x, aa[0]), fma(p, y, aa[1]), fma(p, z, aa[2]), fma(q, y, aa[3]), fma(q, z, aa[4]), fma(r, z, aa[5])),
+        (
+            fma(p, u, ab[0]), fma(p, v, ab[1]), fma(p, w, ab[2]),
+            fma(q, u, ab[3]), fma(q, v, ab[4]), fma(q, w, ab[5]),
+            fma(r, u, ab[6]), fma(r, v, ab[7]), fma(r, w, ab[8]),
+        ),
+        (
+            fma(s, u, bb[0]), fma(s, v, bb[1]), fma(s, w, bb[2]),
+            fma(t, v, bb[3]), fma(t, w, bb[4]), fma(-share * w, w, bb[5]),
+        ),
+    )  # fmt: skip
+
+
+@inlined
+def rotate_covariance(P, A):  # type: ignore[no-untyped-def]
+    """F P Fᵀ of F = [[A, 0], [0, I]]."""
+    aa, ab, bb = P
+    return rotate_symmetric(A, aa), multiply(A, ab), bb
+
+
+@inlined
+def rotation_matrix(quat):  # type: ignore[no-untyped-def]
+    """R_WS of `quat` (4,) xyzw."""
+    x, y, z, w = quat[0], quat[1], quat[2], quat[3]
+    x2, y2, z2 = x + x, y + y, z + z
+    xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
+    wx, wy, wz = w * x2, w * y2, w * z2
+    return 1.0 - (yy + zz), xy - wz, xz + wy, xy + wz, 1.0 - (xx + zz), yz - wx, xz - wy, yz + wx, 1.0 - (xx + yy)
 
 
 @inlined
@@ -355,146 +501,50 @@ def sum_of_three(one, cross, outer, wx, wy, wz):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def propagate(P, A, B):  # type: ignore[no-untyped-def]
-    """F P Fᵀ of F = [[A, B], [0, I]]."""
-    aa, ab, bb = P
-    b = times_symmetric(A, B, ab, bb)  # A P_ab + B P_bb
-    ba = ab[0], ab[3], ab[6], ab[1], ab[4], ab[7], ab[2], ab[5], ab[8]
-    a = times_symmetric(B, A, ba, aa)  # A P_aa + B P_ba
+def dot(a, x, b, y, c, z):  # type: ignore[no-untyped-def]
+    """a x + b y + c z."""
+    return fma(a, x, fma(b, y, c * z))
+
+
+@inlined
+def add_dot(more, a, x, b, y, c, z):  # type: ignore[no-untyped-def]
+    """more + a x + b y + c z."""
+    return fma(a, x, fma(b, y, fma(c, z, more)))
+
+
+@inlined
+def transpose(A):  # type: ignore[no-untyped-def]
+    return A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8]
+
+
+@inlined
+def multiply(A, X):  # type: ignore[no-untyped-def]
+    """A X."""
     return (
-        (
-            add_dot(dot(a[0], A[0], a[1], A[1], a[2], A[2]), b[0], B[0], b[1], B[1], b[2], B[2]),
-            add_dot(dot(a[0], A[3], a[1], A[4], a[2], A[5]), b[0], B[3], b[1], B[4], b[2], B[5]),
-            add_dot(dot(a[0], A[6], a[1], A[7], a[2], A[8]), b[0], B[6], b[1], B[7], b[2], B[8]),
-            add_dot(dot(a[3], A[3], a[4], A[4], a[5], A[5]), b[3], B[3], b[4], B[4], b[5], B[5]),
-            add_dot(dot(a[3], A[6], a[4], A[7], a[5], A[8]), b[3], B[6], b[4], B[7], b[5], B[8]),
-            add_dot(dot(a[6], A[6], a[7], A[7], a[8], A[8]), b[6], B[6], b[7], B[7], b[8], B[8]),
-        ),
-        b,
-        bb,
+        dot(A[0], X[0], A[1], X[3], A[2], X[6]),
+        dot(A[0], X[1], A[1], X[4], A[2], X[7]),
+        dot(A[0], X[2], A[1], X[5], A[2], X[8]),
+        dot(A[3], X[0], A[4], X[3], A[5], X[6]),
+        dot(A[3], X[1], A[4], X[4], A[5], X[7]),
+        dot(A[3], X[2], A[4], X[5], A[5], X[8]),
+        dot(A[6], X[0], A[7], X[3], A[8], X[6]),
+        dot(A[6], X[1], A[7], X[4], A[8], X[7]),
+        dot(A[6], X[2], A[7], X[5], A[8], X[8]),
     )
 
 
 @inlined
-def times_symmetric(A, B, X, S):  # type: ignore[no-untyped-def]
-    """A X + B S of matrices and an upper triangle S."""
+def rotate_symmetric(A, s):  # type: ignore[no-untyped-def]
+    """A S Aᵀ of an upper triangle."""
+    a = multiply(A, (s[0], s[1], s[2], s[1], s[3], s[4], s[2], s[4], s[5]))
     return (
-        add_dot(dot(B[0], S[0], B[1], S[1], B[2], S[2]), A[0], X[0], A[1], X[3], A[2], X[6]),
-        add_dot(dot(B[0], S[1], B[1], S[3], B[2], S[4]), A[0], X[1], A[1], X[4], A[2], X[7]),
-        add_dot(dot(B[0], S[2], B[1], S[4], B[2], S[5]), A[0], X[2], A[1], X[5], A[2], X[8]),
-        add_dot(dot(B[3], S[0], B[4], S[1], B[5], S[2]), A[3], X[0], A[4], X[3], A[5], X[6]),
-        add_dot(dot(B[3], S[1], B[4], S[3], B[5], S[4]), A[3], X[1], A[4], X[4], A[5], X[7]),
-        add_dot(dot(B[3], S[2], B[4], S[4], B[5], S[5]), A[3], X[2], A[4], X[5], A[5], X[8]),
-        add_dot(dot(B[6], S[0], B[7], S[1], B[8], S[2]), A[6], X[0], A[7], X[3], A[8], X[6]),
-        add_dot(dot(B[6], S[1], B[7], S[3], B[8], S[4]), A[6], X[1], A[7], X[4], A[8], X[7]),
-        add_dot(dot(B[6], S[2], B[7], S[4], B[8], S[5]), A[6], X[2], A[7], X[5], A[8], X[8]),
+        dot(a[0], A[0], a[1], A[1], a[2], A[2]),
+        dot(a[0], A[3], a[1], A[4], a[2], A[5]),
+        dot(a[0], A[6], a[1], A[7], a[2], A[8]),
+        dot(a[3], A[3], a[4], A[4], a[5], A[5]),
+        dot(a[3], A[6], a[4], A[7], a[5], A[8]),
+        dot(a[6], A[6], a[7], A[7], a[8], A[8]),
     )
-
-
-@inlined
-def rotate_covariance(P, A):  # type: ignore[no-untyped-def]
-    """F P Fᵀ of F = [[A, 0], [0, I]]."""
-    s, x, bb = P
-    a = (
-        dot(A[0], s[0], A[1], s[1], A[2], s[2]),
-        dot(A[0], s[1], A[1], s[3], A[2], s[4]),
-        dot(A[0], s[2], A[1], s[4], A[2], s[5]),
-        dot(A[3], s[0], A[4], s[1], A[5], s[2]),
-        dot(A[3], s[1], A[4], s[3], A[5], s[4]),
-        dot(A[3], s[2], A[4], s[4], A[5], s[5]),
-        dot(A[6], s[0], A[7], s[1], A[8], s[2]),
-        dot(A[6], s[1], A[7], s[3], A[8], s[4]),
-        dot(A[6], s[2], A[7], s[4], A[8], s[5]),
-    )
-    return (
-        (
-            dot(a[0], A[0], a[1], A[1], a[2], A[2]),
-            dot(a[0], A[3], a[1], A[4], a[2], A[5]),
-            dot(a[0], A[6], a[1], A[7], a[2], A[8]),
-            dot(a[3], A[3], a[4], A[4], a[5], A[5]),
-            dot(a[3], A[6], a[4], A[7], a[5], A[8]),
-            dot(a[6], A[6], a[7], A[7], a[8], A[8]),
-        ),
-        (
-            dot(A[0], x[0], A[1], x[3], A[2], x[6]),
-            dot(A[0], x[1], A[1], x[4], A[2], x[7]),
-            dot(A[0], x[2], A[1], x[5], A[2], x[8]),
-            dot(A[3], x[0], A[4], x[3], A[5], x[6]),
-            dot(A[3], x[1], A[4], x[4], A[5], x[7]),
-            dot(A[3], x[2], A[4], x[5], A[5], x[8]),
-            dot(A[6], x[0], A[7], x[3], A[8], x[6]),
-            dot(A[6], x[1], A[7], x[4], A[8], x[7]),
-            dot(A[6], x[2], A[7], x[5], A[8], x[8]),
-        ),
-        bb,
-    )
-
-
-@inlined
-def correct(state, model, P, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
-    """Algorithm 1, correction in a static phase; return P after it.
-
-    y = [accel/g; gyro], h = [R_WSᵀ e_z; b̂], H = [[[R_WSᵀ e_z]×, 0], [0, I]].
-
-    The noises of the two are independent, so gyro is taken first and accel after it, which is the same correction with
-    two S of (3, 3) in place of one of (6, 6).
-    """
-    bias = state.gyro_bias
-    ux, uy, uz = up_in_sensor(state.quat_WS)
-    # gyro: H P = [P_ba, P_bb], S = P_bb + Σ_ω
-    R = model.static_gyro_cov
-    _, b, c = P
-    before = compute_variance_along(c, ux, uy, uz)
-    S = c[0] + R[0], c[1] + R[1], c[2] + R[2], c[3] + R[3], c[4] + R[4], c[5] + R[5]
-    rows = (
-        (b[0], b[3], b[6], c[0], c[1], c[2]),
-        (b[1], b[4], b[7], c[1], c[3], c[4]),
-        (b[2], b[5], b[8], c[2], c[4], c[5]),
-    )
-    P, d = fuse(P, rows, S, (gx - bias[0], gy - bias[1], gz - bias[2]))
-    # accel: H P = [u]× [P_aa, P_ab], S = [u]× P_aa [u]×ᵀ + Σ_g; what gyro said of the attitude is off the innovation
-    R = model.static_accel_cov
-    g = model.inverse_gravity
-    innovation = (
-        fma(ax, g, -ux) - (uy * d[2] - uz * d[1]),
-        fma(ay, g, -uy) - (uz * d[0] - ux * d[2]),
-        fma(az, g, -uz) - (ux * d[1] - uy * d[0]),
-    )
-    a, b, _ = P
-    x, y = (a[0], a[1], a[2], b[0], b[1], b[2]), (a[1], a[3], a[4], b[3], b[4], b[5])
-    z = a[2], a[4], a[5], b[6], b[7], b[8]
-    row0, row1, row2 = difference(uy, z, uz, y), difference(uz, x, ux, z), difference(ux, y, uy, x)
-    S = (
-        fma(row0[2], uy, fma(-row0[1], uz, R[0])),
-        fma(row0[0], uz, fma(-row0[2], ux, R[1])),
-        fma(row0[1], ux, fma(-row0[0], uy, R[2])),
-        fma(row1[0], uz, fma(-row1[2], ux, R[3])),
-        fma(row1[1], ux, fma(-row1[0], uy, R[4])),
-        fma(row2[1], ux, fma(-row2[0], uy, R[5])),
-    )
-    P, e = fuse(P, (row0, row1, row2), S, innovation)
-    tx, ty, tz = d[0] + e[0], d[1] + e[1], d[2] + e[2]
-    rotate_by_vector(state.quat_WS, tx, ty, tz)
-    if not model.first_order:
-        # The direction of the vertical in S changes with the correction. The long axis of P, the heading, has to follow
-        # it: otherwise it would have a horizontal part, which the next sample of accel would correct.
-        A, _ = transition(tx, ty, tz, 0.0, False)
-        P = rotate_covariance(P, A)
-    bx, by, bz = d[3] + e[3], d[4] + e[4], d[5] + e[5]
-    bias[0] += bx
-    bias[1] += by
-    bias[2] += bz
-    aa, ab, bb = P
-    after = compute_variance_along(bb, ux, uy, uz)
-    add_correction(state.about_vertical, ux * tx + uy * ty + uz * tz, ux * bx + uy * by + uz * bz, before, after)
-    return add_along(aa, model.static_turn, ux, uy, uz), ab, bb
-
-
-@inlined
-def add_along(P, variance, ux, uy, uz):  # type: ignore[no-untyped-def]
-    """P + variance u uᵀ of an upper triangle."""
-    x, y, z = variance * ux, variance * uy, variance * uz
-    return fma(x, ux, P[0]), fma(x, uy, P[1]), fma(x, uz, P[2]), fma(y, uy, P[3]), fma(y, uz, P[4]), fma(z, uz, P[5])
 
 
 @inlined
@@ -502,82 +552,6 @@ def compute_variance_along(P, ux, uy, uz):  # type: ignore[no-untyped-def]
     """Compute uᵀ P u of an upper triangle."""
     x, y, z = dot(P[0], ux, P[1], uy, P[2], uz), dot(P[1], ux, P[3], uy, P[4], uz), dot(P[2], ux, P[4], uy, P[5], uz)
     return dot(x, ux, y, uy, z, uz)
-
-
-@inlined
-def difference(a, x, b, y):  # type: ignore[no-untyped-def]
-    """a x − b y of six numbers each."""
-    return (
-        fma(a, x[0], -b * y[0]), fma(a, x[1], -b * y[1]), fma(a, x[2], -b * y[2]),
-        fma(a, x[3], -b * y[3]), fma(a, x[4], -b * y[4]), fma(a, x[5], -b * y[5]),
-    )  # fmt: skip
-
-
-@inlined
-def less(x, b, y):  # type: ignore[no-untyped-def]
-    """x − b y of six numbers each."""
-    return (
-        fma(-b, y[0], x[0]), fma(-b, y[1], x[1]), fma(-b, y[2], x[2]),
-        fma(-b, y[3], x[3]), fma(-b, y[4], x[4]), fma(-b, y[5], x[5]),
-    )  # fmt: skip
-
-
-@inlined
-def fuse(P, rows, S, innovation):  # type: ignore[no-untyped-def]
-    """Correct by three measurements: return P − (H P)ᵀ S⁻¹ (H P) and the error state (6,) (H P)ᵀ S⁻¹ (y − h).
-
-    With S = L D Lᵀ and V = L⁻¹ H P these are P − Vᵀ D⁻¹ V and Vᵀ D⁻¹ L⁻¹ (y − h). `rows` are those of H P (3, 6), S is
-    its upper triangle, `innovation` is y − h. A direction in which S is zero corrects nothing.
-    """
-    # D = (p0, p1/p0, p2/(p0 p1)) of the minors p, so that no division waits for another.
-    p0 = S[0] if S[0] > 0.0 else 1.0
-    minor, across = fma(p0, S[3], -S[1] * S[1]), fma(p0, S[4], -S[1] * S[2])
-    p1 = minor if minor > 0.0 else 1.0
-    p2 = fma(fma(p0, S[5], -S[2] * S[2]), p1, -across * across)
-    r0, r1 = 1.0 / p0, 1.0 / p1
-    i0, i1 = r0 if S[0] > 0.0 else 0.0, p0 * r1 if minor > 0.0 else 0.0
-    i2 = p0 * p1 / p2 if p2 > 0.0 else 0.0
-    l10, l20, l21 = S[1] * r0, S[2] * r0, across * r1
-    e0 = innovation[0]
-    e1 = fma(-l10, e0, innovation[1])
-    e2 = fma(-l20, e0, fma(-l21, e1, innovation[2]))
-    a = rows[0]
-    b = less(rows[1], l10, a)
-    c = less(less(rows[2], l20, a), l21, b)
-    aa, ab, bb = P
-
-    p, q, r = -i0 * a[0], -i1 * b[0], -i2 * c[0]
-    aa0, aa1 = add_dot(aa[0], p, a[0], q, b[0], r, c[0]), add_dot(aa[1], p, a[1], q, b[1], r, c[1])
-    aa2 = add_dot(aa[2], p, a[2], q, b[2], r, c[2])
-    ab0, ab1 = add_dot(ab[0], p, a[3], q, b[3], r, c[3]), add_dot(ab[1], p, a[4], q, b[4], r, c[4])
-    ab2 = add_dot(ab[2], p, a[5], q, b[5], r, c[5])
-    g0 = -dot(p, e0, q, e1, r, e2)
-    p, q, r = -i0 * a[1], -i1 * b[1], -i2 * c[1]
-    aa3, aa4 = add_dot(aa[3], p, a[1], q, b[1], r, c[1]), add_dot(aa[4], p, a[2], q, b[2], r, c[2])
-    ab3, ab4 = add_dot(ab[3], p, a[3], q, b[3], r, c[3]), add_dot(ab[4], p, a[4], q, b[4], r, c[4])
-    ab5 = add_dot(ab[5], p, a[5], q, b[5], r, c[5])
-    g1 = -dot(p, e0, q, e1, r, e2)
-    p, q, r = -i0 * a[2], -i1 * b[2], -i2 * c[2]
-    aa5 = add_dot(aa[5], p, a[2], q, b[2], r, c[2])
-    ab6, ab7 = add_dot(ab[6], p, a[3], q, b[3], r, c[3]), add_dot(ab[7], p, a[4], q, b[4], r, c[4])
-    ab8 = add_dot(ab[8], p, a[5], q, b[5], r, c[5])
-    g2 = -dot(p, e0, q, e1, r, e2)
-    p, q, r = -i0 * a[3], -i1 * b[3], -i2 * c[3]
-    bb0, bb1 = add_dot(bb[0], p, a[3], q, b[3], r, c[3]), add_dot(bb[1], p, a[4], q, b[4], r, c[4])
-    bb2 = add_dot(bb[2], p, a[5], q, b[5], r, c[5])
-    g3 = -dot(p, e0, q, e1, r, e2)
-    p, q, r = -i0 * a[4], -i1 * b[4], -i2 * c[4]
-    bb3, bb4 = add_dot(bb[3], p, a[4], q, b[4], r, c[4]), add_dot(bb[4], p, a[5], q, b[5], r, c[5])
-    g4 = -dot(p, e0, q, e1, r, e2)
-    p, q, r = -i0 * a[5], -i1 * b[5], -i2 * c[5]
-    bb5 = add_dot(bb[5], p, a[5], q, b[5], r, c[5])
-    g5 = -dot(p, e0, q, e1, r, e2)
-    P = (
-        (aa0, aa1, aa2, aa3, aa4, aa5),
-        (ab0, ab1, ab2, ab3, ab4, ab5, ab6, ab7, ab8),
-        (bb0, bb1, bb2, bb3, bb4, bb5),
-    )
-    return P, (g0, g1, g2, g3, g4, g5)
 
 
 @kernel
