@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -18,8 +17,7 @@ from wepose_pin.simulation import PEOPLE_PRESET, Person, Simulation, simulate, s
 from wepose_pin.simulation.sequence import TASKS
 from wepose_pin.simulation.signals import make_pulse
 from wepose_pin.subject import Subject, mount_rows
-from wepose_pin.tracking import TrackOptions
-from wepose_pin.tracking.tracker import track_chunks
+from wepose_pin.tracking import TrackOptions, track_chunks
 
 from .free_motion import FreeMotion
 from .headings import LIMBS, UNSCORED_S
@@ -161,14 +159,10 @@ def calibrate_person(person: Person, simulation: Simulation) -> Subject:
 def estimate_errors(simulation: Simulation, recording: Recording, subject: Subject, options: TrackOptions) -> Errors:
     """Track a recording chunk by chunk and return the errors of its relative headings."""
     stride = round(recording.rate_hz / SCORED_HZ)
-
-    def chunks() -> Iterator[Recording]:
-        return recording.chunks(CHUNK_S)
-
     times: list[np.ndarray] = []
     sensor: dict[str, list[np.ndarray]] = {}
     correction = None
-    for tracked in track_chunks(chunks, subject, options=options):
+    for tracked in track_chunks(recording, subject, options=options, chunk_s=CHUNK_S):
         rows = np.flatnonzero(tracked.time > UNSCORED_S)[::stride]
         times.append(tracked.time[rows])
         at = np.searchsorted(simulation.time, tracked.time[rows] - 1e-9)

@@ -1,4 +1,4 @@
-"""What a recording of a day costs: `wepose track` in chunks, its memory, and whether it is bit-identical."""
+"""What a recording of a day costs: the time and the memory of `wepose track`."""
 
 from __future__ import annotations
 
@@ -13,21 +13,18 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import calibrate
 from wepose_pin.errors import NoSolution
 from wepose_pin.model import load_model
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.simulation import simulate, simulate_person
-from wepose_pin.tracking import CHUNK_S, SMOOTHER_CHUNK_S
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import write_subject
 
 from .tables import Column, Section, Table
 
 HOURS, FEW_HOURS = (1.0, 6.0, 24.0), (0.5, 1.0)
-SHORT_S = 120.0  # [s] chunks of the smoother whose error is measured too
 
 
 def sections(quick: bool) -> dict[str, Section]:
@@ -36,7 +33,7 @@ def sections(quick: bool) -> dict[str, Section]:
 
 
 def long_recordings(hours: tuple[float, ...]) -> Table:
-    """Recordings of these lengths [h]; the first is tracked as a whole too."""
+    """Recordings of these lengths [h]; the first is tracked by the smoother too."""
     table = Table(
         "Long recordings: five sensors at 100 Hz, wepose track",
         (
@@ -45,34 +42,15 @@ def long_recordings(hours: tuple[float, ...]) -> Table:
             Column("seconds", "time [s]", 0),
             Column("faster", "times real time", 0),
             Column("memory", "memory [MB]", 0),
-            Column("same", "bit-identical", 0),
-            Column("largest", "largest [deg]", 4),
-            Column("rms", "rms [deg]", 4),
         ),
     )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for length in hours:
             _write(folder / f"{length:g}", length)
-            begin = length == hours[0]
-            if begin:
-                table.rows[f"{length:g} h as a whole"] = _track(folder, length, "whole", chunk_s=0.0)
-            row = _track(folder, length, "chunks", chunk_s=CHUNK_S)
-            if begin:
-                row["same"] = float(_pose(folder, "chunks").equals(_pose(folder, "whole")))
-            table.rows[f"{length:g} h in chunks of {CHUNK_S:g} s"] = row
-            if begin:
-                whole = f"smoother, {length:g} h as a whole"
-                table.rows[whole] = _track(folder, length, "smooth", chunk_s=0.0, method="smoother")
-                for chunk_s in (SHORT_S, SMOOTHER_CHUNK_S):
-                    row = _track(folder, length, "chunks", chunk_s=chunk_s, method="smoother")
-                    row["largest"], row["rms"] = _deviation_deg(_pose(folder, "chunks"), _pose(folder, "smooth"))
-                    table.rows[f"smoother, {length:g} h in chunks of {chunk_s:g} s"] = row
-    table.notes.append("Bit-identical: 1 where every number of pose.parquet is that of the recording as a whole.")
-    table.notes.append(
-        "Deviation: segments of the smoother in chunks, which looks one chunk ahead, from those of the smoother of the "
-        "whole, whose own errors are in docs/validation.md."
-    )
+            table.rows[f"{length:g} h"] = _track(folder, length)
+            if length == hours[0]:
+                table.rows[f"smoother, {length:g} h"] = _track(folder, length, "smoother")
     table.notes.append("Memory is that of the whole process, Python and all libraries in it, at its highest.")
     return table
 
@@ -121,7 +99,7 @@ def there_and_back(recording: Recording, rest: slice) -> Recording:
     return replace(recording, time=np.arange(n) / recording.rate_hz, sensors=sensors)
 
 
-def _track(folder: Path, hours: float, out: str, *, chunk_s: float, method: str = "amekf") -> dict[str, float]:
+def _track(folder: Path, hours: float, method: str = "amekf") -> dict[str, float]:
     """What it costs in a process of its own.
 
     Raises
@@ -130,9 +108,8 @@ def _track(folder: Path, hours: float, out: str, *, chunk_s: float, method: str 
         It fails.
     """
     session = folder / f"{hours:g}"
-    argv = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(folder / out), "--force"]
+    argv = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(folder / "out"), "--force"]
     argv += ["--subject", str(session / "subject"), "--method", method, "--no-report"]
-    argv += ["--chunk-seconds", f"{chunk_s:g}"]
     begun = time.perf_counter()
     process = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     assert process.stderr is not None
@@ -146,24 +123,8 @@ def _track(folder: Path, hours: float, out: str, *, chunk_s: float, method: str 
     seconds = time.perf_counter() - begun
     return {
         "read": (session / "recording.parquet").stat().st_size / 1e6,
-        "written": (folder / out / "pose.parquet").stat().st_size / 1e6,
+        "written": (folder / "out" / "pose.parquet").stat().st_size / 1e6,
         "seconds": seconds,
         "faster": 3600.0 * hours / seconds,
         "memory": used.ru_maxrss * (1.0 if sys.platform == "darwin" else 1024.0) / 1e6,
     }
-
-
-def _pose(folder: Path, out: str) -> pl.DataFrame:
-    return pl.read_parquet(folder / out / "pose.parquet")
-
-
-def _deviation_deg(ours: pl.DataFrame, whole: pl.DataFrame) -> tuple[float, float]:
-    """Largest and rms angle [deg] between the segments of two poses."""
-    names = [name.removesuffix("_qw") for name in whole.columns if name.endswith("_qw")]
-    angles = []
-    for name in names:
-        columns = [f"{name}_q{c}" for c in "xyzw"]
-        a, b = (Rotation.from_quat(table.select(columns).to_numpy()) for table in (ours, whole))
-        angles.append(np.degrees((a.inv() * b).magnitude()))
-    every = np.concatenate(angles)
-    return float(every.max()), float(np.sqrt(np.mean(every**2)))

@@ -32,7 +32,7 @@ SUBJECT = {
 def estimate_segments(recording: Recording, subject: Subject | None = None, **options: Any) -> SegmentOrientations:
     """Segment orientations of a whole recording from the N-pose; options and errors as of `SegmentEstimator`."""
     estimator = SegmentEstimator(subject, **options)
-    [(_, segments)] = estimator.push(recording) + estimator.finish()
+    _, segments = estimator.push(recording)
     return segments
 
 

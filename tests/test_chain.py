@@ -30,7 +30,7 @@ from wepose_pin.readers.describe import describe_file
 from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.subject import Subject, load_subject
-from wepose_pin.tracking import Tracker, summarize, track
+from wepose_pin.tracking import summarize, track, track_chunks
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import read_result, write_subject
 
@@ -184,12 +184,6 @@ def test_the_command_writes_joints_orientations_and_torques(
     facts = describe_file(out).facts
     assert "sensors: wrist_1_link, forearm_link" in facts
     assert any(fact.startswith("joints: shoulder_pan_joint") for fact in facts)
-
-    shorter = tmp_path / "shorter"
-    with pytest.raises(SystemExit) as end:
-        main(["track", str(tmp_path), "--model", str(urdf), "--chunk-seconds", "20", "--no-report", "-o", str(shorter)])
-    assert end.value.code == 0
-    assert pl.read_parquet(shorter / "joints.parquet").equals(joints)
 
 
 def test_a_session_that_is_written_gives_the_recording_back(urdf: Path, tmp_path: Path) -> None:
@@ -422,8 +416,7 @@ def test_calibrated_mounts_are_those_of_the_links(urdf: Path, table: Path) -> No
 def test_chunks_and_causal_tracking_give_the_joints_of_the_whole(urdf: Path) -> None:
     recording, _ = made(urdf, MARKED_WITH_SENSORS, 20.0)
     whole = track(recording, model=urdf)
-    tracker = Tracker(model=urdf)
-    parts = [part for chunk in recording.chunks(6.0) for part in tracker.push(chunk)] + tracker.finish()
+    parts = list(track_chunks(recording, model=urdf, chunk_s=6.0))
     assert len(parts) > 1
     for name, values in whole.joints.items():
         np.testing.assert_array_equal(np.concatenate([part.joints[name] for part in parts]), values)

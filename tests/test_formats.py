@@ -223,8 +223,6 @@ def test_times_in_the_unit_that_is_stated(unit: str, a_second: float, where: str
     if where == "sensor":
         text = f"[data]\ngyro_unit = 'rad/s'\naccel_unit = 'm/s^2'\n{sensor}\n{own}"
     check_raw(load(tmp_path, text))
-    pieces = list(wp.readers.iter_session(tmp_path / "session.toml", 1.0))
-    np.testing.assert_allclose(np.concatenate([piece.time for piece in pieces]), TIME, atol=1e-9)
     with pytest.raises(BadSession, match=r"time_unit = 'min' is not known; there is: s, ms, us, ns"):
         load(tmp_path, text.replace(f"'{unit}'", "'min'"))
 
@@ -642,16 +640,6 @@ def test_raw_data_that_are_not_there_cannot_be_used(format: str, tmp_path: Path)
         return
     with pytest.raises(BadData, match=r"leave out data\.use"):
         read_device(path, format, "raw")
-
-
-def test_a_session_in_pieces_is_the_session(tmp_path: Path) -> None:
-    mt_manager(tmp_path / "a.txt")
-    whole = load(tmp_path, '[data]\nfile = "a.txt"\n[sensors.torso]')
-    pieces = list(wp.readers.iter_session(tmp_path / "session.toml", 1.0))
-    assert len(pieces) == 4
-    np.testing.assert_array_equal(
-        np.concatenate([p.sensors["torso"].gyro_S for p in pieces]), whole.sensors["torso"].gyro_S
-    )
 
 
 # A description of one's own ----------------------------------------------------------------------------------------

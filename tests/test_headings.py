@@ -399,8 +399,9 @@ def test_a_chunk_may_end_with_the_last_sample_of_the_start_pose(made: tuple[Simu
     recording = replace(recording.cut(slice(0, 1500)), phases=phases)
     tracker, last = Tracker(), recording.span(phases["start"][0]).stop
     assert recording.time[last - 1] < phases["start"][0][1] < recording.time[last]
-    chunks = [chunk for span in ((0, last), (last, 1500)) for chunk in tracker.push(recording.cut(slice(*span)))]
-    chunks += tracker.finish()
+    for span in ((0, last), (last, 1500)):
+        assert tracker.push(recording.cut(slice(*span))) is None
+    chunks = list(tracker.finish())
     for name, quat_WL in track(recording).quat_WL.items():
         assert np.array_equal(np.concatenate([chunk.quat_WL[name] for chunk in chunks]), quat_WL)
 

@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation
 from wepose_pin import load_session, rotations
 from wepose_pin.cli import main
 from wepose_pin.diagnostics import Diagnostic, as_json, render
-from wepose_pin.errors import BadData, BadOption
-from wepose_pin.readers import iter_session
+from wepose_pin.errors import BadData
 from wepose_pin.readers.tables import read_table
-from wepose_pin.recording import ImuSensor, Recording, Sensor, check_recording
+from wepose_pin.recording import ImuSensor, Recording, Sensor
 from wepose_pin.recording.clocks import build_clock
 from wepose_pin.recording.gaps import bridge, mark_lost_samples
 from wepose_pin.recording.limits import GRAVITY_ERROR_NOTED
@@ -162,7 +161,7 @@ def test_csv_as_programs_write_it(change, tmp_path: Path) -> None:
     assert same(load_session(path), load_session(write(tmp_path, table, file="hand.parquet")))
     (path := write(tmp_path, table)).touch()
     (tmp_path / "hand.csv").write_bytes(change(table.write_csv()).encode())
-    assert sum(len(piece) for piece in iter_session(path, 1.7)) == 800
+    assert len(load_session(path)) == 800
 
 
 # Lost samples ------------------------------------------------------------------------------------------------------
@@ -345,54 +344,14 @@ def test_a_gap_is_marked_on_the_common_time(tmp_path: Path) -> None:
     assert not recording.sensors["torso"].gap.any()
 
 
-# Pieces ------------------------------------------------------------------------------------------------------------
-
-
-def joined(pieces: list[Recording], segment: str, name: str) -> np.ndarray:
-    return np.concatenate([getattr(piece.sensors[segment], name) for piece in pieces])
-
-
 @pytest.mark.parametrize("file", ["hand.csv", "hand.parquet"])
-@pytest.mark.parametrize("seconds", [0.05, 0.37, 3.0, 100.0])
-def test_pieces_put_together_are_the_whole(file: str, seconds: float, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("wepose_pin.readers.tables.BLOCK_ROWS", 101)
-    time = np.arange(1000) / 100.0
-    table = table_at(time, 0.01)
-    holes = (np.arange(1000) % 37 < 4) & (time > 0.5)
-    table = table.with_columns(pl.when(where(~holes)).then(pl.col("gx", "az")).name.keep()).filter(
-        np.arange(1000) % 53 != 5
-    )
-    path = write(tmp_path, table, file=file)
-    whole = load_session(path)
-    pieces = list(iter_session(path, seconds))
-    assert all(check_recording(piece) is piece for piece in pieces)
-    assert all(piece.rate_hz == whole.rate_hz for piece in pieces)
-    np.testing.assert_array_equal(np.concatenate([piece.time for piece in pieces]), whole.time)
-    for name in ("gyro_S", "accel_S"):
-        np.testing.assert_array_equal(joined(pieces, "torso", name), getattr(whole.sensors["torso"], name))
-    assert len(pieces) == pytest.approx(max(1, 10.0 / seconds), abs=1)
-    spans = [span for piece in pieces for span in piece.phases.get("start", ())]
-    assert spans[0][0] == 0.5
-    assert spans[-1][1] == pytest.approx(1.9, abs=0.011)
-
-
-def test_pieces_find_what_the_whole_finds(tmp_path: Path) -> None:
-    time = np.arange(1000) / 100.0
-    table = table_at(time).with_columns(pl.when(where((time < 7.0) | (time > 7.2))).then(pl.col("gx")))
-    pieces = iter_session(write(tmp_path, table), 1.0)
-    for _ in range(6):
-        next(pieces)
-    with pytest.raises(BadData, match=r"sensors\.torso\.gyro: \d+ samples without numbers"):
-        list(pieces)
-    text = table.with_columns(gx=pl.col("gx").cast(pl.String).replace(table["gx"][900], "x")).write_csv()
-    (tmp_path / "hand.csv").write_text(text)
+def test_text_is_named_by_its_row(file: str, tmp_path: Path) -> None:
+    table = table_at(np.arange(1000) / 100.0)
+    text = table["gx"].cast(pl.String).to_list()
+    text[900] = "x"
+    path = write(tmp_path, table.with_columns(gx=pl.Series(text)), file=file)
     with pytest.raises(BadData, match="column 'gx' holds text in row 901: 'x'"):
-        load_session(tmp_path)
-    (tmp_path / "hand.csv").write_text(text.replace(",,", ",0.0,"))
-    with pytest.raises(BadData, match="column 'gx' holds text in row 901: 'x'"):
-        list(iter_session(tmp_path, 1.0))
-    with pytest.raises(BadOption, match="seconds=0"):
-        next(iter_session(tmp_path, 0))
+        load_session(path)
 
 
 # Plausibility ------------------------------------------------------------------------------------------------------
@@ -492,6 +451,3 @@ def test_the_upper_body_session_reads_without_a_diagnostic(data: Path) -> None:
     for segment, sensor in recording.sensors.items():
         np.testing.assert_array_equal(sensor.gyro_S, table[[f"{segment}_gyr_{axis}" for axis in "xyz"]])
     assert same(recording, recording)
-    pieces = list(iter_session(data / "upper_body", 7.0))
-    for segment in recording.sensors:
-        np.testing.assert_array_equal(joined(pieces, segment, "accel_S"), recording.sensors[segment].accel_S)

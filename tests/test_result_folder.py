@@ -38,11 +38,7 @@ def track(session: Path, out: Path) -> None:
     run_track(TrackJob(session, out, view=False, report=False, force=True))
 
 
-def track_in_chunks(session: Path, out: Path) -> None:
-    run_track(TrackJob(session, out, view=False, report=False, force=True, chunk_seconds=5.0))
-
-
-WRITERS = pytest.mark.parametrize("write", [calibrate, track, track_in_chunks])
+WRITERS = pytest.mark.parametrize("write", [calibrate, track])
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -132,9 +128,9 @@ def test_what_a_session_in_the_folder_needs_is_not_replaced(
 
 def test_a_page_of_the_user_stays_where_none_is_wanted(session: Path, tmp_path: Path) -> None:
     (tmp_path / "view.html").write_text("mine", encoding="utf-8")
-    track_in_chunks(session, tmp_path)
+    track(session, tmp_path)
     assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"
-    run_track(TrackJob(session, tmp_path, view=False, force=True, chunk_seconds=5.0))
+    run_track(TrackJob(session, tmp_path, view=False, force=True))
     assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"
     assert "Typical uncertainty" in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["samples"] > 0

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -74,8 +74,8 @@ class Pose:
             self, lambda: f"{len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points"
         )
 
-    def cut(self, span: slice) -> Pose:
-        """Return the pose of a span of samples."""
+    def cut(self, span: slice | np.ndarray) -> Pose:
+        """Return the pose of a span of samples, or of samples by their numbers."""
         series = ("quat_WL", "points", "segment_cov", "point_cov", "gap", "joints")
         parts = {name: {key: rows[span] for key, rows in getattr(self, name).items()} for name in series}
         return replace(self, time=self.time[span], q=None if self.q is None else self.q[span], **parts)
@@ -118,6 +118,19 @@ class Pose:
             check_array(f"{where}joints.{joint}", values, (n,), rows=EACH_TIME)
             check_finite(f"{where}joints.{joint}", values, missing=True)
         return self
+
+
+def join_poses(parts: Sequence[Pose]) -> Pose:
+    """Join the samples of consecutive poses of one body."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def join(values: Sequence[Any]) -> Any:
+        if isinstance(values[0], Mapping):
+            return {name: np.concatenate([arrays[name] for arrays in values]) for name in values[0]}
+        return None if values[0] is None else np.concatenate(values)
+
+    return Pose(*(join([getattr(part, entry.name) for part in parts]) for entry in fields(Pose)))
 
 
 @dataclass(frozen=True, repr=False)

@@ -240,12 +240,11 @@ def track(
     model: Path | None = None,
     options: Iterable[str] = (),
 ) -> list[str]:
-    """`options`: of causal, chunks, gaps, covariance, torques, no-limits."""
+    """`options`: of causal, gaps, covariance, torques, no-limits."""
     argv = ["track", str(session), "-o", str(out), "--method", method, "--no-report"]
     argv += ["--subject", str(subject), "--accept-failed"] if subject else []
     argv += ["--model", str(model)] if model else []
-    words = {"chunks": ["--chunk-seconds", "10"]}
-    return argv + [word for name in options for word in words.get(name, [f"--{name}"])]
+    return argv + [f"--{name}" for name in options]
 
 
 def track_live_recording(file: Path, out: Path) -> list[str]:

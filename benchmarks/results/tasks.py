@@ -141,7 +141,7 @@ def _methods(recording: str, exported_methods: Iterable[str] = ()) -> list[Task]
     """A person tracked by each method in each way."""
     found = []
     for method in adapter.METHODS:
-        variants: dict[str, tuple[str, ...]] = {"whole": ("covariance",), "chunks": ("chunks",)}
+        variants: dict[str, tuple[str, ...]] = {"whole": ("covariance",)}
         if method not in adapter.OFFLINE:
             variants["causal"] = ("causal",)
         exports = ("whole",) if method in exported_methods else ()
@@ -268,14 +268,14 @@ def _sessions(places: Places) -> Arrays:
 def tasks() -> list[Task]:
     """All of them, the longest first."""
     plain = {"whole": (), "causal": ("causal",)}
-    real = {"whole": ("torques",), "chunks": ("chunks",), "causal": ("causal",)}
+    real = {"whole": ("torques",), "causal": ("causal",)}
     found = [
         *_methods("mild", ("amekf", "smoother")),
-        Task("ideal", Person("ideal", variants={**plain, "chunks": ("chunks",)})),
-        Task("unknown_mounts", Person("unknown_mounts", variants={**plain, "chunks": ("chunks",)})),
+        Task("ideal", Person("ideal", variants=plain)),
+        Task("unknown_mounts", Person("unknown_mounts", variants=plain)),
         Task("unknown_mounts/smekf", Person("unknown_mounts", "smekf")),
         Task("right_arm_only", Person("right_arm_only", calibrated=False, variants=plain)),
-        Task("gaps", Person("gaps", calibrated=False, variants={"whole": ("gaps",), "chunks": ("gaps", "chunks")})),
+        Task("gaps", Person("gaps", calibrated=False, variants={"whole": ("gaps",)})),
         Task("two_rates", Person("two_rates", variants=plain)),
         Task("measured_orientations", Person("measured_orientations", calibrated=False)),
         Task("no_phases", Person("no_phases", calibrated=False)),

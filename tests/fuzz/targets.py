@@ -71,13 +71,6 @@ def _session_text(folder: Path, data: bytes) -> object:
     return load_session(folder / "session.toml")
 
 
-def _pieces(path: Path) -> object:
-    from wepose_pin.readers import iter_session
-
-    (path.parent / "session.toml").write_text(TABLE.replace("arm.csv", path.name), encoding="utf-8")
-    return list(iter_session(path.parent / "session.toml", 0.05))
-
-
 def _reference(path: Path) -> object:
     from wepose_pin.readers.reference import read_reference
 
@@ -244,7 +237,6 @@ def _device(name: str, format: str) -> Callable[[Path, bytes], object]:
 
 TARGETS = (
     Target("csv", lambda: [seeds.csv(), seeds.wild_csv()], _session("arm.csv", TABLE), LINES, "readers.tables"),
-    Target("pieces", lambda: [seeds.csv()], file("arm.csv", _pieces), LINES, "readers.tables"),
     Target("mvnx", lambda: [seeds.mvnx(True), seeds.mvnx(False)], _device("a.mvnx", "mvnx"), XML, "readers.mvnx"),
     Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES, "readers.table_format"),
     Target("dot", seeds.dot, _device("a.csv", "dot"), LINES, "readers.table_format"),

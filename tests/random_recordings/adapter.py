@@ -15,9 +15,11 @@ import time
 import traceback
 import warnings as python_warnings
 from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import polars as pl
@@ -53,7 +55,6 @@ CAUSES = {
     "bias": {"person-rotates"},
 }
 ALWAYS = ("start", "bias")
-RESAMPLED = "time-resampled"
 
 
 @dataclass
@@ -187,15 +188,18 @@ def track(
     method: str,
     options: Iterable[str],
     subject: Path | None = None,
-    chunk: float | None = None,
 ) -> list[str]:
     options = set(options)
     argv = ["track", str(session), "-o", str(out), *_gaps(options)]
     argv += [] if method == "amekf" else ["--method", method]
     argv += [f"--{name}" for name in ("covariance", "causal", "torques", "no-limits") if name in options]
     argv += [] if "report" in options else ["--no-report"]
-    argv += ["--subject", str(subject)] if subject else []
-    return argv + (["--chunk-seconds", f"{chunk:g}"] if chunk else [])
+    return argv + (["--subject", str(subject)] if subject else [])
+
+
+def tracking_in_chunks(seconds: float) -> AbstractContextManager[object]:
+    """Within it `run` tracks recordings in chunks that are so short; it holds in this process alone."""
+    return mock.patch("wepose_pin.tracking.CHUNK_S", seconds)
 
 
 def _gaps(options: Iterable[str]) -> list[str]:
@@ -335,11 +339,6 @@ def named_cause(diagnostics: Iterable[Diagnosed], segments: Iterable[str], cause
         if each.code in codes and (not each.places or segments & set(each.places)):
             return " ".join((each.code, *each.places))
     return ""
-
-
-def is_resampled(diagnostics: Iterable[Diagnosed]) -> bool:
-    """Whether the recording was put on other times than its own."""
-    return any(each.code == RESAMPLED for each in diagnostics)
 
 
 def refusal(outcome: Outcome) -> str:

@@ -51,7 +51,6 @@ __all__ = [
     "SmekfParams",
     "Smoother",
     "check_method",
-    "chunk_multiple",
     "estimate_orientation",
     "join_orientations",
     "run_filter",
@@ -110,7 +109,7 @@ class Orientation(NamedTuple):
     diagnostics: tuple[Diagnostic, ...] = ()
     about_vertical: np.ndarray | None = None
 
-    def take(self, rows: np.ndarray) -> Orientation:
+    def take(self, rows: slice | np.ndarray) -> Orientation:
         """Take the samples `rows`."""
         values: dict[str, Any] = {name: getattr(self, name) for name in _OF_EACH_SAMPLE}
         taken: dict[str, Any] = {name: None if each is None else each[rows] for name, each in values.items()}
@@ -246,7 +245,7 @@ def estimate_orientation(
         noise, start = estimate_noise(gyro[first:last], accel[first:last], rate_hz), slice(first, last)
     settings = FilterSettings(method, params, static_test or USUAL_TEST, start=start, gyro_range=scan.gyro_range)
     run = SensorRun(rate_hz, noise, settings)
-    return (run.push(gyro, accel) or run.finish())._replace(diagnostics=diagnostics)
+    return run.push(gyro, accel)._replace(diagnostics=diagnostics)
 
 
 def _check_values(name: str, values: np.ndarray, most: float, unit: str) -> None:
@@ -269,11 +268,6 @@ def add_range(method: str, params: Any, gyro_range: float) -> Any:
         return params
     params = params or kinds[method]()
     return replace(params, gyro_range=min(gyro_range, params.gyro_range))
-
-
-def chunk_multiple(method: str, rate_hz: float) -> int:
-    """Return the number of samples of which chunks must be a multiple, except for the last chunk."""
-    return max(1, round(AmekfParams().block_s * rate_hz)) if method in OFFLINE else 1
 
 
 @dataclass(frozen=True)
@@ -303,8 +297,7 @@ class SensorRun:
 
     The filter starts with the tilt of the start phase and runs forward from its first sample, and backward over earlier
     samples, so that a recording may begin in motion. The smoother runs forward over all samples, from the end of the
-    backward run. The smoother alone uses the next chunk: its `push` returns the chunk before. Its chunks are multiples
-    of `chunk_multiple`.
+    backward run, and takes the whole recording as one chunk.
 
     Parameters
     ----------
@@ -324,16 +317,11 @@ class SensorRun:
         self._detector = StaticDetector(noise, rate_hz, self._test)
         self._filter: Any = None
         self._before_cov: np.ndarray | None = None  # attitude_cov before the start phase, until it is returned
-        self._static = np.zeros(0, dtype=np.bool_)  # of the smoother's chunk
 
-    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation | None:
-        """Take a chunk (n, 3) [rad/s], (n, 3) [m/s²]; return it filtered, or the one before it smoothed, first None."""
+    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation:
+        """Filter a chunk: (n, 3) [rad/s], (n, 3) [m/s²]."""
         before = self._begin(gyro_S, accel_S) if self._filter is None else None
-        if self._method in OFFLINE:
-            static = self._detector.run(gyro_S, accel_S)
-            smoothed, self._static, static = self._filter.push(gyro_S, accel_S, static), static, self._static
-            return None if smoothed is None else self._orientation(smoothed, static)
-        if before is None:
+        if before is None or self._method in OFFLINE:
             static = self._detector.run(gyro_S, accel_S)
             return self._orientation(self._filter.run(gyro_S, accel_S, static), static)
         backward, static_before = before
@@ -342,10 +330,6 @@ class SensorRun:
         run = backward.extended(len(gyro_S))
         self._filter.run(gyro_S[rest], accel_S[rest], static, run.part(rest))
         return self._orientation(run, np.concatenate([static_before, static]))
-
-    def finish(self) -> Orientation:
-        """Return the smoother's last chunk; other filters have returned all in `push`."""
-        return self._orientation(self._filter.finish(), self._static)
 
     def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> tuple[FilterRun, np.ndarray] | None:
         """Create the filter; return the samples before its first one filtered, and whether they are static."""
@@ -418,5 +402,4 @@ def run_filter(
     gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise, settings: FilterSettings
 ) -> Orientation:
     """Return the orientations of one sensor, of checked arrays and known noise."""
-    run = SensorRun(rate_hz, noise, settings)
-    return run.push(gyro_S, accel_S) or run.finish()
+    return SensorRun(rate_hz, noise, settings).push(gyro_S, accel_S)

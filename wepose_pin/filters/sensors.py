@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ..diagnostics import Diagnostic
 from ..errors import WeposeError
 from ..recording import OrientationSensor, Recording
-from . import BEST, OFFLINE, FilterSettings, Orientation, SensorRun, check_method
+from . import BEST, FilterSettings, Orientation, SensorRun, check_method
 from .base import run_in_parallel
 from .noise import SensorNoise, estimate_noise
 from .phases import check_common_rotation, check_motion, find_reference_phases
@@ -40,7 +40,6 @@ class SensorFilters:
     Attributes
     ----------
     start, static_phase, diagnostics : as in `FilteredRecording`
-    ahead : true for the smoother: `push` returns the chunk before, and `finish` the last one
 
     Raises
     ------
@@ -53,7 +52,6 @@ class SensorFilters:
     ) -> None:
         check_method(method)
         self.start, self.static_phase, self.diagnostics = find_reference_phases(first)
-        self._queue: list[Recording] = []  # chunks that `push` has not returned; one, with the smoother
         self._runs: dict[str, SensorRun] = {}
         noises: dict[str, SensorNoise] = {}
         for segment, sensor in first.sensors.items():
@@ -80,10 +78,9 @@ class SensorFilters:
                 gyro_range=first.imus[segment].gyro_range,
             )
             self._runs[segment] = SensorRun(first.rate_hz, noise, settings)
-        self.ahead = method in OFFLINE and bool(self._runs)
 
-    def push(self, chunk: Recording) -> tuple[Recording, dict[str, Orientation]] | None:
-        """Filter a chunk; returns it with its orientations. The smoother returns the chunk before, first None."""
+    def push(self, chunk: Recording) -> dict[str, Orientation]:
+        """Filter a chunk; the smoother takes the whole recording as one."""
         measured = []
         for segment in self._runs:
             sensor = chunk.imus[segment]
@@ -92,19 +89,8 @@ class SensorFilters:
                 # A long bridge is a guess and no measurement: filters get NaN, and their covariance grows over it.
                 gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
             measured.append((gyro_S, accel_S))
-        self._queue.append(chunk)
         results = run_in_parallel(lambda run, signals: run.push(*signals), self._runs.values(), measured)
-        orientation = {
-            segment: result for segment, result in zip(self._runs, results, strict=True) if result is not None
-        }
-        if len(orientation) < len(self._runs):
-            return None
-        return self._queue.pop(0), orientation
-
-    def finish(self) -> tuple[Recording, dict[str, Orientation]]:
-        """Return the smoother's last chunk with its orientations."""
-        orientation = run_in_parallel(SensorRun.finish, self._runs.values())
-        return self._queue.pop(), dict(zip(self._runs, orientation, strict=True))
+        return dict(zip(self._runs, results, strict=True))
 
 
 def filter_recording(
@@ -122,8 +108,7 @@ def filter_recording(
         A start phase with too few samples; an unknown method.
     """
     filters = SensorFilters(recording, method=method, static_test=static_test, sways=sways)
-    _, orientation = filters.push(recording) or filters.finish()
-    return combine_chunk(filters, recording, orientation)
+    return combine_chunk(filters, recording, filters.push(recording))
 
 
 def combine_chunk(

@@ -13,12 +13,10 @@ corrections of both ends in proportion. Time is linear in the samples; the block
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from ..compilation import compiled, inlined
-from ..errors import BadData, BadOption
+from ..errors import BadOption
 from ..rotations import fill_matrix, rotate_by_world_vector
 from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, Amekf, AmekfParams
 from .base import RATE_VAR, VERTICAL_COLUMNS, FilterRun
@@ -28,23 +26,10 @@ from .noise import SensorNoise
 COUNT = len(SMOOTHED_STATES)
 
 
-class _Forward(NamedTuple):
-    """A chunk that the filter has gone through."""
-
-    out: FilterRun  # the filter's
-    static: np.ndarray  # (n,) bool
-    blocks: np.ndarray  # of `amekf.BLOCK`
-    P_rows: np.ndarray  # (9, 25) rows `SMOOTHED_STATES` of P before it
-
-
 class Smoother:
     """Smoother of one sensor, for whole recordings; parameters are the aMEKF's.
 
     What bad data does is said at `Amekf`; a stretch without gyro is bridged from both sides.
-
-    A recording too long for that comes in chunks: `push` gives a chunk once the next one has come, smoothed by what
-    both hold; `finish` gives the last. Of a recording in one chunk that is `run`. What the chunks after the next one
-    would have said is lost (docs/long-recordings.md has by how much).
     """
 
     def __init__(
@@ -54,57 +39,19 @@ class Smoother:
         self.noise = noise
         self.rate_hz = rate_hz
         self.quat_WS = np.array(quat_WS, dtype=float)
-        self._filter = Amekf(noise, rate_hz, self.quat_WS, self.params)
-        self._pending: _Forward | None = None
 
-    def run(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun:
+    def run(
+        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
+    ) -> FilterRun:
         """Smooth a whole recording; each call starts anew, so a recording cut in two is two recordings."""
-        self._filter, self._pending = Amekf(self.noise, self.rate_hz, self.quat_WS, self.params), None
-        self.push(gyro_S, accel_S, static)
-        return self.finish()
-
-    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool) -> FilterRun | None:
-        """Take a chunk; gives the one before it.
-
-        Raises
-        ------
-        BadData
-            The chunk before ended within a block of `Amekf.block_samples` samples.
-        """
+        amekf = Amekf(self.noise, self.rate_hz, self.quat_WS, self.params)
         is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
-        if self._pending is not None and len(self._pending.static) % self._filter.block_samples:
-            raise BadData(
-                f"a chunk of {len(self._pending.static)} samples before another: the smoother's must be multiples of "
-                f"{self._filter.block_samples}"
-            )
-        P_rows = np.ascontiguousarray(self._filter.state.P[list(SMOOTHED_STATES)])
-        blocks = np.empty(len(is_static) // self._filter.block_samples, BLOCK)
-        out = self._filter.run_with_blocks(gyro_S, accel_S, is_static, blocks)
-        done = None if self._pending is None else self._smooth(self._pending, blocks)
-        self._pending = _Forward(out, is_static, blocks, P_rows)
-        return done
-
-    def finish(self) -> FilterRun:
-        """The last chunk.
-
-        Raises
-        ------
-        BadData
-            Nothing was pushed.
-        """
-        if self._pending is None:
-            raise BadData("the smoother has no samples: nothing was pushed")
-        last, self._pending = self._pending, None
-        return self._smooth(last, last.blocks[:0])
-
-    def _smooth(self, chunk: _Forward, after: np.ndarray) -> FilterRun:
-        """A chunk in the light of itself and of the blocks `after` it."""
-        blocks, P_rows = chunk.blocks, chunk.P_rows
-        ends = slice(len(blocks) + 1)
-        smoothed = [values[ends] for values in _backward(np.concatenate([blocks, after]), P_rows, self.noise.gravity)]
-        trace = float(np.trace(P_rows[:3, :3]))
-        _interpolate(blocks, *smoothed, trace, self._filter.block_samples, chunk.static, *chunk.out)
-        return chunk.out
+        P_rows = np.ascontiguousarray(amekf.state.P[list(SMOOTHED_STATES)])
+        blocks = np.empty(len(is_static) // amekf.block_samples, BLOCK)
+        run = amekf.run_with_blocks(gyro_S, accel_S, is_static, blocks, out)
+        smoothed = _backward(blocks, P_rows, self.noise.gravity)
+        _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), amekf.block_samples, is_static, *run)
+        return run
 
     def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:  # noqa: ARG002
         """There is none.

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ..diagnostics import Diagnostic
-from ..errors import BadOption, WrongOption
+from ..errors import WrongOption
 from . import Method, Progress, no_progress
 from .fields import field_values
 
 if TYPE_CHECKING:
     from ..subject import Subject
-    from ..tracking import TrackedRecording
 
 
 @dataclass(frozen=True)
@@ -75,10 +74,6 @@ class TrackJob:
         Write view.html, the animation of the motion.
     report
         Write report.html, which shows diagnostics and what to do about them, noise, drift, hands and joint angles.
-    chunk_seconds : SECONDS
-        Track in chunks of this length, so that the memory does not grow with the recording (docs/long-recordings.md).
-        Without it recordings of 500 MB and more are tracked in chunks of 120 s (smoother: 600 s), others as a whole; 0
-        tracks any as a whole.
     force
         Replace the files of an earlier run in DIR.
     """
@@ -98,7 +93,6 @@ class TrackJob:
     torques: bool = False
     view: bool = True
     report: bool = True
-    chunk_seconds: float | None = None
     force: bool = False
 
     def check(self) -> None:
@@ -117,42 +111,28 @@ class TrackOutcome(NamedTuple):
     summary: Mapping[str, Any]  # as in summary.json, page failures apart
     page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
     view_rate_hz: float | None = None  # of view.html, where it shows fewer samples than there are
-    tracked: TrackedRecording | None = None  # where it was tracked as a whole
 
 
 def run_track(job: TrackJob, progress: Progress = no_progress) -> TrackOutcome:
     """Track a recording and write its result folder, whole or not at all; its pages follow.
+
+    A long recording is tracked in chunks, so that only its samples are in memory as a whole.
 
     Raises
     ------
     WeposeError
         What the session, the subject, the model or an option lacks.
     """
-    from ..readers import estimate_data_bytes, is_live_log
-    from ..tracking import LARGE
-
-    job.check()
-    as_whole = (
-        "--torques" if job.torques
-        else f"{job.session}, a recording of wepose live," if is_live_log(job.session)
-        else ""
-    )  # fmt: skip
-    if job.chunk_seconds and as_whole:
-        raise BadOption(f"--chunk-seconds {job.chunk_seconds:g}: {as_whole} is tracked as a whole; leave it out")
-    if job.chunk_seconds or (job.chunk_seconds is None and not as_whole and estimate_data_bytes(job.session) >= LARGE):
-        return _track_in_chunks(job, progress)
-    return _track_as_whole(job, progress)
-
-
-def _track_as_whole(job: TrackJob, progress: Progress) -> TrackOutcome:
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
     from ..report import write_track_pages
+    from ..report.track import MOST_FRAMES
     from ..subject import parse_subject
-    from ..tracking import summarize, track
-    from ..writers import write_result
+    from ..tracking import CHUNK_S, SummaryAccumulator, TrackedRecording, TrackOptions, track_chunks
     from ..writers.folder import result_folder
+    from ..writers.result import write_about, write_poses
 
+    job.check()
     method, causal = job.method or BEST, job.causal
     with result_folder(job.out, job.force) as folder:
         progress("reading", 0.0)
@@ -165,57 +145,33 @@ def _track_as_whole(job: TrackJob, progress: Progress) -> TrackOutcome:
                 subject = parse_subject(log.header["subject"], job.session)
         else:
             recording = load_session(job.session, gaps=job.gaps)
-        progress(f"tracking by {method}", 1 / 3)
-        tracked = track(
-            recording,
-            subject,
-            method=method,
-            model=job.model,
-            causal=causal,
-            open_loop=job.open_loop,
-            limits=job.limits,
-        )
-        summary, torques = summarize(tracked), None
+        accumulator = SummaryAccumulator(recording)
+
+        def track() -> Iterator[TrackedRecording]:
+            for tracked in track_chunks(
+                recording,
+                subject,
+                model=job.model,
+                options=TrackOptions(method, causal=causal, open_loop=job.open_loop, limits=job.limits),
+                chunk_s=float("inf") if job.torques else CHUNK_S,
+                progress=lambda share: progress(f"tracking by {method}", (1.0 + share) / 3.0),
+            ):
+                accumulator.add(tracked)
+                yield tracked
+
+        write_poses(folder, track(), job.covariance)
+        summary, torques = accumulator.finish(), None
         if job.torques:
             from ..angles.torques import pose_torques
 
-            torques = pose_torques(tracked)
-        stated = _collect_provenance(job)
-        write_result(folder, tracked, summary, job.covariance, recording.phases, torques, stated)
+            torques = pose_torques(accumulator.last)
+        write_about(folder, accumulator.last, summary, recording.phases, torques, _collect_provenance(job))
+    is_decimated = len(summary.tracked.time) < summary.content["samples"]
+    view_rate_hz = min(30.0, MOST_FRAMES / summary.content["duration_s"]) if is_decimated else None
     failures: list[Diagnostic] = []
     if job.view or job.report:
         progress("making the pages", 2 / 3)
-        failures = write_track_pages(job.out, summary, view=job.view, report=job.report)
-    return TrackOutcome(summary.content, failures, tracked=tracked)
-
-
-def _track_in_chunks(job: TrackJob, progress: Progress) -> TrackOutcome:
-    """Track in chunks: the memory does not grow with the recording."""
-    from ..filters import BEST
-    from ..readers.session import SessionReader
-    from ..report import write_track_pages
-    from ..report.track import MOST_FRAMES
-    from ..tracking import TrackOptions, track_session
-    from ..writers.chunks import ChunkWriter
-    from ..writers.folder import result_folder
-
-    with result_folder(job.out, job.force) as folder:
-        progress("reading the times", 0.0)
-        subject = _load_subject(job)
-        reader = SessionReader(job.session, gaps=job.gaps, in_memory=False)
-        writer = ChunkWriter(folder, len(reader.time), job.covariance)
-        options = TrackOptions(job.method or BEST, causal=job.causal, open_loop=job.open_loop, limits=job.limits)
-        for chunk in track_session(
-            reader, subject, seconds=job.chunk_seconds, model=job.model, options=options, progress=progress
-        ):
-            writer.add(chunk)
-        progress("writing the result", 1.0)
-        summary = writer.finish(reader.phases, _collect_provenance(job))
-    view_rate_hz = min(30.0, MOST_FRAMES / max(summary.content["duration_s"], 1e-3))
-    failures: list[Diagnostic] = []
-    if job.view or job.report:
-        progress("making the pages", 1.0)
-        failures = write_track_pages(job.out, summary, view=job.view, report=job.report, fps=view_rate_hz)
+        failures = write_track_pages(job.out, summary, view=job.view, report=job.report, fps=view_rate_hz or 30.0)
     return TrackOutcome(summary.content, failures, view_rate_hz)
 
 

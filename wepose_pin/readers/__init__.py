@@ -8,9 +8,8 @@ from ..arguments import check_arguments
 from ..recording import Recording
 from . import session
 from .live_log import is_live_log, read_live_log
-from .session import estimate_data_bytes, iter_session
 
-__all__ = ["estimate_data_bytes", "is_live_log", "iter_session", "load_session", "read_live_log"]
+__all__ = ["is_live_log", "load_session", "read_live_log"]
 
 
 def load_session(path: str | Path, gaps: bool = False) -> Recording:

@@ -41,7 +41,7 @@ from .reference import read_reference
 from .registry import detect_format, find_title, is_whole, may_be_folder, read_device
 from .session import SessionReader
 from .tables import FORMATS as TABLES
-from .tables import Rows, read_columns, read_table
+from .tables import read_columns, read_names, read_table
 
 # A line of a file that says its rate.
 _STATED_RATE = re.compile(r"(sampl\w*|frame|data)[ _]*(frequency|rate)[^0-9]{0,12}(?P<rate>\d+(\.\d+)?)", re.IGNORECASE)
@@ -164,11 +164,11 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
         guess = guess_arrays(arrays.shapes, table)
         proposal = _propose_from_names(path, folder, guess, list(arrays.shapes), arrays, table)
         return _propose_session(path, folder, proposal, wearer)
-    names = (rows := Rows(path)).names if path.suffix.lower() in TABLES else []
+    names, units = read_names(path) if path.suffix.lower() in TABLES else ([], {})
     if len(names) > (path.suffix.lower() == ".txt"):  # a text that is no table has one column
         if any(f"{point}_x" in names for point in table.points):
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns", (), (), None)
-        proposal = _propose_from_names(path, folder, guess_columns(names, table, rows.units), names, None, table)
+        proposal = _propose_from_names(path, folder, guess_columns(names, table, units), names, None, table)
         return _propose_session(path, folder, proposal, wearer)
     known = (
         ".toml, .csv, .parquet, .tsv and .txt (tables with tabs, semicolons or commas; MT Manager), .mvnx, .sto, .h5, "
@@ -229,8 +229,7 @@ def _describe_reference(path: Path) -> Description:
 def _describe_toml(path: Path) -> Description:
     values = read_toml(path, "a session or a subject")
     if "data" in values or "sensors" in values:
-        recording = SessionReader(path, gaps=True)
-        whole = recording.recording(0, len(recording.time))
+        whole = SessionReader(path, gaps=True).recording()
         what = f"{path}: a session, '{whole.name}'"
         return Description(what, _facts(whole), _rows(whole, {}), None, diagnostics=whole.diagnostics)
     if isinstance(values.get("lengths"), dict):
@@ -261,7 +260,7 @@ def _propose_session(path: Path, folder: Path, proposal: _Proposal, wearer: Wear
             values["start_pose"] = CONFIGURATION
             values["sensors"] = {segment: parse_toml("\n".join(table)) for segment, table in proposal.tables.items()}
             reader = SessionReader(folder / "session.toml", gaps=True, values=values)
-            recording = reader.recording(0, len(reader.time))
+            recording = reader.recording()
             unit = guess_gyro_unit(recording) if GUESSED_GYRO_UNIT in head else None
             if unit is None:
                 break
@@ -568,7 +567,7 @@ def _find_tables_beside(
         segment = body.guess_segment(file.stem)
         if segment is not None and segment not in files:
             with contextlib.suppress(WeposeError):
-                if list(Rows(file).names) == list(names):
+                if read_names(file)[0] == list(names):
                     files[segment] = _relative(file, folder)
     return files
 

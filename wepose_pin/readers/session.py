@@ -11,12 +11,11 @@ import numpy as np
 import polars as pl
 
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..documents import TomlTable, is_number, read_toml
-from ..errors import BadData, BadOption, BadSession, MissingFile, WeposeError, printable
+from ..documents import TomlTable
+from ..errors import BadData, BadSession, MissingFile, printable
 from ..model.table import NEUTRAL_POSE
 from ..recording import (
     ImuSensor,
-    Intervals,
     OrientationSensor,
     Recording,
     Sensor,
@@ -26,7 +25,7 @@ from ..recording import (
 )
 from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time, measure_rate
 from ..recording.faults import SensorCheck, check_sensors
-from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_neighbours, find_runs, mark_lost_samples
+from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples
 from ..recording.limits import LARGEST_NUMBER
 from ..recording.plausibility import check_signals
 from ..recording.resampling import resample
@@ -45,17 +44,13 @@ from .session_file import (
     read_sensor_keys,
     read_session_file,
 )
-from .tables import FORMATS as TABLES
-from .tables import Rows, read_column, read_columns, read_table
+from .tables import read_columns, read_table
 
 # Allowed error of a quaternion's norm, from rounded decimals.
 NORM_ERROR = 1e-2
 SI = {"gyro": 1.0, "accel": 1.0}
 # Optional keys of [data]; a key that no sensor uses is an error.
 _FOR_SENSORS = ("file", "time", "time_unit", "rate_hz", "gyro_unit", "accel_unit", "format", "use")
-_NO_ROW = 2**31 - 1
-_BLOCK_ROWS = 1 << 16  # rows of a table that is not in memory
-_BEGINNING_S = 20.0  # [s] a person is static for a second in a beginning of this length
 
 
 def load_session(path: str | Path, gaps: bool = False) -> Recording:
@@ -71,45 +66,7 @@ def load_session(path: str | Path, gaps: bool = False) -> Recording:
     WeposeError
         One line that names the file, the key or column, its value and what would be right.
     """
-    reader = SessionReader(path, gaps=gaps)
-    return reader.recording(0, len(reader.time))
-
-
-def iter_session(path: str | Path, seconds: float = 600.0) -> Iterator[Recording]:
-    """Iterate over a session in chunks of `seconds`, for recordings larger than memory; only the times are in memory.
-
-    The joined chunks are bit-identical to the result of `load_session`, or equal to rounding where different clocks are
-    resampled. A chunk has the phases that overlap it. The first chunk alone checks units.
-
-    Raises
-    ------
-    WeposeError
-        As `load_session`, at the chunk with the error.
-    """
-    if not is_number(seconds) or seconds <= 0.0:
-        raise BadOption(f"seconds={seconds!r}: the length of a chunk, above 0, is needed")
-    reader = SessionReader(path, in_memory=False)
-    n = len(reader.time)
-    size = max(2, round(seconds * reader.rate_hz))
-    first = 0
-    while first < n:
-        last = n if n - first < size + 2 else first + size  # the last chunk has more than one sample
-        yield reader.recording(first, last)
-        first = last
-
-
-def estimate_data_bytes(path: str | Path) -> int:
-    """Estimate the size [bytes] of the CSV and Parquet files of a session; 0 where reading it will raise an error."""
-    try:
-        path = Path(path)
-        path = path / "session.toml" if path.is_dir() else path
-        values = read_toml(path, "a session file")
-        tables = [values.get("data"), *values.get("sensors", {}).values()]
-        named = {table["file"] for table in tables if isinstance(table, dict) and isinstance(table.get("file"), str)}
-        files = [path.parent / name for name in named if Path(name).suffix.lower() in TABLES]
-        return sum(file.stat().st_size for file in files)
-    except (WeposeError, OSError, ValueError, AttributeError):
-        return 0
+    return SessionReader(path, gaps=gaps).recording()
 
 
 @dataclass(frozen=True)
@@ -127,12 +84,11 @@ class _Plan:
 
 
 class SessionReader:
-    """A reader of a session: it reads and checks keys and clocks at once, and values in `recording`.
+    """A reader of a session: it reads and checks keys and clocks at once, and values in `recording`, once.
 
     Parameters
     ----------
     gaps : accept gaps longer than 50 ms
-    in_memory : load CSV and Parquet files whole; otherwise read them by rows, in the order of `recording` calls
     values : the session's contents, where the file does not exist yet
 
     Attributes
@@ -147,7 +103,6 @@ class SessionReader:
         path: str | Path,
         *,
         gaps: bool = False,
-        in_memory: bool = True,
         values: Mapping[str, Any] | None = None,
     ) -> None:
         path = Path(path)
@@ -184,10 +139,9 @@ class SessionReader:
                 for signal, key, known in (("gyro", "gyro_unit", GYRO_UNITS), ("accel", "accel_unit", ACCEL_UNITS))
             }
             self._used |= {"gyro_unit", "accel_unit"}
-        self._tables: dict[str, pl.DataFrame | Rows] = {}
+        self._tables: dict[str, pl.DataFrame] = {}
         self._clocks: dict[tuple[str, str | None, float, float | None, float], Clock] = {}
         self._array_files: dict[Path, ArrayFile] = {}
-        self._in_memory = in_memory
         self.devices: dict[Path, Device] = {}
         self._device_rates: dict[Path, float | None] = {}
         for segment, sensor in stated.items():
@@ -211,9 +165,6 @@ class SessionReader:
         check_phases(str(self.path), self.time, self._head.phases)
         self.phases, self.start_pose, self.remounted = self._head.phases, start_pose, self._head.remounted
         self._refuse_shared_columns()
-        self._check: SensorCheck | None = None
-        self._samples: dict[str, tuple[np.ndarray, ...]] = {}  # as `_read_samples`, of a recording in memory
-        self._orientations: dict[str, tuple[np.ndarray, np.ndarray]] = {}  # times and unit quaternions
 
     def _refuse_shared_columns(self) -> None:
         """Raise an error where two sensors have a column in common."""
@@ -326,16 +277,14 @@ class SessionReader:
                     if len(names) == 1:  # an error: one array, but the file is a table of columns
                         keys.names(signal, WIDTHS[signal])
         if which not in self._tables:
-            self._tables[which] = read_table(path) if self._in_memory else Rows(path)
+            self._tables[which] = read_table(path)
         key = (which, name, unit, rate_hz, offset)
         if key not in self._clocks:
-            table, place = self._tables[which], own.at("time")
-            if isinstance(table, Rows):
-                time, height = read_column(path, name, str(path), place)
+            table = self._tables[which]
+            if rate_hz is not None:
+                time = np.arange(table.height) / rate_hz
             else:
-                time = read_columns(table, [name], str(path), place)[:, 0] if name is not None else np.empty(0)
-                height = table.height
-            time = np.arange(height) / rate_hz if rate_hz is not None else unit * time
+                time = unit * read_columns(table, [name or "time"], str(path), own.at("time"))[:, 0]
             source = str(path) if rate_hz is None else own.at("rate_hz")
             self._clocks[key] = clock = build_clock(time + offset, source)
             lost = find_runs(mark_lost_samples(clock, clock.row >= 0) == LONG)
@@ -375,122 +324,61 @@ class SessionReader:
             wanted[time] = own.at("time")
         return file.table(wanted), named
 
-    def _check_sensors(self) -> SensorCheck:
-        """Check all samples of the sensors for faults, at the first call.
+    def recording(self) -> Recording:
+        """Read and check the recording.
 
         Raises
         ------
         BadData
-            As `check_sensors`, and where values are no numbers.
+            As `check_sensors`, `check_recording` and `check_signals`, and where values are no numbers.
         """
-        if self._check is None:
-            samples = self._read_samples()
-            start = next(iter(self.phases.get("start", ())), None)
-            self._check = check_sensors(str(self.path), samples, start)
-            if self._in_memory:
-                self._samples = samples
-            for segment, (time, *values) in samples.items():
-                if len(values) == 1:
-                    quat = np.clip(values[0], -LARGEST_NUMBER, LARGEST_NUMBER)
-                    norm = np.linalg.norm(quat, axis=1)
-                    good = norm > 0.0
-                    self._orientations[segment] = time[good], quat[good] / norm[good, None]
-        return self._check
-
-    def _read_samples(self) -> dict[str, tuple[np.ndarray, ...]]:
-        """Read all rows of the sensors in SI: times (n,), and gyro and accel (n, 3) or orientations (n, 4)."""
-        clocks = {id(plan.clock): plan.clock for plan in self._plans.values()}
-        times = {
-            # Without lost rows no copy is made.
-            key: clock.time if clock.row[-1] == len(clock.row) - 1 else clock.time[clock.row >= 0]
-            for key, clock in clocks.items()
-        }
-        rows = max(map(len, times.values()))
-        step = rows if self._in_memory else _BLOCK_ROWS
-        blocks: dict[str, list[list[np.ndarray]]] = {segment: [] for segment in self._plans}
-        for first in range(0, rows, step):
-            tables = {plan.table: self._tables[plan.table][first : first + step] for plan in self._plans.values()}
-            for segment, plan in self._plans.items():
-                table = tables[plan.table]
-                blocks[segment].append([self._read_rows(plan, name, table, first) for name in plan.signals])
-        return {
-            segment: (times[id(plan.clock)], *map(np.concatenate, zip(*blocks[segment], strict=True)))
-            for segment, plan in self._plans.items()
-        }
-
-    def _read_rows(self, plan: _Plan, name: str, table: pl.DataFrame, first_row: int) -> np.ndarray:
-        """Read a signal (n, k) in SI from a part of its table that begins at this row."""
-        place = f"{self.path}: {plan.place}.{name}"
-        return plan.units.get(name, 1.0) * read_columns(table, plan.signals[name], str(plan.path), place, first_row)
-
-    def recording(self, first: int, last: int) -> Recording:
-        """Read and check the recording from sample `first` of the common time to before `last`."""
-        check = self._check_sensors()
-        time = self.time[first:last]
-        windows = {segment: self._window(plan, first, last) for segment, plan in self._plans.items()}
-        rows: dict[str, slice] = {}
-        for segment, (low, high) in windows.items():
-            plan = self._plans[segment]
-            row = plan.clock.row[low:high]
-            begin, end = int(row[row >= 0].min(initial=_NO_ROW)), int(row.max(initial=-1)) + 1
-            so_far = rows.get(plan.table, slice(begin, end))
-            rows[plan.table] = slice(min(begin, so_far.start), max(end, so_far.stop))
-        tables = {key: self._tables[key][span] for key, span in rows.items()}
-
+        samples = {segment: self._read_samples(plan) for segment, plan in self._plans.items()}
+        self._tables.clear()
+        start = next(iter(self.phases.get("start", ())), None)
+        check = check_sensors(str(self.path), samples, start)
         sensors: dict[str, Sensor] = {}
         bridged: list[Diagnostic] = []
-        for segment, (low, high) in windows.items():
-            plan = self._plans[segment]
-            clock = replace(plan.clock, time=plan.clock.time[low:high], row=plan.clock.row[low:high])
-            sensor, marks = self._sensor(plan, clock, tables[plan.table], rows[plan.table].start)
-            if not self._resampled:
-                sensors[segment] = sensor.part(slice(first - low, last - low))
-                marks = marks[first - low : last - low]
-            else:
-                before = 1 if first else 0  # the first rate needs the sample before it
-                sensor = resample(sensor, clock.time, self.time[first - before : last])
-                sensors[segment] = sensor.part(slice(before, last - first + before))
-            bridged += _report_bridged_gaps(segment, marks, clock.step)
-        whole = last - first == len(self.time)
+        for segment, plan in self._plans.items():
+            sensor, marks = self._read_sensor(plan, check, samples.pop(segment)[1:])
+            sensors[segment] = resample(sensor, plan.clock.time, self.time) if self._resampled else sensor
+            bridged += _report_bridged_gaps(segment, marks, plan.clock.step)
         recording = replace(
             self._head,
-            time=time,
+            time=self.time,
             rate_hz=self.rate_hz,
             sensors=sensors,
-            phases=self._head.phases if whole else _cut_phases(self._head.phases, time),
             diagnostics=(*self._diagnostics, *check.diagnostics, *bridged),
         )
         check_recording(recording)
-        begins = whole or (first == 0 and time[-1] - time[0] >= _BEGINNING_S)
-        warnings = check_signals(recording, whole=begins, units=first == 0)
-        return replace(recording, diagnostics=(*recording.diagnostics, *warnings))
+        return replace(recording, diagnostics=(*recording.diagnostics, *check_signals(recording)))
 
-    def _window(self, plan: _Plan, first: int, last: int) -> tuple[int, int]:
-        """Find the samples on a sensor's clock that the chunk needs, with neighbours for bridging and resampling."""
+    def _read_samples(self, plan: _Plan) -> tuple[np.ndarray, ...]:
+        """Read all rows of a sensor in SI: times (n,), and gyro and accel (n, 3) or orientations (n, 4)."""
         clock = plan.clock
-        margin = int(np.ceil(clock.longest_bridge / clock.step)) + 2
-        if self._resampled:
-            margin += int(np.ceil(1.0 / self.rate_hz / clock.step))
-            ends = self.time[[max(first - 1, 0), last - 1]]
-            first, last = (int(k) for k in np.searchsorted(clock.time, ends) + [-1, 1])
-        return max(0, first - margin), min(len(clock.time), last + margin)
+        # Without lost rows no copy is made.
+        time = clock.time if clock.row[-1] == len(clock.row) - 1 else clock.time[clock.row >= 0]
+        values = [
+            plan.units.get(name, 1.0)
+            * read_columns(self._tables[plan.table], columns, str(plan.path), f"{self.path}: {plan.place}.{name}")
+            for name, columns in plan.signals.items()
+        ]
+        return (time, *values)
 
-    def _sensor(self, plan: _Plan, clock: Clock, table: pl.DataFrame, first_row: int) -> tuple[Sensor, np.ndarray]:
-        """Read a span of a sensor on its own clock and bridge its gaps; with the gaps' marks."""
-        signals = {name: self._read_signal(plan, name, clock, table, first_row) for name in plan.signals}
+    def _read_sensor(self, plan: _Plan, check: SensorCheck, rows: tuple[np.ndarray, ...]) -> tuple[Sensor, np.ndarray]:
+        """Put the rows of a sensor's signals on its own clock and bridge its gaps; with the gaps' marks."""
+        clock = plan.clock
+        signals = {
+            name: self._place_on_clock(plan, name, values) for name, values in zip(plan.signals, rows, strict=True)
+        }
         marks = {}
         segment = plan.place.removeprefix("sensors.")
-        check = self._check_sensors()
         faults = check.faults.get(segment, [])
         frozen = np.zeros(len(clock.time), dtype=bool)
         for fault in faults:
             frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
         for name, (_, good) in signals.items():
             place = f"{plan.path}: {plan.place}.{name}"
-            in_gap = self.gaps and len(clock.time) < len(plan.clock.time)
-            if name == "orientation":
-                in_gap &= len(self._orientations[segment][0]) > 0
-            if not good.any() and not in_gap:
+            if not good.any():
                 columns_ = ", ".join(plan.signals[name])
                 raise BadData(f"{place}: no numbers from {format_span(clock.time[[0, -1]])} in {columns_}")
             marks[name] = mark_lost_samples(clock, good)
@@ -505,29 +393,22 @@ class SessionReader:
         all_marks = np.max(list(marks.values()), axis=0)
         gap = all_marks == LONG if self.gaps or faults else None
         if "orientation" in signals:
-            edges = find_neighbours(*self._orientations[segment], clock, marks["orientation"])
-            quat = bridge_quat(signals["orientation"][0], marks["orientation"], clock, *edges)
+            quat = bridge_quat(signals["orientation"][0], marks["orientation"], clock)
             return OrientationSensor(quat, plan.mount, gap, plan.aligned), all_marks
         gyro_S = bridge(signals["gyro"][0], marks["gyro"], clock, rate=True)
         accel_S = bridge(signals["accel"][0], marks["accel"], clock)
         gap_marks = np.where(frozen, GOOD, all_marks)  # frozen samples have a diagnostic of their own
         return ImuSensor(gyro_S, accel_S, plan.mount, gap, check.gyro_range[segment]), gap_marks
 
-    def _read_signal(
-        self, plan: _Plan, name: str, clock: Clock, table: pl.DataFrame, first_row: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Read the values (n, k) in SI on the clock, and a mask (n,) of the samples that exist."""
-        if self._samples:
-            whole = self._samples[plan.place.removeprefix("sensors.")][1 + list(plan.signals).index(name)]
-            rows = whole[first_row : first_row + table.height]
-        else:
-            rows = self._read_rows(plan, name, table, first_row)
+    def _place_on_clock(self, plan: _Plan, name: str, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Place the rows (m, k) of a signal on the clock: (n, k), and a mask (n,) of the samples that exist."""
+        clock = plan.clock
         exists = clock.row >= 0
-        if exists.all() and len(rows) == len(clock.row):
+        if exists.all():
             values = rows
         else:
             values = np.full((len(clock.row), rows.shape[1]), np.nan)
-            values[exists] = rows[clock.row[exists] - first_row]
+            values[exists] = rows[clock.row[exists]]
         good = np.isfinite(values).all(axis=1)
         too_large = np.flatnonzero((np.abs(values) > LARGEST_NUMBER).any(axis=1))
         if too_large.size:
@@ -574,14 +455,6 @@ def _explain_unused(key: str) -> str:
         "format": "no sensor here is read by it: they state columns, or a format of their own",
         "use": "no sensor here has a format with both; state the columns to read",
     }[key]
-
-
-def _cut_phases(phases: Mapping[str, Intervals], time: np.ndarray) -> dict[str, Intervals]:
-    """Cut the phases to a chunk; phases that do not overlap it are left out."""
-    low, high = float(time[0]), float(time[-1])
-    clipped = {name: tuple((max(a, low), min(b, high)) for a, b in spans) for name, spans in phases.items()}
-    overlaps = {name: tuple(span for span in spans if span[0] < span[1]) for name, spans in clipped.items()}
-    return {name: spans for name, spans in overlaps.items() if spans}
 
 
 def _explain_gap_limit(clock: Clock) -> str:

@@ -1,4 +1,4 @@
-"""Tables of numbers: CSV and Parquet into polars, whole or by rows, and their columns into float arrays.
+"""Tables of numbers: CSV and Parquet into polars, and their columns into float arrays.
 
 A CSV has its columns separated by commas, semicolons or tabs; beside the last two decimals may have commas. Lines
 before the names, a line of units after them, and names in two lines are read too: `read_layout` finds them.
@@ -9,10 +9,9 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import itertools
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,10 +24,6 @@ from .libraries import library_errors
 
 FORMATS = (".csv", ".tsv", ".txt", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
-# Lines of a CSV in a block.
-BLOCK_ROWS = 50_000
-# Rows of a Parquet column in a block.
-COLUMN_ROWS = 1_000_000
 # Characters of a line without values.
 EMPTY = b",; \t\r\n"
 # The names of a CSV stand within its first lines, or bytes.
@@ -55,7 +50,7 @@ def read_table(path: Path) -> pl.DataFrame:
     _check_table(path)
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"):
-            return pl.read_parquet(_open_source(path))
+            return pl.read_parquet(open_source(path))
     layout = read_layout(path)
     if layout.is_plain:
         table = _parse_csv(path, layout)
@@ -67,11 +62,10 @@ def read_table(path: Path) -> pl.DataFrame:
     return table.head(table.height - _count_empty_end(path)) if table.height else table
 
 
-def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str, first_row: int = 0) -> np.ndarray:
+def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str) -> np.ndarray:
     """Read columns of numbers as a C-contiguous float array (n, len(names)); empty cells are NaN.
 
-    `file` and `place` (such as ``sensors.torso.gyro``) begin the error's text; `first_row` is the row of the file at
-    which the table begins.
+    `file` and `place` (such as ``sensors.torso.gyro``) begin the error's text.
 
     Raises
     ------
@@ -80,7 +74,7 @@ def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: st
     BadData
         A column has other values than numbers, or its name occurs twice in the file.
     """
-    numbers = [_read_numbers(table, name, file, place, first_row) for name in names]
+    numbers = [_read_numbers(table, name, file, place) for name in names]
     return np.ascontiguousarray(pl.DataFrame(numbers).to_numpy().reshape(table.height, len(names)))
 
 
@@ -88,7 +82,7 @@ def _make_column_error(name: str, names: list[str], file: str, place: str) -> Un
     return UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(names, name)}")
 
 
-def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str, first_row: int) -> pl.Series:
+def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.Series:
     if name not in table.columns:
         raise _make_column_error(name, table.columns, file, place)
     if f"{name}_duplicated_0" in table.columns:
@@ -103,106 +97,37 @@ def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str, first_r
             text = stripped[row]
             numeric = text.replace(",", ".", 1).replace("-", "").replace(".", "", 1).isdigit()
             right = f"write decimals with a point: {text.replace(',', '.', 1)}" if numeric else "it must be a number"
-            raise BadData(f"{file}: column '{name}' holds text in row {first_row + row + 1}: '{text[:40]}'; {right}")
+            raise BadData(f"{file}: column '{name}' holds text in row {row + 1}: '{text[:40]}'; {right}")
     elif not series.dtype.is_numeric() and series.dtype != pl.Null:
         content = "true and false" if series.dtype == pl.Boolean else f"values of type {series.dtype}"
         raise BadData(f"{file}: column '{name}' holds {content}; it must hold numbers")
     numbers = series.cast(pl.Float64)
     if numbers.is_infinite().any():
         row = int(numbers.is_infinite().arg_max() or 0)
-        raise BadData(f"{file}: column '{name}' holds inf in row {first_row + row + 1}; it must be a number")
+        raise BadData(f"{file}: column '{name}' holds inf in row {row + 1}; it must be a number")
     return numbers.fill_null(float("nan")).rename(name)
 
 
-# By rows -----------------------------------------------------------------------------------------------------------
+def read_names(path: Path) -> tuple[list[str], dict[str, str]]:
+    """Read the names of the columns of a table, and column → its unit, where a line of a CSV has them.
 
-
-@dataclass
-class Rows:
-    """A table that is read by ranges of rows; a CSV is read again for a range before the last one.
-
-    Memory holds the range and one block of a CSV, or the row groups of a Parquet file that the range overlaps.
+    Raises
+    ------
+    MissingFile, BadData
+        As `read_table`.
     """
-
-    path: Path
-
-    def __post_init__(self) -> None:
-        _check_table(self.path)
-        self._layout = None if _is_parquet(self.path) else read_layout(self.path)
-        self.names = list(_read_parquet_names(self.path) if self._layout is None else self._layout.names)
-        self._restart()
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        """The units by column, where a line of a CSV has them."""
-        return dict(zip(self.names, self._layout.units, strict=False)) if self._layout is not None else {}
-
-    def _restart(self) -> None:
-        self._blocks = iter(()) if self._layout is None else _iterate_csv_blocks(self.path, self._layout)
-        self._rows, self._first = pl.DataFrame(), 0
-
-    def __getitem__(self, rows: slice) -> pl.DataFrame:
-        if rows.stop <= rows.start:
-            return pl.DataFrame(schema=dict.fromkeys(self.names, pl.Float64))
-        if _is_parquet(self.path):
-            with library_errors(self.path, "a Parquet file"):
-                return pl.scan_parquet(_open_source(self.path)).slice(rows.start, rows.stop - rows.start).collect()
-        if rows.start < self._first:
-            self._restart()
-        while self._first + self._rows.height < rows.stop and (block := next(self._blocks, None)) is not None:
-            rest = self._rows.slice(max(0, rows.start - self._first))
-            self._first += self._rows.height - rest.height
-            self._rows = pl.concat([rest, block], how="vertical_relaxed") if rest.height else block
-        return self._rows.slice(rows.start - self._first, rows.stop - rows.start)
-
-
-def read_column(path: Path, name: str | None, file: str, place: str) -> tuple[np.ndarray, int]:
-    """Read a column (n,) of a large table by blocks, with the number of rows; without a name an empty array."""
     _check_table(path)
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"):
-            table = pl.scan_parquet(_open_source(path))
-            height = int(table.select(pl.len()).collect().item())
-            if name is None:
-                return np.empty(0), height
-            if name not in (names := _read_parquet_names(path)):
-                raise _make_column_error(name, names, file, place)
-            values, lazy = np.empty(height), table.select(name)
-            for first in range(0, height, COLUMN_ROWS):  # polars keeps the memory of its largest read
-                part = lazy.slice(first, COLUMN_ROWS).collect()
-                values[first : first + part.height] = read_columns(part, [name], file, place, first)[:, 0]
-        return values, height
-    parts, height = [np.empty(0)], 0
-    for block in _iterate_csv_blocks(path, read_layout(path)):
-        if name is not None:
-            parts.append(read_columns(block, [name], file, place, height)[:, 0])
-        height += block.height
-    return np.concatenate(parts), height
-
-
-def _iterate_csv_blocks(path: Path, layout: CsvLayout) -> Iterator[pl.DataFrame]:
-    with path.open("rb") as lines:
-        for _ in range(layout.head_lines):
-            lines.readline()
-        rows = (line for line in lines if not line.startswith(b"#"))
-        done = 0
-        empty: list[bytes] = []  # empty lines, which count only if a row follows
-        while new := list(itertools.islice(rows, BLOCK_ROWS)):
-            block, empty = empty[::-1] + new, []
-            while block and not block[-1].strip(EMPTY):
-                empty.append(block.pop())
-            if not block:
-                continue
-            table = _parse_csv(path, layout, b"".join([layout.head, *block]), done)
-            done += table.height
-            # A column may have whole numbers in one block and decimals in the next.
-            yield table.with_columns(pl.col(pl.Int64, pl.Null).cast(pl.Float64))
+            return list(pl.read_parquet_schema(open_source(path))), {}
+    layout = read_layout(path)
+    return list(layout.names), dict(zip(layout.names, layout.units, strict=False))
 
 
 # Checks of files ---------------------------------------------------------------------------------------------------
 
 
-def _open_source(path: Path) -> Path | bytes:
+def open_source(path: Path) -> Path | bytes:
     """Return the file as a path, or its contents where the path is not UTF-8, which polars cannot open."""
     try:
         os.fspath(path).encode("utf-8")
@@ -213,11 +138,6 @@ def _open_source(path: Path) -> Path | bytes:
 
 def _is_parquet(path: Path) -> bool:
     return path.suffix.lower() == ".parquet"
-
-
-def _read_parquet_names(path: Path) -> list[str]:
-    with library_errors(path, "a Parquet file"):
-        return list(pl.read_parquet_schema(_open_source(path)))
 
 
 def _check_table(path: Path) -> None:
@@ -349,9 +269,9 @@ def _join_names(lines: Sequence[Sequence[str]]) -> list[str]:
     return [f"{owner} {name.strip()}".strip() for owner, name in zip(owners, lines[1], strict=True)]
 
 
-def _parse_csv(path: Path, layout: CsvLayout, part: bytes = b"", first_row: int = 0) -> pl.DataFrame:
-    """Parse a CSV, or a `part` of it with the line of names and the rows from `first_row` on."""
-    source: Path | bytes = part or _open_source(path)
+def _parse_csv(path: Path, layout: CsvLayout, content: bytes = b"") -> pl.DataFrame:
+    """Parse a CSV, or `content` of it that begins with the line of names."""
+    source: Path | bytes = content or open_source(path)
     options: dict[str, Any] = {
         "null_values": NO_VALUE,
         "comment_prefix": "#",
@@ -372,7 +292,7 @@ def _parse_csv(path: Path, layout: CsvLayout, part: bytes = b"", first_row: int 
             table = pl.read_csv(source, infer_schema_length=None, **options)
     except (pl.exceptions.PolarsError, OSError) as error:
         if "more fields" in str(error):
-            _find_ragged(path, layout, part, first_row)
+            _find_ragged(path, layout, content)
         if "utf-8" in str(error):
             raise BadData(f"{path}: is not UTF-8 text; save it as CSV in UTF-8") from error
         with library_errors(path, "a table"):
@@ -381,7 +301,7 @@ def _parse_csv(path: Path, layout: CsvLayout, part: bytes = b"", first_row: int 
         table.columns = list(names)  # polars reads quotes within names in its own way
     # polars fills short rows silently.
     if table.width > 1 and table[table.columns[-1]].null_count():
-        _find_ragged(path, layout, part, first_row)
+        _find_ragged(path, layout, content)
     return table
 
 
@@ -393,12 +313,12 @@ def _count_empty_end(path: Path) -> int:
     return len(lines) - next((k for k in range(len(lines), 0, -1) if lines[k - 1].strip(EMPTY)), 0)
 
 
-def _find_ragged(path: Path, layout: CsvLayout, part: bytes, first_row: int) -> None:
+def _find_ragged(path: Path, layout: CsvLayout, content: bytes) -> None:
     """Raise an error on the first row of a CSV with other fields than its names; empty lines have no values."""
     width = len(layout.names)
-    with io.BytesIO(part) if part else path.open("rb") as lines:
+    with io.BytesIO(content) if content else path.open("rb") as lines:
         text = io.TextIOWrapper(lines, encoding="utf-8-sig", errors="replace", newline="")
         rows = csv.reader((line for line in text if not line.startswith("#")), delimiter=layout.separator)
-        for k, fields in enumerate(rows, first_row):
+        for k, fields in enumerate(rows):
             if fields and len(fields) != width:
                 raise BadData(f"{path}: row {k} has {len(fields)} fields, the line of names has {width}; mend the row")

@@ -35,14 +35,12 @@ def find_runs(which: np.ndarray) -> list[tuple[int, int]]:
 def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = False) -> np.ndarray:
     """Fill lost samples of `values` (n, k) linearly in time; at the ends with the nearest value.
 
-    Where all samples are lost, as in a chunk of a recording, they are zero. With `rate` the values are angular rates,
+    With `rate` the values are angular rates,
     which in long gaps fade to the rate of the static sensor, its bias.
     """
     lost = marks != GOOD
     if not lost.any():
         return values
-    if lost.all():
-        return np.zeros_like(values)
     time, filled = clock.time, values.copy()
     for k in range(values.shape[1]):
         filled[lost, k] = np.interp(time[lost], time[~lost], values[~lost, k])
@@ -58,43 +56,17 @@ def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = 
     return filled
 
 
-def bridge_quat(
-    quat: np.ndarray,
-    marks: np.ndarray,
-    clock: Clock,
-    before: tuple[float, np.ndarray] | None = None,
-    after: tuple[float, np.ndarray] | None = None,
-) -> np.ndarray:
-    """Fill lost unit quaternions of `quat` (n, 4) along the shortest rotation.
-
-    `before` and `after` are the time [s] and quaternion (4,) of the last measurement before a chunk and the next one
-    after it.
-    """
+def bridge_quat(quat: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray:
+    """Fill lost unit quaternions of `quat` (n, 4) along the shortest rotation; at the ends with the nearest one."""
     filled = quat.copy()
     for first, last in find_runs(marks != GOOD):
-        ends = [
-            before if first == 0 else (clock.time[first - 1], quat[first - 1]),
-            after if last == len(quat) else (clock.time[last], quat[last]),
-        ]
-        near = [end for end in ends if end is not None]
-        if len(near) < 2:
-            filled[first:last] = near[0][1]
+        if first == 0 or last == len(quat):
+            filled[first:last] = quat[last] if first == 0 else quat[first - 1]
             continue
-        times, quats = zip(*near, strict=True)
-        filled[first:last] = Slerp(times, Rotation.from_quat(np.array(quats)))(clock.time[first:last]).as_quat()
+        edges = [first - 1, last]
+        turn = Slerp(clock.time[edges], Rotation.from_quat(quat[edges]))
+        filled[first:last] = turn(clock.time[first:last]).as_quat()
     return filled
-
-
-def find_neighbours(
-    time: np.ndarray, quat: np.ndarray, clock: Clock, marks: np.ndarray
-) -> tuple[tuple[float, np.ndarray] | None, tuple[float, np.ndarray] | None]:
-    """Find the last of the measurements (n,), (n, 4) before a span of a clock and the next after it.
-
-    None: there is none, or that end of the span is not lost.
-    """
-    first, last = int(np.searchsorted(time, clock.time[0])), int(np.searchsorted(time, clock.time[-1], side="right"))
-    before = (float(time[first - 1]), quat[first - 1]) if marks[0] != GOOD and first > 0 else None
-    return before, (float(time[last]), quat[last]) if marks[-1] != GOOD and last < len(time) else None
 
 
 def _estimate_static_rate(gyro_S: np.ndarray, good: np.ndarray, clock: Clock) -> np.ndarray:

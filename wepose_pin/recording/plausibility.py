@@ -55,11 +55,8 @@ NOISE_JERK = float(ndtri(0.75) * np.sqrt(20.0))  # median size of the third diff
 ROUNDING = 1e-9  # steps below this share of the largest value are rounding, not noise
 
 
-def check_signals(recording: Recording, *, whole: bool = True, units: bool = True) -> tuple[Diagnostic, ...]:
+def check_signals(recording: Recording) -> tuple[Diagnostic, ...]:
     """Check the sensors' values: units, ranges, and with diagnostics gravity's norm and saturation.
-
-    In a chunk, which is not the `whole` recording, static sensors are known from stated phases alone; the first chunk
-    alone checks `units`.
 
     Raises
     ------
@@ -69,9 +66,8 @@ def check_signals(recording: Recording, *, whole: bool = True, units: bool = Tru
     diagnostics: list[Diagnostic] = []
     for segment, sensor in recording.imus.items():
         place = f"{recording.where()}: sensors.{segment}"
-        diagnostics += _check_gravity(recording, segment, sensor, place, whole)
-        if units:
-            _check_gyro_unit(sensor, recording.rate_hz, place)
+        diagnostics += _check_gravity(recording, segment, sensor, place)
+        _check_gyro_unit(sensor, recording.rate_hz, place)
         _check_range(recording.time, sensor.gyro_S, HIGHEST_RATE, "rad/s", f"{place}.gyro")
         _check_range(recording.time, sensor.accel_S, HIGHEST_ACCEL, "m/s^2", f"{place}.accel")
         for name, values, least in (
@@ -88,14 +84,12 @@ def check_signals(recording: Recording, *, whole: bool = True, units: bool = Tru
     return tuple(diagnostics)
 
 
-def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str, whole: bool) -> list[Diagnostic]:
+def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place: str) -> list[Diagnostic]:
     name = next((name for name in ("static", "start") if recording.phases.get(name)), "")
     if name:
         static, when = recording.find_measured(segment, recording.phases[name][0]), f"in phases.{name}"
-    elif whole:
-        static, when = _find_static_second(recording, sensor), "in the second in which it turns most evenly"
     else:
-        return []
+        static, when = _find_static_second(recording, sensor), "in the second in which it turns most evenly"
     if len(static) < 2:
         return []
     first, last = (float(recording.time[k]) for k in static[[0, -1]])

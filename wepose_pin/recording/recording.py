@@ -144,14 +144,17 @@ class Recording:
         resets = tuple(tick - first for tick in self.resets if first <= tick < last)
         return replace(self, time=self.time[first:last], sensors=sensors, resets=resets)
 
-    def chunks(self, seconds: float) -> Iterator[Recording]:
-        """Iterate over consecutive chunks of `seconds`; the last one may be half a chunk longer or shorter."""
+    def chunks(self, seconds: float, first_s: float = 0.0) -> Iterator[Recording]:
+        """Iterate over consecutive chunks of `seconds`; the last one may be half a chunk longer or shorter.
+
+        The first one has `first_s` where that is more.
+        """
         size = max(1, round(seconds * self.rate_hz))
-        first = 0
+        first, last = 0, max(size, round(first_s * self.rate_hz))
         while first < len(self):
-            last = len(self) if len(self) - first < 1.5 * size else first + size
+            last = len(self) if len(self) - last < 0.5 * size else last
             yield self.cut(slice(first, last))
-            first = last
+            first, last = last, last + size
 
     def phase(self, name: str) -> Intervals:
         """Return the intervals of a phase.

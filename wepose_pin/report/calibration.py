@@ -84,7 +84,7 @@ def render_calibration_report(
         try:
             options = TrackOptions(method)
             tracker = Tracker(calibration.subject, model=calibration.model, options=options, with_point_cov=False)
-            [tracked] = tracker.push(recording) + tracker.finish()
+            tracked = tracker.push(recording) or next(tracker.finish())
         except Exception as error:
             untracked = [Diagnostic("motion-not-shown", WARNING, facts={"reason": str(error)})]
             if not isinstance(error, WeposeError) and failures is not None:

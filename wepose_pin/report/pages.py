@@ -30,8 +30,7 @@ def write_track_pages(
     writer = PageWriter(folder, [name for name, wanted in zip(PAGES, (view, report), strict=True) if wanted])
 
     def render_view(_: list[str]) -> str:
-        tracked, _measures = summary.decimator.decimated
-        recording = tracked.recording
+        tracked, recording = summary.tracked, summary.tracked.recording
         return pose_html(tracked.model, tracked.pose, phases=recording.phases, title=recording.name, fps=fps)
 
     page = writer.write("view.html", render_view) if view else None

@@ -14,7 +14,7 @@ from ..errors import BadData
 from ..kinematics import compute_orientation_residuals
 from ..model import ROOT, BodyTable
 from ..tracking import TrackedRecording, TrackSummary
-from ..tracking.error_budget import ErrorBudget, group_by_source
+from ..tracking.error_budget import group_by_source
 from ..tracking.measures import (
     Budget,
     Measures,
@@ -62,8 +62,15 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
     summary : of `summarize`
     view : the page of `pose_html`, embedded up to `LARGEST_VIEW`; None: a view is made here
     failures : gets a line for each section that cannot be made; the page has the line in place of the section
+
+    Raises
+    ------
+    BadData
+        The motion could not be measured.
     """
-    tracked, measures = summary.decimator.decimated
+    tracked, measures = summary.tracked, summary.measures
+    if measures is None:
+        raise BadData("the motion could not be measured")
     table = tracked.model.table
     find_angles = cache(lambda: _find_joint_angles(tracked))
     page = Page(f"Motion of {tracked.recording.name or 'a recording'}", failures)
@@ -73,7 +80,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
     page.add("What was recorded", lambda: _list_recorded(tracked, measures))
     page.add("Drift of the headings", lambda: _list_drift(tracked, measures.budgets))
     page.add(f"The {_name_tips(table)}", lambda: _list_tips(tracked, measures.tips))
-    page.add("What the ± of the points is made of", lambda: _list_error_budget(tracked))
+    page.add("What the ± of the points is made of", lambda: _list_error_budget(measures.error_budget))
     page.add("Joint angles", lambda: _list_angles(tracked, find_angles()))
     page.add("The motion in 3D", lambda: _list_view(tracked, view))
     page.add("What was run", lambda: _list_run(tracked))
@@ -307,10 +314,8 @@ def _list_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> list
     ]
 
 
-def _list_error_budget(tracked: TrackedRecording) -> list[Item]:
-    budget = ErrorBudget()
-    budget.add(tracked)
-    rows = {point: group_by_source(parts) for point, parts in budget.summarize().items()}
+def _list_error_budget(budget: Mapping[str, Mapping[str, float]]) -> list[Item]:
+    rows = {point: group_by_source(parts) for point, parts in budget.items()}
     if not rows:
         return []
     header = ["", *(f"{source} [mm]" for source in next(iter(rows.values())))]

@@ -1,6 +1,6 @@
 """Recording and subject → pose: filter, align, correct headings, kinematics.
 
-`Tracker` does it, chunk by chunk; `track` gives it a recording as one chunk, `track_session` a session file in chunks.
+`Tracker` does it, chunk by chunk; `track` gives it a recording as one chunk, `track_chunks` in chunks.
 """
 
 from __future__ import annotations
@@ -14,15 +14,12 @@ from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject
 from .options import TrackOptions
-from .session import CHUNK_S, LARGE, SMOOTHER_CHUNK_S, track_session
 from .summary import SummaryAccumulator, TrackSummary, summarize
 from .tracked import TrackedRecording
-from .tracker import Tracker, track_chunks
+from .tracker import CHUNK_S, Tracker, track_chunks
 
 __all__ = [
     "CHUNK_S",
-    "LARGE",
-    "SMOOTHER_CHUNK_S",
     "SummaryAccumulator",
     "TrackOptions",
     "TrackSummary",
@@ -31,7 +28,6 @@ __all__ = [
     "summarize",
     "track",
     "track_chunks",
-    "track_session",
 ]
 
 
@@ -63,5 +59,4 @@ def track(
     """
     check_arguments(track, locals())
     tracker = Tracker(subject, model=model, options=TrackOptions(method, static_test, open_loop, causal, limits))
-    [tracked] = tracker.push(recording) + tracker.finish()
-    return tracked
+    return tracker.push(recording) or next(tracker.finish())

@@ -108,8 +108,8 @@ class CausalEstimator:
         """What corrects the headings; None: nothing does, or the start pose has not ended."""
         return None if self._segment_estimator is None else self._segment_estimator.headings
 
-    def push(self, chunk: Recording) -> list[Oriented]:
-        """Add a chunk; return its part after the start pose, and its segment orientations.
+    def push(self, chunk: Recording) -> Oriented | None:
+        """Add a chunk; return its part after the start pose with its segment orientations; None: there is no such part.
 
         Raises
         ------
@@ -119,12 +119,12 @@ class CausalEstimator:
         if self._segment_estimator is None:
             chunk = self._find_start(chunk)
         if self._segment_estimator is None or not len(chunk):
-            return []
+            return None
         self._tracked = True
-        return [(chunk, self._segment_estimator.run(chunk))]
+        return chunk, self._segment_estimator.run(chunk)
 
-    def finish(self) -> list[Oriented]:
-        """Check that something was tracked; return nothing, since `push` keeps no chunk back.
+    def finish(self) -> None:
+        """Check that something was tracked.
 
         Raises
         ------
@@ -132,7 +132,7 @@ class CausalEstimator:
             There was no start pose, or nothing after it.
         """
         if self._tracked:
-            return []
+            return
         recording = self._received
         if self._segment_estimator is None and self._start_detector is not None and recording is not None:
             raise BadPhase(
@@ -219,7 +219,7 @@ class CausalSegmentEstimator:
     ) -> None:
         check_mounts(start_recording, subject, start_frames)
         self._filters = SensorFilters(start_recording, method=method, static_test=static_test, sways=start_frames.sways)
-        _, orientation = self._filters.push(start_recording) or self._filters.finish()
+        orientation = self._filters.push(start_recording)
         filtered = combine_chunk(self._filters, start_recording, orientation)
         alignment = align_sensors(start_recording, subject, filtered, start_frames)
         self.start = orient_segments(start_recording, alignment, orientation, subject, start_frames)
@@ -362,7 +362,7 @@ class CausalSegmentEstimator:
 
     def _run(self, chunk: Recording) -> SegmentOrientations:
         """Return the segment orientations of a chunk without resets."""
-        _, orientation = self._filters.push(chunk) or self._filters.finish()
+        orientation = self._filters.push(chunk)
         quat_VS = self._stack_orientations(chunk, orientation)
         if self.headings is not None:
             corrections = stack_heading_corrections(orientation, self.names, len(chunk))

@@ -10,12 +10,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import compute_heading_variance
+from ..filters import Orientation
 from ..kinematics import Pose, compute_axis_std
 from ..model import BodyModel, BodyTable, HingeJoint
 from ..recording import OrientationSensor, Recording
 from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
 from ..recording.plausibility import find_cut_off
+from ..recording.sensors import compute_rate
 from ..subject import Subject
 from .tracked import TrackedRecording
 
@@ -37,28 +39,36 @@ class Signal(NamedTuple):
     bias: tuple[np.ndarray, np.ndarray] | None  # (3,) [rad/s] at the beginning and at the end
 
 
-def measure_signal(recording: Recording, name: str, tracked: TrackedRecording) -> Signal:
-    """The signal of a sensor, with the results of its filter."""
+def measure_signal(
+    recording: Recording, name: str, orientation: Orientation | None, static: np.ndarray | None, every: int
+) -> Signal:
+    """The signal of a sensor, with the results of its filter.
+
+    Parameters
+    ----------
+    recording : with all samples
+    static : (n,) bool of them
+    every : samples that are shown as one: as their fastest, and as what any of them is, or all are static
+    """
     sensor = recording.sensors[name]
+    bins = np.arange(0, len(recording), every)
     nothing = np.zeros(len(recording), dtype=bool)
-    gap = sensor.gap if sensor.gap is not None else nothing
-    if isinstance(sensor, OrientationSensor):
-        R = Rotation.from_quat(sensor.quat_WS)
-        rate = (R[:-1].inv() * R[1:]).magnitude() * recording.rate_hz
+    gap = np.logical_or.reduceat(sensor.gap if sensor.gap is not None else nothing, bins)
+    if isinstance(sensor, OrientationSensor) or orientation is None or static is None:
+        rate = np.linalg.norm(compute_rate(sensor, recording.rate_hz), axis=1)
         nan = float("nan")
-        return Signal(np.concatenate([rate[:1], rate]), nan, nothing, gap, None, nan, nan, nan, None)
-    orientation = tracked.segments.orientation[name]
+        return Signal(np.maximum.reduceat(rate, bins), nan, nothing[bins], gap, None, nan, nan, nan, None)
     cut = find_cut_off(sensor.gyro_S, NARROWEST_GYRO_RANGE) | find_cut_off(sensor.accel_S, NARROWEST_ACCEL_RANGE)
     return Signal(
-        np.linalg.norm(sensor.gyro_S, axis=1),
+        np.maximum.reduceat(np.linalg.norm(sensor.gyro_S, axis=1), bins),
         float(np.linalg.norm(sensor.accel_S, axis=1).max()),
-        cut.any(axis=1),
+        np.logical_or.reduceat(cut.any(axis=1), bins),
         gap,
-        orientation.static,
+        np.logical_and.reduceat(static, bins),
         _rms(orientation.noise.gyro_cov),
         orientation.noise.gravity * _rms(orientation.noise.accel_cov),
         orientation.noise.gravity,
-        (orientation.noise.gyro_bias, orientation.gyro_bias[-1].copy()),  # a view would keep the whole run
+        (orientation.noise.gyro_bias, orientation.gyro_bias[-1]),
     )
 
 
@@ -247,6 +257,7 @@ class Measures:
     budgets : segment → the uncertainty of its heading
     hinges : name → its motion
     tips : point whose path is drawn → its motion
+    error_budget : as `ErrorBudget.summarize`
     """
 
     samples: int
@@ -256,21 +267,41 @@ class Measures:
     budgets: Mapping[str, Budget]
     hinges: Mapping[str, HingeMotion]
     tips: Mapping[str, TipMotion]
+    error_budget: Mapping[str, Mapping[str, float]]
 
 
-def measure(tracked: TrackedRecording, signals: Mapping[str, Signal] | None = None) -> Measures:
-    """All measures of a recording; `signals`, where they are measured already."""
-    recording, table = tracked.recording, tracked.model.table
+def measure(
+    tracked: TrackedRecording,
+    recording: Recording,
+    static: Mapping[str, np.ndarray],
+    error_budget: Mapping[str, Mapping[str, float]],
+    peak_speed: Mapping[str, float],
+) -> Measures:
+    """All measures of a recording.
+
+    Parameters
+    ----------
+    tracked : the samples that are shown
+    recording : with all samples, as `static`, segment → (n,) bool
+    peak_speed : point → [m/s] of all samples, where fewer are shown
+    """
+    table, every = tracked.model.table, round(recording.rate_hz / tracked.recording.rate_hz)
     steps = 1e3 * np.diff(recording.time)
     hinges = {name: measure_hinge(tracked.pose, table, name, tracked.subject) for name in table.hinges}
+    tips = measure_tips(tracked.pose, tracked.recording.rate_hz, table)
+    orientation = tracked.segments.orientation
     return Measures(
         len(recording),
         recording.rate_hz,
         (float(steps.min()), float(steps.max())),
-        signals or {name: measure_signal(recording, name, tracked) for name in recording.sensors},
+        {
+            name: measure_signal(recording, name, orientation.get(name), static.get(name), every)
+            for name in recording.sensors
+        },
         compute_heading_uncertainties(tracked),
         {name: motion for name, motion in hinges.items() if motion is not None},
-        measure_tips(tracked.pose, recording.rate_hz, table),
+        {name: tip._replace(peak_speed=peak_speed.get(name, tip.peak_speed)) for name, tip in tips.items()},
+        error_budget,
     )
 
 

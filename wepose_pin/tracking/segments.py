@@ -12,7 +12,7 @@ from ..alignment import (
     count_lost_samples,
     orient_segments,
 )
-from ..filters import BEST, Orientation
+from ..filters import BEST
 from ..filters.sensors import SensorFilters, combine_chunk
 from ..filters.static import StaticTest
 from ..recording import OrientationSensor, Recording
@@ -24,8 +24,8 @@ Oriented = tuple[Recording, SegmentOrientations]
 class SegmentEstimator:
     """Orientation of each segment of a recording that comes in chunks.
 
-    The chunks of a causal filter together are bit-identical with one chunk; the smoother looks one chunk
-    ahead. The phases `start` and `static` are in the first chunk.
+    The chunks together are bit-identical with one chunk; the smoother takes the whole recording as one. The phases
+    `start` and `static` are in the first chunk.
 
     Parameters
     ----------
@@ -46,8 +46,8 @@ class SegmentEstimator:
         self._alignment: SensorAlignment | None = None
         self._lost: dict[str, int] = {}  # sensor with measured orientations → samples lost at the end of the last chunk
 
-    def push(self, chunk: Recording) -> list[Oriented]:
-        """Take a chunk; gives it and its segments, or with the smoother those of the chunk before.
+    def push(self, chunk: Recording) -> Oriented:
+        """Return a chunk with its segments.
 
         Raises
         ------
@@ -59,18 +59,9 @@ class SegmentEstimator:
             self._filters = SensorFilters(
                 chunk, method=self._method, static_test=self._static_test, sways=self._start_frames.sways
             )
-        filtered = self._filters.push(chunk)
-        return [] if filtered is None else [self._orient(self._filters, *filtered)]
-
-    def finish(self) -> list[Oriented]:
-        """What is left when the last chunk has been pushed: the smoother's last one."""
-        if self._filters is None or not self._filters.ahead:
-            return []
-        return [self._orient(self._filters, *self._filters.finish())]
-
-    def _orient(self, filters: SensorFilters, chunk: Recording, orientation: dict[str, Orientation]) -> Oriented:
+        orientation = self._filters.push(chunk)
         if self._alignment is None:
-            filtered = combine_chunk(filters, chunk, orientation)
+            filtered = combine_chunk(self._filters, chunk, orientation)
             self._alignment = align_sensors(chunk, self._subject, filtered, self._start_frames)
         oriented = orient_segments(chunk, self._alignment, orientation, self._subject, self._start_frames, self._lost)
         self._lost = {

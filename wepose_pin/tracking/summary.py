@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json, gravest_first, merge
 from ..errors import BadData, reason
-from .decimation import Decimator
+from ..filters import Orientation, join_orientations
+from ..kinematics import Pose, join_poses
+from ..recording import Recording
+from ..recording.gaps import find_runs
 from .error_budget import ErrorBudget
 from .headings import HeadingCorrection
+from .measures import PEAK_OVER_S, Measures, measure, measure_tips
 from .pose_diagnostics import diagnose_pose
 from .tracked import TrackedRecording
 
 MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment
-_MOST_LATER = 10  # diagnostics of the later chunks of a long recording
+MOST_SAMPLES = 50_000  # that pages show; a longer recording is decimated to fewer than twice as many
 
 
 @dataclass(frozen=True)
@@ -28,38 +32,41 @@ class TrackSummary:
     ----------
     content : of ``summary.json``: inputs, options and results
     diagnostics : what the user should know, the gravest first; `content` has them too
-    decimator : has the samples and measures that pages show
+    tracked : the samples that pages show, as if the recording had been so slow
+    measures : what pages state; None: it could not be measured
     """
 
     content: dict[str, Any]
     diagnostics: tuple[Diagnostic, ...]
-    decimator: Decimator
+    tracked: TrackedRecording
+    measures: Measures | None
 
 
 def summarize(tracked: TrackedRecording) -> TrackSummary:
     """The summary of a recording that was tracked as a whole."""
-    accumulator = SummaryAccumulator()
+    accumulator = SummaryAccumulator(tracked.recording)
     accumulator.add(tracked)
     return accumulator.finish()
 
 
 class SummaryAccumulator:
-    """The summary of a recording that is tracked in chunks, each added as it comes.
+    """The summary of a recording that is tracked in chunks, each added as it comes; it does not depend on the chunks.
 
     Parameters
     ----------
-    samples : of the whole recording, where pages shall show as many as fit into memory; 0 for all
+    recording : the whole one
     """
 
-    def __init__(self, samples: int = 0) -> None:
-        self._decimator = Decimator(samples)
+    def __init__(self, recording: Recording) -> None:
+        self._recording, self._every = recording, max(1, len(recording) // MOST_SAMPLES)
         self._last: TrackedRecording | None = None
-        self._begin, self._samples = 0.0, 0
-        self._static: dict[str, int] = {}
-        self._lost: dict[str, tuple[int, int, bool]] = {}  # segment → gaps, lost samples, whether the last one was
+        self._samples = 0
+        self._poses: list[Pose] = []  # decimated, as the orientations
+        self._orientations: dict[str, list[Orientation]] = {}
+        self._static: dict[str, list[np.ndarray]] = {}
+        self._peak_speed: dict[str, float] = {}  # of each tip, where poses are decimated
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
         self._ranges: dict[str, tuple[float, float]] = {}  # joint of a mechanism → least and largest value [rad or m]
-        self._later: list[Diagnostic] = []  # of reading later chunks than the first
         self._error_budget = ErrorBudget()
 
     @property
@@ -77,26 +84,32 @@ class SummaryAccumulator:
 
     def add(self, tracked: TrackedRecording) -> None:
         """Add the next chunk."""
-        if self._last is None:
-            self._begin = float(tracked.time[0])
-        else:
-            known = (*self._later, *tracked.segments.diagnostics)
-            self._later += [each for each in tracked.recording.diagnostics if each not in known]
-        self._samples += len(tracked.time)
+        rows = (
+            np.arange(-self._samples % self._every, len(tracked.time), self._every) if self._every > 1 else slice(None)
+        )
+        self._poses.append(tracked.pose.cut(rows))
         for segment, orientation in tracked.segments.orientation.items():
-            self._static[segment] = self._static.get(segment, 0) + int(np.count_nonzero(orientation.static))
-        for segment, gap in tracked.pose.gap.items():
-            gaps, samples, before = self._lost.get(segment, (0, 0, False))
-            begun = int(np.count_nonzero(np.diff(gap, prepend=before) & gap))
-            self._lost[segment] = gaps + begun, samples + int(np.count_nonzero(gap)), bool(gap[-1])
+            self._static.setdefault(segment, []).append(orientation.static)
+            self._orientations.setdefault(segment, []).append(orientation.take(rows))
+        if self._every > 1:
+            self._add_peak_speeds(tracked)
         for segment, angle in tracked.orientation_residual().items():
             self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
         for joint, values in tracked.joints.items():
             low, high = self._ranges.get(joint, (np.inf, -np.inf))
             self._ranges[joint] = min(low, float(values.min())), max(high, float(values.max()))
         self._error_budget.add(tracked)
-        self._decimator.add(tracked)
+        self._samples += len(tracked.time)
         self._last = tracked
+
+    def _add_peak_speeds(self, tracked: TrackedRecording) -> None:
+        """Take the highest speeds within a chunk, and from the one before into it."""
+        poses, size = [tracked.pose], max(1, round(PEAK_OVER_S * tracked.recording.rate_hz))
+        if self._last is not None:
+            poses.append(join_poses([self._last.pose.cut(slice(-size, None)), tracked.pose.cut(slice(size))]))
+        for pose in poses:
+            for name, tip in measure_tips(pose, tracked.recording.rate_hz, tracked.model.table).items():
+                self._peak_speed[name] = max(self._peak_speed.get(name, 0.0), tip.peak_speed)
 
     def finish(self) -> TrackSummary:
         """The summary, after the last chunk.
@@ -106,25 +119,54 @@ class SummaryAccumulator:
         BadData
             No chunk was added.
         """
-        diagnostics = self._diagnose()
-        return TrackSummary(self._compose(diagnostics), diagnostics, self._decimator)
+        tracked, recording = self._decimate()
+        measures = None
+        try:  # hours of tracking are not lost by what only assesses them
+            static = {segment: np.concatenate(parts) for segment, parts in self._static.items()}
+            budget = self._error_budget.summarize()
+            measures = measure(tracked, recording, static, budget, self._peak_speed)
+            of_motion = diagnose_pose(tracked, measures)
+        except Exception as error:
+            of_motion = [Diagnostic("motion-not-assessed", WARNING, facts={"reason": reason(error)})]
+        diagnostics = tuple(gravest_first(merge(self._diagnose(), of_motion)))
+        return TrackSummary(self._compose(recording, diagnostics), diagnostics, tracked, measures)
 
-    def _compose(self, diagnostics: Iterable[Diagnostic]) -> dict[str, Any]:
+    def _decimate(self) -> tuple[TrackedRecording, Recording]:
+        """Return what pages show, and the tracked part of the recording with all samples."""
+        last, n = self.last, len(self._recording)
+        recording = self._recording.cut(slice(n - self._samples, n))
+        orientation = {segment: join_orientations(parts) for segment, parts in self._orientations.items()}
+        shown = replace(
+            recording,
+            time=recording.time[:: self._every],
+            rate_hz=recording.rate_hz / self._every,
+            sensors={name: sensor.part(slice(None, None, self._every)) for name, sensor in recording.sensors.items()},
+        )
+        tracked = replace(
+            last,
+            pose=join_poses(self._poses),
+            recording=shown,
+            segments=replace(last.segments, time=shown.time, orientation=orientation),
+        )
+        return tracked, recording
+
+    def _compose(self, recording: Recording, diagnostics: Iterable[Diagnostic]) -> dict[str, Any]:
         last = self.last
         sensors: dict[str, Any] = {}
-        for segment in last.recording.sensors:
+        for segment, sensor in recording.sensors.items():
             about: dict[str, Any] = {"heading_deg": round(float(np.degrees(last.segments.heading_offset[segment])), 3)}
             orientation = last.segments.orientation.get(segment)
             if orientation is None:
                 about["orientations"] = "from the recording"
             else:
-                about["static_share"] = round(self._static[segment] / self._samples, 4)
+                static = sum(int(np.count_nonzero(part)) for part in self._static[segment])
+                about["static_share"] = round(static / self._samples, 4)
                 about["gyro_bias_start_deg_s"] = np.degrees(orientation.noise.gyro_bias).round(5).tolist()
                 about["gyro_bias_end_deg_s"] = np.degrees(orientation.gyro_bias[-1]).round(5).tolist()
                 about["gravity_m_s2"] = round(orientation.noise.gravity, 4)
-            if segment in self._lost:
-                about["gaps"], lost, _ = self._lost[segment]
-                about["gap_s"] = round(lost / last.recording.rate_hz, 3)
+            if sensor.gap is not None:
+                about["gaps"] = len(find_runs(sensor.gap))
+                about["gap_s"] = round(int(np.count_nonzero(sensor.gap)) / recording.rate_hz, 3)
             sensors[segment] = about
         residual_rms = self._residual_rms()
         return {
@@ -136,7 +178,7 @@ class SummaryAccumulator:
             "subject": {"name": last.subject.name, "note": last.subject.note},
             "samples": self._samples,
             "rate_hz": round(last.recording.rate_hz, 4),
-            "duration_s": round(float(last.time[-1]) - self._begin, 3),
+            "duration_s": round(float(recording.time[-1] - recording.time[0]), 3),
             "phases": {"start": list(last.segments.start), "static": list(last.segments.static_phase)},
             "sensors": sensors,
             "points": sorted(last.points),
@@ -151,14 +193,11 @@ class SummaryAccumulator:
         }
 
     def _diagnose(self) -> tuple[Diagnostic, ...]:
-        """Those of reading, alignment and model, and those of the motion. Of later chunks a day's would be too many."""
+        """The diagnostics of reading, alignment and model."""
         last = self.last
         variant = {"variant": "mechanism"} if last.model.table.is_mechanism else {}
-        more = len(self._later) - _MOST_LATER
-        known = (
+        return (
             *last.segments.diagnostics,
-            *self._later[:_MOST_LATER],
-            *([Diagnostic("diagnostics-omitted", INFO, value=more)] if more > 0 else []),
             *_diagnose_unknown_points(last),
             *_diagnose_undetermined_joints(last),
             *(
@@ -168,11 +207,6 @@ class SummaryAccumulator:
             ),
             *last.model.diagnostics,
         )
-        try:
-            of_motion = diagnose_pose(*self._decimator.decimated)
-        except Exception as error:  # hours of tracking are not lost by what only assesses them
-            of_motion = [Diagnostic("motion-not-assessed", WARNING, facts={"reason": reason(error)})]
-        return tuple(gravest_first(merge(known, of_motion)))
 
     def _summarize_joints(self) -> dict[str, Any]:
         """Start configuration, ranges and undetermined joints of a mechanism; of a person nothing."""

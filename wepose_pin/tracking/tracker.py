@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +10,8 @@ import numpy as np
 
 from ..alignment import SegmentOrientations
 from ..errors import BadOption, BadPhase
+from ..filters import OFFLINE
+from ..filters.noise import BEGINNING_S
 from ..kinematics import KinematicsSolver, compute_point_covariances
 from ..model import BodyModel
 from ..recording import Recording
@@ -21,18 +23,20 @@ from .options import TrackOptions
 from .segments import Oriented, SegmentEstimator
 from .tracked import TrackedBody, TrackedRecording, make_body
 
-Chunks = Callable[[], Iterable[Recording]]
+CHUNK_S = 600.0  # of `track_chunks`
+SHORTEST_S = 2.0  # of a chunk: a filter's first window has to fit
 
 
 class Tracker:
     """Tracks the body of a recording that comes in chunks; the whole recording may be one chunk.
 
-    `push` returns the chunks that are complete, `finish` the rest: the smoother needs the next chunk, and the heading
-    correction the whole recording. To save memory, pass over the chunks with `observe_headings` first and give its
-    result as `headings`. A causal tracker takes single samples as well, by `segment_estimator.step`.
+    `push` returns the pose of a chunk where nothing later changes it: of a causal tracker, and where nothing observes
+    headings. Other chunks are returned by `finish`, after the heading correction has seen all of them: the tracker
+    keeps their samples and filters them again, so that its memory holds the results of one chunk. A causal tracker
+    takes single samples as well, by `segment_estimator.step`.
 
-    All chunks of a recording carry its phases; `start` and `static` are in the first. The result of a causal filter
-    does not depend on the chunks.
+    All chunks of a recording carry its phases; `start` and `static` are in the first. The smoother takes the whole
+    recording as one chunk; the results of other filters do not depend on the chunks.
 
     Parameters
     ----------
@@ -40,9 +44,6 @@ class Tracker:
     model : a body, its file, or the name of a body of the package, scaled to the subject's lengths; None: the one that
         the recording names, else the upper body. Without a subject a model that is given or named keeps its own lengths
     options : None: the default ones
-    headings : what `observe_headings` returned; None with `observed`: nothing observes the headings
-    observed : `observe_headings` has passed over all chunks. False: the tracker observes headings itself, and where
-        there is something to observe, all chunks are returned by `finish`
     with_point_cov : compute the covariances of the points; a page that shows none does without
     """
 
@@ -52,18 +53,17 @@ class Tracker:
         *,
         model: BodyModel | str | Path | None = None,
         options: TrackOptions | None = None,
-        headings: HeadingCorrector | None = None,
-        observed: bool = False,
         with_point_cov: bool = True,
     ) -> None:
         self.options = options or TrackOptions()
         self._with_point_cov = with_point_cov
         self._subject, self._model = subject, model
-        self._headings, self._solved = headings, observed
+        self._headings: HeadingCorrector | None = None
         self._estimator: SegmentEstimator | CausalEstimator | None = None  # made at the first chunk
         self._body: TrackedBody | None = None
         self._kinematics: KinematicsSolver | None = None
-        self._waiting: list[Oriented] = []  # until the headings are solved
+        self._waiting: list[Recording] = []  # until the headings are solved
+        self._first: Oriented | None = None  # of the first chunk, while it is the only one
 
     @property
     def segment_estimator(self) -> CausalSegmentEstimator:
@@ -80,44 +80,56 @@ class Tracker:
             raise BadPhase("the start pose has not ended: push a recording that includes it")
         return self._estimator.segment_estimator
 
-    def push(self, chunk: Recording) -> list[TrackedRecording]:
-        """Add the next chunk; return those that are complete.
+    def push(self, chunk: Recording) -> TrackedRecording | None:
+        """Add the next chunk; return it with its pose, or None where `finish` returns it.
 
         Raises
         ------
         WeposeError
             The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
         """
-        if self._estimator is None or self._body is None:
+        is_first = self._body is None
+        if self._body is None or self._estimator is None:
             self._body = make_body(self._subject, self._model, chunk)
             self._estimator = _make_estimator(self._subject, self._body, self.options)
+        elif self.options.method in OFFLINE:
+            raise BadOption(f"method '{self.options.method}' takes the whole recording as one chunk")
         if self.options.open_loop and chunk.resets:
             chunk = replace(chunk, resets=())
-        return [tracked for oriented in self._estimator.push(chunk) for tracked in self._process(oriented, self._body)]
+        oriented = self._estimator.push(chunk)
+        if oriented is None:
+            return None
+        if is_first:
+            self._headings = _make_heading_corrector(oriented, self._body, self.options)
+        if self._headings is None:
+            return self._solve_pose(oriented, self._body)
+        self._headings.add_observations(*oriented)
+        self._waiting.append(chunk)
+        self._first = oriented if is_first else None
+        return None
 
-    def finish(self) -> list[TrackedRecording]:
-        """Return the remaining chunks, after the last one has been pushed."""
-        if self._estimator is None or self._body is None:
-            return []
-        done = [tracked for oriented in self._estimator.finish() for tracked in self._process(oriented, self._body)]
-        if self._headings is not None and not self._solved:
-            self._solved = True
-            if not self._headings.solve():
-                self._headings = None
-            waiting, self._waiting = self._waiting, []
-            done += [self._solve_pose(oriented, self._body) for oriented in waiting]
-        return done
+    def finish(self) -> Iterator[TrackedRecording]:
+        """Iterate over the chunks that `push` did not return, after the last one has been pushed.
 
-    def _process(self, oriented: Oriented, body: TrackedBody) -> list[TrackedRecording]:
-        """Return a chunk with its pose, or nothing while the headings are observed."""
-        if self._headings is None and not self._solved:
-            self._headings = make_heading_corrector(oriented, body.subject, body.model, self.options)
-            self._solved = self._headings is None
-        if self._headings is not None and not self._solved:
-            self._headings.add_observations(*oriented)
-            self._waiting.append(oriented)
-            return []
-        return [self._solve_pose(oriented, body)]
+        Raises
+        ------
+        WeposeError
+            A causal tracker was given no start pose, or nothing after it.
+        """
+        if isinstance(self._estimator, CausalEstimator):
+            self._estimator.finish()
+        if self._headings is None or self._body is None:
+            return
+        if not self._headings.solve():
+            self._headings = None
+        if self._first is not None:
+            yield self._solve_pose(self._first, self._body)
+            return
+        self._estimator = _make_estimator(self._subject, self._body, self.options)
+        for chunk in self._waiting:
+            oriented = self._estimator.push(chunk)
+            if oriented is not None:
+                yield self._solve_pose(oriented, self._body)
 
     def _solve_pose(self, oriented: Oriented, tracked_body: TrackedBody) -> TrackedRecording:
         """Return a chunk with its pose, after its headings have been corrected."""
@@ -146,91 +158,57 @@ class Tracker:
         return TrackedRecording(recording.name, pose, body, person, recording, segments, self.options, correction)
 
 
-def observe_headings(
-    chunks: Iterable[Recording],
-    subject: Subject | None = None,
-    options: TrackOptions | None = None,
-    model: BodyModel | str | Path | None = None,
-) -> HeadingCorrector | None:
-    """Pass over the chunks of a recording and return its heading corrector; None: nothing observes headings.
-
-    Parameters as of `Tracker`.
-
-    Raises
-    ------
-    WeposeError
-        As `Tracker.push`.
-    """
-    options = options or TrackOptions()
-    headings: HeadingCorrector | None = None
-    for oriented, body in _estimate(chunks, subject, model, options):
-        headings = headings or make_heading_corrector(oriented, body.subject, body.model, options)
-        if headings is None:
-            return None
-        headings.add_observations(*oriented)
-    return headings if headings is not None and headings.solve() else None
-
-
-def _estimate(
-    chunks: Iterable[Recording], subject: Subject | None, model: BodyModel | str | Path | None, options: TrackOptions
-) -> Iterator[tuple[Oriented, TrackedBody]]:
-    """Iterate over all chunks with their segment orientations, each with the body."""
-    body: TrackedBody | None = None
-    estimator: SegmentEstimator | CausalEstimator | None = None
-    for chunk in chunks:
-        if body is None or estimator is None:
-            body = make_body(subject, model, chunk)
-            estimator = _make_estimator(subject, body, options)
-        for oriented in estimator.push(chunk):
-            yield oriented, body
-    if body is not None and estimator is not None:
-        for oriented in estimator.finish():
-            yield oriented, body
-
-
-def make_heading_corrector(
-    oriented: Oriented, subject: Subject, body: BodyModel, options: TrackOptions
-) -> HeadingCorrector | None:
-    """Return a heading corrector for a recording whose first chunk this is; None: nothing observes its headings."""
-    recording, segments = oriented
-    if options.causal or options.open_loop or any(sensor.aligned for sensor in recording.sensors.values()):
-        return None
-    problem = make_heading_problem(recording, segments, subject, body, causal=False)
-    return None if problem is None else HeadingCorrector(recording, segments, problem)
-
-
 def track_chunks(
-    chunks: Chunks,
+    recording: Recording,
     subject: Subject | None = None,
     *,
     model: BodyModel | str | Path | None = None,
     options: TrackOptions | None = None,
-    progress: Callable[[str, Recording], None] | None = None,
+    chunk_s: float = CHUNK_S,
+    progress: Callable[[float], None] | None = None,
 ) -> Iterator[TrackedRecording]:
-    """Iterate over the tracked chunks of a recording that is too long for memory.
+    """Iterate over a recording's chunks with their poses: results of a day that are too long for memory.
 
-    `chunks()` iterates over the recording's chunks; it is called twice where headings are corrected. `progress` is
-    called with the name of the task and each chunk that it has finished.
+    The smoother's is one chunk. Parameters as of `Tracker`.
+
+    Parameters
+    ----------
+    chunk_s : [s] of the chunks; the first one is as much longer as the phases `start` and `static` need
+    progress : is called with the share that is done, chunk by chunk
 
     Raises
     ------
     WeposeError
-        As `Tracker.push`, at the chunk that it comes from.
+        As `Tracker`.
     """
     options = options or TrackOptions()
+    tracker = Tracker(subject, model=model, options=options)
+    begin, end = float(recording.time[0]), float(recording.time[-1])
+    spans = [recording.phases[phase][0] for phase in ("start", "static") if recording.phases.get(phase)]
+    first_s = max(last for _, last in spans) - begin + SHORTEST_S if spans else BEGINNING_S
+    chunk_s = min(end - begin + 1.0, np.inf if options.method in OFFLINE else max(chunk_s, SHORTEST_S))
 
-    def report(task: str) -> Iterator[Recording]:
-        for chunk in chunks():
-            yield chunk
-            if progress is not None:
-                progress(task, chunk)
+    def report(tracked: TrackedRecording | Recording, part: int) -> None:
+        if progress is not None:
+            progress((part + (float(tracked.time[-1]) - begin) / (end - begin)) / 2.0)
 
-    observed = not options.open_loop and not options.causal
-    headings = observe_headings(report("observing headings"), subject, options, model) if observed else None
-    tracker = Tracker(subject, model=model, options=options, headings=headings, observed=observed)
-    for chunk in report(f"tracking by {options.method}"):
-        yield from tracker.push(chunk)
-    yield from tracker.finish()
+    for chunk in recording.chunks(chunk_s, first_s):
+        tracked = tracker.push(chunk)
+        report(chunk, 0)
+        if tracked is not None:
+            yield tracked
+    for tracked in tracker.finish():
+        report(tracked, 1)
+        yield tracked
+
+
+def _make_heading_corrector(oriented: Oriented, body: TrackedBody, options: TrackOptions) -> HeadingCorrector | None:
+    """Return a heading corrector for a recording whose first chunk this is; None: nothing observes its headings."""
+    recording, segments = oriented
+    if options.causal or options.open_loop or any(sensor.aligned for sensor in recording.sensors.values()):
+        return None
+    problem = make_heading_problem(recording, segments, body.subject, body.model, causal=False)
+    return None if problem is None else HeadingCorrector(recording, segments, problem)
 
 
 def _make_estimator(

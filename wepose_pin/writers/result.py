@@ -9,7 +9,7 @@ import contextlib
 import json
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
@@ -25,13 +25,15 @@ from ..errors import BadData, ExistingOutput, MissingFile
 from ..kinematics import Pose, build_pose_table, cut_pose, parse_pose_table
 from ..model import BodyModel, BodyTable, load_model, load_table
 from ..model.table_file import MODEL_TABLE, format_table
-from ..readers.tables import read_table
+from ..readers.tables import open_source, read_table
 from ..recording import Intervals, Mark, select_interval
 from ..subject import Subject, load_subject, subject_toml
 from ..tracking import TrackedRecording, TrackSummary
 
+POSE = "pose.parquet"
 JOINTS = "joints.parquet"
 SUBJECT_URDF = "subject.urdf"
+ROW_GROUP = 50_000  # rows of a table in chunks that are written at a time
 
 
 def write_result(
@@ -43,32 +45,65 @@ def write_result(
     torques: Torques | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a tracked recording into an existing folder; with `covariance` its entries besides standard deviations.
+    """Write a recording that was tracked as a whole into an existing folder: `write_poses` and `write_about`."""
+    write_poses(folder, [tracked], covariance)
+    write_about(folder, tracked, summary, phases, torques, provenance)
 
-    `phases` of the recording go to the summary, so that a page made from the folder shows them too. `torques` become
-    ``torques.parquet``, `provenance` part of the summary.
+
+def write_poses(folder: Path, chunks: Iterable[TrackedRecording], covariance: bool = False) -> None:
+    """Write ``pose.parquet``, and of a mechanism ``joints.parquet``, of consecutive chunks, one in memory at a time.
+
+    With `covariance` they have its entries besides standard deviations.
+
+    Raises
+    ------
+    ExistingOutput
+        They cannot be written: a full disk, say.
     """
-    write_table(folder / "pose.parquet", build_pose_table(tracked.pose, covariance))
-    if tracked.joints:
-        write_table(folder / JOINTS, build_joint_table(tracked.pose))
-    content = summary.content
-    if torques is not None:
-        write_table(folder / "torques.parquet", torque_table(torques))
-        content = {**content, "torques": torques.summary()}
-    write_about(folder, tracked, content, phases, provenance)
+    parts: dict[str, list[Path]] = {}
+    for tracked in chunks:
+        tables = {POSE: build_pose_table(tracked.pose, covariance)}
+        if tracked.joints:
+            tables[JOINTS] = build_joint_table(tracked.pose)
+        for name, table in tables.items():
+            files = parts.setdefault(name, [])
+            files.append(folder / f"{name}.{len(files):06d}")
+            write_table(files[-1], table)
+    for name, files in parts.items():
+        if len(files) == 1:
+            files[0].rename(folder / name)
+            continue
+        with writing_errors(name), (folder / name).open("wb") as out:
+            sources: list[Any] = [open_source(file) for file in files]
+            pl.scan_parquet(sources).sink_parquet(out, row_group_size=ROW_GROUP)
+        for file in files:
+            file.unlink()
 
 
 def write_about(
     folder: Path,
     tracked: TrackedRecording,
-    summary: Mapping[str, Any],
+    summary: TrackSummary,
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+    torques: Torques | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the files of a result beside its tables: the subject as used, and ``summary.json``."""
+    """Write the files of a result beside its poses.
+
+    Parameters
+    ----------
+    tracked : the last chunk
+    phases : of the recording; they go to the summary, so that a page made from the folder shows them too
+    torques : become ``torques.parquet``
+    provenance : becomes part of the summary
+    """
+    content = summary.content
+    if torques is not None:
+        write_table(folder / "torques.parquet", torque_table(torques))
+        content = {**content, "torques": torques.summary()}
     write_subject(folder, tracked.subject, tracked.model)
     spans = {name: [[float(a), float(b)] for a, b in intervals] for name, intervals in (phases or {}).items()}
-    about = {**summary, "recorded_phases": spans, "versions": versions()}
+    about = {**content, "recorded_phases": spans, "versions": versions()}
     if tracked.recording.marks:
         about["recorded_marks"] = [[mark.time, mark.text] for mark in tracked.recording.marks]
     if provenance is not None:
@@ -89,12 +124,18 @@ def write_table(path: Path, table: pl.DataFrame, metadata: Mapping[str, str] | N
     ExistingOutput
         It cannot be written: a full disk, say.
     """
+    with writing_errors(path.name), path.open("wb") as file:  # polars takes no path that is not in UTF-8
+        table.write_parquet(file, metadata=None if metadata is None else dict(metadata))
+
+
+@contextlib.contextmanager
+def writing_errors(name: str) -> Iterator[None]:
+    """Raise `ExistingOutput` where a table of this name cannot be written."""
     try:
-        with path.open("wb") as file:  # polars takes no path that is not in UTF-8
-            table.write_parquet(file, metadata=None if metadata is None else dict(metadata))
+        yield
     except (pl.exceptions.PolarsError, OSError) as error:
         reason = str(error).splitlines()[0]
-        raise ExistingOutput(f"{path.name}: cannot be written: {reason}; nothing was written") from error
+        raise ExistingOutput(f"{name}: cannot be written: {reason}; nothing was written") from error
 
 
 def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
