@@ -132,6 +132,6 @@ def test_a_page_of_the_user_stays_where_none_is_wanted(session: Path, tmp_path: 
     assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"
     run_track(TrackJob(session, tmp_path, view=False, force=True))
     assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"
-    assert "Typical uncertainty" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<b>Good for</b> elbow flexion" in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["samples"] > 0
     assert np.isfinite(pl.read_parquet(tmp_path / "pose.parquet")["torso_qw"].to_numpy()).all()

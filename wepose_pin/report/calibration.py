@@ -160,26 +160,36 @@ def _list_diagnostics(
 def _list_lengths(calibration: Calibration, contact: _Contact) -> list[Item]:
     subject, prior, table = calibration.subject, calibration.prior, calibration.model.table
     rows, cells = [], []
+    scales = calibration.scale_std if contact.chain else np.nan, _compute_scale_std(prior)
     for parts in _group_rigid_lengths(table):
         value, before = (sum(person.lengths.get(part, np.nan) for part in parts) for person in (subject, prior))
         std, before_std = (_std(person, parts) for person in (subject, prior))
         measured = calibration.measured.get(parts[0], np.nan) if len(parts) == 1 else np.nan
         label = " + ".join(plain(table.shared_name(part) if k else part) for k, part in enumerate(parts))
         rows.append(LengthRow(label, value, std, before, before_std, measured))
-        learned = calibration.information_shares.get(" + ".join(parts))
+        proportion, proportion_before = (
+            1e3 * np.sqrt(max(total**2 - (scale * length) ** 2, 0.0))
+            for total, scale, length in ((std, scales[0], value), (before_std, scales[1], before))
+        )
+        in_chain = set(parts) <= set(contact.chain) and np.isfinite(proportion)
         cells.append(
             [
                 label,
                 f"**{plus_minus(1e3 * value, 1e3 * std, 'mm')}**",
+                f"± {proportion:.0f} mm, before ± {proportion_before:.0f}" if in_chain else "",
                 plus_minus(1e3 * before, 1e3 * before_std, "mm"),
                 f"{1e3 * measured:.0f} mm" if np.isfinite(measured) else "",
-                f"{100 * float(np.sum(learned)):.0f} %" if learned is not None else "",
             ]
         )
     outside = [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.measured]
     text = "± is one standard deviation throughout: two times out of three the truth lies within."
-    if calibration.information_shares:
-        text += " Learned from the motion: its fraction of the information; the rest is of prior and measured lengths."
+    if np.isfinite(scales[0]):
+        source = listed([plain(name) for name in calibration.scale_lengths])
+        text += (
+            " The motion determines the proportions of the lengths, as if one common scale of all were known. "
+            f"{'The scale comes from the measured ' + source if source else 'The scale is that of the prior'}, to "
+            f"± {100 * scales[0]:.1f} %."
+        )
     if any(len(parts) > 1 and set(parts) <= set(contact.chain) for parts in _group_rigid_lengths(table)):
         text += (
             " Of a segment without a sensor and the one above it, the motion determines the sum; the prior splits it."
@@ -189,8 +199,17 @@ def _list_lengths(calibration: Calibration, contact: _Contact) -> list[Item]:
     return [
         draw_lengths(rows),
         text,
-        Table(["length", "estimated", "prior", "measured", "learned from the motion"], cells),
+        Table(["length", "estimated", "its proportion", "prior, before the motion", "measured"], cells),
     ]
+
+
+def _compute_scale_std(subject: Subject) -> float:
+    """The relative standard deviation of the common scale of all lengths, with their proportions as they are."""
+    lengths = np.array(list(subject.lengths.values()))
+    covariance = subject.lengths_covariance()
+    if not np.linalg.cond(covariance) < 1e12:
+        return float("nan")
+    return float(1.0 / np.sqrt(lengths @ np.linalg.solve(covariance, lengths)))
 
 
 def _list_sensors(calibration: Calibration, recording: Recording) -> list[Item]:

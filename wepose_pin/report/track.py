@@ -91,26 +91,25 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
 
 
 def _list_reliance(tracked: TrackedRecording, measures: Measures, angles: Angles | None) -> list[Item]:
-    """Two sentences: the usual uncertainty of angles and positions, and the worst of the headings."""
-    after_start = find_samples_after_start(tracked)
+    """Return what the motion is good for: the usual uncertainty of hinges, hands and rotations, and the least certain.
+
+    Hinges are what people look for first, as the elbows; the worst instant of a heading stands with the headings.
+    """
+    after_start, table = find_samples_after_start(tracked), tracked.model.table
     stds = _find_angle_stds(angles, after_start) if angles is not None else {}
     tips = [finite_median(tip.std[after_start]) for tip in measures.tips.values() if tip.std is not None]
-    best, worst = (pick(stds, key=stds.__getitem__, default=None) for pick in (min, max))
-    hinges = {plain(tracked.model.table.shared_name(hinge)) for hinge in tracked.model.table.hinges}
+    hinges = {plain(table.shared_name(hinge)) for hinge in table.hinges}
+    best = min(stds, key=stds.__getitem__, default=None)
     best = next((name for name in stds if name.removesuffix(" flexion") in hinges), best)
-    usual = [f"{best} ± {stds[best]:.0f}°"] if best is not None else []
+    worst = max(stds, key=stds.__getitem__, default=None)
+    known = [f"{best} to ± {stds[best]:.0f}°"] if best is not None else []
     if tips and np.isfinite(tips).any():
-        table = tracked.model.table
-        usual.append(f"{_name_tips(table)} ± {1e3 * np.nanmax(tips):.0f} mm from {_name_root(table)}")
-    if not usual:
+        known.append(f"{_name_tips(table)} to ± {1e3 * np.nanmax(tips):.0f} mm from {_name_root(table)}")
+    known += [f"{name} to ± {std:.0f}°" for name, std in stds.items() if name.endswith("rotation") and name != worst]
+    if not known:
         return [_explain_no_covariance(tracked)]
-    least = f"; least certain: {worst}, ± {stds[worst]:.0f}°" if worst not in (best, None) else ""
-    sentences = [f"Typical uncertainty: {', '.join(usual)}{least}."]
-    largest = _find_largest_heading(tracked, measures.budgets)
-    if largest is not None:
-        name, std, at = largest
-        sentences.append(f"At worst, at {at:.1f} s, the heading of the {plain(name)} is uncertain by ± {std:.1f}°.")
-    return [" ".join(sentences)]
+    least = f" Least certain: {worst}, ± {stds[worst]:.0f}°." if worst not in (best, None) else ""
+    return [f"**Good for** {listed(known)}.{least}"]
 
 
 def _find_angle_stds(angles: Angles, samples: np.ndarray) -> dict[str, float]:
@@ -126,17 +125,6 @@ def _find_angle_stds(angles: Angles, samples: np.ndarray) -> dict[str, float]:
             if np.isfinite(each).any():
                 stds[f"{plain(group)} {plain(name)}"] = float(np.nanmax(each))
     return stds
-
-
-def _find_largest_heading(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> tuple[str, float, float] | None:
-    """Segment, ± [deg] and time [s] of the largest uncertainty of a heading after the start pose."""
-    after_start = find_samples_after_start(tracked)
-    stds = {name: np.nan_to_num(np.where(after_start, budget.std, 0.0)) for name, budget in budgets.items()}
-    if not stds:
-        return None
-    worst = max(stds, key=lambda name: float(stds[name].max()))
-    sample = int(np.argmax(stds[worst]))
-    return worst, float(np.degrees(stds[worst][sample])), float(tracked.time[sample])
 
 
 def _explain_no_covariance(tracked: TrackedRecording) -> str:
