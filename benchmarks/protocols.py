@@ -150,7 +150,7 @@ def summarize_cells(results: Results) -> dict[Cell, dict[str, float]]:
 
 
 def write_page(results: Results) -> str:
-    """The page of the results, in Markdown."""
+    """The section of docs/validation.md with the results, in Markdown."""
     rows = summarize_cells(results)
     persons = max(round(row["persons"]) for row in rows.values())
     return _PAGE.format(persons=persons, scatter=SCATTER / np.sqrt(persons), closed=_format_table(rows))
@@ -159,7 +159,7 @@ def write_page(results: Results) -> str:
 def _format_table(rows: dict[Cell, dict[str, float]]) -> str:
     shown = list(QUANTITIES.values())
     header = ["protocol", "seconds", "people", "pass", *(f"{name} [{unit}]" for _, name, _, unit in shown)]
-    lines = [f"| {' | '.join(header)} |", f"|{'---|' * len(header)}"]
+    lines = [f"|{'|'.join(header)}|", f"|{'---|' * len(header)}"]
     for cell, row in rows.items():
         entries = [cell.protocol, f"{cell.seconds:g}", f"{row['persons']:.0f}", f"{row['passed']:.0f}"]
         for key, _, _, unit in shown:
@@ -170,24 +170,22 @@ def _format_table(rows: dict[Cell, dict[str, float]]) -> str:
                 else ""
             )
             entries.append(f"{row[key]:{digits}}{std}" if key in row else "–")
-        lines.append(f"| {' | '.join(entries)} |")
+        lines.append(f"|{'|'.join(entries)}|")
     return "\n".join(lines)
 
 
-_PAGE = """# What calibration protocols are worth
+_PAGE = """## Calibration protocols
 
-Written by `python -m benchmarks protocols --persons {persons} --page docs/protocols.md`. Simulated people
-([simulated people](simulated-people.md)) with sensors mounted at any rotation; stature and sex known, shoulder width
-and trunk measured to 12 mm. Seconds are those after the start pose, with all changes from one part to the next. Each
-entry has the root mean square of the error over people, ± the stated standard deviation, and the root mean square of
-error over standard deviation: 1 is right, above it the ± is too small. That figure scatters by {scatter:.2f} with
-{persons} people.
-The people are the same in all rows, but for those whose arms do not reach through the motion that was drawn. What is
-known of their lengths without any closure is in the rows `t_pose+bow` and `free`.
+`python -m benchmarks protocols --persons {persons} --page benchmarks/validation/protocols.md` writes this section. The
+people are simulated (`people`), with sensors mounted at any rotation; stature and sex are known, shoulder width and
+trunk are measured to 12 mm. Seconds are those after the start pose. An entry is the rms of the error over people, ± the
+stated standard deviation, and the rms of error over standard deviation: 1 is right, above it the ± is too small. That
+last figure scatters by {scatter:.2f} with {persons} people. The row `free` shows what is known of the lengths without
+any closure.
 
-Headings are those of the mounts, all sensors. Most of an error is common to all of them, as the torso's heading defines
-which way is forward. The palm is the right one on a circle drawn after the calibration, from the root and from the
-middle of the shoulders; of `free` in the tasks themselves.
+Headings are those of the mounts of all sensors. Most of their error is common to all, because the heading of the torso
+defines which way is forward. The palm is the right one on a circle drawn after the calibration, from the root and from
+the middle of the shoulders; in `free` it is that of the tasks themselves.
 
 {closed}
 """

@@ -21,7 +21,6 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx_copybutton",
     "commands",
-    "figures",
     "gallery",
     "mathml",
     "notebook",

@@ -9,7 +9,7 @@ with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as incoming, contextlib.su
     incoming.bind(("127.0.0.1", 9001))
     print("waiting for poses on 127.0.0.1:9001; Ctrl-C ends", flush=True)
     while line := incoming.recv(65535):
-        while select.select([incoming], [], [], 0.0)[0]:  # whoever is slow goes on with the newest pose
+        while select.select([incoming], [], [], 0.0)[0]:  # a slow receiver continues with the newest pose
             line = incoming.recv(65535)
         pose = json.loads(line)
         print(f"{pose['t']:.3f} s  right hand {pose['points'].get('right_palm')} m", flush=True)

@@ -1,6 +1,6 @@
 """Files of Shimmer, Noraxon, Delsys, phones, ROS and LabRecorder: one known motion, read back in SI.
 
-Bags are written by rosbags; the XDF by the few lines here, from the specification. Tables are as docs/formats has
+Bags are written by rosbags; the XDF by the few lines here, from the specification. Tables are as docs/formats.md has
 them, from files that labs have published.
 """
 

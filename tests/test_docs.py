@@ -26,7 +26,7 @@ from wepose_pin.readers.registry import read_device
 from wepose_pin.retargeting.maps import read_map
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("CONTRIBUTING.md", "docs/architecture.md", "docs/glossary.md", "docs/recipes.md")
+PAGES = ("CONTRIBUTING.md", "docs/architecture.md", "docs/glossary.md", "docs/contributing.md")
 NOTATION = {"p_WH"}  # examples of how frames are written, which no code needs to have
 LAYERS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]["contracts"][0][
     "layers"
@@ -140,9 +140,9 @@ def test_every_room_is_in_the_architecture_and_its_picture() -> None:
 
 
 def example(path: str, folder: Path) -> Path:
-    """The file of that path as docs/recipes.md shows it, in the folder."""
+    """The file of that path as docs/contributing.md shows it, in the folder."""
     language = {".py": "python", ".toml": "toml"}[Path(path).suffix]
-    [block] = [block for block in blocks("docs/recipes.md", language) if block.startswith(f"# {path}\n")]
+    [block] = [block for block in blocks("docs/contributing.md", language) if block.startswith(f"# {path}\n")]
     file = folder / Path(path).name
     file.write_text(block, encoding="utf-8")
     return file
@@ -195,7 +195,7 @@ def test_the_protocol_and_the_robot_of_the_recipes_are_read(tmp_path: Path) -> N
 
 def test_the_other_examples_of_the_recipes_import_what_is_there() -> None:
     names = []
-    for block in blocks("docs/recipes.md", "python"):
+    for block in blocks("docs/contributing.md", "python"):
         if not block.startswith((" ", "# wepose_pin/")):  # not lines for the middle of a function
             for node in ast.walk(ast.parse(block)):
                 if isinstance(node, ast.ImportFrom) and node.module is not None:
@@ -203,7 +203,7 @@ def test_the_other_examples_of_the_recipes_import_what_is_there() -> None:
     assert names
     for module, name in names:
         assert hasattr(import_module(module), name), f"{module}.{name}"
-    for block in blocks("docs/recipes.md", "toml"):
+    for block in blocks("docs/contributing.md", "toml"):
         assert tomllib.loads(block)
 
 

@@ -200,7 +200,7 @@ def test_what_is_no_file_is_refused_wherever_one_is_read(
 
 @pytest.mark.parametrize("name", ["../outside/arm.csv", "ABSOLUTE", "link.csv"])
 def test_data_may_lie_where_the_lab_keeps_them(name: str, tmp_path: Path) -> None:
-    """docs/security.md says so, and why."""
+    """docs/install.md says so, and why."""
     outside = tmp_path / "outside"
     outside.mkdir()
     (tmp_path / "in").mkdir()
@@ -229,7 +229,7 @@ def test_names_of_data_that_are_none(name: str, tmp_path: Path, capsys: pytest.C
 @pytest.mark.kill
 @pytest.mark.usefixtures("result")  # numba has compiled
 def test_a_run_that_is_killed_at_any_moment_leaves_the_whole_result_or_nothing(session: Path, tmp_path: Path) -> None:
-    """Two moments of those in which it writes; twenty by hand: docs/security.md. The page comes after the result."""
+    """Two moments of those in which it writes; twenty by hand: docs/install.md. The page comes after the result."""
     out = tmp_path / "out"
     command = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "--no-report", "-o", str(out)]
     begun = time.monotonic()

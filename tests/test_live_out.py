@@ -55,8 +55,8 @@ def test_json_keeps_micrometres_and_says_what_is_not_known() -> None:
 
 
 def test_json_of_the_document() -> None:
-    """docs/live-page.md shows a message; it has the keys and the shapes of one."""
-    shown = re.search(r"```json\n(.*?)```", (ROOT / "docs" / "live-page.md").read_text(encoding="utf-8"), re.DOTALL)
+    """docs/live-outputs.md shows a message; it has the keys and the shapes of one."""
+    shown = re.search(r"```json\n(.*?)```", (ROOT / "docs" / "live-outputs.md").read_text(encoding="utf-8"), re.DOTALL)
     assert shown is not None
     documented, real = json.loads(shown[1]), json.loads(pose_json(INFO, pose()))
     assert list(documented) == list(real)
@@ -137,7 +137,7 @@ def test_a_port_alone_is_this_machine(receiver: socket.socket) -> None:
 def test_the_example_reads_it() -> None:
     script = (ROOT / "examples" / "live_consumer.py").read_text(encoding="utf-8")
     code = script.split('"""\n\n', 1)[1]
-    assert f"```python\n{code}```" in (ROOT / "docs" / "live-page.md").read_text(encoding="utf-8")
+    assert f"```python\n{code}```" in (ROOT / "docs" / "live-outputs.md").read_text(encoding="utf-8")
     assert code.count("\n") <= 15
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))

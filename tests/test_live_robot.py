@@ -437,7 +437,7 @@ def test_the_loop_never_waits_for_the_solver(robot_out, arm: Robot, receiver: Re
 
 
 def test_the_document_shows_a_message_and_the_example(arm: Robot) -> None:
-    text = (ROOT / "docs" / "live-robot.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "live-outputs.md").read_text(encoding="utf-8").partition("## A robot that follows")[2]
     shown = re.search(r"```json\n(.*?)```", text, re.DOTALL)
     assert shown is not None
     real = Session(arm, stream_info(person(0.5))).run(live_poses(person(0.5))[:3]).messages()[-1]

@@ -185,7 +185,7 @@ def test_a_map_needs_the_keys_that_its_table_calls_required(tmp_path: Path, with
 
 
 def test_the_page_and_the_loader_have_the_same_keys_of_a_map() -> None:
-    page = (Path(__file__).parents[1] / "docs" / "retargeting.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "robot-maps.md").read_text(encoding="utf-8")
     rows = [
         f"| `{name}` | {key.unit} | {key.default or '**required**'} | {key.meaning} |" for name, key in KEYS.items()
     ]

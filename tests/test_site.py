@@ -33,10 +33,9 @@ PAGES = [
 ]
 # Pages whose commands run one after the other, each page in a folder with a recording and its result.
 RUN = [
-    *("README.md", "docs/start.md", "docs/calibrate.md", "docs/track.md", "docs/biomechanics.md", "docs/robots.md"),
-    *("docs/angles.md", "docs/tutorial-opensim.md", "docs/retargeting.md", "docs/live.md", "docs/live-robot.md"),
-    *("docs/long-recordings.md", "docs/simulated-people.md", "docs/models.md", "docs/batch.md"),
-    *(page for page in PAGES if page.startswith("docs/formats/ev") or page.startswith("docs/formats/ex")),
+    *("README.md", "docs/start.md", "docs/calibrate.md", "docs/track.md", "docs/numbers.md", "docs/retargeting.md"),
+    *("docs/angles.md", "docs/opensim.md", "docs/live.md", "docs/live-outputs.md", "docs/people.md", "docs/models.md"),
+    *("docs/batch.md", "docs/formats.md", "docs/export.md"),
 ]
 # What is not run on these pages, and why.
 ELSEWHERE = {
@@ -53,8 +52,8 @@ ELSEWHERE = {
     r"…|examples/": "no whole command; tests/test_examples.py",
 }
 # Their Python runs too; tests/test_api.py has that of the README and docs/python.md.
-PYTHON = [page for page in RUN if page == "docs/angles.md" or page.startswith("docs/formats/")]
-PYTHON.remove("docs/formats/export-robots.md")  # needs lerobot: tests/lerobot_peer.py
+PYTHON = ("docs/angles.md", "docs/export.md")  # that of docs/opensim.md: tests/test_tutorial_opensim.py
+FILES = {"bvh": "HIERARCHY", "mot": "inDegrees", "sto": "DataType", "trc": "PathFileType"}  # a word of each shown file
 PRELUDE = 'import wepose_pin as wp\nrecording, subject = wp.load_session("session.toml"), wp.load_subject("anna")\n'
 
 
@@ -115,7 +114,7 @@ def test_toml_of_pages_is_toml() -> None:
 def test_python_of_pages_imports_what_is_there() -> None:
     for page in PAGES:
         for kind, body in blocks(page):
-            if kind != "python" or page == "docs/recipes.md":  # tests/test_docs.py runs the recipes
+            if kind != "python" or page == "docs/contributing.md":  # tests/test_docs.py runs the recipes
                 continue
             compile(body, page, "exec")
             for module, names in re.findall(r"^from (wepose_pin[\w.]*) import (.+)$", body, re.MULTILINE):
@@ -222,9 +221,10 @@ def test_commands_of_a_page_run(page: str, workplace: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", ["bvh", "mot", "sto", "trc"])
+@pytest.mark.parametrize("suffix", FILES)
 def test_files_begin_as_the_pages_show(suffix: str, workplace: Path, tmp_path: Path) -> None:
-    [shown] = [body for kind, body in blocks(f"docs/formats/export-{suffix}.md") if kind == ""]
+    texts = [body for page in ("docs/opensim.md", "docs/export.md") for kind, body in blocks(page) if kind == "text"]
+    [shown] = [body for body in texts if FILES[suffix] in body]
     wp.export(workplace / "result", tmp_path / f"circles.{suffix}")
     written = mask((tmp_path / f"circles.{suffix}").read_text(encoding="utf-8"))
     parts = [mask(part) for line in shown.splitlines() for part in line.split("…")]

@@ -48,7 +48,7 @@ def test_the_tutorial_runs_as_it_stands(data: Path, tmp_path: Path) -> None:
     shutil.copyfile(data / "osim" / "Rajagopal_2015.osim", tmp_path / "Rajagopal_2015.osim")  # what the page asks for
     run(["wepose", "simulate", "-o", "bin/recorded", "--seed", "1"], tmp_path)
     pl.read_parquet(tmp_path / "bin/recorded/recording.parquet").write_csv(tmp_path / "trial.csv")  # in place of step 1
-    blocks = BLOCK.findall((ROOT / "docs" / "tutorial-opensim.md").read_text(encoding="utf-8"))
+    blocks = BLOCK.findall((ROOT / "docs" / "opensim.md").read_text(encoding="utf-8"))
     assert [kind for kind, _ in blocks].count("python") == 1
     for kind, text in blocks:
         if kind == "python":

@@ -34,7 +34,7 @@ from ..model import BodyTable, list_breadths
 
 PROTOCOLS = ("bow", "clasp", "free", "t_pose", "table", "tip")
 _OF_CLASP = "clasp with a measured length, as in --measured biacromial=0.41"
-_OWN = "a protocol of your own whose point stays at a fixed place (docs/closure.md)"
+_OWN = "a protocol of your own whose point stays at a fixed place (docs/protocols.md)"
 # Protocols of earlier versions → what to do instead.
 REMOVED = {
     "clasp_measured": _OF_CLASP,
@@ -48,7 +48,7 @@ REMOVED = {
     "touch_right": _OWN,
 }
 DEFAULT = "clasp"
-GUIDED, BOW = "clasp+t_pose", "bow"  # the best of docs/protocols.md in a minute; for whom hands alone are not enough
+GUIDED, BOW = "clasp+t_pose", "bow"  # the best of docs/validation.md in a minute; for whom hands alone are not enough
 ALSO = ("t_pose", BOW)  # what makes it better within the same minute, by phases of their names
 # How many points each kind takes, and the keys that are its own.
 KINDS = {"coincide": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}

@@ -35,8 +35,8 @@ MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about rig
 ELBOW_STD = np.deg2rad(4.0)
 LEAST_BEND = 0.2  # sine of the angle by which a segment must bend to show its axis
 CONTRADICTED = 3.0  # standard deviations between a measured length, or a pose, and what is known without it
-# [m] rms by which the estimated lengths of simulated people are off after a minute (docs/protocols.md): soft tissue and
-# shoulders, which the residuals show in part.
+# [m] rms error of the lengths of simulated people after a minute (docs/validation.md), from soft tissue and shoulders,
+# which the residuals show in part.
 LEAST_LENGTH_STD = 0.010
 SUSPECT = 1.5  # the same of a pose from which on it is compared with a solution without it
 

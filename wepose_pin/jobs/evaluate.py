@@ -42,11 +42,11 @@ class EvaluateJob:
         Bring a file of another system to the clock and the world of the result.
     fit : world|segments
         Fit this to the result, also of a table. world: clock, heading and place; segments: in addition a constant
-        rotation of each segment's frame, for frames that are not those of docs/glossary.md.
+        rotation of each segment's frame, for frames that are not those of docs/concepts.md.
     time_offset : SECONDS
         Add this to the times of the reference, instead of fitting the offset.
     markers : TOML
-        Use this table of markers before the one of the package (docs/formats/evaluate.md).
+        Use this table of markers before the one of the package (docs/formats.md).
     """
 
     result: Path

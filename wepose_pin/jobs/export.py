@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class ExportJob:
     """Write the motion of a person or of a robot for other programs: OpenSim, BVH, C3D, LeRobot, ROS 2 and others.
 
-    What each file holds: docs/formats/export.md.
+    What each file holds: docs/export.md.
 
     Parameters
     ----------

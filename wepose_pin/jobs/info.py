@@ -19,7 +19,7 @@ class InfoJob:
 
     Prints the description and the proposal; writes nothing without --write or -o. Reads CSV, Parquet, HDF5 and MATLAB;
     Xsens MVNX and text files of MT Manager, Movella DOT, x-IMU3, APDM, Shimmer, Delsys, Noraxon, phones (Sensor Logger,
-    phyphox), ROS bags, XDF and OpenSim's orientations, .sto (docs/formats/); recordings of `wepose live`, sessions,
+    phyphox), ROS bags, XDF and OpenSim's orientations, .sto (docs/formats.md); recordings of `wepose live`, sessions,
     subjects and results. Entries of the proposed session that are guesses are marked CHECK.
 
     Parameters

@@ -36,7 +36,7 @@ class LiveJob:
         (docs/live-sources.md). Without HOST only this machine can send.
     guide
         Lead through the calibration first: which sensor sits where, the start pose, the motion, its quality
-        (docs/live-guide.md). Needs no subject and no session.
+        (docs/live.md). Needs no subject and no session.
     out : DIR
         With --guide: write subject, recordings and the sensors' setup to this folder. Without it to a new folder
         named by the date.
@@ -81,11 +81,11 @@ class LiveJob:
     port : PORT
         Serve the page at this port; 0 takes any that is free.
     udp : [HOST:]PORT
-        Send each pose as JSON to this UDP port (docs/live-page.md). Without HOST to this machine.
+        Send each pose as JSON to this UDP port (docs/live-outputs.md). Without HOST to this machine.
     lsl : NAME
         Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
     robot : NAME|FILE
-        Send joint commands that let this robot follow the person (docs/live-robot.md): one of the names of `wepose
+        Send joint commands that let this robot follow the person (docs/live-outputs.md): one of the names of `wepose
         retarget --robot`, a URDF with a robot map beside it (ARM.urdf, ARM.toml), or the robot map. First bring the
         robot into the rest posture of its robot map.
     arm

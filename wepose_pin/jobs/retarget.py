@@ -24,7 +24,7 @@ class RetargetJob:
 
     Robots by name: panda and ur5, both also on a table (panda_table, ur5_table), so101, baxter, tiago_dual, talos, g1,
     alex (from the package example-robot-data). Any other by its URDF with a robot map beside it, a TOML that says which
-    links are shoulder, elbow and hand (docs/retargeting.md).
+    links are shoulder, elbow and hand (docs/robot-maps.md).
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ class SensorStep(Step):
         return (
             f"These sensors measure orientations and no accelerations: the motion does not show how the one on the "
             f"{place} is turned, and the calibration will not pass. Add a bow to the protocol (+bow), or state that "
-            f"sensor's mount, as docs/live-guide.md says.",
+            f"sensor's mount, as docs/live.md says.",
         )
 
 

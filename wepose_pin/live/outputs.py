@@ -1,4 +1,4 @@
-"""The live pose for other programs: JSON over UDP, and a stream of the Lab Streaming Layer. See docs/live-page.md."""
+"""The live pose for other programs: JSON over UDP, a stream of the Lab Streaming Layer (docs/live-outputs.md)."""
 
 from __future__ import annotations
 

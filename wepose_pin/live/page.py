@@ -2,7 +2,7 @@
 
 meshcat's own server listens on every interface and queues what a slow browser has not taken. So the page carries
 meshcat's viewer inside and gets frames through a WebSocket of ours: a browser that has not drawn its last frame gets
-none, and then the newest. `docs/live-page.md` documents the protocol.
+none, and then the newest. `docs/live-outputs.md` documents the protocol.
 """
 
 from __future__ import annotations

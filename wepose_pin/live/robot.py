@@ -1,4 +1,4 @@
-"""A robot that follows the live pose: commands at a constant rate, JSON over UDP. See docs/live-robot.md."""
+"""A robot that follows the live pose: commands at a constant rate, JSON over UDP. See docs/live-outputs.md."""
 
 from __future__ import annotations
 

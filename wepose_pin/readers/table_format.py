@@ -1,6 +1,6 @@
 """Tables of devices: a TOML describes how a vendor writes them, and one engine reads them all.
 
-A description (`formats/*.toml`, or a user's own, docs/formats/devices.md) says how a file is recognised, which lines
+A description (`formats/*.toml`, or a user's own, docs/formats.md) says how a file is recognised, which lines
 belong to the names of its columns, which columns are whose gyroscope, accelerometer or orientation, their units, and
 the clock.
 """
@@ -100,7 +100,7 @@ class ClockColumn:
 
 @dataclass(frozen=True)
 class TableFormat:
-    """A description of tables; keys as in docs/formats/devices.md."""
+    """A description of tables; keys as in docs/formats.md."""
 
     name: str
     title: str

@@ -159,7 +159,7 @@ def find_map(robot: str) -> RobotMap:
         if not file.is_file():
             raise MissingFile(
                 f"--robot {robot}: no {file.name} beside it; a map says which links are shoulder, elbow and hand"
-                " (docs/retargeting.md)"
+                " (docs/robot-maps.md)"
             )
         return read_map(file, urdf=path)
     if robot not in ROBOTS:
@@ -175,7 +175,7 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     MissingFile, BadModel
         As `find_map`.
     """
-    top = TomlTable(read_toml(path, "a robot's map (docs/retargeting.md)", BadModel), path.name, error=BadModel)
+    top = TomlTable(read_toml(path, "a robot's map (docs/robot-maps.md)", BadModel), path.name, error=BadModel)
     top.allow(*list_keys())
     if top.values.get("format") != 1:
         raise BadModel(f"{top.at('format')} = {top.values.get('format')!r}; this version reads format = 1")

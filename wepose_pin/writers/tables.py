@@ -1,4 +1,4 @@
-"""CSV and Parquet: the pose with its joint angles, a row a sample (columns: docs/formats/export-csv.md)."""
+"""CSV and Parquet: the pose with its joint angles, a row a sample (columns: docs/export.md)."""
 
 from __future__ import annotations
 
