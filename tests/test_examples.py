@@ -22,6 +22,7 @@ SAYS = {
     "move_robot.py": "Trajectory('panda_table'",
     "robot_receiver.py": "waiting for commands on 127.0.0.1:9002",
     "track_recording.py": "right hand from its shoulder",
+    "udp_sender.py": "sent 200 samples of each of 5 sensors to 127.0.0.1:9000",
 }
 WRITES = {"joint_angles.py": {"figures"}, "move_robot.py": {"view.html"}, "track_recording.py": {"view.html"}}
 LONGEST = ("calibrate_subject.py", "joint_angles.py", "move_robot.py", "track_recording.py")
