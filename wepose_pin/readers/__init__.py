@@ -6,8 +6,8 @@ from pathlib import Path
 
 from ..arguments import check_arguments
 from ..recording import Recording
-from . import session
 from .live_log import is_live_log, read_live_log
+from .session import read_session
 
 __all__ = ["is_live_log", "load_session", "read_live_log"]
 
@@ -44,4 +44,4 @@ def load_session(path: str | Path, gaps: bool = False) -> Recording:
     check_arguments(load_session, locals())
     if is_live_log(Path(path)):
         return read_live_log(Path(path)).recording
-    return session.load_session(path, gaps)
+    return read_session(Path(path), gaps)

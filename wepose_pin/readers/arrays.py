@@ -7,8 +7,7 @@ MATLAB's v7.3, needs h5py, which is optional. Arrays in other files, by links or
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,11 @@ import numpy as np
 import polars as pl
 from scipy.io import loadmat
 
-from ..errors import BadData, MissingFile, UnknownColumn, one_of
-from .libraries import import_library, library_errors
+from ..errors import BadData, UnknownColumn, one_of
+from .libraries import check_file, import_library, library_errors
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
+KIND = "an HDF5 or MATLAB file"
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 # A sensor's signal has at most so many columns.
 MOST_COLUMNS = 16
@@ -45,16 +45,12 @@ class ArrayFile:
     shapes: dict[str, tuple[int, ...]] = field(init=False)
 
     def __post_init__(self) -> None:
-        if self.path.exists() and not self.path.is_file():
-            raise MissingFile(f"{self.path}: is no regular file; an HDF5 or MATLAB file is wanted here")
-        try:
-            with self.path.open("rb") as file:
-                start = file.read(1024)
-        except OSError as error:
-            reason = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
-            raise MissingFile(f"{self.path}: {reason}; an HDF5 or MATLAB file is wanted here") from None
+        check_file(self.path, KIND)
+        with library_errors(self.path, KIND), self.path.open("rb") as file:
+            start = file.read(520)
         self._loaded: dict[str, np.ndarray] = {}
-        if HDF5_MAGIC in (start[:8], start[512:520]):  # MATLAB puts 512 bytes of its own before it
+        if HDF5_MAGIC in (start[:8], start[512:]):  # MATLAB puts 512 bytes of its own before it
+            self._hdf5 = import_library("h5py", self.path, "HDF5 (MATLAB's v7.3 is too)")
             self.shapes = self._read_hdf5_shapes()
         else:
             self._loaded = {name: values for name, values in read_mat(self.path).items() if values.ndim}
@@ -79,24 +75,20 @@ class ArrayFile:
 
     def expand(self, name: str, width: int, place: str) -> list[str]:
         """List the `width` columns of an array."""
-        path = self._find(name, place)
-        shape = self.shapes[path]
+        shape = self.shapes[self._find(name, place)]
         if len(shape) != 2 or width not in shape:
             raise BadData(f"{place}: {name} in {self.path.name} has shape {shape}; (n, {width}) is needed")
         return [f"{name}[{k}]" for k in range(width)]
 
     def _read_column(self, name: str, place: str) -> np.ndarray:
         part = re.fullmatch(r"(.*)\[(\d+)\]", name)
-        path = self._find(part[1] if part else name, place)
-        values = self.read_array(path)
+        values = self._read_array(self._find(part[1] if part else name, place))
         if values.ndim == 2 and (values.shape[1] > MOST_COLUMNS or values.shape[0] == 1):
             values = values.T  # MATLAB's v7.3 transposes arrays
         if part is None:
-            if values.ndim == 2 and values.shape[1] == 1:
-                values = values[:, 0]
-            if values.ndim != 1:
+            if values.ndim == 2 and values.shape[1] > 1:
                 raise BadData(f"{place}: {name} in {self.path.name} has shape {values.shape}; name a column: {name}[0]")
-            return values
+            return values.reshape(-1)
         k = int(part[2])
         if values.ndim != 2 or k >= values.shape[1]:
             raise UnknownColumn(f"{place}: no column {k} in {part[1]} of {self.path.name}, its shape is {values.shape}")
@@ -108,10 +100,9 @@ class ArrayFile:
             raise UnknownColumn(f"{place}: no array '{name}' in {self.path.name}; {one_of(self.shapes, path)}")
         return path
 
-    def read_array(self, path: str) -> np.ndarray:
-        """Read an array, a key of `shapes`."""
+    def _read_array(self, path: str) -> np.ndarray:
         if path not in self._loaded:
-            with _open_hdf5(self.path) as file:
+            with library_errors(self.path, KIND), self._hdf5.File(self.path) as file:
                 self._loaded[path] = np.asarray(file[path], dtype=float)
         return self._loaded[path]
 
@@ -125,16 +116,9 @@ class ArrayFile:
             if node.dtype.kind in "fiu" and 1 <= len(node.shape) <= 2:
                 shapes[f"/{name}"] = tuple(int(size) for size in node.shape)
 
-        with _open_hdf5(self.path) as file:
+        with library_errors(self.path, KIND), self._hdf5.File(self.path) as file:
             file.visititems(visit)
         return shapes
-
-
-@contextmanager
-def _open_hdf5(path: Path) -> Iterator[Any]:
-    h5py = import_library("h5py", path, "HDF5 (MATLAB's v7.3 is too)")
-    with library_errors(path, "an HDF5 or MATLAB file"), h5py.File(path) as file:
-        yield file
 
 
 def read_mat(path: Path) -> dict[str, np.ndarray]:
@@ -159,7 +143,7 @@ def read_mat(path: Path) -> dict[str, np.ndarray]:
             if array.dtype.kind in "biuf" and array.ndim <= 2:
                 arrays[place] = array.astype(float)
 
-    with library_errors(path, "an HDF5 or MATLAB file"):
+    with library_errors(path, KIND):
         content = loadmat(path, simplify_cells=True)
     visit("", {name: value for name, value in content.items() if not name.startswith("__")})
     return arrays

@@ -41,13 +41,7 @@ class _C3d(NamedTuple):
         return [label for suffix in ("", *range(2, 17)) for label in self.values(group, f"LABELS{suffix}")]
 
     def rate_hz(self, group: str) -> float:
-        """Return the rate of a group.
-
-        Raises
-        ------
-        BadData
-            It is none.
-        """
+        """Return the rate of a group; raise `BadData` where it is none."""
         rate_hz = float([*self.values(group, "RATE"), 0.0][0])
         if not 1.0 <= rate_hz <= 1e5:
             raise BadData(f"{self.path}: {group}:RATE is {rate_hz:g}; frames a second are needed there")
@@ -80,29 +74,23 @@ def _open(path: Path) -> _C3d:
         data = file["data"]
         points = data["points"][:3].transpose(2, 1, 0)
         valid = np.isfinite(points).all(axis=2) & (data["meta_points"]["residuals"][0].T >= 0.0) & points.any(axis=2)
-        return _C3d(
-            path,
-            file["parameters"],
-            np.where(valid[:, :, None], points, np.nan),
-            data["rotations"].transpose(3, 2, 0, 1),
-        )
+        points = np.where(valid[:, :, None], points, np.nan)
+        return _C3d(path, file["parameters"], points, data["rotations"].transpose(3, 2, 0, 1))
 
 
 def _read_markers(file: _C3d) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Read times (n,) [s] and marker → (n, 3) [m]."""
     labels = [label.rpartition(":")[2].strip() for label in file.labels("POINT")]
     frames, used, _ = file.points.shape
-    if not used or not labels:
-        raise BadData(f"{file.path}: neither points nor rotations in it; export the markers")
-    if frames < 2:
-        raise BadData(f"{file.path}: {frames} frames; a recording has at least 2")
+    if not used or not labels or frames < 2:
+        raise BadData(f"{file.path}: {used} points in {frames} frames, and no rotations; export the markers")
     units = {text.strip().lower() for text in file.values("POINT", "UNITS") if text.strip()}
     if len(units) != 1 or not units <= set(UNITS):
         raise BadData(f"{file.path}: POINT:UNITS is {', '.join(sorted(units)) or 'missing'}; {one_of(UNITS)}")
-    time = np.arange(frames) / file.rate_hz("POINT")
     metres = UNITS[units.pop()] * file.points
-    check_measured(file.path, np.nan_to_num(metres.reshape(frames, -1)), "a marker")
-    return time, {name: metres[:, k] for k, name in enumerate(labels[:used])}
+    check_measured(file.path, metres.reshape(frames, -1), "a marker")
+    markers = {name: metres[:, k] for k, name in enumerate(labels[:used])}
+    return np.arange(frames) / file.rate_hz("POINT"), markers
 
 
 def _read_rotations(file: _C3d, table: MarkerTable) -> Reference:
@@ -121,8 +109,7 @@ def _read_rotations(file: _C3d, table: MarkerTable) -> Reference:
             good = np.isfinite(R).all(axis=(1, 2))
             good &= np.abs(np.linalg.det(np.where(good[:, None, None], R, 0.0)) - 1.0) < 0.01
             quats[segment] = np.full((frames, 4), np.nan)
-            if good.any():
-                quats[segment][good] = Rotation.from_matrix(R[good]).as_quat()
+            quats[segment][good] = Rotation.from_matrix(R[good]).as_quat()
     if not quats:
         listed = ", ".join(labels[:8]) or "without labels"
         raise BadData(f"{file.path}: its rotations are of no known segment ({listed}); name them under --markers")

@@ -1,100 +1,130 @@
-"""Common parts of the readers of device files: a table in SI with a clock, and text with lines before its table."""
+"""What a reader finds in the file of a device: its sensors, in SI, each with its clock."""
 
 from __future__ import annotations
 
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import polars as pl
 
-from ..diagnostics import INFO, Diagnostic
+from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, MissingFile, one_of
+from ..model import load_table
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from .guess import guess_unit
+from .libraries import library_errors
 
-AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "xyzw"}
+# What a sensor is read for → the signals that it needs.
+NEEDED = {"raw": ("gyro", "accel"), "orientation": ("orientation",)}
 GYRO_UNITS = {"rad/s": 1.0, "deg/s": np.pi / 180.0}
 ACCEL_UNITS = {"m/s^2": 1.0, "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}
-# A zip may unpack to so many bytes, or to so many times its own size: sensor noise packs to a tenth.
-MOST_BYTES, MOST_GROWTH = 1 << 28, 50
+FEWEST = 3  # samples of a recording
 # Where the gyroscope's clock is not the accelerometer's, a sample is between two that are at most so many steps apart.
 LONGEST_STEPS = 2.5
 
 
+class Signal(NamedTuple):
+    """The samples of one signal of a sensor."""
+
+    time: np.ndarray  # (n,) [s]
+    values: np.ndarray  # (n, 3) in SI, or (n, 4) xyzw; NaN: lost
+
+
 @dataclass(frozen=True)
-class Device:
-    """The contents of a device's file, in SI.
+class DeviceSensor:
+    """A sensor in a device's file.
 
     Parameters
     ----------
-    format : its name, as `wepose_pin.readers.registry` knows it
-    table : `time` [s] on the device's clock, and the columns of `name_columns`
-    own_tables : label → such a table, of the sensors that have clocks of their own; these all begin at one moment
-    labels : the file's name of each sensor or segment → our segment, None where the name is not clear
-    kind : "raw" for gyro and accel, "orientation"
+    time : (n,) [s] on the device's clock
+    signals : "gyro" [rad/s] and "accel" [m/s²] (n, 3), or "orientation" (n, 4) xyzw
+    segment : that its name says; None: it is not clear
+    mount : (4,) xyzw, sensor to segment, where the file states it
+    """
+
+    time: np.ndarray
+    signals: Mapping[str, np.ndarray]
+    segment: str | None = None
+    mount: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Device:
+    """The contents of a device's file.
+
+    Parameters
+    ----------
+    kind : a key of `NEEDED`
+    sensors : the file's name of each sensor or segment → what it measured
     since_power_on : the clock starts at power-on, or at another arbitrary moment
     wraps_s : [s] after which such a clock wraps; None: it does not
     aligned : the orientations are the segments' own, in one world
-    mounts : label → (4,) xyzw, sensor to segment, where the file states it
     diagnostics : assumptions, and missing data
     """
 
-    format: str
-    table: pl.DataFrame
-    labels: Mapping[str, str | None]
     kind: str
-    since_power_on: bool = False
+    sensors: Mapping[str, DeviceSensor]
+    since_power_on: bool = True
     wraps_s: float | None = None
     aligned: bool = False
-    mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
     diagnostics: tuple[Diagnostic, ...] = ()
-    own_tables: Mapping[str, pl.DataFrame] = field(default_factory=dict)
 
-    def find_table(self, label: str) -> pl.DataFrame:
-        """Return the table with the columns of a sensor, and its clock."""
-        return self.own_tables.get(label, self.table)
-
-    def signals(self, label: str) -> dict[str, list[str]]:
-        """Return signal → columns."""
-        return {
-            name: name_columns(label, name) for name in (("gyro", "accel") if self.kind == "raw" else ("orientation",))
-        }
-
-
-def name_columns(label: str, signal: str) -> list[str]:
-    """Name the columns of a sensor's signal, one an axis."""
-    return [f"{label} {signal} {axis}" for axis in AXES[signal]]
-
-
-def make_table(time: np.ndarray, values: Mapping[str, Mapping[str, np.ndarray]]) -> pl.DataFrame:
-    """Make the table of a `Device` from times (n,) [s] and label → signal → (n, 3 or 4)."""
-    columns = {"time": time}
-    for label, signals in values.items():
-        for signal, array in signals.items():
-            columns |= dict(zip(name_columns(label, signal), array.T, strict=True))
-    return pl.DataFrame(columns)
+    @property
+    def begin(self) -> float:
+        """The earliest time [s] of its sensors."""
+        return min(float(np.nanmin(sensor.time)) for sensor in self.sensors.values())
 
 
 def make_device(
-    format: str,
-    kind: str,
-    clocks: Mapping[str, np.ndarray],
-    values: Mapping[str, Mapping[str, np.ndarray]],
-    labels: Mapping[str, str | None],
+    path: Path,
+    found: Mapping[str, Mapping[str, Signal]],
+    needs: str,
+    use: str | None = None,
+    rate_hz: float | None = None,
     diagnostics: Sequence[Diagnostic] = (),
+    hints: Mapping[str, str] | None = None,
 ) -> Device:
-    """Make a `Device` whose sensors may have clocks of their own: label → times (n,) [s], and as for `make_table`."""
-    tables = {label: make_table(clocks[label], {label: signals}) for label, signals in values.items()}
-    first, *others = tables.values()
-    if all(table["time"].equals(first["time"]) for table in others):
-        first, tables = pl.concat([first, *(table.drop("time") for table in others)], how="horizontal"), {}
-    return Device(format, first, labels, kind, True, diagnostics=tuple(diagnostics), own_tables=tables)
+    """Make a `Device` of the signals of its sensors, label → signal → samples.
+
+    Parameters
+    ----------
+    needs : what the file must have, for an error's text
+    use : "raw" or "orientation"; None: raw data where a sensor has them, else orientations
+    rate_hz : replaces the times
+    hints : label → another text that may name its segment
+
+    Raises
+    ------
+    BadData
+        No sensor has what `use` asks for; numbers that no device measures; signals without a time in common.
+    """
+    kinds = [use] if use else list(NEEDED)
+    kind = next((kind for kind in kinds if any(set(NEEDED[kind]) <= set(signals) for signals in found.values())), None)
+    if kind is None:
+        raise BadData(f"{path}: no sensor in it has {needs}{'; leave out data.use' if use else ''}")
+    sensors, diagnostics = {}, list(diagnostics)
+    chosen = {label: signals for label, signals in found.items() if set(NEEDED[kind]) <= set(signals)}
+    for label, signals in chosen.items():
+        for signal in NEEDED[kind]:
+            check_measured(path, signals[signal].values, f"{signal} of {label}")
+        place = path.name if len(found) == 1 else f"{path.name} {label}"
+        time, values, joined = join_signals(place, {name: signals[name] for name in NEEDED[kind]})
+        diagnostics += joined
+        if len(time) < FEWEST:
+            raise BadData(f"{path}: holds {len(time)} samples of {label}; the export is empty or cut off")
+        texts = [label, *([hints[label]] if hints else []), *([path.absolute().stem] if len(chosen) == 1 else [])]
+        segment = next(filter(None, map(load_table().guess_segment, texts)), None)
+        sensors[label] = DeviceSensor(np.arange(len(time)) / rate_hz if rate_hz else time, values, segment)
+    left_out = [label for label in found if label not in chosen]
+    if left_out:
+        facts = {"devices": ", ".join(left_out), "signals": " and ".join(NEEDED[kind])}
+        diagnostics.append(Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts))
+    return Device(kind, sensors, diagnostics=tuple(diagnostics))
 
 
 def convert(path: Path, signal: str, values: np.ndarray, unit: str, column: str) -> np.ndarray:
@@ -124,25 +154,27 @@ def spread_equal_times(time: np.ndarray) -> np.ndarray:
 
 
 def join_signals(
-    place: str, gyro: tuple[np.ndarray, np.ndarray], accel: tuple[np.ndarray, np.ndarray]
+    place: str, signals: Mapping[str, Signal]
 ) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Diagnostic, ...]]:
-    """Join rates and specific forces of different clocks on that of the rates: times, values, and what was done.
+    """Join signals of different clocks on that of the first: times (n,), values by signal, and what was done.
 
-    Each is times (n,) [s] and values (n, 3). Specific force between two samples is interpolated, NaN where these are
-    further apart than `LONGEST_STEPS`.
+    Values of the second signal between two samples are interpolated, NaN where these are further apart than
+    `LONGEST_STEPS`.
 
     Raises
     ------
     BadData
         They have no time in common.
     """
-    (time, rates), (own, forces) = (_drop_missing(*each) for each in (gyro, accel))
+    (name, first), *rest = signals.items()
+    if all(signal.time is first.time for _, signal in rest):
+        return first.time, {name: signal.values for name, signal in signals.items()}, ()
+    ((other, second),) = rest
+    (time, rates), (own, forces) = _drop_missing(first), _drop_missing(second)
     if len(time) < 2 or len(own) < 2 or min(time[-1], own[-1]) <= max(time[0], own[0]):
-        raise BadData(
-            f"{place}: gyroscope and accelerometer have no time in common, of {len(time)} and {len(own)} rows"
-        )
-    if len(time) == len(own) and np.array_equal(time, own):
-        return time, {"gyro": rates, "accel": forces}, ()
+        raise BadData(f"{place}: {name} and {other} have no time in common, of {len(time)} and {len(own)} rows")
+    if np.array_equal(time, own):
+        return time, {name: rates, other: forces}, ()
     inside = (time >= own[0]) & (time <= own[-1])
     time, rates = time[inside], rates[inside]
     after = np.clip(np.searchsorted(own, time), 1, len(own) - 1)
@@ -151,50 +183,33 @@ def join_signals(
     off = np.minimum(time - own[after - 1], own[after] - time)
     joined[(steps > LONGEST_STEPS * np.median(np.diff(own))) & (off > 0.0)] = np.nan
     facts = {"off": float(np.max(off, initial=0.0))}
-    return time, {"gyro": rates, "accel": joined}, (Diagnostic("signals-joined", INFO, place, facts=facts),)
+    return time, {name: rates, other: joined}, (Diagnostic("signals-joined", INFO, place, facts=facts),)
 
 
-def _drop_missing(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _drop_missing(signal: Signal) -> Signal:
     """Leave out rows without a time, spread equal stamps, and sort."""
-    known = np.isfinite(time)
-    order = np.argsort(time[known], kind="stable")
-    return spread_equal_times(time[known][order]), values[known][order]
+    known = np.isfinite(signal.time)
+    order = np.argsort(signal.time[known], kind="stable")
+    return Signal(spread_equal_times(signal.time[known][order]), signal.values[known][order])
 
 
 @contextmanager
-def open_folder(path: Path, what: str) -> Iterator[dict[str, Path]]:
+def open_folder(path: Path) -> Iterator[dict[str, Path]]:
     """Open a folder, or a zip of one, as name → file; of a file of neither kind, what lies beside it.
 
     Raises
     ------
     BadData
-        The zip is damaged, or holds far more than its size.
+        The zip is damaged.
     """
-    if not (path.is_file() and zipfile.is_zipfile(path)):
-        folder = path if path.is_dir() else path.parent
+    if path.suffix.lower() != ".zip" or path.is_dir():
+        folder = path if path.is_dir() else path.absolute().parent
         yield {file.name: file for file in sorted(folder.iterdir()) if file.is_file()}
         return
     with tempfile.TemporaryDirectory() as unpacked:
-        try:
-            with zipfile.ZipFile(path) as archive:
-                members = [each for each in archive.infolist() if each.filename.lower().endswith((".csv", ".json"))]
-                if sum(each.file_size for each in members) > max(MOST_BYTES, MOST_GROWTH * path.stat().st_size):
-                    raise BadData(f"{path}: holds far more than its size; no {what} packs so well")
-                for k, member in enumerate(members):  # a name may lead out of the folder
-                    name = PurePosixPath(member.filename).name
-                    (Path(unpacked) / str(k)).mkdir()
-                    (Path(unpacked) / str(k) / name).write_bytes(archive.read(member))
-        except (
-            zipfile.BadZipFile,
-            zlib.error,
-            NotImplementedError,
-            RuntimeError,
-            OSError,
-            EOFError,
-            ValueError,
-        ) as error:
-            raise BadData(f"{path}: is a damaged zip: {error}") from error
-        yield {file.name: file for file in sorted(Path(unpacked).glob("*/*"))}
+        with library_errors(path, "a zip"), zipfile.ZipFile(path) as archive:
+            archive.extractall(unpacked)
+        yield {file.name: file for file in sorted(Path(unpacked).rglob("*")) if file.is_file()}
 
 
 def check_measured(path: Path, values: np.ndarray, what: str) -> None:
@@ -217,7 +232,5 @@ def read_first_lines(path: Path, most: int = 100) -> list[str]:
         with path.open("rb") as file:
             # The limit bounds the memory for a file without line ends.
             return [file.readline(2**16).decode("utf-8-sig", errors="replace").rstrip("\r\n") for _ in range(most)]
-    except FileNotFoundError:
-        raise MissingFile(f"{path}: no such file") from None
     except OSError as error:
         raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error

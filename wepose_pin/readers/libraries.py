@@ -10,7 +10,14 @@ from typing import Any
 
 import polars as pl
 
-from ..errors import BadData, WeposeError, how_to_install, native_stderr_muted, reason
+from ..errors import BadData, MissingFile, WeposeError, how_to_install, native_stderr_muted, reason
+
+
+def check_file(path: Path, kind: str) -> None:
+    """Raise `MissingFile` where `path` is no regular file; its `kind` is such as "a C3D"."""
+    if not path.is_file():
+        found = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
+        raise MissingFile(f"{path}: {found}; {kind} is wanted here")
 
 
 def import_library(module: str, path: Path, kind: str) -> Any:
@@ -30,12 +37,12 @@ def import_library(module: str, path: Path, kind: str) -> Any:
 
 @contextmanager
 def library_errors(path: Path, kind: str) -> Iterator[None]:
-    """Turn what a library raises on a file that it cannot read into one line; `kind` is such as "a C3D".
+    """Turn what is raised on a file that cannot be read into one line; `kind` is such as "a C3D".
 
     Raises
     ------
     BadData
-        The library raised an error.
+        A library, or the code of the block, raised an error of another kind than ours.
     """
     try:
         with native_stderr_muted():  # polars prints its panics, which are no Exception

@@ -27,16 +27,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..documents import TomlTable, is_number
-from ..errors import BadData, MissingFile
+from ..errors import BadData
 from ..recording import ImuSensor, Intervals, Mark, OrientationSensor, Recording, Sensor, check_recording
 from ..recording.arrivals import Arrivals, StreamSynchronizer, Ticks, unpack_orientations
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge, bridge_quat
-from .device import Device, make_table
-from .session_file import read_phases
+from .device import Device, DeviceSensor
+from .libraries import check_file, library_errors
 
-EARLIER = b"WEPOSE-LIVE-1\n"  # a file of an earlier version begins so
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "wepose-live"
 HEADER, SENSORS, EVENTS, POSES = "wepose", "/sensors/", "/events", "/pose"  # name of the metadata, and topics
@@ -47,16 +45,7 @@ SAMPLE_BYTES = 57  # of a sample in the file, at least
 MOST_SILENT = 3_000_000
 MOST_RATE, MOST_WAIT_S = 10_000.0, 10.0
 LONGEST_TEXT = 200  # letters of a phase's name, or of a marked text
-_EVENTS = {
-    "clock": ("rate_hz", "begin", "wait_s"),
-    "start": ("begin", "end"),
-    "reset": ("tick",),
-    "begin": ("phase", "time"),
-    "end": ("phase", "time"),
-    "discard": ("phase",),
-    "mark": ("text", "time"),
-    "assign": ("segments",),
-}
+KIND = "a recording of wepose live"
 _VECTOR = {"type": "array", "items": {"type": "number"}}
 SCHEMAS: dict[str, dict[str, Any]] = {
     name: {"type": "object", "properties": properties}
@@ -112,30 +101,17 @@ class LiveRecording(NamedTuple):
     """The contents of a live session's recording."""
 
     recording: Recording  # on its ticks, with its start pose, marked phases and texts, and resets
-    header: dict[str, Any]  # as `HEAD`
+    header: dict[str, Any]  # the settings before the first sample
     first: int  # tick of the first pose
     quat_WL: np.ndarray  # (n, k, 4) xyzw, the live poses, in the order of the header's sensors
 
 
 def is_live_log(path: Path) -> bool:
-    """Return whether the file is the recording of a live session.
-
-    Raises
-    ------
-    BadData
-        It is one of an earlier version.
-    """
+    """Return whether the file is the recording of a live session."""
     if not path.is_file():  # a pipe would block
         return False
-    try:
-        with path.open("rb") as file:
-            start = file.read(64)
-    except OSError:
-        return False
-    if start.startswith(EARLIER):
-        raise BadData(
-            f"{path}: recorded by an earlier version, whose files are no longer read; record again, to an .mcap"
-        )
+    with library_errors(path, KIND), path.open("rb") as file:
+        start = file.read(64)
     # The magic, opcode and length of the header, then the profile with its length.
     return start.startswith(MAGIC) and start[17:].startswith(len(PROFILE).to_bytes(4, "little") + PROFILE.encode())
 
@@ -148,38 +124,41 @@ def read_live_log(path: Path) -> LiveRecording:
     MissingFile, BadData
         The file is missing, is no such recording, or ends before the start pose.
     """
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file; `wepose live --record FILE` writes one")
+    check_file(path, f"{KIND}, as --record writes one,")
     if not is_live_log(path):
         raise BadData(f"{path}: is not the recording of a live session")
-    content = _read_content(path)
-    header, markers = content.header, Markers()
-    synchronizer: StreamSynchronizer | None = None
-    start: tuple[int, int] | None = None
-    resets = []
-    for kind, event in content.events:
-        if kind == "clock":
-            clock = event["rate_hz"], event["begin"], event["wait_s"]
-            synchronizer = StreamSynchronizer(header["sensors"], *clock, header["orientations"])
-        elif kind == "start":
-            start = int(event["begin"]), int(event["end"])
-        elif kind == "reset":
-            resets.append(int(event["tick"]))
-        else:
-            markers.add(kind, event)
-    ticks = [] if synchronizer is None else [_make_ticks(path, synchronizer, content.arrivals)]
-    if synchronizer is None or synchronizer.next_tick < 2:
-        raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
-    resets = [tick for tick in resets if tick < synchronizer.next_tick]
-    if start is not None and synchronizer.next_tick <= start[1] + 1:
-        raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
-    header["sensors"] = _assign_segments(path, header["sensors"], markers.segments)
-    ends = synchronizer.begin, synchronizer.begin + (synchronizer.next_tick - 1) / synchronizer.rate_hz
-    header["phases"] = {**header["phases"], **markers.phases(*ends)}
-    if start is None and not any(end <= ends[1] for _, end in header["phases"].get("start", ())):
-        raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
-    recording = check_recording(build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets)))
-    recording = replace(recording, marks=tuple(markers.texts))
+    with library_errors(path, KIND):
+        content = _read_content(path)
+        header, markers = content.header, Markers()
+        synchronizer: StreamSynchronizer | None = None
+        start: tuple[int, int] | None = None
+        resets = []
+        for event in content.events:
+            kind = event["kind"]
+            if kind == "clock":
+                if not (0.1 <= event["rate_hz"] <= MOST_RATE and 0.0 <= event["wait_s"] <= MOST_WAIT_S):
+                    raise BadData(f"{path}: ticks at {event['rate_hz']:g} Hz; the file is damaged")
+                clock = event["rate_hz"], event["begin"], event["wait_s"]
+                synchronizer = StreamSynchronizer(header["sensors"], *clock, header["orientations"])
+            elif kind == "start":
+                start = int(event["begin"]), int(event["end"])
+            elif kind == "reset":
+                resets.append(int(event["tick"]))
+            else:
+                markers.add(kind, event)
+        ticks = [] if synchronizer is None else [_make_ticks(path, synchronizer, content.arrivals)]
+        if synchronizer is None or synchronizer.next_tick < 2:
+            raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
+        resets = [tick for tick in resets if tick < synchronizer.next_tick]
+        if start is not None and synchronizer.next_tick <= start[1] + 1:
+            raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
+        header["sensors"] = [markers.segments.get(name, name) for name in header["sensors"]]
+        ends = synchronizer.begin, synchronizer.begin + (synchronizer.next_tick - 1) / synchronizer.rate_hz
+        header["phases"] = {**header["phases"], **markers.phases(*ends)}
+        if start is None and not any(end <= ends[1] for _, end in header["phases"].get("start", ())):
+            raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
+        recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets))
+    recording = replace(check_recording(recording), marks=tuple(markers.texts))
     if not content.is_complete:
         killed = Diagnostic("live-recording-incomplete", WARNING, path.name, facts={"variant": "killed"})
         recording = replace(recording, diagnostics=(killed,))
@@ -196,14 +175,6 @@ def _make_ticks(path: Path, synchronizer: StreamSynchronizer, arrivals: Arrivals
     return synchronizer.push(Arrivals(*(column[~far] for column in arrivals)) if far.any() else arrivals)
 
 
-def _assign_segments(path: Path, sensors: Sequence[str], segments: Mapping[str, str]) -> list[str]:
-    """The segments of the sensors (k) after those that were assigned to another one."""
-    assigned = [segments.get(name, name) for name in sensors]
-    if not set(segments) <= set(sensors) or len(set(assigned)) < len(assigned):
-        raise BadData(f"{path}: segments = {dict(segments)!r} of sensors {list(sensors)!r}; the file is damaged")
-    return assigned
-
-
 def read_live_device(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
     """Read a live recording as a device, for a session that names the file and adds phases; lost samples are NaN.
 
@@ -214,39 +185,28 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     """
     if rate_hz is not None:
         raise BadData(f"{path}: rate_hz = {rate_hz:g}: a live recording has times of its own; leave it out")
-    log = read_live_log(path)
-    kinds = {"orientation" if isinstance(s, OrientationSensor) else "raw" for s in log.recording.sensors.values()}
+    recording = read_live_log(path).recording
+    kinds = {"orientation" if isinstance(sensor, OrientationSensor) else "raw" for sensor in recording.sensors.values()}
     kind = kinds.pop()
     if kinds or use not in (None, kind):
         held = "raw data of some sensors and orientations of others" if kinds else f"'{kind}' of its sensors"
         remedy = "track it as it is" if kinds else "leave it out"
         raise BadData(f"{path}: use = {use!r}: the live recording holds {held}; {remedy}")
-    values = {}
-    for label, sensor in log.recording.sensors.items():
-        lost = np.zeros((len(log.recording), 1), dtype=bool) if sensor.gap is None else sensor.gap[:, None]
-        if isinstance(sensor, OrientationSensor):
-            signals = {"orientation": sensor.quat_WS}
-        else:
-            signals = {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
-        values[label] = {name: np.where(lost, np.nan, signal) for name, signal in signals.items()}
-    mounts = {
-        label: sensor.stated_quat_LS
-        for label, sensor in log.recording.sensors.items()
-        if sensor.stated_quat_LS is not None
-    }
-    resets = log.recording.resets
-    diagnostics = list(log.recording.diagnostics)
-    if resets:
-        diagnostics.append(Diagnostic("heading-resets-not-repeated", INFO, path.name, len(resets)))
-    return Device(
-        "wepose_live",
-        make_table(log.recording.time, values),
-        {label: label for label in values},
-        kind,
-        aligned=all(sensor.aligned for sensor in log.recording.sensors.values()),
-        mounts=mounts,
-        diagnostics=tuple(diagnostics),
-    )
+    sensors = {}
+    for name, sensor in recording.sensors.items():
+        signals = (
+            {"orientation": sensor.quat_WS}
+            if isinstance(sensor, OrientationSensor)
+            else {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
+        )
+        if sensor.gap is not None:
+            signals = {key: np.where(sensor.gap[:, None], np.nan, values) for key, values in signals.items()}
+        sensors[name] = DeviceSensor(recording.time, signals, name, sensor.stated_quat_LS)
+    diagnostics = recording.diagnostics
+    if recording.resets:
+        diagnostics += (Diagnostic("heading-resets-not-repeated", INFO, path.name, len(recording.resets)),)
+    aligned = all(sensor.aligned for sensor in recording.sensors.values())
+    return Device(kind, sensors, since_power_on=False, aligned=aligned, diagnostics=diagnostics)
 
 
 class _Content(NamedTuple):
@@ -254,7 +214,7 @@ class _Content(NamedTuple):
 
     header: dict[str, Any]
     arrivals: Arrivals
-    events: list[tuple[str, dict[str, Any]]]
+    events: list[dict[str, Any]]
     first: int  # tick of the first pose
     quat_WL: np.ndarray  # (n, k, 4) xyzw
     is_complete: bool  # nothing is missing at its end
@@ -285,28 +245,29 @@ def read_messages(path: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def _read_content(path: Path) -> _Content:
-    header: dict[str, Any] | None = None
+    header: dict[str, Any] = {}
     events, is_complete = [], False
     samples, poses = array("d"), array("d")  # eight numbers a sample, and a tick with four numbers a sensor
     for topic, text in read_messages(path):
         if not topic:
             is_complete = True
-        elif topic == HEADER:
-            header = header or _header(path, text)
-        elif header is None:
-            raise BadData(f"{path}: begins without a header; the file is damaged")
+            continue
+        message = json.loads(text)
+        if topic == HEADER and not header:
+            if message["format"] != FORMAT:
+                raise BadData(f"{path}: is of format {message['format']}; this version reads format {FORMAT}")
+            header = {"subject": None, "joints": {}, "model": "", "orientations": {}, **message}
         elif topic == EVENTS:
-            events.append(_event(path, text))
-        else:
-            message = _json(path, text)
-            try:
-                if topic == POSES:
-                    poses.extend(_list_pose(message, header["sensors"]))
-                else:
-                    samples.extend(_list_sample(message, header["sensors"].index(topic.removeprefix(SENSORS))))
-            except (ValueError, TypeError, KeyError, OverflowError) as error:
-                raise BadData(f"{path}: a message {text[:80]!r} of {topic}: {error!r}; the file is damaged") from None
-    if header is None:
+            events.append(message)
+        elif topic == POSES:
+            poses.append(message["tick"])
+            for name in header["sensors"]:
+                poses.extend(message["quat_WL"][name])
+        elif topic.startswith(SENSORS):
+            samples.extend((header["sensors"].index(topic.removeprefix(SENSORS)), message["t"]))
+            packed = [*message["orientation"], 0.0, 0.0] if "orientation" in message else None
+            samples.extend(packed or [*message["gyro"], *message["accel"]])
+    if not header:
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     which, time, gyro, accel = np.split(np.array(samples).reshape(-1, 8), [1, 2, 5], axis=1)
     arrivals = Arrivals(which[:, 0].astype(np.uint8), time[:, 0].copy(), gyro.copy(), accel.copy())
@@ -314,93 +275,6 @@ def _read_content(path: Path) -> _Content:
     rows = np.array(poses).reshape(-1, 1 + 4 * count)
     first = int(rows[0, 0]) if len(rows) else 0
     return _Content(header, arrivals, events, first, rows[:, 1:].reshape(-1, count, 4).copy(), is_complete)
-
-
-def _list_sample(message: Mapping[str, Any], sensor: int) -> tuple[float, ...]:
-    """The sensor's number, the time and six numbers of a sample, an orientation packed."""
-    if "orientation" in message:
-        x, y, z, w = message["orientation"]
-        return sensor, message["t"], x, y, z, w, 0.0, 0.0
-    (gx, gy, gz), (ax, ay, az) = message["gyro"], message["accel"]
-    return sensor, message["t"], gx, gy, gz, ax, ay, az
-
-
-def _list_pose(message: Mapping[str, Any], sensors: Sequence[str]) -> list[float]:
-    """The tick, and four numbers of each sensor."""
-    row = [float(int(message["tick"]))]
-    for name in sensors:
-        x, y, z, w = message["quat_WL"][name]
-        row += x, y, z, w
-    return row
-
-
-def _header(path: Path, payload: bytes) -> dict[str, Any]:
-    header = _json(path, payload)
-    sensors = header.get("sensors")
-    named = isinstance(sensors, list) and sensors and all(isinstance(name, str) for name in sensors)
-    if header.get("format") != FORMAT or not named or len(set(sensors or ())) < len(sensors or ()):
-        raise BadData(
-            f"{path}: format {header.get('format')!r} with sensors {sensors!r}; this version reads format {FORMAT}"
-        )
-    texts = [header.get(key) for key in ("name", "start_pose", "method")]
-    mounts, phases = header.get("mounts"), header.get("phases")
-    well = isinstance(header.get("subject") or "", str) and isinstance(header.get("remounted"), bool)
-    if not (well and all(isinstance(text, str) for text in texts)):
-        raise BadData(f"{path}: its header lacks name, start_pose, remounted or method; the file is damaged")
-    if not (isinstance(mounts, dict) and all(_is_quat(mount) for mount in mounts.values())):
-        raise BadData(f"{path}: mounts = {mounts!r} in its header; a unit quaternion x, y, z, w each is needed")
-    read_phases(TomlTable(phases if isinstance(phases, dict) else {"phases": phases}, str(path), "phases."))
-    joints, model = header.get("joints", {}), header.get("model", "")
-    if not isinstance(model, str) or not isinstance(joints, dict) or not all(map(is_number, joints.values())):
-        raise BadData(f"{path}: joints = {joints!r}, model = {model!r} in its header; the file is damaged")
-    orientations = header.get("orientations", {})
-    if not isinstance(orientations, dict) or not set(orientations) <= set(sensors or ()):
-        raise BadData(f"{path}: orientations = {orientations!r} in its header; the file is damaged")
-    return {"subject": None, "joints": {}, "model": "", "orientations": {}, **header}
-
-
-def _is_quat(value: Any) -> bool:
-    numbers = isinstance(value, list) and len(value) == 4 and all(is_number(v, 2.0) for v in value)
-    return numbers and abs(float(np.linalg.norm(value)) - 1.0) < 1e-6
-
-
-def _json(path: Path, payload: bytes) -> dict[str, Any]:
-    try:
-        content = json.loads(payload)
-    except (ValueError, RecursionError) as error:
-        raise BadData(f"{path}: holds JSON that is none: {error}; the file is damaged") from error
-    if not isinstance(content, dict):
-        raise BadData(f"{path}: holds {str(content)[:40]!r} in place of an object; the file is damaged")
-    return content
-
-
-def _event(path: Path, payload: bytes) -> tuple[str, dict[str, Any]]:
-    """Read kind and values of an event; an unknown kind has none."""
-    event = _json(path, payload)
-    kind = str(event.get("kind"))
-    values = {name: event.get(name) for name in _EVENTS.get(kind, ())}
-    if not _is_event(kind, values):
-        raise BadData(f"{path}: an event '{kind}' with {values!r}; the file is damaged")
-    return kind, values
-
-
-def _is_event(kind: str, values: Mapping[str, Any]) -> bool:
-    """Whether the values are such as an event of this kind has."""
-    texts = [values[name] for name in ("phase", "text") if name in values]
-    if not all(isinstance(text, str) and 0 < len(text) <= LONGEST_TEXT for text in texts):
-        return False
-    if "segments" in values:
-        segments = values["segments"]
-        return isinstance(segments, dict) and all(isinstance(segment, str) for segment in segments.values())
-    numbers = [value for name, value in values.items() if name not in ("phase", "text")]
-    if not all(is_number(value, 1e12) for value in numbers):
-        return False
-    if kind == "clock":
-        return bool(0.1 <= values["rate_hz"] <= MOST_RATE and 0.0 <= values["wait_s"] <= MOST_WAIT_S)
-    if kind in ("start", "reset"):
-        ticks = [int(value) for value in numbers if value == int(value)]
-        return len(ticks) == len(numbers) and ticks == sorted(set(ticks)) and min(ticks, default=0) >= 0
-    return True
 
 
 def _cut_spans(phase: str, spans: Sequence[Sequence[float]], time: np.ndarray) -> Intervals:

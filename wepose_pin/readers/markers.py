@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -46,33 +46,30 @@ def read_marker_table(path: Path | None = None) -> MarkerTable:
     MissingFile, BadSession, BadData
         No such file; no TOML; an unknown key; an entry that is none.
     """
-    table = _parse(TomlTable(read_toml(SHIPPED, "a table of markers"), str(SHIPPED)))
+    table = _read_table(SHIPPED)
     if path is None:
         return table
-    own = _parse(TomlTable(read_toml(path, "a table of markers"), str(path)))
-    return MarkerTable(
-        {name: [*own.points.get(name, ()), *table.points.get(name, ())] for name in {**table.points, **own.points}},
-        {
-            name: [*own.segments.get(name, ()), *table.segments.get(name, ())]
-            for name in {**table.segments, **own.segments}
-        },
-        {**table.rotations, **own.rotations},
-        own.points,
-    )
+    own = _read_table(path)
+
+    def join(ours: Mapping[str, Any], theirs: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: [*theirs.get(name, ()), *ours.get(name, ())] for name in {**ours, **theirs}}
+
+    points, segments = join(table.points, own.points), join(table.segments, own.segments)
+    return MarkerTable(points, segments, {**table.rotations, **own.rotations}, own.points)
 
 
-def _parse(top: TomlTable) -> MarkerTable:
-    top.allow("points", "segments", "rotations")
-    points: dict[str, list[list[str]]] = {}
-    segments: dict[str, list[dict[str, list[list[str]]]]] = {}
-    names: dict[str, str] = {}
-    for key, target in (("points", points), ("segments", segments), ("rotations", names)):
+def _read_table(path: Path) -> MarkerTable:
+    top = TomlTable(read_toml(path, "a table of markers"), str(path))
+    top.allow(*_FORMS)
+    entries: dict[str, dict[str, Any]] = {key: {} for key in _FORMS}
+    for key, (form, is_of_form) in _FORMS.items():
         for name, value in top.table(key, {}).values.items():
             for side in SIDES if "{" in name else SIDES[:1]:
-                written = _write_side(value, side)
-                _check(top, key, name, written)
-                target[str(_write_side(name, side))] = written
-    return MarkerTable(points, segments, names)
+                entry = _write_side(value, side)
+                if not is_of_form(entry):
+                    raise BadData(f"{top.at(key)}.{name} = {str(entry)[:60]}; {form} is needed")
+                entries[key][_write_side(name, side)] = entry
+    return MarkerTable(**entries)
 
 
 def _write_side(value: Any, side: Mapping[str, str]) -> Any:
@@ -85,30 +82,30 @@ def _write_side(value: Any, side: Mapping[str, str]) -> Any:
     return {key: _write_side(each, side) for key, each in value.items()} if isinstance(value, dict) else value
 
 
-def _check(top: TomlTable, key: str, name: str, value: Any) -> None:
-    """Raise an error where an entry is not of its kind."""
+def _are_names(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(name, str) for name in value)
 
-    def is_names(each: Any) -> bool:
-        return isinstance(each, list) and bool(each) and all(isinstance(text, str) for text in each)
 
-    if key == "points":
-        good, form = (
-            isinstance(value, list) and all(map(is_names, value)),
-            '[["A", "B"], ["C"]], ways, each of markers',
-        )
-    elif key == "rotations":
-        good, form = isinstance(value, str), "the name of a rotation"
-    else:
-        form = '[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions from markers to markers'
-        good = isinstance(value, list) and all(
-            isinstance(way, dict)
-            and len(way) == 2
-            and len({DIRECTIONS.get(direction) for direction in way} - {None}) == 2
-            and all(isinstance(ends, list) and len(ends) == 2 and all(map(is_names, ends)) for ends in way.values())
-            for way in value
-        )
-    if not good:
-        raise BadData(f"{top.at(key)}.{name} = {str(value)[:60]}; {form} is needed")
+def _are_directions(value: Any) -> bool:
+    """Whether a value is a way to orient a segment: two directions of different axes, each from markers to markers."""
+    if not isinstance(value, dict) or len(value) != 2 or len({DIRECTIONS.get(each) for each in value} - {None}) != 2:
+        return False
+    return all(isinstance(ends, list) and len(ends) == 2 and all(map(_are_names, ends)) for ends in value.values())
+
+
+def _are_all(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, list) and all(map(test, value))
+
+
+# Table → what its entries look like, and the test of one.
+_FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "points": ('[["A", "B"], ["C"]], ways, each of markers', _are_all(_are_names)),
+    "segments": (
+        '[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions from markers to markers',
+        _are_all(_are_directions),
+    ),
+    "rotations": ("the name of a rotation", lambda value: isinstance(value, str)),
+}
 
 
 def locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], table: MarkerTable) -> Reference:
@@ -154,19 +151,13 @@ def _orient(segment: str, frame: Mapping[str, Sequence[Sequence[str]]], known: M
         axes[DIRECTIONS[direction]] = sign * along
     (first, kept), (second, near) = axes.items()
     third = ({"x", "y", "z"} - {first, second}).pop()
-    order = "xyz".index(second) - "xyz".index(first)
-    across = np.cross(kept, near) * (1.0 if order in (1, -2) else -1.0)
+    in_order = first + second in "xyzx"
+    across = np.cross(kept, near) if in_order else np.cross(near, kept)
     with np.errstate(invalid="ignore", divide="ignore"):
-        axes = {
-            first: kept / np.linalg.norm(kept, axis=1)[:, None],
-            third: across / np.linalg.norm(across, axis=1)[:, None],
-        }
-    axes[second] = np.cross(axes[third], axes[first]) * (
-        1.0 if "xyz".index(first) - "xyz".index(third) in (1, -2) else -1.0
-    )
+        axes = {name: v / np.linalg.norm(v, axis=1)[:, None] for name, v in ((first, kept), (third, across))}
+    axes[second] = np.cross(axes[third], axes[first]) if in_order else np.cross(axes[first], axes[third])
     R = np.stack([axes[axis] for axis in "xyz"], axis=2)
     quat = np.full((len(R), 4), np.nan)
     good = np.isfinite(R).all(axis=(1, 2))
-    if good.any():
-        quat[good] = Rotation.from_matrix(R[good]).as_quat()
+    quat[good] = Rotation.from_matrix(R[good]).as_quat()
     return quat

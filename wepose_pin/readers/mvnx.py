@@ -14,17 +14,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadData, MissingFile
+from ..errors import BadData
 from ..model import load_table
 from ..model.table import ROOT
-from .device import Device, check_measured, make_table
+from .device import Device, DeviceSensor, check_measured
+from .libraries import library_errors
 from .markers import Reference
 
 SEGMENT_OF = {
@@ -98,35 +99,32 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         Not there; no MVNX, damaged, cut off, or without what `use` asks for; arms that do not lie along their frames.
     """
     frames = read_frames(path, rate_hz)
-    assumed: tuple[Diagnostic, ...] = ()
     raw = {"sensorAngularVelocity", "sensorAcceleration"} <= set(frames.values)
     if use == "raw" and not raw:
         raise BadData(
             f"{path}: no sensorAngularVelocity and sensorAcceleration; MVN writes them no more since 2018. Leave out "
             f"data.use, and its segments' orientations are read"
         )
+    diagnostics: tuple[Diagnostic, ...] = ()
+    signals: dict[str, dict[str, np.ndarray]]
     if raw and use != "orientation":
         gyro, accel = frames.values["sensorAngularVelocity"], frames.values["sensorAcceleration"]
-        values = {
-            label: {"gyro": gyro[:, k], "accel": accel[:, k]}
-            for k, label in enumerate(frames.sensors)
-            if label in SEGMENT_OF
-        }
+        signals = {label: {"gyro": gyro[:, k], "accel": accel[:, k]} for k, label in enumerate(frames.sensors)}
+        kind = "raw"
     else:
-        values = {label: {"orientation": quat} for label, quat in _read_orientations(path, frames).items()}
+        signals = {label: {"orientation": quat} for label, quat in _read_orientations(path, frames).items()}
+        kind = "orientation"
         if frames.t_pose is None:
-            assumed = (Diagnostic("arm-frames-assumed", WARNING, path.name),)
-    if not values:
+            diagnostics = (Diagnostic("arm-frames-assumed", WARNING, path.name),)
+    sensors = {
+        label: DeviceSensor(frames.time, values, SEGMENT_OF[label])
+        for label, values in signals.items()
+        if label in SEGMENT_OF
+    }
+    if not sensors:
         listed = ", ".join(frames.segments[:12])
         raise BadData(f"{path}: none of the upper body's segments, such as T8; there is: {listed}")
-    return Device(
-        "mvnx",
-        make_table(frames.time, values),
-        {label: SEGMENT_OF[label] for label in values},
-        "raw" if raw and use != "orientation" else "orientation",
-        aligned=not raw or use == "orientation",
-        diagnostics=assumed,
-    )
+    return Device(kind, sensors, since_power_on=False, aligned=kind == "orientation", diagnostics=diagnostics)
 
 
 def read_mvnx_reference(path: Path) -> Reference:
@@ -253,117 +251,76 @@ def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
 
     Raises
     ------
-    MissingFile, BadData
-        Not there; no MVNX, damaged or cut off; frames of unlike size; entities, which MVNX has no use for.
+    BadData
+        Not there; no MVNX, damaged or cut off; frames of unlike size.
     """
     from lxml import etree
 
-    segments: list[str] = []
-    sensors: list[str] = []
+    labels: dict[str, list[str]] = {"segment": [], "sensor": []}
     times: list[tuple[str, str]] = []
     texts: dict[str, list[str]] = {}
     t_pose: list[str] = []
-    own_rate_hz = 0.0
-    try:
-        with path.open("rb") as file:
-            # Entities are not expanded and other files not fetched, so that a file cannot grow in memory.
-            events = etree.iterparse(
-                file, events=("start", "end"), resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
-            )
-            root = None
-            for event, element in events:
-                if root is None:
-                    root = element
-                    _check_root(path, root)
-                name = _name(element)
-                if event == "start":
-                    if name == "subject" and rate_hz is None:
-                        own_rate_hz = _number(path, element, "frameRate")
-                elif name in ("segment", "sensor") and element.get("label"):
-                    (segments if name == "segment" else sensors).append(element.get("label"))
-                elif name == "frame":
-                    if element.get("type", "normal") == "normal":
-                        times.append((element.get("index", ""), element.get("time", "")))
-                        for child in element:
-                            if (tag := _name(child)) in WIDTH:
-                                texts.setdefault(tag, []).append(child.text or "")
-                    elif element.get("type") == "tpose":
-                        t_pose = [child.text or "" for child in element if _name(child) == "orientation"][:1]
-                    element.clear()
-                    while element.getprevious() is not None:
-                        del element.getparent()[0]
-    except OSError:
-        raise MissingFile(f"{path}: no such file, or it cannot be read; an .mvnx file is wanted here") from None
-    except etree.XMLSyntaxError as error:
-        read = f" after {len(times)} frames" if times else ""
-        raise BadData(
-            f"{path}: is damaged or cut off in line {error.lineno}{read}: {' '.join((error.msg or 'no XML').split())}; "
-            f"export it again"
-        ) from error
+    with library_errors(path, "an MVNX"), path.open("rb") as file:
+        # Entities are not expanded and other files not fetched, so that a file cannot grow in memory.
+        tags = ("{*}segment", "{*}sensor", "{*}frame", "{*}subject")
+        for _, element in etree.iterparse(file, tag=tags, resolve_entities=False, no_network=True, load_dtd=False):
+            name = etree.QName(element).localname
+            if name in labels and element.get("label"):
+                labels[name].append(element.get("label"))
+            elif name == "subject":
+                rate_hz = rate_hz or _read_rate(path, element.get("frameRate", ""))
+            elif name == "frame":
+                if element.get("type", "normal") == "normal":
+                    times.append((element.get("index", ""), element.get("time", "")))
+                    for tag in WIDTH:
+                        if (text := element.findtext(f"{{*}}{tag}")) is not None:
+                            texts.setdefault(tag, []).append(text)
+                elif element.get("type") == "tpose":
+                    t_pose = [element.findtext("{*}orientation") or ""]
+                element.clear()
+                while element.getprevious() is not None:
+                    del element.getparent()[0]
     if len(times) < 2:
         raise BadData(f"{path}: {len(times)} frames of type 'normal'; a recording has at least 2")
     if "orientation" not in texts:
         raise BadData(f"{path}: its frames hold no <orientation>; export it with the segments' orientations")
-    values = {
-        tag: _values(path, tag, rows, len(segments) if tag in ("orientation", "position") else len(sensors), len(times))
-        for tag, rows in texts.items()
-    }
-    quats = _values(path, "orientation", t_pose, len(segments), len(t_pose)).reshape(-1, 4)
-    return Frames(
-        _times(path, times, rate_hz or own_rate_hz),
-        segments,
-        sensors,
-        values,
-        _select_good(quats)[0] if len(quats) and _select_good(quats)[1].all() else None,
-    )
+    values = {}
+    for tag, rows in texts.items():
+        if len(rows) != len(times):
+            raise BadData(f"{path}: <{tag}> stands in {len(rows)} of {len(times)} frames; it is needed in all")
+        values[tag] = _read_values(path, tag, rows, len(labels["sensor" if tag.startswith("sensor") else "segment"]))
+    quats, good = _select_good(_read_values(path, "orientation", t_pose, len(labels["segment"])).reshape(-1, 4))
+    time = _read_times(path, times, rate_hz)
+    return Frames(time, labels["segment"], labels["sensor"], values, quats if t_pose and good.all() else None)
 
 
-def _name(element: Any) -> str:
-    """Return an element's name without its namespace; empty for comments and the like."""
-    return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
-
-
-def _check_root(path: Path, root: Any) -> None:
-    if _name(root) != "mvnx":
-        raise BadData(f"{path}: is XML, but no MVNX: its root is <{_name(root)}>, not <mvnx>")
-    dtd = root.getroottree().docinfo.internalDTD
-    if dtd is not None and any(True for _ in dtd.iterentities()):
-        raise BadData(f"{path}: declares entities (<!ENTITY …>), which no MVNX has; it is not read")
-
-
-def _number(path: Path, element: Any, name: str) -> float:
-    text = element.get(name, "")
+def _read_rate(path: Path, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = 0.0
     if not 1.0 <= value <= 10000.0:
-        raise BadData(f"{path}: subject {name}='{text}' is no rate; frames a second are needed there")
+        raise BadData(f"{path}: subject frameRate='{text}' is no rate; frames a second are needed there")
     return value
 
 
-def _values(path: Path, tag: str, rows: list[str], count: int, frames: int) -> np.ndarray:
+def _read_values(path: Path, tag: str, rows: Sequence[str], count: int) -> np.ndarray:
     """Read an element's numbers (frames, count, width)."""
-    size = WIDTH[tag] * count
-    if len(rows) != frames:
-        raise BadData(f"{path}: <{tag}> stands in {len(rows)} of {frames} frames; it is needed in all")
-    values = np.empty((frames, size))
+    values = np.empty((len(rows), WIDTH[tag] * count))
     for k, text in enumerate(rows):
         try:
-            row = np.array(text.split(), dtype=float)
+            values[k] = np.array(text.split(), dtype=float).reshape(values.shape[1])
         except ValueError:
-            raise BadData(f"{path}: <{tag}> of frame {k} holds something else than numbers: '{text[:40]}'") from None
-        if len(row) != size:
             raise BadData(
-                f"{path}: <{tag}> of frame {k} holds {len(row)} numbers; {WIDTH[tag]} for each of {count} are needed"
-            )
-        values[k] = row
+                f"{path}: <{tag}> of frame {k} begins with '{text[:40]}'; {WIDTH[tag]} numbers for each of {count} are "
+                f"needed"
+            ) from None
     check_measured(path, values, f"<{tag}>")
-    return values.reshape(frames, count, WIDTH[tag])
+    return values.reshape(len(rows), count, WIDTH[tag])
 
 
-def _times(path: Path, times: list[tuple[str, str]], rate_hz: float) -> np.ndarray:
-    """Times (n,) [s]: the frames' numbers over the rate, as `time` is cut to milliseconds."""
+def _read_times(path: Path, times: Sequence[tuple[str, str]], rate_hz: float | None) -> np.ndarray:
+    """Read times (n,) [s]: the frames' numbers over the rate, as `time` is cut to milliseconds."""
     try:
         index = np.array([float(number) for number, _ in times])
     except ValueError:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import MissingFile
 from .c3d import read_c3d
+from .libraries import check_file
 from .markers import Reference, read_marker_table
 from .mvnx import read_mvnx_reference
 from .trc import read_trc
@@ -26,8 +26,7 @@ def read_reference(path: Path, markers: Path | None = None) -> Reference:
     MissingFile, BadData
         Not there; damaged; without what is needed.
     """
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file; a C3D, TRC or MVNX is wanted here")
+    check_file(path, "a C3D, TRC or MVNX")
     suffix = path.suffix.lower()
     if suffix == ".mvnx":
         return read_mvnx_reference(path)

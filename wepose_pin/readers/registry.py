@@ -2,35 +2,65 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
-from ..errors import BadData, BadSession, MissingFile, WeposeError, one_of
+import numpy as np
+
+from ..errors import BadData, BadSession, WeposeError, one_of
 from .device import Device, read_first_lines
+from .libraries import check_file
 from .live_log import is_live_log, read_live_device
 from .mvnx import read_mvnx
 from .opensim import read_opensim
 from .rosbag import SUFFIXES as ROSBAGS
 from .rosbag import is_rosbag, read_rosbag
 from .sensor_logger import is_sensor_logger, read_sensor_logger
-from .table_format import TableFormat, detects, load_format, load_formats, read_table_format
+from .table_format import detects, load_format, load_formats, read_table_format
 from .xdf import is_xdf, read_xdf
 
-# Formats that are no tables of one kind: title, and reader.
-MODULES: Mapping[str, tuple[str, Callable[[Path, str | None, float | None], Device]]] = {
-    "mvnx": ("Xsens MVNX", read_mvnx),
-    "sensor_logger": ("recording of Sensor Logger", read_sensor_logger),
-    "rosbag": ("ROS bag", read_rosbag),
-    "xdf": ("XDF", read_xdf),
-    "opensim": ("OpenSim table of IMU orientations", read_opensim),
-    "wepose_live": ("recording of wepose live", read_live_device),
-}
 USES = ("raw", "orientation")
 
 
-def list_formats() -> list[str]:
-    """List the names of all formats."""
-    return [*MODULES, *load_formats()]
+class Format(NamedTuple):
+    """A format of a device or program.
+
+    Parameters
+    ----------
+    title : what a file of it is called
+    read : path, "raw" or "orientation" or None, and a rate [Hz] or None → the contents
+    whole : all sensors of a recording are in one file
+    folder : a recording may be a folder
+    """
+
+    title: str
+    read: Callable[[Path, str | None, float | None], Device]
+    whole: bool = False
+    folder: bool = False
+
+
+# Formats that are no tables of one kind.
+MODULES = {
+    "mvnx": Format("Xsens MVNX", read_mvnx, whole=True),
+    "sensor_logger": Format("recording of Sensor Logger", read_sensor_logger, folder=True),
+    "rosbag": Format("ROS bag", read_rosbag, whole=True, folder=True),
+    "xdf": Format("XDF", read_xdf, whole=True),
+    "opensim": Format("OpenSim table of IMU orientations", read_opensim, whole=True),
+    "wepose_live": Format("recording of wepose live", read_live_device),
+}
+
+
+def load(name: str) -> Format:
+    """Load a format by its name, or the path of a description."""
+    if name in MODULES:
+        return MODULES[name]
+    described = load_format(Path(name)) if name.endswith(".toml") else load_formats()[name]
+
+    def read(path: Path, use: str | None, rate_hz: float | None) -> Device:
+        return read_table_format(described, path, use, rate_hz)
+
+    return Format(described.title, read, described.whole, bool(described.files))
 
 
 def find_format(name: str, folder: Path, place: str) -> str:
@@ -44,30 +74,10 @@ def find_format(name: str, folder: Path, place: str) -> str:
     if name.endswith(".toml"):
         load_format(folder / name)
         return str(folder / name)
-    if name not in list_formats():
-        raise BadSession(
-            f"{place} = '{name}' is not known; {one_of(list_formats(), name)}; or a description, such as lab.toml"
-        )
+    known = [*MODULES, *load_formats()]
+    if name not in known:
+        raise BadSession(f"{place} = '{name}' is not known; {one_of(known, name)}; or a description, such as lab.toml")
     return name
-
-
-def _describe(format: str) -> TableFormat:
-    return load_format(Path(format)) if format.endswith(".toml") else load_formats()[format]
-
-
-def find_title(format: str) -> str:
-    """Find what a file of the format is called."""
-    return MODULES[format][0] if format in MODULES else _describe(format).title
-
-
-def is_whole(format: str) -> bool:
-    """Return whether all sensors of a recording are in one file."""
-    return format in ("mvnx", "opensim", "rosbag", "xdf") or (format not in MODULES and _describe(format).whole)
-
-
-def may_be_folder(format: str) -> bool:
-    """Return whether a recording may be a folder."""
-    return format in ("sensor_logger", "rosbag") or (format not in MODULES and bool(_describe(format).files))
 
 
 def detect_format(path: Path) -> str | None:
@@ -77,28 +87,25 @@ def detect_format(path: Path) -> str | None:
 
     Raises
     ------
-    MissingFile
+    WeposeError
         The file is not readable.
     """
     if not (path.is_file() or path.is_dir()) and path.exists():
         return None
     suffix = path.suffix.lower()
-    if path.is_dir() or suffix in (".zip", ".json"):
-        tests = {"rosbag": is_rosbag, "sensor_logger": is_sensor_logger}
-        return next((format for format, test in tests.items() if test(path)), None) or _detect_table(path, "")
     if is_live_log(path):
         return "wepose_live"
     by_suffix = {".mvnx": "mvnx", ".sto": "opensim", **dict.fromkeys(ROSBAGS, "rosbag")}
     if suffix in by_suffix or is_xdf(path):
         return by_suffix.get(suffix, "xdf")
-    if suffix not in (".csv", ".tsv", ".txt", ".xml"):
-        return None
-    start = "\n".join(read_first_lines(path, 40))
-    if "<mvnx" in start:
-        return "mvnx"
-    if suffix == ".csv" and is_sensor_logger(path):
-        return "sensor_logger"
-    return _detect_table(path, start)
+    if path.is_dir() and is_rosbag(path):
+        return "rosbag"
+    if path.is_dir() or suffix in (".zip", ".json", ".csv", ".tsv", ".txt", ".xml"):
+        start = "" if path.is_dir() or suffix == ".zip" else "\n".join(read_first_lines(path, 40))
+        if "<mvnx" in start:
+            return "mvnx"
+        return "sensor_logger" if is_sensor_logger(path) else _detect_table(path, start)
+    return None
 
 
 def _detect_table(path: Path, start: str) -> str | None:
@@ -111,8 +118,8 @@ def _detect_table(path: Path, start: str) -> str | None:
     return next((name for name, format in load_formats().items() if detects(format, path, start)), None)
 
 
-def read_device(path: Path, format: str, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """Read a file of this format, one of `list_formats` or the path of a description.
+def read_device(path: Path, name: str, use: str | None = None, rate_hz: float | None = None) -> Device:
+    """Read a file of a format, by its name or the path of a description.
 
     `use` selects "raw" or "orientation" of a file with both; `rate_hz` replaces its own clock.
 
@@ -121,18 +128,10 @@ def read_device(path: Path, format: str, use: str | None = None, rate_hz: float 
     MissingFile, BadData
         The file is missing, damaged, or of another format.
     """
-    title = find_title(format)
-    if not path.exists():
-        raise MissingFile(f"{path}: no such file or folder; a {title} is wanted here")
-    if not (path.is_file() or path.is_dir()):
-        raise MissingFile(f"{path}: is no regular file; a {title} is wanted here")
-    if path.is_dir() and not may_be_folder(format):
-        raise MissingFile(f"{path}: is a folder; a {title} is wanted here")
-    if format in MODULES:
-        device = MODULES[format][1](path, use, rate_hz)
-    else:
-        device = read_table_format(_describe(format), path, use, rate_hz)
-    for table in (device.table, *device.own_tables.values()):
-        if not table["time"].is_finite().any():
-            raise BadData(f"{path}: no row with a time in it; the export is empty or cut off")
+    format = load(name)
+    if not (format.folder and path.is_dir()):
+        check_file(path, f"a {format.title}")
+    device = format.read(path, use, rate_hz)
+    if not all(np.isfinite(sensor.time).any() for sensor in device.sensors.values()):
+        raise BadData(f"{path}: no row with a time in it; the export is empty or cut off")
     return device

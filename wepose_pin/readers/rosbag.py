@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadData
-from ..model import load_table
-from .device import Device, check_measured, make_device
+from .device import Device, Signal, make_device
 from .libraries import import_library, library_errors
 
 SUFFIXES = (".db3", ".mcap", ".bag")
 MESSAGE = "sensor_msgs/msg/Imu"
 NS = 1e-9
+NEEDS = "angular_velocity and linear_acceleration, nor orientation (a covariance of -1: not provided)"
 
 
 def is_rosbag(path: Path) -> bool:
@@ -42,26 +42,17 @@ def read_rosbag(path: Path, use: str | None = None, rate_hz: float | None = None
     frames = _read_messages(path)
     if not frames:
         raise BadData(f"{path}: no messages of type {MESSAGE} in it; record the topics of the IMUs")
-    numbers = {key: np.array(rows) for key, rows in frames.items()}
-    topics = [topic for topic, _ in numbers]
-    # Columns: time, whether it has raw data and an orientation, 3 + 3 + 4 values.
-    kind = use or ("raw" if any(rows[:, 1].all() for rows in numbers.values()) else "orientation")
-    flag, signals = (1, {"gyro": slice(3, 6), "accel": slice(6, 9)}) if kind == "raw" else (2, {kind: slice(9, 13)})
-    clocks, values, labels = {}, {}, {}
-    for (topic, frame), rows in numbers.items():
-        if not rows[:, flag].all():
-            continue
-        check_measured(path, np.nan_to_num(rows[:, 3:]), topic)
+    topics = [topic for topic, _ in frames]
+    found, hints = {}, {}
+    for (topic, frame), messages in frames.items():
         label = topic if topics.count(topic) == 1 else f"{topic} {frame}"
-        clocks[label] = np.arange(len(rows)) / rate_hz if rate_hz else NS * rows[:, 0]
-        values[label] = {name: rows[:, columns] for name, columns in signals.items()}
-        labels[label] = load_table().guess_segment(label) or load_table().guess_segment(frame)
-    if not values:
-        what = "angular_velocity and linear_acceleration" if kind == "raw" else "orientation"
-        raise BadData(
-            f"{path}: no sensor provides {what} (its covariance begins with -1){'; leave out use' if use else ''}"
-        )
-    return make_device("rosbag", kind, clocks, values, labels)
+        numbers = np.array(messages)
+        time, has_raw, has_orientation = NS * numbers[:, 0], numbers[:, 1].all(), numbers[:, 2].all()
+        raw = {"gyro": Signal(time, numbers[:, 3:6]), "accel": Signal(time, numbers[:, 6:9])}
+        orientation = {"orientation": Signal(time, numbers[:, 9:13])}
+        found[label] = (raw if has_raw else {}) | (orientation if has_orientation else {})
+        hints[label] = frame
+    return make_device(path, found, NEEDS, use, rate_hz, hints=hints)
 
 
 def _read_messages(path: Path) -> dict[tuple[str, str], list[list[float]]]:

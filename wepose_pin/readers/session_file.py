@@ -102,14 +102,16 @@ def choose_label(keys: TomlTable, device: Device, segment: str, path: Path) -> s
     """
     label = keys.text("label", None)
     if label is not None:
-        if label not in device.labels:
-            raise BadSession(f"{keys.at('label')} = '{label}' is not in {path.name}; {one_of(device.labels, label)}")
+        if label not in device.sensors:
+            raise BadSession(f"{keys.at('label')} = '{label}' is not in {path.name}; {one_of(device.sensors, label)}")
         return label
     incomplete = any(each.code == "devices-left-out" for each in device.diagnostics)
-    alone = len(device.labels) == 1 and (not incomplete or None in device.labels.values())
-    matches = [name for name, guess in device.labels.items() if guess == segment or alone]
+    alone = len(device.sensors) == 1 and (
+        not incomplete or any(sensor.segment is None for sensor in device.sensors.values())
+    )
+    matches = [name for name, sensor in device.sensors.items() if sensor.segment == segment or alone]
     if len(matches) != 1:
-        raise BadSession(f"{keys.at('label')} is missing; which of {path.name} is it? {one_of(device.labels)}")
+        raise BadSession(f"{keys.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
     return matches[0]
 
 

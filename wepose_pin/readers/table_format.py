@@ -7,7 +7,6 @@ the clock.
 
 from __future__ import annotations
 
-import contextlib
 import fnmatch
 import re
 from collections.abc import Mapping, Sequence
@@ -22,19 +21,14 @@ from scipy.spatial.transform import Rotation
 
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import TomlTable, read_toml
-from ..errors import BadData, BadSession, MissingFile, MissingRate, WeposeError
-from ..model import load_table
-from .device import Device, check_measured, convert, join_signals, make_device, open_folder, read_first_lines
-from .device import spread_equal_times as spread
-from .tables import NO_VALUE, read_columns
+from ..errors import BadData, BadSession, MissingFile, MissingRate
+from .device import NEEDED, Device, Signal, convert, make_device, open_folder, read_first_lines, spread_equal_times
+from .tables import parse_rows, read_body, read_columns
 
 FOLDER = Path(__file__).parent / "formats"
 SEPARATORS = "\t,; "
 MOST_LINES = 2000  # before the names; some exports have a line for each channel
 MOST_AFTER = 4  # lines of text between the names and the numbers
-MOST_FILES = 50  # of a folder
-FEWEST = 3  # samples that show a rate
-NEEDED = {"raw": ("gyro", "accel"), "orientation": ("orientation",)}
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "wxyz"}
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)(e[-+]?\d+)?|\d{4}[/-]\d.*", re.IGNORECASE)
 _STATED_RATE = re.compile(r"\d+(\.\d*)?(?![\d.])")
@@ -120,6 +114,14 @@ class TableFormat:
     label_line: str | None
     label_in_name: re.Pattern[str] | None
     sync_line: str | None
+
+    def is_time(self, name: str) -> bool:
+        """Return whether a column of this name gives the time."""
+        return any(clock.column.fullmatch(name) for clock in self.clocks)
+
+    def is_signal(self, name: str) -> bool:
+        """Return whether a column of this name is one of a signal."""
+        return any(columns.match(name, AXES[signal]) for signal, each in self.signals.items() for columns in each)
 
 
 def load_format(path: Path) -> TableFormat:
@@ -249,18 +251,15 @@ def detects(format: TableFormat, path: Path, start: str) -> bool:
         return any(matches) and (len(matches) == 1 or (not all(matches) and detects(format, path.parent, "")))
     if not format.files:
         return False
-    try:
-        with open_folder(path, format.title) as files:
-            named = [file for pattern in format.files.values() for file in _select(files, pattern)]
-            starts = ["\n".join(read_first_lines(file, 3)) for file in dict.fromkeys(named)]
-    except (WeposeError, OSError):
-        return False
+    with open_folder(path) as files:
+        named = {file for pattern in format.files.values() for file in _select(files, pattern)}
+        starts = ["\n".join(read_first_lines(file, 3)) for file in named]
     matches = [any(pattern.search(text) for text in starts) for pattern in format.detect]
     return bool(matches) and all(matches)
 
 
 def _select(files: Mapping[str, Path], pattern: str) -> list[Path]:
-    return [file for name, file in files.items() if fnmatch.fnmatch(name, pattern)][:MOST_FILES]
+    return [file for name, file in files.items() if fnmatch.fnmatch(name, pattern)]
 
 
 # Tables ------------------------------------------------------------------------------------------------------------
@@ -285,7 +284,8 @@ class DeviceTable:
     path : the file
     names, units : of the columns
     about : name → value of the lines `name: value` before the names
-    cells : columns "0", "1", … that the description names, without an incomplete last line
+    cells : columns "0", "1", … that the description names, without rows that have no values in them
+    times : column → times (n,) [s] that were read from it; None: of a rate
     """
 
     path: Path
@@ -293,6 +293,7 @@ class DeviceTable:
     units: Sequence[str]
     about: Mapping[str, str]
     cells: pl.DataFrame
+    times: dict[int | None, np.ndarray] = field(default_factory=dict)
 
     def has_values(self, column: int) -> bool:
         """Whether any cell of a column has a value."""
@@ -302,9 +303,7 @@ class DeviceTable:
         """Return columns (n, k); empty cells are NaN."""
         names = [self.names[k] for k in columns]
         table = self.cells.select(pl.col(str(k)).alias(self.names[k]) for k in columns)
-        values = read_columns(table, names, str(self.path), str(self.path))
-        check_measured(self.path, values, ", ".join(names))
-        return values
+        return read_columns(table, names, str(self.path), str(self.path))
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -313,15 +312,12 @@ def _split(line: str, separator: str) -> list[str]:
 
 def _find_header(format: TableFormat, lines: Sequence[str]) -> Header | None:
     """Find the first line with a column of time and one of a signal."""
-    patterns = [(columns, AXES[signal]) for signal, each in format.signals.items() for columns in each]
     for k, line in enumerate(lines):
         for separator in () if line.startswith(("//", "#")) else SEPARATORS:
             if line.count(separator) < 3:
                 continue
             names, units = _name_columns(format, lines, k, separator)
-            if any(clock.column.fullmatch(name) for clock in format.clocks for name in names) and any(
-                columns.match(name, axes) for columns, axes in patterns for name in names
-            ):
+            if any(map(format.is_time, names)) and any(map(format.is_signal, names)):
                 first = k + 1 + max(format.axes_line, format.units_line, 0)
                 for cells in (_split(row, separator) for row in lines[first : first + MOST_AFTER]):
                     if any(map(_NUMBER.fullmatch, cells)) and (cells[0] or not format.times_before):
@@ -335,16 +331,16 @@ def _name_columns(format: TableFormat, lines: Sequence[str], k: int, separator: 
     """Name the columns of line k, as ``sensor/name/axis`` where these stand in lines of their own; and their units."""
 
     def read(offset: int) -> list[str]:
-        row = _split(lines[k + offset], separator) if offset and 0 <= k + offset < len(lines) else []
-        return [*row, *[""] * len(own)][: max(len(own), len(row))]
+        return _split(lines[k + offset], separator) if offset and 0 <= k + offset < len(lines) else []
 
     own = _split(lines[k], separator)
-    owners, axes, units = read(format.sensors_line), read(format.axes_line), read(format.units_line)
-    width = max(len(own), len(axes))
-    own, owners, axes, units = ([*row, *[""] * width][:width] for row in (own, owners, axes, units))
-    begins = [k for k in range(width) if own[k] and format.sensor_begins and format.sensor_begins.fullmatch(own[k])]
+    rows = [own, read(format.sensors_line), read(format.axes_line), read(format.units_line)]
+    width = max(len(rows[0]), len(rows[2]))
+    own, owners, axes, units = ([*row, *[""] * width][:width] for row in rows)
     if format.sensor_begins is None:
-        begins = [k for k, owner in enumerate(owners) if owner]
+        begins = [column for column, owner in enumerate(owners) if owner]
+    else:
+        begins = [column for column, name in enumerate(own) if name and format.sensor_begins.fullmatch(name)]
     full, short, name = [""] * width, [""] * width, ""
     for count, (first, last) in enumerate(zip(begins, [*begins, width][1:], strict=True), 1):
         *numbers, title = [cell for cell in owners[first:last] if cell] or [f"sensor {count}"]
@@ -379,63 +375,18 @@ def parse_table(format: TableFormat, path: Path) -> DeviceTable | None:
         name, colon, value = line.strip("/ ").partition(":")
         if colon:
             about[name.strip()] = value.strip(f" {SEPARATORS}")
-    with path.open("rb") as file:
-        for _ in range(header.first_row):
-            file.readline()
-        body = file.read()
-    if b"\0" in body:
-        raise BadData(f"{path}: is no {format.title}: there are zero bytes in it")
-    if not body.strip():
-        raise BadData(
-            f"{path}: has no line of numbers after its names in line {header.line + 1}; the export is empty or cut off"
-        )
+    body = read_body(path, header.first_row)
+    if b"\0" in body or not body.strip():
+        found = "zero bytes" if body.strip() else f"no line of numbers after the names in line {header.line + 1}"
+        raise BadData(f"{path}: there is {found} in it; the export is damaged, empty or cut off")
     width = max(len(header.names), body.partition(b"\n")[0].count(header.separator.encode()) + 1)
     last = max(k for k, name in enumerate(header.names) if name)
-    columns = [k for k, name in enumerate(header.names) if k == last or _is_used(format, name)]
-    cells = _parse_rows(path, body, width, columns, header.separator, format.title)
+    columns = [str(k) for k, name in enumerate(header.names) if format.is_time(name) or format.is_signal(name)]
+    cells = parse_rows(path, body, [str(k) for k in range(width)], header.separator, lenient=True)
     if cells.height and not body.endswith(b"\n") and cells[str(last)][-1] is None:
         cells = cells.head(-1)  # the last line is incomplete
+    cells = cells.select(columns).filter(pl.any_horizontal(pl.all().is_not_null()))
     return DeviceTable(path, header.names, header.units, about, cells)
-
-
-def _is_used(format: TableFormat, name: str) -> bool:
-    return any(clock.column.fullmatch(name) for clock in format.clocks) or any(
-        columns.match(name, AXES[signal]) for signal, each in format.signals.items() for columns in each
-    )
-
-
-def _parse_rows(path: Path, body: bytes, width: int, columns: Sequence[int], separator: str, what: str) -> pl.DataFrame:
-    """Parse the chosen columns: cells are numbers, or text where one of them is none; null without a value."""
-
-    def parse(kind: type[pl.DataType]) -> pl.DataFrame:
-        return pl.read_csv(
-            body,
-            has_header=False,
-            separator=separator,
-            schema={str(k): kind if k in chosen else pl.String for k in range(width)},
-            columns=list(columns),
-            null_values=NO_VALUE,
-            truncate_ragged_lines=True,
-            encoding="utf8-lossy",
-            quote_char=None,
-        )
-
-    chosen = set(columns)
-    try:
-        with contextlib.suppress(pl.exceptions.PolarsError):  # most tables have numbers alone
-            return _drop_empty(parse(pl.Float64))
-        cells = parse(pl.String)
-    except pl.exceptions.PolarsError as error:
-        raise BadData(f"{path}: cannot be read as {what}: {' '.join(str(error).split())[:120]}") from error
-    cells = cells.with_columns(pl.all().str.strip_chars(' "\r'))
-    cells = cells.with_columns(pl.when(~pl.all().is_in(NO_VALUE)).then(pl.all()).name.keep())
-    if separator != ",":
-        cells = cells.with_columns(pl.all().str.replace(",", ".", literal=True))
-    return _drop_empty(cells)
-
-
-def _drop_empty(cells: pl.DataFrame) -> pl.DataFrame:
-    return cells.filter(cells.select(pl.any_horizontal(pl.all().is_not_null()))[:, 0])
 
 
 # Sensors -----------------------------------------------------------------------------------------------------------
@@ -460,7 +411,7 @@ class _Source:
         return [self.places[k] for k in sorted(self.places)]
 
 
-_Sensors = dict[str, dict[str, list[_Source]]]  # sensor → signal → its columns, those to prefer first
+_Sensors = dict[str, dict[str, list[_Source]]]  # sensor → signal → its complete columns, those to prefer first
 
 
 def read_table_format(format: TableFormat, path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
@@ -473,95 +424,75 @@ def read_table_format(format: TableFormat, path: Path, use: str | None = None, r
     MissingFile, BadData
         Not there; no such table; no times; an unknown unit; not what `use` asks for.
     """
-    if use == "orientation" and not format.signals["orientation"]:
-        raise BadData(f"{path}: orientations of a {format.title} are not read; leave out data.use")
     tables = _open_tables(format, path, use)
     sensors = _find_sensors(format, tables)
-    kinds = [use] if use else list(NEEDED)
-    kind = next((kind for kind in kinds if any(_has(signals, kind) for signals in sensors.values())), None)
-    if kind is None:
-        instead = "; leave out data.use" if use and format.signals["orientation"] else ""
-        names = ", ".join(filter(None, tables[0].names[:12]))
-        raise BadData(f"{path}: no sensor in it has {format.needs}{instead}; it has: {names}")
-    clocks: dict[str, np.ndarray] = {}
-    values: dict[str, dict[str, np.ndarray]] = {}
-    labels: dict[str, str | None] = {}
-    diagnostics, wraps_s = list[Diagnostic](), None
-    chosen = {sensor: signals for sensor, signals in sensors.items() if _has(signals, kind)}
-    for sensor, signals in chosen.items():
-        label = sensor or tables[0].about.get(format.label_line or "") or _name_alone(format, path)
-        place = f"{path.name} {label}" if sensor else path.name
-        clocks[label], values[label], joined, wraps_s = _read_sensor(format, place, sensor, signals, kind, rate_hz)
-        if len(clocks[label]) < FEWEST:
-            raise BadData(f"{path}: holds {len(clocks[label])} samples of {label}; the export is empty or cut off")
-        diagnostics += joined
-        labels[label] = load_table().guess_segment(label)
-        if len(chosen) == 1:
-            labels[label] = labels[label] or load_table().guess_segment(path.absolute().stem)
-    left_out = [sensor for sensor in sensors if sensor not in chosen]
-    if left_out:
-        facts = {"devices": ", ".join(left_out), "signals": " and ".join(NEEDED[kind])}
-        diagnostics.append(Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts))
+    kind = use or next((kind for kind in NEEDED if _has(sensors, kind)), "raw")
+    joins = format.times_before or len(tables) > 1  # a rate is that of the joined signals
+    alone = tables[0].about.get(format.label_line or "") or _name_alone(format, path)
+    found: dict[str, dict[str, Signal]] = {}
+    wraps_s = None
+    for sensor, signals in sensors.items():
+        own = found.setdefault(sensor or alone, {})
+        for name in NEEDED[kind] if set(NEEDED[kind]) <= set(signals) else ():
+            first, *others = signals[name]
+            time, wraps_s = _read_time(format, first, sensor, None if joins else rate_hz)
+            values = _read_values(name, first, time)
+            if others and (np.abs(values) > first.columns.limit).any():
+                values = _read_values(name, others[0], time)
+            own[name] = Signal(time, values)
+    diagnostics = []
     # Clocks of devices that were not synchronized start at power-on.
     if format.sync_line and not tables[0].about.get(format.sync_line, "synced").lower().startswith("synced"):
         diagnostics.append(Diagnostic("device-not-synchronized", WARNING, path.name))
-    device = make_device(format.name, kind, clocks, values, labels, diagnostics)
-    return replace(device, wraps_s=wraps_s)
+    needs = f"{format.needs}; it has: {', '.join(filter(None, tables[0].names[:12]))}"
+    device = make_device(path, found, needs, use, rate_hz if joins else None, diagnostics)
+    return replace(device, wraps_s=None if joins else wraps_s)
 
 
 def _open_tables(format: TableFormat, path: Path, use: str | None) -> list[DeviceTable]:
     """Parse the file, or those of a folder or zip that hold what is wanted."""
     kinds = [use] if use else list(NEEDED)
-    if path.is_file() and path.suffix.lower() != ".zip":
-        table = parse_table(format, path)
-        alone = table and any(_has(each, kind) for each in _find_sensors(format, [table]).values() for kind in kinds)
-        if table and (alone or not format.files):
-            return [table]
-        if not format.files:
-            raise _no_names(format, path)
-    with open_folder(path, format.title) as files:
-        for pattern in (format.files[kind] for kind in kinds if kind in format.files):
-            selected = _select(files, pattern)
-            tables = [table for file in selected if (table := parse_table(format, file)) is not None]
+    alone = path.is_file() and path.suffix.lower() != ".zip"
+    table = parse_table(format, path) if alone else None
+    if table and (not format.files or any(_has(_find_sensors(format, [table]), kind) for kind in kinds)):
+        return [table]
+    clock = " or ".join(f"'{clock.column.pattern}'" for clock in format.clocks)
+    named = f"line of names with {clock} and columns of a signal in its first {MOST_LINES} lines"
+    if not format.files:
+        raise BadData(f"{path}: no {named}, which a {format.title} has; {format.needs} are needed")
+    patterns = [format.files[kind] for kind in kinds if kind in format.files]
+    with open_folder(path) as files:
+        for pattern in patterns:
+            tables = [table for file in _select(files, pattern) if (table := parse_table(format, file)) is not None]
             if tables:
                 return tables
-            if selected and len(selected) == 1:
-                raise _no_names(format, path if path.is_file() else selected[0])
-        kinds_needed = " or ".join(dict.fromkeys(format.files[kind] for kind in kinds if kind in format.files))
-    raise MissingFile(f"{path}: no {kinds_needed} in it with {format.needs}")
+    listed = " or ".join(dict.fromkeys(patterns))
+    raise MissingFile(f"{path}: no {listed} with a {named}, which a {format.title} has; {format.needs} are needed")
 
 
-def _no_names(format: TableFormat, path: Path) -> BadData:
-    clock = " or ".join(f"'{clock.column.pattern}'" for clock in format.clocks)
-    return BadData(
-        f"{path}: no line of names with {clock} and columns of a signal in its first {MOST_LINES} lines, which a "
-        f"{format.title} has; {format.needs} are needed"
-    )
-
-
-def _has(signals: Mapping[str, Sequence[_Source]], kind: str) -> bool:
-    return all(any(source.is_complete(AXES[name]) for source in signals.get(name, ())) for name in NEEDED[kind])
+def _has(sensors: _Sensors, kind: str) -> bool:
+    return any(set(NEEDED[kind]) <= set(signals) for signals in sensors.values())
 
 
 def _find_sensors(format: TableFormat, tables: Sequence[DeviceTable]) -> _Sensors:
     sensors: _Sensors = {}
-    for signal, each in format.signals.items():
-        for columns in each:
-            for table in tables:
-                own: dict[str, _Source] = {}
-                for k, name in enumerate(table.names):
-                    match = columns.match(name, AXES[signal])
-                    if match is None:
-                        continue
-                    sensor, axis, unit = match
-                    source = own.setdefault(sensor, _Source(table, columns))
-                    if axis in source.places:
-                        raise BadData(f"{table.path}: '{name}' and '{table.names[source.places[axis]]}' are one axis")
-                    source.places[axis] = k
-                    source.unit = source.unit or unit or (table.units[k] if k < len(table.units) else "")
-                    source.unit = source.unit or columns.unit
-                for sensor, source in own.items():
-                    sensors.setdefault(sensor, {}).setdefault(signal, []).append(source)
+    entries = [(name, columns, table) for name, each in format.signals.items() for columns in each for table in tables]
+    for signal, columns, table in entries:
+        own: dict[str, _Source] = {}
+        for k, name in enumerate(table.names):
+            match = columns.match(name, AXES[signal])
+            if match is None:
+                continue
+            sensor, axis, unit = match
+            source = own.setdefault(sensor, _Source(table, columns))
+            if axis in source.places:
+                raise BadData(f"{table.path}: '{name}' and '{table.names[source.places[axis]]}' are one axis")
+            source.places[axis] = k
+            source.unit = source.unit or unit or (table.units[k] if k < len(table.units) else "") or columns.unit
+        for sensor, source in own.items():
+            signals = sensors.setdefault(sensor, {})
+            if source.is_complete(AXES[signal]):
+                signals.setdefault(signal, []).append(source)
     return sensors
 
 
@@ -572,32 +503,6 @@ def _name_alone(format: TableFormat, path: Path) -> str:
         return path.name if path.is_dir() else path.parent.name
     match = format.label_in_name.fullmatch(path.stem) if format.label_in_name else None
     return match["label"] if match else path.stem
-
-
-def _read_sensor(
-    format: TableFormat,
-    place: str,
-    sensor: str,
-    signals: Mapping[str, Sequence[_Source]],
-    kind: str,
-    rate_hz: float | None,
-) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Diagnostic, ...], float | None]:
-    """Read times [s], values in SI, what was done, and the time [s] after which the clock wraps."""
-    first = {name: next(s for s in signals[name] if s.is_complete(AXES[name])) for name in NEEDED[kind]}
-    joins = format.times_before or len({id(source.table) for source in first.values()}) > 1
-    values, times, wraps_s = {}, {}, None
-    for name in NEEDED[kind]:
-        source = first[name]
-        time, wraps_s = _read_time(format, source, sensor, None if joins else rate_hz)
-        values[name] = _read_values(name, source, time)
-        complete = [each for each in signals[name] if each.is_complete(AXES[name])]
-        if len(complete) > 1 and (np.abs(values[name]) > source.columns.limit).any():
-            values[name] = _read_values(name, complete[1], time)
-        times[name] = time
-    if not joins:
-        return times[NEEDED[kind][0]], values, (), wraps_s
-    time, values, joined = join_signals(place, (times["gyro"], values["gyro"]), (times["accel"], values["accel"]))
-    return np.arange(len(time)) / rate_hz if rate_hz else time, values, joined, None
 
 
 def _read_values(signal: str, source: _Source, time: np.ndarray) -> np.ndarray:
@@ -619,8 +524,7 @@ def _read_turns(quat_wxyz: np.ndarray) -> np.ndarray:
     """Return rotation vectors (n, 3) of quaternions (n, 4); NaN where there is none."""
     turns = np.full((len(quat_wxyz), 3), np.nan)
     good = np.isfinite(quat_wxyz).all(axis=1) & (np.linalg.norm(quat_wxyz, axis=1) > 0.5)
-    if good.any():
-        turns[good] = Rotation.from_quat(quat_wxyz[good][:, [1, 2, 3, 0]]).as_rotvec()
+    turns[good] = Rotation.from_quat(quat_wxyz[good][:, [1, 2, 3, 0]]).as_rotvec()
     return turns
 
 
@@ -630,8 +534,6 @@ def _read_quat(table: DeviceTable, values: np.ndarray) -> np.ndarray:
         return values[:, [1, 2, 3, 0]]
     quat = np.full((len(values), 4), np.nan)
     good = np.isfinite(values).all(axis=1)
-    if not good.any():
-        return quat
     if values.shape[1] == 3:
         quat[good] = Rotation.from_euler("ZYX", values[good][:, ::-1], degrees=True).as_quat()
         return quat
@@ -660,12 +562,15 @@ def _read_time(
             if rate > 0.0 and np.isfinite(counter).all() and len(counter) > 1:
                 packets = unwrap_counter(counter, clock.wraps)
                 a_second = max(1.0, float(np.median(np.diff(packets)))) * rate
-                return packets / a_second, clock.wraps / a_second if clock.wraps else None
+                time = table.times.setdefault(column, packets / a_second)
+                return time, clock.wraps / a_second if clock.wraps else None
         elif not rate_hz:
-            time = _read_stamps(clock, table, column)
-            return spread(time) if clock.spread else time, clock.unit_s * clock.wraps if clock.wraps else None
+            if column not in table.times:
+                time = _read_stamps(clock, table, column)
+                table.times[column] = spread_equal_times(time) if clock.spread else time
+            return table.times[column], clock.unit_s * clock.wraps if clock.wraps else None
     if rate_hz:
-        return np.arange(table.cells.height) / rate_hz, None
+        return table.times.setdefault(None, np.arange(table.cells.height) / rate_hz), None
     names = " or ".join(f"'{clock.column.pattern}'" for clock in format.clocks)
     raise MissingRate(
         f"{table.path}: no times are known from {names}, or a rate in a line before the table; state the update "

@@ -11,10 +11,9 @@ import csv
 import io
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -29,7 +28,6 @@ EMPTY = b",; \t\r\n"
 # The names of a CSV stand within its first lines, or bytes.
 MOST_PREAMBLE, PREAMBLE_BYTES = 100, 1 << 20
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?nan", re.IGNORECASE)
-_DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _UNITS = re.compile(
     r"[\[(]?(s|ms|[uµμ]s|ns|sec(onds?)?|m/\(?s(\^2|²|/s|\^2\))\)?|m/s\*\*2|m?g|deg(rees)?|rad|(deg|rad|°|dps)(/s(ec)?)?|"
     r"[unµμ]?T|gauss|°c|degrees celsius|k?pa|hz|m?v|%|n/?a|no_units|local_flux|-|1)[\])]?",
@@ -50,16 +48,90 @@ def read_table(path: Path) -> pl.DataFrame:
     _check_table(path)
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"):
-            return pl.read_parquet(open_source(path))
+            return pl.read_parquet(_open_source(path))
     layout = read_layout(path)
-    if layout.is_plain:
-        table = _parse_csv(path, layout)
-    else:
-        with path.open("rb") as file:
-            for _ in range(layout.head_lines):
-                file.readline()
-            table = _parse_csv(path, layout, layout.head + file.read())
-    return table.head(table.height - _count_empty_end(path)) if table.height else table
+    body = read_body(path, layout.head_lines)
+    # Editors and spreadsheets leave lines without values at the end.
+    content = len(body.rstrip(EMPTY))
+    end = body.find(b"\n", content)
+    body = body[: end if end >= 0 else None] if content else b""
+    names = [
+        f"{name}_duplicated_{layout.names[:k].count(name) - 1}" if name in layout.names[:k] else name
+        for k, name in enumerate(layout.names)
+    ]
+    table = parse_rows(path, body, names, layout.separator)
+    # polars fills short rows silently.
+    if table.width > 1 and table[table.columns[-1]].null_count():
+        _find_ragged(path, body, len(names), layout.separator)
+    return table
+
+
+def read_body(path: Path, head_lines: int) -> bytes:
+    """Read what follows the first lines of a file."""
+    with path.open("rb") as file:
+        for _ in range(head_lines):
+            file.readline()
+        return file.read()
+
+
+def read_names(path: Path) -> tuple[list[str], dict[str, str]]:
+    """Read the names of a table's columns, and the units of those that have one in a line of a CSV."""
+    _check_table(path)
+    if _is_parquet(path):
+        with library_errors(path, "a Parquet file"):
+            return list(pl.read_parquet_schema(_open_source(path))), {}
+    layout = read_layout(path)
+    return list(layout.names), dict(zip(layout.names, layout.units, strict=False))
+
+
+def parse_rows(path: Path, body: bytes, names: Sequence[str], separator: str, *, lenient: bool = False) -> pl.DataFrame:
+    """Parse the rows of a CSV: columns are numbers, or text where a cell is none; null without a value.
+
+    Decimals may have commas where these separate no columns. `lenient`: cells beyond the names are left out.
+
+    Raises
+    ------
+    BadData
+        A row has more cells than there are names; the table is damaged.
+    """
+
+    def parse(texts: Collection[str], decimal_comma: bool = False, n_rows: int | None = None) -> pl.DataFrame:
+        return pl.read_csv(
+            body,
+            has_header=False,
+            schema={name: pl.String if name in texts else pl.Float64 for name in names},
+            separator=separator,
+            decimal_comma=decimal_comma,
+            n_rows=n_rows,
+            null_values=NO_VALUE,
+            comment_prefix="#",
+            encoding="utf8-lossy",
+            raise_if_empty=False,
+            truncate_ragged_lines=lenient,
+        )
+
+    point = pl.all().str.replace(r"^([-+]?\d*),(\d*)", "$1.$2") if separator != "," else pl.all()
+    try:
+        first = parse(names, n_rows=MOST_PREAMBLE).with_columns(point)
+        numbers = first.with_columns(pl.all().str.strip_chars().cast(pl.Float64, strict=False))
+        texts = [name for name in names if numbers[name].null_count() > first[name].null_count()]
+        for decimal_comma in (False, True) if separator != "," else (False,):
+            with contextlib.suppress(pl.exceptions.PolarsError):
+                return parse(texts, decimal_comma)
+        return parse(names).with_columns(point)  # an error can name the text in a later row
+    except pl.exceptions.PolarsError:
+        if not lenient:
+            _find_ragged(path, body, len(names), separator)
+        with library_errors(path, "a table"):
+            raise
+
+
+def _find_ragged(path: Path, body: bytes, width: int, separator: str) -> None:
+    """Raise an error on the first row that has another number of fields; empty lines have no values."""
+    text = io.TextIOWrapper(io.BytesIO(body), encoding="utf-8", errors="replace", newline="")
+    for k, fields in enumerate(csv.reader((line for line in text if not line.startswith("#")), delimiter=separator), 1):
+        if fields and len(fields) != width:
+            raise BadData(f"{path}: row {k} has {len(fields)} fields, the line of names has {width}; mend the row")
 
 
 def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: str) -> np.ndarray:
@@ -78,13 +150,9 @@ def read_columns(table: pl.DataFrame, names: Sequence[str], file: str, place: st
     return np.ascontiguousarray(pl.DataFrame(numbers).to_numpy().reshape(table.height, len(names)))
 
 
-def _make_column_error(name: str, names: list[str], file: str, place: str) -> UnknownColumn:
-    return UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(names, name)}")
-
-
 def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.Series:
     if name not in table.columns:
-        raise _make_column_error(name, table.columns, file, place)
+        raise UnknownColumn(f"{place}: no column '{name}' in {Path(file).name}; {one_of(table.columns, name)}")
     if f"{name}_duplicated_0" in table.columns:
         raise BadData(f"{file}: column '{name}' stands there more than once; each column needs a name of its own")
     series = table[name]
@@ -108,26 +176,10 @@ def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.S
     return numbers.fill_null(float("nan")).rename(name)
 
 
-def read_names(path: Path) -> tuple[list[str], dict[str, str]]:
-    """Read the names of the columns of a table, and column → its unit, where a line of a CSV has them.
-
-    Raises
-    ------
-    MissingFile, BadData
-        As `read_table`.
-    """
-    _check_table(path)
-    if _is_parquet(path):
-        with library_errors(path, "a Parquet file"):
-            return list(pl.read_parquet_schema(open_source(path))), {}
-    layout = read_layout(path)
-    return list(layout.names), dict(zip(layout.names, layout.units, strict=False))
-
-
 # Checks of files ---------------------------------------------------------------------------------------------------
 
 
-def open_source(path: Path) -> Path | bytes:
+def _open_source(path: Path) -> Path | bytes:
     """Return the file as a path, or its contents where the path is not UTF-8, which polars cannot open."""
     try:
         os.fspath(path).encode("utf-8")
@@ -150,32 +202,16 @@ def _check_table(path: Path) -> None:
         raise MissingFile(f"{path}: no such file; {one_of(sorted(beside), path.name)}")
 
 
-@dataclass(frozen=True)
-class CsvLayout:
-    """How a CSV is written.
+# Layout of a CSV ---------------------------------------------------------------------------------------------------
 
-    Parameters
-    ----------
-    names : of the columns
-    separator : of the columns
-    decimal_comma : decimals have a comma
-    head_lines : lines up to the first row of values
-    units : of the columns, where a line of them follows the names; empty: there is none
-    is_plain : commas, points, and nothing but comments before one line of names
-    """
 
-    names: tuple[str, ...]
+class CsvLayout(NamedTuple):
+    """How a CSV is written."""
+
+    names: list[str]  # of the columns
+    units: list[str]  # of the columns, where a line of them follows the names; empty: there is none
     separator: str
-    decimal_comma: bool
-    head_lines: int
-    units: tuple[str, ...] = ()
-    is_plain: bool = True
-
-    @property
-    def head(self) -> bytes:
-        """The line of names as polars reads it before any rows."""
-        cells = ('"' + name.replace('"', '""') + '"' for name in self.names)
-        return (self.separator.join(cells) + "\n").encode()
+    head_lines: int  # lines up to the first row of values
 
 
 def read_layout(path: Path) -> CsvLayout:
@@ -201,24 +237,17 @@ def read_layout(path: Path) -> CsvLayout:
     if b"\0" in lines[0][1]:
         raise BadData(f"{path}: is not a CSV in UTF-8: there are zero bytes in its first line; save it as UTF-8")
     try:
-        text, unicode = [(k, line.decode("utf-8-sig").rstrip("\r\n")) for k, line in lines], True
+        text = [(k, line.decode("utf-8-sig").rstrip("\r\n")) for k, line in lines]
     except UnicodeDecodeError:  # as spreadsheets of Windows write it
-        text, unicode = [(k, line.decode("cp1252", errors="replace").rstrip("\r\n")) for k, line in lines], False
+        text = [(k, line.decode("cp1252", errors="replace").rstrip("\r\n")) for k, line in lines]
     stated = re.fullmatch(r'"?sep=(.|\\t)"?[;,\t]*', text[0][1])  # a hint for spreadsheets
     text = text[1:] if stated and len(text) > 1 else text
     separator = stated[1].replace("\\t", "\t") if stated else _find_separator([line for _, line in text])
-    try:
+    with library_errors(path, "a CSV"):
         rows = [(k, next(csv.reader([line], delimiter=separator), [])) for k, line in text]
-    except csv.Error as error:
-        raise BadData(f"{path}: its line of names cannot be read: {error}; save it as CSV in UTF-8") from error
-    names_at, units = _find_names([cells for _, cells in rows])
-    names = _join_names([cells for _, cells in rows[slice(*names_at)]])
-    first = rows[names_at[1]][0] + 1 if units else rows[names_at[1] - 1][0] + 1
-    cells = [cell.strip() for _, row in rows[names_at[1] :] for cell in row]
-    comma = separator != "," and any(_DECIMAL_COMMA.fullmatch(cell) for cell in cells)
-    plain = separator == "," and unicode and not stated and names_at == (0, 1) and not units
-    plain = plain and all(line.strip() for line in raw[:first])
-    return CsvLayout(tuple(names), separator, comma, first, tuple(units), plain)
+    (first, last), units = _find_names([cells for _, cells in rows])
+    names = _join_names([cells for _, cells in rows[first:last]])
+    return CsvLayout(names, units, separator, rows[last if units else last - 1][0] + 1)
 
 
 def _find_separator(lines: Sequence[str]) -> str:
@@ -267,58 +296,3 @@ def _join_names(lines: Sequence[Sequence[str]]) -> list[str]:
         upper = cell.strip() or upper
         owners.append(upper)
     return [f"{owner} {name.strip()}".strip() for owner, name in zip(owners, lines[1], strict=True)]
-
-
-def _parse_csv(path: Path, layout: CsvLayout, content: bytes = b"") -> pl.DataFrame:
-    """Parse a CSV, or `content` of it that begins with the line of names."""
-    source: Path | bytes = content or open_source(path)
-    options: dict[str, Any] = {
-        "null_values": NO_VALUE,
-        "comment_prefix": "#",
-        "separator": layout.separator,
-        "decimal_comma": layout.decimal_comma,
-        "encoding": "utf8" if layout.is_plain else "utf8-lossy",
-    }
-    names = layout.names
-    numbers: dict[str, Any] = dict.fromkeys(names, pl.Float64)
-    table = None
-    if len(numbers) == len(names):
-        # Most tables have numbers alone. Others are read below.
-        with contextlib.suppress(pl.exceptions.PolarsError):
-            table = pl.read_csv(source, schema=numbers, **options)
-    try:
-        if table is None:
-            # Types are inferred from the whole file, so that an error can name text in any row.
-            table = pl.read_csv(source, infer_schema_length=None, **options)
-    except (pl.exceptions.PolarsError, OSError) as error:
-        if "more fields" in str(error):
-            _find_ragged(path, layout, content)
-        if "utf-8" in str(error):
-            raise BadData(f"{path}: is not UTF-8 text; save it as CSV in UTF-8") from error
-        with library_errors(path, "a table"):
-            raise
-    if len(numbers) == table.width:
-        table.columns = list(names)  # polars reads quotes within names in its own way
-    # polars fills short rows silently.
-    if table.width > 1 and table[table.columns[-1]].null_count():
-        _find_ragged(path, layout, content)
-    return table
-
-
-def _count_empty_end(path: Path) -> int:
-    """Count the lines without values at the end of a CSV, which editors and spreadsheets leave."""
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - 2**16))
-        lines = file.read().splitlines()
-    return len(lines) - next((k for k in range(len(lines), 0, -1) if lines[k - 1].strip(EMPTY)), 0)
-
-
-def _find_ragged(path: Path, layout: CsvLayout, content: bytes) -> None:
-    """Raise an error on the first row of a CSV with other fields than its names; empty lines have no values."""
-    width = len(layout.names)
-    with io.BytesIO(content) if content else path.open("rb") as lines:
-        text = io.TextIOWrapper(lines, encoding="utf-8-sig", errors="replace", newline="")
-        rows = csv.reader((line for line in text if not line.startswith("#")), delimiter=layout.separator)
-        for k, fields in enumerate(rows):
-            if fields and len(fields) != width:
-                raise BadData(f"{path}: row {k} has {len(fields)} fields, the line of names has {width}; mend the row")

@@ -11,10 +11,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 
 from ..errors import BadData, one_of
 from .device import check_measured, read_first_lines
+from .libraries import library_errors
 from .markers import MarkerTable, Reference, locate
+from .tables import read_body
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
@@ -25,9 +28,9 @@ def read_trc(path: Path, table: MarkerTable) -> Reference:
     Raises
     ------
     MissingFile, BadData
-        Not there; no TRC; an unknown unit; rows of another length; no marker that the table knows.
+        Not there; no TRC; an unknown unit; rows that are too long, or hold text; no marker that the table knows.
     """
-    lines = read_first_lines(path, 6)
+    lines = read_first_lines(path, 5)
     if not lines[0].startswith("PathFileType"):
         raise BadData(f"{path}: is no TRC: its first line does not begin with PathFileType")
     about = dict(zip(lines[1].split("\t"), lines[2].split("\t"), strict=False))
@@ -37,27 +40,20 @@ def read_trc(path: Path, table: MarkerTable) -> Reference:
     names = [name.strip() for name in lines[3].split("\t")[2:] if name.strip()]
     if not names or len(set(names)) < len(names):
         raise BadData(f"{path}: line 4 names {'no markers' if not names else 'a marker twice'}: {lines[3][:60]!r}")
-    body = path.read_text(encoding="utf-8", errors="replace").splitlines()[5:]
-    width = 2 + 3 * len(names)
-    values = []
-    for k, line in enumerate(body, 6):
-        if not line.strip():
-            continue
-        cells = [cell.strip() for cell in line.removesuffix("\t").split("\t")]
-        if cells[-1] and len(cells) < width and (len(cells) - 2) % 3:
-            raise BadData(f"{path}: line {k} ends within a marker, after {len(cells)} of {width} cells; it was cut off")
-        cells += [""] * (width - len(cells))
-        try:
-            values.append([float(cell) if cell else np.nan for cell in cells[:width]])
-        except ValueError:
-            raise BadData(f"{path}: line {k} holds something else than numbers: '{line[:40]}'") from None
-        if any(cells[width:]):
-            raise BadData(f"{path}: line {k} has {len(cells)} cells; {width} are needed for {len(names)} markers")
-    if len(values) < 2:
-        raise BadData(f"{path}: {len(values)} rows of markers; a recording has at least 2")
-    rows = np.array(values)
+    columns = [str(k) for k in range(2 + 3 * len(names))]
+    with library_errors(path, "a TRC"):
+        body = read_body(path, 5)
+        # A tab may end each row.
+        cells = pl.read_csv(body, has_header=False, separator="\t", schema=dict.fromkeys([*columns, "end"], pl.String))
+        cells = cells.select(pl.all().str.strip_chars().replace("", None)).drop_nulls("1")
+        rows = cells.select(columns).cast(pl.Float64).to_numpy()
+    if cells["end"].count():
+        row = int(cells["end"].is_not_null().arg_max() or 0) + 1
+        raise BadData(f"{path}: row {row} has more than the {len(columns)} cells of {len(names)} markers")
+    if len(rows) < 2:
+        raise BadData(f"{path}: {len(rows)} rows of markers; a recording has at least 2")
     if not np.all(np.diff(rows[:, 1]) > 0.0):
         raise BadData(f"{path}: the times of its rows do not increase")
-    check_measured(path, np.nan_to_num(rows[:, 2:]), "a marker")
+    check_measured(path, rows[:, 2:], "a marker")
     points = UNITS[unit] * rows[:, 2:].reshape(len(rows), -1, 3)
     return locate(path, rows[:, 1], {name: points[:, k] for k, name in enumerate(names)}, table)
