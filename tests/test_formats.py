@@ -289,7 +289,7 @@ def test_apdm_knows_its_sensors_by_name(tmp_path: Path) -> None:
     with pytest.raises(BadSession, match=r"label is missing; which of a\.csv is it\? there is: Left Wrist, Chest"):
         load(tmp_path, '[data]\nfile = "a.csv"\n[sensors.head]')
     device = read_device(tmp_path / "a.csv", "apdm", "orientation")
-    assert list(device.labels) == ["Chest"]
+    assert list(device.sensors) == ["Chest"]
     (missing,) = device.diagnostics
     assert (missing.code, missing.facts["devices"]) == ("devices-left-out", "Left Wrist")
 
@@ -298,7 +298,7 @@ def test_a_real_export_of_apdm(data: Path, tmp_path: Path) -> None:
     """Gravity is up in the world of its orientations, and 128 Hz come from its microseconds."""
     file = data / "mt_manager" / "apdm_format7.csv"
     device = read_device(file, "apdm")
-    assert list(device.labels) == ["Lumbar", "Right Ankle", "Left Ankle", "Left Foot", "Chest", "Right Foot"]
+    assert list(device.sensors) == ["Lumbar", "Right Ankle", "Left Ankle", "Left Foot", "Chest", "Right Foot"]
     recording = load(tmp_path, f"[data]\nfile = '{file}'\n[sensors.torso]\nlabel = 'Right Foot'")
     assert recording.rate_hz == pytest.approx(128.0, rel=1e-3)
     ready = load(tmp_path, f"[data]\nfile = '{file}'\nuse = 'orientation'\n[sensors.torso]\nlabel = 'Right Foot'")
@@ -456,10 +456,9 @@ def test_opensim_orientations(tmp_path: Path) -> None:
     [
         (("DataType=Quaternion", "DataType=double"), "DataType=double; orientations are needed"),
         (("endheader", "end"), "no line 'endheader'"),
-        (("0.010000\t", "0.010000\tmore\t"), "row 2 has 4 cells, the line of names has 3"),
-        (("time\ttorso_imu", "torso_imu\ttime"), "a line of names that begins with time"),
-        (("humerus_r_imu", "torso_imu"), "two columns have one name"),
-        (("1.000000000,0.", "one,0."), "column 'torso_imu' holds 'one,0"),
+        (("0.010000\t", "0.010000\tmore\t"), "cannot be read as an OpenSim .sto; .* more fields"),
+        (("time\ttorso_imu", "torso_imu\ttime"), "cannot be read as an OpenSim .sto"),
+        (("1.000000000,0.", "one,0."), "in column 'torso_imu'; .*one"),
     ],
 )
 def test_opensim_files_that_are_wrong(change: tuple[str, str], says: str, tmp_path: Path) -> None:
@@ -629,17 +628,9 @@ def test_gigantic_numbers_are_refused(format: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("format", MAKERS)
 def test_raw_data_that_are_not_there_cannot_be_used(format: str, tmp_path: Path) -> None:
     path = made(format, tmp_path)
-    if format == "opensim":
-        with pytest.raises(BadData, match="no gyroscope and accelerometer"):
-            read_device(path, format, "raw")
-        return
     path.write_bytes(path.read_bytes().replace(b"Gyr", b"Gxx"))
     assert format != "apdm" or b"Gxx" in path.read_bytes()
-    if format == "ximu3":
-        with pytest.raises(BadData, match="no sensor in it has Gyroscope X"):
-            read_device(path, format, "raw")
-        return
-    with pytest.raises(BadData, match=r"leave out data\.use"):
+    with pytest.raises(BadData, match=r"no sensor in it has .*; leave out data\.use"):
         read_device(path, format, "raw")
 
 

@@ -172,7 +172,7 @@ def test_layouts(
 ) -> None:
     (tmp_path / "a.csv").write_text(text)
     layout = read_layout(tmp_path / "a.csv")
-    assert (layout.separator, layout.names) == (separator, names)
+    assert (layout.separator, tuple(layout.names)) == (separator, names)
     assert read_table(tmp_path / "a.csv").rows() == rows
 
 

@@ -63,7 +63,8 @@ def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = Non
         )
         cells = cells.rename(str.strip).drop_nulls(cells.columns[0])
         time = cells["time"].cast(pl.Float64).to_numpy()
-        for label in cells.columns[1:]:
+    for label in cells.columns[1:]:
+        with library_errors(path, f"quaternions w,x,y,z, one a row, in column '{label}'"):
             wxyz = cells[label].str.split(",").list.to_array(4).cast(pl.Array(pl.Float64, 4)).to_numpy()
             quats[label] = wxyz[:, [1, 2, 3, 0]]
     if own:

@@ -462,12 +462,12 @@ def _open_tables(format: TableFormat, path: Path, use: str | None) -> list[Devic
         raise BadData(f"{path}: no {named}, which a {format.title} has; {format.needs} are needed")
     patterns = [format.files[kind] for kind in kinds if kind in format.files]
     with open_folder(path) as files:
-        for pattern in patterns:
-            tables = [table for file in _select(files, pattern) if (table := parse_table(format, file)) is not None]
-            if tables:
-                return tables
-    listed = " or ".join(dict.fromkeys(patterns))
-    raise MissingFile(f"{path}: no {listed} with a {named}, which a {format.title} has; {format.needs} are needed")
+        for selected in filter(None, (_select(files, pattern) for pattern in patterns)):
+            tables = [table for file in selected if (table := parse_table(format, file)) is not None]
+            if not tables:
+                raise BadData(f"{path}: {selected[0].name} has no {named}; {format.needs} are needed")
+            return tables
+    raise MissingFile(f"{path}: no {' or '.join(dict.fromkeys(patterns))} in it with {format.needs}")
 
 
 def _has(sensors: _Sensors, kind: str) -> bool:

@@ -18,12 +18,14 @@ from typing import Any
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
+from ..errors import BadData
 from ..recording.limits import STANDARD_GRAVITY
 from .device import ACCEL_UNITS, Device, Signal, convert, make_device
 from .guess import group_columns
 from .libraries import import_library, library_errors
 
 NEEDS = "gyroscope and accelerometer, nor orientation, by the labels of its channels; they need labels as gyr_x"
+MAGIC = b"XDF:", b"\x1f\x8b"  # the latter of gzip
 _SIGNAL_WORDS = re.compile("accelerometer|gyroscope|accel|gyro|acc|gyr")
 
 
@@ -43,6 +45,9 @@ def read_xdf(path: Path, use: str | None = None, rate_hz: float | None = None) -
         No XDF, or damaged; no stream of a sensor; an unknown unit; not what `use` asks for; pyxdf is not installed.
     """
     pyxdf = import_library("pyxdf", path, "an XDF")
+    with path.open("rb") as file:
+        if not file.read(4).startswith(MAGIC):
+            raise BadData(f"{path}: is no XDF: it does not begin with 'XDF:'")
     logging.getLogger("pyxdf").setLevel(logging.CRITICAL)  # it reports what it mends
     with library_errors(path, "an XDF"):
         streams, _ = pyxdf.load_xdf(str(path))
