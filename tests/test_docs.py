@@ -176,12 +176,12 @@ def test_the_description_of_the_recipe_is_read(tmp_path: Path) -> None:
     rows = "0;180;0;0;0;0;1000\n10;0;0;90;0;0;1000\n20;0;0;90;0;0;1000\n"
     file.write_text(f"serial: A17\nt_ms;wx;wy;wz;fx;fy;fz\n{rows}", encoding="utf-8")
     device = read_device(file, str(example("wepose_pin/readers/formats/acme.toml", tmp_path)))
-    assert dict(device.labels) == {"A17": "torso"}
-    assert device.table["time"].to_list() == [0.0, 0.01, 0.02]
-    np.testing.assert_allclose(
-        device.table[device.signals("A17")["gyro"]].to_numpy()[:2], [[np.pi, 0, 0], [0, 0, np.pi / 2]]
-    )
-    np.testing.assert_allclose(device.table[device.signals("A17")["accel"]].to_numpy()[:, 2], 9.80665)
+    assert list(device.sensors) == ["A17"]
+    sensor = device.sensors["A17"]
+    assert sensor.segment == "torso"
+    np.testing.assert_array_equal(sensor.time, [0.0, 0.01, 0.02])
+    np.testing.assert_allclose(sensor.signals["gyro"][:2], [[np.pi, 0, 0], [0, 0, np.pi / 2]])
+    np.testing.assert_allclose(sensor.signals["accel"][:, 2], 9.80665)
 
 
 def test_the_protocol_and_the_robot_of_the_recipes_are_read(tmp_path: Path) -> None:

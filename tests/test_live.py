@@ -23,7 +23,6 @@ from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, Output, Status, StreamInfo
-from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log, read_messages
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.arrivals import Samples
@@ -524,12 +523,6 @@ def test_files_that_are_none_are_said_to_be(recording: Recording, tmp_path: Path
     other.write_bytes(b"something else")
     with pytest.raises(BadData, match="is not the recording of a live session"):
         read_live_log(other)
-    other.write_bytes(b"WEPOSE-LIVE-1\nHEAD")
-    for read in (read_live_log, load_session):
-        with pytest.raises(
-            BadData, match=r"other\.mcap: recorded by an earlier version, whose files are no longer read"
-        ):
-            read(other)
     with pytest.raises(ExistingOutput, match="exists; --force"):
         live(recording, other)
     with pytest.raises(ExistingOutput, match="cannot be written"):

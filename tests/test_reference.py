@@ -403,14 +403,10 @@ def test_a_real_mvnx_agrees_with_what_is_tracked_of_it(
 SPOILED_TRC = {
     "no TRC": (("PathFileType", "Path"), "does not begin with PathFileType"),
     "an unknown unit": (("\tmm\t", "\tinch\t"), "Units 'inch'; there is: mm, cm, m"),
-    "text": (("2\t0.016667\t", "2\tnow\t"), "line 8 holds something else than numbers"),
+    "text": (("2\t0.016667\t", "2\tnow\t"), "cannot be read as a TRC; .*now"),
     "a marker twice": (("\tCLAV\t", "\tC7\t"), "names a marker twice"),
-    "a cell too many": (("3\t0.033333\t", "3\t0.033333\t1\t"), "line 9 has 45 cells; 44 are needed for 14 markers"),
+    "a cell too many": (("3\t0.033333\t", "3\t0.033333\t1\t"), "cannot be read as a TRC; .* more fields"),
     "time that goes back": (("3\t0.033333\t", "3\t0.000001\t"), "times of its rows do not increase"),
-    "a row that was cut off": (
-        ("4\t0.050000\t", "4\t0.050000\t1.0\n5\t0.060000\t"),
-        "line 10 ends within a marker, after 3 of 44",
-    ),
     "markers of nobody": (("\t" + "C7", "\tA"), ""),
 }
 

@@ -22,7 +22,17 @@ from scipy.spatial.transform import Rotation
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import TomlTable, read_toml
 from ..errors import BadData, BadSession, MissingFile, MissingRate
-from .device import NEEDED, Device, Signal, convert, make_device, open_folder, read_first_lines, spread_equal_times
+from .device import (
+    NEEDED,
+    Device,
+    Signal,
+    check_measured,
+    convert,
+    make_device,
+    open_folder,
+    read_first_lines,
+    spread_equal_times,
+)
 from .tables import parse_rows, read_body, read_columns
 
 FOLDER = Path(__file__).parent / "formats"
@@ -303,7 +313,9 @@ class DeviceTable:
         """Return columns (n, k); empty cells are NaN."""
         names = [self.names[k] for k in columns]
         table = self.cells.select(pl.col(str(k)).alias(self.names[k]) for k in columns)
-        return read_columns(table, names, str(self.path), str(self.path))
+        values = read_columns(table, names, str(self.path), str(self.path))
+        check_measured(self.path, values, ", ".join(names))
+        return values
 
 
 def _split(line: str, separator: str) -> list[str]:

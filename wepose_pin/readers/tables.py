@@ -107,6 +107,7 @@ def parse_rows(path: Path, body: bytes, names: Sequence[str], separator: str, *,
             comment_prefix="#",
             encoding="utf8-lossy",
             raise_if_empty=False,
+            missing_columns="insert",
             truncate_ragged_lines=lenient,
         )
 

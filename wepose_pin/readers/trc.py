@@ -42,9 +42,9 @@ def read_trc(path: Path, table: MarkerTable) -> Reference:
         raise BadData(f"{path}: line 4 names {'no markers' if not names else 'a marker twice'}: {lines[3][:60]!r}")
     columns = [str(k) for k in range(2 + 3 * len(names))]
     with library_errors(path, "a TRC"):
+        schema = dict.fromkeys([*columns, "end"], pl.String)  # a tab may end each row
         body = read_body(path, 5)
-        # A tab may end each row.
-        cells = pl.read_csv(body, has_header=False, separator="\t", schema=dict.fromkeys([*columns, "end"], pl.String))
+        cells = pl.read_csv(body, has_header=False, separator="\t", schema=schema, missing_columns="insert")
         cells = cells.select(pl.all().str.strip_chars().replace("", None)).drop_nulls("1")
         rows = cells.select(columns).cast(pl.Float64).to_numpy()
     if cells["end"].count():
