@@ -17,7 +17,8 @@ from wepose_pin.evaluation import evaluate
 from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.table_file import format_table
-from wepose_pin.readers.describe import Wearer, describe_file
+from wepose_pin.readers.describe import describe_file
+from wepose_pin.readers.propose import Wearer
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report import render_track_report
 from wepose_pin.report.viewer import FLOOR_Z, find_floor, pose_html

@@ -62,7 +62,8 @@ def run_info(job: InfoJob, progress: Progress = no_progress) -> InfoOutcome:
     """
     from ..documents import check_file, whole_file
     from ..model import load_model
-    from ..readers.describe import Wearer, describe_file, find_file
+    from ..readers.describe import describe_file, find_file
+    from ..readers.propose import Wearer
 
     progress("reading", 0.0)
     wearer = Wearer(load_model(job.model).table, job.model) if job.model is not None else None

@@ -101,6 +101,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     measured = files.read_sensors(tables)
     time, resampled = find_common_time(str(path), {segment: each.clock for segment, each in measured.items()})
     check_phases(str(path), time, head.phases)
+    _refuse_shared_columns(path, measured)
     start = next(iter(head.phases.get("start", ())), None)
     check = check_sensors(str(path), {segment: each.list_samples() for segment, each in measured.items()}, start)
     sensors: dict[str, Sensor] = {}
@@ -155,15 +156,6 @@ class _Files:
         unused = [key for key in _UNUSED if key in self._data and key not in self._used]
         if unused:
             raise BadSession(f"{self._data.at(unused[0])}: {_UNUSED[unused[0]]}; leave it out")
-        owner: dict[tuple[Path, str], str] = {}
-        for segment, each in measured.items():
-            for signal, name in ((signal, name) for signal, names in each.columns.items() for name in names):
-                other = owner.setdefault((each.path, name), segment)
-                if other != segment:
-                    raise BadSession(
-                        f"{self._path}: sensors.{segment}.{signal} names column '{name}' of {each.path.name}, which is "
-                        f"that of sensors.{other}; each sensor has columns of its own"
-                    )
         return measured
 
     def list_diagnostics(self) -> Iterator[Diagnostic]:
@@ -326,6 +318,19 @@ def _read_aligned(keys: TomlTable, stated: SensorKeys, signals: Mapping[str, obj
     if aligned and "orientation" not in signals:
         raise BadSession(f"{keys.at('aligned')} = true needs orientations; leave it out where there are none")
     return aligned
+
+
+def _refuse_shared_columns(path: Path, measured: Mapping[str, _Measured]) -> None:
+    """Raise an error where two sensors have a column in common."""
+    owner: dict[tuple[Path, str], str] = {}
+    for segment, each in measured.items():
+        for signal, name in ((signal, name) for signal, names in each.columns.items() for name in names):
+            other = owner.setdefault((each.path, name), segment)
+            if other != segment:
+                raise BadSession(
+                    f"{path}: sensors.{segment}.{signal} names column '{name}' of {each.path.name}, which is that of "
+                    f"sensors.{other}; each sensor has columns of its own"
+                )
 
 
 # Sensors -----------------------------------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ def read_table(path: Path) -> pl.DataFrame:
     _check_table(path)
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"):
-            return pl.read_parquet(_open_source(path))
+            return pl.read_parquet(open_source(path))
     layout = read_layout(path)
     body = read_body(path, layout.head_lines)
     # Editors and spreadsheets leave lines without values at the end.
@@ -79,7 +79,7 @@ def read_names(path: Path) -> tuple[list[str], dict[str, str]]:
     _check_table(path)
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"):
-            return list(pl.read_parquet_schema(_open_source(path))), {}
+            return list(pl.read_parquet_schema(open_source(path))), {}
     layout = read_layout(path)
     return list(layout.names), dict(zip(layout.names, layout.units, strict=False))
 
@@ -180,7 +180,7 @@ def _read_numbers(table: pl.DataFrame, name: str, file: str, place: str) -> pl.S
 # Checks of files ---------------------------------------------------------------------------------------------------
 
 
-def _open_source(path: Path) -> Path | bytes:
+def open_source(path: Path) -> Path | bytes:
     """Return the file as a path, or its contents where the path is not UTF-8, which polars cannot open."""
     try:
         os.fspath(path).encode("utf-8")
