@@ -55,24 +55,12 @@ def test_every_method_is_measured() -> None:
     assert 0.0 < measured["accuracy"].rows["smekf"]["total_rmse"] < 1.0
 
 
-@pytest.mark.peer
-def test_scipy_solves_the_same_calibration() -> None:
-    rows = calibration.calibration(10.0, (10.0,), 1).rows
-    names = [name.partition(": ")[2] for name in rows]
-    solvers = ["nlpsol", "Gauss-Newton loop", "least_squares, our Jacobian", "least_squares, 2-point"]
-    assert names == ["building", *solvers, *(f"whole, {name}" for name in solvers[:2])]
-    for name, row in rows.items():
-        assert "cost" not in row or row["cost"] == pytest.approx(1.0, abs=1e-3), name
-    assert len({name.partition(":")[0] for name in rows}) == 1
-
-
 @pytest.mark.slow
 def test_nlpsol_and_the_loop_are_compared_on_every_kind_of_calibration() -> None:
     rows = calibration.solvers_by_case(15.0, 1).rows
     assert {"clasp", "clasp, unknown mounts", "clasp, 5 s", "t_pose+bow"} == set(rows)
     for name, row in rows.items():
         assert row["difference"] < 1.0, name
-        assert 2 <= row["nlpsol_evaluations"] < 300, name
         assert row["nlpsol_s"] > 0.0 < row["loop_s"], name
 
 

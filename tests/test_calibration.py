@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import Calibration, calibrate
-from wepose_pin.calibration.chain import rotate
+from wepose_pin.calibration.equations import rotate
 from wepose_pin.calibration.quality import assess
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person

@@ -1,4 +1,4 @@
-"""Quaternion algebra: the only place that has it, for arrays and for compiled kernels.
+"""Quaternion algebra for arrays and for compiled kernels; `calibration.equations` has what CasADi needs beside it.
 
 Quaternions are xyzw, unit norm, as in Pinocchio and SciPy. Functions on arrays come first. The kernels below them are
 the per-sample steps of filters and of live tracking: they work on numbers and on the first four entries of a row, and
@@ -27,8 +27,8 @@ def wxyz_from_xyzw(quat_xyzw: ArrayLike) -> np.ndarray:
     return np.roll(np.asarray(quat_xyzw, dtype=float), 1, axis=-1)
 
 
-def _product(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped-def]
-    """``a ⊗ b`` of the components of two quaternions, numbers or arrays, as four."""
+def product_terms(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped-def]
+    """``a ⊗ b`` of the components of two quaternions, numbers, arrays or symbols, as four."""
     return (
         aw * bx + ax * bw + ay * bz - az * by,
         aw * by - ax * bz + ay * bw + az * bx,
@@ -37,12 +37,12 @@ def _product(ax, ay, az, aw, bx, by, bz, bw):  # type: ignore[no-untyped-def]
     )
 
 
-product = inlined(_product)
+product = inlined(product_terms)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Products of quaternions (..., 4) xyzw; on 60 000 ten times as fast as SciPy's."""
-    parts = _product(*(quat[..., k] for quat in (a, b) for k in range(4)))  # type: ignore[no-untyped-call]
+    parts = product_terms(*(quat[..., k] for quat in (a, b) for k in range(4)))  # type: ignore[no-untyped-call]
     out = np.empty((*parts[0].shape, 4))  # `np.stack` takes half of the time of a few
     out[..., 0], out[..., 1], out[..., 2], out[..., 3] = parts
     return out

@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
+from .equations import Layout
 from .initial_headings import find_distinct_headings
-from .least_squares import Gaussian, Layout, Observations, place_points
-from .solver import Fit, LeastSquares, solve
+from .least_squares import Estimate, Gaussian, LeastSquares, Observations, solve
+from .priors import place_points
 from .weights import WeightedFit
 
 COMPARED_SAMPLES = 120  # on which solutions are compared
@@ -53,16 +54,16 @@ def find_alternatives(
     stride = max(1, len(observations) // COMPARED_SAMPLES)
     few = np.concatenate([np.arange(len(observations))[span][::stride] for _, span in observations.spans()])
     some, weights = observations.take(few), stride * result.weights[few]
-    rows = np.arange(layout.size)[layout.heading]
+    rows = layout.heading
 
-    def solve_from(psi: np.ndarray) -> Fit:
+    def solve_from(psi: np.ndarray) -> Estimate:
         start = fit.x.copy()
         start[rows] += np.where(unknown, (psi - start[rows] + np.pi) % (2.0 * np.pi) - np.pi, 0.0)
         start = place_points(start, some)
         return solve(LeastSquares(some, prior_at(start), weights), start, STEPS, strict=False)
 
     best = solve_from(fit.x[rows])
-    std = np.sqrt(np.diag(np.linalg.inv(fit.information))[rows])
+    std = np.sqrt(np.diag(fit.covariance)[rows])
     alternatives: list[Alternative] = []
     closed = observations.take(observations.closed)
     for psi in find_distinct_headings(closed, fit.x, stated):
@@ -86,7 +87,7 @@ def widen_covariance(covariance: np.ndarray, others: list[Alternative], layout: 
     total = 1.0 + sum(each.weight for each in others)
     outer = sum((each.weight / total * np.outer(each.offset, each.offset) for each in others), 0.0 * covariance)
     widened = covariance + outer
-    rows = np.arange(layout.size)[layout.heading]
+    rows = layout.heading
     std = np.sqrt(np.diag(widened))
     shrink = np.ones(layout.size)
     shrink[rows] = np.minimum(1.0, CIRCLE_STD / std[rows])

@@ -8,7 +8,7 @@ is the frame of such a segment that equals W in the start pose: of a person in t
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -44,11 +44,13 @@ class Loop:
     ----------
     ways : parts from the root to a point, or from one point to another where the closure is between two
     girdles : of each way, the girdles that move its points, each with the sign of its displacement
+    unknown : number of its unknown fixed point or plane among those of its kind
     """
 
     closure: Closure
     ways: tuple[tuple[Part, ...], ...]
     girdles: tuple[tuple[tuple[str, float], ...], ...] = ()
+    unknown: int = 0
 
     @property
     def kind(self) -> str:
@@ -169,7 +171,9 @@ def resolve_conditions(
     table, constraints = model.table, list[Constraint]()
     for condition in protocol.conditions:
         if isinstance(condition, Closure):
-            constraints.append(_resolve_closure(condition, protocol, model, start, sensors))
+            loop = _resolve_closure(condition, protocol, model, start, sensors)
+            unknown = sum(isinstance(other, Loop) and other.kind == loop.kind for other in constraints)
+            constraints.append(replace(loop, unknown=unknown))
         elif isinstance(condition, Direction):
             _check_posed((condition.segment, table.reference), protocol, model, sensors)
             constraints.append(

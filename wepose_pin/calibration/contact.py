@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from .conditions import Loop
-from .least_squares import Observations, residuals
+from .least_squares import Observations
 
 WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
 MANY_WIDE = 0.05  # share of samples with such gaps, above which subsets are tried
@@ -40,7 +40,7 @@ def find_initial_guess(
     few = observations.take(scored[np.linspace(0, len(scored) - 1, min(len(scored), SCORED)).astype(int)])
 
     def gap_ratios(x: np.ndarray, some: Observations) -> np.ndarray:
-        return np.sum(residuals(x, some)[2] ** 2, axis=1) / WIDE**2
+        return np.sum(some.gaps(x) ** 2, axis=1) / WIDE**2
 
     def score(x: np.ndarray) -> float:
         return float(np.mean(np.minimum(gap_ratios(x, few), 1.0)))

@@ -19,8 +19,9 @@ import numpy as np
 from ..filters.butterworth import band_pass, low_pass
 from ..filters.sensors import FilteredRecording
 from ..recording import Recording
+from .equations import Layout
 from .initial_headings import Coupling
-from .least_squares import Gaussian, Layout
+from .least_squares import Gaussian
 from .sample_losses import find_sample_losses, mask_connected
 from .weights import LEAST_CORRELATION_S
 
@@ -86,7 +87,7 @@ def add_couplings(prior: Gaussian, layout: Layout, couplings: Sequence[Coupling]
     for row, coupling in enumerate(couplings):
         for name, sign in ((coupling.near, 1.0), (coupling.far, -1.0)):
             i = layout.sensors.index(name)
-            H[row, layout.heading.start + i], H[row, layout.drift.start + i] = sign, sign * coupling.elapsed_s
+            H[row, layout.heading[i]], H[row, layout.drift[i]] = sign, sign * coupling.elapsed_s
         off[row] = H[row] @ (start - prior.mean) + np.angle(np.exp(1j * (coupling.heading - H[row] @ start)))
     weight = np.array([coupling.std**-2 for coupling in couplings])
     information = prior.information + H.T @ (weight[:, None] * H)

@@ -1,138 +1,30 @@
-"""The unknowns of a calibration and the residuals of its samples, with their Jacobian; `solver` minimises them.
+"""The least squares of a calibration in numbers: samples, prior and weights, and the solution by CasADi's `nlpsol`.
 
-For each sensor i the filter gives R_VS(t) in a world V of its own heading, and Q(t) = R_VS(t) R_VS(start)ᵀ. Here L is
-the frame of its segment that equals W in the start pose (L' in `conditions`). With a start pose that is ε off the
-stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
-
-    R_WL(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
-
-with ψ the heading, d its drift since the start, and A the soft-tissue artefact: soft tissue rotates a sensor as the
-direction of gravity in the segment changes. A segment's points may move, as the shoulders do by collarbones and
-shoulder blades while the arms are raised (`model.girdle`). d, A and the hinges are nuisance parameters: the covariance
-of lengths and mounts includes their effect.
-
-Each sample belongs to one condition of the protocol. A closure (`Loop`) gives the gap, whitened by the covariance that
-errors of the orientations and slipping palms give it, and of each hinge the angle by which the segment that it moves
-leaves its plane. The covariance depends on the lengths, so that scaling all lengths does not shrink the residual (see
-`lengths`). A stated pose (`Pointing`) gives the deviation of a segment from its direction, an axis (`Level`) how far it
-rises while the segment bends. Each sample has the same residuals: three of its condition and one a hinge; those that do
-not apply are zero.
+The expressions are those of `equations`. Tests hold the solution against Gauss-Newton with Marquardt's damping in a few
+lines of NumPy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
 
-from ..model.girdle import PARAMETERS, displace
-from ..model.reaches import UNIVERSE
-from .blocks import Program, evaluate, make_program
-from .chain import about_z, inverse, product, rotate, small_turn
-from .conditions import Constraint, GirdleTerm, HingeUnknown, Loop, Moving, Part, Pointing
+from ..errors import NoSolution
+from .conditions import Constraint, Loop, Moving
+from .equations import GAP_ROWS, Layout, sample_functions
 
-HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
-GAP_ROWS = 3  # residuals of a sample's condition
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The places of the unknowns in their vector x, and of the data of a sample; the properties are slices of them.
-
-    Parameters
-    ----------
-    lengths : names, in the order of the table
-    sensors : names of their segments, in the order of the table
-    hinges, girdles : between segments of these sensors
-    fixed : number of unknown fixed points
-    planes : number of level planes of unknown height
-    recorded : the samples have a recorded place
-    rigid : sensors without a soft-tissue artefact
-    attitude_std : [rad] of each sensor's orientation about an axis across its segment; only the ratios matter
-    """
-
-    lengths: tuple[str, ...]
-    sensors: tuple[str, ...]
-    hinges: tuple[HingeUnknown, ...] = ()
-    girdles: tuple[GirdleTerm, ...] = ()
-    fixed: int = 0
-    planes: int = 0
-    recorded: bool = False
-    rigid: tuple[str, ...] = ()
-    attitude_std: tuple[float, ...] = ()
-
-    @cached_property
-    def soft(self) -> tuple[str, ...]:
-        """Sensors with a soft-tissue artefact."""
-        return tuple(name for name in self.sensors if name not in self.rigid)
-
-    @cached_property
-    def length(self) -> slice:
-        """The lengths [m]."""
-        return slice(0, len(self.lengths))
-
-    @cached_property
-    def heading(self) -> slice:
-        """ψ [rad] of each sensor."""
-        return slice(self.length.stop, self.length.stop + len(self.sensors))
-
-    @cached_property
-    def tilt(self) -> slice:
-        """ε about x, y of L [rad] of each sensor: how far its segment is off the start pose."""
-        return slice(self.heading.stop, self.heading.stop + 2 * len(self.sensors))
-
-    @cached_property
-    def drift(self) -> slice:
-        """d [rad/s] of each sensor's heading."""
-        return slice(self.tilt.stop, self.tilt.stop + len(self.sensors))
-
-    @cached_property
-    def hinge(self) -> slice:
-        """Two numbers a hinge: the displacements of its axis, of length 1, along `across` and `tilted`."""
-        return slice(self.drift.stop, self.drift.stop + 2 * len(self.hinges))
-
-    @cached_property
-    def soft_tissue(self) -> slice:
-        """A (3, 3) of each of the `soft` sensors, column by column [rad]."""
-        return slice(self.hinge.stop, self.hinge.stop + 9 * len(self.soft))
-
-    @cached_property
-    def girdle(self) -> slice:
-        """`model.girdle.PARAMETERS` of each girdle: a share of its law, then [m]."""
-        return slice(self.soft_tissue.stop, self.soft_tissue.stop + len(PARAMETERS) * len(self.girdles))
-
-    @cached_property
-    def points(self) -> slice:
-        """Unknown points of W (3,) each [m]."""
-        return slice(self.girdle.stop, self.girdle.stop + 3 * self.fixed)
-
-    @cached_property
-    def heights(self) -> slice:
-        """Heights of level planes in W [m]."""
-        return slice(self.points.stop, self.points.stop + self.planes)
-
-    @cached_property
-    def size(self) -> int:
-        return self.heights.stop
-
-    @cached_property
-    def rows(self) -> int:
-        """Number of values that a sample has."""
-        return self.place.stop + 1
-
-    @cached_property
-    def place(self) -> slice:
-        """Of a sample's data: the recorded place (3,) [m] in W."""
-        return slice(4 * len(self.sensors), 4 * len(self.sensors) + 3 * self.recorded)
-
-    @cached_property
-    def residuals(self) -> int:
-        """Number of residuals of a sample."""
-        return GAP_ROWS + len(self.hinges)
+MIN_LENGTH = 0.01  # [m] below which a length has not converged
+STEPS = 60
+TOLERANCE = 1e-4  # of the gradient, by standard deviations of the prior
+LOOSE_TOLERANCE = 0.05  # standard deviations of the result that may be left to go after the last step
+_QUIET = dict.fromkeys(("print_header", "print_time", "error_on_fail"), False)
+QUIET_QP = _QUIET | dict.fromkeys(("print_iter", "print_info"), False)
+_QUIET_NLP = _QUIET | dict.fromkeys(("print_iteration", "print_status", "show_eval_warnings"), False)
+_BLAS = "classic" if ca.has_blas("classic") else "reference"
 
 
 class Gaussian(NamedTuple):
@@ -173,162 +65,166 @@ class Observations:
         """(n,) bool: samples of a closure or of free motion, which have the residuals of hinges."""
         return np.array([isinstance(c, Loop | Moving) for c in self.conditions], dtype=bool)[self.condition_index]
 
+    def residuals(self, x: ca.MX | np.ndarray) -> tuple[ca.MX, ca.MX]:
+        """Return the residuals (k, n) and the gaps (3, n) [m], zero without a closure, in CasADi."""
+        r, gaps = zip(*(functions[0](x, data) for functions, data in self._functions()), strict=True)
+        return ca.horzcat(*r), ca.horzcat(*gaps)
 
-def residuals(x: np.ndarray, observations: Observations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the residuals (n, k), their Jacobian (n, k, len(x)), and the gaps (n, 3) [m], zero without a closure."""
-    parts, k = [], observations.layout.residuals
-    for (condition, span), place in zip(observations.spans(), _unknown_places(observations.conditions), strict=True):
-        program = _residual_program(observations.layout, condition, place)
-        r, J, gap = evaluate(program, x, observations.data[:, span])
-        parts.append((r, J.reshape(-1, k, len(x)), gap))
-    if len(parts) == 1:
-        return parts[0]
-    r, J, gap = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return r, J, gap
+    def jacobian(self, x: ca.MX | np.ndarray) -> ca.MX:
+        """Return the transposed Jacobian of all residuals (m, n k), sample by sample, in CasADi."""
+        return ca.horzcat(*(functions[1](x, data) for functions, data in self._functions()))
 
+    def _functions(self) -> list[tuple[tuple[ca.Function, ca.Function], ca.DM]]:
+        """Return the functions of each condition that has samples, with their data, which CasADi maps them over."""
+        spans = [(condition, span) for condition, span in self.spans() if span.start < span.stop]
+        return [(sample_functions(self.layout, condition), ca.DM(self.data[:, span])) for condition, span in spans]
 
-def _unknown_places(conditions: Sequence[Constraint]) -> list[int]:
-    """Return of each condition the number of its unknown point, or of its plane's height, among those of its kind."""
-    places, counts = [], {"fixed_point": 0, "plane": 0}
-    for condition in conditions:
-        kind = condition.kind if isinstance(condition, Loop) else ""
-        places.append(counts.get(kind, 0))
-        if kind in counts:
-            counts[kind] += 1
-    return places
+    def gaps(self, x: np.ndarray) -> np.ndarray:
+        """Return the gaps (n, 3) [m] at x (m,), zero without a closure."""
+        return np.asarray(self.residuals(x)[1]).T
 
 
-def place_points(x: np.ndarray, observations: Observations) -> np.ndarray:
-    """Return x with each unknown fixed point and height at the mean of the body's points that lie on it."""
-    layout = observations.layout
-    if not layout.fixed and not layout.planes:
-        return x
-    x, gaps = x.copy(), residuals(x, observations)[2]
-    points, heights = layout.points, layout.heights
-    for (condition, span), place in zip(observations.spans(), _unknown_places(observations.conditions), strict=True):
-        if isinstance(condition, Loop) and condition.kind == "fixed_point" and condition.closure.at is None:
-            x[points][3 * place : 3 * place + 3] += gaps[span].mean(axis=0)
-        elif isinstance(condition, Loop) and condition.kind == "plane":
-            x[heights][place] += gaps[span, : condition.rows].mean()
-    return x
+@dataclass(frozen=True)
+class LeastSquares:
+    """½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c), to be made least.
+
+    Parameters
+    ----------
+    observations : the samples, whose residuals are r
+    prior : c and Λ
+    weights : w (n, k)
+    """
+
+    observations: Observations
+    prior: Gaussian
+    weights: np.ndarray
+
+    @property
+    def lower_bounds(self) -> np.ndarray:
+        """(m,) of x: no length is below `MIN_LENGTH`, all else is free."""
+        bounds = np.full(self.observations.layout.size, -np.inf)
+        bounds[self.observations.layout.length] = MIN_LENGTH
+        return bounds
 
 
-@lru_cache(maxsize=32)
-def _residual_program(layout: Layout, condition: Constraint, place: int) -> Program:
-    return make_program(_residual_function(layout, condition, place))
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A least squares at one x (m,)."""
+
+    problem: LeastSquares
+    x: np.ndarray
+
+    @cached_property
+    def _residuals(self) -> tuple[np.ndarray, np.ndarray]:
+        r, gaps = self.problem.observations.residuals(self.x)
+        return np.asarray(r).T, np.asarray(gaps).T
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """(n, k) of the samples."""
+        return self._residuals[0]
+
+    @property
+    def closure(self) -> np.ndarray:
+        """(n, 3) whitened residuals of the gap, or those of another condition."""
+        return self.residuals[:, :GAP_ROWS]
+
+    @property
+    def hinge(self) -> np.ndarray:
+        """(n, k − 3) residuals of the hinges, in units of `HINGE_STD`."""
+        return self.residuals[:, GAP_ROWS:]
+
+    @property
+    def gaps(self) -> np.ndarray:
+        """(n, 3) [m], zero without a closure."""
+        return self._residuals[1]
+
+    @cached_property
+    def jacobian(self) -> np.ndarray:
+        """(n, k, m) of the residuals."""
+        return np.asarray(self.problem.observations.jacobian(self.x)).T.reshape(*self.residuals.shape, -1)
+
+    @cached_property
+    def information(self) -> np.ndarray:
+        """JᵀWJ + Λ (m, m)."""
+        J = self.jacobian.reshape(-1, len(self.x))
+        weights = np.broadcast_to(self.problem.weights, self.residuals.shape)
+        return (J.T * weights.ravel()) @ J + self.problem.prior.information
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """(m, m) the inverse of the information."""
+        return np.linalg.inv(self.information)
+
+    @property
+    def cost(self) -> float:
+        """Twice what is made least."""
+        off = self.x - self.problem.prior.mean
+        return float(np.sum(self.problem.weights * self.residuals**2) + off @ self.problem.prior.information @ off)
+
+    @property
+    def gradient(self) -> np.ndarray:
+        """(m,) of half the cost."""
+        weighted = (self.problem.weights * self.residuals).ravel()
+        mean, information = self.problem.prior
+        return self.jacobian.reshape(-1, len(self.x)).T @ weighted + information @ (self.x - mean)
+
+    @property
+    def remaining(self) -> float:
+        """What is left to go to the minimum [standard deviations], but for lengths at their bound."""
+        free = (self.x > self.problem.lower_bounds + 1e-6) | (self.gradient < 0.0)
+        gradient = self.gradient[free]
+        return float(np.sqrt(gradient @ np.linalg.solve(self.information[np.ix_(free, free)], gradient)))
 
 
-def _residual_function(layout: Layout, condition: Constraint, place: int) -> Any:
-    """Return the CasADi function of a sample: (x, data) → residuals (k), transposed Jacobian (len(x), k), gap (3)."""
-    sensors = layout.sensors
-    x, data = ca.SX.sym("x", layout.size), ca.SX.sym("data", layout.rows)
-    heading, tilt, drift, soft_tissue = x[layout.heading], x[layout.tilt], x[layout.drift], x[layout.soft_tissue]
-    quat_WL = {}
-    for i, name in enumerate(sensors):
-        now = heading[i] + drift[i] * data[-1]
-        turned = product(about_z(now), data[4 * i : 4 * i + 4])
-        turned = product(turned, about_z(-heading[i]))
-        quat = product(turned, small_turn(ca.vertcat(tilt[2 * i], tilt[2 * i + 1], 0.0)))
-        if name in layout.soft:
-            k = 9 * layout.soft.index(name)
-            A = ca.reshape(soft_tissue[k : k + 9], 3, 3)
-            quat = product(quat, small_turn(A @ (rotate(inverse(quat), _UP) - _UP)))
-        quat_WL[name] = quat
-    gap, hinges = ca.SX.zeros(3), ca.SX.zeros(len(layout.hinges))
-    if isinstance(condition, Loop):
-        whitened, gap = _closure_residual(layout, condition, x, quat_WL, place, data[layout.place])
-        hinges = _hinge_residuals(layout, x, quat_WL)
-    elif isinstance(condition, Moving):
-        whitened, hinges = ca.SX.zeros(3), _hinge_residuals(layout, x, quat_WL)
-    elif isinstance(condition, Pointing):
-        along = rotate(
-            inverse(quat_WL[condition.reference]), rotate(quat_WL[condition.segment], ca.DM(condition.along))
+def solve(problem: LeastSquares, start: np.ndarray, steps: int = STEPS, *, strict: bool = True) -> Estimate:
+    """Return the minimiser by CasADi's `nlpsol`: sequential quadratic programming with the Gauss-Newton Hessian.
+
+    Parameters
+    ----------
+    start : x (m,) to begin with
+    steps : at most
+    strict : raise where the steps do not suffice, instead of returning the last x
+
+    Raises
+    ------
+    NoSolution
+        It did not converge.
+    """
+    observations, (mean, information) = problem.observations, problem.prior
+    start = np.maximum(start, problem.lower_bounds)
+    # In units of the prior's standard deviations the gradient says how far there is to go.
+    scale = np.diag(information) ** -0.5
+    z = ca.MX.sym("z", len(start))
+    x = start + scale * z
+    off, weights = x - mean, np.broadcast_to(problem.weights, (len(observations), observations.layout.residuals))
+    cost = 0.5 * ca.dot(ca.DM(weights.T), observations.residuals(x)[0] ** 2) + 0.5 * ca.bilin(information, off, off)
+    JT = scale * observations.jacobian(x)
+    hessian = ca.mtimes(JT @ ca.diag(ca.DM(weights.ravel())), JT.T, _BLAS)
+    hessian += np.outer(scale, scale) * information
+    inputs = {"x": z, "p": ca.MX.sym("none", 0, 1), "lam:f": ca.MX.sym("lam", 1), "lam:g": ca.MX.sym("none", 0, 1)}
+    options: dict[str, Any] = _QUIET_NLP | {
+        "hess_lag": ca.Function("nlp_hess_l", [*inputs.values()], [hessian], [*inputs], ["hess:gamma:x:x"]),
+        "no_nlp_grad": True,
+        "calc_lam_p": False,
+        "max_iter": steps,
+        "tol_du": TOLERANCE,
+        "min_step_size": 0.0,  # the gradient alone says when it is done
+        "max_iter_ls": 30,
+        "beta": 0.5,
+        "merit_memory": 1,  # every step lowers the cost
+        "qpsol": "qrqp",
+        "qpsol_options": QUIET_QP,
+    }
+    program: dict[str, Any] = {"x": z, "f": cost}
+    solver = ca.nlpsol("calibration", "sqpmethod", program, options)
+    found = np.asarray(solver(x0=0.0, lbx=(problem.lower_bounds - start) / scale)["x"]).ravel()
+    if not np.all(np.isfinite(found)):
+        found = np.zeros(len(start))
+    estimate = Estimate(problem, np.maximum(start + scale * found, problem.lower_bounds))
+    if strict and not estimate.remaining < LOOSE_TOLERANCE:
+        raise NoSolution(
+            f"the lengths did not converge ({estimate.remaining:.2g} standard deviations to go); check that the hands "
+            f"do in the phase what the protocol says, and that every sensor sits where the session says"
         )
-        whitened = (along - ca.DM(condition.direction)) / condition.std
-    else:
-        i, axis = sensors.index(condition.segment), ca.DM(condition.axis)
-        before = rotate(small_turn(ca.vertcat(tilt[2 * i], tilt[2 * i + 1], 0.0)), axis)
-        rise = rotate(quat_WL[condition.segment], axis)[2] - before[2]
-        whitened = ca.vertcat(rise / condition.std, 0.0, 0.0)
-    r = ca.cse(ca.vertcat(whitened, hinges))
-    return ca.Function("sample", [x, data], ca.cse([r, ca.densify(ca.jacobian(r, x)).T, ca.densify(gap)]))
-
-
-_UP = ca.vertcat(0.0, 0.0, 1.0)
-
-
-def orient_parts(layout: Layout, x: Any, quat_WL: Mapping[str, Any], parts: Sequence[Part]) -> list[tuple[str, Any]]:
-    """Return sensor and vector (3,) [m] in W of each part of a way between points, in CasADi."""
-    lengths, vectors = x[layout.length], []
-    for part in parts:
-        rows = [
-            sum((row[i] * lengths[i] for i in map(int, np.flatnonzero(row))), start=ca.SX(c))
-            for row, c in zip(np.array(part.by_length), part.constant, strict=True)
-        ]
-        vector = ca.vertcat(*rows)
-        vectors.append((part.sensor, vector if part.sensor == UNIVERSE else rotate(quat_WL[part.sensor], vector)))
-    return vectors
-
-
-def _displace_girdle(layout: Layout, x: Any, quat_WL: Mapping[str, Any], k: int) -> Any:
-    """Return the displacement (3,) [m] in W of the point that the k-th girdle moves, in CasADi."""
-    term = layout.girdles[k]
-    R_on, law = ca.DM(np.reshape(term.R_on, (3, 3))), term.law
-    along = R_on.T @ rotate(inverse(quat_WL[law.on]), rotate(quat_WL[law.moves], ca.DM(term.along)))
-    by_law, raised = displace(law, (along[0], along[1], along[2]), term.scale, ca)
-    own = x[layout.girdle][len(PARAMETERS) * k : len(PARAMETERS) * (k + 1)]
-    return rotate(quat_WL[law.on], R_on @ ((1.0 + own[0]) * ca.vertcat(*by_law) + own[1:4] + raised * own[4:]))
-
-
-def _closure_residual(
-    layout: Layout, loop: Loop, x: Any, quat_WL: Mapping[str, Any], place: int, recorded: Any
-) -> tuple[Any, Any]:
-    """Return the whitened residual (3) and the gap (3) [m] of a closure, in CasADi.
-
-    `place` is the number of its unknown point or plane, `recorded` (3) [m] the sample's recorded place.
-    """
-    gaps, covariances = [], []
-    names = [term.name for term in layout.girdles]
-    for way, girdles in zip(loop.ways, loop.girdles, strict=True):
-        gap, covariance = ca.SX.zeros(3), loop.closure.slip**2 * ca.SX.eye(3)
-        for name, sign in girdles:
-            if name in names:
-                gap += sign * _displace_girdle(layout, x, quat_WL, names.index(name))
-        for sensor, v in orient_parts(layout, x, quat_WL, way):
-            gap += v
-            if sensor != UNIVERSE:
-                covariance += _spread(layout, sensor, v)
-        gaps.append(gap)
-        covariances.append(covariance)
-    if loop.kind == "plane":
-        off = [gap[2] - x[layout.heights][place] for gap in gaps]
-        rows = [d / ca.sqrt(covariance[2, 2]) for d, covariance in zip(off, covariances, strict=True)]
-        missing = GAP_ROWS - len(off)
-        return ca.vertcat(*rows, *[0.0] * missing), ca.vertcat(*off, *[0.0] * missing)
-    [gap], [covariance] = gaps, covariances
-    if loop.kind == "fixed_point":
-        first = layout.points.start + 3 * place
-        gap -= x[first : first + 3]
-    elif loop.kind == "recorded":
-        gap -= recorded
-    return ca.solve(ca.chol(covariance).T, gap), gap
-
-
-def _spread(layout: Layout, sensor: str, v: Any) -> Any:
-    """Return the covariance (3, 3) [m²] that errors of its sensor give the end of a part v (3,) [m], in CasADi.
-
-    An error of variance σ² about each axis moves the end by a vector of covariance σ² (‖v‖² 1 − v vᵀ). Only the ratios
-    of these weights matter.
-    """
-    std = layout.attitude_std[layout.sensors.index(sensor)]
-    return std**2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
-
-
-def _hinge_residuals(layout: Layout, x: Any, quat_WL: Mapping[str, Any]) -> Any:
-    """Return the angles by which segments leave the planes of their hinges, in units of `HINGE_STD`, in CasADi."""
-    unknown, residual = x[layout.hinge], []
-    for i, hinge in enumerate(layout.hinges):
-        along = rotate(inverse(quat_WL[hinge.on]), rotate(quat_WL[hinge.moves], ca.DM(hinge.along)))
-        axis = ca.DM(hinge.axis) + unknown[2 * i] * ca.DM(hinge.across) + unknown[2 * i + 1] * ca.DM(hinge.tilted)
-        residual.append(ca.dot(axis, along) / ca.norm_2(axis) / HINGE_STD)
-    return ca.vertcat(*residual)
+    return estimate

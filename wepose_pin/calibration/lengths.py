@@ -39,24 +39,23 @@ from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
 from ..model import BodyModel, convert_breadths, list_breadths
 from ..model.body import load_sensed_model
-from ..model.girdle import PARAMETERS
 from ..recording import Recording
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject, population_subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
 from .anatomy import BETTER, LEAST_ROTATION, LabelCheck, check_labels
 from .conditions import Level, Pointing, find_hinges, group_lengths, is_scale_observed
 from .contact import find_initial_guess
+from .equations import HINGE_STD
 from .fusion import fuse_calibrations, separate_mounts
 from .initial_headings import Coupling, estimate_joint_headings
 from .joints import add_couplings, estimate_couplings
-from .least_squares import HINGE_STD, Gaussian, Observations, place_points, residuals
+from .least_squares import MIN_LENGTH, Gaussian, Observations
 from .observability import diagnose_closures, diagnose_lengths, diagnose_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
-from .priors import build_prior, combine_lengths
+from .priors import build_prior, combine_lengths, place_points
 from .problem import LOOSE, SAMPLE_RATE_HZ, CalibrationProblem
 from .protocols import Protocol, choose_protocol, load_protocol
 from .result import Calibration
-from .solver import MIN_LENGTH
 from .weights import (
     CONTRADICTED,
     LEAST_LENGTH_STD,
@@ -220,8 +219,10 @@ def _calibrate_checked(problem: CalibrationProblem) -> Calibration:
             unused += [_diagnose_unused_mount(n, angle, MOUNT_WARNING_DEG, "motion") for n, angle in wrong.items()]
             problem = problem.remove_mounts(wrong)
             doubt = 0.0 if wrong else doubt
-    # Other labels close other chains; hands that hardly move do not show which.
-    if doubt > 1.0 and stated.rotation > LEAST_ROTATION:
+    if doubt > 1.0 and stated.rotation < LEAST_ROTATION:  # hands that hardly move show nothing
+        labels = LabelCheck.from_motion(stated.limbs(), problem.model.table)
+        return replace(stated, labels=labels, posed={}, unused_mounts=tuple(unused))
+    if doubt > 1.0 and stated.rotation >= LEAST_ROTATION:  # other labels close other chains
         labels = check_labels(
             stated.limbs(),
             lambda moved: solve_calibration(problem.relabel(moved), quick=True).limbs(),
@@ -300,7 +301,7 @@ def _solve(problem: CalibrationProblem) -> _Solution:
     result = solve_reweighted(observations, coupled, guess, contact)
 
     headings = problem.stated_headings(layout.sensors)
-    free = layout.heading.start + np.flatnonzero([name not in headings for name in layout.sensors])
+    free = layout.heading[[name not in headings for name in layout.sensors]]
 
     def prior_at(x: np.ndarray) -> Gaussian:
         mean = prior.mean.copy()
@@ -316,7 +317,7 @@ def _solve(problem: CalibrationProblem) -> _Solution:
             f"session says"
         )
     sums = list(group_lengths(observations.conditions, layout.lengths).values())
-    shares = compute_information_shares(result.fit, layout, result.weights, np.linalg.inv(result.fit.information), sums)
+    shares = compute_information_shares(result.fit, layout, result.weights, result.fit.covariance, sums)
     covariance = estimate_covariance(observations, result, coupled.information)
     covariance = widen_covariance(covariance, alternatives, layout)
     return _Solution(observations, samples, prior, result, covariance, shares, alternatives)
@@ -340,7 +341,7 @@ def _start_without_closure(
     headings = estimate_joint_headings(observations, couplings, stated)
     for i, name in enumerate(layout.sensors):
         if name not in stated:
-            mean[layout.heading.start + i] = headings[i]
+            mean[layout.heading[i]] = headings[i]
     return Gaussian(mean, prior.information)
 
 
@@ -372,7 +373,7 @@ def _solve_quickly(problem: CalibrationProblem) -> _Solution:
         prior = _start_without_closure(problem, observations, prior, couplings)
         prior = add_couplings(prior, observations.layout, couplings, prior.mean)
     result = solve_reweighted(observations, prior, prior.mean, np.ones(len(samples)), quick=True)
-    return _Solution(observations, samples, prior, result, np.linalg.inv(result.fit.information), {}, [])
+    return _Solution(observations, samples, prior, result, result.fit.covariance, {}, [])
 
 
 def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Calibration:
@@ -381,13 +382,13 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
     recording, protocol, prior = problem.recording, problem.protocol, problem.prior
     observations, samples, fit = solution.observations, solution.samples, solution.result.fit
     layout, contact = observations.layout, solution.result.contact
-    lengths, covariance = fit.x[layout.length], solution.covariance[layout.length, layout.length]
+    lengths, covariance = fit.x[layout.length], solution.covariance[np.ix_(layout.length, layout.length)]
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1) if len(lengths) else float("nan")
     # A length outside the chain, such as the trunk where the hands are joined, does not fix its scale.
     scale_lengths = [name for name in problem.measured if name in (problem.lengths_in_closures or layout.lengths)]
     bending = observations.bending
     hinges = _hinges(fit.hinge[bending], fit.x[layout.hinge], problem) if bending.any() else {}
-    offsets = Rotation.from_rotvec(np.pad(fit.x[layout.tilt].reshape(-1, 2), ((0, 0), (0, 1)))).as_rotvec()[:, :2]
+    offsets = Rotation.from_rotvec(np.pad(fit.x[layout.tilt], ((0, 0), (0, 1)))).as_rotvec()[:, :2]
     subject = _make_subject(problem, solution, {joint: hinge for joint, (hinge, _) in hinges.items()}, offsets)
     scale_observed = is_scale_observed(problem.conditions)
     scale = "of the population prior" if prior.is_population else f"of {prior.name}"
@@ -396,13 +397,13 @@ def solve_calibration(problem: CalibrationProblem, *, quick: bool = False) -> Ca
 
     prior_x = fit.x.copy()
     prior_x[layout.length] = [prior.lengths[name] for name in layout.lengths]
-    prior_gaps = residuals(place_points(prior_x, observations), observations)[2]
+    prior_gaps = observations.gaps(place_points(prior_x, observations))
     gap, prior_gap = (np.linalg.norm(gaps, axis=1) for gaps in (fit.gaps, prior_gaps))
     gap[~observations.closed] = prior_gap[~observations.closed] = np.nan
     touching = observations.closed & (contact > MIN_CONTACT)
 
     diagnostics = [*problem.filtered.diagnostics, *problem.diagnose_losses()]
-    prior_lengths_cov = np.linalg.inv(solution.prior.information[layout.length, layout.length])
+    prior_lengths_cov = np.linalg.inv(solution.prior.information[np.ix_(layout.length, layout.length)])
     if not scale_observed:
         free_scale_std = None if scale_lengths else scale_std
         diagnostics += diagnose_lengths(problem, lengths, covariance, prior_lengths_cov, free_scale_std)
@@ -456,11 +457,11 @@ def _hinges(
     Parameters
     ----------
     hinge_residuals : (n, h) in units of `HINGE_STD`
-    unknown : (2 h,) by which each axis is turned across and tilted
+    unknown : (h, 2) by which each axis is turned across and tilted
     """
     hinges = {}
     layout_hinges = find_hinges(problem.model, problem.start_pose, problem.sensors)
-    for i, (hinge, (across, tilted)) in enumerate(zip(layout_hinges, unknown.reshape(-1, 2), strict=True)):
+    for i, (hinge, (across, tilted)) in enumerate(zip(layout_hinges, unknown, strict=True)):
         axis = np.array(hinge.axis) + across * np.array(hinge.across) + tilted * np.array(hinge.tilted)
         axis_L = problem.start_rotation(hinge.on).inv().apply(axis / np.linalg.norm(axis))
         rms = HINGE_STD * _rms(hinge_residuals[:, i])
@@ -475,15 +476,15 @@ def _make_subject(
     layout, x, filtered = solution.observations.layout, solution.result.fit.x, problem.filtered
     mounts = {}
     for i, name in enumerate(layout.sensors):
-        tilt = Rotation.from_rotvec(-np.append(x[layout.tilt][2 * i : 2 * i + 2], 0.0))
-        R_LS = problem.start_rotation(name).inv() * tilt * _about_z(x[layout.heading][i]) * filtered.R_VS_start[name]
+        tilt = Rotation.from_rotvec(-np.append(x[layout.tilt[i]], 0.0))
+        R_LS = problem.start_rotation(name).inv() * tilt * _about_z(x[layout.heading[i]]) * filtered.R_VS_start[name]
         mounts[name] = R_LS.as_quat()
     # The mounts of sensors outside the chain are those of the start pose.
     for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
         mounts[name] = (problem.start_rotation(name).inv() * _about_z(psi) * filtered.R_VS_start[name]).as_quat()
     order, covariance = project_to_subject(layout, solution.covariance, problem.start_pose)
     std = np.sqrt(np.diag(solution.covariance))
-    offset_stds = np.minimum(std[layout.tilt], np.pi).reshape(-1, 2)  # no angle is more uncertain than half a turn
+    offset_stds = np.minimum(std[layout.tilt], np.pi)  # no angle is more uncertain than half a turn
     return replace(
         problem.prior,
         name=problem.recording.name,
@@ -498,10 +499,7 @@ def _make_subject(
         },
         lengths=dict(zip(layout.lengths, x[layout.length].tolist(), strict=True)),
         girdles=dict(problem.prior.girdles)
-        | {
-            term.name: values
-            for term, values in zip(layout.girdles, x[layout.girdle].reshape(-1, len(PARAMETERS)), strict=True)
-        },
+        | {term.name: values for term, values in zip(layout.girdles, x[layout.girdle], strict=True)},
         order=order,
         covariance=covariance,
         mounts=mounts,

@@ -38,15 +38,14 @@ from ..model.start_pose import orient_links
 from ..model.table import NEUTRAL_POSE
 from ..subject import Subject
 from .anatomy import LabelCheck
-from .chain import rotate
 from .conditions import Constraint, Loop, StartPose, resolve_conditions
-from .least_squares import Observations
+from .equations import rotate
+from .least_squares import MIN_LENGTH, QUIET_QP, Observations
 from .observability import diagnose_lengths
 from .priors import combine_lengths
 from .problem import CalibrationProblem
 from .protocols import Closure, Protocol
 from .result import Calibration
-from .solver import MIN_LENGTH, QUIET_QP
 from .weights import LEAST_VARIANCE, MeasuredLength, count_correlated_samples, min_correlation
 
 Formulation = Literal["full", "paper"]

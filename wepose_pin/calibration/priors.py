@@ -17,8 +17,9 @@ from ..model.girdle import PARAMETERS
 from ..model.table import NEUTRAL_POSE
 from ..subject import Subject
 from .conditions import Loop
+from .equations import Layout
 from .initial_headings import estimate_headings
-from .least_squares import Gaussian, Layout, Observations, place_points
+from .least_squares import Gaussian, Observations
 from .problem import CalibrationProblem
 
 # Priors, one standard deviation. A stated mount names sensor axes, estimated by eye.
@@ -46,14 +47,15 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     stated_headings = problem.stated_headings(layout.sensors)
     headings = estimate_headings(observations, mean, stated_headings)
     for i, name in enumerate(layout.sensors):
-        rows = [layout.tilt.start + 2 * i, layout.tilt.start + 2 * i + 1, layout.heading.start + i]
+        rows = [*layout.tilt[i], layout.heading[i]]
         mean[rows[2]] = stated_headings.get(name, headings[i])
         offset, information[np.ix_(rows, rows)] = _mount_prior(problem, name, stated_headings.get(name))
         mean[rows] += offset
-    information[layout.drift, layout.drift] = np.eye(len(layout.sensors)) / DRIFT_STD**2
+    information[layout.drift, layout.drift] = DRIFT_STD**-2
     segments = problem.model.table.segments
-    soft_tissue = np.ravel([3 * segments[name].soft_tissue_std for name in layout.soft])
-    information[layout.soft_tissue, layout.soft_tissue] = np.diag(np.maximum(soft_tissue, LEAST_SOFT_TISSUE) ** -2.0)
+    for name, rows in zip(layout.soft, layout.soft_tissue, strict=True):
+        std = np.maximum(3 * segments[name].soft_tissue_std, LEAST_SOFT_TISSUE)
+        information[rows, rows] = std**-2.0
     _add_hinges(information, layout, problem.model.table)
     return Gaussian(place_points(mean, observations), information)
 
@@ -74,7 +76,7 @@ def _add_shape(mean: np.ndarray, information: np.ndarray, problem: CalibrationPr
     chosen += [first + size * names.index(term.name) + k for term in layout.girdles for k in range(size)]
     covariance = prior.shape_covariance(table)[np.ix_(chosen, chosen)]
     covariance[len(layout.lengths) :, len(layout.lengths) :] += LEAST_GIRDLE_STD**2 * np.eye(size * len(own))
-    rows = np.concatenate((np.arange(layout.size)[layout.length], np.arange(layout.size)[layout.girdle]))
+    rows = np.concatenate((layout.length, layout.girdle.ravel()))
     K, before = np.linalg.inv(covariance), np.concatenate((of_lengths, *own))
     target = K @ before
     for i, name in enumerate(layout.lengths):
@@ -88,10 +90,9 @@ def _add_shape(mean: np.ndarray, information: np.ndarray, problem: CalibrationPr
 def _add_places(mean: np.ndarray, information: np.ndarray, observations: Observations) -> None:
     """Unknown points and heights of planes, and known points."""
     layout = observations.layout
-    information[layout.heights, layout.heights] = np.eye(layout.planes) / POINT_STD**2
+    information[layout.height, layout.height] = POINT_STD**-2
     fixed = [c.closure for c in observations.conditions if isinstance(c, Loop) and c.kind == "fixed_point"]
-    for k, closure in enumerate(fixed):
-        rows = np.arange(layout.points.start + 3 * k, layout.points.start + 3 * k + 3)
+    for closure, rows in zip(fixed, layout.point, strict=True):
         std = POINT_STD if closure.at is None else closure.at_std
         information[rows, rows] = std**-2
         mean[rows] = 0.0 if closure.at is None else closure.at
@@ -99,16 +100,30 @@ def _add_places(mean: np.ndarray, information: np.ndarray, observations: Observa
 
 def _add_hinges(information: np.ndarray, layout: Layout, table: BodyTable) -> None:
     """The axes of hinges; those of a left and a right one are partly alike."""
-    rows = {hinge.name: layout.hinge.start + 2 * i for i, hinge in enumerate(layout.hinges)}
-    for name, across in rows.items():
+    rows = {hinge.name: places for hinge, places in zip(layout.hinges, layout.hinge, strict=True)}
+    for name, (across, tilted) in rows.items():
         hinge, other = table.hinges[name], table.counterpart(name)
-        information[across + 1, across + 1] += hinge.tilt_std**-2
+        information[tilted, tilted] += hinge.tilt_std**-2
         if other not in rows:
             information[across, across] += (hinge.common_std**2 + hinge.mirror_std**2) ** -1.0
         elif table.side(name) == "left":
-            columns = (across, rows[other])
+            columns = (across, rows[other][0])
             for std, share in ((hinge.common_std, np.array([0.5, 0.5])), (hinge.mirror_std, np.array([0.5, -0.5]))):
                 information[np.ix_(columns, columns)] += np.outer(share, share) / std**2
+
+
+def place_points(x: np.ndarray, observations: Observations) -> np.ndarray:
+    """Return x with each unknown fixed point and height at the mean of the body's points that lie on it."""
+    layout = observations.layout
+    if not layout.fixed and not layout.planes:
+        return x
+    x, gaps = x.copy(), observations.gaps(x)
+    for condition, span in observations.spans():
+        if isinstance(condition, Loop) and condition.kind == "fixed_point" and condition.closure.at is None:
+            x[layout.point[condition.unknown]] += gaps[span].mean(axis=0)
+        elif isinstance(condition, Loop) and condition.kind == "plane":
+            x[layout.height[condition.unknown]] += gaps[span, : condition.rows].mean()
+    return x
 
 
 def _mount_prior(problem: CalibrationProblem, segment: str, heading: float | None) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,8 @@ from .conditions import (
     find_measured_lengths,
     resolve_conditions,
 )
-from .least_squares import Layout, Observations
+from .equations import Layout
+from .least_squares import Observations
 from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 from .recorded import read_recorded_places
 from .sample_losses import SampleLoss, find_sample_losses, mask_connected

@@ -15,8 +15,8 @@ import numpy as np
 from ..model.girdle import PARAMETERS
 from ..subject import mount_rows
 from .conditions import Level, Loop, Moving, Pointing, StartPose
-from .least_squares import GAP_ROWS, HINGE_STD, Gaussian, Layout, Observations
-from .solver import STEPS, Fit, LeastSquares, solve
+from .equations import GAP_ROWS, HINGE_STD, Layout
+from .least_squares import STEPS, Estimate, Gaussian, LeastSquares, Observations, solve
 
 # Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
 LEAST_VARIANCE = 1e-4
@@ -25,6 +25,7 @@ LEAST_VARIANCE = 1e-4
 LEAST_CORRELATION_S = 3.0
 THIRD_CHI2 = {1: 0.1485, 2: 0.7133, 3: 1.4237}  # 30 % quantile of chi², by degrees of freedom
 ROUNDS = 5
+ROUND_STEPS = 2  # of the rounds after the first: the next one goes on
 FINAL_STEPS = 300  # of the last solve, which must converge: hands that hardly move take a hundred
 QUICK_ROUNDS, QUICK_STEPS = 1, 15
 MANY_SAMPLES = 1000  # from twice as many on, all rounds but the last take every second, third, … sample
@@ -58,7 +59,7 @@ class MeasuredLength(NamedTuple):
 class WeightedFit(NamedTuple):
     """A solution with the weights that its own residuals give."""
 
-    fit: Fit
+    fit: Estimate
     weights: np.ndarray  # (n, k) of the residuals
     contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
     effective_sample_size: float  # effective sample size of the gap
@@ -85,7 +86,7 @@ def solve_reweighted(
         start, rounds = thinned.fit.x, rounds[-1:]
         contact, *columns = (np.interp(np.arange(n), rows, column) for column in (thinned.contact, *thinned.weights.T))
         weights = np.column_stack(columns) * (len(rows) / n)  # all together weigh what the few did
-    x: np.ndarray | Fit = start
+    x = start
     if quick:
         weights[:, GAP_ROWS:] = 0.0
     for condition, span in observations.spans():
@@ -97,12 +98,12 @@ def solve_reweighted(
             weights[span] = size**-2 / (span.stop - span.start)
     effective = float(closed.sum())
     if not closed.any():
-        fit = solve(LeastSquares(observations, prior, weights), x, steps, not quick)
+        fit = solve(LeastSquares(observations, prior, weights), x, steps, strict=not quick)
         return WeightedFit(fit, weights, contact, effective)
     for k in rounds:
-        x = fit = solve(
-            LeastSquares(observations, prior, weights), x, steps, strict=False
-        )  # the last solve is the strict one
+        # The last solve is the strict one.
+        fit = solve(LeastSquares(observations, prior, weights), x, steps if k == 0 else ROUND_STEPS, strict=False)
+        x = fit.x
         effective = 0.0
         for closure, span in observations.spans():
             if isinstance(closure, Loop):
@@ -112,7 +113,7 @@ def solve_reweighted(
                 effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], correlation)
         if observations.layout.hinges and not quick:
             weights[closed, GAP_ROWS:] = _weigh(fit.hinge[closed], np.ones(int(closed.sum())), correlation)
-    fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, not quick)
+    fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, strict=not quick)
     return WeightedFit(fit, weights, contact, effective)
 
 
@@ -167,8 +168,8 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
     C (Λ + Σ (Σ w J)ᵀ σ² (Σ w J) / duration) C, as of Newey and West 1987 with their triangle of weights.
     """
     fit, contact = result.fit, result.contact
-    C = np.linalg.inv(fit.information)
-    J, r, least = fit.jacobian, np.hstack((fit.closure, fit.hinge)), min_correlation(observations)
+    C = fit.covariance
+    J, r, least = fit.jacobian, fit.residuals, min_correlation(observations)
     weights = np.broadcast_to(result.weights, r.shape)
     hinges = list(range(GAP_ROWS, observations.layout.residuals))
     gradient = prior_information.copy()
@@ -197,13 +198,13 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
 
 
 def compare_measured(
-    fit: Fit, layout: Layout, measured: Mapping[str, tuple[float, float]], least_std: float
+    fit: Estimate, layout: Layout, measured: Mapping[str, tuple[float, float]], least_std: float
 ) -> dict[str, MeasuredLength]:
     """Each measured length, name → ([m], its standard deviation [m]), beside the solution without it.
 
     `least_std` [m] is that of any estimate of a length.
     """
-    C, compared = np.linalg.inv(fit.information), {}
+    C, compared = fit.covariance, {}
     rows = {name: row for row, name in enumerate(layout.lengths)}
     for name, (metres, std) in measured.items():
         variance = C[rows[name], rows[name]]
@@ -266,18 +267,17 @@ def project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose)
     of_girdles = [f"girdles.{term.name}.{parameter}" for term in layout.girdles for parameter in PARAMETERS]
     T = np.zeros((K + len(rows) + len(of_girdles), layout.size))
     T[:K, :K] = np.eye(K)
-    T[K + len(rows) :, layout.girdle] = np.eye(len(of_girdles))
+    T[K + len(rows) :, layout.girdle.ravel()] = np.eye(len(of_girdles))
     for i, name in enumerate(layout.sensors):
         own = np.zeros((3, layout.size))
-        own[0, layout.tilt.start + 2 * i] = -1.0
-        own[1, layout.tilt.start + 2 * i + 1] = -1.0
-        own[2, layout.heading.start + i] = 1.0
+        own[[0, 1], layout.tilt[i]] = -1.0
+        own[2, layout.heading[i]] = 1.0
         T[K + 3 * i : K + 3 * i + 3] = start.R_WK[name].T @ own
     return (*layout.lengths, *rows, *of_girdles), T @ covariance @ T.T
 
 
 def compute_information_shares(
-    fit: Fit, layout: Layout, weights: np.ndarray, covariance: np.ndarray, sums: Sequence[tuple[str, ...]]
+    fit: Estimate, layout: Layout, weights: np.ndarray, covariance: np.ndarray, sums: Sequence[tuple[str, ...]]
 ) -> dict[str, np.ndarray]:
     """Name → share (n,) of the information that each sample brings: C = C (Σ Jᵀ W J + Λ) C, over C, is a sum to 1.
 
@@ -291,8 +291,8 @@ def compute_information_shares(
         " + ".join(names): np.sum([directions[name] for name in names], axis=0) for names in sums if len(names) > 1
     }
     for i, name in enumerate(layout.sensors):
-        rows = (layout.tilt.start + 2 * i, layout.tilt.start + 2 * i + 1, layout.heading.start + i)
-        directions |= dict(zip(mount_rows(name), unit[list(rows)], strict=True))
+        rows = [*layout.tilt[i], layout.heading[i]]
+        directions |= dict(zip(mount_rows(name), unit[rows], strict=True))
     T = np.array(list(directions.values()))
     moved = fit.jacobian @ covariance @ T.T  # (n, residuals, k)
     share = np.einsum("ni,nik->kn", weights, moved**2) / np.einsum("ki,ij,kj->k", T, covariance, T)[:, None]
