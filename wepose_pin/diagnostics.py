@@ -262,30 +262,23 @@ def example(code: str, variant: str = "") -> Diagnostic:
 def document() -> str:
     """``docs/diagnostics.md``."""
     lines = [
-        "# Diagnostics",
+        "# Troubleshooting",
         "",
-        "What a user should know of a recording, a calibration, a motion or a robot is a diagnostic. It has a code, a",
-        "severity, a place, a value and its limit. The severities are *info* (good to know), *warning* (results may be",
-        "wrong or uncertain by it) and *error* (do not use the results). Results hold their diagnostics under",
-        "`diagnostics` in `summary.json` and `calibration.json`, in SI units and with their text. This page lists all",
-        "codes; the numbers in the texts are examples. After ± stands one standard deviation. What a word means:",
-        "[glossary](glossary.md).",
+        "Look a message up here by its words or by its code: what is wrong, and **what to do**. The message also",
+        "says why it matters. Its severity is *info* (good to know), *warning* (results may be wrong or uncertain) or",
+        "*error* (do not use the results). `summary.json` and `calibration.json` hold all messages of a result under",
+        "`diagnostics`, with code, place, value and limit in SI units. The numbers here are examples; ± is one",
+        "standard deviation. Some texts vary with the case. Words: [glossary](glossary.md).",
         "",
-        "Made by `python -m wepose_pin.diagnostics > docs/diagnostics.md` from `wepose_pin/diagnostics.toml`.",
+        "`python -m wepose_pin.diagnostics > docs/diagnostics.md` writes this page from `wepose_pin/diagnostics.toml`.",
     ]
     group = ""
     for code, entry in catalogue().items():
         if entry.group != group:
             group = entry.group
             lines += ["", f"## {group.replace('-', ' ').capitalize()}"]
-        lines += ["", f"### {code}", "", f"**{entry.text.title}.**"]
-        first = render(example(code))
-        lines += ["", first.what, "", f"*Why:* {first.why}", "", f"*What to do:* {first.do}"]
-        for variant in entry.variants:
-            text = render(example(code, variant))
-            shown = [part for part, base in zip(text[1:], first[1:], strict=True) if part != base]
-            if shown:
-                lines += ["", f"- `{variant}`: {' '.join(shown)}"]
+        text = render(example(code))
+        lines += ["", f"### {code}", "", text.what, f"**{text.do}**"]
     return "\n".join(lines) + "\n"
 
 
