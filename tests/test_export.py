@@ -392,7 +392,7 @@ def test_a_sample_without_orientation_is_named(tmp_path: Path, pose: Pose) -> No
         (["-o", "x.trc", "--format", "tcr"], "--format tcr: not known; did you mean 'trc'?"),
         (["-o", "x.dat", "--format", "c3d"], "name it x.c3d"),
         (["-o", "x.txt", "--format", "placement"], "name it x.sto"),
-        (["-o", "x.trc", "--names", "isb"], "--names isb: only a .mot has names to choose, and the format is trc"),
+        (["-o", "x.trc", "--names", "isb"], "--names isb: only of format mot, and the format is trc"),
         (["-o", "x.mot", "--names", "rajagopal"], "--names: 'rajagopal' is not known; there is: isb, opensim"),
         (["-o", "x.trc", "--rate-hz", "0"], "--rate-hz 0: between 1 and 10000 samples a second"),
         (["-o", "x.trc", "--rate-hz", "nan"], "--rate-hz: 'nan' is not a number"),

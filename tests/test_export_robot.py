@@ -260,7 +260,7 @@ def change_urdf(folder: Path, old: str, new: str) -> None:
         (lambda f: change_summary(f, root={"x": 0.0}), "summary.json: is damaged, or of no trajectory: KeyError('y')"),
         (lambda f: change_summary(f, root=dict.fromkeys(("x", "y", "z", "qx", "qy", "qz", "qw"), 0.0)), "unit quat"),
         (lambda f: change_summary(f, joints=[*JOINTS, "gripper"]), "trajectory.parquet: no column 'gripper'"),
-        (lambda f: change_table(f, pl.lit("fast").alias("elbow_velocity")), "trajectory.parquet: a column holds text"),
+        (lambda f: change_table(f, pl.lit("fast").alias("elbow_velocity")), "'elbow_velocity' holds text in row 1"),
         (lambda f: change_table(f, pl.lit(float("nan")).alias("elbow")), "elbow has no number in row 1"),
         (lambda f: change_table(f, pl.lit(1.0).alias("time")), "whose times do not all grow"),
         (lambda f: change_table(f, pl.col("time") ** 1.5 + pl.col("time")), "times that are uneven; the file has only"),

@@ -34,7 +34,7 @@ class RetargetJob:
         Move this robot: one of the names above, a URDF with a robot map beside it (ARM.urdf, ARM.toml), or the robot
         map itself.
     out : DIR
-        Write trajectory.parquet and .csv, joint_trajectory.json and .yaml, summary.json, view.html and report.html to
+        Write trajectory.parquet and .csv, joint_trajectory.json, summary.json, view.html and report.html to
         this folder.
     arm
         Move only this arm of the robot, or both. Without it all arms that the robot has.

@@ -45,14 +45,12 @@ def build_table(trajectory: Trajectory) -> pl.DataFrame:
 
 
 def write_trajectory(folder: Path, trajectory: Trajectory) -> None:
-    """Write ``trajectory.parquet``, ``.csv``, ``joint_trajectory.json`` and ``.yaml``, and ``robot.urdf``."""
+    """Write ``trajectory.parquet`` and ``.csv``, ``joint_trajectory.json``, and ``robot.urdf``."""
     table = build_table(trajectory)
     (folder / ROBOT_URDF).write_text(resolve_meshes(trajectory.robot.map.urdf), encoding="utf-8")
     write_table(folder / TRAJECTORY, table)
     table.write_csv(folder / "trajectory.csv", float_precision=DIGITS)
-    text = _format_joint_trajectory(trajectory)
-    for suffix in ("json", "yaml"):  # JSON is YAML, one point a line
-        (folder / f"joint_trajectory.{suffix}").write_text(text, encoding="utf-8")
+    (folder / "joint_trajectory.json").write_text(_format_joint_trajectory(trajectory), encoding="utf-8")
 
 
 def _format_joint_trajectory(trajectory: Trajectory) -> str:

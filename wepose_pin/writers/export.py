@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -30,7 +29,7 @@ from .joint_motion import (
 )
 from .lerobot import diagnose_episodes, list_episodes, write_lerobot
 from .motion import Motion, check_rate, resampled
-from .opensim import OpenSenseFiles, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
+from .opensim import list_setups, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
 from .provenance import provenance_file, provenance_text, write_provenance
 from .result import SUBJECT_URDF, format_urdf, read_result
 from .ros import write_mcap, write_rosbag
@@ -38,27 +37,52 @@ from .rrd import write_rrd
 from .tables import write_csv, write_parquet
 
 Result = PosedBody | HasJointMotion | str | Path
-Writer = Callable[[Path, Motion], list[Diagnostic]]  # gives what the file cannot hold
-JointWriter = Callable[[Path, JointMotion], None]
+PERSON, JOINTS, BODY = "a person's motion", "joints", "a body"  # what a format is of
+MOTION = ("rate_hz", "interval", "phase")  # options of a format with a motion
+NAMES = ("isb", "opensim")
 
-# Of a person; of a person or a robot, by joints; of a robot alone.
-WRITERS: dict[str, Writer] = {
-    "csv": write_csv,
-    "parquet": write_parquet,
-    "mot": write_mot,
-    "sto": write_sto,
-    "placement": write_placement,
-    "trc": write_trc,
-    "bvh": write_bvh,
-    "c3d": write_c3d,
-    "scale": write_scale,
-}
-JOINT_WRITERS: dict[str, JointWriter] = {"rosbag": write_rosbag, "mcap": write_mcap, "rrd": write_rrd}
+
+class Format(NamedTuple):
+    """A format of others.
+
+    Parameters
+    ----------
+    of : what it holds: `PERSON`; `JOINTS` of a person or a robot; `BODY`, without a motion
+    write : path, motion and own options → what the file cannot hold, or None
+    options : that it has of those of `export`
+    suffix : of the file; None: the name of the format. Empty: a folder
+    earlier : patterns of the files of an earlier run in the folder, which `force` replaces
+    """
+
+    of: str
+    write: Callable[..., list[Diagnostic] | None]
+    options: tuple[str, ...] = MOTION
+    suffix: str | None = None
+    earlier: tuple[str, ...] = ()
+
+
 LEROBOT = "lerobot"
-FORMATS = (*WRITERS, "urdf", *JOINT_WRITERS, LEROBOT)
-# Formats that are folders → what an earlier run left in one, which `force` replaces.
-FOLDERS = {LEROBOT: ("data/**/*.parquet", "meta/**/*.*"), "rosbag": ("*.db3", "*.mcap", "metadata.yaml")}
-SUFFIXES = {"placement": ".sto", "scale": ".xml", **dict.fromkeys(FOLDERS, "")}  # where it is not the format's name
+FORMATS = {
+    "csv": Format(PERSON, write_csv),
+    "parquet": Format(PERSON, write_parquet),
+    "mot": Format(PERSON, write_mot, (*MOTION, "names")),
+    "sto": Format(PERSON, write_sto, (*MOTION, "osim_model")),
+    "placement": Format(PERSON, write_placement, (), ".sto"),
+    "trc": Format(PERSON, write_trc),
+    "bvh": Format(PERSON, write_bvh),
+    "c3d": Format(PERSON, write_c3d),
+    "scale": Format(PERSON, write_scale, ("osim_model",), ".xml"),
+    "urdf": Format(BODY, lambda path, result: _write_urdf(path, result), ()),
+    "rosbag": Format(JOINTS, write_rosbag, suffix="", earlier=("*.db3", "*.mcap", "metadata.yaml")),
+    "mcap": Format(JOINTS, write_mcap),
+    "rrd": Format(JOINTS, write_rrd),
+    LEROBOT: Format(
+        *(JOINTS, write_lerobot, (*MOTION, "episodes", "instruction"), ""),
+        ("data/**/*.parquet", "meta/**/*.*"),
+    ),
+}
+SUFFIXES = {name: format.suffix for name, format in FORMATS.items() if format.suffix is not None}
+WITHOUT_MOTION = tuple(name for name, format in FORMATS.items() if "rate_hz" not in format.options)
 # Format that was written before → what to do instead.
 _OF_ROBOTS = "trajectory.csv of `wepose retarget` has the joints, and lerobot, mcap and rosbag are written"
 REMOVED = {
@@ -67,9 +91,6 @@ REMOVED = {
     **dict.fromkeys(("bvh-lafan1", "bvh-nokov", "bvh-soma", "bvh-xsens"), "bvh has the person's own skeleton"),
     **dict.fromkeys(("pkl", "npz", "csv-beyondmimic"), _OF_ROBOTS),
 }
-FILE_SUFFIXES = (*FORMATS, "bag", "db3")
-WITHOUT_MOTION = ("urdf", "placement", "scale")
-NAMES = ("isb", "opensim")
 
 
 class Exported(NamedTuple):
@@ -165,78 +186,58 @@ def export(
     check_arguments(export, locals())
     results = [result] if isinstance(result, Result) else list(result)
     file = Path(file)
-    format = _format(file, format)
-    _check_options(
-        format,
-        names=names,
-        rate_hz=rate_hz,
-        interval=interval,
-        phase=phase,
-        episodes=episodes,
-        instruction=instruction,
-        osim_model=osim_model,
-    )
-    if len(results) != 1 and format != LEROBOT:
-        raise BadOption(
-            f"--format {format}: a file of {len(results)} results; only {LEROBOT} takes several, as episodes"
-        )
+    name = _choose_format(file, format)
+    kind = FORMATS[name]
+    stated: dict[str, Any] = {"names": names, "rate_hz": rate_hz, "interval": interval, "phase": phase}
+    stated |= {"episodes": episodes, "instruction": instruction, "osim_model": osim_model}
+    _check_options(name, {option: value for option, value in stated.items() if value is not None})
+    if len(results) != 1 and name != LEROBOT:
+        raise BadOption(f"--format {name}: a file of {len(results)} results; only {LEROBOT} takes several, as episodes")
     with contextlib.ExitStack() as files:
-        if format in FOLDERS:
-            partial = files.enter_context(_replaced_folder(file, FOLDERS[format], force))
+        if kind.earlier:
+            partial = files.enter_context(_replaced_folder(file, kind.earlier, force))
         else:
             partial = files.enter_context(whole_file(file, force))
-        if provenance is not None and format in FOLDERS:
+        if provenance is not None and kind.earlier:
             write_provenance(partial, provenance)
         elif provenance is not None:
             partial_provenance = files.enter_context(whole_file(provenance_file(file), True))
             partial_provenance.write_text(provenance_text(provenance), encoding="utf-8")
-        if format == "urdf":
-            _write_urdf(partial, results[0])
-            return Exported(format, [])
-        if format in WRITERS:
-            motion = _read_motion(results[0], format, interval, phase, rate_hz)
-            write = WRITERS[format]
-            if names is not None:
-                write = functools.partial(write_mot, names=names)
-            if format == "scale" and osim_model is not None:
-                write = functools.partial(write_scale, model=str(osim_model))
-            diagnostics = write(partial, motion)
-            if format == "sto" and osim_model is not None:
-                beside = OpenSenseFiles.beside(file)
-                others = (beside.placement, beside.placer, beside.ik)
-                written = OpenSenseFiles(partial, *(files.enter_context(whole_file(path, force)) for path in others))
-                write_setups(beside, written, motion, str(osim_model))
-            return Exported(format, diagnostics)
-        motions = [_read_joint_motion(each, format, interval, phase) for each in results]
+        if kind.of == BODY:
+            return Exported(name, kind.write(partial, results[0]) or [])
+        if kind.of == PERSON:
+            motion = _read_motion(results[0], name, interval, phase, rate_hz)
+            own = {"names": names} if names is not None else {}
+            if name == "scale" and osim_model is not None:
+                own["model"] = str(osim_model)
+            diagnostics = kind.write(partial, motion, **own)
+            if name == "sto" and osim_model is not None:
+                setups = {path: files.enter_context(whole_file(path, force)) for path in list_setups(file)}
+                write_setups(file, setups, motion, str(osim_model))
+            return Exported(name, diagnostics or [])
+        motions = [_read_joint_motion(each, name, interval, phase) for each in results]
         if rate_hz is not None:
             motions = [resample_joints(each, rate_hz) for each in motions]
-        if format == LEROBOT:
-            write_lerobot(partial, [one for each in motions for one in list_episodes(each, episodes, instruction)])
-            return Exported(format, [one for each in motions for one in diagnose_episodes(each, episodes)])
-        JOINT_WRITERS[format](partial, motions[0])
-        return Exported(format, [])
+        if name != LEROBOT:
+            return Exported(name, kind.write(partial, motions[0]) or [])
+        kind.write(partial, [one for each in motions for one in list_episodes(each, episodes, instruction)])
+        return Exported(name, [one for each in motions for one in diagnose_episodes(each, episodes)])
 
 
-def _check_options(format: str, **options: Any) -> None:
-    """Raise `BadOption` for an option that the format does not have."""
-    stated = {name.replace("_", "-"): value for name, value in options.items() if value is not None}
-    names = stated.get("names")
-    if names is not None and format != "mot":
-        raise BadOption(f"--names {names}: only a .mot has names to choose, and the format is {format}")
-    if names not in (None, *NAMES):
-        raise BadOption(f"--names {names}: not known; {one_of(NAMES, names)}")
-    rate_hz = stated.get("rate-hz")
-    if rate_hz is not None:
-        check_rate(rate_hz)
-    for name in ("episodes", "instruction"):
-        if name in stated and format != LEROBOT:
-            raise BadOption(f"--{name} {stated[name]}: only of format {LEROBOT}, and the format is {format}")
-    if format in WITHOUT_MOTION and (unused := [name for name in ("rate-hz", "interval", "phase") if name in stated]):
-        value = f" {rate_hz:g}" if rate_hz is not None else ""
-        raise BadOption(f"--{unused[0]}{value}: there is no motion in a file of format {format}")
-    osim_model = stated.get("osim-model")
-    if osim_model is not None and format not in ("sto", "scale"):
-        raise BadOption(f"--osim-model {osim_model}: only of formats sto and scale, and the format is {format}")
+def _check_options(name: str, stated: Mapping[str, Any]) -> None:
+    """Raise `BadOption` for an option that the format does not have, or a value that none is."""
+    for option, value in stated.items():
+        text = f"--{option.replace('_', '-')} {f'{value:g}' if option == 'rate_hz' else value}"
+        if option == "rate_hz":
+            check_rate(value)
+        if option in FORMATS[name].options:
+            continue
+        if option in MOTION:
+            raise BadOption(f"{text}: there is no motion in a file of format {name}")
+        having = " and ".join(each for each, format in FORMATS.items() if option in format.options)
+        raise BadOption(f"{text}: only of format {having}, and the format is {name}")
+    if stated.get("names", "isb") not in NAMES:
+        raise BadOption(f"--names {stated['names']}: not known; {one_of(NAMES, stated['names'])}")
 
 
 @contextlib.contextmanager
@@ -252,6 +253,7 @@ def _replaced_folder(out: Path, own: Sequence[str], force: bool) -> Iterator[Pat
 
 
 def _write_urdf(file: Path, result: Result) -> None:
+    """Write the body of a person or a robot."""
     if isinstance(result, PosedBody):
         file.write_text(format_urdf(result.subject, result.model), encoding="utf-8")
     elif isinstance(result, HasJointMotion):
@@ -295,7 +297,7 @@ def _read_motion(
     if _is_of_robot(result):
         raise BadOption(
             f"--format {format}: is of a person's motion, and this is a robot's trajectory; "
-            f"of that there is: {', '.join(FORMATS[len(WRITERS) :])}"
+            f"of that there is: {', '.join(each for each in FORMATS if FORMATS[each].of != PERSON)}"
         )
     if isinstance(result, PosedBody):
         recorded = result.recording if isinstance(result, TrackedRecording) else result
@@ -312,23 +314,23 @@ def _read_motion(
     return motion if rate_hz is None else resampled(motion, rate_hz)
 
 
-def _format(file: Path, format: str | None) -> str:
-    if format is None:
-        format = file.suffix.lower().removeprefix(".")
-        if format not in FORMATS and format not in REMOVED:
+def _choose_format(file: Path, name: str | None) -> str:
+    """Choose the format that is stated, or that of the file's suffix."""
+    if name is None:
+        name = file.suffix.lower().removeprefix(".")
+        if name not in FORMATS and name not in REMOVED:
             raise BadOption(
                 f"-o {file}: '{file.suffix}' is no format's suffix; state it by --format; {one_of(FORMATS)}"
             )
-    if format in REMOVED:
-        raise BadOption(f"--format {format}: no longer written; {REMOVED[format]}")
-    if format not in FORMATS:
-        raise BadOption(f"--format {format}: not known; {one_of(FORMATS, format)}")
-    suffix = SUFFIXES.get(format, f".{format}")
-    if format in FOLDERS:
-        if file.suffix.lower().removeprefix(".") in FILE_SUFFIXES:  # readers would take the folder for a file
-            raise BadOption(f"-o {file}: format {format} is a folder; name it {file.stem}")
-    elif file.suffix.lower() != suffix:
+    if name in REMOVED:
+        raise BadOption(f"--format {name}: no longer written; {REMOVED[name]}")
+    if name not in FORMATS:
+        raise BadOption(f"--format {name}: not known; {one_of(FORMATS, name)}")
+    suffix = SUFFIXES.get(name, f".{name}")
+    if not suffix and file.suffix.lower().removeprefix(".") in (*FORMATS, "bag", "db3"):
         raise BadOption(
-            f"-o {file}: format {format} is for programs that go by the suffix: name it {file.stem}{suffix}"
-        )
-    return format
+            f"-o {file}: format {name} is a folder; name it {file.stem}"
+        )  # readers would take it for a file
+    if suffix and file.suffix.lower() != suffix:
+        raise BadOption(f"-o {file}: format {name} is for programs that go by the suffix: name it {file.stem}{suffix}")
+    return name

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..documents import whole_folder
-from ..errors import ExistingOutput, WeposeError
-from ..model.table_file import MODEL_TABLE, format_table, read_table
-from ..readers.tables import read_table as read_columns
+from ..errors import ExistingOutput
+from ..model.table_file import MODEL_TABLE
 from .provenance import INSIDE, list_files
-from .result import JOINTS, SUBJECT_URDF
+from .result import JOINTS
 
 
 @contextmanager
@@ -22,14 +20,15 @@ def result_folder(out: Path, force: bool) -> Iterator[Path]:
     Raises
     ------
     ExistingOutput
-        As `whole_folder`. One of those files is of no result in `out`, or a session in `out` needs a file that would be
-        replaced.
+        As `whole_folder`. There are such files but no result in `out`, or a session in `out` needs a file that would
+        be replaced.
     """
     with whole_folder(out, force) as folder:
         inputs = _list_inputs(out)
         earlier = [out / name for name in (MODEL_TABLE, JOINTS) if (out / name).exists()]
+        has_result = any((out / name).is_file() for name in INSIDE)
         for file in earlier:
-            if file.resolve() in inputs or not _is_of_result(file):
+            if file.resolve() in inputs or not has_result:
                 raise ExistingOutput(
                     f"{file}: is no file of an earlier result, and would be replaced or read with the new one; move "
                     f"it, or name another folder by -o"
@@ -52,16 +51,3 @@ def _list_inputs(out: Path) -> set[Path]:
     if not (out / "session.toml").is_file():
         return set()
     return {file.resolve() for file in list_files(out, truth=True)}
-
-
-def _is_of_result(file: Path) -> bool:
-    """Whether a file that not every result has is of the result in its folder, and nobody has changed it since."""
-    folder = file.parent
-    try:
-        if file.name == MODEL_TABLE:
-            as_written = format_table(read_table(file)[0], SUBJECT_URDF)
-            return any((folder / name).is_file() for name in INSIDE) and file.read_text("utf-8") == as_written
-        summary = json.loads((folder / "summary.json").read_text("utf-8"))
-        return read_columns(file).columns == ["time", *summary["joints"]]
-    except (WeposeError, OSError, ValueError, KeyError, TypeError):
-        return False

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-import polars as pl
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
@@ -21,15 +20,14 @@ from ..kinematics import solve_configuration
 from ..model import BodyModel, read_urdf
 from ..model.configurations import joint_values
 from ..model.tree import joint_axis, joint_placement, parse_tree
-from ..readers.tables import read_table
+from ..readers.tables import read_columns, read_table
 from ..recording import Intervals, select_interval
 from ..rotations import multiply
-from .motion import EVEN, FEW, MOST_NEW, Motion, check_complete, resample_evenly
+from .motion import EVEN, SLACK_S, Motion, check_complete, find_usual_rate, make_times, resample_evenly
 from .result import read_phases
 
 TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
 REPETITIONS = "repetitions"  # in the summary of a trajectory, and as the name of what makes episodes
-SLACK_S = 1e-6  # [s] by which times that are written with digits differ from those in the summary
 
 
 @dataclass(frozen=True)
@@ -72,8 +70,8 @@ class JointMotion:
 
     @property
     def rate_hz(self) -> float:
-        """One over the usual time step, to six digits."""
-        return float(f"{1.0 / float(np.median(np.diff(self.time))):.6g}")
+        """The rate of its usual time step."""
+        return find_usual_rate(self.time)
 
     @cached_property
     def ordered(self) -> tuple[Any, ...]:
@@ -194,31 +192,23 @@ def read_joint_motion(folder: Path) -> JointMotion:
     for name in (TRAJECTORY, ROBOT_URDF, "summary.json"):
         if not (folder / name).is_file():
             raise MissingFile(f"{folder}: no {name} in it; a folder that `wepose retarget` wrote is wanted here")
-    table, file = read_table(folder / TRAJECTORY), folder / TRAJECTORY
+    file, summary_file = folder / TRAJECTORY, folder / "summary.json"
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = json.loads(summary_file.read_text(encoding="utf-8"))
         joints = tuple(map(str, summary["joints"]))
         place = [float(summary["root"][key]) for key in ("x", "y", "z", "qx", "qy", "qz", "qw")]
         posture = {str(joint): float(value) for joint, value in summary["posture"].items()}
         approach_s, name, source = float(summary["approach_s"]), str(summary["robot"]), str(summary["recording"])
     except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
-        raise BadData(f"{folder / 'summary.json'}: is damaged, or of no trajectory: {error!r}") from error
-    lost = [c for c in ("time", "recorded_time", *joints, *(f"{j}_velocity" for j in joints)) if c not in table.columns]
-    if lost:
-        raise BadData(f"{file}: no column '{lost[0]}'; summary.json beside it states that joint")
-    try:
-        numbers = {c: table[c].cast(pl.Float64).to_numpy() for c in table.columns}
-    except pl.exceptions.PolarsError as error:
-        raise BadData(f"{file}: a column holds text: {str(error).splitlines()[0]}") from error
-    for column, values in numbers.items():
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values))) + 1
-            raise BadData(f"{file}: {column} has no number in row {row}; a robot needs one in every row")
-    time = numbers["time"]
+        raise BadData(f"{summary_file}: is damaged, or of no trajectory: {error!r}") from error
     if not np.isfinite(place).all() or abs(np.linalg.norm(place[3:]) - 1.0) > 1e-3:
-        raise BadData(
-            f"{folder / 'summary.json'}: root is at {place}; three coordinates and a unit quaternion are needed"
-        )
+        raise BadData(f"{summary_file}: root is at {place}; three coordinates and a unit quaternion are needed")
+    columns = ["time", "recorded_time", *joints, *(f"{joint}_velocity" for joint in joints)]
+    values = read_columns(read_table(file), columns, str(file), str(file))
+    if (lost := ~np.isfinite(values)).any():
+        row, column = np.argwhere(lost)[0]
+        raise BadData(f"{file}: {columns[column]} has no number in row {row + 1}; a robot needs one in every row")
+    time = values[:, 0]
     if len(time) < 2 or np.any(np.diff(time) <= 0.0):
         raise BadData(f"{file}: {len(time)} rows whose times do not all grow; a trajectory has at least 2 that do")
     robot = read_urdf(folder / ROBOT_URDF)
@@ -238,12 +228,12 @@ def read_joint_motion(folder: Path) -> JointMotion:
         urdf=(folder / ROBOT_URDF).read_text(encoding="utf-8", errors="replace"),
         joints=joints,
         time=time,
-        position=np.stack([numbers[joint] for joint in joints], axis=1),
-        velocity=np.stack([numbers[f"{joint}_velocity"] for joint in joints], axis=1),
+        position=values[:, 2 : 2 + len(joints)],
+        velocity=values[:, 2 + len(joints) :],
         posture=posture,
         p_WB=np.array(place[:3]),
         quat_WB=np.array(place[3:]) / np.linalg.norm(place[3:]),
-        recorded_time=numbers["recorded_time"],
+        recorded_time=values[:, 1],
         phases=phases,
         begin=int(np.searchsorted(time, approach_s - SLACK_S)),
         source=source,
@@ -314,13 +304,7 @@ def resample_joints(motion: JointMotion, rate_hz: float) -> JointMotion:
     BadData
         Times so far apart that nearly all samples would be new.
     """
-    samples = int((motion.time[-1] - motion.time[0]) * rate_hz + SLACK_S) + 1
-    if samples > max(FEW, MOST_NEW * len(motion.time)):
-        raise BadData(
-            f"{motion.where}: {len(motion.time)} samples from {motion.time[0]:g} to {motion.time[-1]:g} s; at "
-            f"{rate_hz:g} Hz that is {samples}"
-        )
-    time = motion.time[0] + np.arange(samples) / rate_hz
+    time = make_times(motion.where, motion.time, rate_hz)
     curve = CubicHermiteSpline(motion.time, motion.position, motion.velocity)
     inside = np.minimum(time, motion.time[-1])
     begin = int(np.searchsorted(time, motion.time[min(motion.begin, len(motion.time) - 1)] - SLACK_S))

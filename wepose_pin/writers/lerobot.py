@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
-from .. import __version__
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadData, WrongOption, one_of
-from .joint_motion import REPETITIONS, SLACK_S, JointMotion, cut_interval, find_whole_rate, is_followed
+from ..errors import BadData, BadOption, WrongOption, how_to_install, one_of
+from .joint_motion import REPETITIONS, JointMotion, cut_interval, find_whole_rate, is_followed
+from .motion import SLACK_S
 from .result import write_table
 
 VERSION = "v3.0"
@@ -71,24 +71,23 @@ def list_episodes(motion: JointMotion, by: str | None, instruction: str | None) 
 
 def diagnose_episodes(motion: JointMotion, by: str | None) -> list[Diagnostic]:
     """Return what `list_episodes` cuts off the intervals of a phase, or the repetitions, and which it leaves out."""
-    spans = motion.phases.get(by, ()) if by is not None else ()
-    outside = [each for each in spans if not is_followed(motion, each)]
-    diagnostics = []
+    if by is None:
+        return []
+    spans = motion.phases.get(by, ())
     first, last = motion.recorded_time[[motion.begin, -1]].tolist()
-    if outside and by is not None:
-        facts: dict[str, float | str] = {"count": float(len(spans)), "span": "{:g} to {:g} s".format(*outside[0])}
-        facts["recorded"] = f"{first:g} to {last:g} s"
-        diagnostics.append(Diagnostic("episode-outside", WARNING, by, float(len(outside)), facts=facts))
-    inside = [each for each in spans if each not in outside]
-    shortened = [(a, b) for a, b in inside if max(first - a, b - last) > 1.0 / motion.rate_hz + SLACK_S]
-    if not shortened or by is None:
-        return diagnostics
-    facts = {
-        "count": float(len(spans)),
-        "span": "{:g} to {:g} s".format(*shortened[0]),
-        "recorded": f"{first:g} to {last:g} s",
-    }
-    return [*diagnostics, Diagnostic("episode-shortened", WARNING, by, float(len(shortened)), facts=facts)]
+    outside = [each for each in spans if not is_followed(motion, each)]
+    slack_s = 1.0 / motion.rate_hz + SLACK_S
+    shortened = [(a, b) for a, b in spans if (a, b) not in outside and max(first - a, b - last) > slack_s]
+    diagnostics = []
+    for code, affected in (("episode-outside", outside), ("episode-shortened", shortened)):
+        if affected:
+            facts: dict[str, float | str] = {
+                "count": float(len(spans)),
+                "span": "{:g} to {:g} s".format(*affected[0]),
+                "recorded": f"{first:g} to {last:g} s",
+            }
+            diagnostics.append(Diagnostic(code, WARNING, by, float(len(affected)), facts=facts))
+    return diagnostics
 
 
 def write_lerobot(folder: Path, episodes: Sequence[Episode]) -> None:
@@ -197,9 +196,7 @@ def _compute_stats(table: pl.DataFrame) -> dict[str, dict[str, list[Any]]]:
     """Return feature → statistic → a value for each of its components."""
     stats = {}
     for feature in table.columns:
-        values = np.stack([table[feature].to_numpy()], axis=1) if table[feature].dtype != pl.Array else None
-        values = table[feature].to_numpy() if values is None else values
-        values = values.astype(float)
+        values = table[feature].to_numpy().reshape(len(table), -1).astype(float)
         of_feature = {"min": values.min(0), "max": values.max(0), "mean": values.mean(0), "std": values.std(0)}
         of_feature |= {name: np.quantile(values, share, axis=0) for name, share in QUANTILES.items()}
         stats[feature] = {name: each.tolist() for name, each in of_feature.items()} | {"count": [len(values)]}
@@ -232,25 +229,27 @@ def _write_episodes(
 
 
 def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
-    """Write the tasks as pandas writes a table whose index is their text."""
+    """Write the tasks as pandas writes a table whose index is their text; pyarrow stores what pandas says of it.
+
+    Raises
+    ------
+    BadOption
+        pyarrow is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError:
+        raise BadOption(f"--format lerobot: needs pyarrow: {how_to_install('pyarrow')}") from None
     index = "__index_level_0__"
-    table = pl.DataFrame({"task_index": np.arange(len(tasks)), index: list(tasks)})
     kinds = {"task_index": ("task_index", "int64", "int64"), index: (None, "unicode", "object")}
-    described = [
+    columns = [
         {"name": name, "field_name": column, "pandas_type": kind, "numpy_type": numpy_kind, "metadata": None}
         for column, (name, kind, numpy_kind) in kinds.items()
     ]
-    pandas = {
-        "index_columns": [index],
-        "column_indexes": [],
-        "columns": described,
-        "creator": {"library": "wepose-pin", "version": __version__},
-        "pandas_version": "2.0.0",
-    }
-    write_table(path, table, {"pandas": json.dumps(pandas)})
-    # pyarrow takes metadata from the Arrow schema where a file has one, and polars writes one without ours: under
-    # another name of the same length it is passed over, and the file's own metadata counts.
-    path.write_bytes(path.read_bytes().replace(b"ARROW:schema", b"polars:arrow"))
+    pandas = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
+    table = pyarrow.table({"task_index": list(range(len(tasks))), index: list(tasks)})
+    pyarrow.parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path)
 
 
 def _write_json(path: Path, values: Any) -> None:

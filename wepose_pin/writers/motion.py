@@ -16,6 +16,7 @@ from ..recording import format_span
 
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
+SLACK_S = 1e-6  # [s] by which times that are written with digits differ
 # Up to so many new samples for one, or up to a few, times are filled; 10 kHz of 100 Hz are a hundred for one.
 MOST_NEW, FEW = 200, 1_000_000
 
@@ -38,8 +39,31 @@ class Motion:
 
     @property
     def rate_hz(self) -> float:
-        """One over the usual time step, to six digits: steps are differences of rounded times."""
-        return float(f"{1.0 / float(np.median(np.diff(self.pose.time))):.6g}")
+        """The rate of its usual time step."""
+        return find_usual_rate(self.pose.time)
+
+
+def find_usual_rate(time: np.ndarray) -> float:
+    """Return one over the usual step of times (n,) [s], to six digits: steps are differences of rounded times."""
+    return float(f"{1.0 / float(np.median(np.diff(time))):.6g}")
+
+
+def make_times(where: str, time: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return even times (m,) [s] at this rate, from the first of the times (n,) to the last.
+
+    Raises
+    ------
+    BadData
+        A time gap so long that nearly all new samples would be interpolated.
+    """
+    samples = int(np.floor((time[-1] - time[0]) * rate_hz + SLACK_S)) + 1
+    if samples > max(FEW, MOST_NEW * len(time)):
+        jump = int(np.argmax(np.diff(time)))
+        raise BadData(
+            f"{where}: time jumps from {format_span((time[jump], time[jump + 1]))} in row {jump + 2} of its table; at "
+            f"{rate_hz:g} Hz that is {samples} samples of {len(time)}"
+        )
+    return np.asarray(time[0] + np.arange(samples) / rate_hz)
 
 
 def resample_evenly(motion: Motion) -> tuple[Motion, list[Diagnostic]]:
@@ -75,15 +99,7 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
     check_complete(motion, "resampling")
     pose = motion.pose
     old = pose.time
-    samples = int(np.floor((old[-1] - old[0]) * rate_hz + 1e-6)) + 1
-    if samples > max(FEW, MOST_NEW * len(old)):
-        jump = int(np.argmax(np.diff(old)))
-        raise BadData(
-            f"{motion.where}: time jumps from {format_span((old[jump], old[jump + 1]))} in row {jump + 2} of "
-            f"pose.parquet; at {rate_hz:g} Hz that is {samples} samples of {len(old)}"
-        )
-    time = old[0] + np.arange(samples) / rate_hz
-    time = np.minimum(time, old[-1])
+    time = np.minimum(make_times(motion.where, old, rate_hz), old[-1])
     after = np.clip(np.searchsorted(old, time, side="left"), 1, len(old) - 1)
     share = (time - old[after - 1]) / (old[after] - old[after - 1])
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
@@ -104,38 +103,6 @@ def _write_coordinates(path: Path, motion: Motion, columns: Mapping[str, np.ndar
     _write(path, [name, *(f"{key}={value}" for key, value in header.items()), "endheader"], rows)
 
 
-@dataclass(frozen=True)
-class OpenSenseFiles:
-    """The files of one motion that OpenSense goes by.
-
-    Parameters
-    ----------
-    orientations : the .sto
-    placement, placer, ik : the sample and the set-ups of OpenSense's two tools
-    """
-
-    orientations: Path
-    placement: Path
-    placer: Path
-    ik: Path
-
-    @classmethod
-    def beside(cls, sto: Path) -> OpenSenseFiles:
-        """The files beside a .sto, named after it."""
-        endings = ("_placement.sto", "_placer.xml", "_ik.xml")
-        return cls(sto, *(sto.with_name(f"{sto.stem}{ending}") for ending in endings))
-
-    @property
-    def placed_model(self) -> str:
-        """The name of the model with sensors, which the IMU Placer writes."""
-        return f"{self.orientations.stem}_placed.osim"
-
-    @property
-    def solution(self) -> str:
-        """The name of the motion that the IK writes."""
-        return f"{self.orientations.stem}_ik.mot"
-
-
 # Orientations -----------------------------------------------------------------------------------------------------
 
 
@@ -159,13 +126,18 @@ def write_placement(path: Path, motion: Motion) -> list[Diagnostic]:
     return []
 
 
-def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion, model: str) -> None:
-    """Write what OpenSense needs beside the .sto and the subject's model: the set-ups of IMU Placer and IK.
+def list_setups(sto: Path) -> list[Path]:
+    """List what OpenSense needs beside a .sto: the placement, and the set-ups of IMU Placer and IK."""
+    return [sto.with_name(f"{sto.stem}{ending}") for ending in ("_placement.sto", "_placer.xml", "_ik.xml")]
+
+
+def write_setups(sto: Path, written: Mapping[Path, Path], motion: Motion, model: str) -> None:
+    """Write what OpenSense needs beside the .sto and the subject's model.
 
     Parameters
     ----------
-    files : names that the set-ups mention; all in one folder, from which OpenSim reads them
-    written : where to write them now
+    sto : the file of orientations; the set-ups are read from its folder
+    written : each of `list_setups` → where to write it now
     motion : whose .sto it is
     model : name of the subject's model
 
@@ -174,25 +146,33 @@ def write_setups(files: OpenSenseFiles, written: OpenSenseFiles, motion: Motion,
     BadData
         No segment is a body of the model.
     """
-    write_placement(written.placement, motion)
-    placer = {
-        "model_file": model,
-        "sensor_to_opensim_rotations": "0 0 0",
-        "orientation_file_for_calibration": files.placement.name,
-        "output_model_file": files.placed_model,
-    }
-    _write_setup(written.placer, "IMUPlacer", placer)
+    placement, placer, ik = list_setups(sto)
+    placed_model = f"{sto.stem}_placed.osim"  # with sensors, which the IMU Placer writes
+    write_placement(written[placement], motion)
+    _write_setup(
+        written[placer],
+        "IMUPlacer",
+        {
+            "model_file": model,
+            "sensor_to_opensim_rotations": "0 0 0",
+            "orientation_file_for_calibration": placement.name,
+            "output_model_file": placed_model,
+        },
+    )
     step = 0.5 / motion.rate_hz  # past the last sample, whose time is rounded in the file
-    solver = {
-        "model_file": files.placed_model,
-        "orientations_file": files.orientations.name,
-        "sensor_to_opensim_rotations": "0 0 0",
-        "time_range": f"{motion.pose.time[0] - step:.6f} {motion.pose.time[-1] + step:.6f}",
-        "report_errors": "true",
-        "results_directory": ".",
-        "output_motion_file": files.solution,
-    }
-    _write_setup(written.ik, "IMUInverseKinematicsTool", solver)
+    _write_setup(
+        written[ik],
+        "IMUInverseKinematicsTool",
+        {
+            "model_file": placed_model,
+            "orientations_file": sto.name,
+            "sensor_to_opensim_rotations": "0 0 0",
+            "time_range": f"{motion.pose.time[0] - step:.6f} {motion.pose.time[-1] + step:.6f}",
+            "report_errors": "true",
+            "results_directory": ".",
+            "output_motion_file": f"{sto.stem}_ik.mot",
+        },
+    )
 
 
 def _write_setup(path: Path, tool: str, properties: Mapping[str, Any], name: str = "") -> None:

@@ -25,7 +25,7 @@ from ..errors import BadData, ExistingOutput, MissingFile
 from ..kinematics import Pose, build_pose_table, cut_pose, parse_pose_table
 from ..model import BodyModel, BodyTable, load_model, load_table
 from ..model.table_file import MODEL_TABLE, format_table
-from ..readers.tables import open_source, read_table
+from ..readers.tables import open_source, read_columns, read_table
 from ..recording import Intervals, Mark, select_interval
 from ..subject import Subject, load_subject, subject_toml
 from ..tracking import TrackedRecording, TrackSummary
@@ -116,8 +116,8 @@ def build_joint_table(pose: Pose) -> pl.DataFrame:
     return pl.DataFrame({"time": pose.time, **pose.joints})
 
 
-def write_table(path: Path, table: pl.DataFrame, metadata: Mapping[str, str] | None = None) -> None:
-    """A Parquet file, with entries for those who read its schema.
+def write_table(path: Path, table: pl.DataFrame) -> None:
+    """Write a Parquet file.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def write_table(path: Path, table: pl.DataFrame, metadata: Mapping[str, str] | N
         It cannot be written: a full disk, say.
     """
     with writing_errors(path.name), path.open("wb") as file:  # polars takes no path that is not in UTF-8
-        table.write_parquet(file, metadata=None if metadata is None else dict(metadata))
+        table.write_parquet(file)
 
 
 @contextlib.contextmanager
@@ -219,13 +219,10 @@ def read_marks(summary: Mapping[str, Any]) -> tuple[Mark, ...]:
 def _read_joints(file: Path, samples: int) -> dict[str, np.ndarray]:
     """Joint → its values (n,) [rad or m]."""
     table = read_table(file)
-    try:
-        joints = {name: table[name].cast(pl.Float64).to_numpy() for name in table.columns if name != "time"}
-    except pl.exceptions.PolarsError as error:
-        raise BadData(f"{file}: a column holds text: {str(error).splitlines()[0]}") from error
     if len(table) != samples:
         raise BadData(f"{file}: {len(table)} rows, and pose.parquet beside it has {samples}; they must be as many")
-    return joints
+    names = [name for name in table.columns if name != "time"]
+    return dict(zip(names, read_columns(table, names, str(file), str(file)).T, strict=True))
 
 
 @cache

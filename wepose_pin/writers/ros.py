@@ -9,9 +9,9 @@ Source: sensor_msgs/JointState, tf2_msgs/TFMessage, REP 105 (frames); rosbags' d
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -28,12 +28,6 @@ TYPES = {
 LATCHED = ("/robot_description", "/tf_static")
 NAME = "motion"  # of the file in a bag's folder
 BAG_VERSION = 8
-
-
-class _Message(NamedTuple):
-    topic: str
-    time_ns: int
-    value: Any
 
 
 def write_rosbag(folder: Path, motion: JointMotion) -> None:
@@ -86,13 +80,12 @@ def _write_bag(folder: Path, motion: JointMotion, storage: str) -> None:
             )
             for topic, kind in TYPES.items()
         }
-        for message in _list_messages(motion, store.types):
-            raw = store.serialize_cdr(message.value, TYPES[message.topic])
-            writer.write(connections[message.topic], message.time_ns, raw)
+        for topic, time_ns, message in _list_messages(motion, store.types):
+            writer.write(connections[topic], time_ns, store.serialize_cdr(message, TYPES[topic]))
 
 
-def _list_messages(motion: JointMotion, types: Any) -> Iterator[_Message]:
-    """The messages in the order of time."""
+def _list_messages(motion: JointMotion, types: Any) -> Iterator[tuple[str, int, Any]]:
+    """List topic, time [ns] and message, of the types of a store, in the order of time."""
     time = motion.time - min(0.0, motion.time[0])
     stamps = np.maximum(np.rint(1e9 * time), 1).astype(np.int64).tolist()
     transforms = compute_link_transforms(motion)
@@ -100,46 +93,34 @@ def _list_messages(motion: JointMotion, types: Any) -> Iterator[_Message]:
     placed = {motion.root: LinkTransform(fixed_frame, motion.quat_WB[None], motion.p_WB[None])} | transforms
     moving = {link: each for link, each in placed.items() if not each.fixed}
     still = {link: each for link, each in placed.items() if each.fixed}
-    build = _MessageBuilder(types)
-    yield _Message("/robot_description", stamps[0], types["std_msgs/msg/String"](data=motion.urdf))
-    yield _Message("/tf_static", stamps[0], build.transforms(stamps[0], still, 0))
+    yield "/robot_description", stamps[0], types["std_msgs/msg/String"](data=motion.urdf)
+    yield "/tf_static", stamps[0], _make_transforms(types, stamps[0], still, 0)
     joints = list(motion.moving)
     position, velocity = (np.stack([get(joint) for joint in joints], axis=1) for get in (motion.values, motion.rates))
     for k, stamp in enumerate(stamps):
-        yield _Message("/joint_states", stamp, build.joint_state(stamp, joints, position[k], velocity[k]))
-        if moving:
-            yield _Message("/tf", stamp, build.transforms(stamp, moving, k))
-
-
-class _MessageBuilder:
-    """Messages of the types of a store."""
-
-    def __init__(self, types: Any) -> None:
-        self._types = types
-
-    def joint_state(self, stamp_ns: int, joints: Sequence[str], position: np.ndarray, velocity: np.ndarray) -> Any:
-        return self._types["sensor_msgs/msg/JointState"](
-            header=self._header(stamp_ns, ""), name=joints, position=position, velocity=velocity, effort=np.empty(0)
+        state = types["sensor_msgs/msg/JointState"](
+            header=_make_header(types, stamp, ""),
+            name=joints,
+            position=position[k],
+            velocity=velocity[k],
+            effort=np.empty(0),
         )
+        yield "/joint_states", stamp, state
+        if moving:
+            yield "/tf", stamp, _make_transforms(types, stamp, moving, k)
 
-    def transforms(self, stamp_ns: int, links: dict[str, LinkTransform], k: int) -> Any:
-        """The transforms of some links at sample `k`."""
-        types, stamped = self._types, []
-        vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
-        for link, (parent, quat, p) in links.items():
-            (x, y, z), (qx, qy, qz, qw) = p[k].tolist(), quat[k].tolist()
-            stamped.append(
-                types["geometry_msgs/msg/TransformStamped"](
-                    header=self._header(stamp_ns, parent),
-                    child_frame_id=link,
-                    transform=types["geometry_msgs/msg/Transform"](
-                        translation=vector(x=x, y=y, z=z), rotation=quaternion(x=qx, y=qy, z=qz, w=qw)
-                    ),
-                )
-            )
-        return types["tf2_msgs/msg/TFMessage"](transforms=stamped)
 
-    def _header(self, stamp_ns: int, frame: str) -> Any:
-        seconds, nanoseconds = divmod(stamp_ns, 10**9)
-        time = self._types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)
-        return self._types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
+def _make_transforms(types: Any, stamp_ns: int, links: Mapping[str, LinkTransform], k: int) -> Any:
+    """Make the message of the transforms of some links at sample `k`."""
+    vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    transform, stamped = types["geometry_msgs/msg/Transform"], types["geometry_msgs/msg/TransformStamped"]
+    transforms = []
+    for link, (parent, quat, p) in links.items():
+        place = transform(translation=vector(*p[k].tolist()), rotation=quaternion(*quat[k].tolist()))
+        transforms.append(stamped(_make_header(types, stamp_ns, parent), child_frame_id=link, transform=place))
+    return types["tf2_msgs/msg/TFMessage"](transforms=transforms)
+
+
+def _make_header(types: Any, stamp_ns: int, frame: str) -> Any:
+    time = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+    return types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
