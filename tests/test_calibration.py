@@ -113,7 +113,7 @@ def test_without_a_gauge_the_proportions_are_right_and_the_scale_is_the_priors(e
     assert np.ptp(ratio) < 2e-3
     assert abs(np.mean(ratio) - 1) < 4 * calibration.scale_std
     assert 0.02 < calibration.scale_std < 0.1
-    assert calibration.measured == {}
+    assert calibration.problem.measured == {}
     assert "scale-from-prior" in codes(calibration)
     # Nothing drifts to zero: another prior, ten per cent larger, gives everything ten per cent larger.
     average = population_subject()

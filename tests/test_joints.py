@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from benchmarks.validation.real import RING_SEGMENTS, assume_noise, register_ring
 from wepose_pin import rotations
 from wepose_pin.alignment import compute_heading_offset
-from wepose_pin.calibration import calibrate, lengths
+from wepose_pin.calibration import calibrate, problem
 from wepose_pin.calibration.joints import (
     MAX_STD,
     SYSTEMATIC_STD,
@@ -106,7 +106,7 @@ def test_soft_tissue_of_the_torso_is_no_heading(seed: int, monkeypatch: pytest.M
     for coupled in (True, False):
         with monkeypatch.context() as patch:
             if not coupled:
-                patch.setattr(lengths, "estimate_couplings", lambda *_: [])
+                patch.setattr(problem, "estimate_couplings", lambda *_: [])
             subject = calibrate(simulation.recording(), measured=measured, prior=person.prior).subject
         error = Rotation.from_quat(subject.mounts["torso"]) * Rotation.from_quat(simulation.quat_LS["torso"]).inv()
         off[coupled] = abs(float(np.degrees(error.as_rotvec()[2])))

@@ -197,7 +197,7 @@ def test_mounts_of_the_prior_are_used_and_stay(made: tuple[Person, Simulation, R
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
     calibration = calibrate(recording, measured=measured, prior=prior, method="smekf", formulation="paper")
     assert calibration.subject.mounts == simulation.quat_LS
-    assert calibration.subject.lengths["left_upper_arm"] != calibration.prior.lengths["left_upper_arm"]
+    assert calibration.subject.lengths["left_upper_arm"] != calibration.problem.prior.lengths["left_upper_arm"]
 
 
 @pytest.mark.parametrize(

@@ -280,7 +280,7 @@ def test_a_sensor_upside_down_is_another_mount_or_said_and_solved(
     calibration = solved(turned(stated.recording(), "left_forearm", over), person)
     quality = assess(calibration)
     assert quality.quality == "poor"
-    (unused,) = calibration.unused_mounts
+    (unused,) = calibration.problem.unused_mounts
     assert (unused.code, unused.place, unused.facts) == ("mount-not-used", "left_forearm", {})
     assert unused.value == pytest.approx(np.pi, abs=0.6)
     assert unused in quality.reasons
@@ -324,7 +324,7 @@ def test_exit_code_and_file_carry_the_quality(
 def test_the_page_has_the_limits_of_the_code() -> None:
     page = (Path(__file__).parents[1] / "docs" / "calibrate.md").read_text(encoding="utf-8")
     deg = (np.degrees(1.0), "°")
-    rows: list[list[tuple[quality.Limits, float, str]]] = [
+    rows: list[list[tuple[quality.QualityLimits, float, str]]] = [
         [(quality.LENGTH, 1e3, " mm")],
         [(limits, *deg) for limits in (quality.ARM_HEADING, quality.TORSO_HEADING, quality.HAND_HEADING)],
         [(quality.SCALE, 1e2, " %")],

@@ -50,7 +50,10 @@ def test_it_says_what_was_found_and_how_well_it_is_known(made: Made, page: str) 
     for name, value in calibration.subject.lengths.items():
         assert f"<td>{name.replace('_', ' ')}</td>" in page
         assert plus_minus(1e3 * value, 1e3 * calibration.subject.std(name), "mm") in page
-        assert plus_minus(1e3 * calibration.prior.lengths[name], 1e3 * calibration.prior.std(name), "mm") in page
+        assert (
+            plus_minus(1e3 * calibration.problem.prior.lengths[name], 1e3 * calibration.problem.prior.std(name), "mm")
+            in page
+        )
     for name in calibration.subject.mounts:
         assert f"{np.degrees(calibration.subject.std(f'mounts.{name}.z')):.1f}°" in page
     assert f"{1e3 * calibration.prior_rms_gap:.1f} mm before, {1e3 * calibration.rms_gap:.1f} mm after" in text_of(page)
@@ -97,7 +100,7 @@ def test_diagnostics_stand_above_the_figures_in_words(made: Made) -> None:
 
 def test_what_keeps_it_from_passing_is_not_said_twice(made: Made) -> None:
     twice = replace(made[0], remarks=(Diagnostic("scale-from-prior", INFO, value=0.05), *made[0].remarks))
-    quality = assess(replace(twice, scale_lengths=(), scale_std=0.05))
+    quality = assess(replace(twice, problem=replace(twice.problem, measured={}), scale_std=0.05))
     assert [d.code for d in quality.diagnostics].count("scale-from-prior") == 1
 
 
@@ -138,11 +141,9 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
         subject=replace(calibration.subject, order=(), covariance=np.zeros((0, 0))),
         gap=np.full_like(calibration.gap, np.nan),
         prior_gap=np.full_like(calibration.gap, np.nan),
-        rms_gap=float("nan"),
-        measured={},
+        problem=replace(calibration.problem, measured={}),
         start_pose_offset={"torso": np.array([np.nan, 0.0])},
         heading_drift={},
-        hinge_axes={},
         hinge_rms={},
         information_shares={},
     )

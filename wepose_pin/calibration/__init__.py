@@ -1,12 +1,12 @@
 """Link lengths, mounts and headings from hands held together, or from another protocol.
 
-`lengths` is the calibration from a recording to a subject. `protocols` describes what a person does, `problem` collects
-inputs and samples, `chain` is the model's chains in CasADi, `least_squares` unknowns and residuals, `solver` the
-problem and its solution by `nlpsol`, `priors` what is known before. `initial_headings` and `contact` give the initial
-guess, `joints` adds what accelerations observe of headings, `sample_losses` finds the samples connected with the start
-pose, `weights` weighs the samples, `alternatives` searches other minima, `anatomy` checks sensors and mounts. `paper`
-is the published calibration of the lengths alone. `fusion` adds an earlier calibration of the person. `result` is what
-comes of it, `observability` and `quality` assess it.
+`procedure` is the calibration from a recording to a subject, step by step. `protocols` describes what a person does,
+`conditions` what follows for a body, `problem` collects inputs and samples. `equations` has the unknowns and residuals
+in CasADi, `priors` what is known before, `least_squares` the problem and its solution by `nlpsol`. `initial_headings`
+and `contact` give the initial guess, `joints` adds what accelerations observe of headings, `sample_losses` finds the
+samples connected with the start pose, `weights` weighs the samples, `alternatives` searches other minima. `solution`
+makes of it a `result`, which `anatomy`, `observability` and `quality` assess. `paper` is the published calibration of
+the lengths alone. `fusion` adds an earlier calibration of the person.
 """
 
 from __future__ import annotations
@@ -15,24 +15,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .lengths import MEASURED_STD, calibrate
     from .paper import Formulation
+    from .procedure import MEASURED_STD, calibrate
     from .protocols import PROTOCOLS, Protocol, load_protocol
-    from .quality import CalibrationQuality, Check, assess, document
-    from .result import Calibration
+    from .quality import assess
+    from .result import Calibration, CalibrationQuality, Check
 
 # Loaded on first use: tracking takes protocols and conditions from here, and does not need CasADi.
 _WHERE = {
-    "MEASURED_STD": "lengths",
+    "MEASURED_STD": "procedure",
     "PROTOCOLS": "protocols",
     "Calibration": "result",
-    "CalibrationQuality": "quality",
-    "Check": "quality",
+    "CalibrationQuality": "result",
+    "Check": "result",
     "Formulation": "paper",
     "Protocol": "protocols",
     "assess": "quality",
-    "calibrate": "lengths",
-    "document": "quality",
+    "calibrate": "procedure",
     "load_protocol": "protocols",
 }
 __all__ = [
@@ -45,7 +44,6 @@ __all__ = [
     "Protocol",
     "assess",
     "calibrate",
-    "document",
     "load_protocol",
 ]
 

@@ -9,19 +9,16 @@ the limbs of a person. Ranges of hinges are those of the body's table.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import permutations
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..diagnostics import ERROR, Diagnostic, Severity
+from ..diagnostics import ERROR, Diagnostic
 from ..model import BodyTable, HingeJoint
 from .conditions import Loop, find_parts
-
-if TYPE_CHECKING:
-    from .result import Calibration
+from .result import Calibration, LabelCheck
 
 # Limits of a person's limbs, with soft tissue and headings some degrees off.
 BACKWARD = 0.15  # share of samples out of a hinge's range
@@ -67,57 +64,22 @@ class LimbMotion(NamedTuple):
         return doubts
 
 
-@dataclass(frozen=True)
-class LabelCheck:
-    """Whether the sensors sit where the session says.
+def measure_rotation(calibration: Calibration) -> float:
+    """How far the segments turned [rad] while the closure held: the rms angle from their mean, median over them.
 
-    Parameters
-    ----------
-    doubt : of the stated labels, above 1 where a person cannot move so
-    contradiction : the movement that a person cannot make; None where all is well
-    moved : segment → label of the sensor on it, of the labelling with a person's limbs; empty where that is the stated
-        one, or none is
-    places : segments with sensors of the chain, in the order of the table
-    pairs : of them, left → right
+    NaN without a closure.
     """
-
-    doubt: float = 0.0
-    contradiction: Diagnostic | None = None
-    moved: Mapping[str, str] = field(default_factory=dict)
-    places: tuple[str, ...] = ()
-    pairs: Mapping[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def from_motion(cls, limbs: LimbMotion, table: BodyTable) -> LabelCheck:
-        """The check of labels by how the limbs moved; a mechanism has no limits of anatomy."""
-        doubt = 0.0 if table.is_mechanism else limbs.doubt()
-        return cls(doubt, limbs.contradiction() if doubt > 1.0 else None)
-
-    def diagnostic(self, severity: Severity = ERROR) -> Diagnostic:
-        """The sensors that sit on other segments, or the movement that a person cannot make."""
-        if not self.moved:
-            return Diagnostic("limb-motion-implausible", severity, "", self.doubt, 1.0)
-        exchanged = all(self.moved[b] == a for a, b in self.moved.items())
-        variant = {} if exchanged else {"variant": "mixed"}
-        place = ", ".join(f"{label} sits on the {place}" for place, label in sorted(self.moved.items()))
-        if exchanged:
-            pairs = {tuple(sorted(pair, key=self.places.index)) for pair in self.moved.items()}
-            place = ", ".join(f"{a} and {b}" for a, b in sorted(pairs))
-            if pairs == set(self.pairs.items()):
-                variant = {"variant": "sides"}
-        return Diagnostic("sensors-exchanged", severity, place, self.doubt, 1.0, variant)
-
-
-def measure_rotation(quat_WL: Mapping[str, np.ndarray]) -> float:
-    """How far the segments turned [rad]: the rms angle from their mean orientation, median over the segments."""
-    R = [Rotation.from_quat(quat) for quat in quat_WL.values()]
+    if not calibration.closed.any():
+        return float("nan")
+    R = [Rotation.from_quat(quat[calibration.closed]) for quat in calibration.quat_WL.values()]
     return float(np.median([np.sqrt(np.mean((each.mean().inv() * each).magnitude() ** 2)) for each in R]))
 
 
-def measure_limbs(calibration: Calibration, quat_WL: Mapping[str, np.ndarray], gap: float) -> LimbMotion:
-    """How the limbs moved, from segment orientations (n, 4) xyzw where the chain is closed."""
-    table = calibration.model.table
-    R = {name: Rotation.from_quat(quat) for name, quat in quat_WL.items()}
+def measure_limbs(calibration: Calibration) -> LimbMotion:
+    """How the limbs moved while the closure held; without a closure, in all samples."""
+    table, closed = calibration.problem.model.table, calibration.closed
+    rows = calibration.touching if closed.any() else np.ones(len(closed), dtype=bool)
+    R = {name: Rotation.from_quat(quat[rows]) for name, quat in calibration.quat_WL.items()}
     flexion, backward, sideways = {}, {}, {}
     for joint, hinge in table.hinges.items():
         if hinge.on not in R or hinge.moves not in R:
@@ -128,6 +90,9 @@ def measure_limbs(calibration: Calibration, quat_WL: Mapping[str, np.ndarray], g
         backward[joint] = float(np.mean((angle < low) | (angle > high)))
         sideways[joint] = float(np.degrees(np.linalg.svd(along, compute_uv=False)[-1] / np.sqrt(len(along))))
         flexion[joint] = angle if high > -low else -angle
+    gap = 0.0
+    if closed.any():
+        gap = float(np.sqrt(np.average(calibration.gap[closed] ** 2, weights=calibration.contact[closed])))
     return LimbMotion(flexion, backward, sideways, _share_behind(calibration, R), gap)
 
 
@@ -139,22 +104,27 @@ def compute_hinge_angles(hinge: HingeJoint, along_on: Sequence[float], along: np
 
 def _share_behind(calibration: Calibration, R: Mapping[str, Rotation]) -> float:
     """The largest share of samples in which a closure's point is behind the segment in front of which it belongs."""
-    model, shares = calibration.model, [0.0]
+    problem, shares = calibration.problem, [0.0]
+    model, start = problem.model, problem.start_pose
     lengths = np.array([calibration.subject.lengths[name] for name in model.lengths])
-    turned = {
-        name: rotation * Rotation.from_matrix(calibration.start_pose.R_WK[name]).inv() for name, rotation in R.items()
-    }
-    for loop in calibration.conditions:
+    turned = {name: rotation * problem.start_rotation(name).inv() for name, rotation in R.items()}
+    for loop in problem.conditions:
         if not isinstance(loop, Loop) or loop.closure.in_front_of not in R:
             continue
         for point in loop.closure.points:
             limb = next((limb for limb in model.table.limbs if limb[-1] == point), None)
             if limb is None:
                 continue
-            parts = find_parts(model, calibration.start_pose, R, [(point, 1.0), (limb[0], -1.0)])
+            parts = find_parts(model, start, R, [(point, 1.0), (limb[0], -1.0)])
             reach = sum(turned[part.sensor].apply(part.vector(lengths)) for part in parts)
             shares.append(float(np.mean(R[loop.closure.in_front_of].inv().apply(reach)[:, 0] < -BACK)))
     return max(shares)
+
+
+def check_limbs(limbs: LimbMotion, table: BodyTable) -> LabelCheck:
+    """The check of labels by how the limbs moved; a mechanism has no limits of anatomy."""
+    doubt = 0.0 if table.is_mechanism else limbs.doubt()
+    return LabelCheck(doubt, limbs.contradiction() if doubt > 1.0 else None)
 
 
 def check_labels(
@@ -168,9 +138,9 @@ def check_labels(
     solve : segment → label of the sensor on it → how the limbs moved with these
     places : segments with sensors of the chain
     """
-    doubt = stated.doubt()
-    if doubt <= 1.0 or table.is_mechanism:
-        return LabelCheck(doubt)
+    check = check_limbs(stated, table)
+    if check.doubt <= 1.0:
+        return check
     # Labellings that close the same chain, fewest moves first: one of each shows whether it closes.
     alike: dict[frozenset, list[dict[str, str]]] = {}
     for order in permutations(places):
@@ -181,13 +151,24 @@ def check_labels(
     for sides, labellings in alike.items():
         labellings.sort(key=len)
         gaps[sides] = solve(labellings[0]).gap
-    best, moved = np.inf, dict[str, str]()
     closing = [sides for sides, gap in gaps.items() if gap < OPEN and gap < 2.0 * min(gaps.values())]
-    for labelling in (labelling for sides in closing for labelling in alike[sides]):
-        limbs = solve(labelling)
-        if limbs.doubt() < best:
-            best, moved = limbs.doubt(), labelling
-    pairs = {left: right for left, right in table.pairs.items() if left in places and right in places}
-    return LabelCheck(
-        doubt, stated.contradiction(), moved if best < min(1.0, BETTER * doubt) else {}, tuple(places), pairs
-    )
+    doubts = [(solve(labelling).doubt(), labelling) for sides in closing for labelling in alike[sides]]
+    best, moved = min(doubts, key=lambda pair: pair[0], default=(np.inf, {}))
+    return check._replace(moved=moved) if best < min(1.0, BETTER * check.doubt) else check
+
+
+def diagnose_labels(calibration: Calibration) -> Diagnostic:
+    """The sensors that sit on other segments, or the movement that a person cannot make."""
+    labels, table = calibration.labels, calibration.problem.model.table
+    if not labels.moved:
+        return Diagnostic("limb-motion-implausible", ERROR, "", labels.doubt, 1.0)
+    place = ", ".join(f"{label} sits on the {place}" for place, label in sorted(labels.moved.items()))
+    variant = {"variant": "mixed"}
+    if all(labels.moved[b] == a for a, b in labels.moved.items()):  # pairs of sensors, exchanged
+        order = list(table.segments)
+        pairs = {tuple(sorted(pair, key=order.index)) for pair in labels.moved.items()}
+        place = ", ".join(f"{a} and {b}" for a, b in sorted(pairs))
+        places = set(calibration.problem.sensors) & set(table.needed)
+        sides = {(left, right) for left, right in table.pairs.items() if {left, right} <= places}
+        variant = {"variant": "sides"} if pairs == sides else {}
+    return Diagnostic("sensors-exchanged", ERROR, place, labels.doubt, 1.0, variant)

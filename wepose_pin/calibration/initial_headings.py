@@ -15,13 +15,13 @@ the size of each sensor's part of the chain, with the prior's few per cent of un
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..model.reaches import UNIVERSE
 from .conditions import Constraint, Level, Loop, Part, Pointing
+from .joints import Coupling
 from .least_squares import Observations
 
 STARTS, NEARER = 256, 24  # starts, and how many of the best continue after some rounds
@@ -32,16 +32,6 @@ SEARCH_SAMPLES, LEAST_SEARCH_SAMPLES = 48, 8  # of all closures together, of eac
 GAP_STD = 0.03  # [m] of a closure in the search; includes all that the search leaves out
 SIZE_STD = 0.08  # of a part of the chain, relative
 KNOWN_STD = np.deg2rad(10.0)  # [rad] of a heading from a mount or a pose
-
-
-class Coupling(NamedTuple):
-    """The heading of one sensor's world relative to that of its neighbour."""
-
-    near: str
-    far: str
-    heading: float  # [rad] ψ of the near one less ψ of the far one, mean over the samples
-    std: float  # [rad]
-    elapsed_s: float  # from the start pose to the mean time of the samples
 
 
 def estimate_headings(observations: Observations, x: np.ndarray, stated: Mapping[str, float]) -> np.ndarray:

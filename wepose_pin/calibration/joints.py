@@ -13,6 +13,7 @@ on the closure as a heading, but none on a joint's acceleration, since orientati
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,14 +21,15 @@ from ..filters.butterworth import band_pass, low_pass
 from ..filters.sensors import FilteredRecording
 from ..recording import Recording
 from .equations import Layout
-from .initial_headings import Coupling
 from .least_squares import Gaussian
 from .sample_losses import find_sample_losses, mask_connected
-from .weights import LEAST_CORRELATION_S
 
 # What people move in, without gravity's constant and without what tissue shakes; of the rate, before it is derived.
 BAND_HZ, RATE_HZ = (0.1, 1.5), 8.0
 SAMPLES_HZ = 10.0
+# Errors of orientations are slow: two samples closer than this [s] are never independent, however white the residual
+# of one phase is. Chosen on simulated people, whose joint errors it brings within the covariance.
+LEAST_CORRELATION_S = 3.0
 LEAST_RATE_HZ, LEAST_S = 20.0, 20.0  # of recordings that are used
 LEAST_LEVER = 1e-6  # [1/s⁴], keeps unobserved levers finite
 LEAST_MISMATCH = 0.005  # [m/s²] below which no two sensors agree
@@ -37,6 +39,16 @@ DISTANT = np.deg2rad(30.0)  # [rad] from the best heading, from where on others 
 # is 1.1 deg at elbows and 1.6 at shoulders, where the residual alone gives half of it.
 SYSTEMATIC_STD = np.deg2rad(1.5)
 MAX_STD = np.deg2rad(20.0)  # above it the problem is not linear
+
+
+class Coupling(NamedTuple):
+    """The heading of one sensor's world relative to that of its neighbour."""
+
+    near: str
+    far: str
+    heading: float  # [rad] ψ of the near one less ψ of the far one, mean over the samples
+    std: float  # [rad]
+    elapsed_s: float  # from the start pose to the mean time of the samples
 
 
 def estimate_couplings(

@@ -13,7 +13,7 @@ from .conditions import Loop, choose_variant, find_segments
 from .least_squares import Observations
 from .problem import CalibrationProblem
 from .protocols import PROTOCOLS, load_protocol
-from .weights import MIN_CONTACT
+from .result import MIN_CONTACT
 
 LOOSE_SCALE = 0.6  # of the prior's relative standard deviation, above which a measured length shows little of limbs
 MOST_OPEN = 0.10  # share of a phase in which the closure may be open

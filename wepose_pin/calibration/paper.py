@@ -37,7 +37,7 @@ from ..model import BodyModel
 from ..model.start_pose import orient_links
 from ..model.table import NEUTRAL_POSE
 from ..subject import Subject
-from .anatomy import LabelCheck
+from .anatomy import check_limbs, measure_limbs
 from .conditions import Constraint, Loop, StartPose, resolve_conditions
 from .equations import rotate
 from .least_squares import MIN_LENGTH, QUIET_QP, Observations
@@ -45,8 +45,8 @@ from .observability import diagnose_lengths
 from .priors import combine_lengths
 from .problem import CalibrationProblem
 from .protocols import Closure, Protocol
-from .result import Calibration
-from .weights import LEAST_VARIANCE, MeasuredLength, count_correlated_samples, min_correlation
+from .result import Calibration, MeasuredLength
+from .weights import LEAST_VARIANCE, count_correlated_samples, min_correlation
 
 Formulation = Literal["full", "paper"]
 LEAST_EFFECT = 1e-6  # of a change of the lengths on the gaps, beside that of the change with the largest effect
@@ -115,18 +115,12 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     covariance = _estimate_covariance(A, gaps, constraints, correlated)
     gap, prior_gap = (np.linalg.norm(vectors, axis=1) for vectors in (gaps, prior_gaps))
     measured_covariance = np.linalg.inv(combine_lengths(prior, problem.measured, tuple(problem.model.lengths))[1])
-    scale_lengths = tuple(name for name in problem.measured if name in problem.lengths_in_closures)
+    note = f"{protocol.title}, lengths alone as in the paper; scale measured: {', '.join(problem.scale_lengths)}"
+    subject = _replace_lengths(prior, lengths, covariance, name=recording.name, note=note)
     calibration = Calibration(
-        subject=_replace_lengths(
-            prior, lengths, covariance,
-            name=recording.name,
-            note=f"{protocol.title}, lengths alone as in the paper; scale measured: {', '.join(scale_lengths)}",
-        ).fix_girdles(problem.model.table),
-        prior=prior,
-        rms_gap=float(np.sqrt(np.mean(gap**2))),
-        prior_rms_gap=float(np.sqrt(np.mean(prior_gap**2))),
+        problem=problem,
+        subject=subject.fix_girdles(problem.model.table),
         effective_sample_size=len(gap) / correlated,
-        measured={name: metres for name, (metres, _) in problem.measured.items()},
         scale_std=float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1),
         remarks=(
             *alignment.diagnostics,
@@ -137,26 +131,15 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         gap=gap,
         prior_gap=prior_gap,
         contact=np.ones(len(gap)),
-        start_pose_offset={},
-        heading_drift={},
-        hinge_axes={},
-        hinge_rms={},
         prior_covariance=_replace_lengths(prior, lengths, measured_covariance).covariance,
         quat_WL=quat_WL,
-        protocol=protocol.name,
-        closure="coincide",
-        measured_example=problem.measured_example,
         measured_lengths={  # beside the prior alone: the gap is least without any length
             name: MeasuredLength(metres, prior.lengths[name], prior.std(name), std)
             for name, (metres, std) in problem.measured.items()
         },
-        scale_lengths=scale_lengths,
         formulation="paper",
-        model=problem.model,
-        start_pose=problem.start_pose,
-        conditions=problem.conditions,
-    )  # fmt: skip
-    return replace(calibration, labels=LabelCheck.from_motion(calibration.limbs(), problem.model.table))
+    )
+    return replace(calibration, labels=check_limbs(measure_limbs(calibration), problem.model.table))
 
 
 def compute_gap_matrices(observations: Observations, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -18,7 +18,7 @@ from ..model.table import NEUTRAL_POSE
 from ..subject import Subject
 from .conditions import Loop
 from .equations import Layout
-from .initial_headings import estimate_headings
+from .initial_headings import estimate_headings, estimate_joint_headings
 from .least_squares import Gaussian, Observations
 from .problem import CalibrationProblem
 
@@ -32,7 +32,8 @@ POINT_STD = 3.0  # [m] of an unknown point of W
 
 
 def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaussian:
-    """All that is known before the closure, as one Gaussian over x; unknown headings start at those of the closure.
+    """All that is known before the closure, as one Gaussian over x; unknown headings start at those that
+    the closure shows, or joints and hinges where no closure holds.
 
     Raises
     ------
@@ -45,7 +46,10 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     _add_places(mean, information, observations)
 
     stated_headings = problem.stated_headings(layout.sensors)
-    headings = estimate_headings(observations, mean, stated_headings)
+    if problem.is_free_motion:
+        headings = estimate_joint_headings(observations, problem.couplings, stated_headings)
+    else:
+        headings = estimate_headings(observations, mean, stated_headings)
     for i, name in enumerate(layout.sensors):
         rows = [*layout.tilt[i], layout.heading[i]]
         mean[rows[2]] = stated_headings.get(name, headings[i])

@@ -31,6 +31,7 @@ from .conditions import (
     resolve_conditions,
 )
 from .equations import Layout
+from .joints import Coupling, estimate_couplings
 from .least_squares import Observations
 from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 from .recorded import read_recorded_places
@@ -60,6 +61,7 @@ class CalibrationProblem:
     measured : name of a length → value and standard deviation [m]
     model : the body
     loose : phases whose poses are not used, as they contradict all else
+    unused_mounts, unused_phases : diagnostics of mounts and poses that are not used, as all else contradicts them
     """
 
     recording: Recording
@@ -69,6 +71,8 @@ class CalibrationProblem:
     measured: Mapping[str, tuple[float, float]]
     model: BodyModel
     loose: tuple[str, ...] = ()
+    unused_mounts: tuple[Diagnostic, ...] = ()
+    unused_phases: tuple[Diagnostic, ...] = ()
 
     @cached_property
     def start_pose(self) -> StartPose:
@@ -95,6 +99,29 @@ class CalibrationProblem:
     def lengths_in_closures(self) -> tuple[str, ...]:
         """The names of the lengths that some closure contains."""
         return find_measured_lengths(self.protocol, self.model)
+
+    @property
+    def scale_lengths(self) -> tuple[str, ...]:
+        """The measured lengths that fix the scale; empty: the prior does."""
+        # A length outside the chain, such as the trunk where the hands are joined, does not fix its scale.
+        return tuple(name for name in self.measured if name in (self.lengths_in_closures or self.model.lengths))
+
+    @property
+    def closure_kind(self) -> str:
+        """The kind of the protocol's closure, "coincide" for joined hands; empty where it has none."""
+        return next((closure.kind for closure in self.protocol.closures), "")
+
+    @property
+    def is_free_motion(self) -> bool:
+        """Whether limbs move and no closure holds."""
+        return bool(self.protocol.free_motions) and not self.protocol.closures
+
+    @cached_property
+    def couplings(self) -> list[Coupling]:
+        """The relative headings of neighbours by the acceleration of the joint between them."""
+        neighbours = [(self.model.parents[name], name) for name in self.sensors]
+        pairs = [(above, name) for above, name in neighbours if above is not None and above in self.sensors]
+        return estimate_couplings(self.recording, self.filtered, pairs, self.moving_intervals)
 
     def intervals(self, condition: Condition) -> Intervals:
         """Return the intervals [s] in which a condition holds.
@@ -171,6 +198,17 @@ class CalibrationProblem:
         mounts = {name: mount for name, mount in self.prior.mounts.items() if name not in segments}
         recording, prior = replace(self.recording, sensors=sensors), replace(self.prior, mounts=mounts)
         return replace(self, recording=recording, prior=prior)
+
+    def leave_out_mounts(
+        self, angles_deg: Mapping[str, float], limit_deg: float, variant: str = ""
+    ) -> CalibrationProblem:
+        """Return the same problem without mounts that are off by these angles, which it states."""
+        facts: dict[str, float | str] = {"variant": variant} if variant else {}
+        unused = [
+            Diagnostic("mount-not-used", WARNING, name, float(np.deg2rad(angle)), float(np.deg2rad(limit_deg)), facts)
+            for name, angle in angles_deg.items()
+        ]
+        return replace(self.remove_mounts(angles_deg), unused_mounts=(*self.unused_mounts, *unused))
 
     def loosen_phase(self, phase: str) -> CalibrationProblem:
         """Return the same problem with poses of this phase that tell next to nothing."""

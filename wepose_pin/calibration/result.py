@@ -1,23 +1,163 @@
-"""`Calibration`: the result of a calibration."""
+"""`Calibration`: the result of a calibration, and what its quality is made of."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from ..diagnostics import Diagnostic, notebook_html, render
-from ..model import BodyModel
-from ..subject import Subject
-from .anatomy import LabelCheck, LimbMotion, measure_limbs, measure_rotation
-from .conditions import Constraint, Loop, StartPose, choose_variant
-from .weights import MIN_CONTACT, MeasuredLength
+from ..subject import Quality, Subject
+from .problem import CalibrationProblem
 
-if TYPE_CHECKING:
-    from .quality import CalibrationQuality
+MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
+MIN_INFORMATION = 1e-2  # of a direction, in units of the prior's, below which the motion does not show it
+
+
+class MeasuredLength(NamedTuple):
+    """A measured length beside the estimate without it, from the motion, the prior and other measured lengths."""
+
+    metres: float  # [m] as measured
+    expected: float  # [m] without it
+    std: float  # [m] of that
+    measured_std: float  # [m]
+
+    @property
+    def deviation(self) -> float:
+        """By how many standard deviations the two differ."""
+        return abs(self.metres - self.expected) / float(np.hypot(self.std, self.measured_std))
+
+
+class LabelCheck(NamedTuple):
+    """Whether the sensors sit where the session says.
+
+    Parameters
+    ----------
+    doubt : of the stated labels, above 1 where a person cannot move so
+    contradiction : the movement that a person cannot make; None where all is well
+    moved : segment → label of the sensor on it, of the labelling with a person's limbs; empty where that is the stated
+        one, or none is
+    """
+
+    doubt: float = 0.0
+    contradiction: Diagnostic | None = None
+    moved: Mapping[str, str] = {}
+
+
+class QualityLimits(NamedTuple):
+    """Up to `passes` a value passes, up to `poor` it is poor; from them on where `passes` is the larger one."""
+
+    passes: float
+    poor: float
+
+    def quality(self, value: float) -> Quality:
+        """Pass, poor or fail; NaN, a value that was not computed, passes."""
+        sign = -1.0 if self.passes > self.poor else 1.0
+        value, passes, poor = sign * value, sign * self.passes, sign * self.poor
+        return "fail" if value > poor else "poor" if value > passes else "pass"
+
+
+class Check(NamedTuple):
+    """One number against its limits."""
+
+    diagnostic: Diagnostic  # what is checked: its value, and as limit that up to which it passes
+    quality: Quality
+    limits: QualityLimits
+    cause: Diagnostic | None = None  # the motion that was too small
+
+    @property
+    def value(self) -> float:
+        """Of the diagnostic; NaN where it has none."""
+        return float("nan") if self.diagnostic.value is None else self.diagnostic.value
+
+    @property
+    def excess(self) -> float:
+        """The ratio of value and limit, above 1 where it does not pass."""
+        passes, poor = self.limits
+        value, limit = (passes, self.value) if passes > poor else (self.value, passes)
+        return value / max(limit, 1e-9)
+
+
+class Range(NamedTuple):
+    """From the 2nd to the 98th percentile [deg]."""
+
+    low: float
+    high: float
+
+    @property
+    def size(self) -> float:
+        return self.high - self.low
+
+
+class MotionRange(NamedTuple):
+    """How far the body moved while the chain was closed; keys are limbs, by side or by their last point."""
+
+    elevation: dict[str, Range]  # of the limb's first segment in the one above, 0 hanging, 90 level
+    sideways: dict[str, Range]  # azimuth of the limb's end from its beginning in the segment above, positive left
+    bend: dict[str, Range]  # flexion of its hinge, 0 straight
+    lean: float  # [deg] of the first segment's axis from its mean, 98th percentile
+    twist: Range | None  # heading of the first segment
+
+
+class InformationDirection(NamedTuple):
+    """A combination of lengths and mounts, and how much information the motion gives on it."""
+
+    information: float  # in units of the prior's: 0 none, 1 as much again
+    parts: dict[str, float]  # its largest parts, each in units of its standard deviation before
+
+
+@dataclass(frozen=True)
+class CalibrationQuality:
+    """The quality of a calibration, and how the motion determined it.
+
+    Parameters
+    ----------
+    quality : the worst of all checks
+    checks : all of them, in the order of the results
+    reasons : why it does not pass, the worst first, each followed by its cause
+    further : what else the user should know
+    motion : how far the body moved
+    directions : of lengths and mounts jointly, best determined first
+    """
+
+    quality: Quality = "fail"
+    checks: tuple[Check, ...] = ()
+    reasons: tuple[Diagnostic, ...] = ()
+    further: tuple[Diagnostic, ...] = ()
+    motion: MotionRange = field(default_factory=lambda: MotionRange({}, {}, {}, np.nan, None))
+    directions: tuple[InformationDirection, ...] = ()
+
+    def __repr__(self) -> str:
+        failing = sum(check.quality != "pass" for check in self.checks)
+        return f"CalibrationQuality({self.quality!r}: {failing} of {len(self.checks)} checks do not pass)"
+
+    @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """All that a user should know of the calibration."""
+        return (*self.reasons, *self.further)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of lengths and mounts' angles that are not known exactly."""
+        return len(self.directions)
+
+    @property
+    def rank(self) -> int:
+        """How many directions the motion shows."""
+        return sum(d.information > MIN_INFORMATION for d in self.directions)
+
+    @property
+    def determined(self) -> int:
+        """How many directions the motion determines better than the prior."""
+        return sum(d.information > 1.0 for d in self.directions)
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest standard deviation after the motion, each in units of that before."""
+        after = [1.0 / (1.0 + d.information) for d in self.directions]
+        return float(np.sqrt(max(after) / min(after))) if after else float("nan")
 
 
 @dataclass(frozen=True)
@@ -30,85 +170,74 @@ class Calibration:
 
     Parameters
     ----------
+    problem : recording, protocol, body, prior and measured lengths, without the mounts and poses that are not used
     subject : lengths and mounts with their joint covariance; its `quality` is that of the calibration
-    prior : the subject before the calibration
-    rms_gap : [m] root mean square of the gap's length, where the hands are joined
-    prior_rms_gap : the same with the prior's lengths
     effective_sample_size : number of independent samples with as much information as the gaps
-    measured : name → measured length [m]; empty: the scale is the prior's
     scale_std : relative standard deviation of the overall scale, with the proportions as estimated
     remarks : diagnostics of the estimation, without those of its quality; `diagnostics` has both
     time : (n,) [s] of the samples
     gap, prior_gap : (n,) [m] length of the gap, as estimated and with the prior's lengths; NaN outside of closures
     contact : (n,) weight of each sample's gap, near 0 where the palms are apart
-    start_pose_offset : segment → (2,) [rad] about x and y of W, by which it was off the start pose
-    heading_drift : segment → [rad/s] drift of its sensor's heading
-    hinge_axes : joint → (3,) its axis in the frame of the segment above, unit length
-    hinge_rms : joint → [rad] rms angle of the segment below to the plane across that axis
-    information_shares : name as in the subject's covariance, or ``left_forearm + left_hand`` → (n,) share of the
-        information on it that each sample brings; their sum and the prior's share make 1
     prior_covariance : (k, k) before the motion, rows as `subject.order`
     quat_WL : segment → (n, 4) xyzw at each sample, as tracking gives it
-    protocol : its name
-    closure : the kind of its closure, "coincide" for joined hands; empty where it has none
-    measured_example : the length that would fix the scale best, as ``name=metres``
     measured_lengths : name → measured length beside the estimate without it
+    start_pose_offset : segment → (2,) [rad] about x and y of W, by which it was off the start pose
+    heading_drift : segment → [rad/s] drift of its sensor's heading
+    hinge_rms : joint → [rad] rms angle of the segment below to the plane across its axis
+    information_shares : name as in the subject's covariance, or ``left_forearm + left_hand`` → (n,) share of the
+        information on it that each sample brings; their sum and the prior's share make 1
     labels : the check that each sensor is on the segment that the session states
     posed : phase of poses → by how many standard deviations it deviates from what is known without it; where no
         closure tells which of them is wrong
-    unused_mounts : diagnostics of stated mounts that gravity or the motion contradicts
-    scale_lengths : names of the measured lengths that fix the scale; empty: the prior does
-    model, start_pose, conditions : the body, its links in the start pose, and the protocol's conditions on it
     formulation : "full" or "paper"
+    quality : of `quality.assess`
     """
 
+    problem: CalibrationProblem
     subject: Subject
-    prior: Subject
-    model: BodyModel
-    start_pose: StartPose
-    conditions: tuple[Constraint, ...]
-    rms_gap: float
-    prior_rms_gap: float
     effective_sample_size: float
-    measured: Mapping[str, float]
     scale_std: float
     remarks: tuple[Diagnostic, ...]
     time: np.ndarray
     gap: np.ndarray
     prior_gap: np.ndarray
     contact: np.ndarray
-    start_pose_offset: Mapping[str, np.ndarray]
-    heading_drift: Mapping[str, float]
-    hinge_axes: Mapping[str, np.ndarray]
-    hinge_rms: Mapping[str, float]
+    prior_covariance: np.ndarray
+    quat_WL: Mapping[str, np.ndarray]
+    measured_lengths: Mapping[str, MeasuredLength]
+    start_pose_offset: Mapping[str, np.ndarray] = field(default_factory=dict)
+    heading_drift: Mapping[str, float] = field(default_factory=dict)
+    hinge_rms: Mapping[str, float] = field(default_factory=dict)
     information_shares: Mapping[str, np.ndarray] = field(default_factory=dict)
-    prior_covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
-    quat_WL: Mapping[str, np.ndarray] = field(default_factory=dict)
-    protocol: str = "clasp"
-    closure: str = "coincide"
-    measured_example: str = ""
-    measured_lengths: Mapping[str, MeasuredLength] = field(default_factory=dict)
     labels: LabelCheck = field(default_factory=LabelCheck)
     posed: Mapping[str, float] = field(default_factory=dict)
-    unused_mounts: tuple[Diagnostic, ...] = ()
-    scale_lengths: tuple[str, ...] = ()
     formulation: str = "full"
-
-    @cached_property
-    def quality(self) -> CalibrationQuality:
-        """The quality, `quality.quality` "pass", "poor" or "fail", with all checks and reasons."""
-        from .quality import assess
-
-        return assess(self)
+    quality: CalibrationQuality = field(default_factory=CalibrationQuality)
 
     @property
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """What the user should know: the reasons of its quality first, then the remarks."""
         return self.quality.diagnostics
 
-    def state_quality(self) -> Calibration:
-        """Return the same calibration with a subject that states its quality."""
-        return replace(self, subject=replace(self.subject, quality=self.quality.quality))
+    @property
+    def closed(self) -> np.ndarray:
+        """(n,) bool: samples of a closure."""
+        return np.isfinite(self.gap)
+
+    @property
+    def touching(self) -> np.ndarray:
+        """(n,) bool: samples at which the palms touch."""
+        return self.closed & (self.contact > MIN_CONTACT)
+
+    @property
+    def rms_gap(self) -> float:
+        """[m] root mean square of the gap's length, where the hands are joined; NaN without a closure."""
+        return _rms(self.gap[self.touching])
+
+    @property
+    def prior_rms_gap(self) -> float:
+        """[m] the same with the prior's lengths."""
+        return _rms(self.prior_gap[self.touching])
 
     def __repr__(self) -> str:
         stds = [1e3 * std for name in self.subject.lengths if np.isfinite(std := self.subject.std(name))]
@@ -120,28 +249,6 @@ class Calibration:
     def _repr_html_(self) -> str:
         return notebook_html(self, self.diagnostics, [self.subject.lengths_html()])
 
-    @property
-    def variant(self) -> str:
-        """The variant of texts about it: the kind of its closure, or "general"; empty without a closure."""
-        table = self.model.table
-        variants = {choose_variant(each.closure, table) for each in self.conditions if isinstance(each, Loop)}
-        return "general" if table.is_mechanism or "general" in variants else self.closure
 
-    @property
-    def body(self) -> BodyModel:
-        """The body with the estimated lengths."""
-        return self.subject.shape(self.model)
-
-    @property
-    def rotation(self) -> float:
-        """How far the segments turned [rad] while the closure held; NaN without one."""
-        closed = np.isfinite(self.gap)
-        return measure_rotation({name: quat[closed] for name, quat in self.quat_WL.items()}) if closed.any() else np.nan
-
-    def limbs(self) -> LimbMotion:
-        """Return how the limbs moved while the closure held; without a closure, in all samples."""
-        closed = np.isfinite(self.gap)
-        rows = closed & (self.contact > MIN_CONTACT) if closed.any() else np.ones(len(self.gap), dtype=bool)
-        gap = np.sqrt(np.average(self.gap[closed] ** 2, weights=self.contact[closed])) if closed.any() else 0.0
-        quat_WL = {name: quat[rows] for name, quat in self.quat_WL.items()}
-        return measure_limbs(self, quat_WL, float(gap))
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

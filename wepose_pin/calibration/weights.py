@@ -16,13 +16,12 @@ from ..model.girdle import PARAMETERS
 from ..subject import mount_rows
 from .conditions import Level, Loop, Moving, Pointing, StartPose
 from .equations import GAP_ROWS, HINGE_STD, Layout
+from .joints import LEAST_CORRELATION_S
 from .least_squares import STEPS, Estimate, Gaussian, LeastSquares, Observations, solve
+from .result import MIN_CONTACT, MeasuredLength
 
 # Residual variance, in units of the weights', that no person's hands stay below (a fraction of a millimetre).
 LEAST_VARIANCE = 1e-4
-# Errors of orientations are slow: two samples closer than this [s] are never independent, however white the residual
-# of one phase is. Chosen on simulated people, whose joint errors it brings within the covariance.
-LEAST_CORRELATION_S = 3.0
 THIRD_CHI2 = {1: 0.1485, 2: 0.7133, 3: 1.4237}  # 30 % quantile of chi², by degrees of freedom
 ROUNDS = 5
 ROUND_STEPS = 2  # of the rounds after the first: the next one goes on
@@ -30,7 +29,6 @@ FINAL_STEPS = 300  # of the last solve, which must converge: hands that hardly m
 QUICK_ROUNDS, QUICK_STEPS = 1, 15
 MANY_SAMPLES = 1000  # from twice as many on, all rounds but the last take every second, third, … sample
 OUTLIER = 5.0  # times the usual gap, at which the palms are apart
-MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
 MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about right
 # [rad] by which people's elbows leave a hinge (docs/people.md): an oblique axis, and one that wanders.
 ELBOW_STD = np.deg2rad(4.0)
@@ -40,20 +38,6 @@ CONTRADICTED = 3.0  # standard deviations between a measured length, or a pose, 
 # which the residuals show in part.
 LEAST_LENGTH_STD = 0.010
 SUSPECT = 1.5  # the same of a pose from which on it is compared with a solution without it
-
-
-class MeasuredLength(NamedTuple):
-    """A measured length beside the estimate without it, from the motion, the prior and other measured lengths."""
-
-    metres: float  # [m] as measured
-    expected: float  # [m] without it
-    std: float  # [m] of that
-    measured_std: float  # [m]
-
-    @property
-    def deviation(self) -> float:
-        """By how many standard deviations the two differ."""
-        return abs(self.metres - self.expected) / float(np.hypot(self.std, self.measured_std))
 
 
 class WeightedFit(NamedTuple):
@@ -277,7 +261,7 @@ def project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose)
 
 
 def compute_information_shares(
-    fit: Estimate, layout: Layout, weights: np.ndarray, covariance: np.ndarray, sums: Sequence[tuple[str, ...]]
+    result: WeightedFit, layout: Layout, sums: Sequence[tuple[str, ...]]
 ) -> dict[str, np.ndarray]:
     """Name → share (n,) of the information that each sample brings: C = C (Σ Jᵀ W J + Λ) C, over C, is a sum to 1.
 
@@ -285,15 +269,14 @@ def compute_information_shares(
     ----------
     sums : lengths that the closures show together, which are one direction as well, named with " + "
     """
-    unit = np.eye(layout.size)
+    unit, covariance = np.eye(layout.size), result.fit.covariance
     directions = dict(zip(layout.lengths, unit, strict=False))
     directions |= {
         " + ".join(names): np.sum([directions[name] for name in names], axis=0) for names in sums if len(names) > 1
     }
     for i, name in enumerate(layout.sensors):
-        rows = [*layout.tilt[i], layout.heading[i]]
-        directions |= dict(zip(mount_rows(name), unit[rows], strict=True))
+        directions |= dict(zip(mount_rows(name), unit[[*layout.tilt[i], layout.heading[i]]], strict=True))
     T = np.array(list(directions.values()))
-    moved = fit.jacobian @ covariance @ T.T  # (n, residuals, k)
-    share = np.einsum("ni,nik->kn", weights, moved**2) / np.einsum("ki,ij,kj->k", T, covariance, T)[:, None]
+    moved = result.fit.jacobian @ covariance @ T.T  # (n, residuals, k)
+    share = np.einsum("ni,nik->kn", result.weights, moved**2) / np.einsum("ki,ij,kj->k", T, covariance, T)[:, None]
     return dict(zip(directions, share, strict=True))

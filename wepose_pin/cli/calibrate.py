@@ -29,19 +29,19 @@ def run(job: CalibrateJob) -> int:
         outcome = run_calibrate(job, progress)
     calibration, quality, protocol = outcome.calibration, outcome.quality, outcome.protocol
     print_diagnostics([*quality.further, *outcome.page_failures])
-    of_people = outcome.prior.is_population and not calibration.model.table.is_mechanism
+    of_people = outcome.prior.is_population and not calibration.problem.model.table.is_mechanism
     prior_name = "population prior" if of_people else "prior"
     print_lengths(
         f"Lengths, by {protocol.title}",
         calibration.subject,
         outcome.prior,
-        calibration.measured,
+        {name: metres for name, (metres, _) in calibration.problem.measured.items()},
         prior_name=prior_name,
     )
     _print_mounts(calibration)
     if protocol.closures:
         points = " and ".join(point.replace("_", " ") for point in protocol.closures[0].points)
-        gap = GAPS[calibration.closure].format(points)
+        gap = GAPS[calibration.problem.closure_kind].format(points)
         prior_mm = f"{1e3 * calibration.prior_rms_gap:.1f} mm with the lengths of the {prior_name}"
         say(f"{gap}: {1e3 * calibration.rms_gap:.1f} mm rms, {prior_mm}")
         say(f"Effective sample size of the motion: {calibration.effective_sample_size:.0f}")

@@ -167,7 +167,7 @@ def run_calibrate(job: CalibrateJob, progress: Progress = no_progress) -> Calibr
             formulation=job.formulation,
         )
         quality = assess(calibration)
-        write_subject(folder, calibration.subject, calibration.body)
+        write_subject(folder, calibration.subject, calibration.subject.shape(calibration.problem.model))
         write_calibration(folder, calibration, quality, collect_provenance("calibrate", field_values(job)))
     failures: list[Diagnostic] = []
     if job.report:
@@ -175,4 +175,4 @@ def run_calibrate(job: CalibrateJob, progress: Progress = no_progress) -> Calibr
         failures = write_calibration_page(
             job.out, calibration, recording, method=job.method, protocol=protocol, quality=quality
         )
-    return CalibrateOutcome(calibration, quality, protocol, prior or calibration.prior, failures)
+    return CalibrateOutcome(calibration, quality, protocol, prior or calibration.problem.prior, failures)

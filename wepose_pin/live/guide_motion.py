@@ -261,8 +261,8 @@ class CalibrationStep(Step):
         if not any(REMEDIES.get(reason.code) == MEASURE for reason in quality.reasons):
             return ""
         known = {*self.guide.options.measured, *self._measured}
-        best = calibration.measured_example.partition("=")[0]
-        choices = (STATURE, best) if calibration.scale_lengths else (best, STATURE)
+        best = calibration.problem.measured_example.partition("=")[0]
+        choices = (STATURE, best) if calibration.problem.scale_lengths else (best, STATURE)
         return next((name for name in choices if name not in known), "")
 
     def _exchange(self, moved: Mapping[str, str]) -> None:
@@ -287,7 +287,7 @@ class CalibrationStep(Step):
         }[quality.quality]
         if quality.quality == "poor" and all(reason.code.startswith("scale-") for reason in quality.reasons):
             sentence = "The proportions are good. One measured length gives the scale too."
-            if calibration.scale_lengths:
+            if calibration.problem.scale_lengths:
                 sentence = "The proportions are good. The scale is still uncertain."
         if quality.quality == "fail" and self._lacks_motion:
             sentence = "There was too little of the motion. More of it may be enough."

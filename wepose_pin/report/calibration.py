@@ -13,8 +13,7 @@ from ..calibration import Calibration, CalibrationQuality
 from ..calibration.conditions import find_measured_lengths, group_lengths
 from ..calibration.observability import find_intervals
 from ..calibration.protocols import Protocol, load_protocol
-from ..calibration.quality import Check
-from ..calibration.weights import MIN_CONTACT
+from ..calibration.result import MIN_CONTACT, Check
 from ..diagnostics import WARNING, Diagnostic, lines, quantity
 from ..errors import WeposeError, reason
 from ..filters import BEST
@@ -83,7 +82,8 @@ def render_calibration_report(
     if tracked is None:
         try:
             options = TrackOptions(method)
-            tracker = Tracker(calibration.subject, model=calibration.model, options=options, with_point_cov=False)
+            model = calibration.problem.model
+            tracker = Tracker(calibration.subject, model=model, options=options, with_point_cov=False)
             tracked = tracker.push(recording) or next(tracker.finish())
         except Exception as error:
             untracked = [Diagnostic("motion-not-shown", WARNING, facts={"reason": str(error)})]
@@ -96,7 +96,8 @@ def render_calibration_report(
     page.add("Sensors", lambda: _list_sensors(calibration, recording))
     page.add(f"{capital(contact.gap)} over time", lambda: _list_gap(calibration, contact))
     page.add("The start pose", lambda: _list_posture(calibration))
-    joints = dict.fromkeys(plural(plain(calibration.model.table.shared_name(name))) for name in calibration.hinge_axes)
+    table = calibration.problem.model.table
+    joints = dict.fromkeys(plural(plain(table.shared_name(name))) for name in calibration.hinge_rms)
     page.add(f"The {listed([*joints])} as hinges", lambda: _list_hinges(calibration))
     page.add("The motion in 3D", lambda: _list_view(calibration, recording, tracked))
     page.add("Behind the quality", lambda: _list_checks(quality, contact))
@@ -113,7 +114,7 @@ class _Contact(NamedTuple):
 
 
 def _describe_contact(protocol: Protocol, calibration: Calibration) -> _Contact:
-    chain, table = find_measured_lengths(protocol, calibration.model), calibration.model.table
+    chain, table = find_measured_lengths(protocol, calibration.problem.model), calibration.problem.model.table
     points = dict.fromkeys(point for closure in protocol.closures for point in closure.points)
     if not points:
         return _Contact(protocol.name, "gap", chain)
@@ -158,13 +159,13 @@ def _list_diagnostics(
 
 
 def _list_lengths(calibration: Calibration, contact: _Contact) -> list[Item]:
-    subject, prior, table = calibration.subject, calibration.prior, calibration.model.table
+    subject, prior, table = calibration.subject, calibration.problem.prior, calibration.problem.model.table
     rows, cells = [], []
     scales = calibration.scale_std if contact.chain else np.nan, _compute_scale_std(prior)
     for parts in _group_rigid_lengths(table):
         value, before = (sum(person.lengths.get(part, np.nan) for part in parts) for person in (subject, prior))
         std, before_std = (_std(person, parts) for person in (subject, prior))
-        measured = calibration.measured.get(parts[0], np.nan) if len(parts) == 1 else np.nan
+        measured = calibration.problem.measured.get(parts[0], (np.nan,))[0] if len(parts) == 1 else np.nan
         label = " + ".join(plain(table.shared_name(part) if k else part) for k, part in enumerate(parts))
         rows.append(LengthRow(label, value, std, before, before_std, measured))
         proportion, proportion_before = (
@@ -181,10 +182,10 @@ def _list_lengths(calibration: Calibration, contact: _Contact) -> list[Item]:
                 f"{1e3 * measured:.0f} mm" if np.isfinite(measured) else "",
             ]
         )
-    outside = [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.measured]
+    outside = [plain(n) for n in subject.lengths if n not in contact.chain and n not in calibration.problem.measured]
     text = "± is one standard deviation throughout: two times out of three the truth lies within."
     if np.isfinite(scales[0]):
-        source = listed([plain(name) for name in calibration.scale_lengths])
+        source = listed([plain(name) for name in calibration.problem.scale_lengths])
         text += (
             " The motion determines the proportions of the lengths, as if one common scale of all were known. "
             f"{'The scale comes from the measured ' + source if source else 'The scale is that of the prior'}, to "
@@ -269,7 +270,7 @@ def _list_posture(calibration: Calibration) -> list[Item]:
     tilt = {name: t for name, t in tilt.items() if np.isfinite(t).all()}
     if not tilt:
         return []
-    rows, table = [], calibration.model.table
+    rows, table = [], calibration.problem.model.table
     for name, (x, y) in tilt.items():
         std = np.degrees([calibration.subject.std(row) for row in mount_rows(name)[:2]])
         observed = ~(std > UNOBSERVED * np.degrees(table.segments[name].start_std[:2]))
@@ -292,13 +293,13 @@ def _list_posture(calibration: Calibration) -> list[Item]:
 
 
 def _list_hinges(calibration: Calibration) -> list[Item]:
-    rows, table = [], calibration.model.table
-    for joint, axis in calibration.hinge_axes.items():
-        x, y, z = np.asarray(axis, dtype=float)
+    rows, table = [], calibration.problem.model.table
+    for joint, rms in calibration.hinge_rms.items():
+        x, y, z = calibration.subject.hinges[joint].axis
         if table.side(joint) == "right":  # seen along its outer end
             x, y, z = -x, -y, -z
         forward, up = np.degrees(np.arctan2(x, abs(y))), np.degrees(np.arctan2(z, abs(y)))
-        softness = float(np.degrees(calibration.hinge_rms.get(joint, np.nan)))
+        softness = float(np.degrees(rms))
         if not np.isfinite([forward, up]).all():
             continue
         ends = f"{abs(forward):.1f}° {'forwards' if forward > 0 else 'backwards'}", f"{abs(up):.1f}° "
@@ -337,7 +338,7 @@ def _list_view(calibration: Calibration, recording: Recording, tracked: TrackedR
 
 
 def _list_run(calibration: Calibration, recording: Recording, contact: _Contact, method: str) -> list[Item]:
-    lengths = {name: calibration.measured_lengths[name] for name in calibration.measured}
+    lengths = {name: calibration.measured_lengths[name] for name in calibration.problem.measured}
     measured = [f"{plain(n)} {1e3 * v.metres:.0f} ± {1e3 * v.measured_std:.0f} mm" for n, v in lengths.items()]
     imu, fused = len(recording.imus), len(recording.sensors) - len(recording.imus)
     raw = ["gyroscope and accelerometer"] * (imu > 0) + ["measured orientations"] * (fused > 0)
@@ -349,7 +350,7 @@ def _list_run(calibration: Calibration, recording: Recording, contact: _Contact,
         ("protocol", f"{contact.protocol}, {len(calibration.time)} samples of it"),
         ("filter", method),
         ("measured lengths", ", ".join(measured) or "none"),
-        ("prior", calibration.prior.note or calibration.prior.name),
+        ("prior", calibration.problem.prior.note or calibration.problem.prior.name),
         ("sensors mounted again", "yes" if recording.remounted else "no"),
         ("made with", versions()),
     ]
@@ -497,8 +498,8 @@ def _group_rigid_lengths(table: BodyTable) -> list[tuple[str, ...]]:
 
 def _group_shares(calibration: Calibration, contact: _Contact) -> dict[str, list[str]]:
     """Label → names in `Calibration.information_shares`, of the quantities that the motion can show."""
-    learned, table = calibration.information_shares, calibration.model.table
-    groups = group_lengths(calibration.conditions, calibration.model.lengths)
+    learned, table = calibration.information_shares, calibration.problem.model.table
+    groups = group_lengths(calibration.problem.conditions, calibration.problem.model.lengths)
     limbs = [" + ".join(names) for sensor, names in groups.items() if not table.segments[sensor].spine]
     shown = {
         "lengths": [name for name in limbs if name in learned and set(name.split(" + ")) <= set(contact.chain)],

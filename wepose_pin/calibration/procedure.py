@@ -1,0 +1,295 @@
+"""From a hands-together recording to a subject: lengths, mounts and headings with their joint covariance.
+
+While the palms are held together the chain shoulder–arm–palm–palm–arm–shoulder is closed: the gap
+
+    g(ℓ) = R_torso e_y w + Σ_left R_i(−e_z) ℓ_i − Σ_right R_i(−e_z) ℓ_i
+
+is zero. Other bodies and points have other terms (`conditions`). It is linear and homogeneous in the lengths ℓ, unless
+a length of the chain is known as it is on a robot, which decides the form of the problem:
+
+- Nothing in g fixes the scale: ℓ = 0 closes the chain perfectly. Errors of the orientations even favour it, since they
+  add to ‖g‖² in proportion to ‖ℓ‖². So the residual is the gap whitened by the covariance that errors of the
+  orientations give it. That covariance is as homogeneous as the gap, so the residual does not change with the scale
+  (total instead of ordinary least squares).
+- The scale comes from outside: a measured length, else the population prior; the result says which.
+- What the gap does not show keeps the prior: `trunk` cancels, and of a hand without a sensor the gap shows only the sum
+  forearm + hand, which the prior splits.
+- Sensors may sit anywhere: where no mount is stated, headings come from the closure, and nobody holds the start pose
+  exactly. Without a magnetometer headings drift, and soft tissue moves under the sensors. None of this is noise that
+  averages out over the phase, so all of it is estimated beside the lengths (`equations`), with priors (`priors`).
+- The accelerations of shoulders and elbows, which two sensors each measure, show headings as well (`joints`).
+- The weight of the samples is measured, not assumed (`weights`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG
+from ..arguments import Positive, check_arguments
+from ..diagnostics import WARNING, Diagnostic
+from ..errors import BadModel, BadOption, BadPhase, BadSession, NoSolution, one_of
+from ..filters import BEST, check_method
+from ..filters.sensors import filter_recording
+from ..model import BodyModel, convert_breadths, list_breadths
+from ..model.body import load_sensed_model
+from ..recording import Recording
+from ..subject import Subject, population_subject
+from .anatomy import BETTER, LEAST_ROTATION, check_labels, check_limbs, measure_limbs, measure_rotation
+from .conditions import Level, Pointing
+from .fusion import fuse_calibrations, separate_mounts
+from .paper import Formulation, check_paper_formulation, solve_paper_calibration
+from .priors import combine_lengths
+from .problem import CalibrationProblem
+from .protocols import Protocol, choose_protocol, load_protocol
+from .quality import assess
+from .result import Calibration, LabelCheck
+from .solution import solve_fully, solve_quickly
+from .weights import CONTRADICTED, SUSPECT
+
+# One standard deviation [m] of a length measured over the skin, where the user gives none.
+MEASURED_STD = 0.003
+MEASURED_RANGE = 0.02, 1.0  # [m] of lengths that a user may measure
+
+
+def calibrate(
+    recording: Recording,
+    *,
+    measured: Mapping[str, float] | None = None,
+    prior: Subject | None = None,
+    stature: Positive | None = None,
+    sex: Literal["f", "m"] | None = None,
+    model: BodyModel | str | Path | None = None,
+    protocol: str | Path | Protocol | None = None,
+    method: str = BEST,
+    measured_std: Positive = MEASURED_STD,
+    formulation: Formulation = "full",
+) -> Calibration:
+    """Calibrate a subject: estimate lengths and mounts with their covariance from joined hands, or another protocol.
+
+    Joined hands determine the proportions of the arms and not their scale: that comes from a measured length. A poor
+    or failed calibration raises nothing: it is returned, and its `quality` says so.
+
+    Parameters
+    ----------
+    recording : Recording
+        With the phases of the protocol, "clasp" for joined hands.
+    measured : mapping, optional
+        Name → [m] that was measured on the person: a length of the body such as "shoulder_width"; the breadth
+        "biacromial", from which a length follows. Without any the scale is the prior's.
+    prior : Subject, optional
+        Lengths with covariance, and mounts, as known before: the subject of an earlier calibration is combined with
+        what this recording shows. None: `population_subject(stature, sex)`.
+    stature : float, optional
+        [m] the person's body height, which narrows the population prior.
+    sex : str, optional
+        "f" or "m", which narrows the population prior.
+    model : BodyModel, str or Path, optional
+        The body, or its file or name as for `load_model`; None: that which the recording states, else the upper body.
+    protocol : str, Path or Protocol, optional
+        What the person did in which phase: the name of a protocol, such as "clasp" or "free", a .toml file, or what
+        `wepose_pin.calibration.load_protocol` returned; None: "clasp", with "t_pose" and "bow" if the recording has
+        those phases and the formulation is not "paper".
+    method : str
+        The orientation filter: "amekf", "smoother", "smekf", "smekf_published", "ncf" or "gdc", as in
+        `estimate_orientation`.
+    measured_std : float
+        Standard deviation [m] of each measured value; 3 mm by default.
+    formulation : str
+        "full" estimates lengths, mounts, headings, drift and soft tissue together; "paper" the lengths alone, by the
+        plain least squares of Lisini Baldi et al. 2019, which needs a measured length.
+
+    Returns
+    -------
+    Calibration
+        `subject`, which `track` takes; `quality`, whose `quality` is "pass", "poor" or "fail"; `diagnostics`.
+
+    Raises
+    ------
+    BadOption
+        An unknown protocol, method or formulation; a measured name that is no length of the body, an implausible value,
+        or none with the formulation "paper".
+    BadSession, BadPhase
+        The recording lacks a sensor or a phase that the protocol needs.
+    BadModel
+        The table of the body names no lengths.
+
+    Examples
+    --------
+    >>> calibration = wp.calibrate(recording, measured={"shoulder_width": 0.33})
+    >>> calibration.quality.quality
+    'poor'
+    >>> [diagnostic.code for diagnostic in calibration.diagnostics]
+    ['motion-too-short']
+    >>> wp.track(recording, calibration).subject.quality
+    'poor'
+    """
+    check_arguments(calibrate, locals())
+    check_method(method)
+    if not isinstance(protocol, Protocol):
+        protocol = load_protocol(choose_protocol(recording.phases, formulation) if protocol is None else protocol)
+    if not isinstance(model, BodyModel):
+        model = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
+    _check_body(recording, protocol, model)
+    _check_measured(measured or {}, model)
+    _check_sensors(recording, protocol)
+    if prior is not None and (stature is not None or sex is not None):
+        raise BadOption("prior has the lengths of a person; stature and sex narrow those of the population")
+    prior = prior or population_subject(stature, sex, model)
+    prior.check_body(model.table)
+    lengths = convert_breadths(measured or {}, model.table, measured_std)
+    if formulation == "paper":
+        check_paper_formulation(protocol, model, lengths, recording.sensors, recording.start_pose)
+    for condition in protocol.conditions:
+        if condition.phase:
+            recording.phase(condition.phase)
+    filtered = filter_recording(recording, method=method, sways=not model.table.is_mechanism)
+    earlier = prior if prior.start_pose_offset and formulation == "full" else None
+    if earlier is not None:  # the two calibrations are fused, each on the population prior
+        prior = separate_mounts(earlier, population_subject(body=model))
+    problem = CalibrationProblem(recording, filtered, protocol, prior, lengths, model)
+    calibration = solve_paper_calibration(problem) if formulation == "paper" else solve_plausible(problem)
+    if earlier is not None and not calibration.labels.moved:
+        fused = fuse_calibrations(earlier, calibration.subject, prior, lengths, model.table)
+        calibration = replace(calibration, subject=fused, problem=replace(calibration.problem, prior=earlier))
+    quality = assess(calibration)
+    return replace(calibration, quality=quality, subject=replace(calibration.subject, quality=quality.quality))
+
+
+def _check_body(recording: Recording, protocol: Protocol, model: BodyModel) -> None:
+    """Raises where the body lacks a segment of the recording, lengths, or what the protocol names."""
+    model.table.check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
+    if not model.table.lengths:
+        raise BadModel(
+            f"{model.table.where}: this body has no lengths; a table beside the URDF names its points and [lengths], "
+            f"as docs/models.md shows"
+        )
+    protocol.check_body(model.table)
+
+
+def _check_measured(measured: Mapping[str, float], model: BodyModel) -> None:
+    """Raises `BadOption` where what is measured is no length or breadth, or not plausible."""
+    names, (low, high) = (*model.lengths, *list_breadths(model.table)), MEASURED_RANGE
+    for name, metres in measured.items():
+        if name not in names:
+            raise BadOption(f"measured {name}: not a length; {one_of(names, name)}")
+        if not low < metres < high:
+            raise BadOption(f"measured {name}={metres:g}: a length in metres is needed, between {low} and {high}")
+
+
+def _check_sensors(recording: Recording, protocol: Protocol) -> None:
+    """Raises `BadSession` where a segment has no sensor that the protocol needs."""
+    for segment in protocol.needs:
+        if segment not in recording.sensors:
+            raise BadSession(
+                f"{recording.where()}: no sensor on {segment}; protocol '{protocol.name}' needs one each on "
+                f"{', '.join(protocol.needs)}"
+            )
+
+
+def solve_plausible(problem: CalibrationProblem) -> Calibration:
+    """The calibration without the mounts and poses that gravity or the motion contradicts, its labels checked.
+
+    Mounts, labels and poses are revised one after the other, each on a quick or a full solution of the problem before.
+    """
+    problem = problem.leave_out_mounts(problem.mounts_against_gravity(), MAX_MOUNT_ERROR_DEG)
+    problem.observe()  # raises where a phase is too short, before anything is estimated
+    _check_free_motion(problem)
+    problem, stated = _revise_mounts(problem)
+    labels = _revise_labels(stated)
+    if labels.moved:
+        return _keep_prior(replace(stated, labels=labels))
+    rotation = measure_rotation(stated)
+    if labels.doubt > 1.0 and rotation < LEAST_ROTATION:  # hands that hardly move show nothing
+        return replace(stated, labels=labels, posed={})
+    try:
+        best = solve_fully(problem)
+    except NoSolution as error:
+        hint = ""
+        if rotation < LEAST_ROTATION:
+            turned_deg = np.degrees(rotation)
+            hint = f"; the segments turned by {turned_deg:.1f} deg only: move for a minute through the whole reach"
+        raise NoSolution(f"{problem.recording.where()}: {error}{hint}") from error
+    revised = _revise_poses(best)
+    if revised is not problem:
+        return solve_plausible(revised)
+    posed = {} if problem.protocol.closures else best.posed
+    return replace(best, posed=posed, labels=check_limbs(measure_limbs(best), problem.model.table))
+
+
+def _revise_mounts(problem: CalibrationProblem) -> tuple[CalibrationProblem, Calibration]:
+    """The problem without the mounts that the motion contradicts, and its quick solution."""
+    stated = solve_quickly(problem)
+    doubt = measure_limbs(stated).doubt()
+    if doubt > 1.0 or problem.mounts_against_motion(stated.subject.mounts):
+        free = solve_quickly(problem.remove_mounts(problem.filtered.R_VS))
+        wrong = problem.mounts_against_motion(free.subject.mounts)
+        if wrong and measure_limbs(free).doubt() < min(1.0, BETTER * max(doubt, 1.0 / BETTER)):
+            problem = problem.leave_out_mounts(wrong, MOUNT_WARNING_DEG, "motion")
+            return problem, solve_quickly(problem)
+    return problem, stated
+
+
+def _revise_labels(stated: Calibration) -> LabelCheck:
+    """The check of the labels: other labels close other chains; hands that hardly move do not show which."""
+    problem, limbs = stated.problem, measure_limbs(stated)
+    table = problem.model.table
+    if not measure_rotation(stated) >= LEAST_ROTATION:
+        return check_limbs(limbs, table)
+    places = [name for name in problem.sensors if name in table.needed]
+    return check_labels(limbs, lambda moved: measure_limbs(solve_quickly(problem.relabel(moved))), places, table)
+
+
+def _revise_poses(calibration: Calibration) -> CalibrationProblem:
+    """The problem without the phase of poses that contradicts all else, if there is one."""
+    problem = calibration.problem
+    posed = {phase: deviation for phase, deviation in calibration.posed.items() if phase not in problem.loose}
+    phase = max(posed, key=lambda name: posed[name], default="")
+    if phase and posed[phase] > SUSPECT and problem.protocol.closures:
+        # Where a pose is wrong all else fits worse: what it is compared with must be found without it.
+        loose = problem.loosen_phase(phase)
+        deviation = solve_fully(loose).posed[phase]
+        if deviation > CONTRADICTED:
+            unused = Diagnostic("phase-not-used", WARNING, phase, deviation, CONTRADICTED)
+            return replace(loose, unused_phases=(unused, *loose.unused_phases))
+    return problem
+
+
+def _keep_prior(calibration: Calibration) -> Calibration:
+    """The calibration with the lengths and covariance from before the motion, where sensors sit on other segments."""
+    problem, names = calibration.problem, tuple(calibration.subject.lengths)
+    lengths, information = combine_lengths(problem.prior, problem.measured, names)
+    subject = replace(
+        calibration.subject,
+        lengths=dict(zip(names, lengths.tolist(), strict=True)),
+        covariance=calibration.prior_covariance,
+        hinges={},
+        start_pose_offset={},
+        heading_drift={},
+        note="sensors sit elsewhere than labelled: nothing of the motion is used",
+    )
+    scale_std = float(np.sqrt(lengths @ information @ lengths) ** -1)
+    return replace(calibration, subject=subject, scale_std=scale_std, hinge_rms={})
+
+
+def _check_free_motion(problem: CalibrationProblem) -> None:
+    """Raises `BadPhase` where no closure holds and joints do not show the heading of a sensor without a mount."""
+    if not problem.is_free_motion:
+        return
+    stated = set(problem.stated_headings(problem.sensors))
+    shown = {c.segment for c in problem.conditions if isinstance(c, Pointing | Level)}
+    known = stated | shown or {problem.model.table.reference}
+    for _ in problem.couplings:
+        known |= {name for c in problem.couplings for name in (c.near, c.far) if {c.near, c.far} & known}
+    unknown = [name for name in problem.sensors if name not in known]
+    if unknown:
+        raise BadPhase(
+            f"{problem.recording.where()}: the motion does not show how {', '.join(f'sensors.{n}' for n in unknown)} "
+            f"turned against {'its neighbour' if len(unknown) == 1 else 'their neighbours'}: too little of it, or no "
+            f"accelerometer; state the mount, move both arms for a minute, or use a protocol with a closure"
+        )

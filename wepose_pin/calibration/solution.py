@@ -1,0 +1,191 @@
+"""The solution of a calibration's problem, quick or in full, and the `Calibration` that it makes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import NoSolution
+from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject
+from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
+from .conditions import find_hinges, group_lengths, is_scale_observed
+from .contact import find_initial_guess
+from .equations import HINGE_STD
+from .joints import add_couplings
+from .least_squares import MIN_LENGTH, Gaussian, Observations
+from .observability import diagnose_closures, diagnose_lengths, diagnose_mounts
+from .priors import build_prior, place_points
+from .problem import LOOSE, CalibrationProblem
+from .result import Calibration
+from .weights import (
+    LEAST_LENGTH_STD,
+    WeightedFit,
+    compare_measured,
+    compare_posed,
+    compute_information_shares,
+    estimate_covariance,
+    project_to_subject,
+    solve_reweighted,
+)
+
+QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
+
+
+class _Solution(NamedTuple):
+    """The solved least squares."""
+
+    observations: Observations
+    samples: np.ndarray  # (n,) of the recording
+    prior: Gaussian  # without what accelerations show
+    result: WeightedFit
+    covariance: np.ndarray  # (m, m) of x
+    alternatives: list[Alternative]
+
+
+def solve_quickly(problem: CalibrationProblem) -> Calibration:
+    """The calibration at fewer samples, by the closure alone: whether mounts and labels can be as stated."""
+    observations, samples = problem.observe(QUICK_RATE_HZ)
+    prior = build_prior(problem, observations)
+    if problem.is_free_motion:
+        prior = add_couplings(prior, observations.layout, problem.couplings, prior.mean)
+    result = solve_reweighted(observations, prior, prior.mean, np.ones(len(samples)), quick=True)
+    return _describe(problem, _Solution(observations, samples, prior, result, result.fit.covariance, []))
+
+
+def solve_fully(problem: CalibrationProblem) -> Calibration:
+    """The calibration with all that is known, and with other solutions that explain the motion nearly as well.
+
+    Raises
+    ------
+    NoSolution
+        It did not converge, or a length is at its bound.
+    """
+    observations, samples = problem.observe()
+    layout, prior = observations.layout, build_prior(problem, observations)
+    guess, contact = find_initial_guess(observations, prior.mean, lambda some: build_prior(problem, some).mean)
+    coupled = add_couplings(prior, layout, problem.couplings, guess)
+    result = solve_reweighted(observations, coupled, guess, contact)
+
+    headings = problem.stated_headings(layout.sensors)
+    free = layout.heading[[name not in headings for name in layout.sensors]]
+
+    def prior_at(x: np.ndarray) -> Gaussian:
+        mean = prior.mean.copy()
+        mean[free] = x[free]
+        return add_couplings(Gaussian(mean, prior.information), layout, problem.couplings, x)
+
+    alternatives = find_alternatives(observations, prior_at, result, headings)
+    lengths = result.fit.x[layout.length]
+    if np.min(lengths, initial=np.inf) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
+        raise NoSolution(
+            f"the lengths did not converge ({layout.lengths[int(np.argmin(lengths))]} = {1e3 * np.min(lengths):.0f} "
+            f"mm); check that the points do in the phase what the protocol says, and that every sensor sits where the "
+            f"session says"
+        )
+    covariance = widen_covariance(estimate_covariance(observations, result, coupled.information), alternatives, layout)
+    solution = _Solution(observations, samples, prior, result, covariance, alternatives)
+    sums = list(group_lengths(problem.conditions, layout.lengths).values())
+    return replace(_describe(problem, solution), information_shares=compute_information_shares(result, layout, sums))
+
+
+def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
+    """The calibration that a solution makes."""
+    observations, samples, prior, result, x_cov, alternatives = solution
+    layout, fit = observations.layout, result.fit
+    lengths, covariance = fit.x[layout.length], x_cov[np.ix_(layout.length, layout.length)]
+    scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1) if len(lengths) else float("nan")
+    scale_observed = is_scale_observed(problem.conditions)
+    scale = "of the population prior" if problem.prior.is_population else f"of {problem.prior.name}"
+    if problem.scale_lengths or scale_observed:
+        scale = f"measured: {', '.join(problem.scale_lengths)}" if problem.scale_lengths else "of the closure"
+    subject, hinge_rms = _make_subject(problem, solution)
+
+    prior_x = fit.x.copy()
+    prior_x[layout.length] = [problem.prior.lengths[name] for name in layout.lengths]
+    gap, prior_gap = (
+        np.where(observations.closed, np.linalg.norm(gaps, axis=1), np.nan)
+        for gaps in (fit.gaps, observations.gaps(place_points(prior_x, observations)))
+    )
+    prior_cov = np.linalg.inv(prior.information)
+    diagnostics = [*problem.unused_phases, *problem.filtered.diagnostics, *problem.diagnose_losses()]
+    if not scale_observed:
+        length_cov = np.linalg.inv(prior.information[np.ix_(layout.length, layout.length)])
+        free_scale_std = None if problem.scale_lengths else scale_std
+        diagnostics += diagnose_lengths(problem, lengths, covariance, length_cov, free_scale_std)
+    diagnostics += diagnose_ambiguity(alternatives, layout)
+    diagnostics += diagnose_mounts([name for name in problem.filtered.R_VS if name not in subject.mounts], problem)
+    time = problem.recording.time[samples]
+    diagnostics += diagnose_closures(time, result.contact, observations, problem.model)
+    least_std = 0.0 if problem.model.table.is_mechanism else LEAST_LENGTH_STD
+    phases, loose = [condition.phase for condition in problem.protocol.conditions], dict.fromkeys(problem.loose, LOOSE)
+    return Calibration(
+        problem=problem,
+        subject=replace(subject, note=f"{problem.protocol.title}; scale {scale}"),
+        effective_sample_size=result.effective_sample_size,
+        scale_std=scale_std,
+        remarks=tuple(diagnostics),
+        time=time,
+        gap=gap,
+        prior_gap=prior_gap,
+        contact=result.contact,
+        prior_covariance=project_to_subject(layout, prior_cov, problem.start_pose)[1],
+        quat_WL=problem.orient_segments(subject.mounts, samples),
+        measured_lengths=compare_measured(fit, layout, problem.measured, least_std),
+        start_pose_offset={name: offset.tilt for name, offset in subject.start_pose_offset.items()},
+        heading_drift={name: drift.rate for name, drift in subject.heading_drift.items()},
+        hinge_rms=hinge_rms,
+        posed=compare_posed(observations, result, phases, loose),
+    )
+
+
+def _make_subject(problem: CalibrationProblem, solution: _Solution) -> tuple[Subject, dict[str, float]]:
+    """The subject of a solution, and joint → the rms [rad] by which its segment leaves the plane across its hinge."""
+    layout, x, filtered = solution.observations.layout, solution.result.fit.x, problem.filtered
+    mounts, offsets, drifts = {}, {}, {}
+    std = np.sqrt(np.diag(solution.covariance))
+    for name, tilt, heading, drift in zip(layout.sensors, layout.tilt, layout.heading, layout.drift, strict=True):
+        start_W = Rotation.from_rotvec(-np.append(x[tilt], 0.0)) * Rotation.from_rotvec([0.0, 0.0, x[heading]])
+        mounts[name] = (problem.start_rotation(name).inv() * start_W * filtered.R_VS_start[name]).as_quat()
+        offset = Rotation.from_rotvec(np.append(x[tilt], 0.0)).as_rotvec()[:2]
+        offset_std = np.minimum(std[tilt], np.pi)  # no angle is more uncertain than half a turn
+        offsets[name] = StartPoseOffset(offset, float(np.sqrt(np.mean(offset_std**2))))
+        drifts[name] = HeadingDrift(float(x[drift]), float(std[drift]))
+    # The mounts of sensors outside the chain are those of the start pose.
+    for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
+        start_W = Rotation.from_rotvec([0.0, 0.0, psi]) * filtered.R_VS_start[name]
+        mounts[name] = (problem.start_rotation(name).inv() * start_W).as_quat()
+    hinges = _estimate_hinges(problem, solution)
+    order, covariance = project_to_subject(layout, solution.covariance, problem.start_pose)
+    subject = replace(
+        problem.prior,
+        name=problem.recording.name,
+        hinges={joint: hinge for joint, (hinge, _) in hinges.items()},
+        start_pose_offset=offsets,
+        heading_drift=drifts,
+        lengths=dict(zip(layout.lengths, x[layout.length].tolist(), strict=True)),
+        girdles=dict(problem.prior.girdles)
+        | {term.name: values for term, values in zip(layout.girdles, x[layout.girdle], strict=True)},
+        order=order,
+        covariance=covariance,
+        mounts=mounts,
+    )
+    return subject, {joint: rms for joint, (_, rms) in hinges.items()}
+
+
+def _estimate_hinges(problem: CalibrationProblem, solution: _Solution) -> Mapping[str, tuple[Hinge, float]]:
+    """Joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it."""
+    layout, fit, hinges = solution.observations.layout, solution.result.fit, {}
+    bending = fit.hinge[solution.observations.bending]
+    if not len(bending):
+        return {}
+    terms = find_hinges(problem.model, problem.start_pose, problem.sensors)
+    for term, (across, tilted), residuals in zip(terms, fit.x[layout.hinge], bending.T, strict=True):
+        axis = np.array(term.axis) + across * np.array(term.across) + tilted * np.array(term.tilted)
+        axis_L = problem.start_rotation(term.on).inv().apply(axis / np.linalg.norm(axis))
+        rms = float(HINGE_STD * np.sqrt(np.mean(residuals**2)))
+        hinges[term.name] = Hinge(axis_L, max(rms, problem.model.table.hinges[term.name].softness)), rms
+    return hinges
