@@ -1,6 +1,7 @@
 """Films the view page of a tracked circle in Chromium, for the README and the site: `python docs/picture.py`.
 
 It simulates a person, calibrates, tracks, and writes docs/demo.webp, an animated picture that begins and ends at rest.
+docs/robot.webp is view.html of `wepose retarget demo/result --robot panda_table` after the demo.
 """
 
 from __future__ import annotations

@@ -50,13 +50,14 @@ def make_title(script: Path) -> str:
 
 
 def write_page(script: Path, pages: Path, drawn: Path) -> str:
-    """Write the page of a script; returns its line in the index."""
+    """Write the page of a script; returns its entry in the index, with its first figure."""
     code = script.read_text(encoding="utf-8")
     first, _, rest = (ast.get_docstring(ast.parse(code)) or "").partition("\n")
     printed = run_script(script, drawn / script.stem)
     body = code.split('"""', 2)[2].strip()
     parts = [f"# {first.rstrip('.')}", rest.strip("\n"), f"```python\n{body}\n```"]
     parts += [f"It prints:\n```text\n{printed.rstrip()}\n```"]
+    line = f"- [{make_title(script)}]({script.stem}.md): {first}"
     for file in sorted((drawn / script.stem).rglob("*.*")):
         address = f"../../{file.relative_to(drawn.parent).as_posix()}"
         if file.suffix == ".html":
@@ -64,9 +65,11 @@ def write_page(script: Path, pages: Path, drawn: Path) -> str:
             parts += [f'<iframe class="motion" src="{address}" title="{title}" loading="lazy"></iframe>']
             parts += [f'<p><a href="{address}">This page by itself</a>: one file, which opens offline.</p>']
         elif file.suffix == ".svg":
-            parts += [f'<img class="drawn" src="{address}" alt="{html.escape(file.stem)}">']
+            picture = f'<img class="drawn" src="{address}" alt="{html.escape(file.stem)}">'
+            parts += [picture]
+            line += f"\n\n  {picture}" if "<img" not in line else ""
     (pages / f"{script.stem}.md").write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
-    return f"- [{make_title(script)}]({script.stem}.md): {first}"
+    return line
 
 
 def write_gallery(app: Sphinx) -> None:
