@@ -23,10 +23,11 @@ import numpy as np
 import wepose_pin as wp
 from wepose_pin import rotations
 from wepose_pin.errors import how_to_install
-from wepose_pin.filters import METHODS, OFFLINE, FilterSettings, Smekf, run_filter
-from wepose_pin.filters.bank import LiveBank
+from wepose_pin.filters import METHODS, OFFLINE, FilterSettings, run_filter
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
+from wepose_pin.filters.sensors import SensorFilters
 from wepose_pin.filters.static import StaticDetector, StaticTest
+from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import simulate, simulate_paper_dynamic, simulate_person
 
 from .tables import Column, Section, Table, is_installed, time_in_turn
@@ -227,7 +228,7 @@ def live(effort: Effort) -> Table:
     table = Table(
         "Live: one sensor, a call a sample for the filter and one for its detector",
         (Column("ns", "a sample [ns]", 0), Column("ratio", "ratio to VQF", 2, True)),
-        notes=["LiveBank, below, makes one call for all sensors."],
+        notes=["SensorFilters, below, make one call for all sensors."],
     )
     for name, timing in time_in_turn(_live_filters(data), effort.rounds, "VQF").items():
         table.rows[name] = {"ns": 1e9 * timing.median / len(data.gyro_S), "ratio": timing.ratio}
@@ -237,7 +238,7 @@ def live(effort: Effort) -> Table:
 def bank(effort: Effort) -> Table:
     """One live update of several sensors in one call."""
     table = Table(
-        "Live: one update of all sensors, detector and smekf in one call (LiveBank)",
+        "Live: one step of all sensors, detector and smekf in one call (SensorFilters)",
         (
             Column("median_us", "median [µs]", 2),
             Column("worst_us", "99.9 % within [µs]", 2),
@@ -250,11 +251,7 @@ def bank(effort: Effort) -> Table:
         data = repeated_trial(5.0 * effort.live_seconds + count)
         rows = np.arange(count)[None, :] * 100 + np.arange(len(data.gyro_S) - 100 * count)[:, None]
         gyro, accel = list(data.gyro_S[rows]), list(data.accel_S[rows])
-        bank = LiveBank(
-            [Smekf(data.noise, data.rate_hz, rotations.quat_from_gravity(accel[0][i])) for i in range(count)],
-            [StaticDetector(data.noise, data.rate_hz) for _ in range(count)],
-        )
-        ours = _each(bank.update, gyro, accel)
+        ours = _each(_start_filters(data, count).step, gyro, accel)
         row = {"median_us": float(np.median(ours)), "worst_us": float(np.percentile(ours, 99.9))}
         if is_installed("vqf"):
             import vqf
@@ -271,6 +268,18 @@ def bank(effort: Effort) -> Table:
     return _noted(table)
 
 
+def _start_filters(data: Sample, count: int) -> SensorFilters:
+    """Return the filters of as many sensors after the static phase."""
+    n = round(STATIC_S[1] * data.rate_hz)
+    sensor = ImuSensor(data.gyro_S[:n], data.accel_S[:n])
+    sensors = {f"sensor_{i}": sensor for i in range(count)}
+    time = np.arange(n) / data.rate_hz
+    start = Recording("trial", time, data.rate_hz, sensors, {"start": (STATIC_S,)})
+    filters = SensorFilters(start, method="smekf")
+    filters.push(start)
+    return filters
+
+
 def _each(update: Callable[..., Any], gyro: list[np.ndarray], accel: list[np.ndarray]) -> np.ndarray:
     """Time of each call [µs]."""
     times = np.empty(len(gyro))
@@ -285,10 +294,10 @@ _FIRST_USE = """
 import sys, time
 begin = time.perf_counter()
 import numpy as np
-from wepose_pin.filters import METHODS, OFFLINE, FilterSettings, Smekf, run_filter
-from wepose_pin.filters.bank import LiveBank
+from wepose_pin.filters import METHODS, FilterSettings, run_filter
 from wepose_pin.filters.noise import estimate_noise
-from wepose_pin.filters.static import StaticDetector
+from wepose_pin.filters.sensors import SensorFilters
+from wepose_pin.recording import ImuSensor, Recording
 rng = np.random.default_rng(0)
 gyro = rng.normal(scale=1e-3, size=(1000, 3))
 accel = rng.normal(scale=1e-2, size=(1000, 3)) + [0.0, 0.0, 9.81]
@@ -299,9 +308,11 @@ for name in METHODS:
     run_filter(gyro, accel, 100.0, noise, FilterSettings(name))
     print(name, time.perf_counter() - begin)
 begin = time.perf_counter()
-bank = LiveBank([Smekf(noise, 100.0, np.array([0.0, 0.0, 0.0, 1.0]))], [StaticDetector(noise, 100.0)])
-bank.update(gyro[:1], accel[:1])
-print("LiveBank", time.perf_counter() - begin)
+start = Recording("start", np.arange(1000) / 100.0, 100.0, {"a": ImuSensor(gyro, accel)}, {"start": ((0.0, 9.0),)})
+filters = SensorFilters(start, method="smekf")
+filters.push(start)
+filters.step(gyro[:1], accel[:1])
+print("SensorFilters", time.perf_counter() - begin)
 """
 
 

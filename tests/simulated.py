@@ -31,9 +31,7 @@ SUBJECT = {
 
 def estimate_segments(recording: Recording, subject: Subject | None = None, **options: Any) -> SegmentOrientations:
     """Segment orientations of a whole recording from the N-pose; options and errors as of `SegmentEstimator`."""
-    estimator = SegmentEstimator(subject, **options)
-    _, segments = estimator.push(recording)
-    return segments
+    return SegmentEstimator(subject, **options).push(recording)
 
 
 def within(sim: Simulation, *phases: str) -> np.ndarray:

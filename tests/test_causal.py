@@ -17,8 +17,8 @@ from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import Simulation
 from wepose_pin.subject import Subject, mount_rows, population_subject
 from wepose_pin.tracking import TrackedRecording, Tracker, TrackOptions, track
-from wepose_pin.tracking.causal import CausalSegmentEstimator, stack_ticks
-from wepose_pin.tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
+from wepose_pin.tracking.segments import SegmentEstimator
+from wepose_pin.tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, stack_ticks
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def whole(recording: Recording) -> TrackedRecording:
 
 def started(
     recording: Recording, subject: Subject | None = None, method: str = "amekf"
-) -> tuple[CausalSegmentEstimator, int]:
+) -> tuple[SegmentEstimator, int]:
     """A causal tracker whose start pose has just ended, and the sample that comes next."""
     begin = recording.span(recording.phases["start"][0]).stop
     tracker = Tracker(subject, options=TrackOptions(method, causal=True))
@@ -155,7 +155,7 @@ def test_causal_chunks_put_together_are_the_whole(recording: Recording) -> None:
     for of in (named, unnamed):
         tracker, whole = Tracker(options=TrackOptions(causal=True)), track(of, causal=True)
         chunks = [tracked for chunk in of.chunks(1.7) if (tracked := tracker.push(chunk)) is not None]
-        assert not list(tracker.finish())
+        assert not list(tracker.smooth())
         assert len(chunks) > 10
         table = pl.concat([build_pose_table(chunk.pose, covariance=True) for chunk in chunks])
         assert table.equals(build_pose_table(whole.pose, covariance=True))

@@ -25,9 +25,10 @@ from wepose_pin.filters import (
     estimate_orientation,
     run_filter,
 )
-from wepose_pin.filters.bank import LiveBank
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
-from wepose_pin.filters.static import StaticDetector, StaticTest
+from wepose_pin.filters.sensors import SensorFilters
+from wepose_pin.filters.static import StaticTest
+from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import quat_from_gravity
 from wepose_pin.simulation import simulate_paper_dynamic
 
@@ -483,40 +484,45 @@ def test_wrong_input_is_named() -> None:
 # Live, in threads, and with samples missing ---------------------------------------------------------------------------
 
 
-def sensors(
-    count: int, seconds: float = 20.0
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[SensorNoise], list[np.ndarray]]:
-    """Gyro (n, k, 3), accel (n, k, 3), true quaternions (n, k, 4), noise and start of each."""
+def sensors(count: int, seconds: float = 20.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gyro (n, k, 3), accel (n, k, 3) and true quaternions (n, k, 4)."""
     drawn = [measured(np.random.default_rng(seed), seconds, bias=(0.01, -0.02, 0.005)) for seed in range(count)]
     gyro, accel, true = (np.stack([sensor[i] for sensor in drawn], axis=1) for i in range(3))
-    noises = [estimate_noise(gyro[:180, i], accel[:180, i], RATE) for i in range(count)]
-    return gyro, accel, true, noises, [quat_from_gravity(accel[:50, i].mean(axis=0)) for i in range(count)]
+    return gyro, accel, true
 
 
-def test_a_create_bank_sensors_gives_the_bits_of_each_alone() -> None:
-    gyro, accel, _, noises, starts = sensors(5)
-    gyro[700:703, 2] = np.nan  # one sensor's samples do not come
-    accel[1400, 4] = np.nan
-    alone, statics = [], []
-    for i, (noise, start) in enumerate(zip(noises, starts, strict=True)):
-        statics.append(StaticDetector(noise, RATE).run(gyro[:, i], accel[:, i]))
-        alone.append(Smekf(noise, RATE, start).run(gyro[:, i], accel[:, i], statics[-1]))
-    assert 0.1 < np.mean(statics) < 0.9
-    for first in (0, 1, 333):  # the bank goes on where single runs were
-        filters = [Smekf(noise, RATE, start) for noise, start in zip(noises, starts, strict=True)]
-        detectors = [StaticDetector(noise, RATE) for noise in noises]
-        for i, (filter_, detector) in enumerate(zip(filters, detectors, strict=True)):
-            filter_.run(gyro[:first, i], accel[:first, i], detector.run(gyro[:first, i], accel[:first, i]))
-        before = filters[0].state.record.copy()
-        bank = LiveBank(filters, detectors)
-        for k in range(first, len(gyro)):
-            quat = bank.update(gyro[k], accel[k])
-            np.testing.assert_array_equal(quat, [run.quat_WS[k] for run in alone])
-            np.testing.assert_array_equal(bank.static, [static[k] for static in statics])
-        assert quat is bank.quat_WS
-        np.testing.assert_array_equal(bank.gyro_bias, [run.gyro_bias[-1] for run in alone])
-        np.testing.assert_array_equal(bank.attitude_cov, [run.attitude_cov[-1] for run in alone])  # type: ignore[index]
-        np.testing.assert_array_equal(filters[0].state.record, before)  # on copies
+@pytest.mark.parametrize("method", ["amekf", "smekf", "ncf"])
+def test_steps_of_many_sensors_give_the_bits_of_chunks(method: str) -> None:
+    gyro, accel, _ = sensors(5)
+    gap = np.zeros((len(gyro), 5), dtype=bool)
+    gap[700:703, 2] = gap[1400, 4] = True  # one sensor's samples do not come
+    recording = Recording(
+        "many",
+        np.arange(len(gyro)) / RATE,
+        RATE,
+        {f"sensor_{i}": ImuSensor(gyro[:, i], accel[:, i], gap=gap[:, i]) for i in range(5)},
+        {"start": ((0.0, 179 / RATE),)},
+    )
+    whole = SensorFilters(recording, method=method).push(recording)
+    alone = list(whole.values())
+    assert 0.1 < np.mean([orientation.static for orientation in alone]) < 0.9
+    gyro[gap], accel[gap] = np.nan, np.nan
+    filters = SensorFilters(recording, method=method)
+    filters.push(recording.cut(slice(0, 200)))
+    for k in range(200, 1000):
+        quat = filters.step(gyro[k], accel[k])
+        np.testing.assert_array_equal(quat, [orientation.quat_WS[k] for orientation in alone])
+        np.testing.assert_array_equal(filters.static, [orientation.static[k] for orientation in alone])
+    rest = filters.push(recording.cut(slice(1000, 1800)))  # chunks and samples in turn
+    for name, orientation in whole.items():
+        np.testing.assert_array_equal(rest[name].quat_WS, orientation.quat_WS[1000:1800])
+    for k in range(1800, len(gyro)):
+        quat = filters.step(gyro[k], accel[k])
+    assert quat is filters.quat_WS
+    np.testing.assert_array_equal(quat, [orientation.quat_WS[-1] for orientation in alone])
+    np.testing.assert_array_equal(filters.gyro_bias, [orientation.gyro_bias[-1] for orientation in alone])
+    if filters.attitude_cov is not None:
+        np.testing.assert_array_equal(filters.attitude_cov, [orientation.attitude_cov[-1] for orientation in alone])
 
 
 @pytest.mark.parametrize("method", ["smekf", "ncf", "gdc"])

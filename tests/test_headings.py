@@ -401,7 +401,7 @@ def test_a_chunk_may_end_with_the_last_sample_of_the_start_pose(made: tuple[Simu
     assert recording.time[last - 1] < phases["start"][0][1] < recording.time[last]
     for span in ((0, last), (last, 1500)):
         assert tracker.push(recording.cut(slice(*span))) is None
-    chunks = list(tracker.finish())
+    chunks = list(tracker.smooth())
     for name, quat_WL in track(recording).quat_WL.items():
         assert np.array_equal(np.concatenate([chunk.quat_WL[name] for chunk in chunks]), quat_WL)
 

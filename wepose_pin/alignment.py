@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,7 +19,6 @@ from . import rotations
 from .diagnostics import WARNING, Diagnostic
 from .errors import BadSession
 from .filters import Orientation, join_orientations
-from .filters.sensors import FilteredRecording, collect_rotations
 from .filters.smekf import HOLD_S, LOST_RATE_STD
 from .filters.start import ACCEL_BIAS_STD
 from .model import BodyModel, BodyTable, load_table
@@ -139,27 +137,6 @@ def join_segments(parts: Sequence[SegmentOrientations]) -> SegmentOrientations:
     )
 
 
-@dataclass(frozen=True)
-class SensorAlignment:
-    """Mounts of the sensors and heading offsets of their worlds, from one start pose.
-
-    Parameters
-    ----------
-    R_LS : segment → mount, sensor to segment
-    R_WV : segment → Rz(ψ), the sensor's world V to W
-    heading_offset : segment → ψ [rad]
-    start, static_phase : intervals [s]; headings and mounts are from the first, noise and bias from the second
-    diagnostics : of the recording, its start pose and its mounts
-    """
-
-    R_LS: Mapping[str, Rotation]
-    R_WV: Mapping[str, Rotation]
-    heading_offset: Mapping[str, float]
-    start: tuple[float, float]
-    static_phase: tuple[float, float]
-    diagnostics: tuple[Diagnostic, ...]
-
-
 def check_mounts(recording: Recording, subject: Subject | None, start_frames: StartFrames) -> None:
     """Raise `BadSession` where neither the subject nor the session has the mount of a sensor."""
     collect_nominal_mounts(recording, subject, start_frames)
@@ -207,14 +184,19 @@ def suggest_mounts(segments: Sequence[str], table: BodyTable) -> str:
 
 
 def align_sensors(
-    recording: Recording, subject: Subject | None, filtered: FilteredRecording, start_frames: StartFrames = N_POSE
-) -> SensorAlignment:
-    """Compute mounts and heading offsets.
+    recording: Recording,
+    subject: Subject | None,
+    R_VS_start: Mapping[str, Rotation],
+    start: tuple[float, float],
+    start_frames: StartFrames = N_POSE,
+) -> tuple[dict[str, Rotation], dict[str, float], list[Diagnostic]]:
+    """Compute mounts R_LS and heading offsets ψ [rad] of all sensors, with the diagnostics of the mounts.
 
     Parameters
     ----------
     recording : the one that was filtered, or its chunk that contains the start pose
     subject : its mounts are used in place of those that the session states; None: the stated ones are used
+    R_VS_start, start : mean orientations of the sensors in the start pose, and its interval [s]
     start_frames : `find_start_frames` of the body; left out: the N-pose
 
     Raises
@@ -222,23 +204,24 @@ def align_sensors(
     BadSession
         No mount is known for a sensor, or gravity contradicts it.
     """
-    start, diagnostics = filtered.start, list(filtered.diagnostics)
+    diagnostics: list[Diagnostic] = []
     facts: dict[str, float | str] = {"variant": "guessed"} if _start_is_guessed(recording) else {}
     nominal_mounts = collect_nominal_mounts(recording, subject, start_frames)
-    mounts, heading_offsets = {}, {}
+    mounts: dict[str, Rotation] = {}
+    heading_offsets: dict[str, float] = {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
         # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
         first = aligned[0]
         R_WL_start = start_frames.to_world(first, Rotation.identity())
-        aligned_heading_offset = compute_heading_offset(filtered.R_VS_start[first], R_WL_start)
-    for segment, R_VS_start in filtered.R_VS_start.items():
+        aligned_heading_offset = compute_heading_offset(R_VS_start[first], R_WL_start)
+    for segment, R_VS in R_VS_start.items():
         if recording.sensors[segment].aligned:
             mounts[segment], heading_offsets[segment] = Rotation.identity(), aligned_heading_offset
             continue
         R_WS_nominal = start_frames.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
-        psi = compute_heading_offset(R_VS_start, R_WS_nominal)
-        R_WS_start = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS_start
+        psi = compute_heading_offset(R_VS, R_WS_nominal)
+        R_WS_start = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS
         tilt_error_deg = np.degrees((R_WS_start * R_WS_nominal.inv()).magnitude())
         if tilt_error_deg > MAX_MOUNT_ERROR_DEG:
             raise BadSession(_describe_mount_error(recording, segment, subject, tilt_error_deg, start))
@@ -252,7 +235,7 @@ def align_sensors(
             misfit = (R_WS_start * R_WS_nominal.inv()).as_rotvec()[:2]
             misfit_cov = mount_cov[:2, :2] + np.diag(start_frames.std(segment)[:2] ** 2)
             R_WS_start = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_WS_nominal
-            psi = compute_heading_offset(R_VS_start, R_WS_start)
+            psi = compute_heading_offset(R_VS, R_WS_start)
             calibrated_offset = subject.start_pose_offset.get(segment) if subject is not None else None
             if calibrated_offset is not None:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
@@ -265,8 +248,7 @@ def align_sensors(
                 stds = {"stds": MOUNT_MOVED_STDS}
                 diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, limit, facts | stds))
         mounts[segment], heading_offsets[segment] = start_frames.to_segment(segment, R_WS_start), psi
-    R_WV = {segment: Rotation.from_rotvec([0.0, 0.0, psi]) for segment, psi in heading_offsets.items()}
-    return SensorAlignment(mounts, R_WV, heading_offsets, start, filtered.static_phase, tuple(diagnostics))
+    return mounts, heading_offsets, diagnostics
 
 
 def _start_is_guessed(recording: Recording) -> bool:
@@ -289,50 +271,6 @@ def _describe_mount_error(
     return (
         f"{recording.where()}: sensors.{segment}{name} is {tilt_error_deg:.0f} deg off gravity in the start pose "
         f"({format_span(start)}){reason}; {remedy}"
-    )
-
-
-def orient_segments(
-    chunk: Recording,
-    alignment: SensorAlignment,
-    orientation: Mapping[str, Orientation],
-    subject: Subject | None,
-    start_frames: StartFrames,
-    lost_before: Mapping[str, int] = MappingProxyType({}),
-) -> SegmentOrientations:
-    """Return the segment orientations of a recording or a chunk of it, from the results of its sensors' filters.
-
-    `lost_before`: sensor with measured orientations → for how many samples before the chunk it has been lost.
-    """
-    quat_WL, covariance_W = {}, {}
-    for segment, R_VS in collect_rotations(chunk, orientation).items():
-        R_LS, quat_WS = alignment.R_LS[segment], rotations.multiply(alignment.R_WV[segment].as_quat(), R_VS.as_quat())
-        sensor, filtered = chunk.sensors[segment], orientation.get(segment)
-        attitude_cov = None if filtered is None else filtered.attitude_cov
-        if isinstance(sensor, OrientationSensor):
-            lost = count_lost_samples(sensor, lost_before.get(segment, 0))
-            attitude_cov = compute_measured_covariance(lost / chunk.rate_hz)
-            if sensor.aligned:
-                quat_WL[segment], covariance_W[segment] = quat_WS, attitude_cov
-                continue
-        quat_WL[segment] = rotations.multiply(quat_WS, rotations.conjugate(R_LS.as_quat()))
-        if attitude_cov is not None:
-            covariance_W[segment] = compute_segment_covariance(
-                chunk, segment, subject, quat_WS, R_LS, attitude_cov, start_frames
-            )
-    for segment, cov in compute_soft_tissue_covariances(start_frames.table, quat_WL).items():
-        if segment in covariance_W:
-            covariance_W[segment] = covariance_W[segment] + cov
-    return SegmentOrientations(
-        chunk.time,
-        quat_WL,
-        {segment: R_LS.as_quat() for segment, R_LS in alignment.R_LS.items()},
-        alignment.heading_offset,
-        orientation,
-        covariance_W,
-        alignment.start,
-        alignment.static_phase,
-        alignment.diagnostics,
     )
 
 

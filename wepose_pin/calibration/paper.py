@@ -29,6 +29,7 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 from scipy.linalg import block_diag, null_space
+from scipy.spatial.transform import Rotation
 
 from ..alignment import PALM_SLIP_STD, align_sensors
 from ..diagnostics import WARNING, Diagnostic
@@ -95,10 +96,10 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         The gap does not determine the lengths.
     """
     recording, filtered, protocol, prior = problem.recording, problem.filtered, problem.protocol, problem.prior
-    alignment = align_sensors(recording, prior, filtered)
+    mounts, headings, mount_diagnostics = align_sensors(recording, prior, filtered.R_VS_start, filtered.start)
     observations, samples = problem.observe()
     quat_WL = {
-        name: (alignment.R_WV[name] * R_VS[samples] * alignment.R_LS[name].inv()).as_quat()
+        name: (Rotation.from_rotvec([0.0, 0.0, headings[name]]) * R_VS[samples] * mounts[name].inv()).as_quat()
         for name, R_VS in filtered.R_VS.items()
     }
     A = compute_gap_matrices(observations, quat_WL)
@@ -123,7 +124,8 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         effective_sample_size=len(gap) / correlated,
         scale_std=float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1),
         remarks=(
-            *alignment.diagnostics,
+            *filtered.diagnostics,
+            *mount_diagnostics,
             *diagnose_lengths(problem, lengths, covariance, measured_covariance, None),
             Diagnostic("lengths-alone-estimated", WARNING),
         ),

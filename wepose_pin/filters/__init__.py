@@ -94,7 +94,6 @@ class Orientation(NamedTuple):
     attitude_cov : (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_WS`; None where the filter
         has none
     noise : of gyroscope and accelerometer in the static phase
-    filter, detector : after the last sample, to continue live; None: it cannot
     diagnostics : what the user should know
     about_vertical : (n, 6), as `base.AboutVertical`; None where the filter has no covariance
     """
@@ -104,8 +103,6 @@ class Orientation(NamedTuple):
     static: np.ndarray
     attitude_cov: np.ndarray | None
     noise: SensorNoise
-    filter: OrientationFilter | None = None
-    detector: StaticDetector | None = None
     diagnostics: tuple[Diagnostic, ...] = ()
     about_vertical: np.ndarray | None = None
 
@@ -303,6 +300,10 @@ class SensorRun:
     ----------
     noise : of the sensor, from its static phase
 
+    Attributes
+    ----------
+    filter, detector : after the samples so far
+
     Raises
     ------
     BadData
@@ -314,21 +315,21 @@ class SensorRun:
         self._method, self._test = settings.method, settings.static_test
         if METHODS[settings.method] is PublishedSmekf:
             self._test = replace(self._test, rate_stds=np.inf)
-        self._detector = StaticDetector(noise, rate_hz, self._test)
-        self._filter: Any = None
+        self.detector = StaticDetector(noise, rate_hz, self._test)
+        self.filter: Any = None
         self._before_cov: np.ndarray | None = None  # attitude_cov before the start phase, until it is returned
 
     def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation:
         """Filter a chunk: (n, 3) [rad/s], (n, 3) [m/s²]."""
-        before = self._begin(gyro_S, accel_S) if self._filter is None else None
+        before = self._begin(gyro_S, accel_S) if self.filter is None else None
         if before is None or self._method in OFFLINE:
-            static = self._detector.run(gyro_S, accel_S)
-            return self._orientation(self._filter.run(gyro_S, accel_S, static), static)
+            static = self.detector.run(gyro_S, accel_S)
+            return self._orientation(self.filter.run(gyro_S, accel_S, static), static)
         backward, static_before = before
         rest = slice(len(static_before), None)
-        static = self._detector.run(gyro_S[rest], accel_S[rest])
+        static = self.detector.run(gyro_S[rest], accel_S[rest])
         run = backward.extended(len(gyro_S))
-        self._filter.run(gyro_S[rest], accel_S[rest], static, run.part(rest))
+        self.filter.run(gyro_S[rest], accel_S[rest], static, run.part(rest))
         return self._orientation(run, np.concatenate([static_before, static]))
 
     def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> tuple[FilterRun, np.ndarray] | None:
@@ -348,7 +349,7 @@ class SensorRun:
                 # The forward run alone uses these samples.
                 start = StartTilt(rotations.turned(run.quat_WS[0], -turn), MOVING_TILT_STD)
                 self._before_cov = run.attitude_cov
-        self._filter = self._create_filter(self._method, self._noise, start)
+        self.filter = self._create_filter(self._method, self._noise, start)
         return before
 
     def _run_backward(self, start: StartTilt, gyro_S: np.ndarray, accel_S: np.ndarray) -> tuple[FilterRun, np.ndarray]:
@@ -381,20 +382,12 @@ class SensorRun:
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
         """Return a run as orientations."""
-        filter_, detector = (None, None) if self._method in OFFLINE else (self._filter, self._detector)
         if self._before_cov is not None and run.attitude_cov is not None:
             # The smoother's heading is exact where the recording begins; the headings are aligned in the start phase.
             run.attitude_cov[: len(self._before_cov)] = self._before_cov
             self._before_cov = None
         return Orientation(
-            run.quat_WS,
-            run.gyro_bias,
-            static,
-            run.attitude_cov,
-            self._noise,
-            filter_,
-            detector,
-            about_vertical=run.about_vertical,
+            run.quat_WS, run.gyro_bias, static, run.attitude_cov, self._noise, about_vertical=run.about_vertical
         )
 
 

@@ -268,7 +268,7 @@ class Amekf:
 
     @property
     def bank_kernel(self) -> Callable[..., None]:
-        """The kernel that steps many sensors at a time (`bank.LiveBank`)."""
+        """The kernel that steps many sensors at a time (`sensors.SensorFilters`)."""
         return _step_bank
 
     def run(
@@ -695,7 +695,7 @@ def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, ou
 
 @kernel
 def _step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
-    """Detect and filter one sample of each of k sensors; the arrays of `bank.LiveBank` have one row per sensor."""
+    """Detect and filter one sample of each of k sensors; the arrays of `SensorFilters` have one row per sensor."""
     for i in range(len(states)):
         gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]
         ax, ay, az = accel_S[i, 0], accel_S[i, 1], accel_S[i, 2]

@@ -1,21 +1,22 @@
-"""The filters of a recording's sensors, chunk by chunk; each sensor has a world of its own."""
+"""The filters of a recording's sensors, chunk by chunk or a sample of each at a time; each sensor has its own world."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..diagnostics import Diagnostic
-from ..errors import WeposeError
+from ..errors import BadData, WeposeError
 from ..recording import OrientationSensor, Recording
-from . import BEST, FilterSettings, Orientation, SensorRun, check_method
+from . import BEST, OFFLINE, FilterSettings, Orientation, SensorRun, check_method
 from .base import run_in_parallel
+from .covariance import symmetric
 from .noise import SensorNoise, estimate_noise
 from .phases import check_common_rotation, check_motion, find_reference_phases
-from .static import StaticTest
+from .static import StaticState, StaticTest
 
 
 class FilteredRecording(NamedTuple):
@@ -30,7 +31,11 @@ class FilteredRecording(NamedTuple):
 
 
 class SensorFilters:
-    """The filters of a recording in chunks; `filter_recording` is one chunk.
+    """The filters of a recording: `push` takes chunks, `step` a sample of each sensor, with bit-identical results.
+
+    After the first chunk the states of all sensors share memory, so that `step` is one compiled call for all of them,
+    static detector and filter together. It allocates nothing: the next one overwrites its result and the arrays named
+    here.
 
     Parameters
     ----------
@@ -40,6 +45,9 @@ class SensorFilters:
     Attributes
     ----------
     start, static_phase, diagnostics : as in `FilteredRecording`
+    names : the k segments whose sensors have a filter
+    quat_WS, gyro_bias : (k, 4) xyzw, (k, 3) [rad/s] now
+    static : (k,) bool, of the last step
 
     Raises
     ------
@@ -52,7 +60,6 @@ class SensorFilters:
     ) -> None:
         check_method(method)
         self.start, self.static_phase, self.diagnostics = find_reference_phases(first)
-        self._runs: dict[str, SensorRun] = {}
         noises: dict[str, SensorNoise] = {}
         for segment, sensor in first.sensors.items():
             if not sensor.aligned:
@@ -69,28 +76,88 @@ class SensorFilters:
                 raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
             noises[segment] = noise
         self.diagnostics += check_common_rotation(first, noises, self.static_phase)
-        for segment, noise in noises.items():
-            settings = FilterSettings(
-                method,
-                static_test=static_test or StaticTest(),
-                measured_start=True,
-                start=first.span(self.start),
-                gyro_range=first.imus[segment].gyro_range,
+        self.names = tuple(noises)
+        self._runs = [
+            SensorRun(
+                first.rate_hz,
+                noise,
+                FilterSettings(
+                    method,
+                    static_test=static_test or StaticTest(),
+                    measured_start=True,
+                    start=first.span(self.start),
+                    gyro_range=first.imus[segment].gyro_range,
+                ),
             )
-            self._runs[segment] = SensorRun(first.rate_hz, noise, settings)
+            for segment, noise in noises.items()
+        ]
+        self._step: Any = None  # the kernel for all sensors; None: the filters have none
+        self._method, self._is_begun = method, False
 
     def push(self, chunk: Recording) -> dict[str, Orientation]:
         """Filter a chunk; the smoother takes the whole recording as one."""
         measured = []
-        for segment in self._runs:
+        for segment in self.names:
             sensor = chunk.imus[segment]
             gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
             if sensor.gap is not None:
                 # A long bridge is a guess and no measurement: filters get NaN, and their covariance grows over it.
                 gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
             measured.append((gyro_S, accel_S))
-        results = run_in_parallel(lambda run, signals: run.push(*signals), self._runs.values(), measured)
-        return dict(zip(self._runs, results, strict=True))
+        results = run_in_parallel(lambda run, signals: run.push(*signals), self._runs, measured)
+        if not self._is_begun and self._method not in OFFLINE:
+            self._share_memory()
+        self._is_begun = True
+        return dict(zip(self.names, results, strict=True))
+
+    def _share_memory(self) -> None:
+        """Put the states of all sensors side by side, for `step`."""
+        filters, detectors = [run.filter for run in self._runs], [run.detector for run in self._runs]
+        k = len(filters)
+        self.static = np.zeros(k, dtype=np.bool_)
+        self.quat_WS, self.gyro_bias = np.empty((k, 4)), np.empty((k, 3))
+        self._step = getattr(filters[0], "bank_kernel", None) if k else None
+        if self._step is not None:
+            self._states = np.concatenate([filter_.state.record for filter_ in filters])
+            self._models = np.concatenate([filter_.model for filter_ in filters])
+            self._detector_states = StaticState(
+                *map(np.concatenate, zip(*(detector.state for detector in detectors), strict=True))
+            )
+            self.quat_WS, self.gyro_bias = self._states["quat_WS"], self._states["gyro_bias"]
+        for i, (filter_, detector) in enumerate(zip(filters, detectors, strict=True)):
+            if self._step is not None:
+                filter_.state = type(filter_.state)(self._states[i : i + 1])
+                detector.state = StaticState(*(values[i : i + 1] for values in self._detector_states))
+            else:
+                self.quat_WS[i], self.gyro_bias[i] = filter_.state.quat_WS, filter_.state.gyro_bias
+                filter_.state = type(filter_.state)(self.quat_WS[i], self.gyro_bias[i])
+
+    def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+        """Take a sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²]; return `quat_WS` (k, 4).
+
+        A sensor whose sample did not come has NaN in its row: its rate is held and fades, its covariance grows.
+        """
+        gyro, accel = np.ascontiguousarray(gyro_S, dtype=float), np.ascontiguousarray(accel_S, dtype=float)
+        shape = self.gyro_bias.shape
+        if gyro.shape != shape or accel.shape != shape:  # the compiled step would read beyond their ends
+            raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape}: a row for each of {shape[0]} sensors")
+        if self._step is not None:
+            self._step(self._states, self._models, *self._detector_states, gyro, accel, self.static)
+            return self.quat_WS
+        for i, run in enumerate(self._runs):
+            self.static[i] = run.detector.update(gyro[i], accel[i])
+            run.filter.update(gyro[i], accel[i], bool(self.static[i]))
+        return self.quat_WS
+
+    @property
+    def attitude_cov(self) -> np.ndarray | None:
+        """Covariance (k, 3, 3) [rad²] of the error on the right, in S; a copy. None: the filters have none."""
+        return None if self._step is None else symmetric(self._states["attitude_cov"])
+
+    @property
+    def about_vertical(self) -> np.ndarray | None:
+        """(k, 6) as `AboutVertical`; a view. None: the filters have no covariance."""
+        return None if self._step is None else np.asarray(self._states["about_vertical"])
 
 
 def filter_recording(
@@ -108,23 +175,21 @@ def filter_recording(
         A start phase with too few samples; an unknown method.
     """
     filters = SensorFilters(recording, method=method, static_test=static_test, sways=sways)
-    return combine_chunk(filters, recording, filters.push(recording))
-
-
-def combine_chunk(
-    filters: SensorFilters, chunk: Recording, orientation: Mapping[str, Orientation]
-) -> FilteredRecording:
-    """Combine a chunk that contains the start pose with its orientations from `filters`."""
-    R_VS = collect_rotations(chunk, orientation)
-    R_VS_start = {segment: R[chunk.find_measured(segment, filters.start)].mean() for segment, R in R_VS.items()}
-    return FilteredRecording(
-        R_VS, R_VS_start, dict(orientation), filters.start, filters.static_phase, filters.diagnostics
-    )
-
-
-def collect_rotations(chunk: Recording, orientation: Mapping[str, Orientation]) -> dict[str, Rotation]:
-    """Collect segment → n orientations of its sensor, each in a world of its own."""
-    return {
+    orientation = filters.push(recording)
+    R_VS = {
         segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_WS)
-        for segment, sensor in chunk.sensors.items()
+        for segment, sensor in recording.sensors.items()
     }
+    R_VS_start = find_start_orientations(recording, orientation, filters.start)
+    return FilteredRecording(R_VS, R_VS_start, orientation, filters.start, filters.static_phase, filters.diagnostics)
+
+
+def find_start_orientations(
+    first: Recording, orientation: Mapping[str, Orientation], start: tuple[float, float]
+) -> dict[str, Rotation]:
+    """Find segment → mean orientation of its sensor in the start pose `start` [s], from a chunk that contains it."""
+    R_VS_start = {}
+    for segment, sensor in first.sensors.items():
+        source = sensor if isinstance(sensor, OrientationSensor) else orientation[segment]
+        R_VS_start[segment] = Rotation.from_quat(source.quat_WS[first.find_measured(segment, start)]).mean()
+    return R_VS_start

@@ -179,7 +179,7 @@ class Smekf:
 
     @property
     def bank_kernel(self) -> Callable[..., None]:
-        """The kernel that steps many sensors at a time (`bank.LiveBank`)."""
+        """The kernel that steps many sensors at a time (`sensors.SensorFilters`)."""
         return _step_bank
 
     def run(
@@ -571,7 +571,7 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
 
 @kernel
 def _step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
-    """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `bank.LiveBank` has them."""
+    """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `SensorFilters` has them."""
     for i in range(len(states)):
         gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]
         ax, ay, az = accel_S[i, 0], accel_S[i, 1], accel_S[i, 2]

@@ -40,8 +40,8 @@ from ..recording.arrivals import (
 from ..recording.plausibility import check_signals, find_unseen_rate
 from ..subject import population_subject
 from ..tracking import Tracker, TrackOptions
-from ..tracking.causal import CausalSegmentEstimator
 from ..tracking.headings import CAUSAL_KNOT_S
+from ..tracking.segments import SegmentEstimator
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates
 from ..writers.live_log import LiveLog
 from .losses import SampleLosses
@@ -200,7 +200,7 @@ class LiveLoop:
         self._stood_s = 0.0  # [s] longest time that the person stood still before tracking
         self._phase_edges = PhaseEdges(self.setup.phases)
         self._start_search: StartPoseSearch | None = None  # set when the ticks begin
-        self._segment_estimator: CausalSegmentEstimator | None = None  # set when the start pose is found
+        self._segment_estimator: SegmentEstimator | None = None  # set when the start pose is found
         self._heading_reset_time = 0.0
         self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
         self._covariance: Iterator[np.ndarray | None] = iter(())  # computed in parts, one or more with each tick
@@ -319,7 +319,7 @@ class LiveLoop:
         quat_WL = self.kinematics.orient_segments(quat_WL).copy()
         return LivePose(self._last_pose, quat_WL, points, self._std, ticks.lost[-1].copy(), latency)
 
-    def _update_std(self, estimator: CausalSegmentEstimator, tick: int) -> None:
+    def _update_std(self, estimator: SegmentEstimator, tick: int) -> None:
         """Compute some of the covariances; by ticks, so that a recording reproduces the values."""
         if tick % self._covariance_ticks == 0:
             self._covariance = estimator.covariance_gradually()
@@ -327,7 +327,7 @@ class LiveLoop:
             if covariance is not None:
                 self._std, self._heading_std = compute_axis_std(covariance), np.sqrt(covariance[:, 2, 2])
 
-    def _start_tracking(self, search: StartPoseSearch, begin: int, end: int) -> CausalSegmentEstimator:
+    def _start_tracking(self, search: StartPoseSearch, begin: int, end: int) -> SegmentEstimator:
         """Align by the start pose, ticks `begin` to `end`, and return the estimator for the ticks after it."""
         rate_hz = search.synchronizer.rate_hz
         recording = build_recording(
@@ -540,9 +540,7 @@ class LiveLoop:
                 for name, row in zip(sensors, counts, strict=True)
             },
             self._latency,
-            ()
-            if self._segment_estimator is None
-            else (*self._segment_estimator.start.diagnostics, *self._unit_diagnostics),
+            () if self._segment_estimator is None else (*self._segment_estimator.diagnostics, *self._unit_diagnostics),
             "" if self.log is None else self.log.problem,
             None if self.log is None else self.log.path,
         )

@@ -84,7 +84,7 @@ def render_calibration_report(
             options = TrackOptions(method)
             model = calibration.problem.model
             tracker = Tracker(calibration.subject, model=model, options=options, with_point_cov=False)
-            tracked = tracker.push(recording) or next(tracker.finish())
+            tracked = tracker.push(recording) or next(tracker.smooth())
         except Exception as error:
             untracked = [Diagnostic("motion-not-shown", WARNING, facts={"reason": str(error)})]
             if not isinstance(error, WeposeError) and failures is not None:

@@ -59,4 +59,4 @@ def track(
     """
     check_arguments(track, locals())
     tracker = Tracker(subject, model=model, options=TrackOptions(method, static_test, open_loop, causal, limits))
-    return tracker.push(recording) or next(tracker.finish())
+    return tracker.push(recording) or next(tracker.smooth())

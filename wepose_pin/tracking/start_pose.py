@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import BadPhase
 from ..filters.phases import SWAYS_DEG, SWAYS_DEG_S
-from ..recording import Intervals, OrientationSensor, Recording, Sensor
-from ..recording.arrivals import unpack_orientations
+from ..recording import Intervals, OrientationSensor, Recording, Sensor, join_recordings
+from ..recording.arrivals import list_numbers, unpack_orientations
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
 
@@ -107,6 +107,59 @@ class TickRates:
         rates[self._measured] = turns * self._rate_hz
         self._last = quat
         return rates
+
+
+class StartPoseCutter:
+    """Cuts the start pose out of a recording that comes in chunks: `phases.start`, or the first one that is found."""
+
+    def __init__(self) -> None:
+        self._received: Recording | None = None
+        self._detector: StartPoseDetector | None = None
+        self._rates: TickRates | None = None
+
+    def push(self, chunk: Recording) -> tuple[Recording, Recording] | None:
+        """Add a chunk; return the recording up to the end of the start pose, as `cut_start_pose`, and what follows.
+
+        None: the start pose has not ended.
+        """
+        received = chunk if self._received is None else join_recordings(self._received, chunk)
+        self._received = received
+        if received.phases.get("start"):
+            interval = received.phases["start"][0]
+            if received.time[-1] < interval[1] - 1e-9:
+                return None
+            last = received.span(interval).stop
+        else:
+            if self._detector is None or self._rates is None:
+                measured = [isinstance(sensor, OrientationSensor) for sensor in received.sensors.values()]
+                self._detector = StartPoseDetector(received.rate_hz, len(measured))
+                self._rates = TickRates(np.array(measured), received.rate_hz)
+            for gyro_S, accel_S in zip(*stack_ticks(chunk), strict=True):
+                if self._detector.push(self._rates.push(gyro_S, accel_S)) == "ready":
+                    break
+            else:
+                return None
+            interval = float(received.time[self._detector.begin]), float(received.time[self._detector.end])
+            last = self._detector.end + 1
+        start = replace(cut_start_pose(received, interval), start_is_guessed=not received.phases.get("start"))
+        return start, received.cut(slice(last, len(received)))
+
+    def explain_end(self) -> str:
+        """Explain why nothing was tracked of the recording that has ended."""
+        where = "" if self._received is None else f"{self._received.where()}: "
+        if self._detector is None or self._detector.state == "ready":
+            return f"{where}phases.start ends with the recording; nothing is left to track"
+        return (
+            f"{where}no start pose of {START_POSE_HOLD_S:g} s without motion ({self._detector.held_s:.1f} s at its "
+            f"end); state the seconds of the start pose, [phases] start = [[from, to]]"
+        )
+
+
+def stack_ticks(chunk: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """Stack the six numbers of all sensors as ticks have them, (n, k, 3) each, orientations packed; bridged in gaps."""
+    numbers = [list_numbers(sensor) for sensor in chunk.sensors.values()]
+    gyro_S, accel_S = (np.stack(column, axis=1) for column in zip(*numbers, strict=True))
+    return gyro_S, accel_S
 
 
 def cut_start_pose(recording: Recording, interval: tuple[float, float]) -> Recording:

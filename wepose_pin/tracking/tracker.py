@@ -16,11 +16,11 @@ from ..kinematics import KinematicsSolver, compute_point_covariances
 from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject
-from .causal import CausalEstimator, CausalSegmentEstimator
 from .heading_problem import HeadingProblem
 from .headings import HeadingCorrector, make_heading_problem
 from .options import TrackOptions
-from .segments import Oriented, SegmentEstimator
+from .segments import SegmentEstimator
+from .start_pose import StartPoseCutter
 from .tracked import TrackedBody, TrackedRecording, make_body
 
 CHUNK_S = 600.0  # of `track_chunks`
@@ -31,12 +31,12 @@ class Tracker:
     """Tracks the body of a recording that comes in chunks; the whole recording may be one chunk.
 
     `push` returns the pose of a chunk where nothing later changes it: of a causal tracker, and where nothing observes
-    headings. Other chunks are returned by `finish`, after the heading correction has seen all of them: the tracker
+    headings. Other chunks are returned by `smooth`, after the heading correction has seen all of them: the tracker
     keeps their samples and filters them again, so that its memory holds the results of one chunk. A causal tracker
     takes single samples as well, by `segment_estimator.step`.
 
-    All chunks of a recording carry its phases; `start` and `static` are in the first. The smoother takes the whole
-    recording as one chunk; the results of other filters do not depend on the chunks.
+    All chunks of a recording carry its phases; `start` and `static` are in the first, unless the tracker is causal. The
+    smoother takes the whole recording as one chunk; the results of other filters do not depend on the chunks.
 
     Parameters
     ----------
@@ -58,15 +58,17 @@ class Tracker:
         self.options = options or TrackOptions()
         self._with_point_cov = with_point_cov
         self._subject, self._model = subject, model
+        self._body: TrackedBody | None = None  # made at the first chunk
+        self._start = StartPoseCutter()  # of a causal tracker
+        self._estimator: SegmentEstimator | None = None  # after the start pose
         self._headings: HeadingCorrector | None = None
-        self._estimator: SegmentEstimator | CausalEstimator | None = None  # made at the first chunk
-        self._body: TrackedBody | None = None
         self._kinematics: KinematicsSolver | None = None
-        self._waiting: list[Recording] = []  # until the headings are solved
-        self._first: Oriented | None = None  # of the first chunk, while it is the only one
+        self._chunks: list[Recording] = []  # that wait for the headings
+        self._only: SegmentOrientations | None = None  # of the first chunk, while it is the only one
+        self._has_tracked = False
 
     @property
-    def segment_estimator(self) -> CausalSegmentEstimator:
+    def segment_estimator(self) -> SegmentEstimator:
         """The estimator of segment orientations for single samples, of a causal tracker after the start pose.
 
         Raises
@@ -76,64 +78,97 @@ class Tracker:
         """
         if not self.options.causal:
             raise BadOption("a tracker takes single samples where its options are causal")
-        if not isinstance(self._estimator, CausalEstimator):
+        if self._estimator is None:
             raise BadPhase("the start pose has not ended: push a recording that includes it")
-        return self._estimator.segment_estimator
+        return self._estimator
 
     def push(self, chunk: Recording) -> TrackedRecording | None:
-        """Add the next chunk; return it with its pose, or None where `finish` returns it.
+        """Add the next chunk; return it with its pose; None: `smooth` returns it, or the start pose has not ended.
 
         Raises
         ------
         WeposeError
             The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
         """
-        is_first = self._body is None
-        if self._body is None or self._estimator is None:
-            self._body = make_body(self._subject, self._model, chunk)
-            self._estimator = _make_estimator(self._subject, self._body, self.options)
+        body = self._body = self._body or make_body(self._subject, self._model, chunk)
+        if chunk.resets and (self.options.open_loop or not self.options.causal):
+            chunk = replace(chunk, resets=())
+        if not self.options.causal:
+            return self._push_offline(chunk, body)
+        if self._estimator is None:
+            found = self._start.push(chunk)
+            if found is None:
+                return None
+            start, chunk = found
+            self._estimator = self._make_estimator(body)
+            segments = self._estimator.push(start)
+            problem = self._make_problem(start, segments, body)
+            if problem is not None:
+                self._estimator.correct_headings(problem, start, segments)
+        if not len(chunk):
+            return None
+        self._has_tracked = True
+        return self._solve_pose(chunk, self._estimator.push(chunk), body)
+
+    def _push_offline(self, chunk: Recording, body: TrackedBody) -> TrackedRecording | None:
+        is_first = self._estimator is None
+        if self._estimator is None:
+            self._estimator = self._make_estimator(body)
         elif self.options.method in OFFLINE:
             raise BadOption(f"method '{self.options.method}' takes the whole recording as one chunk")
-        if self.options.open_loop and chunk.resets:
-            chunk = replace(chunk, resets=())
-        oriented = self._estimator.push(chunk)
-        if oriented is None:
-            return None
+        segments = self._estimator.push(chunk)
         if is_first:
-            self._headings = _make_heading_corrector(oriented, self._body, self.options)
+            problem = self._make_problem(chunk, segments, body)
+            self._headings = None if problem is None else HeadingCorrector(chunk, segments, problem)
         if self._headings is None:
-            return self._solve_pose(oriented, self._body)
-        self._headings.add_observations(*oriented)
-        self._waiting.append(chunk)
-        self._first = oriented if is_first else None
+            return self._solve_pose(chunk, segments, body)
+        self._headings.add_observations(chunk, segments)
+        self._chunks.append(chunk)
+        self._only = segments if is_first else None
         return None
 
-    def finish(self) -> Iterator[TrackedRecording]:
+    def smooth(self) -> Iterator[TrackedRecording]:
         """Iterate over the chunks that `push` did not return, after the last one has been pushed.
 
         Raises
         ------
-        WeposeError
+        BadPhase
             A causal tracker was given no start pose, or nothing after it.
         """
-        if isinstance(self._estimator, CausalEstimator):
-            self._estimator.finish()
+        if self.options.causal and not self._has_tracked:
+            raise BadPhase(self._start.explain_end())
         if self._headings is None or self._body is None:
             return
         if not self._headings.solve():
             self._headings = None
-        if self._first is not None:
-            yield self._solve_pose(self._first, self._body)
+        if self._only is not None:
+            yield self._solve_pose(self._chunks[0], self._only, self._body)
             return
-        self._estimator = _make_estimator(self._subject, self._body, self.options)
-        for chunk in self._waiting:
-            oriented = self._estimator.push(chunk)
-            if oriented is not None:
-                yield self._solve_pose(oriented, self._body)
+        estimator = self._make_estimator(self._body)
+        for chunk in self._chunks:
+            yield self._solve_pose(chunk, estimator.push(chunk), self._body)
 
-    def _solve_pose(self, oriented: Oriented, tracked_body: TrackedBody) -> TrackedRecording:
+    def _make_estimator(self, body: TrackedBody) -> SegmentEstimator:
+        return SegmentEstimator(
+            self._subject,
+            start_frames=body.start_frames,
+            method=self.options.method,
+            static_test=self.options.static_test,
+            causal=self.options.causal,
+        )
+
+    def _make_problem(
+        self, first: Recording, segments: SegmentOrientations, body: TrackedBody
+    ) -> HeadingProblem | None:
+        """Return what observes the headings of a recording whose first chunk this is; None: nothing."""
+        if self.options.open_loop or any(sensor.aligned for sensor in first.sensors.values()):
+            return None
+        return make_heading_problem(first, segments, body.subject, body.model, causal=self.options.causal)
+
+    def _solve_pose(
+        self, recording: Recording, segments: SegmentOrientations, tracked_body: TrackedBody
+    ) -> TrackedRecording:
         """Return a chunk with its pose, after its headings have been corrected."""
-        recording, segments = oriented
         person, body = tracked_body.subject, tracked_body.model
         if self._headings is not None:
             segments = self._headings.correct(recording, segments)
@@ -142,7 +177,7 @@ class Tracker:
                 body, segments.quat_WL, limits=self.options.limits, start=tracked_body.start
             )
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
-        headings = self._estimator.headings if isinstance(self._estimator, CausalEstimator) else self._headings
+        headings = self._headings or (self._estimator.headings if self._estimator is not None else None)
         correction = None if headings is None else headings.summarize()
         point_cov: dict[str, np.ndarray] = {}
         if self._with_point_cov:
@@ -188,46 +223,15 @@ def track_chunks(
     first_s = max(last for _, last in spans) - begin + SHORTEST_S if spans else BEGINNING_S
     chunk_s = min(end - begin + 1.0, np.inf if options.method in OFFLINE else max(chunk_s, SHORTEST_S))
 
-    def report(tracked: TrackedRecording | Recording, part: int) -> None:
+    def report(chunk: TrackedRecording | Recording, pass_number: int) -> None:
         if progress is not None:
-            progress((part + (float(tracked.time[-1]) - begin) / (end - begin)) / 2.0)
+            progress((pass_number + (float(chunk.time[-1]) - begin) / (end - begin)) / 2.0)
 
     for chunk in recording.chunks(chunk_s, first_s):
         tracked = tracker.push(chunk)
         report(chunk, 0)
         if tracked is not None:
             yield tracked
-    for tracked in tracker.finish():
+    for tracked in tracker.smooth():
         report(tracked, 1)
         yield tracked
-
-
-def _make_heading_corrector(oriented: Oriented, body: TrackedBody, options: TrackOptions) -> HeadingCorrector | None:
-    """Return a heading corrector for a recording whose first chunk this is; None: nothing observes its headings."""
-    recording, segments = oriented
-    if options.causal or options.open_loop or any(sensor.aligned for sensor in recording.sensors.values()):
-        return None
-    problem = make_heading_problem(recording, segments, body.subject, body.model, causal=False)
-    return None if problem is None else HeadingCorrector(recording, segments, problem)
-
-
-def _make_estimator(
-    subject: Subject | None, body: TrackedBody, options: TrackOptions
-) -> SegmentEstimator | CausalEstimator:
-    """Return the estimator of segment orientations of a recording."""
-
-    def make_problem(recording: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
-        if any(sensor.aligned for sensor in recording.sensors.values()):
-            return None
-        return make_heading_problem(recording, segments, body.subject, body.model, causal=True)
-
-    start_frames, method, static_test = body.start_frames, options.method, options.static_test
-    if not options.causal:
-        return SegmentEstimator(subject, start_frames=start_frames, method=method, static_test=static_test)
-    return CausalEstimator(
-        subject,
-        start_frames=start_frames,
-        method=method,
-        static_test=static_test,
-        make_problem=None if options.open_loop else make_problem,
-    )
