@@ -49,10 +49,12 @@ class StartFrames:
     ----------
     R_WL : segment → its orientation; a segment that is not named has the frame of W
     table : of the body
+    q : (nq,) its configuration; None: not known
     """
 
     R_WL: Mapping[str, Rotation] = field(default_factory=dict)
     table: BodyTable = field(default_factory=load_table)
+    q: np.ndarray | None = None
 
     @property
     def sways(self) -> bool:
@@ -93,7 +95,7 @@ def find_start_frames(body: BodyModel, recording: Recording) -> StartFrames:
     if table.is_mechanism or recording.start_pose != NEUTRAL_POSE:
         R_WK = orient_links(body, q)
         R_WL = {segment: Rotation.from_matrix(R_WK[segment]) for segment in recording.sensors}
-    return StartFrames(R_WL, table)
+    return StartFrames(R_WL, table, q)
 
 
 @dataclass(frozen=True)

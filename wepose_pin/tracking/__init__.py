@@ -13,9 +13,8 @@ from ..filters.static import StaticTest
 from ..model import BodyModel
 from ..recording import Recording
 from ..subject import Subject
-from .options import TrackOptions
 from .summary import SummaryAccumulator, TrackSummary, summarize
-from .tracked import TrackedRecording
+from .tracked import TrackedRecording, TrackOptions
 from .tracker import CHUNK_S, Tracker, track_chunks
 
 __all__ = [

@@ -1,23 +1,50 @@
-"""`TrackedRecording`: a pose with its inputs and intermediate results; `TrackedBody`: its body."""
+"""`TrackOptions`: how a recording is tracked; `TrackedRecording`: its pose with inputs and intermediate results."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..alignment import SegmentOrientations, StartFrames, find_start_frames
-from ..errors import BadSession
+from ..alignment import SegmentOrientations
+from ..errors import BadOption
+from ..filters import BEST, OFFLINE, check_method
+from ..filters.static import StaticTest
 from ..kinematics import PosedBody, compute_orientation_residuals
-from ..model import BodyModel
-from ..model.body import load_sensed_model
 from ..model.configurations import find_undetermined_joints
-from ..model.start_pose import compute_start_configuration
 from ..recording import Recording
-from ..subject import Subject, population_subject
 from .headings import HeadingCorrection
-from .options import TrackOptions
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """What is chosen for `Tracker`, beside the person and the body model.
+
+    Parameters
+    ----------
+    method : the orientation filter, a key of `wepose_pin.filters.METHODS`
+    static_test : when a sensor counts as static; None: the default values
+    open_loop : do not correct heading drift, neither by joint accelerations, hinges and joined hands, nor by the resets
+        of a live session: orientations are the filter's from the start pose on
+    causal : begin at the end of the start pose and look at nothing ahead, as a live session does
+    limits : keep the limits of the model's joints of one axis
+
+    Raises
+    ------
+    BadOption
+        A method that is not known, or that needs the whole recording where `causal` is chosen.
+    """
+
+    method: str = BEST
+    static_test: StaticTest | None = None
+    open_loop: bool = False
+    causal: bool = False
+    limits: bool = True
+
+    def __post_init__(self) -> None:
+        check_method(self.method)
+        if self.causal and self.method in OFFLINE:
+            raise BadOption(f"method '{self.method}' needs the whole recording; 'amekf' looks at nothing ahead")
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,45 +71,3 @@ class TrackedRecording(PosedBody):
         if not self.model.table.is_mechanism:
             return []
         return find_undetermined_joints(self.model.pin, list(self.quat_WL))
-
-
-@dataclass(frozen=True)
-class TrackedBody:
-    """The body of a recording.
-
-    Parameters
-    ----------
-    subject : lengths and mounts as used
-    model : the body with those lengths
-    start_frames : its segment frames in the start pose
-    start : (nq,) its configuration then
-    """
-
-    subject: Subject
-    model: BodyModel
-    start_frames: StartFrames
-    start: np.ndarray
-
-
-def make_body(subject: Subject | None, model: BodyModel | str | Path | None, recording: Recording) -> TrackedBody:
-    """The body of a recording: `model`, else the one that the recording names, else the upper body.
-
-    It has the subject's lengths, without a subject those of the population prior, or of a chosen model its own.
-
-    Raises
-    ------
-    WeposeError
-        A body that cannot be read; sensors, a start pose or lengths that are not its own.
-    """
-    where = recording.where()
-    chosen = model or recording.model or None
-    body = chosen if isinstance(chosen, BodyModel) else load_sensed_model(chosen, recording.sensors, where)
-    body.table.check_segments(recording.sensors, f"{where}: sensors.", BadSession)
-    start_frames = find_start_frames(body, recording)
-    person = subject or population_subject(body=body)
-    person.check_body(body.table)
-    if subject is None and chosen is not None:  # a chosen model has its person's lengths
-        person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
-    body = person.shape(body)
-    start = compute_start_configuration(body, recording.start_pose, recording.joints, where)
-    return TrackedBody(person, body, start_frames, start)

@@ -8,20 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from ..alignment import SegmentOrientations
-from ..errors import BadOption, BadPhase
+from ..alignment import SegmentOrientations, StartFrames, find_start_frames
+from ..errors import BadOption, BadPhase, BadSession
 from ..filters import OFFLINE
 from ..filters.noise import BEGINNING_S
 from ..kinematics import KinematicsSolver, compute_point_covariances
 from ..model import BodyModel
+from ..model.body import load_sensed_model
 from ..recording import Recording
-from ..subject import Subject
+from ..subject import Subject, population_subject
 from .heading_problem import HeadingProblem
 from .headings import HeadingCorrector, make_heading_problem
-from .options import TrackOptions
 from .segments import SegmentEstimator
 from .start_pose import StartPoseCutter
-from .tracked import TrackedBody, TrackedRecording, make_body
+from .tracked import TrackedRecording, TrackOptions
 
 CHUNK_S = 600.0  # of `track_chunks`
 SHORTEST_S = 2.0  # of a chunk: a filter's first window has to fit
@@ -58,7 +58,10 @@ class Tracker:
         self.options = options or TrackOptions()
         self._with_point_cov = with_point_cov
         self._subject, self._model = subject, model
-        self._body: TrackedBody | None = None  # made at the first chunk
+        self._person: Subject  # as used; it and the next two from the first chunk on
+        self._body: BodyModel
+        self._start_frames: StartFrames
+        self._is_begun = False
         self._start = StartPoseCutter()  # of a causal tracker
         self._estimator: SegmentEstimator | None = None  # after the start pose
         self._headings: HeadingCorrector | None = None
@@ -90,38 +93,41 @@ class Tracker:
         WeposeError
             The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
         """
-        body = self._body = self._body or make_body(self._subject, self._model, chunk)
+        if not self._is_begun:
+            self._is_begun = True
+            self._person, self._body, self._start_frames = _fit_body(self._subject, self._model, chunk)
         if chunk.resets and (self.options.open_loop or not self.options.causal):
             chunk = replace(chunk, resets=())
-        if not self.options.causal:
-            return self._push_offline(chunk, body)
+        return self._push_causal(chunk) if self.options.causal else self._push_offline(chunk)
+
+    def _push_causal(self, chunk: Recording) -> TrackedRecording | None:
         if self._estimator is None:
             found = self._start.push(chunk)
             if found is None:
                 return None
             start, chunk = found
-            self._estimator = self._make_estimator(body)
+            self._estimator = self._make_estimator()
             segments = self._estimator.push(start)
-            problem = self._make_problem(start, segments, body)
+            problem = self._make_problem(start, segments)
             if problem is not None:
                 self._estimator.correct_headings(problem, start, segments)
         if not len(chunk):
             return None
         self._has_tracked = True
-        return self._solve_pose(chunk, self._estimator.push(chunk), body)
+        return self._solve_pose(chunk, self._estimator.push(chunk))
 
-    def _push_offline(self, chunk: Recording, body: TrackedBody) -> TrackedRecording | None:
+    def _push_offline(self, chunk: Recording) -> TrackedRecording | None:
         is_first = self._estimator is None
         if self._estimator is None:
-            self._estimator = self._make_estimator(body)
+            self._estimator = self._make_estimator()
         elif self.options.method in OFFLINE:
             raise BadOption(f"method '{self.options.method}' takes the whole recording as one chunk")
         segments = self._estimator.push(chunk)
         if is_first:
-            problem = self._make_problem(chunk, segments, body)
+            problem = self._make_problem(chunk, segments)
             self._headings = None if problem is None else HeadingCorrector(chunk, segments, problem)
         if self._headings is None:
-            return self._solve_pose(chunk, segments, body)
+            return self._solve_pose(chunk, segments)
         self._headings.add_observations(chunk, segments)
         self._chunks.append(chunk)
         self._only = segments if is_first else None
@@ -137,44 +143,40 @@ class Tracker:
         """
         if self.options.causal and not self._has_tracked:
             raise BadPhase(self._start.explain_end())
-        if self._headings is None or self._body is None:
+        if self._headings is None:
             return
         if not self._headings.solve():
             self._headings = None
         if self._only is not None:
-            yield self._solve_pose(self._chunks[0], self._only, self._body)
+            yield self._solve_pose(self._chunks[0], self._only)
             return
-        estimator = self._make_estimator(self._body)
+        estimator = self._make_estimator()
         for chunk in self._chunks:
-            yield self._solve_pose(chunk, estimator.push(chunk), self._body)
+            yield self._solve_pose(chunk, estimator.push(chunk))
 
-    def _make_estimator(self, body: TrackedBody) -> SegmentEstimator:
+    def _make_estimator(self) -> SegmentEstimator:
         return SegmentEstimator(
             self._subject,
-            start_frames=body.start_frames,
+            start_frames=self._start_frames,
             method=self.options.method,
             static_test=self.options.static_test,
             causal=self.options.causal,
         )
 
-    def _make_problem(
-        self, first: Recording, segments: SegmentOrientations, body: TrackedBody
-    ) -> HeadingProblem | None:
+    def _make_problem(self, first: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
         """Return what observes the headings of a recording whose first chunk this is; None: nothing."""
         if self.options.open_loop or any(sensor.aligned for sensor in first.sensors.values()):
             return None
-        return make_heading_problem(first, segments, body.subject, body.model, causal=self.options.causal)
+        return make_heading_problem(first, segments, self._person, self._body, causal=self.options.causal)
 
-    def _solve_pose(
-        self, recording: Recording, segments: SegmentOrientations, tracked_body: TrackedBody
-    ) -> TrackedRecording:
+    def _solve_pose(self, recording: Recording, segments: SegmentOrientations) -> TrackedRecording:
         """Return a chunk with its pose, after its headings have been corrected."""
-        person, body = tracked_body.subject, tracked_body.model
+        person, body = self._person, self._body
         if self._headings is not None:
             segments = self._headings.correct(recording, segments)
         if self._kinematics is None:
             self._kinematics = KinematicsSolver(
-                body, segments.quat_WL, limits=self.options.limits, start=tracked_body.start
+                body, segments.quat_WL, limits=self.options.limits, start=self._start_frames.q
             )
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
         headings = self._headings or (self._estimator.headings if self._estimator is not None else None)
@@ -235,3 +237,28 @@ def track_chunks(
     for tracked in tracker.smooth():
         report(tracked, 1)
         yield tracked
+
+
+def _fit_body(
+    subject: Subject | None, model: BodyModel | str | Path | None, recording: Recording
+) -> tuple[Subject, BodyModel, StartFrames]:
+    """Return the person and the body of a recording with their lengths, and its segment frames in the start pose.
+
+    The body is `model`, else the one that the recording names, else the upper body. Without a subject the lengths are
+    those of the population prior, or of a chosen model its own.
+
+    Raises
+    ------
+    WeposeError
+        A body that cannot be read; sensors, a start pose or lengths that are not its own.
+    """
+    where = recording.where()
+    chosen = model or recording.model or None
+    body = chosen if isinstance(chosen, BodyModel) else load_sensed_model(chosen, recording.sensors, where)
+    body.table.check_segments(recording.sensors, f"{where}: sensors.", BadSession)
+    start_frames = find_start_frames(body, recording)
+    person = subject or population_subject(body=body)
+    person.check_body(body.table)
+    if subject is None and chosen is not None:  # a chosen model has its person's lengths
+        person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
+    return person, person.shape(body), start_frames
