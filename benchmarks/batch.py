@@ -7,8 +7,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-from wepose_pin.batch import run_batch
-from wepose_pin.jobs.batch import BatchJob
+from wepose_pin.batch.study import run_batch
 from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session
 
@@ -55,7 +54,7 @@ def _study(sessions: int) -> Table:
         first = None
         for case, workers, out in (("one process", 1, "one"), ("two processes", 2, "two"), ("all is done", 1, "one")):
             begin = time.perf_counter()
-            rows = run_batch(BatchJob(folder / "plan.toml", str(folder / out), workers=workers)).table.drop("seconds")
+            rows = run_batch(folder / "plan.toml", str(folder / out), workers=workers).table.drop("seconds")
             seconds = time.perf_counter() - begin
             first = rows if first is None else first
             same = sum(a == b for a, b in zip(rows.iter_rows(), first.iter_rows(), strict=True))

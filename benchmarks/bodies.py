@@ -19,10 +19,10 @@ from benchmarks.trials import RING_SEGMENTS, find_ring
 from benchmarks.validation import real
 from benchmarks.validation.experiment import align_rotation
 from wepose_pin import rotations
-from wepose_pin.cli import main
+from wepose_pin.commands import main
+from wepose_pin.commands.evaluate import evaluate
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.evaluation import attitude_error
-from wepose_pin.jobs.evaluate import EvaluateJob, run_evaluate
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.mvnx import SEGMENT_OF, read_frames
@@ -383,7 +383,7 @@ def measure_legs(activities: Sequence[str], folder: Path) -> Table:
             run(
                 *("track", made, "--model", "whole_body", "--open-loop", "-o", result, "--no-view", "--no-report"),
             )
-            errors = run_evaluate(EvaluateJob(result, made)).joints
+            errors = evaluate(result, made).joints
             for joint in LEG_JOINTS:
                 sides = [[error.rmse for error in errors[f"{side}_{joint}"].values()] for side in ("left", "right")]
                 rms = np.sqrt(np.mean(np.square(sides), axis=0))

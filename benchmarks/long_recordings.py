@@ -108,7 +108,7 @@ def _track(folder: Path, hours: float, method: str = "amekf") -> dict[str, float
         It fails.
     """
     session = folder / f"{hours:g}"
-    argv = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(folder / "out"), "--force"]
+    argv = [sys.executable, "-m", "wepose_pin", "track", str(session), "-o", str(folder / "out"), "--force"]
     argv += ["--subject", str(session / "subject"), "--method", method, "--no-report"]
     begun = time.perf_counter()
     process = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import tempfile
 import time
 from collections.abc import Sequence
@@ -12,9 +14,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from wepose_pin.commands.retarget import retarget
+from wepose_pin.commands.track import track
 from wepose_pin.errors import BadOption
-from wepose_pin.jobs.retarget import RetargetJob, run_retarget
-from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.kinematics import Pose
 from wepose_pin.retargeting import ROBOTS, Robot, check_limits, find_map, find_self_collisions, load_robot
 from wepose_pin.retargeting.stream import ArmObserver, Command, CommandStream
@@ -64,12 +66,12 @@ def measure_offline(session: Path, robots: Sequence[str], interval: tuple[float,
     table = Table("The upper-body recording retargeted", columns, notes=[NOTE])
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / "result"
-        run_track(TrackJob(session, result, view=False, report=False))
+        with contextlib.redirect_stdout(io.StringIO()):
+            track(session, out=result, view=False, report=False)
         for name in robots:
             begin = time.process_time()
-            summary = run_retarget(
-                RetargetJob(result, name, Path(folder) / name, interval=interval, view=False)
-            ).summary
+            with contextlib.redirect_stdout(io.StringIO()):
+                summary = retarget(result, robot=name, out=Path(folder) / name, interval=interval, view=False).summary
             wall = time.process_time() - begin
             common = _name_margins(summary["limit_margins"]) | {
                 "infeasible": 100.0 * summary["steps"]["stopping_share"],
@@ -101,7 +103,8 @@ def measure_live(session: Path, robots: Sequence[str], interval: tuple[float, fl
     )
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / "result"
-        run_track(TrackJob(session, result, causal=True, view=False, report=False))
+        with contextlib.redirect_stdout(io.StringIO()):
+            track(session, out=result, causal=True, view=False, report=False)
         pose = read_result(result, interval)[0]
     for name in robots:
         robot = load_robot(find_map(name))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+
 import pytest
 
-from wepose_pin.cli import main
+from wepose_pin.commands import main
+from wepose_pin.commands.command_line import APP
 
 
 def run(*words: object) -> int:
@@ -12,3 +15,11 @@ def run(*words: object) -> int:
     with pytest.raises(SystemExit) as stop:
         main([str(word) for word in words])
     return int(stop.value.code or 0)
+
+
+def options(name: str) -> dict[str, inspect.Parameter]:
+    """Name → parameter of what a command takes besides words by position."""
+    parameters = inspect.signature(APP[name].default_command).parameters.values()
+    return {
+        each.name: each for each in parameters if each.kind is each.KEYWORD_ONLY and "UNSEEN" not in each.annotation
+    }

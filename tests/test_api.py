@@ -22,11 +22,12 @@ import pytest
 from arms import write_arm
 
 import wepose_pin as wp
-from wepose_pin.cli import main
+from wepose_pin.commands import main
+from wepose_pin.commands.track import track as track_session
 from wepose_pin.diagnostics import example
 from wepose_pin.errors import how_to_install
-from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.kinematics import PosedBody
+from wepose_pin.recording import find_mount_axes
 from wepose_pin.simulation import Imperfections, ImuNoise, Simulation
 from wepose_pin.subject import subject_toml
 from wepose_pin.writers import write_session
@@ -141,7 +142,7 @@ def test_a_saved_result_is_that_of_the_command(result: wp.TrackResult, tmp_path:
 def test_a_saved_result_says_what_made_it_as_that_of_the_command_does(workplace: Path) -> None:
     result = wp.track(wp.load_session("session.toml"), wp.load_subject("subject.toml"), method="smekf", causal=True)
     result.save(workplace / "mine")
-    run_track(TrackJob(Path("session.toml"), Path("theirs"), Path("subject.toml"), method="smekf", causal=True))
+    track_session(Path("session.toml"), out=Path("theirs"), subject=Path("subject.toml"), method="smekf", causal=True)
     made, theirs = (
         json.loads((workplace / name / "summary.json").read_text(encoding="utf-8"))["provenance"]
         for name in ("mine", "theirs")
@@ -313,7 +314,7 @@ def test_a_subject_whose_calibration_failed_is_refused(
     line = r"subject 'anna': its calibration failed \(quality = \"fail\"\).*calibrate again"
     with pytest.raises(wp.WeposeError, match=line):
         wp.track(simulated.recording(), failed)
-    assert wp.track(simulated.recording(), failed, force=True).subject.quality == "fail"
+    assert wp.track(simulated.recording(), failed, accept_failed=True).subject.quality == "fail"
     track = ["track", "session.toml", "--subject", "subject.toml", "-o", "out", "--no-view", "--no-report"]
     live = ["live", "--source", "replay:session.toml", "--subject", "subject.toml", "--no-page"]
     for argv in (track, live):
@@ -325,3 +326,22 @@ def test_a_subject_whose_calibration_failed_is_refused(
     with pytest.raises(SystemExit, match="0"):
         main([*track, "--accept-failed"])
     assert wp.load_result("out").subject.quality == "fail"
+
+
+def test_a_recording_of_arrays_is_that_of_the_session(simulated: Simulation) -> None:
+    recording = simulated.recording()
+    arrays = {name: (sensor.gyro_S, sensor.accel_S) for name, sensor in recording.imus.items()}
+    mounts = {name: find_mount_axes(sensor.stated_quat_LS) for name, sensor in recording.imus.items()}
+    made = wp.Recording.from_arrays(100, name="mine", phases=recording.phases, mounts=mounts, **arrays)
+    assert np.array_equal(wp.track(made).points["right_palm"], wp.track(recording).points["right_palm"])
+    quat = np.tile([0.0, 0.0, 0.0, 1.0], (900, 1))
+    assert isinstance(wp.Recording.from_arrays(50.0, torso=quat).sensors["torso"], wp.OrientationSensor)
+    for wrong, said in (
+        ({"rate_hz": 0.0, "torso": quat}, "rate_hz = 0.0: a finite number above 0 is needed"),
+        ({"rate_hz": 50.0}, "no sensors"),
+        ({"rate_hz": 50.0, "torso": (quat,)}, "torso: gyro_S and accel_S, "),
+        ({"rate_hz": 50.0, "torso": quat, "mounts": {"torso": ("z", "+x")}}, "mounts: torso.up = 'z' is not known"),
+        ({"rate_hz": 50.0, "torso": quat, "left_arm": quat}, "sensors.left_arm is no segment"),
+    ):
+        with pytest.raises(wp.WeposeError, match=re.escape(said)):
+            wp.track(wp.Recording.from_arrays(**wrong))

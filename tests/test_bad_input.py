@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 
 RATE = 100.0
 SESSION = """

@@ -11,25 +11,25 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import polars as pl
 import pytest
 from studies import PLAN, files, sessions_and_plan, three_sessions  # noqa: F401
 
-from wepose_pin.batch import run_batch
-from wepose_pin.cli import main
+from wepose_pin.batch.study import run_batch
+from wepose_pin.commands import main
 from wepose_pin.errors import BadOption, ExistingOutput, LostWorker
-from wepose_pin.jobs.batch import BatchJob
 
-WEPOSE = [sys.executable, "-m", "wepose_pin.cli"]
+WEPOSE = [sys.executable, "-m", "wepose_pin"]
 NAMES = ["data-one", "data-three", "data-two"]
 
 
 def run(study: Path, *, force: bool = False, plan: str | None = None, out: str = "out") -> pl.DataFrame:
     if plan is not None:
         (study / "plan.toml").write_text(plan)
-    return run_batch(BatchJob(study / "plan.toml", str(study / out), workers=1, force=force)).table
+    return run_batch(study / "plan.toml", str(study / out), workers=1, force=force).table
 
 
 def command(*words: object) -> int:
@@ -43,7 +43,7 @@ def test_a_study_is_made_once_and_what_fails_is_named(study: Path) -> None:
     (study / "data" / "bad" / "session.toml").write_text("[data]\nfile = 3\n")
     (study / "data" / "two" / "truth.parquet").unlink()
     calls: list[tuple[int, int, int]] = []
-    outcome = run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=2), lambda *now: calls.append(now))
+    outcome = run_batch(study / "plan.toml", str(study / "out"), workers=2, progress=lambda *now: calls.append(now))
     table = outcome.table
     assert table.equals(pl.read_parquet(study / "out" / "results.parquet"))
     assert table["item"].to_list() == ["data-bad", *NAMES]
@@ -56,7 +56,7 @@ def test_a_study_is_made_once_and_what_fails_is_named(study: Path) -> None:
     before = files(study / "out" / "items")
     (study / "data" / "bad" / "session.toml").unlink()
     os.utime(study / "data" / "one" / "recording.parquet")  # only touched
-    again = run_batch(BatchJob(study / "plan.toml", str(study / "out"), workers=1))
+    again = run_batch(study / "plan.toml", str(study / "out"), workers=1)
     assert (again.reused, files(study / "out" / "items")) == (2, before)
 
 
@@ -202,18 +202,18 @@ def scheduler(folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 def test_the_workers_of_a_scheduler_give_the_same(study: Path) -> None:
     here = run(study).drop("seconds")
     with scheduler(study) as (address, process):
-        job = BatchJob(study / "plan.toml", str(study / "there"), scheduler=address)
-        assert run_batch(job).table.drop("seconds").equals(here)
-        assert run_batch(job).reused == 3
+        run_there = partial(run_batch, study / "plan.toml", str(study / "there"), scheduler=address)
+        assert run_there().table.drop("seconds").equals(here)
+        assert run_there().reused == 3
         os.killpg(process.pid, signal.SIGKILL)
         with pytest.raises((LostWorker, BadOption), match="scheduler"):
-            run_batch(job)
+            run_there()
 
 
 def test_no_scheduler_at_an_address(study: Path) -> None:
     pytest.importorskip("distributed")
     with pytest.raises(BadOption, match="--scheduler nonsense: no scheduler there, as in tcp://HOST:8786"):
-        run_batch(BatchJob(study / "plan.toml", str(study / "out"), scheduler="nonsense"))
+        run_batch(study / "plan.toml", str(study / "out"), scheduler="nonsense")
 
 
 def test_a_study_below_a_url(study: Path) -> None:
@@ -221,13 +221,13 @@ def test_a_study_below_a_url(study: Path) -> None:
     pytest.importorskip("fsspec")
     here = run(study).drop("seconds", "session")
     (study / "plan.toml").write_text(PLAN.replace("data/*", f"file://{study}/data/*"))
-    job = BatchJob(study / "plan.toml", f"file://{study}/there", workers=1)
-    there = run_batch(job).table
+    run_there = partial(run_batch, study / "plan.toml", f"file://{study}/there", workers=1)
+    there = run_there().table
     assert there["status"].to_list() == ["done"] * 3, there["message"].to_list()
     ours = pl.read_parquet(study / "out" / "items" / "data-one" / "track" / "pose.parquet")
     (theirs,) = (study / "there" / "items").glob("*data-one/track/pose.parquet")
     assert pl.read_parquet(theirs).equals(ours)
     assert there.drop("seconds", "session", "item").equals(here.drop("item"))
-    assert run_batch(job).reused == 3
+    assert run_there().reused == 3
     next((study / "there" / "items").glob("*data-one/done.json")).unlink()  # without it an item is not whole
-    assert run_batch(job).reused == 2
+    assert run_there().reused == 2

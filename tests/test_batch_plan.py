@@ -7,7 +7,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from wepose_pin.batch import Plan, read_plan
+from wepose_pin.batch.plan import Plan, read_plan
 from wepose_pin.errors import BadPlan, MissingFile, WeposeError
 
 STEPS = "[steps.calibrate]\n[steps.track]\n"
@@ -103,8 +103,10 @@ def test_items_keep_their_names_when_others_join(folder: Path) -> None:
         ('[sessions]\nfiles = ["anna/*"]\n', "steps is missing"),
         ('[sessions]\nfiles = ["anna/*"]\n[steps]\n', "no step"),
         ('[sessions]\nfiles = ["anna/*"]\n[steps.trak]\n', "did you mean 'track'?"),
-        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\nmethod = "amek"\n', "did you mean 'amekf'?"),
-        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\ngaps = 1\n', "gaps = 1: True or False is needed"),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\nmethod = "amek"\n', 'Did you mean "amekf"?'),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\ngaps = 3\n', 'gaps: unable to convert "3" into bool'),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\nsubject = "a"\n', "steps.track.subject is not a known key"),
+        ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\nmetod = "ncf"\n', "did you mean 'method'?"),
         ('[sessions]\nfiles = ["anna/*"]\n[steps.evaluate]\n', "needs the step [steps.track]"),
         (
             '[sessions]\nfiles = ["anna/*"]\n[steps.track]\n[steps.export]\n',
@@ -138,14 +140,17 @@ def test_items_keep_their_names_when_others_join(folder: Path) -> None:
         ('[sessions]\nfiles = "anna/*"\n[steps.calibrate]\nprotocol = "clsp"', "did you mean 'clasp'?"),
         ('[sessions]\nfiles = "anna/*"\n[steps.track]\nmodel = "nobody.urdf"', "model = nobody.urdf: no such file"),
         ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "pandda"', "did you mean 'panda'?"),
-        ('[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "panda"\narm = "up"', "arm = 'up'"),
+        (
+            '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "panda"\narm = "up"',
+            'Invalid value "up" for --arm',
+        ),
         (
             '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.retarget]\nrobot = "panda"\nrate_hz = -3',
             "rate_hz = -3: from 10 to 2000",
         ),
         (
             '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.export]\nformats = ["mot"]\nnames = "isp"',
-            "did you mean 'isb'?",
+            'Did you mean "isb"?',
         ),
     ],
 )

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.ur5_arm import RUNS, UPRIGHT, UR5, write_ur5_session, write_urdf
 from benchmarks.validation.real import UNSCORED_S
-from wepose_pin.cli import main
+from wepose_pin.commands import main
+from wepose_pin.commands.track import track as track_session
 from wepose_pin.errors import BadModel, BadSession, BadSubject, WeposeError
-from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.kinematics import LiveKinematics, compute_link_poses, compute_point_covariances
 from wepose_pin.live import LivePose, Output, SensorSetup, run_session
 from wepose_pin.live.sources.replay import ReplaySource
@@ -485,12 +485,12 @@ def test_a_result_on_another_body_does_not_stay(urdf: Path, data: Path, tmp_path
     """Its table and its joints would be read with the next result in the same folder."""
     write_ur5_session(data, "circle-100", tmp_path)
     out = tmp_path / "out"
-    run_track(TrackJob(tmp_path, out, model=urdf, view=False, report=False))
+    track_session(tmp_path, out=out, model=urdf, view=False, report=False)
     assert (out / "model.toml").is_file()
     assert (out / "joints.parquet").is_file()
     (tmp_path / "person").mkdir()
     write_session(tmp_path / "person", replace(t_pose_recording(), start_pose="n_pose"))
-    run_track(TrackJob(tmp_path / "person", out, view=False, report=False, force=True))
+    track_session(tmp_path / "person", out=out, view=False, report=False, force=True)
     assert not (out / "model.toml").exists()
     assert not (out / "joints.parquet").exists()
     assert not read_result(out)[1].table.is_mechanism
@@ -521,7 +521,7 @@ def test_a_session_names_a_body_of_the_package(tmp_path: Path) -> None:
     tracked = track(load_session(tmp_path))
     assert {"pelvis", "left_thigh"} <= set(tracked.model.table.segments)
     out = tmp_path / "out"
-    run_track(TrackJob(tmp_path, out, view=False, report=False))
+    track_session(tmp_path, out=out, view=False, report=False)
     pose, model, _ = read_result(out)
     assert list(model.table.segments) == list(tracked.model.table.segments)
     assert list(model.table.lengths) == list(tracked.model.table.lengths)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -10,17 +12,22 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import polars as pl
 import pytest
-from commands import run
+from commands import options, run
 
-from wepose_pin import __version__
-from wepose_pin.cli import COMMANDS, find_command
-from wepose_pin.jobs.fields import field_types
+from benchmarks.results import adapter
+from wepose_pin import __version__, calibration
+from wepose_pin.calibration import PROTOCOLS
+from wepose_pin.commands.command_line import COMMANDS, parse
+from wepose_pin.commands.options import Formulation, LiveMethod, Method
+from wepose_pin.filters import METHODS, OFFLINE
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import Simulation, simulate
+from wepose_pin.simulation.sequence import TASKS
 from wepose_pin.writers import write_session
 
 
@@ -42,7 +49,8 @@ def test_help_of_all_commands(capsys: pytest.CaptureFixture[str]) -> None:
     for command in COMMANDS:
         assert command in text
         assert run(command, "--help") == 0
-        assert f"Example: wepose {command}" in capsys.readouterr().out
+        [example] = re.findall(r"^Example: wepose (.+)$", capsys.readouterr().out, re.MULTILINE)
+        assert parse(shlex.split(example))[0].__name__ == command
     assert run("--version") == 0
     assert __version__ in capsys.readouterr().out
 
@@ -51,17 +59,46 @@ def test_help_reads_like_a_manual(capsys: pytest.CaptureFixture[str], monkeypatc
     """Each option says what happens when it is given; values have names, and what is off or on is no default."""
     monkeypatch.setenv("COLUMNS", "300")
     for name in COMMANDS:
-        job = find_command(name).job
         assert run(name, "--help") == 0
         text = capsys.readouterr().out
-        for wrong in ("None", "True", "False", "{", "Path"):
+        for wrong in ("None", "True", "False", "{", "Path", "│", "╭"):
             assert wrong not in text, (name, wrong)
-        for field, kind in field_types(job).items():
-            words = field.rstrip("_").replace("_", "-")
-            switch = f"--no-{words}" if kind is bool and getattr(job, field) is True else f"--{words}"
-            assert switch in text or field in find_command(name).arguments, (name, switch)
-            if switch.startswith("--no-"):
-                assert f"{switch} Do not " in " ".join(text.split()), (name, switch)
+        for option, parameter in options(name).items():
+            words = option.replace("_", "-")
+            switch = f"--no-{words} Do not " if parameter.default is True else f"--{words}"
+            assert switch in " ".join(text.split()), (name, switch)
+
+
+def test_help_is_grouped(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("track", "--help") == 0
+    text = capsys.readouterr().out
+    groups = ("\nOptions:", "  --subject", "\nMore options:", "  --torques", "\nOptions for research:", "  --open-loop")
+    places = [text.index(word) for word in groups]
+    assert places == sorted(places)
+
+
+def test_choices_of_options_are_those_of_the_rooms() -> None:
+    """Options are annotated without loading a room; what is added there must be added here."""
+    assert get_args(Method) == tuple(METHODS) == adapter.METHODS
+    assert get_args(Formulation) == get_args(calibration.Formulation)
+    assert get_args(LiveMethod) == tuple(name for name in METHODS if name not in OFFLINE)
+    assert set(TASKS) <= set(PROTOCOLS)
+
+
+def test_words_become_arguments() -> None:
+    words = "calibrate s.toml --measured biacromial=0.4 --protocol table --measured trunk=0.5 --sex f -o out"
+    command, bound = parse(words.split())
+    assert (command.__name__, bound.args) == ("calibrate", (Path("s.toml"),))
+    measured = {"biacromial": 0.4, "trunk": 0.5}
+    assert bound.kwargs == {"measured": measured, "protocol": "table", "sex": "f", "out": Path("out")}
+    _, bound = parse("track --out=out s.toml --subject anna --no-limits --open-loop --covariance".split())
+    given = {"subject": Path("anna"), "limits": False, "open_loop": True, "covariance": True, "out": Path("out")}
+    assert (bound.args, bound.kwargs) == ((Path("s.toml"),), given)
+    _, bound = parse("export a b c -o x.csv --interval -1 2".split())
+    assert bound.args == (Path("a"), Path("b"), Path("c"))
+    assert bound.kwargs == {"out": Path("x.csv"), "interval": (-1.0, 2.0)}
+    _, bound = parse("simulate -o out --imperfection bits=12 --imperfection mount=any".split())
+    assert bound.kwargs["imperfection"] == {"bits": 12.0, "mount": "any"}
 
 
 @pytest.mark.slow
@@ -181,7 +218,7 @@ def test_a_session_that_lacks_sensors_says_what_is_not_known(
 @pytest.mark.parametrize("seconds", [0.8, 1.6, 2.4])
 def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: float) -> None:
     """Ctrl-C, and the SIGTERM of a cluster, at any time: exit 130 and no trace, or done before it came."""
-    command = [sys.executable, "-m", "wepose_pin.cli", "calibrate", str(session), "-o", str(tmp_path / "subject")]
+    command = [sys.executable, "-m", "wepose_pin", "calibrate", str(session), "-o", str(tmp_path / "subject")]
     for number in (signal.SIGINT, signal.SIGTERM):
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
         time.sleep(seconds)
@@ -202,11 +239,15 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["trak"], "did you mean 'track'?"),
         (["reproduce", "result"], "run the command that `provenance` in the result's summary.json names again"),
         (["validate", "--quick"], "in a clone of the project, run make validation DATA=DIR"),
-        (["track"], "wepose track needs SESSION and -o DIR; see wepose track --help"),
-        (["track", "s.toml", "-o"], "-o/--out: expected one argument; see wepose track --help"),
+        (["track"], 'Command "track" parameter SESSION requires an argument; see wepose track --help'),
+        (["track", "s.toml", "-o"], 'Command "track" parameter -o requires an argument; see wepose track --help'),
+        (["track", "s.toml", "-o", "OUT", "-o", "OUT"], "-o specified multiple times; see wepose track --help"),
         (["track", "s.toml", "t.toml", "-o", "OUT"], "'t.toml' is one word too many for wepose track"),
-        (["evaluate", "a", "b", "--interval", "3"], "--interval: expected 2 arguments"),
-        (["simulate", "-o", "OUT", "--rate-hz", "fast"], "--rate-hz: 'fast' is not a number; see wepose simulate"),
+        (["evaluate", "a", "b", "--interval", "3"], "--interval requires 2 positional arguments. Only got 1"),
+        (
+            ["simulate", "-o", "OUT", "--rate-hz", "fast"],
+            'Invalid value for --rate-hz: unable to convert "fast" into float; see wepose simulate',
+        ),
         (["simulate", "-o", "OUT", "--prset", "ideal"], "not an option of wepose simulate; did you mean '--preset'?"),
         (
             ["calibrate", "s.toml", "-o", "OUT", "--protocol", "poses"],
@@ -214,8 +255,9 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         ),
         (["simulate", "-o", "OUT", "--protocol", "handle"], "protocol 'handle' is no longer there; use clasp with"),
         (["calibrate", "a", "b", "-o", "OUT"], "'b' is one word too many for wepose calibrate"),
-        (["track", "s.toml"], "wepose track needs -o DIR"),
-        (["track", "s.toml", "-o", "OUT", "--method", "ekf"], "--method: 'ekf' is not known; did you mean 'smekf'?"),
+        (["track", "s.toml"], "parameter --out requires an argument"),
+        (["track", "s.toml", "-o", "OUT", "--method", "ekf"], 'Invalid value "ekf" for --method. Choose from: "amekf"'),
+        (["angles", "result", "-o", "OUT", "--low-pass-hz", "nan"], 'Invalid value "nan" for --low-pass-hz'),
         (["track", "nowhere.toml", "-o", "OUT"], "nowhere.toml: no such file"),
         (
             ["calibrate", "s.toml", "-o", "OUT", "--model", "upper_body", "--measured", "shoulder=0.4"],

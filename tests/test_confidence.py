@@ -14,7 +14,7 @@ from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.calibration import calibrate
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.kinematics import compute_axis_std, compute_point_covariances, compute_pose
 from wepose_pin.model import load_model
 from wepose_pin.model.girdle import PARAMETERS

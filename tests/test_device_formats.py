@@ -19,7 +19,7 @@ from test_formats import ACCEL, GYRO, RATE, TIME, WXYZ, N, check_orientation, ch
 from test_info import info
 
 import wepose_pin as wp
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.errors import BadData, WeposeError
 from wepose_pin.readers.device import Signal, join_signals, spread_equal_times
 from wepose_pin.readers.registry import detect_format, read_device

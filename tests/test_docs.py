@@ -15,13 +15,13 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from commands import options
 from scipy.spatial.transform import Rotation
 
 import wepose_pin
 from wepose_pin.calibration import load_protocol
-from wepose_pin.cli import COMMANDS, find_command
+from wepose_pin.commands.command_line import COMMANDS
 from wepose_pin.filters import TYPICAL
-from wepose_pin.jobs.fields import field_types
 from wepose_pin.readers.registry import read_device
 from wepose_pin.retargeting.maps import read_map
 
@@ -86,10 +86,9 @@ def resolve(name: str) -> object:
 
 
 @cache
-def options() -> dict[str, frozenset[str]]:
+def known_options() -> dict[str, frozenset[str]]:
     """Command → its options."""
-    switches = {name: field_types(find_command(name).job) for name in COMMANDS}
-    return {name: frozenset(f"--{field.replace('_', '-')}" for field in fields) for name, fields in switches.items()}
+    return {name: frozenset(f"--{option.replace('_', '-')}" for option in options(name)) for name in COMMANDS}
 
 
 def missing(span: str) -> str:
@@ -101,10 +100,10 @@ def missing(span: str) -> str:
     if words[0] == "wepose":
         if len(words) == 1 or words[1].startswith("-") or words[1] == "X":
             return ""
-        known = options().get(words[1], frozenset())
+        known = known_options().get(words[1], frozenset())
         return "" if known and {word for word in words if word.startswith("--")} <= known else span
     if words[0].startswith("--"):
-        return "" if any(words[0] in known for known in [known_words(), *options().values()]) else span
+        return "" if any(words[0] in known for known in [known_words(), *known_options().values()]) else span
     if span.startswith(".venv"):
         return "" if ".venv" in text_of("Makefile") else span
     if re.fullmatch(r"[\w.-]*/[\w./-]*", span):

@@ -18,7 +18,7 @@ from arms import JOINTS, write_arm
 from scipy.spatial.transform import Rotation
 from test_export import a_pose, write_folder
 
-from wepose_pin import cli
+from wepose_pin.commands import main
 from wepose_pin.errors import WeposeError, WrongOption
 from wepose_pin.kinematics import PosedBody
 from wepose_pin.subject import population_subject
@@ -281,7 +281,7 @@ def test_a_spoiled_trajectory_takes_one_line(
 
 def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str) -> None:
     with pytest.raises(SystemExit) as stop:
-        cli.main(["export", *arguments])
+        main(["export", *arguments])
     error = capsys.readouterr().err
     assert (stop.value.code, error.count("\n")) == (2, 1), error
     assert said in error

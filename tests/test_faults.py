@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 from test_bad_input import Files, good_table, refused
 
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.documents import whole_file, whole_folder
 from wepose_pin.errors import ExistingOutput
 from wepose_pin.simulation import simulate, simulate_person
@@ -132,7 +132,7 @@ def test_a_place_that_nobody_can_write_to(
 def test_no_home_and_no_cache(session: Path, tmp_path: Path) -> None:
     """Nothing but the output is wanted: no folder of settings, no cache of fonts."""
     nowhere = dict.fromkeys(("HOME", "XDG_CACHE_HOME", "XDG_CONFIG_HOME", "MPLCONFIGDIR"), "/dev/null/nowhere")
-    command = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "wepose_pin", "track", str(session), "-o", str(tmp_path / "out")]
     run = subprocess.run(command, env=os.environ | nowhere, cwd="/", capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
     assert {path.name for path in (tmp_path / "out").iterdir()} == TRACKED
@@ -231,7 +231,7 @@ def test_names_of_data_that_are_none(name: str, tmp_path: Path, capsys: pytest.C
 def test_a_run_that_is_killed_at_any_moment_leaves_the_whole_result_or_nothing(session: Path, tmp_path: Path) -> None:
     """Two moments of those in which it writes; twenty by hand: docs/install.md. The page comes after the result."""
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "--no-report", "-o", str(out)]
+    command = [sys.executable, "-m", "wepose_pin", "track", str(session), "--no-report", "-o", str(out)]
     begun = time.monotonic()
     subprocess.run(command, check=True, capture_output=True)
     whole, took = {path.name for path in out.iterdir()}, time.monotonic() - begun

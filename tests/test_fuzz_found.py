@@ -16,7 +16,7 @@ import polars as pl
 import pytest
 from test_bad_input import Files, good_table, refused
 
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.documents import whole_folder, written
 from wepose_pin.errors import (
     BadData,
@@ -295,7 +295,7 @@ def test_a_device_without_end_is_no_file(suffix: str, tmp_path: Path, capsys: py
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 def test_a_full_disk_under_stdout(tmp_path: Path, session: Path) -> None:
-    command = [sys.executable, "-m", "wepose_pin.cli", "track", str(session), "-o", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "wepose_pin", "track", str(session), "-o", str(tmp_path / "out")]
     with open("/dev/full", "w") as full:
         run = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
     assert run.returncode == 2

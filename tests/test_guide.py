@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import select
 import socket
@@ -19,9 +18,9 @@ from guided_person import TRACKERS, GuidedPerson, PersonSource, TrackerPerson, p
 
 from wepose_pin.assets import asset
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, load_protocol
+from wepose_pin.commands.guide import choose_parts, choose_protocol
+from wepose_pin.commands.live import live
 from wepose_pin.errors import BadSession
-from wepose_pin.jobs.guide import choose_parts, choose_protocol
-from wepose_pin.jobs.live import LiveJob, run_live
 from wepose_pin.live import open_source
 from wepose_pin.live.assignment import read_segments, write_segments
 from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
@@ -440,19 +439,20 @@ def test_trackers_are_guided_and_a_robot_follows_at_once(tmp_path: Path) -> None
                 person.follow("clasp", "", None)  # the arms move
             return False
 
-        job = LiveJob(
-            f"slimevr:{port}",
-            guide=True,
-            out=tmp_path / "anna",
-            protocol=f"{tmp_path / 'short.toml'}+bow",
-            measured=MEASURED,
-            page=False,
-            robot=str(write_arm(tmp_path)),
-            arm="right",
-            to=str(to),
-        )
+        robot = tmp_path / "follow.toml"
+        robot.write_text(f'robot = "{write_arm(tmp_path).name}"\narm = "right"\nto = {to}\n', encoding="utf-8")
         with TrackerPerson(person, port):
-            outcome = run_live(job, views=[view], stop=contextlib.nullcontext(stop))
+            outcome = live(
+                source=f"slimevr:{port}",
+                guide=True,
+                out=tmp_path / "anna",
+                protocol=f"{tmp_path / 'short.toml'}+bow",
+                measured=MEASURED,
+                page=False,
+                robot=str(robot),
+                views=[view],
+                until=stop,
+            )
     assert view.steps == ["sensors", "assignment", "static", "start", "clasp", "bow", "quality"]
     assert read_segments(tmp_path / "anna", load_model().table.segments) == person.worn
     assert {"hold", "approach", "follow"} <= states

@@ -87,7 +87,7 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     measured = f"shoulder_width={LENGTHS['shoulder_width']}"
-    command = [sys.executable, "-m", "wepose_pin.cli", "live", "--source", f"udp:{port}", "--guide", "-o", "anna"]
+    command = [sys.executable, "-m", "wepose_pin", "live", "--source", f"udp:{port}", "--guide", "-o", "anna"]
     command += ["--no-open", "--protocol", "short.toml", "--measured", measured]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     run = subprocess.Popen(
@@ -138,9 +138,9 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
     # No sample was lost while the motion was evaluated.
     assert not any(sensor.gap is not None and sensor.gap.any() for sensor in recording.sensors.values())
     # The take is a phase of the recording, which tracks as it was.
-    track = [sys.executable, "-m", "wepose_pin.cli", "track", "anna/session-1.mcap", "-o", "result", "--no-report"]
+    track = [sys.executable, "-m", "wepose_pin", "track", "anna/session-1.mcap", "-o", "result", "--no-report"]
     subprocess.run([*track, "--no-view"], check=True, cwd=tmp_path, env=environment, capture_output=True)
-    export = [sys.executable, "-m", "wepose_pin.cli", "export", "result", "--phase", "take_1", "-o", "take.parquet"]
+    export = [sys.executable, "-m", "wepose_pin", "export", "result", "--phase", "take_1", "-o", "take.parquet"]
     subprocess.run(export, check=True, cwd=tmp_path, env=environment, capture_output=True)
     take = pl.read_parquet(tmp_path / "take.parquet")["time"]
     assert 1.5 < take[-1] - take[0] < 8.0

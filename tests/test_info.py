@@ -15,7 +15,7 @@ from test_formats import ACCEL, GYRO, RATE, TIME, WXYZ, dot, mat, mt_manager, st
 from test_mvnx import mvnx, turning
 
 import wepose_pin as wp
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.diagnostics import ERROR, WARNING, Diagnostic, render
 from wepose_pin.readers.describe import describe_file, find_static_intervals
 from wepose_pin.recording import ImuSensor, Recording

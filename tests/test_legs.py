@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin.angles import joint_angles
+from wepose_pin.commands.evaluate import evaluate as evaluate_result
 from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import evaluate
-from wepose_pin.jobs.evaluate import EvaluateJob, run_evaluate
 from wepose_pin.kinematics import Pose, parse_pose_table
 from wepose_pin.model import load_model
 from wepose_pin.simulation import NOISE_FREE, Imperfections, Simulation, simulate_activity
@@ -249,7 +249,7 @@ def test_the_commands_find_the_angles_of_the_legs(activity: str, preset: str, mo
     # Open loop: what neighbours tell of headings has an error of its own, of half a degree and more.
     assert run("track", made, "--model", "whole_body", "--open-loop", "--no-view", "--no-report", "-o", result) == 0
     assert run("evaluate", result, made) == 0
-    errors = run_evaluate(EvaluateJob(result, made))
+    errors = evaluate_result(result, made)
     for joint in LEG_JOINTS:
         for name, error in errors.joints[joint].items():
             assert error.rmse < most_deg, (joint, name)

@@ -17,7 +17,7 @@ import pytest
 from bodies import LENGTHS, SEGMENTS
 from test_causal import first
 
-from wepose_pin import cli
+from wepose_pin.commands import main
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.simulation import Simulation
@@ -37,7 +37,7 @@ def session(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) ->
 
 def run(*arguments: str, code: int = 0) -> None:
     with pytest.raises(SystemExit) as stop:
-        cli.main(list(arguments))
+        main(list(arguments))
     assert stop.value.code == code
 
 
@@ -48,7 +48,7 @@ def test_ended_at_any_moment_the_file_holds_what_was_shown(session: Path, tmp_pa
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listening:
         listening.bind(("127.0.0.1", 0))
         listening.settimeout(120.0)
-        command = [sys.executable, "-m", "wepose_pin.cli", "live", "--source", f"replay:{session}", "--no-page"]
+        command = [sys.executable, "-m", "wepose_pin", "live", "--source", f"replay:{session}", "--no-page"]
         command += ["--record", str(file), "--speed", str(SPEED), "--udp", str(listening.getsockname()[1])]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         shown = {}
@@ -184,7 +184,7 @@ def test_ctrl_c_stops_the_wait_for_senders_at_once(tmp_path: Path) -> None:
 # Says when it waits, so that the interrupt comes neither before nor after.
 _WAITING = """
 import sys
-from wepose_pin import cli
+from wepose_pin.commands import main
 from wepose_pin.live.sources.datagrams import DatagramSource
 find = DatagramSource._find_sensors
 def say(self, waiting):
@@ -192,7 +192,7 @@ def say(self, waiting):
     find(self, waiting)
 DatagramSource._find_sensors = say
 sys.argv[1:] = ["live", "--source", sys.argv[1], "--subject", "subject.toml", "--no-page"]
-cli.main()
+main()
 """
 
 

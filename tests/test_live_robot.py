@@ -23,7 +23,7 @@ from arms import FORE, HAND, UPPER, person, write_arm
 from bodies import LENGTHS, RIGID_SHOULDERS
 from test_causal import first
 
-from wepose_pin import cli
+from wepose_pin.commands import main
 from wepose_pin.errors import BadOption
 from wepose_pin.kinematics import Pose, compute_axis_std, compute_point_covariances
 from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, TickReplay, command_json
@@ -532,8 +532,10 @@ def session(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) ->
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_stopped_amid_a_motion_the_robot_stands(session: Path, tmp_path: Path, receiver: Receiver, number: int) -> None:
     urdf = write_arm(tmp_path)
-    command = [sys.executable, "-m", "wepose_pin.cli", "live", "--source", f"replay:{session}", "--no-page"]
-    command += ["--speed", "2", "--robot", str(urdf), "--arm", "right", "--to", receiver.port]
+    command = [sys.executable, "-m", "wepose_pin", "live", "--source", f"replay:{session}", "--no-page"]
+    follow = tmp_path / "follow.toml"
+    follow.write_text(f'robot = "{urdf.name}"\narm = "right"\nto = {receiver.port}\n', encoding="utf-8")
+    command += ["--speed", "2", "--robot", str(follow)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     receiver.until(lambda m: m["state"] == "approach" and max(map(abs, m["velocity"])) > 0.2)
     process.send_signal(number)
@@ -564,27 +566,35 @@ def test_wrong_robots_are_one_line_before_the_source_opens(
     write_arm(bare, without="elbow.velocity")
     only = first(load_session(session), 2000)
     write_session(torso, replace(only, sensors={name: only.sensors[name] for name in ("torso", "left_upper_arm")}))
+
+    def follow(line: str) -> str:
+        """A file that lets the arm follow with one more key."""
+        file = tmp_path / f"{len(list(tmp_path.iterdir()))}-follow.toml"
+        file.write_text(f'robot = "arm.urdf"\n{line}\n', encoding="utf-8")
+        return str(file)
+
     for arguments, said in (
         (["--robot", "pandda"], "--robot pandda: not known; did you mean 'panda'?"),
         (["--robot", str(tmp_path / "none.urdf")], "none.urdf: no such file"),
         (["--robot", str(alone / "arm.urdf")], "no arm.toml beside it"),
         (["--robot", str(bare / "arm.urdf")], "joint 'elbow' has no velocity limit"),
-        (["--robot", str(whole), "--arm", "left"], "--arm left: arm has no left arm"),
-        (["--robot", str(whole), "--to", "there"], "--to there: a port or HOST:PORT is needed"),
-        (["--robot", str(whole), "--robot-hz", "5"], "--robot-hz 5: from 10 to 1000"),
-        (["--robot", str(whole), "--hold-after", "2"], "--hold-after 2, --stop-after 1: seconds, the second longer"),
-        (["--robot", str(whole), "--speed-scale", "0"], "--speed-scale 0: above 0, up to 1"),
+        (["--robot", follow('arm = "left"')], "follow.toml: arm = left: arm has no left arm; there is: right"),
+        (["--robot", follow('arm = "up"')], "follow.toml: arm = 'up' is not known; there is: left, right, both"),
+        (["--robot", follow('to = "there"')], "to = there: a port or HOST:PORT is needed"),
+        (["--robot", follow("rate_hz = 5")], "follow.toml: rate_hz = 5: from 10 to 1000"),
+        (["--robot", follow("hold_after = 2")], "hold_after = 2: seconds, above 0 and less than stop_after = 1"),
+        (["--robot", follow("speed_scale = 0")], "follow.toml: speed_scale = 0: above 0, up to 1"),
+        (["--robot", follow("rate = 5")], "follow.toml: rate is not a known key; did you mean 'rate_hz'?"),
         (["--robot", str(tmp_path / "no.toml")], "no.toml: no such file"),
-        (["--arm", "left"], "--arm left: goes with --robot, which is not given"),
-        (["--to", "9002"], "--to 9002: goes with --robot"),
+        (["--arm", "left"], "--arm is no option any more: --robot takes a TOML file that has it"),
     ):
         with pytest.raises(SystemExit) as stop:
-            cli.main(["live", "--source", f"replay:{session}", "--no-page", *arguments])
+            main(["live", "--source", f"replay:{session}", "--no-page", *arguments])
         err = capsys.readouterr().err.strip()
         assert stop.value.code == 2, said
         assert said in err
         assert len(err.splitlines()) == 1
     with pytest.raises(SystemExit) as stop:
-        cli.main(["live", "--source", f"replay:{torso}", "--no-page", "--robot", str(whole)])
+        main(["live", "--source", f"replay:{torso}", "--no-page", "--robot", str(whole)])
     assert stop.value.code == 2
     assert "no sensor on right_upper_arm, right_forearm, which its right arm follows" in capsys.readouterr().err

@@ -30,7 +30,7 @@ from wepose_pin.angles.movement_tables import build_comparison_table
 from wepose_pin.angles.smoothing import smooth_pose
 from wepose_pin.angles.tables import summarize_joint
 from wepose_pin.angles.uncertainty import compute_summary_std
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.errors import WrongOption
 from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import load_model
@@ -299,7 +299,7 @@ def test_where_nothing_repeats_there_are_phases_all_the_same(
         ("--repetitions bend --cycles", "--cycles: finds repetitions, and --repetitions bend marks them"),
         ("--interval 5 99", "--interval 5 99: the recording runs from 0 to 14 s"),
         ("--phase bend", "--phase bend: bend has 3 intervals"),
-        ("--shoulder XYZ", "'XYZ' is not known"),
+        ("--shoulder XYZ", 'Invalid value "XYZ" for --shoulder'),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_2(

@@ -12,7 +12,7 @@ import pytest
 from reading import text_of
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.recording import ImuSensor, Recording, check_recording, compute_mount
 from wepose_pin.report import render_track_report
 from wepose_pin.tracking import TrackedRecording, summarize, track

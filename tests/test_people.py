@@ -12,8 +12,8 @@ from commands import run
 from scipy.spatial.transform import Rotation
 from simulated import SUBJECT, check_accel, check_gyro, check_lengths, in_torso, within
 
+from wepose_pin.commands.simulate import simulate as simulate_session
 from wepose_pin.errors import BadOption
-from wepose_pin.jobs.simulate import SimulateJob
 from wepose_pin.kinematics import parse_pose_table
 from wepose_pin.readers import load_session
 from wepose_pin.rotations import heading
@@ -391,4 +391,4 @@ def test_the_command_has_people(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert run("simulate", "-o", tmp_path / "tasks", "--activity", "tasks", "--rate-hz", 20, "--seconds", 6) == 0
     assert set(load_session(tmp_path / "tasks").phases) == {"start", "tasks", "rest"}
     with pytest.raises(BadOption, match="--seconds 2"):
-        SimulateJob(tmp_path, seconds=2.0).check()
+        simulate_session(out=tmp_path, seconds=2.0)

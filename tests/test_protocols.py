@@ -23,7 +23,7 @@ from wepose_pin.calibration.conditions import (
 from wepose_pin.calibration.equations import Layout
 from wepose_pin.calibration.least_squares import Observations
 from wepose_pin.calibration.protocols import Closure, Direction
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
 from wepose_pin.model import BodyModel, load_model
 from wepose_pin.model.start_pose import orient_links

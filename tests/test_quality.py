@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import wepose_pin as wp
 from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, quality
 from wepose_pin.calibration.quality import OPEN_SHARE, QUALITIES
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.diagnostics import ERROR, INFO, WARNING, from_json, render
 from wepose_pin.errors import BadSubject
 from wepose_pin.recording import Recording
@@ -220,7 +220,7 @@ def test_a_failed_calibration_says_so_and_is_not_tracked(
     assert "left upper arm and left forearm seem to be exchanged" in failed._repr_html_()
     with pytest.raises(BadSubject, match="its calibration failed"):
         wp.track(moved, failed)
-    assert wp.track(moved, failed, force=True).subject.quality == "fail"
+    assert wp.track(moved, failed, accept_failed=True).subject.quality == "fail"
     assert unmeasured.subject.quality == "poor"
     assert "Measure" in repr(unmeasured)
 

@@ -13,7 +13,7 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import load_session, rotations
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.diagnostics import Diagnostic, as_json, render
 from wepose_pin.errors import BadData
 from wepose_pin.readers.tables import read_table

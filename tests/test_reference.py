@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from test_info import info
 from test_mvnx import mvnx, turning
 
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.errors import BadData, WeposeError
 from wepose_pin.evaluation import compute_agreement, compute_icc, evaluate, register
 from wepose_pin.kinematics import Pose, build_pose_table

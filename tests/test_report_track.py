@@ -19,7 +19,7 @@ from PIL import Image
 from reading import captions, headings, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.kinematics import Pose, compute_axis_std
 from wepose_pin.recording import OrientationSensor, Recording

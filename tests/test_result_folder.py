@@ -10,9 +10,9 @@ import numpy as np
 import polars as pl
 import pytest
 
+from wepose_pin.commands.calibrate import calibrate as calibrate_session
+from wepose_pin.commands.track import track as track_session
 from wepose_pin.errors import ExistingOutput
-from wepose_pin.jobs.calibrate import CalibrateJob, run_calibrate
-from wepose_pin.jobs.track import TrackJob, run_track
 from wepose_pin.model import load_model
 from wepose_pin.model.table_file import format_table, load_table
 from wepose_pin.simulation import simulate, simulate_person
@@ -31,11 +31,11 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def calibrate(session: Path, out: Path) -> None:
-    run_calibrate(CalibrateJob(session, out, report=False, force=True))
+    calibrate_session(session, out=out, report=False, force=True)
 
 
 def track(session: Path, out: Path) -> None:
-    run_track(TrackJob(session, out, view=False, report=False, force=True))
+    track_session(session, out=out, view=False, report=False, force=True)
 
 
 WRITERS = pytest.mark.parametrize("write", [calibrate, track])
@@ -125,7 +125,7 @@ def test_a_page_of_the_user_stays_where_none_is_wanted(session: Path, tmp_path: 
     (tmp_path / "view.html").write_text("mine", encoding="utf-8")
     track(session, tmp_path)
     assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"
-    run_track(TrackJob(session, tmp_path, view=False, force=True))
+    track_session(session, out=tmp_path, view=False, force=True)
     assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"
     assert "<b>Good for</b> elbow flexion" in (tmp_path / "report.html").read_text(encoding="utf-8")
     assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["samples"] > 0

@@ -14,7 +14,7 @@ import trimesh
 from arms import HAND, JOINTS, UPPER, person, write_arm
 from scipy.spatial.transform import Rotation
 
-from wepose_pin import cli
+from wepose_pin.commands import main
 from wepose_pin.errors import BadData, BadModel, BadOption, MissingFile, NoSolution
 from wepose_pin.kinematics import Pose
 from wepose_pin.retargeting import (
@@ -652,7 +652,7 @@ def test_the_same_motion_at_another_rate(arm) -> None:
 
 def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
     with pytest.raises(SystemExit) as stop:
-        cli.main(list(argv))
+        main(list(argv))
     text = capsys.readouterr()
     return int(stop.value.code or 0), text.out + text.err
 

@@ -23,12 +23,12 @@ def test_a_room_imports_only_from_above(monkeypatch: pytest.MonkeyPatch, capsys:
 
 
 def test_lazy_imports_are_seen() -> None:
-    """The façade of the jobs imports writers only while it runs."""
+    """Commands import writers only while they run."""
     graph = grimp.build_graph("wepose_pin", cache_dir=None)
-    lazy = [name for name in ("retarget", "simulate", "track") if f"wepose_pin.jobs.{name}" in graph.modules]
+    lazy = [name for name in ("calibrate", "track") if f"wepose_pin.commands.{name}" in graph.modules]
     assert lazy
     for name in lazy:
-        assert graph.direct_import_exists(importer=f"wepose_pin.jobs.{name}", imported="wepose_pin.writers")
+        assert graph.direct_import_exists(importer=f"wepose_pin.commands.{name}", imported="wepose_pin.report")
 
 
 def test_the_facade_knows_where_everything_is() -> None:
@@ -47,7 +47,7 @@ def test_editors_see_every_public_name() -> None:
 
 def test_help_loads_no_heavy_room() -> None:
     code = (
-        "import sys, wepose_pin.cli as c\n"
+        "import sys, wepose_pin.commands as c\n"
         "try:\n    c.main(['--help'])\nexcept SystemExit:\n    pass\n"
         "heavy = {'numpy', 'pinocchio', 'numba', 'yourdfpy', 'casadi', 'polars', 'meshcat', 'matplotlib'}\n"
         "print(sorted(set(sys.modules) & heavy))"

@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 from test_export import a_pose, write_folder
 
-from wepose_pin.cli import main
+from wepose_pin.commands import main
 from wepose_pin.errors import BadData, WrongOption
 from wepose_pin.kinematics import cut_pose
 from wepose_pin.recording import select_interval

@@ -19,8 +19,7 @@ import pytest
 from conftest import DATA
 
 import wepose_pin as wp
-from wepose_pin.cli import COMMANDS, find_command
-from wepose_pin.cli.parser import parse
+from wepose_pin.commands.command_line import COMMANDS, parse
 from wepose_pin.writers import write_session
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -103,7 +102,8 @@ def test_commands_of_a_page_are_understood(page: str) -> None:
     for name, *words in wepose_calls(page):
         if not name.startswith("-") and not toys & set(words) and "--help" not in words:
             assert name in COMMANDS
-            parse(name, find_command(name), words)
+            if not re.search(r"humanSubject01|corner|xarm7|arm\.toml", " ".join(words)):  # the reader's files
+                parse([name, *words])
 
 
 def test_toml_of_pages_is_toml() -> None:
@@ -138,7 +138,7 @@ def workplace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     bin_ = folder / "bin"
     bin_.mkdir()
     script = bin_ / "wepose"
-    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -c "from wepose_pin.cli import main; main()" "$@"\n')
+    script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -c "from wepose_pin.commands import main; main()" "$@"\n')
     script.chmod(0o755)
     for line in (
         "wepose calibrate session.toml --measured biacromial=0.41 --stature 1.78 --sex f -o anna",

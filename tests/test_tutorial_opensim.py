@@ -43,7 +43,7 @@ def test_the_tutorial_runs_as_it_stands(data: Path, tmp_path: Path) -> None:
         pytest.skip("OpenSim's Python package, or ezc3d, is not installed")
     (tmp_path / "bin").mkdir()
     wepose = tmp_path / "bin" / "wepose"
-    wepose.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m wepose_pin.cli "$@"\n')
+    wepose.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m wepose_pin "$@"\n')
     wepose.chmod(0o755)
     shutil.copyfile(data / "osim" / "Rajagopal_2015.osim", tmp_path / "Rajagopal_2015.osim")  # what the page asks for
     run(["wepose", "simulate", "-o", "bin/recorded", "--seed", "1"], tmp_path)

@@ -161,7 +161,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "open_loop": (*FLAG, None),
         "causal": (*FLAG, None),
         "limits": (*FLAG, None),
-        "force": (*FLAG, None),
+        "accept_failed": (*FLAG, None),
     },
     "calibrate": {
         "recording": (*THING, None),

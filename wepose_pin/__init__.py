@@ -27,11 +27,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what editors and type checkers see
     from .angles import joint_angles as joint_angles
-    from .api import TrackResult as TrackResult
-    from .api import load_result as load_result
-    from .api import track as track
     from .calibration import Calibration as Calibration
     from .calibration import calibrate as calibrate
+    from .commands.results import TrackResult as TrackResult
+    from .commands.results import load_result as load_result
+    from .commands.results import track as track
     from .errors import WeposeError as WeposeError
     from .errors import WeposeWarning as WeposeWarning
     from .evaluation import evaluate as evaluate
@@ -59,7 +59,7 @@ _WHERE = {
     "Recording": "recording",
     "StaticTest": "filters.static",
     "Subject": "subject",
-    "TrackResult": "api",
+    "TrackResult": "commands.results",
     "WeposeError": "errors",
     "WeposeWarning": "errors",
     "calibrate": "calibration",
@@ -68,13 +68,13 @@ _WHERE = {
     "export": "writers.export",
     "joint_angles": "angles",
     "load_model": "model",
-    "load_result": "api",
+    "load_result": "commands.results",
     "load_session": "readers",
     "load_subject": "subject",
     "population_subject": "subject",
     "retarget": "retargeting",
     "simulate": "simulation",
-    "track": "api",
+    "track": "commands.results",
 }
 __all__ = ["__version__", *sorted(_WHERE)]
 __version__ = "0.1.0"

@@ -1,5 +1,6 @@
 """`python -m wepose_pin`: the command ``wepose``."""
 
-from .cli import main
+from .commands import main
 
-main()
+if __name__ == "__main__":
+    main()

@@ -211,7 +211,7 @@ def solve_by_loop() -> None:
 
 def run(argv: list[str]) -> Outcome:
     """Run a command in this process."""
-    from wepose_pin.cli import main
+    from wepose_pin.commands import main
 
     out, err, code = io.StringIO(), io.StringIO(), 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

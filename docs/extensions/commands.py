@@ -9,7 +9,8 @@ from pathlib import Path
 
 from sphinx.application import Sphinx
 
-from wepose_pin.cli import COMMANDS, main
+from wepose_pin.commands import main
+from wepose_pin.commands.command_line import COMMANDS
 
 HEAD = """# Commands
 

@@ -244,11 +244,11 @@ def run(argv: list[str], as_process: bool = False) -> Outcome:
     begin = time.perf_counter()
     if as_process:
         done = subprocess.run(
-            [sys.executable, "-m", "wepose_pin.cli", *argv], capture_output=True, text=True, errors="replace"
+            [sys.executable, "-m", "wepose_pin", *argv], capture_output=True, text=True, errors="replace"
         )
         failed = done.stderr if "Traceback (most recent call last)" in done.stderr else ""
         return Outcome(argv, done.returncode, done.stdout, done.stderr, time.perf_counter() - begin, failed)
-    from wepose_pin.cli import main
+    from wepose_pin.commands import main
 
     out, err, code, failed = io.StringIO(), io.StringIO(), 0, ""
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), python_warnings.catch_warnings():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -9,31 +10,25 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..commands.command_line import APP, parse
 from ..documents import TomlTable, read_toml
 from ..errors import BadData, BadPlan, BadSession, WeposeError, WrongOption, one_of
-from ..jobs.calibrate import CalibrateJob
-from ..jobs.evaluate import EvaluateJob
-from ..jobs.export import ExportJob
-from ..jobs.fields import build_job, field_types
-from ..jobs.retarget import RetargetJob
-from ..jobs.track import TrackJob
 from ..model import load_table
 from ..model.anthropometry import check_stature
 from ..readers.tables import read_table
 from .storage import find_urls, is_remote
 
-# Step → the job of the command of the same name, whose options it has; in the order in which they run.
-STEPS: dict[str, type] = {
-    "calibrate": CalibrateJob,
-    "track": TrackJob,
-    "retarget": RetargetJob,
-    "export": ExportJob,
-    "evaluate": EvaluateJob,
+# Step → what its command takes by position; in the order in which they run.
+STEPS = {
+    "calibrate": ("session",),
+    "track": ("session",),
+    "retarget": ("result",),
+    "export": ("result",),
+    "evaluate": ("result", "truth"),
 }
-_PATHS = ("session", "out", "result", "truth")
 _PERSON = ("stature", "sex", "measured")
 # Follow from an item's session and subject, or are not of one session.
-_ITEM_OPTIONS = ("subject", "further", "episodes", "instruction", *_PERSON, "force")
+_ITEM_OPTIONS = ("out", "subject", "further", "format", "episodes", "instruction", *_PERSON, "force")
 _REMOVED = {"name": "was for the page of a study, which is gone; remove it"}
 _MEASURED = "measured."  # begins the columns of a table that are measured lengths
 _LONGEST_NAME = 100  # letters of an item's folder
@@ -120,10 +115,20 @@ def _read_plan(path: Path, items_folder: str) -> Plan:
 # Steps ---------------------------------------------------------------------------------------------------------------
 
 
-def step_options(step: str) -> tuple[str, ...]:
-    """The options of a step in a plan: those of its command, but for what follows from the item."""
-    names = ("formats" if name == "format" else name for name in field_types(STEPS[step]))
-    return tuple(name for name in names if name not in (*_PATHS, *_ITEM_OPTIONS))
+def write_words(step: str, places: Sequence[str], options: Mapping[str, Any]) -> list[str]:
+    """The command line of a step: places by position, options as TOML or JSON have them."""
+    words = [step, *places]
+    for name, value in options.items():
+        switch = f"--{name.replace('_', '-')}"
+        if isinstance(value, bool):
+            words.append(switch if value else f"--no-{switch[2:]}")
+        elif isinstance(value, Mapping):
+            words += [f"{switch}={key}={entry}" for key, entry in value.items()]
+        elif isinstance(value, list):
+            words += [switch, *map(str, value)]
+        else:
+            words.append(f"{switch}={value}")
+    return words
 
 
 def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
@@ -132,17 +137,19 @@ def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
     steps: dict[str, dict[str, Any]] = {}
     for step in [step for step in STEPS if step in table]:
         keys = table.table(step)
-        keys.allow(*step_options(step))
         steps[step] = {name: _resolve_option(value, path) for name, value in keys.values.items()}
         if step not in ("calibrate", "track") and "track" not in steps:
             raise BadPlan(f"{keys.where}: needs the step [steps.track], which is missing")
+        command = APP[step].default_command
+        assert command is not None
+        known = inspect.signature(command).parameters
+        keys.allow(*(name for name in known if name not in (*STEPS[step], *_ITEM_OPTIONS)), "formats")
         if step == "export":
             _check_formats(keys)
-        values = {name: value for name, value in steps[step].items() if name != "formats"}
-        values |= {name: name for name in _PATHS if name in field_types(STEPS[step])}
+        options = {name: value for name, value in steps[step].items() if name != "formats"}
+        options |= {} if step == "evaluate" else {"out": "OUT"}
         try:
-            job: Any = build_job(STEPS[step], values)
-            job.check()
+            parse(write_words(step, STEPS[step], options))
         except BadSession:
             raise
         except WrongOption as error:

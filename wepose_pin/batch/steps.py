@@ -1,22 +1,20 @@
-"""Steps of an item: each runs the job of the command of its name and gives columns of the table."""
+"""Steps of an item: each runs the command of its name and gives columns of the table."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..jobs.calibrate import CalibrateJob, run_calibrate
-from ..jobs.evaluate import EvaluateJob, run_evaluate
-from ..jobs.export import ExportJob, run_export
-from ..jobs.fields import build_job
-from ..jobs.retarget import RetargetJob, run_retarget
-from ..jobs.track import TrackJob, run_track
+from ..commands.command_line import parse
 from ..writers.result import as_json
-from .plan import Item
+from .plan import STEPS, Item, write_words
 
 Row = dict[str, Any]
 _WITH_MODEL = ("sto", "scale")  # formats that take OpenSim's model
@@ -33,58 +31,62 @@ def run_steps(item: Item, session: Path, subject: Path | None, folder: Path) -> 
         What the recording, the subject or an option lacks.
     """
     row: Row = {}
+    places = {"session": str(session), "result": str(folder / "track"), "truth": str(session)}
     for step, options in item.steps.items():
-        values = {**options, "out": folder / step, "result": folder / "track"}
+        out = folder / step
+        given = [places[name] for name in STEPS[step]]
         if step == "calibrate":
-            row |= _calibrate({**options, **item.person, "session": session, "out": folder / step})
-            subject = folder / step
+            row |= _describe_calibration(_run(step, given, {**options, **item.person, "out": out}).calibration)
+            subject = out
         elif step == "track":
-            row |= _track({**options, "session": session, "subject": subject, "out": folder / step})
+            known = {} if subject is None else {"subject": subject}
+            tracked = _run(step, given, {**options, **known, "out": out})
+            row |= {name: tracked.summary[name] for name in ("samples", "rate_hz", "duration_s")}
+            row["diagnostics"] = len(tracked.summary["diagnostics"]) + len(tracked.page_failures)
         elif step == "retarget":
-            outcome = run_retarget(build_job(RetargetJob, values))
-            row["trajectory_within_limits"] = outcome.summary["within_limits"]
-            row["trajectory_self_collisions"] = outcome.summary["self_collisions"]["samples"]
+            summary = _run(step, given, {**options, "out": out}).summary
+            row["trajectory_within_limits"] = summary["within_limits"]
+            row["trajectory_self_collisions"] = summary["self_collisions"]["samples"]
         elif step == "export":
-            row["export_diagnostics"] = _export(values)
+            row["export_diagnostics"] = _export(given, options, out)
         else:
-            row |= _evaluate({**options, "result": folder / "track", "truth": session}, folder / step)
+            row |= _evaluate(given, options, out)
     return row
 
 
-def _calibrate(values: Row) -> Row:
-    outcome = run_calibrate(build_job(CalibrateJob, values))
-    subject = outcome.calibration.subject
-    row = {"quality": outcome.quality.quality, "gap_mm": _finite(1e3 * outcome.calibration.rms_gap)}
+def _run(step: str, places: list[str], options: Mapping[str, Any]) -> Any:
+    """What the command of a step returns; what it prints is dropped."""
+    command, bound = parse(write_words(step, places, options))
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        return command(*bound.args, **bound.kwargs)
+
+
+def _describe_calibration(calibration: Any) -> Row:
+    subject = calibration.subject
+    row = {"quality": calibration.quality.quality, "gap_mm": _finite(1e3 * calibration.rms_gap)}
     for name, value in subject.lengths.items():
         row |= {f"{name}_mm": 1e3 * value, f"{name}_std_mm": _finite(1e3 * subject.std(name))}
     return row
 
 
-def _track(values: Row) -> Row:
-    outcome = run_track(build_job(TrackJob, values))
-    row = {name: outcome.summary[name] for name in ("samples", "rate_hz", "duration_s")}
-    return row | {"diagnostics": len(outcome.summary["diagnostics"]) + len(outcome.page_failures)}
-
-
-def _export(values: Row) -> int:
+def _export(places: list[str], options: Mapping[str, Any], folder: Path) -> int:
     """Write all formats; the number of their diagnostics."""
     from ..writers.export import SUFFIXES, WITHOUT_MOTION
 
-    folder = values["out"]
     folder.mkdir()
     count = 0
-    for format in values.pop("formats"):
+    for format in options["formats"]:
         file = folder / (f"{format}{SUFFIXES[format]}" if format in SUFFIXES else f"motion.{format}")
         # What is given for another of the formats is left out.
-        others = {"names": format != "mot", "osim_model": format not in _WITH_MODEL}
+        others = {"formats": True, "names": format != "mot", "osim_model": format not in _WITH_MODEL}
         others["rate_hz"] = format in WITHOUT_MOTION
-        own = {name: value for name, value in values.items() if not others.get(name)}
-        count += len(run_export(build_job(ExportJob, own | {"out": file, "format": format})).diagnostics)
+        own = {name: value for name, value in options.items() if not others.get(name)}
+        count += len(_run("export", places, own | {"out": file, "format": format}).diagnostics)
     return count
 
 
-def _evaluate(values: Row, out: Path) -> Row:
-    errors = run_evaluate(build_job(EvaluateJob, values))
+def _evaluate(places: list[str], options: Mapping[str, Any], out: Path) -> Row:
+    errors = _run("evaluate", places, options)
     out.mkdir()
     text = json.dumps(as_json(asdict(errors)), indent=2)
     (out / "errors.json").write_text(text + "\n", encoding="utf-8")

@@ -11,15 +11,15 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import polars as pl
 
 from ..errors import BadOption, LostWorker, how_to_install
 from ..filters.base import count_processors
-from ..jobs.batch import BatchJob
 from ..writers.provenance import code
 from .items import DONE, build_failed_row, run_item
 from .plan import Item, Plan, read_plan
@@ -38,29 +38,44 @@ ItemProgress = Callable[[int, int, int], None]
 
 
 class Study(NamedTuple):
-    """Outcome of a plan."""
+    """What came of a plan."""
 
     plan: Plan
     table: pl.DataFrame  # a row an item, in the order of the plan
     reused: int  # items that were done before
 
+    @property
+    def exit_code(self) -> int:
+        return 3 if (self.table["status"] != DONE).any() else 0
 
-def run_batch(job: BatchJob, progress: ItemProgress = lambda *_: None) -> Study:
+
+def run_batch(
+    plan_file: Path,
+    out: str,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    force: bool = False,
+    progress: ItemProgress = lambda *_: None,
+) -> Study:
     """Run all items of a plan and write ``results.parquet``, in a folder or below a URL.
 
-    Items that were done before are reused where nothing has changed.
+    Items that were done before are reused where nothing has changed. Options as those of `batch`.
 
     Raises
     ------
     WeposeError
         Of the plan or the place. The errors of an item are in its row.
     """
-    job.check()
-    out = job.out.rstrip("/")
+    if workers is not None and (workers < 1 or scheduler is not None):
+        why = "they run at the scheduler, which knows how many" if scheduler else "at least 1"
+        raise BadOption(f"--workers {workers}: {why}")
+    out = out.rstrip("/")
     place = f"{out}/items" if is_remote(out) else str(Path(out).absolute() / "items")
-    plan = read_plan(job.plan, place)
+    plan = read_plan(plan_file, place)
+    run = _run_here if scheduler is None else _run_on_scheduler
     with open_study(out):
-        rows = _run_items(plan, place, job, progress)
+        rows = _run_items(plan, partial(run, place=place, force=force, where=scheduler or workers), progress)
         table = build_table([rows[item.name] for item in plan.all_items])
         content = io.BytesIO()
         table.write_parquet(content)
@@ -68,32 +83,31 @@ def run_batch(job: BatchJob, progress: ItemProgress = lambda *_: None) -> Study:
     return Study(plan, table, sum(bool(row.get("reused")) and row["status"] == DONE for row in rows.values()))
 
 
-def _run_items(plan: Plan, place: str, job: BatchJob, progress: ItemProgress) -> dict[str, Row]:
+def _run_items(plan: Plan, run: Callable[[Sequence[Item]], Generator[Row]], progress: ItemProgress) -> dict[str, Row]:
     """Item → its row; calibrations of subjects first, since sessions need them."""
     rows: dict[str, Row] = {}
     total = len(plan.all_items)
     progress(0, 0, total)
-    run = _run_on_scheduler if job.scheduler is not None else _run_here
     for items in (plan.calibrations, plan.items):
-        with contextlib.closing(run(items, place, job)) as done:
+        with contextlib.closing(run(items)) as done:
             for row in done:
                 rows[row["item"]] = row
                 progress(len(rows), sum(each["status"] != DONE for each in rows.values()), total)
     return rows
 
 
-def _run_here(items: Sequence[Item], place: str, job: BatchJob) -> Generator[Row]:
+def _run_here(items: Sequence[Item], place: str, force: bool, where: Any) -> Generator[Row]:
     """Rows of the items, in the order in which they are done, from processes of this machine.
 
     A process that dies takes those beside it along: their items fail, and the others go on in new processes.
     """
-    todo, count = deque(items), min(job.workers or count_processors(), max(len(items), 1))
+    todo, count = deque(items), min(where or count_processors(), max(len(items), 1))
     before = set(active_children())
     with _one_thread():
         while todo:
             pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_prepare_process)
             try:
-                yield from _run_in_turn(pool, todo, count, place, job)
+                yield from _run_in_turn(pool, todo, count, place, force)
             except BrokenProcessPool:
                 continue
             finally:
@@ -102,7 +116,7 @@ def _run_here(items: Sequence[Item], place: str, job: BatchJob) -> Generator[Row
                     process.terminate()
 
 
-def _run_on_scheduler(items: Sequence[Item], place: str, job: BatchJob) -> Generator[Row]:
+def _run_on_scheduler(items: Sequence[Item], place: str, force: bool, where: Any) -> Generator[Row]:
     """The same by the workers of a running Dask scheduler; `LostWorker` where it goes meanwhile."""
     try:
         from distributed import Client
@@ -110,20 +124,18 @@ def _run_on_scheduler(items: Sequence[Item], place: str, job: BatchJob) -> Gener
         remedy = how_to_install("dask", "distributed")
         raise BadOption(f"wepose batch --scheduler: {error}: {remedy}") from None
     try:
-        client = Client(job.scheduler, timeout=CONNECT_S)
+        client = Client(where, timeout=CONNECT_S)
     except (OSError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
-        raise BadOption(f"--scheduler {job.scheduler}: no scheduler there, as in tcp://HOST:8786: {reason}") from None
+        raise BadOption(f"--scheduler {where}: no scheduler there, as in tcp://HOST:8786: {reason}") from None
     with client, client.get_executor(pure=False) as executor:
         try:
-            yield from _run_in_turn(executor, deque(items), len(items), place, job)
+            yield from _run_in_turn(executor, deque(items), len(items), place, force)
         except CancelledError:
-            raise LostWorker(
-                f"{job.scheduler}: the scheduler is gone; the same command goes on where it stopped"
-            ) from None
+            raise LostWorker(f"{where}: the scheduler is gone; the same command goes on where it stopped") from None
 
 
-def _run_in_turn(executor: Executor, todo: deque[Item], most: int, place: str, job: BatchJob) -> Iterator[Row]:
+def _run_in_turn(executor: Executor, todo: deque[Item], most: int, place: str, force: bool) -> Iterator[Row]:
     """Rows of the items, at most so many at a time; those whose process died are `LostWorker`.
 
     Processes that die end it with `BrokenProcessPool`; `todo` has the items that were not begun.
@@ -133,7 +145,7 @@ def _run_in_turn(executor: Executor, todo: deque[Item], most: int, place: str, j
     while running or (todo and broken is None):
         while todo and len(running) < most and broken is None:
             try:
-                running[executor.submit(run_item, todo[0], place, job.force, code()["code"])] = todo[0]
+                running[executor.submit(run_item, todo[0], place, force, code()["code"])] = todo[0]
                 todo.popleft()
             except BrokenProcessPool as died:
                 broken = died

@@ -9,13 +9,17 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
+from ..documents import TomlTable, read_toml
+from ..errors import BadOption, WrongOption
 from ..model import BodyModel, BodyTable, load_table
-from ..retargeting import Robot
+from ..retargeting import LimitMargins, Robot, find_map, load_robot
+from ..retargeting.maps import list_sides
 from ..retargeting.stream import ArmObserver, Command, CommandStream, StreamOptions, check_segments
 from ..subject import population_subject
 from .loop import Latencies
@@ -90,7 +94,7 @@ class RobotOutput(Output):
         table: BodyTable | None = None,
     ) -> None:
         self.stream, self.robot = stream, stream.robot
-        self._sender = UdpSender(to, "--to", PORT)
+        self._sender = UdpSender(to, "to =", PORT)
         self._lengths_cov, self._table, self._by_ticks = lengths_cov, table, math.isinf(speed)
         self._speed = 1.0 if self._by_ticks else speed
         self._observer: ArmObserver | None = None
@@ -282,6 +286,39 @@ class RobotOptions:
     robot: Robot
     to: str = str(PORT)
     stream: StreamOptions = field(default_factory=StreamOptions)
+
+
+ROBOT_KEYS = ("robot", "arm", "to", "rate_hz", "hold_after", "stop_after", "speed_scale", "limit_margin")
+
+
+def read_robot(name: str) -> RobotOptions:
+    """The robot that ``--robot`` names, and how it follows.
+
+    Parameters
+    ----------
+    name : as of `find_map`, or a TOML file whose key `robot` is such a name and whose other `ROBOT_KEYS` say the rest
+
+    Raises
+    ------
+    WeposeError
+        No such robot, or a key or value that is not possible.
+    """
+    file = Path(name)
+    values = read_toml(file, "a robot", BadOption) if file.suffix == ".toml" and file.is_file() else {}
+    if "robot" not in values:
+        return RobotOptions(load_robot(find_map(name)))
+    keys = TomlTable(values, name, error=BadOption)
+    keys.allow(*ROBOT_KEYS)
+    robot = str(keys.text("robot", None))
+    beside = file.parent / robot
+    given = {key: float(keys.number(key, None) or 0.0) for key in ROBOT_KEYS[3:] if key in keys}
+    timing = {key: given.pop(key) for key in ("rate_hz", "hold_after", "stop_after") if key in given}
+    sides = list_sides(keys.choice("arm", ("left", "right", "both"))) if "arm" in keys else None
+    try:
+        chosen = load_robot(find_map(str(beside) if beside.is_file() else robot), sides, LimitMargins(**given))
+        return RobotOptions(chosen, str(values.get("to", PORT)), StreamOptions(**timing))
+    except WrongOption as error:
+        raise BadOption(f"{name}: {error.name.replace('-', '_')} = {error.value}: {error.needed}") from None
 
 
 def connect_robot(

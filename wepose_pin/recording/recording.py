@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arguments import Positive, check_array, check_fields, check_finite, check_unit, format_object
+from ..arguments import Positive, check_array, check_fields, check_finite, check_unit, check_value, format_object
 from ..diagnostics import Diagnostic, notebook_html
+from ..documents import TomlTable
 from ..errors import BadData, BadOption, BadPhase, one_of
 from .intervals import Intervals, check_phases, check_time
 from .limits import MEDIAN_FORCE
-from .sensors import ImuSensor, OrientationSensor, Sensor, join_sensors
+from .sensors import ImuSensor, OrientationSensor, Sensor, compute_mount, join_sensors, read_axes
 
 # A start pose whose joints the session states.
 CONFIGURATION = "configuration"
@@ -92,6 +93,62 @@ class Recording:
             for segment, sensor in self.sensors.items()
         )
         return notebook_html(self, self.diagnostics, [f"<table>{rows}</table>"])
+
+    @classmethod
+    def from_arrays(
+        cls,
+        rate_hz: float,
+        *,
+        name: str = "recording",
+        phases: Mapping[str, Intervals] | None = None,
+        mounts: Mapping[str, tuple[str, str]] | None = None,
+        **sensors: tuple[np.ndarray, np.ndarray] | np.ndarray,
+    ) -> Recording:
+        """Make a recording of samples at an even rate, the first of them at 0 s, and check it.
+
+        Parameters
+        ----------
+        rate_hz : float
+            Samples a second.
+        name : str
+            Of the recording.
+        phases : mapping, optional
+            Name → intervals [s]; without `start` the start pose is found in the motion.
+        mounts : mapping, optional
+            Segment → axes of its sensor that point up and forwards in the N-pose, such as ("+z", "+x"); not needed with
+            the subject of a calibration.
+        **sensors
+            Segment → (gyro_S, accel_S), (n, 3) [rad/s] and (n, 3) [m/s²], or quat_WS, (n, 4) xyzw.
+
+        Raises
+        ------
+        WeposeError
+            As `check`; a sensor that is neither.
+
+        Examples
+        --------
+        >>> torso = recording.sensors["torso"]
+        >>> mine = wp.Recording.from_arrays(100.0, torso=(torso.gyro_S, torso.accel_S), mounts={"torso": ("+z", "+x")})
+        >>> mine.sensors
+        {'torso': ImuSensor(2250 samples)}
+        """
+        check_value("rate_hz", rate_hz, Positive)
+        built: dict[str, Sensor] = {}
+        for segment, values in sensors.items():
+            mount = None
+            if mounts and segment in mounts:
+                axes = dict(zip(("up", "forward"), mounts[segment], strict=False))
+                mount = compute_mount(*read_axes(TomlTable(axes, "mounts", f"{segment}.", BadOption)))
+            if isinstance(values, np.ndarray):
+                built[segment] = OrientationSensor(values, mount)
+            elif isinstance(values, tuple) and len(values) == 2:
+                built[segment] = ImuSensor(*values, mount)
+            else:
+                raise BadData(f"{segment}: gyro_S and accel_S, (n, 3) each, or quat_WS, (n, 4), are needed")
+        first = next(iter(sensors.values()), ())
+        count = len(first[0] if isinstance(first, tuple) and first else first)
+        time = np.arange(count) / rate_hz
+        return cls(name, time, rate_hz, built, phases or {}).check()
 
     def check(self) -> Recording:
         """Check a recording that was built in code, and return it.

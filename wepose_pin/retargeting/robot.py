@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
-from ..errors import BadModel, BadOption, WrongOption, native_stderr_muted, one_of
+from ..errors import BadModel, WrongOption, native_stderr_muted, one_of
 from ..model.meshes import package_folders
 from .limits import JointLimit
 from .maps import AXES, ArmMap, LinkPoint, RobotMap
@@ -130,7 +130,7 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
 
     Raises
     ------
-    MissingFile, BadModel, BadOption
+    MissingFile, BadModel, WrongOption
         A file, link or joint that does not exist; a joint without limits, or with a range that the margins use up; an
         arm that the robot does not have.
     """
@@ -138,7 +138,7 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
     margins.check()
     for side in sides or ():
         if side not in robot.arms:
-            raise BadOption(f"--arm {side}: {robot.name} has no {side} arm; {one_of(robot.arms)}")
+            raise WrongOption("arm", side, f"{robot.name} has no {side} arm; {one_of(robot.arms)}")
     maps = {side: arm for side, arm in robot.arms.items() if sides is None or side in sides}
     limits = robot.read_joint_limits()
     try:

@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from ..errors import BadData, BadOption
+from ..errors import BadData, WrongOption
 from ..model import BodyTable, load_table
 from .collision import CollisionModel
 from .controller import HandTarget, JointState, QpController
@@ -278,7 +278,7 @@ def check_segments(robot: Robot, segments: Sequence[str], table: BodyTable | Non
         if missing:
             raise BadData(
                 f"--robot {robot.map.name}: no sensor on {', '.join(missing)}, which its {arm.side} arm follows; "
-                "--arm names the other"
+                "arm names the other"
             )
 
 
@@ -294,7 +294,7 @@ class StreamOptions:
 
     Raises
     ------
-    BadOption
+    WrongOption
         A value out of range.
     """
 
@@ -305,11 +305,10 @@ class StreamOptions:
 
     def __post_init__(self) -> None:
         if not 10.0 <= self.rate_hz <= 1000.0:
-            raise BadOption(f"--robot-hz {self.rate_hz:g}: from 10 to 1000 commands a second")
+            raise WrongOption("rate-hz", f"{self.rate_hz:g}", "from 10 to 1000 commands a second")
         if not 0.0 < self.hold_after < self.stop_after < np.inf:
-            raise BadOption(
-                f"--hold-after {self.hold_after:g}, --stop-after {self.stop_after:g}: seconds, the second longer"
-            )
+            needed = f"seconds, above 0 and less than stop_after = {self.stop_after:g}"
+            raise WrongOption("hold-after", f"{self.hold_after:g}", needed)
 
 
 class CommandStream:

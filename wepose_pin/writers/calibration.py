@@ -12,18 +12,16 @@ import numpy as np
 from ..calibration import Calibration, CalibrationQuality
 from ..calibration.quality import find_open_intervals
 from ..diagnostics import as_json as diagnostic_as_json
-from .result import as_json, versions
+from .result import as_json, versions, write_subject
 
 MOST_POINTS = 600  # of the residual over time
 
 
-def write_calibration(
-    folder: Path, calibration: Calibration, quality: CalibrationQuality, provenance: Mapping[str, Any] | None = None
-) -> None:
-    """Write ``calibration.json`` into an existing folder; `provenance` becomes part of it."""
-    content = as_json(_document(calibration, quality)) | {"versions": versions()}
-    if provenance is not None:
-        content["provenance"] = dict(provenance)
+def write_calibration(folder: Path, calibration: Calibration, provenance: Mapping[str, Any]) -> None:
+    """Write the subject and ``calibration.json``, with the provenance, into an existing folder."""
+    write_subject(folder, calibration.subject, calibration.subject.shape(calibration.problem.model))
+    content = as_json(_document(calibration, calibration.quality)) | {"versions": versions()}
+    content["provenance"] = dict(provenance)
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
 

@@ -1,8 +1,4 @@
-"""From a recording to a result that prints, draws, shows and saves itself.
-
-`wepose_pin.track` and `wepose_pin.load_result` are here; both give a `TrackResult`. This room is above all others: a
-result can be written and drawn.
-"""
+"""From a recording to a result that prints, draws, shows and saves itself: `wepose_pin.track` and `load_result`."""
 
 from __future__ import annotations
 
@@ -14,28 +10,28 @@ from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
-from . import tracking
-from .arguments import check_arguments, check_value
-from .diagnostics import WARNING, Diagnostic, from_json, notebook_html
-from .errors import BadData, WeposeError, how_to_install
-from .filters import BEST
-from .filters.static import StaticTest
-from .kinematics import PosedBody, build_pose_table
-from .model import BodyModel
-from .recording import Intervals, Mark, Recording
-from .subject import Subject, load_subject
-from .tracking import TrackedRecording
-from .writers import read_result, write_result
-from .writers.folder import result_folder
-from .writers.provenance import CALL, collect_provenance
-from .writers.result import read_marks
+from .. import tracking
+from ..arguments import check_arguments, check_value
+from ..diagnostics import WARNING, Diagnostic, from_json, notebook_html
+from ..errors import BadData, WeposeError, how_to_install
+from ..filters import BEST
+from ..filters.static import StaticTest
+from ..kinematics import PosedBody, build_pose_table
+from ..model import BodyModel
+from ..recording import Intervals, Mark, Recording
+from ..subject import Subject, load_subject
+from ..tracking import TrackedRecording
+from ..writers import read_result, write_result
+from ..writers.folder import result_folder
+from ..writers.provenance import CALL, collect_provenance
+from ..writers.result import read_marks
 
 if TYPE_CHECKING:
     import pandas
 
-    from .calibration import Calibration
-    from .report.figures import Figures
-    from .report.notebook import ViewPage
+    from ..calibration import Calibration
+    from ..report.figures import Figures
+    from ..report.notebook import ViewPage
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,7 +121,7 @@ class TrackResult(PosedBody):
         >>> figures["angles"].set_size_inches(7.0, 4.0)
         >>> figures["angles"].savefig("angles.pdf")
         """
-        from .report.notebook import draw_figures
+        from ..report.notebook import draw_figures
 
         return draw_figures(self)
 
@@ -148,8 +144,8 @@ class TrackResult(PosedBody):
         >>> page.save("view.html")
         PosixPath('view.html')
         """
-        from .report.notebook import ViewPage, runs_in_notebook
-        from .report.viewer import pose_html
+        from ..report.notebook import ViewPage, runs_in_notebook
+        from ..report.viewer import pose_html
 
         page = ViewPage(self.name, pose_html(self.model, self.pose, phases=self.phases, title=self.name))
         if open and not runs_in_notebook():
@@ -191,7 +187,7 @@ class TrackResult(PosedBody):
                     if file.is_file():
                         shutil.copyfile(file, partial / file.name)
             return out
-        from .report import write_track_pages
+        from ..report import write_track_pages
 
         with result_folder(out, force) as partial:
             summary = tracking.summarize(self.source)
@@ -226,7 +222,7 @@ def track(
     open_loop: bool = False,
     causal: bool = False,
     limits: bool = True,
-    force: bool = False,
+    accept_failed: bool = False,
 ) -> TrackResult:
     """Estimate the pose of a body from a recording.
 
@@ -252,7 +248,7 @@ def track(
         Begin at the end of the start pose and use no later samples, as a live session does.
     limits : bool
         Keep joints of one axis, such as those of a mechanism, within the limits that the model states.
-    force : bool
+    accept_failed : bool
         Use the subject even if its calibration failed.
 
     Returns
@@ -276,8 +272,8 @@ def track(
     True
     """
     person: Any = getattr(subject, "subject", subject)  # a calibration has one
-    check_value("force", force, bool)
-    if isinstance(person, Subject) and not force:
+    check_value("accept_failed", accept_failed, bool)
+    if isinstance(person, Subject) and not accept_failed:
         person.check_quality()
     tracked = tracking.track(
         recording,

@@ -5,13 +5,17 @@ from __future__ import annotations
 import contextlib
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..diagnostics import Diagnostic, lines
 from ..errors import printable
-from ..jobs import Progress
 from .stopping import check_stopped
+
+if TYPE_CHECKING:
+    from ..evaluation import PositionError
+    from ..subject import Subject
 
 WIDTH = 98  # columns of running text
 TABLE_WIDTH = 160  # rich would cut numbers off to fit a narrow terminal, which wraps by itself
@@ -40,6 +44,30 @@ def say_pages(folder: Path, pages: Mapping[str, str]) -> None:
             say(f"{title}:  {folder / name}")
 
 
+def print_lengths(
+    title: str,
+    subject: Subject,
+    prior: Subject,
+    measured: Collection[str],
+    truth: Mapping[str, float] | None = None,
+    prior_name: str = "population prior",
+) -> None:
+    """Each length with its standard deviation beside the prior's, and the truth where it is known."""
+    rows = []
+    for name, value in subject.lengths.items():
+        true = [] if truth is None else [f"{1e3 * truth[name]:.1f}"]
+        before = f"{1e3 * prior.lengths[name]:.1f} ± {1e3 * prior.std(name):.1f}"
+        cells = f"{1e3 * value:.1f}", f"± {1e3 * subject.std(name):.1f}", before
+        rows.append((name, *true, *cells, "measured" if name in measured else ""))
+    columns = [] if truth is None else ["true"]
+    print_table(title, ("length [mm]", *columns, "estimated", "std", prior_name, ""), rows)
+
+
+def mean_std(error: PositionError) -> str:
+    """``mean ± std`` [mm]."""
+    return f"{error.mean:.1f} ± {error.std:.1f}"
+
+
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """A table; the first column is text, the others numbers."""
     from rich import box
@@ -58,8 +86,11 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
 
 
 @contextlib.contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """A bar that shows what is being done and how much of it; none when not on a terminal. A signal ends the job."""
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
+    """A bar that shows the current step and the share of the work that is done; none when not on a terminal.
+
+    A signal ends the command.
+    """
     if not sys.stderr.isatty():
         yield lambda _text, _fraction: check_stopped()
         check_stopped()

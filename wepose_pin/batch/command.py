@@ -1,0 +1,72 @@
+"""``wepose batch``: a plan over many recordings."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from ..commands.options import Number
+from ..commands.output import print_table, progress_bar, say
+
+
+def batch(
+    plan: Path,
+    /,
+    *,
+    out: Annotated[str, Parameter(alias="-o", metavar="DIR|URL")],
+    scheduler: Annotated[str | None, Parameter(metavar="ADDRESS")] = None,
+    workers: Number | None = None,
+    force: bool = False,
+) -> Any:  # a Study, whose modules load late
+    """Run the same steps on many recordings, on all processors of this machine or on a Dask cluster.
+
+    An item is one session of the plan with its steps. If it fails, the table has its error, and the others continue.
+    The same command continues a run that was stopped and repeats nothing that is done. Sessions and DIR may
+    lie on s3:// (docs/batch.md).
+
+    Exit code: 0 all items are done, 3 some are not; 2 invalid plan or folder, nothing is run.
+
+    Example: wepose batch plan.toml -o study
+
+    Parameters
+    ----------
+    plan
+        The plan, a TOML: the sessions, their subjects, and the steps calibrate, track, retarget, export, evaluate with
+        options.
+    out
+        Write items/, one folder per item, and results.parquet to this folder or below this URL.
+    scheduler
+        Use the workers of a running Dask scheduler, tcp://HOST:8786. Without it workers are started here.
+    workers
+        Start this number of workers here. Without it one per processor.
+    force
+        Run those items again whose inputs, options or package version have changed. Without it they are kept, with the
+        status "changed".
+    """
+    from .study import run_batch
+
+    try:
+        with progress_bar() as progress:
+
+            def show(done: int, failed: int, total: int) -> None:
+                text = f"{done} of {total} items" + (f", {failed} failed" if failed else "")
+                progress(text if done or not total else "starting workers", done / max(total, 1))
+
+            study = run_batch(plan, out, scheduler=scheduler, workers=workers, force=force, progress=show)
+    except KeyboardInterrupt:
+        print("wepose: stopped; what is done stays, and the same command goes on from there", file=sys.stderr)
+        raise SystemExit(130) from None
+    failed = study.table.filter(study.table["status"] != "done")
+    if failed.height:
+        causes = failed["error"].value_counts(sort=True).iter_rows()
+        print_table("Not done", ("cause", "items"), [(cause, str(count)) for cause, count in causes])
+        first = failed.unique("error", keep="first", maintain_order=True)
+        for item, message in first.select("item", "message").iter_rows():
+            say(f"  {item}: {message}")
+    reused = f", {study.reused} of them before" if study.reused else ""
+    say(f"{study.table.height - failed.height} of {study.table.height} items done{reused}")
+    say(f"Table: {out.rstrip('/')}/results.parquet")
+    return study

@@ -1,0 +1,194 @@
+"""``wepose angles``: joint angles of results as tables and figures for a paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from ..errors import BadOption, WrongOption
+from .options import MORE, Angle, Hz, Interval, Out, Phase
+from .output import print_diagnostics, print_table, progress_bar, say, say_pages
+
+if TYPE_CHECKING:
+    from ..angles.movement import Movement, MovementOptions
+
+PAGE = "angles.html"
+DECIMALS = 4  # of tables; degrees and seconds
+
+
+def angles(
+    result: Path,
+    /,
+    *further: Path,
+    out: Out,
+    interval: Interval | None = None,
+    phase: Phase | None = None,
+    low_pass_hz: Hz | None = None,
+    force: bool = False,
+    repetitions: Annotated[Phase | None, MORE] = None,
+    main_angle: Annotated[Angle | None, MORE] = None,
+    cycles: Annotated[bool, MORE] = False,
+    shoulder: Annotated[Literal["YXY", "XZY", "ZXY"], MORE] = "YXY",
+) -> None:
+    """Write the joint angles of results as tables and figures for a paper.
+
+    Angles are those of the International Society of Biomechanics (docs/angles.md). Repetitions of the movement are
+    found by the angle of the largest range, or taken from a phase of the recording, and normalised in time, 0 to 100 %.
+    Several results are compared with the first one, for example of the same person before and after a treatment.
+
+    Example: wepose angles before after -o angles --low-pass-hz 6
+
+    Parameters
+    ----------
+    result
+        Folder that `wepose track` wrote.
+    further
+        Further results, each compared with the first one.
+    out
+        Write to this folder: repetitions.csv (lowest, highest, range, peak rate of each angle in each repetition),
+        phases.csv (the same in the whole time and in each phase), summary.csv (mean and standard deviation over
+        repetitions), curves.csv (0 to 100 %), comparison.csv (of several results), sessions.csv, definitions.csv
+        (sequences and signs), the figures as .svg, and angles.html, which shows all of it.
+    interval
+        Use only this time of each recording, in seconds.
+    phase
+        Use only this phase of each recording. Of a phase with several intervals NAME:2 is the second.
+    low_pass_hz
+        Low-pass the orientations at this frequency (Butterworth, second order, forwards and backwards; half the
+        amplitude at HZ). Without it they are not filtered.
+    force
+        Replace the files of an earlier run in DIR.
+    repetitions
+        Take each interval of this phase as a repetition. Without it repetitions are found.
+    main_angle
+        Find repetitions by this angle, such as right_elbow_flexion. Without it by the angle of the largest range.
+    cycles
+        Let a repetition last until the next one begins, as a gait cycle does, and not only until the angle is back.
+    shoulder
+        Use this sequence for the shoulder: YXY (plane of elevation, elevation, internal rotation), XZY or ZXY (flexion
+        and adduction: no gimbal lock where the arm hangs).
+    """
+    options = dict(locals())
+    from polars import selectors
+
+    from ..angles import diagnose_lock
+    from ..angles import movement_tables as tables
+    from ..angles.movement import MovementOptions
+    from ..documents import whole_folder
+    from ..recording import check_selection
+    from ..report.angles import draw_figures, render_angles_page
+    from ..report.page import PageWriter
+    from ..writers.provenance import collect_provenance, write_provenance
+    from ..writers.tables import write_table_csv
+
+    check_selection(interval, phase)
+    finds = f"--main-angle {main_angle}" if main_angle is not None else "--cycles" if cycles else ""
+    if finds and repetitions is not None:
+        raise BadOption(f"{finds}: finds repetitions, and --repetitions {repetitions} marks them; leave one out")
+    with progress_bar() as progress:
+        with whole_folder(out, force) as folder:
+            chosen = MovementOptions(shoulder, low_pass_hz, repetitions, main_angle, None, cycles)
+            movements = _analyze((result, *further), chosen, interval, phase, progress)
+            progress("writing", 0.7)
+            builders = {
+                "sessions": tables.build_session_table,
+                "repetitions": tables.build_repetition_table,
+                "phases": tables.build_phase_table,
+                "summary": tables.build_summary_table,
+                "curves": tables.build_curve_table,
+                "comparison": tables.build_comparison_table,
+                "definitions": tables.build_definition_table,
+            }
+            for name, build in builders.items():
+                table = build(movements)
+                if len(table):
+                    write_table_csv(folder / f"{name}.csv", table.with_columns(selectors.float().round(DECIMALS)))
+            figures = draw_figures(movements)
+            for figure_name, figure in figures.items():
+                (folder / f"{figure_name}.svg").write_text(figure.svg(), encoding="utf-8")
+            files = sorted(path.name for path in folder.iterdir())
+            write_provenance(folder, collect_provenance("angles", options))
+        progress("making the page", 0.9)
+        writer = PageWriter(out, [PAGE])
+        writer.write(PAGE, lambda failures: render_angles_page(movements, figures, files, failures))
+    lock = {each.place: each for movement in movements for each in diagnose_lock(movement.angles)}
+    print_diagnostics([*lock.values(), *writer.diagnostics])
+    for movement in movements:
+        _print_repetitions(movement)
+    _print_ranges(movements)
+    filtered = "not low-passed" if low_pass_hz is None else f"low-passed at {low_pass_hz:g} Hz (half amplitude)"
+    say(f"Orientations {filtered}; shoulder {'-'.join(shoulder)}; ± between repetitions: one standard deviation")
+    say_pages(out, {"Page": PAGE})
+    say(f"Tables and figures: {out}")
+
+
+def _analyze(
+    folders: Sequence[Path],
+    options: MovementOptions,
+    interval: tuple[float, float] | None,
+    phase: str | None,
+    progress: Callable[[str, float], None],
+) -> list[Movement]:
+    """The movements of all results; by the angle, and in the direction, of the first one that has repetitions."""
+    from dataclasses import replace
+
+    from ..angles.movement import analyze_movement
+    from ..writers import read_result
+    from ..writers.result import read_phases
+
+    movements: list[Movement] = []
+    for k, folder in enumerate(folders):
+        progress("reading", 0.7 * k / len(folders))
+        pose, _, summary = read_result(folder, interval, phase)
+        name = str(summary.get("recording") or folder.name)
+        if name in [each.name for each in movements]:
+            name = f"{name} ({k + 1})"
+        try:
+            movement = analyze_movement(name, pose, read_phases(summary), options)
+        except WrongOption as error:
+            raise BadOption(f"{folder}: {error}" if len(folders) > 1 else str(error)) from None
+        found = movement.repetitions
+        if options.phase is None and len(found.spans):
+            options = replace(options, main_angle=found.source, rising=found.rising)
+        movements.append(movement)
+    return movements
+
+
+def _print_repetitions(movement: Movement) -> None:
+    repetitions = movement.repetitions
+    by = f" by {repetitions.source}" if repetitions.source else ""
+    if not len(repetitions.spans):
+        other = "take another angle with --main-angle, or mark them as a phase and name it with --repetitions"
+        say(f"{movement.name}: no repetitions{by}: {repetitions.reason}; {other}")
+        return
+    text = f"{movement.name}: {len(repetitions.spans)} repetitions{by}"
+    if repetitions.rising is not None:
+        text += f", {'rising' if repetitions.rising else 'falling'} first; CMC {repetitions.cmc:.2f}"
+    say(text + (f"; {repetitions.left_out} left out as unlike them, or in gaps" if repetitions.left_out else ""))
+
+
+def _print_ranges(movements: Sequence[Movement]) -> None:
+    import numpy as np
+
+    from ..angles.movement import compute_statistics
+
+    repeated = [movement for movement in movements if movement.curves]
+    rows = []
+    for joint in dict.fromkeys(joint for movement in repeated for joint in movement.curves):
+        for k in range(3):
+            cells, name = [], ""
+            for movement in repeated:
+                if joint not in movement.curves:
+                    cells.append("")
+                    continue
+                name = movement.angles[joint].names[k]
+                each = compute_statistics(
+                    movement.measures[joint].values[:, k, 2], movement.measures[joint].std[:, k, 2]
+                )
+                mean, sd = np.degrees(each.mean), np.degrees(each.sd)
+                cells.append(f"{mean:.1f} ± {sd:.1f}" if np.isfinite(sd) else "")
+            rows.append((f"{joint} {name}", *cells))
+    if rows:
+        names = [f"{movement.name}, n = {len(movement.repetitions.spans)}" for movement in repeated]
+        print_table("Range in a repetition [deg]: mean ± std", ("angle", *names), rows)

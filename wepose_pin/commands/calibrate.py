@@ -1,0 +1,217 @@
+"""``wepose calibrate``: a recording of a protocol → the subject's lengths and mounts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+
+from ..diagnostics import Diagnostic, lines
+from ..errors import WrongOption, one_of
+from .options import RESEARCH, Formulation, Measured, Method, Model, Out, ProtocolName, Stature, Subject
+from .output import print_diagnostics, print_lengths, print_table, progress_bar, say, say_indented, say_pages
+
+if TYPE_CHECKING:
+    from ..calibration import Calibration, CalibrationQuality, Protocol
+    from ..model import BodyModel
+    from ..subject import Subject as Person
+
+EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
+COLOURS = {"pass": "green", "poor": "yellow", "fail": "red"}
+GAPS = {
+    "coincide": "Gap between {}",
+    "fixed_point": "Gap from {} to its place",
+    "plane": "Height of {} off the plane",
+    "recorded": "Gap from {} to its recorded place",
+}
+
+
+class Calibrated(NamedTuple):
+    """What came of `calibrate`."""
+
+    calibration: Calibration
+    page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
+
+    @property
+    def exit_code(self) -> int:
+        return EXIT_CODES[self.calibration.quality.quality]
+
+
+def calibrate(
+    session: Path,
+    /,
+    *,
+    out: Out,
+    measured: Measured | None = None,
+    stature: Stature | None = None,
+    sex: Literal["f", "m"] | None = None,
+    protocol: ProtocolName | None = None,
+    model: Model | None = None,
+    prior: Subject | None = None,
+    gaps: bool = False,
+    report: bool = True,
+    force: bool = False,
+    method: Annotated[Method, RESEARCH] = "amekf",
+    formulation: Annotated[Formulation, RESEARCH] = "full",
+) -> Calibrated:
+    """Calibrate lengths and sensor mounts from a recording of a protocol, such as joined hands.
+
+    Joined hands determine the proportions of the arms and not their scale. Measure one length, such as the breadth of
+    the shoulders, and give it with --measured. Without one the scale is that of the population prior, and the output
+    says how uncertain it is.
+
+    Exit code: 0 quality pass, 3 poor, 4 fail, by the limits in docs/calibrate.md; the files are written in all three
+    cases; 2 invalid input, nothing is written.
+
+    Example: wepose calibrate session.toml --measured biacromial=0.41 --stature 1.78 --sex f -o anna
+
+    Parameters
+    ----------
+    session
+        The recording: session.toml, or the folder that holds it. It names the phases of the protocol, such as clasp, in
+        which the palms are held together.
+    out
+        Write subject.toml, subject.urdf, calibration.json (the quality and all numbers) and report.html to this folder.
+    measured
+        Use this measured length; may be given several times. biacromial=0.41 is the breadth over the acromions, the
+        bony edges on top of the shoulders, which a tape reaches: the distance of the shoulder joints is 0.83 ± 0.03 of
+        it. The other names are those of [lengths] in subject.toml, such as left_forearm: from joint centre to joint
+        centre.
+    stature
+        Narrow the population prior to people of this body height.
+    sex
+        Narrow the population prior to women or men.
+    protocol
+        Calibrate by this protocol. Without it clasp, and t_pose and bow as well where the session has those phases (not
+        with --formulation paper). Protocols:
+        clasp (hands together), t_pose (arms held sideways), bow (the trunk bends forwards), table (both palms on a
+        table), tip (of a robot's arm or another chain: its point "tip" on a fixed point), free (any motion, no
+        protocol: headings and mounts alone), or a file of your own, made like those in calibration/.
+        Several in one session are joined by +, as in clasp+t_pose.
+    model
+        Calibrate this body: a name (upper_body, whole_body), a table of a body (.toml), or a URDF beside its table
+        (docs/models.md). Without it the body that the session names, else upper_body.
+    prior
+        Use as the prior this subject.toml, or the one in this folder, of an earlier calibration of the same person:
+        lengths and shoulders with their covariance, so that each session adds to what is known. Its mounts are used
+        too, unless the sensors were taken off: a session with remounted = true uses none of them. Of an Xsens .mvnx
+        only the lengths are used.
+    gaps
+        Accept gaps of more than 50 ms and bridge them. Without it such a gap is an error.
+    report
+        Write report.html, which shows the quality and what to do about it, lengths, mounts and the gap between the
+        palms.
+    force
+        Replace the files of an earlier run in DIR.
+    method
+        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
+        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases, with an
+        exact covariance and two more conditions of the static test), smekf_published (the same as published), ncf
+        (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011).
+    formulation
+        Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
+        priors) or paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the
+        palms, with the mounts as the session states them and a measured length that fixes the scale).
+    """
+    options = dict(locals())
+    from .. import calibration as room
+    from ..calibration.protocols import choose_protocol
+    from ..model import list_breadths, load_model
+    from ..model.body import load_sensed_model
+    from ..readers import load_session
+    from ..readers.subject import read_subject
+    from ..report import write_calibration_page
+    from ..writers.calibration import write_calibration
+    from ..writers.folder import result_folder
+    from ..writers.provenance import collect_provenance
+
+    def check_measured(body: BodyModel) -> None:
+        known = (*body.lengths, *list_breadths(body.table))
+        for name, metres in (measured or {}).items():
+            if name not in known:
+                raise WrongOption("measured", f"{name}={metres:g}", f"'{name}' is not a length; {one_of(known, name)}")
+
+    if prior is not None and (stature is not None or sex is not None):
+        raise WrongOption(
+            "prior", prior, "has the lengths of a person; --stature and --sex narrow those of the population"
+        )
+    # A URDF without a table has the sensors' links as segments, and those are in the session.
+    if model is not None and not model.lower().endswith(".urdf"):
+        check_measured(load_model(model))
+    with progress_bar() as progress:
+        with result_folder(out, force) as folder:
+            progress("reading", 0.0)
+            recording = load_session(session, gaps=gaps)
+            steps = room.load_protocol(protocol or choose_protocol(recording.phases, formulation))
+            body = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
+            check_measured(body)
+            earlier = None if prior is None else read_subject(prior)
+            progress("calibrating", 1 / 3)
+            calibration = room.calibrate(
+                recording,
+                measured=measured,
+                prior=earlier,
+                stature=stature,
+                sex=sex,
+                model=body,
+                protocol=protocol,
+                method=method,
+                formulation=formulation,
+            )
+            write_calibration(folder, calibration, collect_provenance("calibrate", options))
+        failures: list[Diagnostic] = []
+        if report:
+            progress("writing the report", 2 / 3)
+            failures = write_calibration_page(
+                out, calibration, recording, method=method, protocol=steps, quality=calibration.quality
+            )
+    print_diagnostics([*calibration.quality.further, *failures])
+    _print_lengths_and_gap(calibration, steps, earlier or calibration.problem.prior)
+    if report:
+        say_pages(out, {"Report": "report.html"})
+    say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}  {out / 'calibration.json'}")
+    _print_quality(calibration.quality)
+    return Calibrated(calibration, failures)
+
+
+def _print_lengths_and_gap(calibration: Calibration, protocol: Protocol, prior: Person) -> None:
+    of_people = prior.is_population and not calibration.problem.model.table.is_mechanism
+    prior_name = "population prior" if of_people else "prior"
+    title = f"Lengths, by {protocol.title}"
+    measured = tuple(calibration.problem.measured)
+    print_lengths(title, calibration.subject, prior, measured, prior_name=prior_name)
+    _print_mounts(calibration)
+    if protocol.closures:
+        points = " and ".join(point.replace("_", " ") for point in protocol.closures[0].points)
+        gap = GAPS[calibration.problem.closure_kind].format(points)
+        prior_mm = f"{1e3 * calibration.prior_rms_gap:.1f} mm with the lengths of the {prior_name}"
+        say(f"{gap}: {1e3 * calibration.rms_gap:.1f} mm rms, {prior_mm}")
+        say(f"Effective sample size of the motion: {calibration.effective_sample_size:.0f}")
+
+
+def _print_mounts(calibration: Calibration) -> None:
+    import numpy as np
+
+    from ..recording import find_mount_axes
+    from ..subject import mount_rows
+
+    rows: list[tuple[str, ...]] = []
+    for segment, tilt in calibration.start_pose_offset.items():
+        x, y, z = (np.degrees(calibration.subject.std(row)) for row in mount_rows(segment))
+        up, forward = find_mount_axes(calibration.subject.mounts[segment])
+        off_start, drift = np.degrees(np.linalg.norm(tilt)), 60.0 * np.degrees(calibration.heading_drift[segment])
+        cells = f"± {z:.1f}", f"± {np.hypot(x, y) / 2**0.5:.1f}", f"{off_start:.1f}", f"{drift:+.1f}"
+        rows.append((segment, f"{up} up, {forward} ahead", *cells))
+    if not rows:
+        return
+    header = ("sensor", "nearest axes", "heading", "tilt", "off the start pose", "heading drift per min")
+    print_table("Mounts, in deg: ± is one standard deviation", header, rows)
+
+
+def _print_quality(quality: CalibrationQuality) -> None:
+    from rich.console import Console
+
+    colour = COLOURS[quality.quality]
+    determined = f"the motion determines {quality.determined} of {quality.unknowns} unknowns better than the prior"
+    Console(width=160).print(f"Quality: [bold {colour}]{quality.quality}[/] ({determined})", highlight=False)
+    for _, line in lines(quality.reasons):
+        say_indented(line)

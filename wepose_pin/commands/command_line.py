@@ -1,0 +1,146 @@
+"""The command line, by cyclopts: words → a command and its arguments; help in plain lines; mistakes in one line."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import textwrap
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from cyclopts import App, CycloptsError, Group, Parameter, UnknownOptionError, UnusedCliTokensError
+from cyclopts.help import HelpPanel
+from rich.console import Console, ConsoleOptions, RenderableType
+
+from .. import __version__
+from ..errors import BadOption, WeposeError, one_of
+
+# In the order of `wepose --help`; each is imported when it is needed.
+COMMANDS = {
+    **{name: f"wepose_pin.commands.{name}:{name}" for name in ("demo", "info", "simulate", "calibrate", "track")},
+    **{name: f"wepose_pin.commands.{name}:{name}" for name in ("view", "evaluate", "angles", "export", "retarget")},
+    "live": "wepose_pin.commands.live:live",
+    "batch": "wepose_pin.batch.command:batch",
+}
+# Commands and options of earlier versions → what to do instead.
+REMOVED = {
+    "reproduce": "run the command that `provenance` in the result's summary.json names again, with the same versions",
+    "validate": "in a clone of the project, run make validation DATA=DIR",
+}
+_ON_YOUR_OWN = "--udp sends each pose as JSON, from which examples/live_consumer.py shows how to go on"
+_IN_THE_FILE = "--robot takes a TOML file that has it (docs/live-outputs.md)"
+REMOVED_OPTIONS = {
+    "live": dict.fromkeys(("--mvn", "--vmc"), _ON_YOUR_OWN)
+    | dict.fromkeys(("--arm", "--to", "--robot-hz", "--hold-after", "--stop-after"), _IN_THE_FILE)
+    | dict.fromkeys(("--speed-scale", "--limit-margin"), _IN_THE_FILE),
+}
+WIDEST = 98  # columns of a help text
+_LABEL = 24  # columns of an option's name beside its text
+
+
+def parse(words: Sequence[str]) -> tuple[Callable[..., Any], inspect.BoundArguments]:
+    """The command that these words name, and its arguments; ``--help`` and ``--version`` are commands too.
+
+    Raises
+    ------
+    BadOption
+        A command or an option that is not known, lacks its value or has one that is not possible, or is missing.
+    """
+    first = words[0] if words else ""
+    if first in REMOVED:
+        raise BadOption(f"'{first}' is no command any more: {REMOVED[first]}")
+    if first and not first.startswith("-") and first not in COMMANDS:
+        raise BadOption(f"'{first}' is not a command; {one_of(COMMANDS, first)}")
+    if first in ("", "--help", "-h"):
+        for name in COMMANDS:
+            APP[name]  # imported, for its line in the help
+    for word in words[1:]:
+        if (switch := word.partition("=")[0]) in REMOVED_OPTIONS.get(first, {}):
+            raise BadOption(f"{switch} is no option any more: {REMOVED_OPTIONS[first][switch]}")
+    try:
+        command, bound, _ = APP.parse_args(words, print_error=False, exit_on_error=False)
+    except CycloptsError as error:
+        if isinstance(error.__cause__, WeposeError):  # of a validator
+            raise error.__cause__ from None
+        raise BadOption(f"{_describe(error, first)}; see wepose {first} --help") from None
+    return command, bound
+
+
+def _describe(error: CycloptsError, command: str) -> str:
+    if isinstance(error, UnknownOptionError):
+        switch, known = error.token.keyword or error.token.value, error.argument_collection
+        names = [name for argument in known for name in argument.names if name.startswith("--")]
+        return f"{switch} is not an option of wepose {command}; {one_of(names, switch)}"
+    if isinstance(error, UnusedCliTokensError):
+        return f"'{(error.unused_tokens or [''])[0]}' is one word too many for wepose {command}"
+    error.verbose = False
+    return str(error).rstrip(".")
+
+
+class PlainHelp:
+    """The help as paragraphs and two columns of text, without boxes; of a switch that is on, how to turn it off."""
+
+    def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:  # noqa: ARG002
+        if not panel.entries:
+            return
+        console.out(f"{panel.title}:", highlight=False)
+        for entry in panel.entries:
+            names, text = entry.display_labels_with_metavar, _plain(entry.description)
+            if entry.negative_names:
+                turns_off = entry.default == "True"
+                names = entry.negative_names if turns_off else entry.positive_names + entry.positive_shorts
+                text = f"Do not {text[0].lower()}{text[1:]}" if turns_off else text
+            elif entry.default is not None:
+                text += f" (default: {entry.default})"
+            label = f"  {', '.join(names)}"
+            if entry.choices:
+                label = label.removesuffix("CHOICE") + "|".join(entry.choices)
+            first = label if len(label) < _LABEL else ""
+            if not first:
+                console.out(label, highlight=False)
+            indent = " " * _LABEL
+            width = min(console.width, WIDEST)
+            lines = textwrap.wrap(text, width, initial_indent=f"{first:<{_LABEL}}", subsequent_indent=indent)
+            console.out("\n".join(lines or [first]), highlight=False)
+        console.out("")
+
+    def render_usage(self, console: Console, options: ConsoleOptions, usage: RenderableType) -> None:  # noqa: ARG002
+        console.out(_plain(usage), highlight=False, end="\n\n")
+
+    def render_description(self, console: Console, options: ConsoleOptions, text: RenderableType) -> None:  # noqa: ARG002
+        for paragraph in _plain(text, paragraphs=True).split("\n\n"):
+            line = " ".join(paragraph.split())
+            example = line.startswith("Example: ")
+            console.out(
+                line if example else textwrap.fill(line, min(console.width, WIDEST)), highlight=False, end="\n\n"
+            )
+
+
+def _plain(text: RenderableType | None, paragraphs: bool = False) -> str:
+    """What a renderable says, in one line or with its paragraphs."""
+    console = Console(file=io.StringIO(), width=100_000, no_color=True)
+    with console.capture() as capture:
+        console.print("" if text is None else text, highlight=False)
+    return capture.get().strip() if paragraphs else " ".join(capture.get().split())
+
+
+def _refuse_nan(_kind: type, value: Any) -> None:
+    if isinstance(value, float) and value != value:
+        raise ValueError("a number is needed")
+
+
+APP = App(
+    name="wepose",
+    help="Upper-body pose from wearable IMUs without magnetometers. `wepose demo` shows all of it.",
+    help_epilogue="wepose COMMAND --help says what a command does, with its options and an example. Exit code: 0 "
+    "success, 2 invalid options or input. Terms: docs/glossary.md.",
+    version=f"wepose-pin {__version__}",
+    version_flags=("--version", "-V"),
+    help_format="plaintext",
+    help_formatter=PlainHelp(),
+    group_arguments=Group("Arguments", sort_key=0),
+    group_parameters=Group("Options", sort_key=1),
+    default_parameter=Parameter(negative_iterable=(), negative_none=(), validator=_refuse_nan),
+)
+for _number, (_name, _place) in enumerate(COMMANDS.items()):
+    APP.command(_place, name=_name, help_epilogue="", sort_key=_number)

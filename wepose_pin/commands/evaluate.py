@@ -1,0 +1,211 @@
+"""``wepose evaluate``: a result against a reference."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from ..errors import BadOption, WrongOption
+from .options import MORE, File, Interval, Phase, Seconds
+from .output import mean_std, print_table, progress_bar, say
+
+if TYPE_CHECKING:
+    from ..evaluation import Evaluation, Registration
+
+
+def evaluate(
+    result: Path,
+    truth: Path,
+    /,
+    *,
+    interval: Interval | None = None,
+    phase: Phase | None = None,
+    align: Annotated[bool, MORE] = True,
+    fit: Annotated[Literal["world", "segments"] | None, MORE] = None,
+    time_offset: Annotated[Seconds | None, MORE] = None,
+    markers: Annotated[File | None, MORE] = None,
+) -> Any:  # an Evaluation, whose room loads late
+    """Compare a result with a reference: attitude, drift, joint angles, positions, stated uncertainty.
+
+    Prints for each segment the attitude error (roll, pitch, yaw about the axes of W), inclination, heading and total
+    RMSE [deg] and the drift of the heading [deg/min]; for each joint the error of its angles [deg]; for each point the
+    position error [mm], relative to the root and to the place where its limb begins, such as the middle of the
+    shoulders; and whether the stated standard deviations are consistent with the errors. Writes nothing.
+
+    A table with the columns of pose.parquet is compared as it is, without alignment. A file of another system (.c3d,
+    .trc, .mvnx) is brought to the clock and the heading of the result first, by the first third of the result, which
+    is then not scored. Prints the clock offset and the heading too, and the agreement of joint angles (Bland-Altman,
+    ICC).
+
+    Example: wepose evaluate result truth.parquet --interval 72 115
+
+    Parameters
+    ----------
+    result
+        Folder that `wepose track` wrote.
+    truth
+        Table (.parquet or .csv) with the columns of pose.parquet, or a session that names one (data.truth); markers or
+        rotations (.c3d), markers (.trc), an Xsens MVNX.
+    interval
+        Compare only this time of the recording, in seconds.
+    phase
+        Compare only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
+    align
+        Bring a file of another system to the clock and the world of the result.
+    fit
+        Fit this to the result, also of a table. world: clock, heading and place; segments: in addition a constant
+        rotation of each segment's frame, for frames that are not those of docs/concepts.md.
+    time_offset
+        Add this to the times of the reference, instead of fitting the offset.
+    markers
+        Use this table of markers before the one of the package (docs/formats.md).
+    """
+    from ..recording import check_selection
+
+    check_selection(interval, phase)
+    if not align and fit is not None:
+        raise WrongOption("fit", fit, "nothing is fitted with --no-align; leave out one of the two")
+    with progress_bar() as progress:
+        progress("comparing", 0.0)
+        errors = _compare(result, truth, interval, phase, align, fit, time_offset, markers)
+    _print_errors(errors)
+    return errors
+
+
+def _compare(
+    result: Path,
+    truth: Path,
+    interval: tuple[float, float] | None,
+    phase: str | None,
+    align: bool,
+    fit: str | None,
+    time_offset: float | None,
+    markers: Path | None,
+) -> Evaluation:
+    """The errors of a result; the reference is brought to its clock and world where that is needed."""
+    from ..evaluation import evaluate, register
+    from ..kinematics import Pose, parse_pose_table
+    from ..readers import load_session
+    from ..readers.reference import is_reference, read_reference
+    from ..readers.tables import read_table
+    from ..recording import select_interval
+    from ..writers import read_result
+    from ..writers.result import read_phases
+
+    pose, model, summary = read_result(result)
+    selected = select_interval(pose.time, read_phases(summary), interval, phase)
+    file: Path | None = truth
+    if truth.suffix == ".toml" or truth.is_dir():
+        file = load_session(truth, gaps=True).truth
+    if file is None:
+        raise BadOption(f"{truth}: data.truth is missing; the session names no reference to compare with")
+    foreign = is_reference(file)
+    if markers is not None and not foreign:
+        raise WrongOption("markers", str(markers), f"a .c3d or .trc as TRUTH; {file.name} has no markers")
+    if foreign:
+        measured = read_reference(file, markers)
+        reference, up = Pose(measured.time, measured.quat_VT, measured.points), measured.up
+        fit = fit or ("segments" if measured.own_frames else "world")
+    else:
+        reference, up = parse_pose_table(read_table(file), str(file)), None
+    if not align or fit is None:
+        if time_offset:
+            reference = replace(reference, time=reference.time + time_offset)
+        return evaluate(pose, reference, selected, model.table)
+    reference, registration = register(pose, reference, up=up, frames=fit == "segments", offset_s=time_offset)
+    first, last = registration.scored
+    begin, end = selected or registration.scored
+    scored = max(first, begin), min(last, end)
+    if not scored[0] < scored[1]:
+        needed = f"seconds after {first:.1f}, as those before align the reference; or --no-align"
+        raise WrongOption("interval", f"{begin:g} {end:g}", needed)
+    errors = evaluate(pose, reference, scored, model.table)
+    return replace(errors, registration=replace(registration, scored=scored))
+
+
+def _print_errors(errors: Evaluation) -> None:
+    from ..recording import format_span
+
+    say(f"{errors.samples} samples from {format_span(errors.interval)}")
+    if errors.registration is not None:
+        _say_registration(errors.registration)
+    if errors.attitude:
+        print_table(
+            "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
+            ("segment", "roll", "pitch", "yaw", "inclination", "heading", "total", "drift"),
+            [
+                (
+                    name,
+                    *(f"{mean:.2f} ± {std:.2f}" for mean, std in (error.roll, error.pitch, error.yaw)),
+                    *(f"{rmse:.2f}" for rmse in (error.inclination_rmse, error.heading_rmse, error.total_rmse)),
+                    f"{error.drift_deg_min:+.2f}",
+                )
+                for name, error in errors.attitude.items()
+            ],
+        )
+    if errors.joints:
+        print_table(
+            "Joint angle error [deg]: mean; root mean square; largest (near gimbal lock left out)",
+            ("joint", "angle", "mean", "rms", "largest"),
+            [
+                (joint, angle, f"{error.mean:+.2f}", f"{error.rmse:.2f}", f"{error.worst:.2f}")
+                for joint, angles in errors.joints.items()
+                for angle, error in angles.items()
+            ],
+        )
+    if errors.registration is not None and errors.agreement:
+        print_table(
+            "Agreement of joint angles [deg]: Bland-Altman bias and 95 % limits; root mean square; ICC(A,1); range",
+            ("joint", "angle", "bias", "limits of agreement", "rms", "ICC", "range"),
+            [
+                (
+                    joint,
+                    angle,
+                    f"{each.bias:+.2f}",
+                    f"{each.lower:+.2f} to {each.upper:+.2f}",
+                    f"{each.rmse:.2f}",
+                    f"{each.icc:.3f}",
+                    f"{each.range:.0f}",
+                )
+                for joint, angles in errors.agreement.items()
+                for angle, each in angles.items()
+            ],
+        )
+    if errors.position:
+        on_limb = errors.position_on_limb
+        print_table(
+            "Position error [mm], mean ± std",
+            ("point", "from the root", "from where its limb begins"),
+            [
+                (name, mean_std(error), mean_std(on_limb[name]) if name in on_limb else "")
+                for name, error in errors.position.items()
+            ],
+        )
+    points = {f"{name} (point)": stated for name, stated in errors.position_uncertainty.items()}
+    if stated := {**errors.attitude_uncertainty, **points}:
+        print_table(
+            "Stated uncertainty: right are a normalised squared error of 3, and 68 % and 95 % of the errors within",
+            ("of", "normalised", "within 1 std", "within 2 std"),
+            [
+                (name, f"{u.nees:.2f}", f"{100 * u.within_1:.0f} %", f"{100 * u.within_2:.0f} %")
+                for name, u in stated.items()
+            ],
+        )
+
+
+def _say_registration(registration: Registration) -> None:
+    """Say how the reference was brought to the result, and by which seconds."""
+    from ..recording import format_span
+
+    fitted = registration.correlation == registration.correlation  # NaN where the offset was stated
+    clock = "stated" if not fitted else f"speeds correlate by {registration.correlation:.3f}"
+    say(f"The reference was aligned by {format_span(registration.fitted)}, which are not scored:")
+    say(f"  its clock {registration.offset_s:+.3f} s ({clock})")
+    say(f"  its world: {registration.up} is up, rotated by {registration.heading_deg:+.1f} deg about the vertical")
+    if any(registration.shift_m):
+        x, y, z = registration.shift_m
+        say(f"  its points moved by {x:+.3f} {y:+.3f} {z:+.3f} m")
+    if registration.frames_deg:
+        listed = ", ".join(f"{segment} {angle:.1f}" for segment, angle in registration.frames_deg.items())
+        say(f"  its segments' frames rotated [deg], so that no constant error of these is left: {listed}")

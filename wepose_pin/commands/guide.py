@@ -1,0 +1,182 @@
+"""The guided session of ``wepose live --guide``: from sensors that send to a subject, a setup and a source to track."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from ..errors import ExistingOutput
+
+if TYPE_CHECKING:
+    from ..calibration import Calibration, CalibrationQuality
+    from ..live import Output, SensorSetup
+    from ..live.assignment import AssignedSource
+    from ..live.guide import Calibrated
+    from ..live.sources.base import Source
+    from ..model import BodyModel
+    from ..recording import Recording
+
+SUBJECT_FILES = ("subject.toml", "subject.urdf", "calibration.json", "report.html")
+
+
+class GuidedOutcome(NamedTuple):
+    """What a guided session hands over to tracking."""
+
+    source: AssignedSource
+    setup: SensorSetup
+    folder: Path
+    calibrated: Calibrated
+
+
+def run_guide(
+    source: Source,
+    setup: SensorSetup,
+    model: BodyModel,
+    views: Sequence[Output],
+    until: Callable[[], bool],
+    *,
+    out: Path | None,
+    force: bool,
+    protocol: str | None,
+    measured: Mapping[str, float],
+    stature: float | None,
+    subject: Path | None,
+    setup_folder: Path | None,
+    method: str,
+) -> GuidedOutcome | None:
+    """Lead the person to an accepted calibration, and save its subject; None where it was ended before.
+
+    Parameters
+    ----------
+    source : not open; it stays open where there is an outcome
+    views : stay open
+    out, force, protocol, measured, stature, subject, setup_folder, method : options of `wepose live`
+
+    Raises
+    ------
+    ExistingOutput
+        The folder holds a subject and `force` is not given, or it cannot be made.
+    """
+    from ..calibration import assess, calibrate, load_protocol
+    from ..calibration.protocols import split_protocol
+    from ..live.assignment import read_segments, write_segments
+    from ..live.guide import Calibrated, GuideOptions
+    from ..live.guide_motion import STATURE
+    from ..live.guided import GuidedSession
+    from ..live.loop import warm_up
+    from ..live.session import open_and_wait
+    from ..readers import load_session
+    from ..readers.subject import read_subject
+    from ..report import write_calibration_page
+    from ..subject import load_subject, population_subject
+    from ..writers.calibration import write_calibration
+    from ..writers.folder import result_folder
+    from ..writers.provenance import collect_provenance
+
+    folder = _make_folder(out, force)
+    joined = protocol or choose_protocol(source, setup, model)
+    parts = split_protocol(joined)
+    earlier = None if subject is None else read_subject(subject)
+    prior = earlier or population_subject(stature, None, model)
+
+    def calibrate_file(path: Path, told: Mapping[str, float]) -> Calibrated:
+        lengths = {**measured, **told}
+        recording = load_session(path)
+        steps = choose_parts(joined, recording.phases)
+        calibration = calibrate(
+            recording,
+            measured={name: value for name, value in lengths.items() if name != STATURE},
+            prior=earlier,
+            stature=lengths.get(STATURE, stature),
+            protocol=steps,
+            method=method,
+        )
+        options = {"session": path, "protocol": steps, "measured": lengths, "prior": subject, "method": method}
+        out = path.with_suffix("")
+        with result_folder(out, force=True) as partial:
+            write_calibration(partial, calibration, collect_provenance("calibrate", options))
+        write_calibration_page(
+            out, calibration, recording, method=method, protocol=load_protocol(steps), quality=calibration.quality
+        )
+        return Calibrated(calibration, calibration.quality, out)
+
+    def estimate(recording: Recording) -> tuple[Calibration, CalibrationQuality]:
+        calibration = calibrate(
+            recording,
+            measured=measured,
+            prior=prior,
+            model=model,
+            protocol=choose_parts(joined, recording.phases),
+            method=method,
+        )
+        return calibration, assess(calibration)
+
+    options = GuideOptions(
+        folder,
+        load_protocol(joined),
+        replace(setup, remounted=True),
+        model.table,
+        {name: _depth(model, name) for name in model.table.segments},
+        calibrate_file,
+        estimate,
+        method,
+        {} if setup_folder is None else read_segments(setup_folder, tuple(model.table.segments)),
+        frozenset(step.phase for part in parts[1:] for step in load_protocol(part).steps if step.phase != "start"),
+        frozenset({*measured, *([STATURE] if stature is not None or subject is not None else [])}),
+    )
+    threading.Thread(target=warm_up, args=(method,), daemon=True).start()  # tracking begins without a wait then
+    if not open_and_wait(source, views, until):
+        return None
+    session = GuidedSession(source, options, model, views)
+    calibrated = session.run(until)
+    if calibrated is None:
+        source.close()
+        return None
+    for name in SUBJECT_FILES:
+        if (calibrated.folder / name).is_file():
+            shutil.copyfile(calibrated.folder / name, folder / name)
+    write_segments(folder, session.guide.segments)
+    subject_text = (folder / "subject.toml").read_text(encoding="utf-8")
+    tracked = replace(setup, subject=load_subject(folder), subject_text=subject_text, remounted=False, mounts={})
+    return GuidedOutcome(session.guide.assigned(), tracked, folder, calibrated)
+
+
+def _make_folder(out: Path | None, force: bool) -> Path:
+    folder = out or Path(time.strftime("wepose-%Y%m%d-%H%M%S"))
+    if (folder / "subject.toml").exists() and not force:
+        raise ExistingOutput(f"{folder}: holds a subject; --force replaces it, -o names another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExistingOutput(f"{folder}: cannot be made: {error.strerror}") from error
+    return folder
+
+
+def choose_protocol(source: Source, setup: SensorSetup, model: BodyModel) -> str:
+    """Choose the protocol where none is named: a bow follows where else nothing shows the reference's heading."""
+    from ..calibration.protocols import BOW, GUIDED
+
+    known = model.table.is_mechanism or model.table.reference in setup.mounts
+    return f"{GUIDED}+{BOW}" if source.measures_orientations and not known else GUIDED
+
+
+def choose_parts(protocol: str, phases: Collection[str]) -> str:
+    """Choose the parts of a joined protocol whose phases are there, all where none is: a part may be skipped."""
+    from ..calibration import load_protocol
+    from ..calibration.protocols import split_protocol
+
+    there = [
+        part for part in split_protocol(protocol) if all(step.phase in phases for step in load_protocol(part).steps)
+    ]
+    return "+".join(there) or protocol
+
+
+def _depth(model: BodyModel, segment: str) -> int:
+    """Number of segments between this one and the root."""
+    above = model.parents.get(segment)
+    return 0 if above is None else 1 + _depth(model, above)

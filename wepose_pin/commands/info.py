@@ -1,0 +1,76 @@
+"""``wepose info``: what a file is, and a session for it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..errors import BadOption
+from .options import Model, OutFile
+from .output import print_diagnostics, print_table, progress_bar, say
+
+
+def info(
+    file: Path,
+    /,
+    *,
+    write: bool = False,
+    out: OutFile | None = None,
+    model: Model | None = None,
+    force: bool = False,
+) -> None:
+    """Describe a file, its sensors, rates and gaps, and propose a session file for it.
+
+    Prints the description and the proposal; writes nothing without --write or -o. Reads CSV, Parquet, HDF5 and MATLAB;
+    Xsens MVNX and text files of MT Manager, Movella DOT, x-IMU3, APDM, Shimmer, Delsys, Noraxon, phones (Sensor Logger,
+    phyphox), ROS bags, XDF and OpenSim's orientations, .sto (docs/formats.md); recordings of `wepose live`, sessions,
+    subjects and results. Entries of the proposed session that are guesses are marked CHECK.
+
+    Example: wepose info trial.mvnx --write
+
+    Parameters
+    ----------
+    file
+        A file, or a folder: of one recording, or of files of one sensor each.
+    write
+        Write the session to session.toml beside the file.
+    out
+        Write the session to this file.
+    model
+        Propose the segments of this body: a URDF, a TOML that names one, or the name of a body of the package, such as
+        whole_body (docs/models.md). Without it those of the upper body.
+    force
+        Replace an existing session.
+    """
+    from ..documents import check_file, whole_file
+    from ..model import load_model
+    from ..readers.describe import describe_file, find_file
+    from ..readers.propose import Wearer
+
+    with progress_bar() as progress:
+        progress("reading", 0.0)
+        wearer = Wearer(load_model(model).table, Path(model)) if model is not None else None
+        file = find_file(file, wearer)
+        session = out or file.absolute().parent / "session.toml"
+        writes = write or out is not None
+        if writes:
+            check_file(session, force)
+        description = describe_file(file, session.absolute().parent, wearer)
+        if writes:
+            if description.session is None:
+                raise BadOption(f"--write: there is no session to write for {description.what}")
+            with whole_file(session, force) as partial:
+                partial.write_text(description.session, encoding="utf-8")
+    say(description.what)
+    for fact in description.facts:
+        say(f"  {fact}")
+    print_diagnostics(description.diagnostics)
+    if description.sensors:
+        header = ("sensor", "in the file", "holds", "peak rate", "median specific force", "gaps over 50 ms")
+        print_table("Sensors", header, description.sensors)
+    if writes:
+        then = description.then.replace("SESSION", str(session))
+        check = "check the lines marked CHECK, then: " if "CHECK" in (description.session or "") else ""
+        say(f"Session: {session}  ({check}{then})")
+    elif description.session is not None:
+        say(f"# A session for it; --write writes it to {session}")
+        print(description.session, end="")

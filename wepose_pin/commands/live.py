@@ -1,0 +1,360 @@
+"""``wepose live``: track a stream while the person moves."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+from cyclopts import Group, Parameter
+
+from ..diagnostics import INFO, WARNING, Diagnostic
+from ..errors import BadOption
+from .options import (
+    MORE,
+    RESEARCH,
+    Address,
+    File,
+    Folder,
+    LiveMethod,
+    Measured,
+    Model,
+    Name,
+    Number,
+    Out,
+    ProtocolName,
+    Robot,
+    Session,
+    Speed,
+    Stature,
+    Subject,
+)
+from .output import print_diagnostics, print_table, say
+from .stopping import stop_requests
+
+if TYPE_CHECKING:
+    from ..live import Output, SensorSetup, SessionSummary
+    from ..live.page import LivePage
+    from ..live.robot import RobotOutput, RobotSummary
+    from ..live.sources.base import Source
+    from ..model import BodyModel
+
+GUIDE = Parameter(group=Group("Options with --guide", sort_key=1))
+UNSEEN = Parameter(parse=False)
+
+
+class Live(NamedTuple):
+    """What came of `live`."""
+
+    session: SessionSummary | None  # None: the guided session was ended before tracking
+    robot: RobotSummary | None
+
+
+def live(
+    *,
+    source: Annotated[str, Parameter(metavar="SOURCE")],
+    subject: Subject | None = None,
+    session: Session | None = None,
+    setup: Folder | None = None,
+    guide: bool = False,
+    out: Out | None = None,
+    record: File | None = None,
+    robot: Robot | None = None,
+    udp: Address | None = None,
+    lsl: Name | None = None,
+    page: bool = True,
+    open: bool = True,
+    force: bool = False,
+    stature: Annotated[Stature | None, GUIDE] = None,
+    measured: Annotated[Measured | None, GUIDE] = None,
+    protocol: Annotated[ProtocolName | None, GUIDE] = None,
+    host: Annotated[Address | None, MORE] = None,
+    port: Annotated[Number, MORE] = 0,
+    model: Annotated[Model | None, MORE] = None,
+    speed: Annotated[Speed, MORE] = "1",
+    accept_failed: Annotated[bool, MORE] = False,
+    method: Annotated[LiveMethod, RESEARCH] = "amekf",
+    views: Annotated[Sequence[Any] | None, UNSEEN] = None,
+    until: Annotated[Callable[[], bool] | None, UNSEEN] = None,
+) -> Live:
+    """Track a person live: show the pose in the browser and the terminal, send it to programs or a robot, record it.
+
+    Stand still in the start pose until the message says that it is ready. After that, stand in the start pose again and
+    press r to reset the headings. With --robot, r also lets a stopped robot move again. q or Ctrl-C ends the session.
+    If it is killed, at most the last second of --record is lost.
+
+    Example: wepose live --source udp:9000 --subject anna --record morning.mcap
+
+    Parameters
+    ----------
+    source
+        Take samples from replay:SESSION, udp:[HOST:]PORT, lsl:NAME, mti:DEVICE=SEGMENT,... or slimevr:[HOST]
+        (docs/live-sources.md). Without HOST only this machine can send.
+    subject
+        Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it.
+        Without it lengths are those of the population prior, and mounts those that --session states.
+    session
+        Take the mounts of the sensors from this session file; its data are not read.
+    setup
+        Take from this folder, of an earlier --guide, which sensor sits on which segment.
+    guide
+        Lead through the calibration first: which sensor sits where, the start pose, the motion, its quality
+        (docs/live.md). Needs no subject and no session.
+    out
+        With --guide: write subject, recordings and the sensors' setup to this folder. Without it to a new folder
+        named by the date.
+    record
+        Write all that is received and the poses to this file; `wepose track FILE` gives the same poses again. Without
+        it the first take (key T) begins such a file, which also holds what came before the take.
+    robot
+        Send joint commands that let this robot follow the person (docs/live-outputs.md): one of the names of `wepose
+        retarget --robot`, a URDF with a robot map beside it (ARM.urdf, ARM.toml), the robot map, or a TOML file that
+        names one of these and says how it follows: the arm, the UDP port, the rate, margins and timeouts. First bring
+        the robot into the rest posture of its robot map.
+    udp
+        Send each pose as JSON to this UDP port (docs/live-outputs.md). Without HOST to this machine.
+    lsl
+        Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
+    page
+        Serve the page that shows the pose (which only this machine can open).
+    open
+        Open the page in the browser.
+    force
+        Replace the file of --record.
+    stature
+        With --guide: narrow the population prior to people of this body height.
+    measured
+        With --guide: use this measured length, such as shoulder_width=0.385; may be given several times.
+    protocol
+        With --guide: calibrate by this protocol, as `wepose calibrate`. Without it clasp+t_pose, and a bow after them
+        for sensors that measure orientations and no accelerations where no session states the torso's mount. All but
+        the first part may be skipped.
+    host
+        Serve the page on this address of this machine, such as 0.0.0.0 for all, to open it on a phone. Its URL then
+        holds a token, without which nobody can open it. Without --host this machine alone can open the page.
+    port
+        Serve the page at this port; 0 takes any that is free.
+    model
+        Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package
+        (docs/models.md). Without it the body that the session names, else the upper body.
+    speed
+        With --source replay: replay at this speed; 1 is that of the recording, 4 is four times that, max is as fast as
+        possible.
+    accept_failed
+        Use a subject whose calibration failed (quality = "fail" in subject.toml), which is refused otherwise.
+    method
+        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smekf (Kalman filter of
+        Lisini Baldi et al. 2019, corrected in static phases, with an exact covariance and two more conditions of the
+        static test), smekf_published (the same as published), ncf (complementary filter, Mahony et al. 2008), gdc
+        (gradient descent, Madgwick et al. 2011).
+    views
+        Outputs that show the pose and the state; None: the terminal.
+    until
+        Returns True to end the session; None: Ctrl-C ends it.
+    """
+    from ..calibration import load_protocol
+    from ..calibration.protocols import GUIDED
+    from ..compilation import announce_compilation
+    from ..live import find_setup, open_source, run_session
+    from ..live.loop import build_subject_model, warm_up
+    from ..live.robot import connect_robot, read_robot
+    from ..live.session import check_mounts
+    from ..live.terminal import TerminalView
+    from ..retargeting.stream import check_segments
+    from ..subject import load_subject
+    from .guide import run_guide
+
+    for option, given in {"out": out, "measured": measured, "stature": stature}.items():
+        if given is not None and not guide:
+            raise BadOption(f"--{option}: goes with --guide, which is not given")
+    announce_compilation()  # a stream is waiting
+    # A wrong robot is found before the person does anything.
+    following = None if robot is None else read_robot(robot)
+    if following is not None and guide:
+        check_segments(following.robot, load_protocol(protocol or GUIDED).needs)
+    if subject is not None and not accept_failed:
+        load_subject(subject).check_quality()
+    replays = source.startswith("replay:")
+    stated = None if session is None else find_setup(None, subject, session)
+    if replays:
+        samples = open_source(source, speed=speed)
+        worn = stated or find_setup(samples, subject, None)
+        body = build_subject_model(worn, model, samples.sensors)
+    else:
+        worn = stated or find_setup(None, subject, None)
+        body = build_subject_model(worn, model)
+        samples = _open_stream(source, worn, body, setup, guide)
+    if not guide:
+        check_mounts(samples, worn)  # before the page opens
+    print_diagnostics(body.diagnostics)
+    outputs: list[Output] = list(views or [TerminalView()])
+    driven: RobotOutput | None = None
+    served = _open_page(body, out.absolute().name if out is not None else worn.name, host, port, open) if page else None
+    if served is not None:
+        outputs.insert(0, served)
+    try:
+        with contextlib.nullcontext(until) if until is not None else stop_requests() as should_stop:
+            if guide:
+                guided = run_guide(
+                    samples,
+                    worn,
+                    body,
+                    outputs,
+                    should_stop,
+                    out=out,
+                    force=force,
+                    protocol=protocol,
+                    measured=measured or {},
+                    stature=stature,
+                    subject=subject,
+                    setup_folder=setup,
+                    method=method,
+                )
+                if guided is None:
+                    say("The guided session was ended before a calibration was accepted.")
+                    return Live(None, None)
+                samples, worn, record = guided.source, guided.setup, record or _name_recording(guided.folder)
+                body = build_subject_model(worn, model, samples.sensors)
+            if following is not None:
+                factor = float(speed.replace("max", "inf")) if replays else 1.0
+                driven, samples = connect_robot(following, samples, worn, factor, body.table)
+            if served is not None and (guide or driven is not None):
+                served.set_body(body, None if driven is None else driven.figure(body))
+            if driven is not None:
+                outputs.insert(0, driven)
+            outputs += _open_senders(udp, lsl)
+            if driven is not None:
+                warm_up(method)  # compiles before commands are due
+                driven.open()
+            summary = run_session(
+                samples,
+                worn.with_model(model),
+                method=method,
+                model=body,
+                record=record,
+                force=force,
+                outputs=outputs,
+                until=should_stop,
+            )
+    finally:
+        for output in outputs:
+            output.close()
+    ended = Live(summary, None if driven is None else driven.summary())
+    _print_end(ended, record)
+    return ended
+
+
+def _print_end(ended: Live, record: Path | None) -> None:
+    """What was tracked, what the robot did, and what was recorded."""
+    session = ended.session
+    assert session is not None
+    print_diagnostics(session.diagnostics)
+    _print_session(session)
+    if ended.robot is not None:
+        _print_robot(ended.robot)
+    if session.problem:
+        reason = {"reason": session.problem}
+        print_diagnostics([Diagnostic("live-recording-incomplete", WARNING, str(session.record), facts=reason)])
+    elif session.record is not None:
+        again = f"  (wepose track {session.record} -o DIR gives these poses again)"
+        say(f"Recorded: {session.record}{again}")
+    elif record is not None:
+        say(f"Nothing was recorded to {record}: without the start pose there is nothing to track.")
+
+
+def _open_stream(source: str, worn: SensorSetup, model: BodyModel, folder: Path | None, guide: bool) -> Source:
+    """The source of a stream, not yet opened; with the segments of an earlier guide's `folder`."""
+    from ..live import open_source
+    from ..live.assignment import AssignedSource, read_segments
+
+    sensors, segments = list(worn.mounts), list(model.table.segments)
+    if guide:
+        return open_source(source, segments=segments, any_name=True)
+    if folder is None:
+        return open_source(source, sensors=sensors or None, segments=segments)
+    assigned = read_segments(folder, segments)
+    return AssignedSource(open_source(source, sensors=list(assigned), segments=list(assigned)), assigned, segments)
+
+
+def _open_page(model: BodyModel, title: str, host: str | None, port: int, in_browser: bool) -> LivePage:
+    """Serve the page, and say where."""
+    from ..live.addresses import LOOPBACK
+    from ..live.page import LivePage
+
+    page = LivePage(model, host=host or LOOPBACK, port=port, title=title)
+    page.open()
+    if "token=" in page.url:
+        say(f"Page: {page.url}")
+        say("Whoever reaches this machine there and has this address can watch and press the page's buttons.")
+    else:
+        say(f"Page: {page.url}  (this machine only)")
+    if in_browser:
+        import webbrowser
+
+        if not webbrowser.open(page.url):
+            print_diagnostics([Diagnostic("browser-not-started", INFO)])
+    return page
+
+
+def _open_senders(udp: str | None, lsl: str | None) -> list[Output]:
+    """Outputs for other programs."""
+    senders: list[Output] = []
+    if udp is not None:
+        from ..live.outputs import UdpOutput
+
+        senders.append(UdpOutput(udp))
+    if lsl is not None:
+        from ..live.outputs import LslOutput
+
+        senders.append(LslOutput(lsl))
+    return senders
+
+
+def _name_recording(folder: Path) -> Path:
+    """A file in the folder that is not there yet."""
+    number = next(n for n in itertools.count(1) if not (folder / f"session-{n}.mcap").exists())
+    return folder / f"session-{number}.mcap"
+
+
+def _print_session(session: SessionSummary) -> None:
+    title = "no poses: the start pose was not held"
+    if session.poses:
+        p50, p99 = (1e3 * session.latency.quantile(share) for share in (0.5, 0.99))
+        title = (
+            f"{session.poses} poses in {session.seconds:.1f} s; from the newest sample to its pose {p50:.2f} ms (p50), "
+            f"{p99:.2f} ms (p99)"
+        )
+    print_table(
+        title,
+        ("sensor", "samples", "lost", "ticks without", "late", "twice", "unsound", "frozen", "cut off"),
+        [
+            (
+                name,
+                *(
+                    str(counts[key])
+                    for key in ("taken", "lost", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
+                ),
+            )
+            for name, counts in session.counts.items()
+        ],
+    )
+
+
+def _print_robot(robot: RobotSummary) -> None:
+    title = f"{robot.robot}: {robot.commands} commands, none with a pose"
+    if robot.share:
+        shares = ", ".join(f"{100.0 * share:.1f} % {state}" for state, share in robot.share.items())
+        p50, p99 = (1e3 * robot.step.quantile(share) for share in (0.5, 0.99))
+        took = f"each took {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
+        title = f"{robot.robot}: {robot.commands} commands; with a pose {shares}; {took}"
+    print_table(
+        title,
+        ("arm", "hand off its target [mm]", "in 90 % under"),
+        [
+            (side, *(f"{1e3 * error.quantile(share):.1f}" if error.count else "–" for share in (0.5, 0.9)))
+            for side, error in robot.error.items()
+        ],
+    )
+    print_diagnostics(robot.diagnostics)

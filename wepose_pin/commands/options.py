@@ -1,0 +1,110 @@
+"""Types of options: what a value is called in the help, how it is read, and what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Group, Parameter, Token
+
+from ..errors import BadOption, WrongOption
+
+MORE = Parameter(group=Group("More options", sort_key=2))
+RESEARCH = Parameter(group=Group("Options for research", sort_key=3))
+
+Method = Literal["amekf", "smoother", "smekf", "smekf_published", "ncf", "gdc"]
+LiveMethod = Literal["amekf", "smekf", "smekf_published", "ncf", "gdc"]
+Formulation = Literal["full", "paper"]
+Arms = Literal["left", "right", "both"]
+
+
+# Validators: rooms load when an option is given ----------------------------------------------------------------------
+
+
+def _check_interval(_kind: type, interval: tuple[float, float] | None) -> None:
+    from ..recording import check_selection
+
+    check_selection(interval, None)
+
+
+def _check_model(_kind: type, model: str | None) -> None:
+    path = Path(model or "")
+    if model is not None and not path.is_file() and (path.suffix or len(path.parts) > 1):
+        needed = "no such file; a URDF, a TOML that names one, or the name of a body of the package is needed"
+        raise WrongOption("model", model, needed)
+
+
+def _checked_by(place: str) -> Parameter:
+    """The check is a function ``MODULE:NAME`` of this package, imported when the option is given."""
+
+    def check(_kind: type, value: Any) -> None:
+        module, _, name = place.partition(":")
+        if value is not None:
+            getattr(import_module(f"wepose_pin.{module}"), name)(value)
+
+    return Parameter(validator=check)
+
+
+# Values --------------------------------------------------------------------------------------------------------------
+
+
+def _read_entries(words: Sequence[Token], also_text: bool, needed: str) -> dict[str, Any]:
+    """What several ``NAME=VALUE`` say; of a value that may be a text, a number where it is one."""
+    entries: dict[str, Any] = {}
+    for word in words:
+        name, equals, value = word.value.partition("=")
+        if not (name and equals):
+            raise BadOption(f"{word.keyword}: '{word.value}': {needed} is needed")
+        if name in entries:
+            raise BadOption(f"{word.keyword} {word.value}: '{name}' is given twice")
+        try:
+            entries[name] = float(value)
+        except ValueError:
+            entries[name] = value
+        if entries[name] != entries[name] or (isinstance(entries[name], str) and not also_text):
+            raise BadOption(f"{word.keyword}: {word.value}: '{value}' is not a number; {needed} is needed")
+    return entries
+
+
+def _read_lengths(_kind: type, words: Sequence[Token]) -> dict[str, float]:
+    return _read_entries(words, False, "NAME=METRES")
+
+
+def _read_sizes(_kind: type, words: Sequence[Token]) -> dict[str, float | str]:
+    return _read_entries(words, True, "NAME=VALUE")
+
+
+Out = Annotated[Path, Parameter(alias="-o", metavar="DIR")]
+OutFile = Annotated[Path, Parameter(alias="-o", metavar="FILE")]
+Subject = Annotated[Path, Parameter(metavar="SUBJECT")]
+Session = Annotated[Path, Parameter(metavar="SESSION")]
+Model = Annotated[str, Parameter(metavar="NAME|FILE", validator=_check_model)]
+File = Annotated[Path, Parameter(metavar="FILE")]
+Name = Annotated[str, Parameter(metavar="NAME")]
+Number = Annotated[int, Parameter(metavar="NUMBER")]
+Hz = Annotated[float, Parameter(metavar="HZ")]
+Seconds = Annotated[float, Parameter(metavar="SECONDS")]
+Factor = Annotated[float, Parameter(metavar="FACTOR")]
+Share = Annotated[float, Parameter(metavar="SHARE")]
+Radians = Annotated[float, Parameter(metavar="RAD")]
+Text = Annotated[str, Parameter(metavar="TEXT")]
+Angle = Annotated[str, Parameter(metavar="ANGLE")]
+Address = Annotated[str, Parameter(metavar="ADDRESS")]
+Folder = Annotated[Path, Parameter(metavar="DIR")]
+Phase = Annotated[str, Parameter(metavar="PHASE")]
+Interval = Annotated[tuple[float, float], Parameter(metavar="FROM TO", validator=_check_interval)]
+Stature = Annotated[float, Parameter(metavar="METRES"), _checked_by("model.anthropometry:check_stature")]
+ProtocolName = Annotated[str, Parameter(metavar="NAME|FILE.toml"), _checked_by("calibration:load_protocol")]
+Robot = Annotated[str, Parameter(metavar="NAME|FILE")]
+Speed = Annotated[str, Parameter(metavar="FACTOR")]
+RobotName = Annotated[str, Parameter(metavar="NAME|FILE"), _checked_by("retargeting:find_map")]
+RobotHz = Annotated[float, Parameter(metavar="HZ"), _checked_by("retargeting.trajectory:check_rate")]
+ExportHz = Annotated[float, Parameter(metavar="HZ"), _checked_by("writers.motion:check_rate")]
+if TYPE_CHECKING:
+    Measured = Mapping[str, float]
+    Imperfection = Mapping[str, float | str]
+else:  # cyclopts collects the values of an option that is given several times only of a list
+    Measured = Annotated[list[str], Parameter(metavar="NAME=METRES", converter=_read_lengths)]
+    Imperfection = Annotated[list[str], Parameter(metavar="NAME=VALUE", converter=_read_sizes)]

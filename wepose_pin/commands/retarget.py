@@ -1,0 +1,243 @@
+"""``wepose retarget``: a person's arms → a robot's joint trajectory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+from ..diagnostics import Diagnostic, from_json
+from .options import MORE, Arms, Factor, Hz, Interval, Out, Phase, Radians, RobotHz, RobotName, Share
+from .output import print_diagnostics, print_table, progress_bar, say, say_pages
+
+if TYPE_CHECKING:
+    from ..kinematics import Pose
+    from ..retargeting import Trajectory
+
+
+class Retargeted(NamedTuple):
+    """What came of `retarget`."""
+
+    summary: Mapping[str, Any]  # as in summary.json, page failures apart
+    page_failures: list[Diagnostic]
+    duration_s: float
+
+    @property
+    def exit_code(self) -> int:
+        """0 where a robot may run it: limits kept, no self-collision, no hand off a target that it can reach."""
+        summary = self.summary
+        wrong = not summary["within_limits"] or summary["self_collisions"]["samples"] or summary["missed_targets"]
+        return 3 if wrong else 0
+
+
+def retarget(
+    result: Path,
+    /,
+    *,
+    robot: RobotName,
+    out: Out,
+    arm: Arms | None = None,
+    rate_hz: RobotHz = 100.0,
+    interval: Interval | None = None,
+    phase: Phase | None = None,
+    view: bool = True,
+    report: bool = True,
+    force: bool = False,
+    task: Annotated[Literal["both", "position", "orientation"], MORE] = "both",
+    scale: Annotated[Factor | None, MORE] = None,
+    smoothing_hz: Annotated[Hz, MORE] = 6.0,
+    speed_scale: Annotated[Share, MORE] = 0.9,
+    limit_margin: Annotated[Radians, MORE] = 0.05,
+    strict: Annotated[bool, MORE] = False,
+) -> Retargeted:
+    """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
+
+    Robots by name: panda and ur5, both also on a table (panda_table, ur5_table), so101, baxter, tiago_dual, talos, g1,
+    alex (from the package example-robot-data). Any other by its URDF with a robot map beside it, a TOML that says which
+    links are shoulder, elbow and hand (docs/robot-maps.md).
+
+    Exit code: 0 the trajectory keeps the robot's limits, has no self-collision (checked on what is written), and no
+    hand stays off a target that it can reach; 3 one of these does not hold: the files are written, but no robot may run
+    them; 2 invalid input, nothing is written.
+
+    Example: wepose retarget result --robot panda_table -o panda
+
+    Parameters
+    ----------
+    result
+        Folder that `wepose track` wrote.
+    robot
+        Move this robot: one of the names above, a URDF with a robot map beside it (ARM.urdf, ARM.toml), or the robot
+        map itself.
+    out
+        Write trajectory.parquet and .csv, joint_trajectory.json, summary.json, view.html and report.html to
+        this folder.
+    arm
+        Move only this arm of the robot, or both. Without it all arms that the robot has.
+    rate_hz
+        Sample the trajectory at this rate, 10 to 2000 Hz: that of the robot's own controller.
+    interval
+        Follow only this time of the recording, in seconds.
+    phase
+        Follow only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
+    view
+        Write view.html, the animation of the robot beside the person.
+    report
+        Write report.html, which shows the errors of the hands with their causes, distances and joint limits.
+    force
+        Replace the files of an earlier run in DIR.
+    task
+        Follow the position of the person's hands, their orientation, or both.
+    scale
+        Scale the distance from shoulder to hand by this factor. Without it the ratio of the reach of the robot's arm to
+        the length of the person's (docs/retargeting.md).
+    smoothing_hz
+        Low-pass filter the person's motion at this frequency; 0 does not filter it.
+    speed_scale
+        Use this share of the robot's limits of velocity, acceleration and jerk, above 0, up to 1.
+    limit_margin
+        Keep this distance from the position limits, in radians; from those of a prismatic joint a tenth of it,
+        in metres.
+    strict
+        Refuse a motion that is too fast for the robot, instead of slowing it down.
+    """
+    options = dict(locals())
+    import json
+
+    from .. import retargeting
+    from ..documents import whole_folder
+    from ..recording import check_selection
+    from ..report.page import PageWriter
+    from ..report.retargeting import render_retargeting_report
+    from ..report.viewer import retarget_html
+    from ..retargeting.targets import check_scale_and_smoothing
+    from ..retargeting.trajectory import STAGES
+    from ..writers import read_result
+    from ..writers.joint_motion import REPETITIONS
+    from ..writers.provenance import collect_provenance
+    from ..writers.result import as_json, read_phases
+
+    check_selection(interval, phase)
+    check_scale_and_smoothing(scale, smoothing_hz)
+    retargeting.LimitMargins(speed_scale, limit_margin).check()
+    with progress_bar() as progress:
+        with whole_folder(out, force) as folder:
+            progress("reading", 0.0)
+            pose, body, about = read_result(result, interval, phase)
+            trajectory = retargeting.retarget(
+                pose,
+                robot,
+                arm=arm,
+                task=task,
+                rate_hz=rate_hz,
+                scale=scale,
+                smoothing_hz=smoothing_hz,
+                speed_scale=speed_scale,
+                limit_margin=limit_margin,
+                strict=strict,
+                table=body.table,
+                progress=lambda text, fraction: progress(text, 0.48 * (fraction + STAGES.index(text))),
+            )
+            progress("checking", 0.96)
+            check = retargeting.check_limits(retargeting.build_table(trajectory), trajectory.robot.map)
+            collisions = retargeting.find_self_collisions(trajectory.robot, trajectory.time, trajectory.joint_position)
+            progress("writing", 0.98)
+            retargeting.write_trajectory(folder, trajectory)
+            summary = as_json(retargeting.summarize(trajectory, check, collisions))
+            summary |= {
+                "recording": str(about.get("recording") or result.name),
+                "recorded_phases": {name: list(map(list, spans)) for name, spans in read_phases(about).items()},
+                REPETITIONS: _find_repetitions(pose, trajectory),
+            }
+            text = json.dumps({**summary, "provenance": collect_provenance("retarget", options)}, indent=2)
+            (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
+        progress("making the pages", 0.99)
+        title = f"{about.get('recording') or result.name} on {trajectory.robot.map.name}"
+        pages = {"report.html": report, "view.html": view}
+        writer = PageWriter(out, [name for name, wanted in pages.items() if wanted])
+        page = None
+        if view:
+            page = writer.write("view.html", lambda _: retarget_html(body, pose, trajectory, title=title))
+        if report:
+            writer.write(
+                "report.html",
+                lambda lines: render_retargeting_report(trajectory, summary, title=title, view=page, failures=lines),
+            )
+        writer.save_diagnostics("summary.json")
+    print_diagnostics([*map(from_json, summary["diagnostics"]), *writer.diagnostics])
+    _print_arms(summary)
+    _print_checks(summary)
+    say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
+    say_pages(out, {"Report": "report.html", "Motion": "view.html"})
+    return Retargeted(summary, writer.diagnostics, float(trajectory.time[-1]))
+
+
+def _find_repetitions(pose: Pose, trajectory: Trajectory) -> dict[str, Any]:
+    """The repetitions of the arms that a robot follows, by which angle, when [s].
+
+    They are those that `wepose angles` finds; where no angle repeats, the movements of the hands between rests.
+    """
+    from dataclasses import replace
+
+    from ..angles import joint_angles
+    from ..angles.repetitions import find_movements, find_repetitions
+
+    angles, targets = joint_angles(pose), trajectory.arm_targets
+    sides = tuple(arm.side for arm in trajectory.robot.arms)
+    of_arms = {name: each for name, each in angles.joints.items() if name.startswith(sides)}
+    repetitions = find_repetitions(replace(angles, joints=of_arms))
+    source, spans, reason = repetitions.source, repetitions.spans, repetitions.reason
+    if not len(spans):
+        spans = find_movements(targets.time, *(hand.position for hand in targets.hands))
+        source, reason = ("hands between rests", "") if len(spans) else (source, reason)
+    return {"source": source, "spans": spans.tolist(), "reason": reason}
+
+
+def _print_arms(summary: Mapping[str, Any]) -> None:
+    """Errors of the hands, and their causes."""
+    rows, reasons = [], []
+    for side, arm in summary["arms"].items():
+        inside, rotation, swivel, reachability = (
+            arm[key] for key in ("hand_error_mm", "hand_error_deg", "swivel_error_deg", "reachability")
+        )
+        near = reachability["hand_error_where_reachable_mm"]
+        rows.append(
+            (
+                side,
+                f"{arm['scale']:.2f}",
+                *((f"{error[key]:.1f}" if error else "") for error in (inside, near) for key in ("median", "p90")),
+                f"{rotation['median']:.1f}",
+                f"{swivel['median']:.0f}" if swivel else "",
+                f"{100 * reachability['reachable_share']:.0f}",
+            )
+        )
+        reasons.append((side, *(f"{100 * share:.1f}" for share in arm["error_attribution"].values())))
+    slowdown = summary["slowdown"]
+    hand = ("hand [mm] median", "90 %", "where reachable: median", "90 %")
+    print_table(
+        f"{summary['robot']}: {summary['duration_s']:.1f} s, of which {summary['approach_s']:.1f} s are the approach; "
+        f"{summary['recorded_s']:.1f} s recorded" + (f", {slowdown:.2f} times as long" if slowdown is not None else ""),
+        ("arm", "scale", *hand, "orientation [deg]", "elbow swivel [deg]", "reachable [%]"),
+        rows,
+    )
+    title = "Hand more than 20 mm off [% of the time], by cause; what to do: docs/retargeting.md"
+    print_table(title, ("arm", *arm["error_attribution"]), reasons)
+
+
+def _print_checks(summary: Mapping[str, Any]) -> None:
+    """Margins to the limits, self-collisions and the time of a step."""
+    margins, collisions = summary["limit_margins"], summary["self_collisions"]
+    say(
+        f"Limits {'kept' if summary['within_limits'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "
+        f"velocity {100 * margins['velocity_share']:.1f} %, "
+        f"acceleration {100 * margins['acceleration_share']:.1f} %, jerk {100 * margins['jerk_share']:.1f} % to spare"
+    )
+    if not collisions["pairs"]:
+        say("Self-collision NOT CHECKED: no two shapes of the robot can meet, as its URDF has them")
+    elif not collisions["samples"]:
+        closest = collisions["min_hull_distance_mm"]
+        say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
+    braked = summary["steps"]["stopping_share"]
+    if braked:
+        say(f"Braked in {100 * braked:.2f} % of the steps, since no other kept all limits and left a way to stop")
+    say(f"Solved in {summary['solve_ms']['p50']:.2f} ms (p50), {summary['solve_ms']['p99']:.2f} ms (p99) a step")

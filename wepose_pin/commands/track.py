@@ -1,0 +1,224 @@
+"""``wepose track``: a recording → its pose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+from ..diagnostics import Diagnostic, from_json
+from .options import MORE, RESEARCH, Method, Model, Out, Subject
+from .output import print_diagnostics, print_table, progress_bar, say, say_pages
+
+
+class Tracked(NamedTuple):
+    """What came of `track`."""
+
+    summary: Mapping[str, Any]  # as in summary.json, page failures apart
+    page_failures: list[Diagnostic]  # pages, and parts of pages, that could not be made
+
+
+def track(
+    session: Path,
+    /,
+    *,
+    out: Out,
+    subject: Subject | None = None,
+    method: Method | None = None,
+    model: Model | None = None,
+    gaps: bool = False,
+    view: bool = True,
+    report: bool = True,
+    force: bool = False,
+    accept_failed: Annotated[bool, MORE] = False,
+    covariance: Annotated[bool, MORE] = False,
+    error_budget: Annotated[bool, MORE] = False,
+    torques: Annotated[bool, MORE] = False,
+    causal: Annotated[bool, RESEARCH] = False,
+    open_loop: Annotated[bool, RESEARCH] = False,
+    limits: Annotated[bool, RESEARCH] = True,
+) -> Tracked:
+    """Estimate the pose of a person from a recording: segment orientations and joint centres, with their uncertainty.
+
+    `wepose angles` and `wepose export` compute the joint angles of a person from the result.
+
+    A recording of `wepose live` is tracked causally, with the subject and the method of that session, and gives the
+    displayed poses again, bit-identical. With --subject or --method it is tracked as any other recording.
+
+    To track as Lisini Baldi et al. 2019 do, give --method smekf_published --open-loop and a subject of `wepose
+    calibrate --formulation paper --method smekf_published`, which holds lengths and no mounts.
+
+    Example: wepose track session.toml --subject anna/subject.toml -o result
+
+    Parameters
+    ----------
+    session
+        The recording: session.toml, the folder that holds it, or a file that `wepose live --record` wrote.
+    out
+        Write pose.parquet, subject.toml, subject.urdf, summary.json, view.html and report.html to this folder; of a
+        mechanism joints.parquet too.
+    subject
+        Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it;
+        or the lengths in an Xsens .mvnx. Without it lengths are those of the population prior, and mounts those that
+        the session states.
+    method
+        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
+        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases, with an
+        exact covariance and two more conditions of the static test), smekf_published (the same as published), ncf
+        (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011). Without it amekf, or
+        the method of the live session.
+    model
+        Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package, such as
+        whole_body (docs/models.md). A URDF without such a TOML, as a robot's, is a mechanism: its sensors are named by
+        its links. Without it the body that the session names, else the upper body.
+    gaps
+        Accept gaps of more than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap). Without it such a gap
+        is an error.
+    view
+        Write view.html, the animation of the motion.
+    report
+        Write report.html, which shows diagnostics and what to do about them, noise, drift, hands and joint angles.
+    force
+        Replace the files of an earlier run in DIR.
+    accept_failed
+        Use a subject whose calibration failed (quality = "fail" in subject.toml), which is refused otherwise.
+    covariance
+        Write the covariance of each orientation and point too, not only the standard deviations.
+    error_budget
+        Print the contribution of each source of error to the standard deviation of each point: soft tissue, sensors
+        with their mounts and start poses, lengths, the shoulder girdle. summary.json and report.html have it in any
+        case.
+    torques
+        Write torques.parquet too: joint torques by inverse dynamics. Assumed are a fixed base, gravity as the only
+        external force and no load in the hands; the motion is low-pass filtered at 6 Hz.
+    causal
+        Use only past samples, as `wepose live` does. Poses begin at the end of the start pose.
+    open_loop
+        Correct no headings: neither by joint accelerations, by elbows as hinges and by joined hands, nor by the resets
+        of a live session. Orientations are those of the filter from the start pose on.
+    limits
+        Keep joints with one or two axes within the limits of the model.
+    """
+    options = dict(locals())
+    from ..filters import BEST
+    from ..readers import is_live_log, load_session, read_live_log
+    from ..readers.subject import read_subject
+    from ..report import write_track_pages
+    from ..report.track import MOST_FRAMES
+    from ..subject import parse_subject
+    from ..tracking import CHUNK_S, SummaryAccumulator, TrackedRecording, TrackOptions, track_chunks
+    from ..writers.folder import result_folder
+    from ..writers.provenance import collect_provenance
+    from ..writers.result import write_about, write_poses
+
+    chosen = method or BEST
+    with progress_bar() as progress:
+        with result_folder(out, force) as folder:
+            progress("reading", 0.0)
+            person = None if subject is None else read_subject(subject)
+            if person is not None and not accept_failed:
+                person.check_quality()
+            if is_live_log(session):
+                log = read_live_log(session)
+                recording, causal = log.recording, causal or (method is None and person is None)
+                chosen = method or log.header["method"]
+                if person is None and log.header["subject"]:
+                    person = parse_subject(log.header["subject"], session)
+            else:
+                recording = load_session(session, gaps=gaps)
+            accumulator = SummaryAccumulator(recording)
+
+            def track_chunk_by_chunk() -> Iterator[TrackedRecording]:
+                for tracked in track_chunks(
+                    recording,
+                    person,
+                    model=model,
+                    options=TrackOptions(chosen, causal=causal, open_loop=open_loop, limits=limits),
+                    chunk_s=float("inf") if torques else CHUNK_S,
+                    progress=lambda share: progress(f"tracking by {chosen}", (1.0 + share) / 3.0),
+                ):
+                    accumulator.add(tracked)
+                    yield tracked
+
+            write_poses(folder, track_chunk_by_chunk(), covariance)
+            summary, joint_torques = accumulator.finish(), None
+            if torques:
+                from ..angles.torques import pose_torques
+
+                joint_torques = pose_torques(accumulator.last)
+            # Collected last, so that an input that is wrong is reported by its reader.
+            provenance = collect_provenance("track", options)
+            write_about(folder, accumulator.last, summary, recording.phases, joint_torques, provenance)
+        is_decimated = len(summary.tracked.time) < summary.content["samples"]
+        view_rate_hz = min(30.0, MOST_FRAMES / summary.content["duration_s"]) if is_decimated else None
+        failures: list[Diagnostic] = []
+        if view or report:
+            progress("making the pages", 2 / 3)
+            failures = write_track_pages(out, summary, view=view, report=report, fps=view_rate_hz or 30.0)
+    content = summary.content
+    _print_summary(content, error_budget)
+    print_diagnostics(failures)
+    motion = "Motion" + (f", {view_rate_hz:.2g} frames a second" if view_rate_hz else "")
+    say_pages(out, ({"Report": "report.html"} if report else {}) | ({motion: "view.html"} if view else {}))
+    say(f"Pose: {out / 'pose.parquet'}  ({len(content['sensors'])} segments, {len(content['points'])} points)")
+    if "joints" in content:
+        say(f"Joints: {out / 'joints.parquet'}")
+    if torques:
+        say(f"Torques, estimates: {out / 'torques.parquet'}")
+    return Tracked(content, failures)
+
+
+def _print_summary(summary: Mapping[str, Any], error_budget: bool) -> None:
+    """Diagnostics, the sensors' static share, bias and gravity, joints, and the error budget where it is wanted."""
+    print_diagnostics(from_json(each) for each in summary["diagnostics"])
+    print_table(
+        f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {summary['method']}, "
+        f"lengths: {summary['subject']['note'] or summary['subject']['name']}",
+        ("sensor", "static", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
+        [(segment, *_sensor_cells(about)) for segment, about in summary["sensors"].items()],
+    )
+    if "joints" in summary:
+        _print_joints(summary)
+    if error_budget:
+        _print_error_budget(summary["error_budget_mm"])
+
+
+def _sensor_cells(about: Mapping[str, Any]) -> tuple[str, str, str]:
+    if "static_share" not in about:
+        return "", "orientations from the recording", ""
+    begin, end = (_norm(about[f"gyro_bias_{when}_deg_s"]) for when in ("start", "end"))
+    return f"{100 * about['static_share']:.0f} %", f"{begin:.3f} → {end:.3f}", f"{about['gravity_m_s2']:.3f}"
+
+
+def _norm(values: Sequence[float]) -> float:
+    return sum(value * value for value in values) ** 0.5
+
+
+def _print_joints(summary: Mapping[str, Any]) -> None:
+    print_table(
+        "Joints [rad or m]",
+        ("joint", "minimum", "maximum", ""),
+        [
+            (
+                name,
+                f"{values['min']:.3f}",
+                f"{values['max']:.3f}",
+                "undetermined" if name in summary["undetermined_joints"] else "",
+            )
+            for name, values in summary["joints"].items()
+        ],
+    )
+
+
+def _print_error_budget(budget: Mapping[str, Mapping[str, float]]) -> None:
+    from ..tracking.error_budget import group_by_source
+
+    rows = {point: group_by_source(parts) for point, parts in budget.items()}
+    if not rows:
+        say("Error budget: none, since the filter states no uncertainty, or no point of a person is known")
+        return
+    print_table(
+        "Error budget: one standard deviation of an axis [mm], root mean square; by segment in summary.json",
+        ("point", *next(iter(rows.values()))),
+        [(point, *(f"{value:.1f}" for value in row.values())) for point, row in rows.items()],
+    )

@@ -1,0 +1,69 @@
+"""``wepose view``: the motion of a result as a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from ..diagnostics import INFO, Diagnostic
+from ..errors import BadOption, MissingFile
+from .options import MORE, Interval, OutFile, Phase
+from .output import print_diagnostics, progress_bar, say
+
+
+def view(
+    result: Path,
+    /,
+    *,
+    out: OutFile | None = None,
+    open: bool = True,
+    force: bool = False,
+    interval: Annotated[Interval | None, MORE] = None,
+    phase: Annotated[Phase | None, MORE] = None,
+) -> Path:
+    """Show the motion of a result as one HTML page that opens offline.
+
+    Example: wepose view result
+
+    Parameters
+    ----------
+    result
+        Folder that `wepose track` wrote.
+    out
+        Write the page to this file. Without it view.html in RESULT is used, and written if it is missing.
+    open
+        Open the page in the browser.
+    force
+        Write the page again if it exists.
+    interval
+        Show only this time of the recording, in seconds; needs --out.
+    phase
+        Show only this phase of the recording; needs --out. Of a phase with several intervals NAME:2 is the second.
+    """
+    import webbrowser
+
+    from ..documents import check_file, whole_file
+    from ..recording import check_selection
+    from ..report.viewer import pose_html
+    from ..writers import read_result
+    from ..writers.result import read_phases
+
+    check_selection(interval, phase)
+    if out is None and (interval is not None or phase is not None):
+        option = f"phase {phase}" if interval is None else "interval {:g} {:g}".format(*interval)
+        raise BadOption(f"--{option}: needs -o FILE; view.html in the result shows the whole recording")
+    page = out or result / "view.html"
+    if not (result / "pose.parquet").is_file():
+        raise MissingFile(f"{result}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
+    check_file(page, force=force or out is None)
+    with progress_bar() as progress:
+        if out is not None or force or not page.is_file():
+            progress("making the page", 0.0)
+            pose, model, summary = read_result(result, interval, phase)
+            text = pose_html(model, pose, phases=read_phases(summary), title=summary.get("recording", result.name))
+            with whole_file(page, force=True) as partial:
+                partial.write_text(text, encoding="utf-8")
+    say(f"Motion:  {page}")
+    if open and not webbrowser.open(page.absolute().as_uri()):
+        print_diagnostics([Diagnostic("browser-not-started", INFO)])
+    return page
