@@ -18,7 +18,7 @@ from wepose_pin.calibration import Calibration, CalibrationQuality, assess, cali
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import Recording
 from wepose_pin.report import render_calibration_report
-from wepose_pin.report.calibration import describe_direction, insert_breaks, smooth_shares
+from wepose_pin.report.calibration import describe_direction, insert_breaks
 from wepose_pin.report.words import plus_minus
 from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
 from wepose_pin.tracking import TrackedRecording, track
@@ -145,7 +145,6 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
         start_pose_offset={"torso": np.array([np.nan, 0.0])},
         heading_drift={},
         hinge_rms={},
-        information_shares={},
     )
     page = render_calibration_report(bare, made[1], tracked=made[2])
     assert headings(page) == ["Lengths", "Sensors", "The motion in 3D", "What was run"]
@@ -157,10 +156,6 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
         gap=calibration.gap[:1],
         prior_gap=calibration.prior_gap[:1],
         contact=calibration.contact[:1],
-    )
-    few = replace(
-        few,
-        information_shares={name: share[:1] for name, share in calibration.information_shares.items()},
         start_pose_offset={},
     )
     assert "Palm to palm over time" not in headings(render_calibration_report(few, made[1], tracked=made[2]))
@@ -187,16 +182,6 @@ def test_one_hand_at_a_point(made: Made, tmp_path: Path) -> None:
     assert "Palm to its point over time" in headings(page)
     assert "Not in the chain, known by the prior's proportions" in text_of(page)
     assert "joined" not in without_frame(page)
-
-
-def test_what_each_look_told_and_what_was_known_before_make_one(made: Made) -> None:
-    for name, share in made[0].information_shares.items():
-        assert np.all(share >= 0.0)
-        assert 0.0 <= share.sum() <= 1.0 + 1e-9, name
-    assert made[0].information_shares["trunk"].sum() == pytest.approx(0.0, abs=1e-9)  # it cancels in the closure
-    smooth = smooth_shares(made[0].time, made[0].information_shares["left_upper_arm"])
-    step = np.median(np.diff(made[0].time))
-    assert smooth.sum() * step / 100 == pytest.approx(made[0].information_shares["left_upper_arm"].sum(), rel=0.1)
 
 
 WHERE: Mapping[str, tuple[int, int]] = {

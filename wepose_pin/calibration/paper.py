@@ -40,7 +40,6 @@ from ..model.table import NEUTRAL_POSE
 from ..subject import Subject
 from .anatomy import check_limbs, measure_limbs
 from .conditions import Constraint, Loop, StartPose, resolve_conditions
-from .equations import rotate
 from .least_squares import MIN_LENGTH, QUIET_QP, Observations
 from .observability import diagnose_lengths
 from .priors import combine_lengths
@@ -146,19 +145,12 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
 
 def compute_gap_matrices(observations: Observations, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:
     """A (n, 3, 8) of each sample, from segment orientations (n, 4) xyzw: the gap [m] in W is ``A @ lengths``."""
-    matrices, layout = [], observations.layout
-    K = len(layout.lengths)
+    A = np.zeros((len(observations), 3, len(observations.layout.lengths)))
     for loop, span in observations.spans():
         assert isinstance(loop, Loop)
-        lengths, [way] = ca.SX.sym("lengths", K), loop.ways
-        quats = {part.sensor: ca.SX.sym(part.sensor, 4) for part in way}
-        vectors = [rotate(quats[part.sensor], ca.DM(np.array(part.by_length)) @ lengths) for part in way]
-        gap = ca.sum2(ca.horzcat(*vectors))
-        function = ca.Function("gap", [*quats.values()], [ca.densify(ca.jacobian(gap, lengths))])
-        n = span.stop - span.start
-        rows = np.asarray(function.map(n)(*(quat_WL[sensor][span].T for sensor in quats)))  # (3, K n)
-        matrices.append(rows.reshape(3, n, K).swapaxes(0, 1))
-    return np.concatenate(matrices)
+        for part in loop.parts:
+            A[span] += Rotation.from_quat(quat_WL[part.sensor][span]).as_matrix() @ np.array(part.by_length)
+    return A
 
 
 class _Constraints(NamedTuple):

@@ -39,7 +39,8 @@ from .sample_losses import SampleLoss, find_sample_losses, mask_connected
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
-MIN_SAMPLES = 10  # of each condition
+MOST_SAMPLES = 2000  # of all conditions; longer ones are sampled at a lower rate
+LEAST_S = 1.25  # [s] of each condition, in which all sensors measure
 LOOSE = 100.0  # times the standard deviation of a pose that is not used
 FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phase states it: headings drift
 USUAL_ELEVATION = np.deg2rad(60.0)  # [rad] of the arms off hanging, hands joined before the chest
@@ -277,7 +278,8 @@ class CalibrationProblem:
             A condition has too few samples at which all sensors measure, connected with the start pose.
         """
         recording, filtered, protocol = self.recording, self.filtered, self.protocol
-        stride = max(1, round(recording.rate_hz / rate_hz))
+        total = sum(len(self._find_samples(condition, 1)) for condition in protocol.conditions)
+        stride = max(1, round(recording.rate_hz / rate_hz), total // MOST_SAMPLES)
         start, sensors = self.start_pose, self.sensors
         layout = Layout(
             tuple(self.model.lengths),
@@ -304,13 +306,12 @@ class CalibrationProblem:
                 measured, place = measured[known], place[known]
             parts.append(measured)
             places.append(place)
-            if len(measured) < MIN_SAMPLES * rate_hz / SAMPLE_RATE_HZ:
+            seconds = len(measured) * stride / recording.rate_hz
+            if seconds < LEAST_S:
                 better = "five seconds" if isinstance(constraint, Pointing | Level) else "a minute"
-                seconds = len(measured) * stride / recording.rate_hz
                 raise BadPhase(
                     f"{recording.where()}: {_name_phase(condition)} has {seconds:.1f} s in which all sensors measure; "
-                    f"at least {MIN_SAMPLES / SAMPLE_RATE_HZ:g} s are needed, better {better}{unseen}"
-                    f"{self._describe_losses(phase)}"
+                    f"at least {LEAST_S:g} s are needed, better {better}{unseen}{self._describe_losses(phase)}"
                 )
         samples = np.concatenate(parts)
         rotations_since_start = [

@@ -184,8 +184,6 @@ class Calibration:
     start_pose_offset : segment → (2,) [rad] about x and y of W, by which it was off the start pose
     heading_drift : segment → [rad/s] drift of its sensor's heading
     hinge_rms : joint → [rad] rms angle of the segment below to the plane across its axis
-    information_shares : name as in the subject's covariance, or ``left_forearm + left_hand`` → (n,) share of the
-        information on it that each sample brings; their sum and the prior's share make 1
     labels : the check that each sensor is on the segment that the session states
     posed : phase of poses → by how many standard deviations it deviates from what is known without it; where no
         closure tells which of them is wrong
@@ -208,7 +206,6 @@ class Calibration:
     start_pose_offset: Mapping[str, np.ndarray] = field(default_factory=dict)
     heading_drift: Mapping[str, float] = field(default_factory=dict)
     hinge_rms: Mapping[str, float] = field(default_factory=dict)
-    information_shares: Mapping[str, np.ndarray] = field(default_factory=dict)
     labels: LabelCheck = field(default_factory=LabelCheck)
     posed: Mapping[str, float] = field(default_factory=dict)
     formulation: str = "full"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import NoSolution
 from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
-from .conditions import find_hinges, group_lengths, is_scale_observed
+from .conditions import find_hinges, is_scale_observed
 from .contact import find_initial_guess
 from .equations import HINGE_STD
 from .joints import add_couplings
@@ -26,7 +26,6 @@ from .weights import (
     WeightedFit,
     compare_measured,
     compare_posed,
-    compute_information_shares,
     estimate_covariance,
     project_to_subject,
     solve_reweighted,
@@ -87,9 +86,7 @@ def solve_fully(problem: CalibrationProblem) -> Calibration:
             f"session says"
         )
     covariance = widen_covariance(estimate_covariance(observations, result, coupled.information), alternatives, layout)
-    solution = _Solution(observations, samples, prior, result, covariance, alternatives)
-    sums = list(group_lengths(problem.conditions, layout.lengths).values())
-    return replace(_describe(problem, solution), information_shares=compute_information_shares(result, layout, sums))
+    return _describe(problem, _Solution(observations, samples, prior, result, covariance, alternatives))
 
 
 def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:

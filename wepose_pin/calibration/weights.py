@@ -27,7 +27,6 @@ ROUNDS = 5
 ROUND_STEPS = 2  # of the rounds after the first: the next one goes on
 FINAL_STEPS = 300  # of the last solve, which must converge: hands that hardly move take a hundred
 QUICK_ROUNDS, QUICK_STEPS = 1, 15
-MANY_SAMPLES = 1000  # from twice as many on, all rounds but the last take every second, third, … sample
 OUTLIER = 5.0  # times the usual gap, at which the palms are apart
 MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about right
 # [rad] by which people's elbows leave a hinge (docs/people.md): an oblique axis, and one that wanders.
@@ -61,16 +60,9 @@ def solve_reweighted(
     """
     n, closed = len(observations), observations.closed
     rounds, steps = (range(QUICK_ROUNDS), QUICK_STEPS) if quick else (range(ROUNDS), STEPS)
-    contact, correlation = contact.copy(), min_correlation(observations)
+    x, contact, correlation = start, contact.copy(), min_correlation(observations)
     weights = np.full((n, observations.layout.residuals), 1.0 / correlation)
     weights[:, :3] *= contact[:, None]
-    if n >= 2 * MANY_SAMPLES and closed.any() and not quick:
-        rows = np.concatenate([np.arange(n)[span][:: n // MANY_SAMPLES] for _, span in observations.spans()])
-        thinned = solve_reweighted(observations.take(rows), prior, start, contact[rows])
-        start, rounds = thinned.fit.x, rounds[-1:]
-        contact, *columns = (np.interp(np.arange(n), rows, column) for column in (thinned.contact, *thinned.weights.T))
-        weights = np.column_stack(columns) * (len(rows) / n)  # all together weigh what the few did
-    x = start
     if quick:
         weights[:, GAP_ROWS:] = 0.0
     for condition, span in observations.spans():
@@ -258,25 +250,3 @@ def project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose)
         own[2, layout.heading[i]] = 1.0
         T[K + 3 * i : K + 3 * i + 3] = start.R_WK[name].T @ own
     return (*layout.lengths, *rows, *of_girdles), T @ covariance @ T.T
-
-
-def compute_information_shares(
-    result: WeightedFit, layout: Layout, sums: Sequence[tuple[str, ...]]
-) -> dict[str, np.ndarray]:
-    """Name → share (n,) of the information that each sample brings: C = C (Σ Jᵀ W J + Λ) C, over C, is a sum to 1.
-
-    Parameters
-    ----------
-    sums : lengths that the closures show together, which are one direction as well, named with " + "
-    """
-    unit, covariance = np.eye(layout.size), result.fit.covariance
-    directions = dict(zip(layout.lengths, unit, strict=False))
-    directions |= {
-        " + ".join(names): np.sum([directions[name] for name in names], axis=0) for names in sums if len(names) > 1
-    }
-    for i, name in enumerate(layout.sensors):
-        directions |= dict(zip(mount_rows(name), unit[[*layout.tilt[i], layout.heading[i]]], strict=True))
-    T = np.array(list(directions.values()))
-    moved = result.fit.jacobian @ covariance @ T.T  # (n, residuals, k)
-    share = np.einsum("ni,nik->kn", result.weights, moved**2) / np.einsum("ki,ij,kj->k", T, covariance, T)[:, None]
-    return dict(zip(directions, share, strict=True))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..calibration import Calibration, CalibrationQuality
-from ..calibration.conditions import find_measured_lengths, group_lengths
+from ..calibration.conditions import find_measured_lengths
 from ..calibration.observability import find_intervals
 from ..calibration.protocols import Protocol, load_protocol
 from ..calibration.result import MIN_CONTACT, Check
@@ -29,7 +29,6 @@ from .words import capital, degrees, intervals, listed, plain, plural, plus_minu
 
 FRAMES_A_SECOND = 20.0  # of the 3D view
 UNOBSERVED = 0.97  # of the start pose's standard deviation, above which the motion showed nothing
-SMOOTHED_S = 2.0  # [s] of the information over time
 QUALITIES = {
     "pass": "**Pass:** the calibration is good to use.",
     "poor": "**Poor:** usable, with larger errors than usual.",
@@ -251,18 +250,11 @@ def _list_gap(calibration: Calibration, contact: _Contact) -> list[Item]:
         f"{1e3 * calibration.rms_gap:.1f} mm after. The effective sample size is "
         f"{calibration.effective_sample_size:.0f}: neighbouring samples repeat the same information."
     )
-    learned, step = {}, float(np.median(np.diff(time)))
-    for label, names in _group_shares(calibration, contact).items():
-        share = np.mean([calibration.information_shares[name] for name in names], axis=0)[order]
-        learned[f"learned about {label}"] = smooth_shares(time, share)
-        part = np.cumsum(np.sort(share)[::-1]) / max(float(np.sum(share)), 1e-12)
-        half = (int(np.searchsorted(part, 0.5)) + 1) * step
-        text += f" {half:.0f} s of {len(time) * step:.0f} s showed half of what the motion showed about {label}."
     gaps = {
         "with the prior's lengths": calibration.prior_gap[order],
         "with the estimated lengths": calibration.gap[order],
     }
-    return [draw_gap(time, gaps, calibration.contact[order], learned, contact.gap), text]
+    return [draw_gap(time, gaps, calibration.contact[order], contact.gap), text]
 
 
 def _list_posture(calibration: Calibration) -> list[Item]:
@@ -419,29 +411,20 @@ def draw_lengths(rows: Sequence[LengthRow]) -> ReportFigure:
 
 
 @styled
-def draw_gap(
-    time: np.ndarray, gaps: Mapping[str, np.ndarray], contact: np.ndarray, learned: Mapping[str, np.ndarray], label: str
-) -> ReportFigure:
-    """The gap before and after over time, and below how much each second showed.
+def draw_gap(time: np.ndarray, gaps: Mapping[str, np.ndarray], contact: np.ndarray, label: str) -> ReportFigure:
+    """The gap before and after over time.
 
     Parameters
     ----------
-    gaps, learned : label → (n,) [m] and [%/s]
+    gaps : label → (n,) [m]
     contact : (n,) weight, below `MIN_CONTACT` where the points were apart
     label : what the gap is
     """
-    panels = {f"{label} [mm]": {name: 1e3 * gap for name, gap in gaps.items()}}
+    panels = {f"{label} [mm]": {name: insert_breaks(time, 1e3 * gap) for name, gap in gaps.items()}}
     caption = capital(f"{label} over time, before and after.")
-    if learned:
-        panels["learned [% per second]"] = dict(learned)
-        caption += f" Below: the share of the information that each second gave, over {SMOOTHED_S:g} s."
     at = insert_breaks(time, time)
-    panels = {title: {n: insert_breaks(time, v) for n, v in each.items()} for title, each in panels.items()}
-    line_styles = [(COLOURS["left"], "--"), (COLOURS["right"], "-"), (COLOURS["other"], "-"), (SOFT, "-.")]
-    names = [*gaps, *learned]
-    styles = {
-        name: {"color": c, "linestyle": d, "label": name} for name, (c, d) in zip(names, line_styles, strict=False)
-    }
+    line_styles = [(COLOURS["left"], "--"), (COLOURS["right"], "-")]
+    styles = {name: {"color": c, "linestyle": d, "label": name} for name, (c, d) in zip(gaps, line_styles, strict=True)}
     half = 0.5 * float(np.median(np.diff(time)))
     apart = [(begin - half, end + half) for begin, end in find_intervals(time, contact < MIN_CONTACT)]
     figure = draw_over_time(at, panels, caption, styles, spans=("apart, left out", apart))
@@ -451,15 +434,6 @@ def draw_gap(
         0.0, 1.12 * max(float(np.nanmax(usual, initial=1.0)), 1.0)
     )  # lines may leave it while apart
     return figure
-
-
-def smooth_shares(time: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Smooth shares (n,) of the samples over `SMOOTHED_S`, to [%/s]."""
-    step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    half = SMOOTHED_S / 2.0
-    total = np.concatenate(([0.0], np.cumsum(np.nan_to_num(share))))
-    first, last = np.searchsorted(time, time - half), np.searchsorted(time, time + half, "right")
-    return 100.0 * (total[last] - total[first]) / ((last - first) * step)
 
 
 def insert_breaks(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -494,18 +468,6 @@ def _group_rigid_lengths(table: BodyTable) -> list[tuple[str, ...]]:
             if own.rigid_without_sensor and len(above) == 1 and table.segments[above[0][1]].along == own.along:
                 rows.append((above[0][0], name))
     return rows
-
-
-def _group_shares(calibration: Calibration, contact: _Contact) -> dict[str, list[str]]:
-    """Label → names in `Calibration.information_shares`, of the quantities that the motion can show."""
-    learned, table = calibration.information_shares, calibration.problem.model.table
-    groups = group_lengths(calibration.problem.conditions, calibration.problem.model.lengths)
-    limbs = [" + ".join(names) for sensor, names in groups.items() if not table.segments[sensor].spine]
-    shown = {
-        "lengths": [name for name in limbs if name in learned and set(name.split(" + ")) <= set(contact.chain)],
-        "headings": [name for name in learned if name.startswith("mounts.") and name.endswith(".z")],
-    }
-    return {label: names for label, names in shown.items() if names}
 
 
 def _closure_order(calibration: Calibration) -> np.ndarray:
