@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..diagnostics import ERROR, Diagnostic
+from ..errors import BadSession
 from ..model import BodyTable, HingeJoint
 from .conditions import Loop, find_parts
 from .result import Calibration, LabelCheck
@@ -102,22 +103,33 @@ def compute_hinge_angles(hinge: HingeJoint, along_on: Sequence[float], along: np
     return np.arctan2(np.cross(straight, along) @ axis, along @ straight)
 
 
+def reach_limbs(calibration: Calibration, R: Mapping[str, Rotation]) -> dict[str, np.ndarray]:
+    """Last point of a limb → the vectors (n, 3) [m] in W from its first point to it, of limbs whose links are known.
+
+    Parameters
+    ----------
+    R : segment → its orientations, n each
+    """
+    problem, reaches = calibration.problem, {}
+    lengths = np.array([calibration.subject.lengths[name] for name in problem.model.lengths])
+    for first, *_, last in problem.model.table.limbs:
+        try:
+            parts = find_parts(problem.model, problem.start_pose, R, [(last, 1.0), (first, -1.0)])
+        except BadSession:  # the limb's end is not known
+            continue
+        turned = [R[part.sensor] * problem.start_rotation(part.sensor).inv() for part in parts]
+        reaches[last] = np.sum([t.apply(part.vector(lengths)) for t, part in zip(turned, parts, strict=True)], axis=0)
+    return reaches
+
+
 def _share_behind(calibration: Calibration, R: Mapping[str, Rotation]) -> float:
     """The largest share of samples in which a closure's point is behind the segment in front of which it belongs."""
-    problem, shares = calibration.problem, [0.0]
-    model, start = problem.model, problem.start_pose
-    lengths = np.array([calibration.subject.lengths[name] for name in model.lengths])
-    turned = {name: rotation * problem.start_rotation(name).inv() for name, rotation in R.items()}
-    for loop in problem.conditions:
-        if not isinstance(loop, Loop) or loop.closure.in_front_of not in R:
-            continue
-        for point in loop.closure.points:
-            limb = next((limb for limb in model.table.limbs if limb[-1] == point), None)
-            if limb is None:
-                continue
-            parts = find_parts(model, start, R, [(point, 1.0), (limb[0], -1.0)])
-            reach = sum(turned[part.sensor].apply(part.vector(lengths)) for part in parts)
-            shares.append(float(np.mean(R[loop.closure.in_front_of].inv().apply(reach)[:, 0] < -BACK)))
+    shares, reaches = [0.0], reach_limbs(calibration, R)
+    for loop in calibration.problem.conditions:
+        if isinstance(loop, Loop) and loop.closure.in_front_of in R:
+            to_segment = R[loop.closure.in_front_of].inv()
+            forwards = [to_segment.apply(reaches[point])[:, 0] for point in loop.closure.points if point in reaches]
+            shares += [float(np.mean(x < -BACK)) for x in forwards]
     return max(shares)
 
 

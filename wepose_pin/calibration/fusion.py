@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from ..model import BodyTable
@@ -20,9 +21,7 @@ from ..subject import Subject, girdle_rows
 
 # Share of a calibration's variance that recurs: on simulated people nearly all of it does.
 RECURRING = 0.9
-# Of the shares of the two: relative variance that is given for alike ones, and rounds and steps of the search.
-ALIKE = 0.2
-ROUNDS, STEP = 200, 0.1
+ALIKE = 0.2  # relative variance that is given for alike shares of the two
 LEAST_STD = 1e-6  # [m] keeps covariances of what is known exactly invertible
 
 
@@ -60,20 +59,19 @@ def fuse_calibrations(
     return _replace_shape(subject, mean, fused, x[-1], C[-1], table)
 
 
-def _find_shares(K: Sequence[np.ndarray], lengths: int) -> np.ndarray:
-    """The shares (2,) of two informations in their weighted sum.
+def _find_shares(K: Sequence[np.ndarray], lengths: int) -> tuple[float, float]:
+    """The shares of two informations in their weighted sum.
 
     The least of ln(variance of the lengths) + `ALIKE` Σ share ln(share), which is convex: two calibrations that know as
     much have nearly equal shares, so that what does not recur is averaged, and one that knows less has less.
     """
-    shares = np.full(len(K), 1.0 / len(K))
-    for _ in range(ROUNDS):
-        C = np.linalg.inv(sum(share * each for share, each in zip(shares, K, strict=True)))[:, :lengths]
-        slope = np.array([np.sum(C * (each @ C)) for each in K]) / np.trace(C)
-        target = np.exp((slope - slope.max()) / ALIKE)
-        shares = shares ** (1.0 - STEP) * (target / target.sum()) ** STEP
-        shares /= shares.sum()
-    return np.asarray(shares)
+
+    def cost(share: float) -> float:
+        C = np.linalg.inv(share * K[0] + (1.0 - share) * K[1])[:lengths, :lengths]
+        return float(np.log(np.trace(C)) + ALIKE * (share * np.log(share) + (1.0 - share) * np.log(1.0 - share)))
+
+    share = float(minimize_scalar(cost, bounds=(1e-9, 1.0 - 1e-9), method="bounded", options={"xatol": 1e-9}).x)
+    return share, 1.0 - share
 
 
 def separate_mounts(earlier: Subject, population: Subject) -> Subject:

@@ -218,10 +218,10 @@ def solve(problem: LeastSquares, start: np.ndarray, steps: int = STEPS, *, stric
     }
     program: dict[str, Any] = {"x": z, "f": cost}
     solver = ca.nlpsol("calibration", "sqpmethod", program, options)
-    found = np.asarray(solver(x0=0.0, lbx=(problem.lower_bounds - start) / scale)["x"]).ravel()
-    if not np.all(np.isfinite(found)):
-        found = np.zeros(len(start))
-    estimate = Estimate(problem, np.maximum(start + scale * found, problem.lower_bounds))
+    minimiser = np.asarray(solver(x0=0.0, lbx=(problem.lower_bounds - start) / scale)["x"]).ravel()
+    if not np.all(np.isfinite(minimiser)):
+        minimiser = np.zeros(len(start))
+    estimate = Estimate(problem, np.maximum(start + scale * minimiser, problem.lower_bounds))
     if strict and not estimate.remaining < LOOSE_TOLERANCE:
         raise NoSolution(
             f"the lengths did not converge ({estimate.remaining:.2g} standard deviations to go); check that the hands "

@@ -16,11 +16,10 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity
-from ..errors import BadSession
 from ..model.table import MECHANISM, ROOT
 from ..subject import Quality
-from .anatomy import LEAST_ROTATION, diagnose_labels, measure_limbs, measure_rotation
-from .conditions import Loop, choose_variant, find_parts, group_lengths, is_scale_observed
+from .anatomy import LEAST_ROTATION, diagnose_labels, measure_limbs, measure_rotation, reach_limbs
+from .conditions import Loop, choose_variant, group_lengths, is_scale_observed
 from .observability import MOST_OPEN, find_intervals, format_longest
 from .result import (
     MIN_CONTACT,
@@ -300,29 +299,22 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
 
 
 def _measure_motion(calibration: Calibration) -> MotionRange:
-    problem = calibration.problem
-    model, table = problem.model, problem.model.table
+    model = calibration.problem.model
+    table = model.table
     rows = calibration.touching if calibration.touching.any() else np.ones(len(calibration.time), dtype=bool)
     R = {name: Rotation.from_quat(quat[rows]) for name, quat in calibration.quat_WL.items()}
-    lengths = np.array([calibration.subject.lengths[name] for name in model.lengths])
-    turned = {name: rotation * problem.start_rotation(name).inv() for name, rotation in R.items()}
     hinges = {hinge.on: joint for joint, hinge in table.hinges.items()}
     elevation, sideways, bend = {}, {}, {}
-    flexion = measure_limbs(calibration).flexion
+    flexion, reaches = measure_limbs(calibration).flexion, reach_limbs(calibration, R)
     for limb in () if table.is_mechanism else table.limbs:  # its links hang in no common pose
         key, first = table.side(limb[0]) or limb[-1], table.points[limb[0]].link
-        above = model.parents.get(first)
-        joint = hinges.get(first, "")
-        if above not in R or first not in R or (joint and joint not in flexion):
-            continue
-        try:
-            parts = find_parts(model, problem.start_pose, R, [(limb[-1], 1.0), (limb[0], -1.0)])
-        except BadSession:  # the limb's end is not known
+        above, joint = model.parents.get(first), hinges.get(first, "")
+        if above not in R or first not in R or limb[-1] not in reaches or (joint and joint not in flexion):
             continue
         base = R[above].inv()
         along = (base * R[first]).apply(table.segments[first].along)
         elevation[key] = _range(np.degrees(np.arccos(np.clip(-along[:, 2], -1.0, 1.0))))
-        sideways[key] = _range(_azimuth(base.apply(sum(turned[p.sensor].apply(p.vector(lengths)) for p in parts))))
+        sideways[key] = _range(_azimuth(base.apply(reaches[limb[-1]])))
         if joint:
             bend[key] = _range(flexion[joint])
     lean, twist = float("nan"), None
