@@ -308,7 +308,7 @@ def find_girdles(model: BodyModel, start: StartPose, sensors: Collection[str]) -
     return tuple(terms)
 
 
-def find_measured_lengths(protocol: Protocol, model: BodyModel) -> tuple[str, ...]:
+def find_closure_lengths(protocol: Protocol, model: BodyModel) -> tuple[str, ...]:
     """The lengths in some closure of a protocol."""
     names: dict[str, None] = {}
     for closure in protocol.closures:

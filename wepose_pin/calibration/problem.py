@@ -25,9 +25,9 @@ from .conditions import (
     Moving,
     Pointing,
     StartPose,
+    find_closure_lengths,
     find_girdles,
     find_hinges,
-    find_measured_lengths,
     resolve_conditions,
 )
 from .equations import Layout
@@ -99,7 +99,7 @@ class CalibrationProblem:
     @cached_property
     def lengths_in_closures(self) -> tuple[str, ...]:
         """The names of the lengths that some closure contains."""
-        return find_measured_lengths(self.protocol, self.model)
+        return find_closure_lengths(self.protocol, self.model)
 
     @property
     def scale_lengths(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..calibration import Calibration, CalibrationQuality
-from ..calibration.conditions import find_measured_lengths
+from ..calibration.conditions import find_closure_lengths
 from ..calibration.observability import find_intervals
 from ..calibration.protocols import Protocol, load_protocol
 from ..calibration.result import MIN_CONTACT, Check
@@ -113,7 +113,7 @@ class _Contact(NamedTuple):
 
 
 def _describe_contact(protocol: Protocol, calibration: Calibration) -> _Contact:
-    chain, table = find_measured_lengths(protocol, calibration.problem.model), calibration.problem.model.table
+    chain, table = find_closure_lengths(protocol, calibration.problem.model), calibration.problem.model.table
     points = dict.fromkeys(point for closure in protocol.closures for point in closure.points)
     if not points:
         return _Contact(protocol.name, "gap", chain)
