@@ -25,6 +25,7 @@ FORMATS = (".csv", ".tsv", ".txt", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
 # Characters of a line without values.
 EMPTY = b",; \t\r\n"
+MOST_EMPTY_END = 1 << 16  # bytes of such lines at the end
 # The names of a CSV stand within its first lines, or bytes.
 MOST_PREAMBLE, PREAMBLE_BYTES = 100, 1 << 20
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?nan", re.IGNORECASE)
@@ -50,11 +51,7 @@ def read_table(path: Path) -> pl.DataFrame:
         with library_errors(path, "a Parquet file"):
             return pl.read_parquet(open_source(path))
     layout = read_layout(path)
-    body = read_body(path, layout.head_lines)
-    # Editors and spreadsheets leave lines without values at the end.
-    content = len(body.rstrip(EMPTY))
-    end = body.find(b"\n", content)
-    body = body[: end if end >= 0 else None] if content else b""
+    body = _drop_empty_end(read_body(path, layout.head_lines))
     names = [
         f"{name}_duplicated_{layout.names[:k].count(name) - 1}" if name in layout.names[:k] else name
         for k, name in enumerate(layout.names)
@@ -72,6 +69,16 @@ def read_body(path: Path, head_lines: int) -> bytes:
         for _ in range(head_lines):
             file.readline()
         return file.read()
+
+
+def _drop_empty_end(body: bytes) -> bytes:
+    """Drop lines without values at the end of a CSV, which editors and spreadsheets leave."""
+    end = body[-MOST_EMPTY_END:]
+    content = end.rstrip(EMPTY)
+    first = len(body) - len(end) + len(content)
+    if not content:
+        return body[:first]
+    return body[:first] + body[first:].partition(b"\n")[0] + b"\n" if body.count(b"\n", first) > 1 else body
 
 
 def read_names(path: Path) -> tuple[list[str], dict[str, str]]:
@@ -95,6 +102,8 @@ def parse_rows(path: Path, body: bytes, names: Sequence[str], separator: str, *,
         A row has more cells than there are names; the table is damaged.
     """
 
+    has_comments = b"#" in body  # to look for them takes a third longer
+
     def parse(texts: Collection[str], decimal_comma: bool = False, n_rows: int | None = None) -> pl.DataFrame:
         return pl.read_csv(
             body,
@@ -104,7 +113,7 @@ def parse_rows(path: Path, body: bytes, names: Sequence[str], separator: str, *,
             decimal_comma=decimal_comma,
             n_rows=n_rows,
             null_values=NO_VALUE,
-            comment_prefix="#",
+            comment_prefix="#" if has_comments else None,
             encoding="utf8-lossy",
             raise_if_empty=False,
             missing_columns="insert",
