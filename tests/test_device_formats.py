@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from test_formats import ACCEL, GYRO, RATE, TIME, WXYZ, N, check_orientation, check_raw, load, own, rows
+from test_formats import MAKERS as FIRST_MAKERS
 from test_info import info
 
 import wepose_pin as wp
@@ -468,36 +469,45 @@ def test_the_session_that_is_proposed_needs_no_editing(
 
 
 def _first_file(path: Path) -> Path:
-    files = sorted(path.iterdir(), key=lambda file: file.name != "Gyroscope.csv") if path.is_dir() else [path]
+    files = (
+        sorted(path.iterdir(), key=lambda file: file.name not in ("Gyroscope.csv", "Inertial.csv"))
+        if path.is_dir()
+        else [path]
+    )
     return next(file for file in files if file.suffix != ".yaml")
 
 
+LABELS_IN_FILE = {"noraxon": "Upper spine", "delsys": "Sternum", "apdm": "Chest", "opensim": "torso_imu"}
 DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda _: b"",
     "binary": lambda _: b"\x00\xff\xfe\x01" * 300,
     "head alone": lambda raw: raw[:120],
     "UTF-16": lambda raw: raw.decode("latin-1").encode("utf-16"),
+    "garbage after the names": lambda raw: raw[: raw.rfind(b"\n", 0, 700)] + b"\n" + b"\xff\x00" * 300,
+    "text in the cells": lambda raw: raw.replace(b"\n", b"\n###", 900),
     "zeros in the middle": lambda raw: raw[:1500] + b"\x00" * 3000 + raw[4500:],
 }
 
 
-@pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("format", MAKERS)
+@pytest.mark.parametrize(
+    ("format", "damage"),
+    [
+        (format, damage)
+        for format in (*MAKERS, *FIRST_MAKERS)
+        for damage in DAMAGES
+        if format not in ("rosbag", "xdf") or damage not in ("garbage after the names", "text in the cells")
+    ],
+)
 def test_a_damaged_file_is_one_line(
     format: str, damage: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """Exit 2 with one line that names the file; not one is read as if nothing were wrong."""
-    name, make = MAKERS[format]
+    name, make = {**MAKERS, **FIRST_MAKERS}[format]
     file = _first_file(make(tmp_path / name))
     file.write_bytes(DAMAGES[damage](file.read_bytes()))
-    session = (
-        f'[data]\nfile = "{name}"\nformat = "{format}"\n[sensors.torso]\nmount = {{ up = "+x", forward = "-z" }}\n'
-    )
-    if format in ("noraxon", "delsys"):
-        session = session.replace(
-            "mount", 'label = "Upper spine"\nmount' if format == "noraxon" else 'label = "Sternum"\nmount'
-        )
-    (tmp_path / "session.toml").write_text(session)
+    label = f"label = {LABELS_IN_FILE[format]!r}\n" if format in LABELS_IN_FILE else ""
+    sensor = f'[sensors.torso]\n{label}mount = {{ up = "+x", forward = "-z" }}\n'
+    (tmp_path / "session.toml").write_text(f'[data]\nfile = "{name}"\nformat = "{format}"\n{sensor}')
     with pytest.raises(SystemExit) as stop:
         main(["track", str(tmp_path / "session.toml"), "-o", str(tmp_path / "out")])
     out, err = capsys.readouterr()

@@ -578,30 +578,6 @@ def made(format: str, folder: Path) -> Path:
     return path / "Inertial.csv" if path.is_dir() else path
 
 
-@pytest.mark.parametrize("format", MAKERS)
-@pytest.mark.parametrize(
-    "damage",
-    [
-        lambda _: b"",
-        lambda _: b"\x00\xff\xfe\x01" * 300,
-        lambda raw: raw[:60],
-        lambda raw: raw.decode("latin-1").encode("utf-16"),
-        lambda raw: raw[: raw.rfind(b"\n", 0, 700)] + b"\n" + b"\xff\x00" * 300,
-        lambda raw: raw.replace(b"\n", b"\n###", 900),
-    ],
-    ids=["empty", "binary", "head alone", "UTF-16", "garbage after the names", "text in the cells"],
-)
-def test_a_damaged_file_is_one_line_that_names_it(
-    format: str, damage: Callable[[bytes], bytes], tmp_path: Path
-) -> None:
-    path = made(format, tmp_path)
-    path.write_bytes(damage(path.read_bytes()))
-    with pytest.raises(WeposeError) as error:
-        load(tmp_path, f'[data]\nfile = "{path.relative_to(tmp_path)}"\nformat = "{format}"\n[sensors.torso]')
-    assert "\n" not in str(error.value)
-    assert path.name in str(error.value)
-
-
 @pytest.mark.parametrize("format", ["mt_manager", "dot", "ximu3", "apdm"])
 def test_a_last_line_that_was_cut_off_is_left_out(format: str, tmp_path: Path) -> None:
     path = made(format, tmp_path)

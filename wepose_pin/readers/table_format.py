@@ -161,7 +161,7 @@ def load_format(path: Path) -> TableFormat:
         name=path.stem,
         title=keys.text("title", path.stem) or path.stem,
         needs=keys.text("needs", " and ".join(signal for signal in AXES if signals[signal])) or "",
-        detect=tuple(_compile(keys.at("detect"), text, re.DOTALL | re.MULTILINE) for text in _texts(keys, "detect")),
+        detect=tuple(_compile(keys.at("detect"), text, flags=re.S | re.M) for text in _texts(keys, "detect")),
         suffixes=tuple(_texts(keys, "suffixes")),
         whole=keys.flag("whole"),
         files={kind: files.text(kind, None) or "" for kind in files.values},
@@ -207,35 +207,34 @@ def _read_line(keys: TomlTable, key: str) -> int:
     return int(line)
 
 
-def _compile(place: str, text: str, flags: int = re.IGNORECASE) -> re.Pattern[str]:
+def _compile(place: str, text: str, *groups: str, flags: int = re.IGNORECASE) -> re.Pattern[str]:
+    """Compile a regular expression that has these groups."""
     try:
-        return re.compile(text, flags)
+        pattern = re.compile(text, flags)
     except (re.error, RecursionError, OverflowError) as error:
         raise BadSession(f"{place} = '{text}' is no regular expression: {error}") from None
+    if lacking := [group for group in groups if group not in pattern.groupindex]:
+        raise BadSession(f"{place} = '{text}' has no group (?P<{lacking[0]}>…)")
+    return pattern
 
 
 def _pattern(keys: TomlTable, key: str, *groups: str) -> re.Pattern[str] | None:
     text = keys.text(key, None)
-    if text is None:
-        return None
-    pattern = _compile(keys.at(key), text)
-    lacking = [group for group in groups if group not in pattern.groupindex]
-    if lacking:
-        raise BadSession(f"{keys.at(key)} = '{text}' has no group (?P<{lacking[0]}>…)")
-    return pattern
+    return None if text is None else _compile(keys.at(key), text, *groups)
 
 
 def _read_signal(keys: TomlTable, signal: str) -> Columns:
     keys.allow("columns", "unit", "limit", "increments")
-    unit, increments = keys.text("unit", None) or "", keys.flag("increments")
-    limit = keys.number("limit", np.inf) if "limit" in keys else np.inf
-    if isinstance(keys.values.get("columns"), str):
-        pattern = _pattern(keys, "columns", "axis")
-        return Columns((), pattern, unit, limit or 0.0, increments)
-    counts = {"gyro": (4,) if increments else (3,), "accel": (3,), "orientation": (3, 4, 9)}[signal]
-    names = keys.values.get("columns")
-    count = len(names) if isinstance(names, list) and len(names) in counts else counts[0]
-    return Columns(tuple(keys.names("columns", count)), None, unit, limit or 0.0, increments)
+    increments, names = keys.flag("increments"), keys.values.get("columns")
+    pattern, listed = None, tuple[str, ...]()
+    if isinstance(names, str):
+        pattern = _compile(keys.at("columns"), names, "axis")
+    else:
+        counts = {"gyro": (4,) if increments else (3,), "accel": (3,), "orientation": (3, 4, 9)}[signal]
+        count = len(names) if isinstance(names, list) and len(names) in counts else counts[0]
+        listed = tuple(keys.names("columns", count))
+    limit = keys.number("limit", None, positive=True) or np.inf
+    return Columns(listed, pattern, keys.text("unit", None) or "", limit, increments)
 
 
 def _read_clock(keys: TomlTable) -> ClockColumn:
@@ -276,7 +275,7 @@ def _select(files: Mapping[str, Path], pattern: str) -> list[Path]:
 
 
 class Header(NamedTuple):
-    """The names of the columns, and what stands before and after them."""
+    """The names of the columns, and where they stand."""
 
     line: int
     separator: str

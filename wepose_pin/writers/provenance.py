@@ -119,47 +119,38 @@ def file_hashes(path: Path, truth: bool = False) -> dict[str, str]:
 
 
 def list_files(path: Path, truth: bool = False) -> list[Path]:
-    """The files that an input consists of."""
-    if path.is_dir() and (path / "session.toml").is_file():
+    """List the files that an input consists of, each followed by those that it needs."""
+    if (path / "session.toml").is_file():
         path = path / "session.toml"
     if path.is_dir():
         return [path / name for name in _RESULT if (path / name).is_file()] or sorted(_list_all(path))
-    # A map may name a URDF of example-robot-data, which lies elsewhere and has a version of its own.
-    named = [path.parent / name for name in list_named_files(path, truth)]
-    named += [file for body in named if body.suffix in (".toml", ".urdf") for file in _list_of_body(body)]
-    return [path, *(file for file in named if file.exists() or file.suffix != ".urdf"), *_companion_files(path)]
-
-
-def _list_of_body(body: Path) -> list[Path]:
-    """What is read with a body that a session names."""
-    return [*(body.parent / name for name in list_named_files(body)), *_companion_files(body)]
-
-
-def _companion_files(path: Path) -> list[Path]:
-    """What is read with a URDF because it lies there: the map of a robot, the table of a body."""
-    tables = (path.with_suffix(".toml"), path.with_name("model.toml")) if path.suffix == ".urdf" else ()
-    return [table for table in dict.fromkeys(tables) if table.is_file()]
+    files = [path]
+    for file in files:
+        needed = [file.parent / name for name in list_named_files(file, truth)]
+        if file.suffix == ".urdf":  # the map of a robot, or the table of a body, is read where it lies beside
+            needed += [table for table in (file.with_suffix(".toml"), file.with_name("model.toml")) if table.is_file()]
+        # A map may name a URDF of example-robot-data, which lies elsewhere and has a version of its own.
+        files += [each for each in needed if each not in files and (each.exists() or each.suffix != ".urdf")]
+    return files
 
 
 def list_named_files(path: Path, truth: bool = False) -> list[str]:
-    """Files and folders that a session, or a model's table, names, as they stand there."""
+    """List the files and folders that a session, or a model's table, names, as they stand there."""
     if path.suffix != ".toml" or not path.is_file():  # a pipe would hold us up
         return []
     try:
         content = parse_toml(path.read_bytes().decode("utf-8"))
     except (OSError, ValueError):
         return []  # its reader reports what is wrong
-    data, sensors = content.get("data"), content.get("sensors")
+    data, sensors, model = content.get("data"), content.get("sensors"), content.get("model")
     tables = [data, *(sensors.values() if isinstance(sensors, dict) else ())]
-    names = [table.get("file") for table in tables if isinstance(table, dict)]
-    names += [_named_model(path, content.get("model")), content.get("urdf")]
-    names += [data.get("truth") if truth and isinstance(data, dict) else None]
+    tables = [table for table in tables if isinstance(table, dict)]
+    formats = [name for table in tables if str(name := table.get("format")).endswith(".toml")]
+    # A body of the package is part of the code.
+    bodies = [model] if isinstance(model, str) and (path.parent / model).is_file() else []
+    truths = [data.get("truth")] if truth and isinstance(data, dict) else []
+    names = [*(table.get("file") for table in tables), *formats, *bodies, content.get("urdf"), *truths]
     return sorted({name for name in names if isinstance(name, str) and name})
-
-
-def _named_model(path: Path, name: object) -> str | None:
-    """The body that a session names, where it is a file; one of the package is part of the code."""
-    return name if isinstance(name, str) and (path.parent / name).is_file() else None
 
 
 def file_hash(path: Path) -> str:
