@@ -22,6 +22,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import expit, logit
 
 from ..filters import AboutVertical
 from .heading_observations import OUTLIER_STDS, ClaspDetector, build_gap_rows, correct_headings, linearize_hinge
@@ -36,6 +37,9 @@ LEAST_INFORMATION = 1e-6  # relative to what a filter knew of its bias, below wh
 # growth; that is forgotten with a time constant [s].
 LEAP_RATIO, GROWTH_MEMORY_S = 10.0, 60.0
 MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accelerations
+# People stand off the start pose as the population does, or by a share of it where they take care: the share, and how
+# likely that is before anything is observed; assumptions.
+CAREFUL_SHARE, CAREFUL_PROBABILITY = 0.1, 0.2
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
 _DIFFERENCE = np.array([[1.0, -1.0], [-1.0, 1.0]])
@@ -114,19 +118,21 @@ class HeadingFilter:
 
     def reset(self, headings: np.ndarray) -> None:
         """Set δ (k,) [rad] as known to within the start pose."""
-        self.x[: len(headings)] = headings
+        columns, _, starts = self.problem.start_columns
+        self.x[columns], self.x[starts] = headings, 0.0
         self._set_start_covariance()
 
     def _set_start_covariance(self) -> None:
-        """Set the covariance of δ = s − ε_z and of the mounts' ε_z after a start pose."""
-        k, problem = len(self.problem.names), self.problem
-        headings = np.arange(k)
-        mounts = problem.find_column("mount", 0) + headings
-        both = np.concatenate([headings, mounts])
-        self.P[both, :], self.P[:, both] = 0.0, 0.0
+        """Set the covariance of δ = s − ε_z, of the mounts' ε_z and of the segments' s after a start pose."""
+        problem = self.problem
+        headings, mounts, starts = problem.start_columns
+        at = np.concatenate([headings, mounts, starts])
+        self.P[at, :], self.P[:, at] = 0.0, 0.0
         self.P[headings, headings] = problem.start_var + problem.mount_var
         self.P[mounts, mounts] = problem.mount_var
         self.P[headings, mounts] = self.P[mounts, headings] = -problem.mount_var
+        self.P[starts, starts] = problem.start_var
+        self.P[headings, starts] = self.P[starts, headings] = problem.start_var
 
     def step(self, knot: Knot) -> KnotChange:
         """Predict to the end of a knot and update by its observations; return the change of the prediction."""
@@ -377,40 +383,80 @@ def _symmetric(P: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * (P + P.T))
 
 
-class SmoothedHeadings(NamedTuple):
-    """The headings at m knots.
+class HeadingEstimate(NamedTuple):
+    """The headings of k segments, at a knot or at m of them (m, …).
 
     Parameters
     ----------
-    errors, covariance : (m, k) [rad] and (m, k, k) [rad²] of δ
-    segment_covariance : (m, k, k) [rad²] of the segments' headings, see `HeadingProblem.find_segment_covariance`
-    clasps : [s] intervals in which points were found to coincide
+    errors, covariance : (k,) [rad] and (k, k) [rad²] of δ
+    segment_covariance : (k, k) [rad²] of the segments' headings near the start pose. δ begins at s − ε_z, by errors s
+        of the start pose and ε_z of the mount, and grows by the drift; a segment that hangs is off by δ + ε_z.
     """
 
     errors: np.ndarray
     covariance: np.ndarray
     segment_covariance: np.ndarray
-    clasps: tuple[tuple[float, float], ...]
 
 
-def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> SmoothedHeadings:
-    """Filter and smooth the knots (Rauch, Tung, Striebel 1965)."""
-    k = len(problem.names)
-    forward = HeadingFilter(problem)
+class StanceEstimator:
+    """Finds how well the person stood in the start pose, and the headings by that.
+
+    The filter's start pose is that of the population. That the person took care is a second hypothesis: the headings of
+    the start pose have `CAREFUL_SHARE` of the standard deviation. Its likelihood follows in closed form from what the
+    filter knows of the errors s of the start pose, which are states. Only accelerations of joints tell that much.
+
+    Attributes
+    ----------
+    careful : probability of the second hypothesis
+    """
+
+    def __init__(self, problem: HeadingProblem) -> None:
+        self._columns = np.concatenate(problem.start_columns)
+        self._information = (CAREFUL_SHARE**-2 - 1.0) / problem.start_var  # that care adds, of s
+        self.careful = self._before = CAREFUL_PROBABILITY if problem.pairs else 0.0
+
+    def assess(self, x: np.ndarray, P: np.ndarray) -> None:
+        """Find the probability of care by the state and its covariance."""
+        k = len(self._information)
+        s, P_ss = x[self._columns[2 * k :]], P[np.ix_(self._columns[2 * k :], self._columns[2 * k :])]
+        spread = np.eye(k) + self._information[:, None] * P_ss
+        misfit = s @ np.linalg.solve(spread, self._information * s)
+        log_ratio = -k * np.log(CAREFUL_SHARE) - 0.5 * (np.linalg.slogdet(spread)[1] + misfit)
+        self.careful = float(expit(logit(self._before) + log_ratio))
+
+    def estimate(self, x: np.ndarray, P: np.ndarray) -> HeadingEstimate:
+        """Return the mean over both hypotheses, and its covariance."""
+        k = len(self._information)
+        x, P = x[self._columns], P[np.ix_(self._columns, self._columns)]
+        by_start = P[:, 2 * k :]
+        spread = np.eye(k) + self._information[:, None] * by_start[2 * k :]
+        gain = by_start @ np.linalg.solve(spread, np.diag(self._information))
+        change, p = -gain @ x[2 * k :], self.careful
+        mean = x + p * change
+        cov = _symmetric(P - p * gain @ by_start.T) + p * (1.0 - p) * np.outer(change, change)
+        headings, mounts = slice(0, k), slice(k, 2 * k)
+        both = cov[headings, mounts]
+        return HeadingEstimate(mean[:k], cov[:k, :k], cov[:k, :k] + cov[mounts, mounts] + both + both.T)
+
+
+def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> tuple[HeadingEstimate, list[tuple[float, float]]]:
+    """Filter and smooth the knots (Rauch, Tung, Striebel 1965).
+
+    Return the headings at the knots, and the intervals [s] in which points were found to coincide.
+    """
+    forward, stance = HeadingFilter(problem), StanceEstimator(problem)
     filtered, changes = [], []
     for knot in knots:
         changes.append(forward.step(knot))
         filtered.append((forward.x, forward.P))
     x, P = filtered[-1]
-    means, covs, of_segments = [x[:k]], [P[:k, :k]], [problem.find_segment_covariance(P)]
+    stance.assess(x, P)
+    estimates = [stance.estimate(x, P)]
     for i in range(len(knots) - 2, -1, -1):
         forward.x, forward.P = filtered[i]
         forward.predict(changes[i + 1])
         gain = np.linalg.solve(forward.P, forward.advance(filtered[i][1])).T
         x = filtered[i][0] + gain @ (x - forward.x)
         P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)
-        means.append(x[:k])
-        covs.append(P[:k, :k])
-        of_segments.append(problem.find_segment_covariance(P))
-    errors, covariance, segment_covariance = (np.array(each[::-1]) for each in (means, covs, of_segments))
-    return SmoothedHeadings(errors, covariance, segment_covariance, tuple(forward.clasps))
+        estimates.append(stance.estimate(x, P))
+    return HeadingEstimate(*(np.array(each[::-1]) for each in zip(*estimates, strict=True))), forward.clasps

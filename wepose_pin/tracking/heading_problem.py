@@ -50,7 +50,7 @@ class HeadingNoise:
     """
 
     drift_psd: float = float(np.deg2rad(0.12) ** 2)
-    rate_std: float = float(np.deg2rad(0.1))
+    rate_std: float = float(np.deg2rad(0.05))
     rate_change_psd: float = float(np.deg2rad(0.1) ** 2 / 900.0)
     joint_std: float = float(np.deg2rad(0.5))
     girdle_std: float = float(np.deg2rad(0.9))
@@ -199,7 +199,7 @@ class HeadingProblem:
     names : segments, in the order of δ
     knot_s : [s] length of a knot
     drift_psd : (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate
-    rate_std : (k,) [rad/s] of the gyroscopes' biases at the start
+    rate_std : (k,) [rad/s] of the drift rates at the start: of the gyroscopes' biases, or of measured orientations
     start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
     start : what the filters know at the end of the start pose; None: as at the end of the first knot
     delay_std : [s] by which an accelerometer is late against its gyroscope
@@ -233,15 +233,11 @@ class HeadingProblem:
         """Number of states."""
         return self.find_column("lever", 6 * len(self.pairs))
 
-    def find_segment_covariance(self, P: np.ndarray) -> np.ndarray:
-        """Find the covariance (k, k) [rad²] of the segments' headings near the start pose, in that of the state.
-
-        δ begins at s − ε_z, by errors s of the start pose and ε_z of the mount, and grows by the drift; a segment that
-        hangs is off by δ + ε_z.
-        """
-        k, first = len(self.names), self.find_column("mount", 0)
-        mounts = slice(first, first + k)
-        return np.asarray(P[:k, :k] + P[mounts, mounts] + P[:k, mounts] + P[mounts, :k])
+    @cached_property
+    def start_columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The columns (k,) of the headings, of the mounts' errors and of those of the segments in the start pose."""
+        segments = np.arange(len(self.names))
+        return segments, self.find_column("mount", 0) + segments, self.find_column("start", 0) + segments
 
     def find_column(self, state: str, index: int) -> int:
         """Find the column of a state; `index` is that of its segment, joint or hinge.
@@ -259,7 +255,8 @@ class HeadingProblem:
             "mount": 2 * k + j + 3 * h,
             "force": 3 * k + j + 3 * h,
             "delay": 6 * k + j + 3 * h,
-            "lever": 7 * k + j + 3 * h,
+            "start": 7 * k + j + 3 * h,
+            "lever": 8 * k + j + 3 * h,
         }
         return first[state] + index
 

@@ -2,9 +2,7 @@
 
 The filters' tilt is good and their headings drift. Time is cut into intervals of equal length, the knots, and
 `heading_filter` estimates one error of each heading a knot; an error common to all segments is unobservable. Offline a
-first forward pass estimates where the sensors sit (their levers to the joints); a second one begins from there, as
-uncertain as the first, and a Rauch-Tung-Striebel pass backward gives the errors. Causally there is one forward pass,
-and what a knot shows is corrected in the next one.
+Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is corrected in the next one.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ from ..model import BodyModel
 from ..model.start_pose import orient_links
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..subject import Subject
-from .heading_filter import HeadingFilter, smooth
+from .heading_filter import HeadingFilter, StanceEstimator, smooth
 from .heading_observations import correct_headings, linearize_hinge, move_all_girdles, undo_corrections
 from .heading_problem import (
     MECHANISM_NOISE,
@@ -49,6 +47,7 @@ from .heading_problem import (
 from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, find_pairs
 
 REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
+MEASURED_RATE_STD = np.deg2rad(0.1)  # [rad/s] at which a measured orientation drifts about the vertical; assumption
 LEAST_MOUNT_VAR = np.deg2rad(0.01) ** 2  # [rad²] of a mount's heading, so that covariances can be inverted
 # [s] between knots: causally what a knot observes is corrected by the end of the next one, offline each costs memory.
 CAUSAL_KNOT_S, OFFLINE_KNOT_S = 0.5, 2.0
@@ -204,7 +203,7 @@ def make_heading_problem(
     stride = find_stride(recording.rate_hz)
     samples = max(1, round((CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S) * recording.rate_hz / stride))
     knot_s = samples * stride / recording.rate_hz
-    drift_psd, rate_std = np.full(len(names), noise.drift_psd), np.zeros(len(names))
+    drift_psd, rate_std = np.full(len(names), noise.drift_psd), np.full(len(names), MEASURED_RATE_STD)
     for i, name in enumerate(names):
         if name in orientations.orientation:  # a gyroscope's white noise may be more
             of_sensor = orientations.orientation[name].noise
@@ -368,15 +367,7 @@ class HeadingCorrector:
             self._knots.append(self._reader.close(self._last_filters))
         if not self._knots:
             return False
-        problem = self._problem
-        if problem.pairs:  # the second pass begins with the levers of the first, as uncertain as before
-            learn = HeadingFilter(problem)
-            for knot in self._knots:
-                learn.step(knot)
-            levers = [learn.x[problem.find_lever_columns(i)] for i in range(len(problem.pairs))]
-            pairs = tuple(pair._replace(levers=each) for pair, each in zip(problem.pairs, levers, strict=True))
-            problem = replace(problem, pairs=pairs)
-        self._smoothed = smooth(problem, self._knots)
+        self._smoothed, self._clasps = smooth(self._problem, self._knots)
         if self._measured.any() and not exceed_uncertainty(self._smoothed.errors, self._smoothed.covariance):
             self._smoothed.errors[:, self._measured] = 0.0
         ends = np.array([knot.end for knot in self._knots])
@@ -431,7 +422,7 @@ class HeadingCorrector:
             max_correction_deg=dict(self._max_correction_deg),
             joint_accelerations=tuple(pair.far for pair in self._problem.pairs),
             hinges=tuple(hinge.joint for hinge in self._problem.hinges),
-            found_clasps=self._smoothed.clasps,
+            found_clasps=tuple(self._clasps),
             segments=self._names,
             time=self._knot_times,
             covariance=self._smoothed.covariance,
@@ -478,7 +469,7 @@ class CausalHeadings:
         mounts = np.array([orientations.quat_LS[name] for name in problem.names])
         self.offset = np.array([orientations.heading_offset[name] for name in problem.names])
         self._reader = KnotReader(mounts, self.offset, recording.rate_hz, problem)
-        self._filter = HeadingFilter(problem)
+        self._filter, self._stance = HeadingFilter(problem), StanceEstimator(problem)
         self._rate_hz, self._samples = recording.rate_hz, 0
         self._start_end = float(recording.time[-1])
         self._lead = min(round(SOLVE_SHARE * self._reader.size), self._reader.size - 1)
@@ -491,6 +482,7 @@ class CausalHeadings:
         self._undone = np.zeros(len(problem.names))  # [rad] what the filters have corrected since, at the last knot
         self._knot_filters: FilterHeadings | None = None  # of the last complete knot
         self._var_at_knot = np.zeros(len(problem.names))  # [rad²] of the filters, at the last knot that is applied
+        self._estimate = self._stance.estimate(self._filter.x, self._filter.P)
         self.variance = self._find_variances()
         self._max_correction = np.zeros(len(problem.names))
         self._marked: dict[str, list[tuple[int, int | None]]] = {}  # phase → first sample, and the one after the last
@@ -562,12 +554,10 @@ class CausalHeadings:
         knot = self._reader.form(samples, filters)
         yield
         yield from self._filter.step_gradually(knot)
-        k = len(filters.var)
+        self._stance.assess(self._filter.x, self._filter.P)
+        self._estimate = self._stance.estimate(self._filter.x, self._filter.P)
         if self._record:
-            P = self._filter.P
-            self._history.append(
-                (self._start_end + knot.end, P[:k, :k].copy(), self._problem.find_segment_covariance(P))
-            )
+            self._history.append((self._start_end + knot.end, *self._estimate[1:]))
 
     def _apply(self) -> None:
         """Finish the last knot; its correction fades in from the next sample on."""
@@ -578,10 +568,9 @@ class CausalHeadings:
         self._solving = None
         self._var_at_knot = np.nan_to_num(self._knot_filters.var)
         self._undone = np.nan_to_num(self._knot_filters.about_vertical.heading - self.at_start)
-        k = len(self._end)
-        self._begin, self._end = self._end, self._filter.x[:k].copy()
+        self._begin, self._end = self._end, self._estimate.errors.copy()
         if self._measured.any() and not self._corrects_measured:
-            self._corrects_measured = exceed_uncertainty(self._end[None], self._filter.P[None, :k, :k])
+            self._corrects_measured = exceed_uncertainty(self._end[None], self._estimate.covariance[None])
             self._end[self._measured] *= self._corrects_measured
         self._max_correction = np.maximum(self._max_correction, np.abs(self._end - self._undone))
         self.variance = self._find_variances()
@@ -592,6 +581,7 @@ class CausalHeadings:
         error = heading_offset - self.offset
         error = error + 2.0 * np.pi * np.round((self._end - error) / (2.0 * np.pi))
         self._filter.reset(error)
+        self._estimate = self._stance.estimate(self._filter.x, self._filter.P)
         self._corrects_measured = True
         self._begin = self._end = error
         self._at_reset = error - self._undone
@@ -599,8 +589,11 @@ class CausalHeadings:
 
     def _find_variances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what `variance` is now."""
-        of_segments = np.diag(self._problem.find_segment_covariance(self._filter.P))
-        return of_segments, self._var_at_knot, (self._end - self._undone - self._at_reset) ** 2
+        return (
+            np.diag(self._estimate.segment_covariance),
+            self._var_at_knot,
+            (self._end - self._undone - self._at_reset) ** 2,
+        )
 
     def summarize(self) -> HeadingCorrection:
         """Return what was observed and corrected so far, without residuals: they are not computed causally."""

@@ -30,9 +30,9 @@ LEAST_RATE_HZ = 20.0  # of recordings that are used
 # Where a sensor sits is known from its segment alone: in the middle, give or take this much on each axis; assumption.
 LEVER_STD = 0.08  # [m]
 LEVER_STD_OF_LENGTH = 0.3  # of the distance to the joint, on large bodies
-# A heading may be feigned by this many times the rms of the coherent misfits that no heading explains, found by
-# simulated people who walk.
-COHERENT_MARGIN = 1.5
+# A heading may be feigned by this many times the rms of the coherent misfits that no heading explains, and by no more
+# than a share of the rms misfit; found by simulated people who walk, run, throw and reach.
+COHERENT_MARGIN, LARGEST_COHERENT_SHARE = 2.0, 0.5
 
 
 class JointPair(NamedTuple):
@@ -97,8 +97,8 @@ class JointMisfit(NamedTuple):
 
     Parameters
     ----------
-    products : (3, 3) Σ e fᵀ of the misfit e and the force f
-    misfit, force : (3,) Σ e², Σ f²
+    products : (3, 3) [m²/s⁴] Σ e fᵀ of the misfit e and the force f
+    misfit, force : (3,) [m²/s⁴] Σ e², Σ f²
     samples : that count
     """
 
@@ -134,7 +134,8 @@ class JointMisfit(NamedTuple):
         mixed = E[:2, 2] * np.sqrt(horizontal / max(self.force[2], 1e-9 * horizontal))
         parts = np.array([E[0, 0] + E[1, 1], E[0, 0] - E[1, 1], E[0, 1] + E[1, 0], *mixed, *E[2, :2]])
         by_chance = self.variance / horizontal * correlated_samples / self.samples
-        return COHERENT_MARGIN**2 * max(float(np.mean(parts**2)) - by_chance, 0.0)
+        coherent = COHERENT_MARGIN**2 * max(float(np.mean(parts**2)) - by_chance, 0.0)
+        return min(coherent, LARGEST_COHERENT_SHARE**2 * self.variance * 2.0 * self.samples / horizontal)
 
 
 def find_pairs(model: BodyModel, sensors: Mapping[str, np.ndarray]) -> tuple[JointPair, ...]:
