@@ -17,16 +17,16 @@ from arms import write_arm
 from guided_person import TRACKERS, GuidedPerson, PersonSource, TrackerPerson, perform
 
 from wepose_pin.assets import asset
-from wepose_pin.calibration import Calibration, CalibrationQuality, assess, calibrate, load_protocol
+from wepose_pin.calibration import Calibration, calibrate, load_protocol
 from wepose_pin.commands.guide import choose_parts, choose_protocol
 from wepose_pin.commands.live import live
 from wepose_pin.errors import BadSession
 from wepose_pin.live import open_source
 from wepose_pin.live.assignment import read_segments, write_segments
 from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
-from wepose_pin.live.guided import make_steps
 from wepose_pin.live.setup import SensorSetup
-from wepose_pin.live.state import GuideView, Output, Status
+from wepose_pin.live.state import GuideView, Output, Request, Status
+from wepose_pin.live.steps import make_steps
 from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
@@ -49,11 +49,6 @@ class Moment(NamedTuple):
     view: GuideView
 
 
-def calibrate_recording(recording: Recording, measured: Mapping[str, float]) -> tuple[Calibration, CalibrationQuality]:
-    calibration = calibrate(recording, measured=measured)
-    return calibration, assess(calibration)
-
-
 def make_options(
     folder: Path,
     known: Mapping[str, str] | None = None,
@@ -65,24 +60,26 @@ def make_options(
     steps = tuple(replace(step, seconds=CLASP_S) if step.phase == "clasp" else step for step in protocol.steps)
 
     def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
-        return Calibrated(*calibrate_recording(load_session(path), {**MEASURED, **measured}), folder)
+        return Calibrated(calibrate(load_session(path), measured={**MEASURED, **measured}), folder)
 
-    def estimate(_: Recording) -> tuple[Calibration, CalibrationQuality]:
+    def estimate(_: Recording) -> Calibration:
         raise BadSession("nothing is estimated here")
 
-    depth = {name: int("arm" in name) + int("forearm" in name) for name in model.table.segments}
     return GuideOptions(
         folder,
         replace(protocol, steps=steps),
         SensorSetup(remounted=True, mounts=mounts or {}),
-        model.table,
-        depth,
+        model,
         calibrate_file,
         estimate,
         "amekf",
         known or {},
         frozenset(step.phase for step in protocol.steps) - {"start", "clasp"},
     )
+
+
+def make_guide(source: PersonSource, options: GuideOptions) -> Guide:
+    return Guide(source, options, make_steps(options.protocol))
 
 
 class Session:
@@ -99,7 +96,7 @@ class Session:
         self.source = PersonSource(self.person)
         # The closure does not show how a tracker on the torso is turned, and it has no accelerometer to tell.
         mounts = {"torso": perform(*PERSON).quat_LS["torso"]} if orientations == "sensor" else {}
-        self.guide = Guide(self.source, make_options(folder, known, mounts, protocol), make_steps)
+        self.guide = make_guide(self.source, make_options(folder, known, mounts, protocol))
         self.clicks: list[str] = []
         self.obeys: Callable[[str, GuideView], str] = lambda _step, view: view.highlight
 
@@ -120,15 +117,10 @@ class Session:
             view, step = guide.view(), guide.step.name
             self.person.follow(step, self.obeys(step, view), view.countdown)
             yield Moment(self.source.clock(), step, view)
-            first = view.actions[0].name if view.actions else ""
-            if (step, first) in {
-                ("sensors", "next"),
-                ("start", "next"),
-                ("quality", "accept"),
-                ("quality", "exchange"),
-            }:
+            first = view.actions[0].kind if view.actions else ""
+            if (step, first) in PRESSED:
                 self.clicks.append(first)
-                guide.act(first)
+                guide.ask(Request(first))
             elif step == "quality":
                 time.sleep(0.02)  # the calibration runs in a thread
         guide.close()
@@ -145,12 +137,12 @@ def test_from_sensors_of_any_name_to_the_calibration_of_their_recording(tmp_path
     assert session.guide.accepted is not None
     live = session.guide.accepted.calibration
     file = tmp_path / "calibration-1.mcap"
-    again, quality = calibrate_recording(load_session(file), MEASURED)
+    again = calibrate(load_session(file), measured=MEASURED)
     assert again.subject.lengths == live.subject.lengths
     assert np.array_equal(again.subject.covariance, live.subject.covariance)
     for name, mount in live.subject.mounts.items():
         assert np.array_equal(again.subject.mounts[name], mount)
-    assert quality.quality != "fail"
+    assert again.quality.quality != "fail"
     for name, length in perform(*PERSON).lengths.items():
         assert abs(live.subject.lengths[name] - length) < 3.0 * live.subject.std(name), name
     # What was said on the way is in the file.
@@ -206,7 +198,7 @@ def test_an_accelerometer_in_g_is_not_calibrated(tmp_path: Path) -> None:
     view = session.run(lambda m: bool(m.view.reasons))[-1].view
     assert "accel: norm 1" in view.reasons[0]
     assert ": g? The source must give rad/s and m/s^2" in view.reasons[0]
-    assert [action.name for action in view.actions] == ["again"]
+    assert [action.kind for action in view.actions] == ["again"]
     session.guide.close()
 
 
@@ -230,7 +222,7 @@ def test_a_gentle_shake_is_seen_and_a_stronger_one_asked_for(tmp_path: Path) -> 
 
     session.person.disturb = shake
     assert session.run(lambda m: bool(m.view.note))[-1].view.note == "Too gentle: a7. Shake harder."
-    session.guide.act("again")
+    session.guide.ask(Request("again"))
     rate = 12.0
     session.run(lambda _: len(session.guide.segments) == 1)
     assert session.run(lambda m: bool(m.view.note))[-1].view.note == "Hold all sensors still for a moment. Moving: a7."
@@ -265,16 +257,16 @@ def test_too_little_motion_asks_for_more_of_it(tmp_path: Path, monkeypatch: pyte
     view = Session(tmp_path).run(lambda m: bool(m.view.quality))[-1].view
     assert view.quality == "fail"
     assert view.sentence == "There was too little of the motion. More of it may be enough."
-    assert [action.name for action in view.actions] == ["more", "restart"]
+    assert [action.kind for action in view.actions] == ["more", "restart"]
 
 
 def test_a_length_that_cannot_be_is_refused_and_the_result_stays(tmp_path: Path) -> None:
     session = Session(tmp_path)
     guide = session.guide
     before = session.run(lambda m: m.view.quality == "pass")[-1].view
-    guide.act("measure shoulder_width=wide")
+    guide.ask(Request("measure", "shoulder_width"))
     assert guide.view() == before
-    guide.act("measure shoulder_width=-0.3")
+    guide.ask(Request("measure", "shoulder_width", -0.3))
     assert guide.view().quality == ""
     after = session.run(lambda m: bool(m.view.quality))[-1].view
     assert "shoulder_width" in after.note
@@ -294,7 +286,7 @@ def test_sensors_that_were_mistaken_are_exchanged_without_another_motion(tmp_pat
     assert said.sentence == "Some sensors sit on other segments than assigned. The same motion will do."
     assert "left forearm and right forearm seem to be exchanged" in said.reasons[0]
     recording = load_session(tmp_path / "calibration-1.mcap")
-    assert calibrate_recording(recording, MEASURED)[1].quality == "pass"
+    assert calibrate(recording, measured=MEASURED).quality.quality == "pass"
 
 
 def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -> None:
@@ -303,11 +295,11 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     session = Session(tmp_path, read_segments(tmp_path, load_model().table.segments))
     moments = session.run(lambda m: m.step == "clasp")
     assert "assignment" not in {moment.step for moment in moments}
-    session.guide.act("again")  # is not offered
+    session.guide.ask(Request("again"))  # is not offered
     assert session.guide.step.name == "clasp"
-    session.guide.act("restart")
+    session.guide.ask(Request("restart"))
     assert session.guide.step.name == "start"
-    session.guide.act("go assignment")
+    session.guide.ask(Request("go", "assignment"))
     assert (session.guide.step.name, session.guide.segments) == ("assignment", {})
     session.run(lambda m: m.step == "start")
     assert session.guide.segments == worn
@@ -319,18 +311,18 @@ def test_who_goes_back_by_mistake_keeps_what_was_done(tmp_path: Path) -> None:
     session = Session(tmp_path)
     guide = session.guide
     begin(session, "clasp", 5.0)
-    guide.act("go static")
-    guide.act("skip")
-    assert [action.name for action in guide.view().actions] == ["next", "skip"]
-    guide.act("skip")
+    guide.ask(Request("go", "static"))
+    guide.ask(Request("skip"))
+    assert [action.kind for action in guide.view().actions] == ["next", "skip"]
+    guide.ask(Request("skip"))
     begin(session, "clasp", 8.0)
     assert guide.attempts == 1
     assert [name for name, spans in guide.attempt.recording().phases.items() for _ in spans] == ["start"] + 2 * [
         "clasp"
     ]
-    guide.act("go assignment")
+    guide.ask(Request("go", "assignment"))
     assert guide.segments == {}
-    guide.act("skip")
+    guide.ask(Request("skip"))
     assert (guide.step.name, guide.segments) == ("static", session.person.worn)
     guide.close()
 
@@ -339,11 +331,11 @@ def test_a_part_of_a_joined_protocol_is_skipped_and_more_motion_is_of_the_longes
     session = Session(tmp_path, protocol="clasp+t_pose")
     guide = session.guide
     session.run(lambda m: m.step == "t_pose")
-    assert [action.name for action in guide.view().actions] == ["restart", "skip"]
-    guide.act("skip")
+    assert [action.kind for action in guide.view().actions] == ["restart", "skip"]
+    guide.ask(Request("skip"))
     session.run(lambda m: bool(m.view.quality))
     assert set(guide.attempt.recording().phases) == {"start", "clasp"}
-    guide.act("more")
+    guide.ask(Request("more"))
     assert guide.step.name == "clasp"
     guide.close()
 
@@ -374,7 +366,7 @@ def test_who_wears_trackers_bows_unless_the_torsos_mount_is_stated(
 @pytest.mark.parametrize("protocol", ["clasp", "clasp+bow"])
 def test_without_a_bow_trackers_are_told_what_is_missing(tmp_path: Path, protocol: str) -> None:
     person = GuidedPerson(perform(*PERSON), orientations="sensor")
-    guide = Guide(PersonSource(person), make_options(tmp_path, None, {}, protocol), make_steps)
+    guide = make_guide(PersonSource(person), make_options(tmp_path, None, {}, protocol))
     reasons = guide.view().reasons
     assert [("+bow" in reason) for reason in reasons] == [True] * (protocol == "clasp")
 
@@ -397,7 +389,7 @@ class Follower(Output):
         self.person = person
         self.newest: Status | None = None
         self.steps: list[str] = []
-        self._keys: list[str] = []
+        self._requests: list[Request] = []
 
     def status(self, status: Status) -> None:
         self.newest, guide = status, status.guide
@@ -408,12 +400,12 @@ class Follower(Output):
         self.person.follow(step, guide.highlight, guide.countdown)
         if step not in self.steps:
             self.steps.append(step)
-        if guide.actions and (step, guide.actions[0].name) in PRESSED:
-            self._keys = [guide.actions[0].name]
+        if guide.actions and (step, guide.actions[0].kind) in PRESSED:
+            self._requests = [Request(guide.actions[0].kind)]
 
-    def take_keys(self) -> list[str]:
-        keys, self._keys = self._keys, []
-        return keys
+    def take_requests(self) -> list[Request]:
+        requests, self._requests = self._requests, []
+        return requests
 
 
 @pytest.mark.slow

@@ -22,7 +22,8 @@ from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.sources.base import Source
 from wepose_pin.live.sources.replay import ReplaySource
-from wepose_pin.live.state import LivePose, Output, Status, StreamInfo
+from wepose_pin.live.stage import Stage
+from wepose_pin.live.state import LivePose, Output, Request, Status, StreamInfo
 from wepose_pin.readers.live_log import read_live_log, read_messages
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.arrivals import Samples
@@ -40,14 +41,14 @@ def recording(simulation: Simulation) -> Recording:
 
 
 class Watcher(Output):
-    """An output that keeps what it was shown, and presses keys when the time has come."""
+    """An output that keeps what it was shown, and asks for something when the time has come."""
 
-    def __init__(self, keys: Sequence[tuple[float, str]] = ()) -> None:
+    def __init__(self, requests: Sequence[tuple[float, Request]] = ()) -> None:
         self.info: StreamInfo | None = None
         self.poses: list[LivePose] = []
         self.statuses: list[Status] = []
         self.closed, self.resumed, self.said = False, 0, ""
-        self._keys = list(keys)
+        self._requests = list(requests)
 
     def start(self, info: StreamInfo) -> None:
         self.info = info
@@ -64,10 +65,10 @@ class Watcher(Output):
     def resume(self) -> None:
         self.resumed += 1
 
-    def take_keys(self) -> list[str]:
+    def take_requests(self) -> list[Request]:
         now = self.poses[-1].time if self.poses else -math.inf
-        due = [key for at, key in self._keys if at <= now]
-        self._keys = [(at, key) for at, key in self._keys if at > now]
+        due = [request for at, request in self._requests if at <= now]
+        self._requests = [(at, request) for at, request in self._requests if at > now]
         return due
 
     def close(self) -> None:
@@ -152,7 +153,7 @@ def test_rates_in_deg_s_are_said_while_the_person_waits(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     """A person who stands, and sensors on a table, whose bias alone turns gravity."""
-    monkeypatch.setattr("wepose_pin.live.loop.STATUS_PERIOD_S", 1e-3)
+    monkeypatch.setattr(Stage, "STATUS_PERIOD_S", 1e-3)
     waits = replace(recording.cut(slice(0, 440)), phases={})
     if where == "table":
         noise = 1e-3 * np.random.default_rng(1).standard_normal((440, 3))
@@ -173,18 +174,19 @@ def test_rates_in_deg_s_are_said_while_the_person_waits(
 
 def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Recording, tmp_path: Path) -> None:
     file = tmp_path / "a.mcap"
-    keys = [(9.0, "take"), (12.0, "mark trial 3"), (15.0, "take"), (16.0, "begin clasp"), (17.0, "begin clasp")]
-    keys += [(18.0, "end clasp"), (19.0, "end clasp"), (20.0, "take"), (21.0, "mark "), (22.0, "nonsense")]
+    take, begin, end = Request("take"), Request("begin", "clasp"), Request("end", "clasp")
+    asked = [(9.0, take), (12.0, Request("mark", "trial 3")), (15.0, take), (16.0, begin), (17.0, begin), (18.0, end)]
+    asked += [(19.0, end), (20.0, take), (21.0, Request("mark")), (22.0, Request("nonsense"))]
     names = tuple(recording.sensors)
     arrivals = [(float(t), single(recording, name, k)) for k, t in enumerate(recording.time) for name in names]
     source = Chaos(recording, arrivals)
-    watcher = Watcher(keys)
+    watcher = Watcher(asked)
     live(recording, file, source, watcher)
     log = read_live_log(file)
     phases = log.recording.phases
-    end = log.recording.time[-1]
+    last = log.recording.time[-1]
     # What is marked is marked at the newest tick; the last take was not ended.
-    for name, spans in {"take_1": [(9.0, 15.0)], "clasp": [(16.0, 18.0)], "take_2": [(20.0, end)]}.items():
+    for name, spans in {"take_1": [(9.0, 15.0)], "clasp": [(16.0, 18.0)], "take_2": [(20.0, last)]}.items():
         np.testing.assert_allclose(phases[name], spans, atol=0.15)
     tracked = track(log.recording, causal=True)  # with the clasp that was marked
     for i, name in enumerate(names):
@@ -197,7 +199,7 @@ def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Record
     setup = SensorSetup.from_recording(recording)
     header = setup.header(tuple(recording.sensors)) | {"method": "amekf"}
     source = Chaos(recording, arrivals)
-    watcher = Watcher([(8.0, "r"), (9.0, "mark too early"), (10.0, "take"), (11.0, "take")])
+    watcher = Watcher([(8.0, Request("reset")), (9.0, Request("mark", "too early")), (10.0, take), (11.0, take)])
     LiveLoop(
         source, setup, begin=float(recording.time[0]), outputs=[watcher], open_log=lambda: LiveLog(late, header)
     ).run()
@@ -298,7 +300,7 @@ def test_a_gap_in_a_named_start_pose(recording: Recording, tmp_path: Path, begin
 
 
 def test_heading_resets_are_in_the_file(recording: Recording, tmp_path: Path) -> None:
-    watcher = Watcher([(12.0, "r"), (20.0, "r"), (28.0, "q")])
+    watcher = Watcher([(12.0, Request("reset")), (20.0, Request("reset")), (28.0, Request("quit"))])
     watcher.said = "arm: hold."
     ended = live(recording, tmp_path / "a.mcap", watcher=watcher)
     log = read_live_log(tmp_path / "a.mcap")
@@ -406,7 +408,7 @@ def test_a_sensor_that_freezes_is_lost_and_said_to_be(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str
 ) -> None:
     """It repeats itself for three seconds in motion; what is stated of it grows, as while it sends nothing."""
-    monkeypatch.setattr("wepose_pin.live.loop.STATUS_PERIOD_S", 1e-3)
+    monkeypatch.setattr(Stage, "STATUS_PERIOD_S", 1e-3)
     hurt, begin, end = "right_forearm", 1200, 1500
     recording = recording.cut(slice(0, 2000))
     sensor = recording.sensors[hurt]

@@ -34,6 +34,7 @@ from wepose_pin.live.encoder import AngleCurves, PoseEncoder, RobotFigure
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.state import (
     LivePose,
+    Request,
     SensorStatus,
     Status,
     StreamInfo,
@@ -384,17 +385,20 @@ def test_who_takes_at_once_gets_no_more_than_sixty_a_second(page: LivePage, pers
 
 def test_keys_and_nonsense(page: LivePage) -> None:
     async def press(connection: WebSocketClientConnection) -> None:
-        for message in ("key r", "key q", "key", "{}", b"\xff\x00", "taken", "taken", "taken", "key r"):
+        reset, quit_, nameless = '{"kind": "reset"}', '{"kind": "quit"}', '{"kind": "mark", "name": "\\u0000"}'
+        for message in (reset, quit_, "reset", "{}", "[1]", "1", nameless, b"\xff\x00", "taken", "taken", "taken"):
             await connection.write_message(message, binary=isinstance(message, bytes))
+        await connection.write_message('{"kind": "measure", "name": "stature", "value": 1.8}')
         for _ in range(100):
-            await connection.write_message("key r")
+            await connection.write_message('{"kind": "mark", "name": "trial 3"}')
         await connection.write_message("x" * 100_000)  # too long: that browser is shown the door
         while await connection.read_message() is not None:
             pass
 
     talk(page, press)
-    assert page.take_keys() == ["r"] * 16  # more are thrown away
-    assert page.take_keys() == []
+    asked = page.take_requests()
+    assert asked == [Request("mark", "trial 3")] * 16  # the newest; what came before is dropped
+    assert page.take_requests() == []
     assert get(page.url)[0] == 200
 
 
@@ -465,7 +469,7 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         page.status(person.status("moved", "You moved (torso). Once more."))
         browser.wait("document.querySelector('#say.moved span')?.textContent.includes('Once more')")
 
-        assert browser.run("document.querySelector('#rows tr').innerText").split()[1:4] == ["there", "100", "–"]
+        assert browser.run("document.querySelector('#rows tr').innerText").split()[1:3] == ["there", "100"]
         page.start(person.info)
         page.status(person.status(lost=("left_forearm",), message="No samples from left forearm."))
         page.show(person.pose(0.2, lost=("left_forearm",)))
@@ -474,8 +478,12 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         rows = browser.run(
             "[...document.querySelectorAll('#rows tr')].map((row) => row.innerText.replace(/\\s+/g, ' '))"
         )
-        assert rows[0] == "torso static 100 0.11 −0.29 0.00 – 3 s 6"
+        assert rows[0] == "torso static 100 6"
         assert rows[2].startswith("left forearm lost")
+        browser.run("document.querySelector('#details').click()")
+        row = browser.run("document.querySelector('#rows tr').innerText.replace(/\\s+/g, ' ')")
+        assert row == "torso static 100 0.11 −0.29 0.00 – 3 s 6"
+        assert browser.run(NARROW)
         assert "bad checksums: 3" in browser.run("document.body.innerText")
         stage = box_of(browser, "#stage canvas")
         pictures = {}
@@ -501,9 +509,9 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         browser.call("Input.dispatchKeyEvent", type="keyDown", key="r", text="r")
         browser.wait("document.querySelector('#answer').textContent.length > 0")
         until = time.monotonic() + 10.0
-        while (keys := page.take_keys()) == []:
+        while (asked := page.take_requests()) == []:
             assert time.monotonic() < until
-        assert keys == ["r"]
+        assert [request.kind for request in asked] == ["reset"]
         assert browser.errors == []
 
 

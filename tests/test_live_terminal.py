@@ -15,7 +15,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from wepose_pin.live.state import GuideAction, GuideStep, GuideView, SensorStatus, Status
+from wepose_pin.live.state import GuideAction, GuideStep, GuideView, Request, SensorStatus, Status
 from wepose_pin.live.terminal import TerminalView
 
 
@@ -39,17 +39,22 @@ def status(state: str = "ready", message: str = "Tracking.", sensors: tuple = ()
 
 
 def test_without_a_terminal_a_line_a_change() -> None:
-    file = io.StringIO()
-    with TerminalView(file, keys=False) as view:
+    file, time_s = io.StringIO(), 0.0
+    with TerminalView(file, keys=False, clock=lambda: time_s) as view:
+        time_s = 12.5
         for left in (3, 2, 1):
             view.status(status("start_pose", f"Stand still: {left} s more."))
+        time_s = 13.0
         for rate in (3, 4):
-            said = f"rates of {rate} rad/s while gravity does not turn: deg/s?"
-            view.status(status("moved", said, time=10.0 + rate))
-        view.status(status(sensors=(sensor(lost=True),), time=20.0))
-        view.status(status(sensors=(sensor(lost=True),), time=21.0, problems={"[bad]": 1}))
-        view.status(status(time=22.0, problems={"[bad]": 9}))
-        view.status(status("ended", "The session has ended.", time=23.0))
+            view.status(status("moved", f"rates of {rate} rad/s while gravity does not turn: deg/s?"))
+        time_s = 20.0
+        view.status(status(sensors=(sensor(lost=True),)))
+        time_s = 21.0
+        view.status(status(sensors=(sensor(lost=True),), problems={"[bad]": 1}))
+        time_s = 22.0
+        view.status(status(problems={"[bad]": 9}))
+        time_s = 23.0
+        view.status(status("ended", "The session has ended."))
     assert file.getvalue().splitlines() == [
         "12.5 s  start pose: Stand still: 3 s more.",
         "13.0 s  moved: rates of 3 rad/s while gravity does not turn: deg/s?",
@@ -69,44 +74,45 @@ from wepose_pin.live.terminal import TerminalView
 view = TerminalView()
 try:
     view.status(status())
-    keys = []
-    while "q" not in keys:
-        keys += view.take_keys()
+    kinds = []
+    while "quit" not in kinds:
+        kinds += [request.kind for request in view.take_requests()]
         time.sleep(0.01)
 finally:
     view.close()
-print("keys", "".join(keys))
+print("asked", *kinds)
 """
 
 
-def press(view: TerminalView, keys: str, now: Status) -> list[str]:
+def press(view: TerminalView, keys: str, now: Status) -> list[Request]:
     """What keys ask for, one after the other."""
     view.status(now)
     requests = []
     for key in keys:
         view._keyboard = SimpleNamespace(take=lambda key=key: [key], open=lambda: None, close=lambda: None)  # type: ignore
-        requests += view.take_keys()
+        requests += view.take_requests()
     return requests
 
 
 def test_keys_while_tracking_mark_phases_and_texts() -> None:
     view, live = TerminalView(io.StringIO()), status()
-    assert press(view, "tMr", live) == ["take", "mark mark", "r"]
-    assert press(view, "nTrialx\x7f 3\r", live) == ["mark Trial 3"]
-    assert press(view, "n\r", live) == ["mark mark"]
-    assert press(view, "nq\x1bq", live) == ["q"]
-    assert press(view, "p\rpbox\n", live) == ["begin clasp", "begin box"]
-    assert press(view, "p", status(open_phases=("take_1", "clasp"))) == ["end clasp"]
+    assert press(view, "tMr", live) == [Request("take"), Request("mark", "mark"), Request("reset")]
+    assert press(view, "nTrialx\x7f 3\r", live) == [Request("mark", "Trial 3")]
+    assert press(view, "n\r", live) == [Request("mark", "mark")]
+    assert press(view, "nq\x1bq", live) == [Request("quit")]
+    assert press(view, "p\rpbox\n", live) == [Request("begin", "clasp"), Request("begin", "box")]
+    assert press(view, "p", status(open_phases=("take_1", "clasp"))) == [Request("end", "clasp")]
     assert press(view, "pn", status("start_pose", "Stand still.")) == []
 
 
 def test_keys_of_the_guide_go_back_and_enter_a_length() -> None:
-    steps = tuple(GuideStep(name, name.title(), state) for name, state in (("a", "done"), ("b", "done"), ("c", "now")))
+    states = {"a": "done", "b": "skipped", "c": "now"}
+    steps = tuple(GuideStep(name, name.title(), state) for name, state in states.items())
     guide = GuideView("Result.", steps=steps, actions=(GuideAction("accept", "Accept", "y"),), measurable="biacromial")
     view, shown = TerminalView(io.StringIO()), status("guide", "Result.", guide=guide)
-    assert press(view, "y2q", shown) == ["accept", "go b", "q"]
+    assert press(view, "y2q", shown) == [Request("accept"), Request("go", "b"), Request("quit")]
     assert press(view, "3", shown) == []
-    assert press(view, "l40.5\rl40,5\rlwide\r", shown) == 2 * ["measure biacromial=0.4050"]
+    assert press(view, "l40.5\rl40,5\rlwide\r", shown) == 2 * [Request("measure", "biacromial", pytest.approx(0.405))]
     assert "y Accept, l enter the breadth of the shoulders, from acromion to acromion, 1 A again, 2 B again, q end" in (
         view._file.getvalue()  # type: ignore[attr-defined]
     )
@@ -137,13 +143,13 @@ def test_keys_and_the_terminal_afterwards(end: str) -> None:
     )
     try:
         seen = read_until(master, b"latency")
-        assert b"12.5 s  ready: Tracking." in seen
+        assert b" s  ready: Tracking." in seen
         until = time.monotonic() + 20.0
         while termios.tcgetattr(slave)[3] & termios.ICANON:
             assert time.monotonic() < until
             time.sleep(0.01)
         os.write(master, b"xR" + (b"q" if end == "q" else b"\x03"))
-        seen = read_until(master, b"keys rq" if end == "q" else b"KeyboardInterrupt")
+        seen = read_until(master, b"asked reset quit" if end == "q" else b"KeyboardInterrupt")
         run.wait(20)
         assert (run.returncode == 0) is (end == "q")
         assert termios.tcgetattr(slave) == before

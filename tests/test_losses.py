@@ -5,18 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wepose_pin.live.losses import SampleLosses, measure_step
-from wepose_pin.recording.arrivals import Samples
+from wepose_pin.live.monitor import EvenTimes, measure_step
 
 RATE_HZ = 100.0
 
 
 def count(time_s: np.ndarray, now: float | None = None, block: int = 7) -> int:
-    losses = SampleLosses()
+    times = EvenTimes()
     for k in range(0, len(time_s), block):
-        part = time_s[k : k + block]
-        losses.push([Samples("torso", part, np.zeros((len(part), 3)), np.zeros((len(part), 3)))])
-    return losses.count("torso", time_s[-1] if now is None else now)
+        times.push(time_s[k : k + block])
+    return times.count(time_s[-1] if now is None else now)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 0.3])

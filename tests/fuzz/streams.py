@@ -252,7 +252,7 @@ def _page() -> tuple[Any, _Heard]:
 
 def page(_folder: Path, data: bytes) -> object:
     """Bytes to the page's port: it answers or hangs up, no handler of ours fails, and it serves the next one."""
-    from wepose_pin.live.page import MAX_KEYS
+    from wepose_pin.live.page import MAX_REQUESTS
 
     live, heard = _page()
     with contextlib.suppress(ConnectionError), _connected(live) as line:
@@ -266,12 +266,12 @@ def page(_folder: Path, data: bytes) -> object:
         line.settimeout(10.0)
         line.sendall(b"GET /nothing HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
         assert line.recv(64).startswith(b"HTTP/1.1 404"), "the page serves no more"
-    keys = live.take_keys()
-    assert len(keys) <= MAX_KEYS
-    assert set(keys) <= {"r"}
+    asked = live.take_requests()
+    assert len(asked) <= MAX_REQUESTS
+    assert "quit" not in [request.kind for request in asked]
     if heard.records:
         raise AssertionError("; ".join(heard.records))
-    return keys
+    return asked
 
 
 def _connected(live: Any) -> socket.socket:

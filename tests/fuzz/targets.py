@@ -210,7 +210,8 @@ JSON = (*NUMBERS, b"NaN", b"-Infinity", b"[" * 2000, b"null", b'"\\ud800"', b"{"
 HTTP = (
     b"Host: ", b"Origin: ", b"Upgrade: websocket", b"Content-Length: ", b"Transfer-Encoding: chunked", b"\r\n", b"\0",
     b"GET /stream", b"POST /", b"HEAD /", b"OPTIONS *", b"HTTP/1.0", b"%00", b"[::1]", b"evil.example", b"\x81\xfe",
-    b"\x88\x80", b"\x89\x80", b"\xc1\x80", b"key r", b"taken", b"Sec-WebSocket-Extensions: permessage-deflate",
+    b"\x88\x80", b"\x89\x80", b"\xc1\x80", b'{"kind": "reset"}', b"taken",
+    b"Sec-WebSocket-Extensions: permessage-deflate",
 )  # fmt: skip
 
 SMALL_TABLE = b"""urdf = "upper_body.urdf"

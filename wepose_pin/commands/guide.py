@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ..errors import ExistingOutput
 
 if TYPE_CHECKING:
-    from ..calibration import Calibration, CalibrationQuality
+    from ..calibration import Calibration
     from ..live import Output, SensorSetup
     from ..live.assignment import AssignedSource
     from ..live.guide import Calibrated
@@ -62,14 +62,13 @@ def run_guide(
     ExistingOutput
         The folder holds a subject and `force` is not given, or it cannot be made.
     """
-    from ..calibration import assess, calibrate, load_protocol
+    from ..calibration import calibrate, load_protocol
     from ..calibration.protocols import split_protocol
     from ..live.assignment import read_segments, write_segments
     from ..live.guide import Calibrated, GuideOptions
-    from ..live.guide_motion import STATURE
     from ..live.guided import GuidedSession
-    from ..live.loop import warm_up
-    from ..live.session import open_and_wait
+    from ..live.session import open_and_wait, warm_up
+    from ..live.steps import STATURE
     from ..readers import load_session
     from ..readers.subject import read_subject
     from ..report import write_calibration_page
@@ -103,10 +102,10 @@ def run_guide(
         write_calibration_page(
             out, calibration, recording, method=method, protocol=load_protocol(steps), quality=calibration.quality
         )
-        return Calibrated(calibration, calibration.quality, out)
+        return Calibrated(calibration, out)
 
-    def estimate(recording: Recording) -> tuple[Calibration, CalibrationQuality]:
-        calibration = calibrate(
+    def estimate(recording: Recording) -> Calibration:
+        return calibrate(
             recording,
             measured=measured,
             prior=prior,
@@ -114,14 +113,12 @@ def run_guide(
             protocol=choose_parts(joined, recording.phases),
             method=method,
         )
-        return calibration, assess(calibration)
 
     options = GuideOptions(
         folder,
         load_protocol(joined),
         replace(setup, remounted=True),
-        model.table,
-        {name: _depth(model, name) for name in model.table.segments},
+        model,
         calibrate_file,
         estimate,
         method,
@@ -132,7 +129,7 @@ def run_guide(
     threading.Thread(target=warm_up, args=(method,), daemon=True).start()  # tracking begins without a wait then
     if not open_and_wait(source, views, until):
         return None
-    session = GuidedSession(source, options, model, views)
+    session = GuidedSession(source, options, views)
     calibrated = session.run(until)
     if calibrated is None:
         source.close()
@@ -174,9 +171,3 @@ def choose_parts(protocol: str, phases: Collection[str]) -> str:
         part for part in split_protocol(protocol) if all(step.phase in phases for step in load_protocol(part).steps)
     ]
     return "+".join(there) or protocol
-
-
-def _depth(model: BodyModel, segment: str) -> int:
-    """Number of segments between this one and the root."""
-    above = model.parents.get(segment)
-    return 0 if above is None else 1 + _depth(model, above)

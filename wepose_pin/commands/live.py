@@ -158,9 +158,9 @@ def live(
     from ..calibration.protocols import GUIDED
     from ..compilation import announce_compilation
     from ..live import find_setup, open_source, run_session
-    from ..live.loop import build_subject_model, warm_up
     from ..live.robot import connect_robot, read_robot
-    from ..live.session import check_mounts
+    from ..live.session import warm_up
+    from ..live.setup import build_subject_model, check_mounts
     from ..live.terminal import TerminalView
     from ..retargeting.stream import check_segments
     from ..subject import load_subject

@@ -6,15 +6,16 @@ Outputs load when they are used: `page` for the browser, `terminal`, `outputs` f
 from __future__ import annotations
 
 from .loop import LiveLoop, SessionSummary
-from .session import find_setup, run_session
-from .setup import SensorSetup, read_setup
+from .session import run_session
+from .setup import SensorSetup, find_setup, read_setup
 from .sources import open_source
-from .state import LivePose, Output, SensorStatus, Status, StreamInfo
+from .state import LivePose, Output, Request, SensorStatus, Status, StreamInfo
 
 __all__ = [
     "LiveLoop",
     "LivePose",
     "Output",
+    "Request",
     "SensorSetup",
     "SensorStatus",
     "SessionSummary",

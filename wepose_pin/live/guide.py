@@ -1,45 +1,38 @@
-"""The guided session: from sensors that send to a calibrated subject, as a state machine.
+"""The guided session: from sensors that send to a calibrated subject.
 
-It is independent of pages and terminals: `Guide.push` takes samples, `Guide.act` an action of the person, `Guide.view`
-returns what to tell the person. Each step is a class, before the motion in `guide_preparation`, from then on in
-`guide_motion`; steps can be repeated, and all but the start pose skipped. Times are those of the source's clock.
+`steps.make_steps` is the table of its steps. A step is a generator: it yields what to tell the person, gets what the
+person asks for, and returns the `Turn` that follows. Samples and ticks that came meanwhile are in the guide's
+attributes. Steps can be repeated, and all but the start pose skipped. Times are those of the source's clock.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from ..calibration import Calibration, CalibrationQuality, Protocol
-from ..model import BodyTable
-from ..recording import Recording
+from ..calibration import Calibration, Protocol
+from ..model import BodyModel
+from ..readers.live_log import Markers, build_recording
+from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
+from ..writers.live_log import LiveLog
 from .assignment import AssignedSource
-from .attempt import Attempt
+from .monitor import SensorMonitor
 from .setup import SensorSetup
 from .sources.base import Source
-from .state import GuideAction, GuideStep, GuideView, join_names
-from .units import RateWatch
+from .state import GuideStep, GuideView, Request, join_names
+from .ticks import TickStream
 
 SILENCE_S = 1.0  # [s] without a sample after which a sensor counts as silent
-GET_READY_S = 8.0  # [s] to leave the keyboard and stand ready
-
-NEXT = GuideAction("next", "Continue", "n")
-AGAIN = GuideAction("again", "Once more", "a")
-SKIP = GuideAction("skip", "Skip", "s")
-KEEP = GuideAction("skip", "Keep as it was", "s")
-RESTART = GuideAction("restart", "All again from the start pose", "a")
+NOTHING = Request("")
 
 
 class Calibrated(NamedTuple):
     """Outcome of the calibration of an attempt."""
 
     calibration: Calibration
-    quality: CalibrationQuality
     folder: Path  # of the subject and its report
 
 
@@ -51,8 +44,6 @@ class GuideOptions:
     ----------
     folder : where recordings, calibrations and the sensors' setup go
     setup : name, start pose and body of the session; its mounts, where known
-    table : of the body
-    depth : segment → number of segments between it and the root
     calibrate : calibrates a recorded file, with lengths [m] that the person measured, or "stature"
     estimate : calibrates the recording so far
     method : of the filter, for the recording's header
@@ -64,14 +55,35 @@ class GuideOptions:
     folder: Path
     protocol: Protocol
     setup: SensorSetup
-    table: BodyTable
-    depth: Mapping[str, int]
+    model: BodyModel
     calibrate: Callable[[Path, Mapping[str, float]], Calibrated]
-    estimate: Callable[[Recording], tuple[Calibration, CalibrationQuality]]
+    estimate: Callable[[Recording], Calibration]
     method: str
     known: Mapping[str, str] = field(default_factory=dict)
     optional: frozenset[str] = frozenset()
     measured: frozenset[str] = frozenset()
+
+
+class Turn(NamedTuple):
+    """How the guide goes on after a step."""
+
+    step: str = ""  # that follows; empty: the next one
+    again: bool = False  # it is repeated, though it was done before
+    reason: str = ""  # for which the person must repeat it
+    skipped: bool = False  # the step that ends was skipped
+
+
+StepRun = Generator[GuideView, Request, Turn]
+
+
+class Step(NamedTuple):
+    """A step of the guide."""
+
+    name: str
+    title: str
+    run: Callable[[Guide, Turn], StepRun]
+    before_attempt: bool = False  # sensors and their segments may still change: the recording begins after it
+    records: bool = True  # the attempt goes on recording; else its samples wait for the next step
 
 
 class Guide:
@@ -80,30 +92,34 @@ class Guide:
     Parameters
     ----------
     source : open
-    make_steps : makes the steps of a guide, one of them named "start"
+    steps : the table; one of them is named "start"
 
     Attributes
     ----------
     now : [s] on the source's clock
-    newest_times : sensor → time [s] of its newest sample
+    samples, ticks : that came since the step has last yielded; ticks are those of the attempt
     segments : sensor → segment that it is assigned to
     attempt : the recording of the current attempt; None before
+    measured : lengths [m] that the person entered
     accepted : the calibration that the person accepted; None before
     """
 
-    def __init__(self, source: Source, options: GuideOptions, make_steps: Callable[[Guide], list[Step]]) -> None:
-        self.source, self.options = source, options
+    def __init__(self, source: Source, options: GuideOptions, steps: Sequence[Step]) -> None:
+        self.source, self.options, self.steps = source, options, tuple(steps)
+        self.monitor = SensorMonitor()
         self.now = 0.0
-        self.newest_times: dict[str, float] = {}
+        self.samples: Sequence[Samples] = ()
+        self.ticks: list[Ticks] = []
         self.segments: dict[str, str] = {}
         self.attempt: Attempt | None = None
         self.attempts = 0
+        self.measured: dict[str, float] = {}
         self.accepted: Calibrated | None = None
-        self.steps = make_steps(self)
-        self._index = 0
-        self._rates = RateWatch()
+        self._index, self._skipped = 0, set[str]()
         self._postponed: list[Sequence[Samples]] = []  # that came while an attempt is evaluated
-        self.step.enter()
+        self._view: GuideView
+        self._running: StepRun
+        self._begin(Turn(self.steps[0].name))
 
     @property
     def step(self) -> Step:
@@ -112,7 +128,7 @@ class Guide:
     @property
     def order(self) -> tuple[str, ...]:
         """Segments in the order of the body."""
-        return tuple(self.options.table.segments)
+        return tuple(self.options.model.table.segments)
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -120,69 +136,65 @@ class Guide:
         return self.options.protocol.needs
 
     @property
+    def sending(self) -> list[str]:
+        """Sensors that have sent something."""
+        return list(self.monitor.newest)
+
+    @property
     def silent(self) -> list[str]:
         """Sensors that have sent nothing for a while."""
-        wanted = self.segments or self.newest_times
-        return [name for name in wanted if self.now - self.newest_times.get(name, -np.inf) > SILENCE_S]
+        return self.monitor.list_silent(self.segments or self.sending, self.now, SILENCE_S)
 
     def push(self, samples: Sequence[Samples], now: float) -> None:
         """Take what came since the last call, up to the time `now` [s]."""
-        self.now = now
-        for chunk in samples:
-            if len(chunk.time):
-                self.newest_times[chunk.sensor] = float(chunk.time[-1])
-        self._rates.push(samples, self.source.orientations)
-        self.step.push_samples(samples)
-        self._postponed.append(samples)
-        if self.attempt is not None and self.step.records:
-            postponed, self._postponed = self._postponed, []
-            for each in postponed:
-                for ticks in self.attempt.push(each):
-                    self.step.push_ticks(ticks)
-            self.attempt.log.flush_if_due()
-        elif self.attempt is None:
-            self._postponed.clear()
-        self.step.update()
-
-    def act(self, action: str) -> None:
-        """Do what the person asks for; an action that the step does not offer is ignored."""
-        if action.startswith("go "):
-            name = action.removeprefix("go ")
-            index = next((k for k, step in enumerate(self.steps) if step.name == name), self._index)
-            if index < self._index:
-                self.go(index, again=True)
-        elif action.startswith("measure "):
-            self.step.measure(action.removeprefix("measure "))
-        elif action.startswith("mark ") and self.attempt is not None:
-            self.attempt.mark("mark", text=action.removeprefix("mark "), time=self.attempt.newest)
-        elif action in [offered.name for offered in self.step.actions()]:
-            self.step.act(action)
-
-    def go_on(self) -> None:
-        """Go to the next step."""
-        self.go(self._index + 1)
-
-    def go(self, index: int, again: bool = False) -> None:
-        """Go to a step, which is repeated where `again`; where sensors may change, a new attempt begins with it."""
-        self.step.leave()
-        self._index = index
-        if self.step.before_attempt:
-            self.close()
-        if again:
-            self.step.repeat()
+        self.now, self.samples, self.ticks = now, samples, []
+        self.monitor.push(samples, self.source.orientations)
+        if self.attempt is None:
+            self._postponed = []
         else:
-            self.step.enter()
+            self._postponed.append(samples)
+            if self.step.records:
+                postponed, self._postponed = self._postponed, []
+                self.ticks = [ticks for each in postponed for ticks in self.attempt.push(each)]
+                self.attempt.log.flush_if_due()
+        self._go_on(NOTHING)
 
-    def restart(self, reason: str = "") -> None:
-        """Go to the start pose; where there is a reason, what was recorded cannot go on."""
-        if reason:
-            self.discard_phases()
-        self.go(next(k for k, step in enumerate(self.steps) if step.name == "start"))
-        self.step.reason = reason
+    def ask(self, request: Request) -> None:
+        """Do what the person asks for; what the step does not offer is ignored."""
+        names = [step.name for step in self.steps[: self._index]]
+        self.samples, self.ticks = (), []
+        if request.kind == "go" and request.name in names:
+            self._running.close()
+            self._begin(Turn(request.name, again=True))
+        elif request.kind == "mark" and self.attempt is not None:
+            self.attempt.mark("mark", text=request.name, time=self.attempt.newest)
+        elif request.kind == "measure" or request.kind in [action.kind for action in self._view.actions]:
+            self._go_on(request)
 
-    def assigned(self) -> AssignedSource:
-        """The source with the sensors named by their segments."""
-        return AssignedSource(self.source, self.segments, self.order, is_open=True)
+    def _go_on(self, request: Request) -> None:
+        try:
+            self._view = self._running.send(request)
+        except StopIteration as ended:
+            if ended.value.skipped:
+                self._skipped.add(self.step.name)
+            self._begin(ended.value)
+
+    def _begin(self, turn: Turn) -> None:
+        """Begin the step that follows; where sensors may change, a new attempt begins after it."""
+        names = [step.name for step in self.steps]
+        while True:
+            self._index = names.index(turn.step) if turn.step else self._index + 1
+            self._skipped.discard(self.step.name)
+            if self.step.before_attempt:
+                self.close()
+            self.samples, self.ticks = (), []
+            self._running = self.step.run(self, turn)
+            try:
+                self._view = next(self._running)
+            except StopIteration as ended:  # there is nothing to do in it
+                turn = ended.value
+            else:
+                return
 
     def begin_attempt(self) -> Attempt:
         """Begin to record, unless a recording of these sensors runs."""
@@ -195,11 +207,14 @@ class Guide:
             self.attempt = Attempt(path, source, header)
         return self.attempt
 
+    def assigned(self) -> AssignedSource:
+        """The source with the sensors named by their segments."""
+        return AssignedSource(self.source, self.segments, self.order, is_open=True)
+
     def discard_phases(self) -> None:
         """Take back what was recorded of the protocol."""
-        if self.attempt is not None:
-            for phase in ("start", *(step.phase for step in self.options.protocol.steps)):
-                self.attempt.mark("discard", phase=phase)
+        for phase in ("start", *(step.phase for step in self.options.protocol.steps)):
+            self.begin_attempt().mark("discard", phase=phase)
 
     def close(self) -> None:
         """End the recording; may be called twice."""
@@ -209,63 +224,83 @@ class Guide:
 
     def view(self) -> GuideView:
         """What to tell the person now."""
-        states = ["done"] * self._index + ["now"] + ["ahead"] * len(self.steps)
-        steps = tuple(GuideStep(s.name, s.title, state) for s, state in zip(self.steps, states, strict=False))
-        sensors = tuple((name, self.segments.get(name, "")) for name in sorted(self.newest_times))
-        view = self.step.view()
-        return view._replace(steps=steps, segments=sensors, actions=tuple(self.step.actions()))
+        steps = []
+        for k, step in enumerate(self.steps):
+            state = "ahead" if k > self._index else "now" if k == self._index else "done"
+            steps.append(GuideStep(step.name, step.title, "skipped" if step.name in self._skipped else state))
+        return self._view._replace(steps=tuple(steps))
 
     def describe_problems(self) -> str:
         """A sentence on sensors that send nothing, else on rates in another unit; empty: there are none."""
         silent = [self.segments.get(name, name) for name in self.silent]
         if silent:
             return f"No samples from {self.join_sensors(silent)}. Switched on and in reach?"
-        return self._rates.describe(self.source)
+        return self.monitor.describe_wrong_unit(self.source)
 
     def join_sensors(self, names: Sequence[str]) -> str:
         """Sensors as words."""
-        count = len(self.segments or self.newest_times)
+        count = len(self.segments or self.sending)
         return "any sensor" if len(names) == count > 1 else join_names(list(names))
 
 
-class Step:
-    """A step of the guide."""
+class Attempt:
+    """The recording of one guided calibration, in its file and in memory: raw samples and the protocol's phases.
 
-    name = title = ""
-    before_attempt = False  # sensors and their segments may still change: the recording begins after it
-    records = True  # the attempt goes on recording; else its samples wait for the next step
+    The file gives the same samples and phases again, so that a calibration of it has the same numbers.
 
-    def __init__(self, guide: Guide) -> None:
-        self.guide, self.reason = guide, ""  # why the person must repeat it
+    Parameters
+    ----------
+    source : names the sensors by their segments
+    header : of the recording, as `SensorSetup.header` with the method
+    """
 
-    def enter(self) -> None:
-        """Begin this step."""
+    def __init__(self, path: Path, source: AssignedSource, header: Mapping[str, Any]) -> None:
+        self.log, self._source = LiveLog(path, header), source
+        self.stream = TickStream(source.sensors, source.rate_hz, log=self.log, orientations=source.orientations)
+        self._header, self._markers = dict(header), Markers()
+        self._ticks: list[Ticks] = []
 
-    def repeat(self) -> None:
-        """Begin this step because the person wants it once more."""
-        self.enter()
+    @property
+    def path(self) -> Path:
+        return self.log.path
 
-    def leave(self) -> None:
-        """Go to another step."""
+    @property
+    def newest(self) -> float:
+        """Time [s] of the newest tick; 0 before the first."""
+        return float(self._ticks[-1].time[-1]) if self._ticks else 0.0
 
-    def push_samples(self, samples: Sequence[Samples]) -> None:
-        """Take samples under the names of the source."""
+    @property
+    def segments(self) -> list[str]:
+        """The segment of each sensor, in the order of the ticks' columns."""
+        return [self._markers.segments.get(name, name) for name in self._source.sensors]
 
-    def push_ticks(self, ticks: Ticks) -> None:
-        """Take ticks of the attempt."""
+    def push(self, samples: Sequence[Samples]) -> list[Ticks]:
+        """Record samples of the source; return the ticks that they complete."""
+        ticks = [each for each in self.stream.push(self._source.rename(samples)) if len(each.time)]
+        self._ticks += ticks
+        return ticks
 
-    def update(self) -> None:
-        """Do what is due by now."""
+    def mark(self, kind: str, **values: Any) -> None:
+        """Record an event of `Markers`."""
+        self._markers.add(kind, values)
+        self.log.event(kind, **values)
 
-    def actions(self) -> list[GuideAction]:
-        """What the person may ask for, the usual first."""
-        return []
+    def exchange(self, moved: Mapping[str, str]) -> None:
+        """Move sensors from segment to segment."""
+        now = zip(self._source.sensors, self.segments, strict=True)
+        self.mark("assign", segments={name: moved.get(segment, segment) for name, segment in now})
 
-    def act(self, action: str) -> None:
-        """Do what the person asks for."""
+    def measured_s(self, phase: str) -> float:
+        """Duration [s] of a phase so far."""
+        return sum(last - first for first, last in self._phases().get(phase, ()))
 
-    def measure(self, stated: str) -> None:
-        """Take a measured length, as ``name=metres``."""
+    def recording(self) -> Recording:
+        """The recording so far, as a reader of the file gets it."""
+        header = self._header | {"sensors": self.segments, "phases": self._phases()}
+        return check_recording(build_recording(header, self.stream.clock.rate_hz, self._ticks, None, self.path))
 
-    def view(self) -> GuideView:
-        raise NotImplementedError
+    def close(self) -> None:
+        self.log.close()
+
+    def _phases(self) -> dict[str, Any]:
+        return self._markers.phases(float(self._ticks[0].time[0]), self.newest) if self._ticks else {}

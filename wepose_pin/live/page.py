@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import secrets
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -32,11 +31,11 @@ from ..model import BodyModel
 from ..report.viewer import DARK, LIGHT, backdrop, choose_trail_colour, filled, find_floor, scene, view
 from .addresses import LOOPBACK
 from .encoder import PoseEncoder, RobotFigure
-from .server import Server, ServerOptions
-from .state import LivePose, Output, Status, StreamInfo
+from .server import Content, Server
+from .state import LENGTH_NAMES, LivePose, Output, Request, Status, StreamInfo
 
 FINGERS = 0.1  # [m] beyond the end of a limb
-MAX_KEYS = 16  # not yet taken; more are dropped
+MAX_REQUESTS = 16  # not yet taken; more are dropped
 
 
 class LivePage(Output):
@@ -55,17 +54,14 @@ class LivePage(Output):
     def __init__(
         self, model: BodyModel, info: StreamInfo | None = None, host: str = LOOPBACK, port: int = 0, title: str = ""
     ) -> None:
-        self._encoder = PoseEncoder(model)
-        if info is not None:
-            self._encoder.start(info)
-        identity = secrets.token_hex(8)
-        token = "" if host in (LOOPBACK, "localhost", "::1") else secrets.token_urlsafe(16)
-        self._options = ServerOptions(_fill_page(model, self._encoder, title, identity), identity, host, port, token)
-        self._title = title
+        self._host, self._port, self._title = host, port, title
         self._demonstrated: tuple[str, ...] = ()  # segments of the demonstrated poses
         self._server: Server | None = None
-        self._keys: deque[str] = deque(maxlen=MAX_KEYS)
+        self._requests: deque[Request] = deque(maxlen=MAX_REQUESTS)
         self.url = ""  # of an open page
+        self.set_body(model)
+        if info is not None:
+            self._encoder.start(info)
 
     def open(self) -> None:
         """Serve the page from a thread of its own.
@@ -76,19 +72,17 @@ class LivePage(Output):
             The address is not this machine's, or the port is taken.
         """
         if self._server is None:
-            self._server = Server(self._options, self._encoder, self._keys)
-            self._server.start()
+            token = "" if self._host in (LOOPBACK, "localhost", "::1") else secrets.token_urlsafe(16)
+            self._server = Server(self._content, self._host, self._port, token, self._requests)
             self.url = self._server.url
 
     def set_body(self, model: BodyModel, robot: RobotFigure | None = None) -> None:
         """Draw this body from now on, and a robot beside it; open browsers load the page again."""
-        identity = secrets.token_hex(8)
         self._encoder, self._demonstrated = PoseEncoder(model, robot), ()
-        self._options = replace(
-            self._options, page=_fill_page(model, self._encoder, self._title, identity), identity=identity
-        )
+        identity = secrets.token_hex(8)
+        self._content = Content(_fill_page(model, self._encoder, self._title, identity), identity, self._encoder)
         if self._server is not None:
-            self._server.set_page(self._options, self._encoder)
+            self._server.content = self._content
 
     def demonstrate(self, pose: LivePose, segments: tuple[str, ...]) -> None:
         """Draw a pose of the guide."""
@@ -110,10 +104,9 @@ class LivePage(Output):
         if self._server is not None:
             self._server.status = status
 
-    def take_keys(self) -> list[str]:
-        """Keys pressed in the page since the last call: "r" to reset the headings."""
-        keys = [self._keys.popleft() for _ in range(len(self._keys))]
-        return [key for key in keys if key != "q"]  # who watches does not end the session
+    def take_requests(self) -> list[Request]:
+        """What was asked for in the page since the last call."""
+        return [self._requests.popleft() for _ in range(len(self._requests))]
 
     def close(self) -> None:
         """Tell the browsers, and stop listening. May be called twice."""
@@ -145,6 +138,7 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str
         "scene": scene(encoder.visuals, links, () if robot is None else robot.meshes),
         "backdrops": {name: backdrop(colours, floor) for name, colours in (("light", LIGHT), ("dark", DARK))},
         "view": view(encoder.visuals, body, motion, reach),
+        "length_names": LENGTH_NAMES,
         "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.paths],
     }
     return filled("live/templates/live.html.j2", data, title or "wepose live")

@@ -6,37 +6,24 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ..errors import BadSession, ExistingOutput
+import numpy as np
+
+from ..errors import ExistingOutput
 from ..filters import BEST
-from ..model import BodyModel
-from ..subject import Subject, load_subject
+from ..kinematics import LiveKinematics
+from ..model import BodyModel, load_model, load_table
+from ..recording import ImuSensor, Recording
+from ..recording.arrivals import Samples, StreamSynchronizer, order_arrivals
+from ..recording.plausibility import check_signals, find_unseen_rate
+from ..tracking import Tracker, TrackOptions
+from ..tracking.headings import CAUSAL_KNOT_S
 from ..writers.live_log import LiveLog
 from ..writers.result import versions
-from .loop import EMPTY_SESSION, LiveLoop, SessionSummary, warm_up
-from .setup import SensorSetup, read_setup
+from .loop import EMPTY_SESSION, LiveLoop, SessionSummary
+from .setup import SensorSetup, check_mounts
 from .sources.base import Source
 from .sources.replay import ReplaySource
 from .state import Output, Status
-
-
-def find_setup(source: Source | None, subject: str | Path | None, session: str | Path | None) -> SensorSetup:
-    """The sensor setup: of a replay that of its session, else as `session` states.
-
-    Raises
-    ------
-    WeposeError
-        What is wrong in either file.
-    """
-    loaded: Subject | None = None
-    text = ""
-    if subject is not None:
-        loaded, path = load_subject(subject), Path(subject)
-        text = (path / "subject.toml" if path.is_dir() else path).read_text(encoding="utf-8")
-    if session is not None:
-        return read_setup(Path(session), loaded, text)
-    if isinstance(source, ReplaySource):
-        return SensorSetup.from_recording(source.recording, loaded, text)
-    return SensorSetup(subject=loaded, subject_text=text)
 
 
 def run_session(
@@ -74,7 +61,6 @@ def run_session(
         header = setup.header(source.sensors, source.orientations) | {"method": method, "versions": versions()}
         if record is not None:
             log = LiveLog(record, header, force)
-        begin = float(source.recording.time[0]) if isinstance(source, ReplaySource) else None
         loop = LiveLoop(
             source,
             setup,
@@ -83,7 +69,7 @@ def run_session(
             log=log,
             open_log=lambda: LiveLog(Path(time.strftime("wepose-%Y%m%d-%H%M%S.mcap")), header),
             outputs=outputs,
-            begin=begin,
+            begin=float(source.recording.time[0]) if isinstance(source, ReplaySource) else None,
         )
     except BaseException:
         source.close()
@@ -109,7 +95,7 @@ def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[],
             output.status(Status("waiting", message, 0.0, 0.0, (), (0.0, 0.0), 0.0, dict(source.problems)))
         if until():
             raise KeyboardInterrupt
-        stopped = "q" in [key for output in outputs for key in output.take_keys()]
+        stopped = "quit" in [request.kind for output in outputs for request in output.take_requests()]
         return not stopped
 
     try:
@@ -122,16 +108,31 @@ def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[],
     return not stopped
 
 
-def check_mounts(source: Source, setup: SensorSetup) -> None:
-    """Raise `BadSession` where the mount of a sensor is not known, and its orientation is not the segment's own."""
-    calibrated = setup.subject.mounts if setup.subject is not None and not setup.remounted else {}
-    sensors = [name for name in source.sensors if not source.orientations.get(name)]
-    unknown = [name for name in sensors if name not in calibrated and name not in setup.mounts]
-    nothing_known = not (source.sensors or calibrated or setup.mounts)
-    if unknown or nothing_known:
-        segment = unknown[0] if unknown else "SEGMENT"
-        sensor = f"the sensor of {segment} is" if unknown else "the sensors are"
-        raise BadSession(
-            f"{setup.name}: how {sensor} mounted is not known: find it out with --guide, or give --subject with "
-            f'calibrated mounts, or --session with [sensors.{segment}] mount = {{ up = "+x", forward = "-z" }}'
-        )
+def warm_up(method: str) -> None:
+    """Run a tracker once: compilation and reading of files must not delay the start pose, nor a heading correction."""
+    n, rng, sensors = 200, np.random.default_rng(0), tuple(load_table().segments)[:5]
+    recording = Recording(
+        "warm",
+        np.arange(n) / 100.0,
+        100.0,
+        {
+            name: ImuSensor(
+                gyro_S=1e-3 * rng.standard_normal((n, 3)),
+                accel_S=[0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3)),
+                stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]),
+            )
+            for name in sensors
+        },
+        {"start": ((0.0, 1.9),)},
+    )
+    check_signals(recording)
+    find_unseen_rate(np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1)), recording.rate_hz)
+    tracker = Tracker(options=TrackOptions(method, causal=True))
+    tracker.push(recording)
+    estimator = tracker.segment_estimator
+    for _ in range(round(2.0 * CAUSAL_KNOT_S * recording.rate_hz)):
+        estimator.step(np.zeros((len(sensors), 3)), np.tile([0.0, 0.0, 9.81], (len(sensors), 1)))
+    estimator.covariance()
+    LiveKinematics(load_model(), sensors).compute_points(np.tile([0.0, 0.0, 0.0, 1.0], (len(sensors), 1)))
+    synchronizer = StreamSynchronizer(sensors, 100.0, 0.0)
+    synchronizer.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))

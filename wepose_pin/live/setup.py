@@ -1,4 +1,4 @@
-"""`SensorSetup`: the subject and the mounts of the sensors, as far as known before the first sample."""
+"""What is known before the first sample: the subject, the mounts of the sensors, the body."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import BadSession
+from ..model import BodyModel
+from ..model.body import load_sensed_model
 from ..model.table import NEUTRAL_POSE
 from ..readers.session_file import find_model, read_joints, read_phases, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
-from ..subject import Subject, parse_subject, subject_toml
+from ..subject import Subject, load_subject, parse_subject, population_subject, subject_toml
+from .sources.base import Source
+from .sources.replay import ReplaySource
 
 
 @dataclass(frozen=True)
@@ -84,6 +89,25 @@ class SensorSetup:
         }
 
 
+def find_setup(source: Source | None, subject: str | Path | None, session: str | Path | None) -> SensorSetup:
+    """The sensor setup: of a replay that of its session, else as `session` states.
+
+    Raises
+    ------
+    WeposeError
+        What is wrong in either file.
+    """
+    loaded, text = None, ""
+    if subject is not None:
+        loaded, path = load_subject(subject), Path(subject)
+        text = (path / "subject.toml" if path.is_dir() else path).read_text(encoding="utf-8")
+    if session is not None:
+        return read_setup(Path(session), loaded, text)
+    if isinstance(source, ReplaySource):
+        return SensorSetup.from_recording(source.recording, loaded, text)
+    return SensorSetup(subject=loaded, subject_text=text)
+
+
 def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "") -> SensorSetup:
     """The setup that a session file states; its data and phases belong to another recording and are ignored.
 
@@ -107,3 +131,34 @@ def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "
         joints=read_joints(top, start_pose),
         model=find_model(Path(top.file), top),
     )
+
+
+def check_mounts(source: Source, setup: SensorSetup) -> None:
+    """Raise `BadSession` where the mount of a sensor is not known, and its orientation is not the segment's own."""
+    calibrated = setup.subject.mounts if setup.subject is not None and not setup.remounted else {}
+    sensors = [name for name in source.sensors if not source.orientations.get(name)]
+    unknown = [name for name in sensors if name not in calibrated and name not in setup.mounts]
+    nothing_known = not (source.sensors or calibrated or setup.mounts)
+    if unknown or nothing_known:
+        segment = unknown[0] if unknown else "SEGMENT"
+        sensor = f"the sensor of {segment} is" if unknown else "the sensors are"
+        raise BadSession(
+            f"{setup.name}: how {sensor} mounted is not known: find it out with --guide, or give --subject with "
+            f'calibrated mounts, or --session with [sensors.{segment}] mount = {{ up = "+x", forward = "-z" }}'
+        )
+
+
+def build_subject_model(
+    setup: SensorSetup, model: BodyModel | str | Path | None = None, sensors: Sequence[str] = ()
+) -> BodyModel:
+    """Return `model`, else the body that the setup names, else the upper body, with the subject's lengths.
+
+    Without a subject a chosen body has its own lengths, the upper body those of the population prior. `sensors` are
+    those of the source where it knows them; without them those of the setup.
+    """
+    body = chosen = model or setup.model or None
+    if not isinstance(body, BodyModel):
+        body = load_sensed_model(body, tuple(sensors) or tuple(setup.mounts), setup.name)
+    if setup.subject is None and chosen is not None:
+        return body
+    return (setup.subject or population_subject(body=body)).shape(body)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import NamedTuple
 
 import numpy as np
 
 LENGTH_NAMES = {"biacromial": "breadth of the shoulders, from acromion to acromion", "stature": "body height"}
-# [rad] standard deviation of a direction that is uniform on the circle: with more, nothing is known of a heading.
-UNKNOWN_HEADING_STD = math.pi / math.sqrt(3.0)
+LONGEST_NAME = 120  # letters of a name that is asked for
 
 
 class StreamInfo(NamedTuple):
@@ -48,10 +48,28 @@ class SensorStatus(NamedTuple):
     battery: float = math.nan  # share of its charge, 0 to 1; NaN where it is not known
 
 
-class GuideAction(NamedTuple):
-    """Something that the person may ask the guide for."""
+class Request(NamedTuple):
+    """What a person asks for by a key of the terminal or a button of the page."""
 
-    name: str
+    kind: str  # quit, reset, take, mark, begin, end, go, measure, or that of a `GuideAction`
+    name: str = ""  # of a phase, a step or a length; the text of a mark
+    value: float = math.nan  # a length [m]
+
+    @classmethod
+    def parse(cls, text: str) -> Request | None:
+        """The request in a JSON object with the fields' names; None: it is none."""
+        try:
+            fields = json.loads(text)
+            request = cls(str(fields["kind"]), str(fields.get("name", "")), float(fields.get("value", math.nan)))
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+            return None
+        return request if request.name.isprintable() and len(request.name) <= LONGEST_NAME else None
+
+
+class GuideAction(NamedTuple):
+    """Something that the person may ask the guide for: a `Request` of this kind."""
+
+    kind: str
     label: str  # of a button
     key: str  # of a terminal
 
@@ -61,7 +79,7 @@ class GuideStep(NamedTuple):
 
     name: str
     title: str
-    state: str  # "done", "now", "ahead"
+    state: str  # "done", "skipped", "now", "ahead"
 
 
 class LengthEstimate(NamedTuple):
@@ -82,7 +100,6 @@ class GuideView(NamedTuple):
     progress: float = 0.0  # 0 to 1 of this step
     steps: tuple[GuideStep, ...] = ()
     actions: tuple[GuideAction, ...] = ()  # the first is the usual one
-    segments: tuple[tuple[str, str], ...] = ()  # sensor, and the segment that it is assigned to or ""
     highlight: str = ""  # segment to draw apart from the others
     demonstration: str = ""  # phase of the protocol to draw; empty: the start pose
     lengths: tuple[LengthEstimate, ...] = ()
@@ -129,8 +146,8 @@ class Output:
     def resume(self) -> None:
         """Go on: the person stands in the start pose and asks for new headings."""
 
-    def take_keys(self) -> list[str]:
-        """Keys since the last call: "r" to reset the headings, "q" to end; in a guided session names of its actions."""
+    def take_requests(self) -> list[Request]:
+        """What the person has asked for since the last call."""
         return []
 
     def close(self) -> None:
@@ -140,13 +157,6 @@ class Output:
 def round_finite(value: float, digits: int) -> float | None:
     """A number for JSON; None for NaN and infinity."""
     return round(float(value), digits) if math.isfinite(value) else None
-
-
-def format_heading_std(std: float) -> str:
-    """A heading's standard deviation [rad] in degrees, as text; "–" where there is none, "unknown" above the limit."""
-    if not math.isfinite(std):
-        return "–"
-    return f"{math.degrees(std):.1f}" if std < UNKNOWN_HEADING_STD else "unknown"
 
 
 def name_length(name: str) -> str:

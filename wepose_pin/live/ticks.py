@@ -6,9 +6,10 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
+from ..errors import BadData
 from ..recording.arrivals import JUMP_S, WAIT_S, Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
 from ..writers.live_log import LiveLog
-from .losses import measure_step
+from .monitor import measure_step
 
 RATE_MEASUREMENT_S = 1.0  # [s] over which the rate is measured if the source does not know it
 MAX_ABSENCE_S = 3.0  # [s] after which ticks begin without a sensor that has sent nothing
@@ -28,7 +29,7 @@ class TickStream:
 
     Attributes
     ----------
-    newest_times : sensor → time [s] of its newest sample; −inf before the first
+    measured : (k,) bool: the sensors of `orientations`
     history : the arrivals so far, while nothing is recorded; None once there are more than `MAX_HISTORY`
     synchronizer : what makes the ticks; None before they begin
     """
@@ -43,28 +44,32 @@ class TickStream:
         orientations: Collection[str] = (),
     ) -> None:
         self.sensors, self.log = tuple(sensors), log
-        self.newest_times = dict.fromkeys(self.sensors, -np.inf)
+        self.measured = np.array([name in orientations for name in self.sensors], dtype=np.bool_)
         self.synchronizer: StreamSynchronizer | None = None
-        self._rate_hz, self._begin, self._wait_s = rate_hz, begin, wait_s
-        self._orientations = orientations
         self.history: list[Arrivals] | None = [] if log is None else None
-        self._kept = 0  # samples in the history
+        self._orientations, self._rate_hz, self._begin, self._wait_s = orientations, rate_hz, begin, wait_s
+        self._history_size = 0  # samples
         self._waiting: list[Arrivals] = []
+
+    @property
+    def clock(self) -> StreamSynchronizer:
+        """What makes the ticks; raises `BadData` before they begin."""
+        if self.synchronizer is None:
+            raise BadData("there are no samples of all sensors yet")
+        return self.synchronizer
 
     def push(self, samples: Sequence[Samples]) -> Iterator[Ticks]:
         """Record the samples of one read, and iterate over the ticks that they complete."""
         samples = [chunk for chunk in samples if len(chunk.time)]
         if not samples:
             return
-        for chunk in samples:
-            self.newest_times[chunk.sensor] = max(self.newest_times[chunk.sensor], float(chunk.time[-1]))
         arrivals = order_arrivals(samples, self.sensors)
         if self.log is not None:
             self.log.samples(arrivals)
         elif self.history is not None:
             self.history.append(arrivals)
-            self._kept += len(arrivals.time)
-            self.history = self.history if self._kept <= MAX_HISTORY else None
+            self._history_size += len(arrivals.time)
+            self.history = self.history if self._history_size <= MAX_HISTORY else None
         self._waiting.append(arrivals)
         if self.synchronizer is None:
             self._begin_ticks()
@@ -77,17 +82,18 @@ class TickStream:
                         self.log.flush_if_due()
 
     def _begin_ticks(self) -> None:
-        sensor, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])
-        times = {int(i): time_s[sensor == i] for i in np.unique(sensor)}
-        first = np.array([float(sensor_times[0]) for sensor_times in times.values()])
-        newest = max(self.newest_times.values())
+        which, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])
+        times = [time_s[which == i] for i in np.unique(which)]
+        first, newest = np.array([float(own[0]) for own in times]), max(float(own[-1]) for own in times)
         if len(first) < len(self.sensors) and newest - first.min() < MAX_ABSENCE_S:
             return
         rate = self._rate_hz
         if rate is None:
             if newest - first.max() < RATE_MEASUREMENT_S:
                 return
-            rate = _measure_rate(list(times.values()))
+            # That of the slowest sensor.
+            rates = [1.0 / step for step in map(measure_step, times) if step]
+            rate = max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ
         # A time-stamp outlier must not put all other sensors before the beginning.
         begin = self._begin if self._begin is not None else float(first[first < np.median(first) + JUMP_S].max())
         self.synchronizer = StreamSynchronizer(self.sensors, rate, begin, self._wait_s, self._orientations)
@@ -104,12 +110,6 @@ class TickStream:
         self._record_clock()
 
     def _record_clock(self) -> None:
-        synchronizer = self.synchronizer
-        if self.log is not None and synchronizer is not None:
-            self.log.event("clock", rate_hz=synchronizer.rate_hz, begin=synchronizer.begin, wait_s=self._wait_s)
-
-
-def _measure_rate(times: Sequence[np.ndarray]) -> float:
-    """Measure the rate [Hz] of the slowest sensor from times [s] of each, rounded to 0.1 Hz."""
-    rates = [1.0 / step for step in map(measure_step, times) if step]
-    return max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ
+        if self.log is not None and self.synchronizer is not None:
+            clock = self.synchronizer
+            self.log.event("clock", rate_hz=clock.rate_hz, begin=clock.begin, wait_s=self._wait_s)

@@ -76,6 +76,8 @@ const SHAPES = { there: "M5 1a4 4 0 1 0 .01 0z", moving: "M1 0l9 5-9 5z", static
 const SAYS = { waiting: "Waiting", start_pose: "Stand still", moved: "Moved – again", ready: "Live", ended: "Ended" };
 const known = (value, digits) => (value === null ? "–" : value.toFixed(digits).replace("-", "−"));
 const words = (name) => name.replaceAll("_", " ");
+const degrees = (angle) => (angle === null ? null : angle * 180 / Math.PI);
+const UNKNOWN_HEADING = Math.PI / Math.sqrt(3);                          // [rad] of a direction that is uniform on the circle
 function duration(s) {
   if (s === null) return "–";
   if (s < 60) return `${Math.floor(s)} s`;
@@ -102,18 +104,18 @@ function small(id, value, unit) {
 }
 
 // ---- the guided session
-const MAIN = ["next", "accept", "exchange", "more"];
+const MAIN = ["next", "accept", "exchange", "more"], PAST = ["done", "skipped"];
 let guided = false, guideSays = "", spokenCount = null, voice = false;
 function speak(what) {
   if (!voice || !what) return;
   speechSynthesis.cancel();
   speechSynthesis.speak(new SpeechSynthesisUtterance(what));
 }
-function button({ name, label, key }, main) {
+function button({ kind, label, key }, main) {
   const element = text($("actions"), "button", label, `key ${key.toUpperCase()}`);
   element.className = main ? "main" : "";
-  element.dataset.action = name;
-  element.addEventListener("click", () => ask(name));
+  element.dataset.action = kind;
+  element.addEventListener("click", () => ask(kind));
 }
 function showGuide(guide) {
   guided = guide !== null;
@@ -124,8 +126,8 @@ function showGuide(guide) {
   $("note").textContent = guide.note;
   $("steps").replaceChildren(...guide.steps.map(({ name, title, state }) => {
     const item = Object.assign(document.createElement("li"), { className: state });
-    const inner = text(item, state === "done" ? "button" : "span", title);
-    if (state === "done") inner.addEventListener("click", () => ask(`go ${name}`));
+    const inner = text(item, PAST.includes(state) ? "button" : "span", title);
+    if (PAST.includes(state)) inner.addEventListener("click", () => ask("go", name));
     if (state === "now") item.setAttribute("aria-current", "step");
     return item;
   }));
@@ -133,11 +135,11 @@ function showGuide(guide) {
   const left = guide.remaining === null ? "" : ` · ${known(guide.remaining, 0)} s`;
   $("say").querySelector("strong").textContent = count === null ? now.title + left : Math.ceil(count);
   $("say").classList.toggle("counting", count !== null);
-  const offered = guide.actions.map((action) => action.name + action.label).join();
+  const offered = guide.actions.map((action) => action.kind + action.label).join();
   if ($("actions").dataset.offered !== offered) {                        // a button stays while it is pressed
     $("actions").dataset.offered = offered;
     $("actions").replaceChildren();
-    guide.actions.forEach((action, k) => button(action, k === 0 && MAIN.includes(action.name)));
+    guide.actions.forEach((action, k) => button(action, k === 0 && MAIN.includes(action.kind)));
   }
   showResult(guide);
   if (guideSays !== guide.note + guide.sentence) speak(guide.note || guide.sentence);
@@ -152,23 +154,25 @@ function showResult(guide) {
   $("quality").className = guide.quality;
   $("reasons").replaceChildren();
   guide.reasons.forEach((reason) => text($("reasons"), "p", reason));
-  $("lengths").querySelector("tbody").replaceChildren(...guide.lengths.map(({ name, mm, std_mm }) => {
-    const row = document.createElement("tr");
+  $("lengths").querySelector("tbody").replaceChildren(...guide.lengths.map(({ name, metres, std }) => {
+    const row = document.createElement("tr"), mm = (value, digits) => known(value === null ? null : 1e3 * value, digits);
     text(row, "td", words(name));
-    text(row, "td", `${known(mm, 0)} mm`);
-    text(row, "td", `± ${known(std_mm, 0)}`);
-    const bar = text(text(row, "td", ""), "i", "");
-    bar.style.width = `${Math.min(100, 2.5 * std_mm)}%`;
+    text(row, "td", `${mm(metres, 0)} mm`);
+    text(row, "td", `± ${mm(std, 0)} mm`);
+    const bar = text(text(row, "td", "", "the uncertainty: shorter is better"), "i", "");
+    bar.style.width = `${Math.min(100, 2500 * std)}%`;
     return row;
   }));
   $("measure").hidden = !guide.measurable;
-  $("measure").querySelector("span").textContent = `Measured ${guide.measurable_name}:`;
+  $("measure").querySelector("span").textContent = `Measured ${data.length_names[guide.measurable] ?? words(guide.measurable)}:`;
   $("measure").dataset.name = guide.measurable;
   $("sample-size").textContent = guide.sample_size === null ? ""
     : `Effective sample size ${known(guide.sample_size[0], 1)}; ${known(guide.sample_size[1], 0)} are enough.`;
 }
-function ask(action) {
-  if (socket.readyState === WebSocket.OPEN) socket.send(`key ${action}`);
+function ask(kind, name = "", value = null) {
+  const through = socket.readyState === WebSocket.OPEN;
+  if (through) socket.send(JSON.stringify(value === null ? { kind, name } : { kind, name, value }));
+  return through;
 }
 
 let state = "", offers = [], steps = [], phase = "";                        // phase: open, and no take
@@ -201,9 +205,9 @@ function show(status) {
     place.prepend(shape(is));
     if (sensor.battery !== null) text(place, "small", ` ${Math.round(100 * sensor.battery)} %`, "charge of its battery").className = sensor.battery < .15 ? "low" : "";
     text(row, "td", known(sensor.rate_hz, 0));
-    text(row, "td", sensor.bias_deg_s.map((axis) => known(begun ? axis : null, 2).padStart(5, "\u2007")).join(" "));
-    text(row, "td", sensor.heading_std);
-    text(row, "td", duration(begun ? sensor.heading_age_s : null));
+    text(row, "td", sensor.gyro_bias.map((axis) => known(begun ? degrees(axis) : null, 2).padStart(5, "\u2007")).join(" ")).className = "detail";
+    text(row, "td", sensor.heading_std > UNKNOWN_HEADING ? "unknown" : known(degrees(sensor.heading_std), 1)).className = "detail";
+    text(row, "td", duration(begun ? sensor.heading_age : null)).className = "detail";
     text(row, "td", sensor.missing + sensor.late + sensor.duplicate,
          `never came: ${sensor.missing}, too late: ${sensor.late}, twice: ${sensor.duplicate}`);
     return row;
@@ -213,7 +217,7 @@ function show(status) {
   else $("latency").textContent = "–";
   small("time", `${known(status.time, 1)} s`, " of the source's clock");
   $("recording").textContent = status.recorded_s ? `${status.recorded_s.toFixed(1)} s in the file` : "none";
-  if (status.recorded_s) $("recording").prepend(document.createElement("b"));
+  if (status.recorded_s && state !== "ended") $("recording").prepend(document.createElement("b"));
   const problems = Object.entries(status.problems).filter(([, count]) => count);
   $("problems").hidden = $("problems-name").hidden = !problems.length;
   $("problems").textContent = problems.map(([name, count]) => `${name}: ${count}`).join(", ");
@@ -309,10 +313,8 @@ function connect() {
   };
 }
 
-function press(key) {
-  const through = socket.readyState === WebSocket.OPEN;
-  if (through) socket.send(`key ${key}`);
-  $("answer").textContent = !through ? "Not connected: nothing was asked for."
+function reset() {
+  $("answer").textContent = !ask("reset") ? "Not connected: nothing was asked for."
     : state === "ready" ? "Asked for new headings." : "Headings are set when the start pose has been held.";
   setTimeout(() => { $("answer").textContent = ""; }, 4000);
 }
@@ -322,7 +324,7 @@ function toggleTrails() {
   viewer.set_dirty();
 }
 function mark() {
-  ask(`mark ${typed() || "mark"}`);
+  ask("mark", typed() || "mark");
   $("answer").textContent = "Marked.";
   setTimeout(() => { $("answer").textContent = ""; }, 2000);
 }
@@ -330,12 +332,12 @@ const typed = () => $("mark-text").value.trim();
 function namePhase() {
   $("phase").firstChild.textContent = phase ? `End ${words(phase)} ` : `Begin ${typed() || "clasp"} `;
 }
-function togglePhase() { ask(phase ? `end ${phase}` : `begin ${typed() || "clasp"}`); }
+function togglePhase() { ask(phase ? "end" : "begin", phase || typed() || "clasp"); }
 $("mark-text").addEventListener("input", namePhase);
 $("phase").addEventListener("click", togglePhase);
 $("measure").addEventListener("submit", (event) => {
   event.preventDefault();
-  ask(`measure ${$("measure").dataset.name}=${(Number($("measured").value) / 100).toFixed(4)}`);
+  ask("measure", $("measure").dataset.name, Number($("measured").value) / 100);
   $("measured").value = "";
 });
 $("take").addEventListener("click", () => ask("take"));
@@ -345,19 +347,22 @@ $("voice").addEventListener("click", () => {
   $("voice").setAttribute("aria-pressed", voice);
   if (voice) speak("Voice on"); else speechSynthesis.cancel();
 });
-$("reset").addEventListener("click", () => press("r"));
+$("reset").addEventListener("click", reset);
 $("trails").addEventListener("click", toggleTrails);
+$("details").addEventListener("click", () => {
+  $("details").setAttribute("aria-pressed", document.body.classList.toggle("detailed"));
+});
 $("camera").addEventListener("click", () => { moved = false; fit(); });
 addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
   if (event.target instanceof HTMLInputElement) return;
   const key = event.key.toLowerCase(), offered = offers.find((action) => action.key === key);
-  if (offered || (key === " " && offers.length)) ask((offered ?? offers[0]).name);
-  else if (steps[key - 1]?.state === "done") ask(`go ${steps[key - 1].name}`);
+  if (offered || (key === " " && offers.length)) ask((offered ?? offers[0]).kind);
+  else if (PAST.includes(steps[key - 1]?.state)) ask("go", steps[key - 1].name);
   else if (state === "ready" && key === "t") ask("take");
   else if (state === "ready" && key === "m") mark();
   else if (state === "ready" && key === "p") togglePhase();
-  else if (!offers.length && (key === " " || key === "r")) press("r");
+  else if (!offers.length && (key === " " || key === "r")) reset();
   else return;
   event.preventDefault();
 });

@@ -1,0 +1,65 @@
+"""`Stage`: a part of a live session, the guide or tracking: samples in, requests of the person in, views out."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+from ..recording.arrivals import Samples
+from .sources.base import Source
+from .state import Output, Request, Status
+
+
+class Stage(ABC):
+    """Reads an open source until it ends, and shows what comes of it.
+
+    Attributes
+    ----------
+    source, outputs : stay open
+    """
+
+    READ_TIMEOUT_S = 0.05  # [s]; requests and the status wait for a read
+    STATUS_PERIOD_S = 0.2  # [s]
+
+    def __init__(self, source: Source, outputs: Sequence[Output]) -> None:
+        self.source, self.outputs = source, tuple(outputs)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is nothing more to do."""
+        return False
+
+    @abstractmethod
+    def process(self, samples: list[Samples]) -> None:
+        """Take the samples of one read, perhaps none."""
+
+    @abstractmethod
+    def ask(self, request: Request) -> None:
+        """Do what the person asks for; what cannot be done now is ignored."""
+
+    @abstractmethod
+    def build_status(self) -> Status:
+        """The state now."""
+
+    def loop(self, should_stop: Callable[[], bool]) -> None:
+        """Read, until this is over, the source ends, the person quits or `should_stop` returns True."""
+        due = 0.0
+        while not (self.is_over or should_stop()):
+            samples = self.source.read(self.READ_TIMEOUT_S)
+            if samples is None:
+                return
+            self.process(samples)
+            for request in [request for output in self.outputs for request in output.take_requests()]:
+                if request.kind == "quit":
+                    return
+                self.ask(request)
+            if time.monotonic() >= due:
+                due = time.monotonic() + self.STATUS_PERIOD_S
+                self.send_status()
+
+    def send_status(self) -> None:
+        """Show the state now."""
+        status = self.build_status()
+        for output in self.outputs:
+            output.status(status)
