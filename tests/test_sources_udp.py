@@ -18,7 +18,7 @@ from bodies import SEGMENTS
 
 from wepose_pin.errors import BadOption, BadSource
 from wepose_pin.live.sources import open_source, packets
-from wepose_pin.live.sources.datagrams import MAX_KINDS
+from wepose_pin.live.sources.base import MAX_KINDS
 from wepose_pin.live.sources.udp import UdpSource
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.recording.limits import STANDARD_GRAVITY

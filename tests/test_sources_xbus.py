@@ -78,7 +78,7 @@ def test_frames_of_any_length_in_any_pieces(length: int, piece: int) -> None:
     frames = xbus.Frames()
     read = [f for k in range(0, len(stream), piece) for f in frames.feed(stream[k : k + piece])]
     assert read == [(0x36, data), (0x36, data), (0x42, b"\x04")]
-    assert (frames.skipped, frames.bad_checksums) == (0, 0)
+    assert not frames.problems
 
 
 def test_extended_length_for_a_short_frame() -> None:
@@ -96,8 +96,8 @@ def test_noise_between_frames_is_skipped_and_counted() -> None:
     read += frames.feed(bytes(3000))
     noise += 3000
     assert [f.data[:2] for f in read] == [k.to_bytes(2, "big") for k in range(200)]
-    assert frames.skipped == noise
-    assert frames.bad_checksums >= 40
+    assert frames.problems[xbus.SKIPPED] == noise
+    assert frames.problems[xbus.BAD_CHECKSUMS] >= 40
 
 
 def test_a_wrong_checksum_and_a_cut_frame_cost_themselves_only() -> None:
@@ -105,8 +105,8 @@ def test_a_wrong_checksum_and_a_cut_frame_cost_themselves_only() -> None:
     wrong = good[:-1] + bytes([good[-1] ^ 1])
     frames = xbus.Frames()
     assert frames.feed(good + wrong + good + good[:6] + good + good) == [(0x36, b"good")] * 4
-    assert frames.bad_checksums == 2
-    assert frames.skipped == len(wrong) + 6
+    assert frames.problems[xbus.BAD_CHECKSUMS] == 2
+    assert frames.problems[xbus.SKIPPED] == len(wrong) + 6
 
 
 # Packets -------------------------------------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ def test_rates_and_accelerations_of_different_packets_are_paired_by_time(gyro_st
     np.testing.assert_allclose(time, np.arange(0, 2001, gyro_step) / 1e4)
     np.testing.assert_allclose(values[:, 0], time, atol=1e-7)
     np.testing.assert_allclose(values[:, 3], time * 100.0, atol=1e-5)
-    assert (joiner.unpaired, joiner.untimed) == (0, 0)
+    assert not joiner.problems
 
 
 def test_high_rate_is_taken_where_both_kinds_come() -> None:
@@ -198,17 +198,17 @@ def test_high_rate_is_taken_where_both_kinds_come() -> None:
 def test_rates_without_an_acceleration_are_counted_and_do_not_wait_for_ever() -> None:
     time, _, joiner = joined([mtdata2(100 * k, (0x8020, GYRO)) for k in range(100)])
     assert len(time) == 0
-    assert joiner.unpaired == pytest.approx(90, abs=2)
+    assert joiner.problems[xbus.UNPAIRED] == pytest.approx(90, abs=2)
     lost = [mtdata2(100 * k, (0x8020, GYRO), *([(0x4020, ACCEL)] if not 20 < k < 60 else [])) for k in range(100)]
     time, _, joiner = joined(lost)
     assert len(time) == 100 - 39
-    assert joiner.unpaired == 39
+    assert joiner.problems[xbus.UNPAIRED] == 39
 
 
 def test_packets_without_a_time_are_counted() -> None:
     time, _, joiner = joined([mtdata2(None, (0x8020, GYRO), (0x4020, ACCEL))])
     assert len(time) == 0
-    assert joiner.untimed == 1
+    assert joiner.problems[xbus.UNTIMED] == 1
 
 
 def test_what_is_asked_of_a_device() -> None:

@@ -10,7 +10,6 @@ import os
 import socket
 from collections import deque
 from pathlib import Path
-from queue import SimpleQueue
 from types import SimpleNamespace
 from typing import Any, ClassVar
 from unittest import mock
@@ -115,18 +114,18 @@ def mti(_folder: Path, data: bytes) -> object:
     from wepose_pin.live.sources import mti as module
 
     answers, _, rest = data[1:].rpartition(APART)
-    queue: SimpleQueue[Any] = SimpleQueue()
+    source = module.MTiSource({"torso": "/dev/fuzz"}, 100 if data[:1] < b"\x80" else None)
+    [device] = source._devices
     with mock.patch.multiple(module, ANSWER_S=0.002, WAIT_S=0.001):
-        device = module._Device("torso", "/dev/fuzz", 100 if data[:1] < b"\x80" else None, 115200, queue)
         device._serial = SimpleNamespace(Serial=lambda *_, **__: _Port(answers.split(APART)))
         try:
             device.connect()
             for arrival, part in enumerate((rest[: len(rest) // 3], rest[len(rest) // 3 :])):
-                device._decode(part, float(arrival))
+                device.decode(part, float(arrival))
         finally:
             device.close()
-    came = [queue.get() for _ in range(queue.qsize())]
-    _sound([each for each in came if hasattr(each, "gyro_S")])
+    came = source.read(0.0)
+    _sound(came)
     return came
 
 
@@ -184,7 +183,7 @@ class _Wild:
         return STEP * self._at
 
     def read(self, _timeout_s: float) -> list[Any] | None:
-        from wepose_pin.live.sources.checks import find_plausible
+        from wepose_pin.live.sources.base import find_plausible
         from wepose_pin.recording.arrivals import Samples
 
         self._at += 1

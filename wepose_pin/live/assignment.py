@@ -11,8 +11,7 @@ import numpy as np
 from ..documents import read_toml, toml_key, toml_string, whole_file
 from ..errors import BadSession
 from ..recording.arrivals import Samples, unpack_orientations
-from .sources.base import Source
-from .sources.waiting import Waiting
+from .sources.base import Source, Waiting
 
 SETUP_FILE = "setup.toml"
 SETUP_FORMAT = 1

@@ -2,13 +2,78 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
+import numpy as np
+
+from ...errors import BadOption, BadSource, one_of
 from ...recording.arrivals import Samples
-from .waiting import Waiting
+from ...recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
+
+# Called a few times a second with what is awaited and where; False: no longer.
+Waiting = Callable[[str], bool]
+
+POLL_S = 0.2  # [s] between two such calls
+MAX_KINDS = 24  # of problems
+# Seconds since 1970 have ten digits; larger times are in another unit, or damaged.
+MAX_TIME = 1e10  # [s]
+MAX_VALUES = np.repeat([HIGHEST_RATE, HIGHEST_ACCEL], 3)
+IMPLAUSIBLE = "samples with values that no body sensor gives"
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """How a source is opened.
+
+    Parameters
+    ----------
+    spec : the text that names it, for messages
+    sensors : to take; None: all that it has
+    segments : names that sensors may have
+    any_name : sensors may have any name, and begin to send at any time; they are assigned to segments later
+    speed : of a replay: 1.0 its own, 4.0 four times that, "max" as fast as possible
+    baud : of serial ports
+    wait_s : [s] for which `Source.open` waits for streams or senders
+    """
+
+    spec: str
+    sensors: tuple[str, ...] | None
+    segments: tuple[str, ...]
+    any_name: bool = False
+    speed: float | str = 1.0
+    baud: int = 115200
+    wait_s: float = 10.0
+
+    def read_pairs(self, text: str, example: str) -> dict[str, str]:
+        """Segment → device of ``DEVICE=SEGMENT,…``; raises `BadOption`."""
+        devices: dict[str, str] = {}
+        for pair in text.split(","):
+            device, equals, segment = pair.rpartition("=")
+            if not equals or not device:
+                raise BadOption(f"source '{self.spec}': '{pair}' is no DEVICE=SEGMENT, as {example}={self.segments[0]}")
+            self.check_segment(segment)
+            if segment in devices or device in devices.values():
+                raise BadOption(f"source '{self.spec}': '{pair}': each device and each segment is named once")
+            devices[segment] = device
+        return devices
+
+    def check_segment(self, name: str) -> None:
+        """Raise `BadOption` where this is not the name of a segment."""
+        if name not in self.segments:
+            raise BadOption(f"source '{self.spec}': '{name}' is not a segment; {one_of(self.segments, name)}")
+
+    def choose(self, present: Iterable[str], kind: str) -> tuple[str, ...]:
+        """The sensors to take of those that are present; raises `BadOption` where one is not."""
+        present = tuple(present)
+        for name in self.sensors or ():
+            if name not in present:
+                raise BadOption(f"source '{self.spec}': no {kind} {name}; {one_of(present, name)}")
+        return present if self.sensors is None else self.sensors
 
 
 class Source(ABC):
@@ -67,3 +132,53 @@ class Source(ABC):
     @abstractmethod
     def close(self) -> None:
         """Disconnect and free what `open` took. May be called twice."""
+
+    # For sources -----------------------------------------------------------------------------------------------------
+
+    def count(self, problem: str, number: int = 1) -> None:
+        """Count a problem."""
+        if problem not in self.problems and len(self.problems) >= MAX_KINDS:
+            problem = "other problems"
+        self.problems[problem] += number
+
+    def keep_plausible(self, sensor: str, time: np.ndarray, values: np.ndarray) -> list[Samples]:
+        """The plausible of these samples, times (m,) [s] and values (m, 6) [rad/s, m/s²], as one `Samples` or none."""
+        plausible = find_plausible(time, values)
+        if not plausible.all():
+            self.count(IMPLAUSIBLE, len(time) - int(plausible.sum()))
+            time, values = time[plausible], values[plausible]
+        return [Samples(sensor, time, values[:, :3], values[:, 3:])] if len(time) else []
+
+    def wait_for(
+        self,
+        is_found: Callable[[float], bool],
+        describe: Callable[[], str],
+        waiting: Waiting | None,
+        wait_s: float = math.inf,
+        refuse: Callable[[], str] | None = None,
+    ) -> bool:
+        """Wait until `is_found`, called with the seconds that it may take; False where `waiting` ends it.
+
+        Raises
+        ------
+        BadSource
+            Without `waiting` it is not found in `wait_s` [s]; `refuse` gives the text.
+        """
+        deadline = time.monotonic() + wait_s
+        try:
+            while not is_found(POLL_S):
+                if waiting is not None and not waiting(f"Waiting for {describe()}."):
+                    self.close()
+                    self.sensors = ()
+                    return False
+                if waiting is None and time.monotonic() >= deadline:
+                    raise BadSource(refuse() if refuse else f"nothing came within {wait_s:g} s from {describe()}")
+        except BadSource:
+            self.close()
+            raise
+        return True
+
+
+def find_plausible(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(m,) bool: time (m,) [s] and values (m, 6) [rad/s, m/s²] of a sample are finite and not too large."""
+    return (np.abs(time) < MAX_TIME) & (np.abs(values) <= MAX_VALUES).all(axis=1)  # a NaN is neither

@@ -10,44 +10,16 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from ...errors import BadSource
-from ...model import load_table
 from ...recording.arrivals import Samples
 from ..addresses import name_host
-from .base import Source
-from .packets import AnyName
-from .waiting import Waiting, wait_for
+from .base import Source, Waiting
+from .packets import NUMBERS
 
 MAX_SIZE = 65536  # [bytes] of a datagram
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
 BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
 COLLECT_S = 1.0  # [s] after the first sample in which the other sensors may appear
 MAX_SENSORS = 64  # of any name
-MAX_KINDS = 24  # of problems
-
-
-def bind_socket(kind: str, host: str, port: int) -> socket.socket:
-    """Return a socket for datagrams at an address of this machine, which never blocks; port 0: any free one.
-
-    Raises
-    ------
-    BadSource
-        The address cannot be bound; `kind` is the source that the message names.
-    """
-    bound = None
-    try:
-        family, form, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-        bound = socket.socket(family, form, protocol)
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
-        bound.bind(address)
-    except (OSError, UnicodeError) as error:
-        if bound is not None:
-            bound.close()
-        raise BadSource(
-            f"{kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); "
-            f"an address of this machine and a port that nobody uses are needed"
-        ) from None
-    bound.setblocking(False)
-    return bound
 
 
 class DatagramSource(Source):
@@ -57,7 +29,7 @@ class DatagramSource(Source):
     ----------
     port : 0 for any free one; then see `address`
     sensors : to take; None: those that send while `open` waits
-    segments : names that sensors may have; None: those of the upper body; `AnyName`: `sensors` grows as new ones send
+    segments : names that sensors may have; None: any, and `sensors` grows as new ones send
     wait_s : [s] for which `open` waits for the first sample where `sensors` are not given
 
     Attributes
@@ -74,14 +46,11 @@ class DatagramSource(Source):
         host: str,
         port: int,
         sensors: Sequence[str] | None = None,
-        segments: Collection[str] | None = None,
+        segments: Collection[str] | None = NUMBERS,
         wait_s: float = 10.0,
     ) -> None:
         super().__init__(sensors or ())
-        self.address = (host, port)
-        self._finds = isinstance(segments, AnyName)
-        self._segments = load_table().segments if segments is None else segments
-        self._wait_s = wait_s
+        self.address, self._segments, self._wait_s = (host, port), segments, wait_s
         self._socket: socket.socket | None = None
         self._waiting: list[Samples] = []
 
@@ -100,32 +69,43 @@ class DatagramSource(Source):
         BadSource
             The address cannot be bound, or without `waiting` nothing comes.
         """
-        self._socket = bind_socket(self.kind, *self.address)
+        self._socket = self._bind(*self.address)
         self.address = self._socket.getsockname()[:2]
-        if not self.sensors and not self._finds:
-            self._find_sensors(waiting)
+        if not self.sensors and self._segments is not None:
+            self._find_sensors(self._segments, waiting)
 
-    def _find_sensors(self, waiting: Waiting | None) -> None:
-        """Take the sensors that send."""
-        self.sensors = tuple(self._segments)
+    def _bind(self, host: str, port: int) -> socket.socket:
+        """A socket at an address of this machine, which never blocks."""
+        bound = None
         try:
-            found = wait_for(self._find_any, self.describe_awaited, self._wait_s, waiting)
-        except BadSource:
-            self.close()
-            raise
-        if not found:
-            self.close()
-            self.sensors = ()
-            return
-        deadline = time.monotonic() + COLLECT_S
-        while time.monotonic() < deadline:
-            self._waiting += self.read_new(0.1)
-        present = {samples.sensor for samples in self._waiting}
-        self.sensors = tuple(segment for segment in self._segments if segment in present)
+            family, form, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+            bound = socket.socket(family, form, protocol)
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+            bound.bind(address)
+        except (OSError, UnicodeError) as error:
+            if bound is not None:
+                bound.close()
+            raise BadSource(
+                f"{self.kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); "
+                f"an address of this machine and a port that nobody uses are needed"
+            ) from None
+        bound.setblocking(False)
+        return bound
 
-    def _find_any(self, timeout_s: float) -> bool:
-        self._waiting += self.read_new(timeout_s)
-        return bool(self._waiting)
+    def _find_sensors(self, segments: Collection[str], waiting: Waiting | None) -> None:
+        """Take the sensors that send."""
+
+        def collect(timeout_s: float) -> bool:
+            self._waiting += self._read_new(timeout_s)
+            return bool(self._waiting)
+
+        self.sensors = tuple(segments)
+        if self.wait_for(collect, self.describe_awaited, waiting, self._wait_s):
+            deadline = time.monotonic() + COLLECT_S
+            while time.monotonic() < deadline:
+                collect(0.1)
+            present = {samples.sensor for samples in self._waiting}
+            self.sensors = tuple(segment for segment in segments if segment in present)
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:  # noqa: ARG002
         host, port = self.address
@@ -137,22 +117,17 @@ class DatagramSource(Source):
 
     def read(self, timeout_s: float) -> list[Samples]:
         """Samples since the last call, one `Samples` a sensor."""
-        if self._waiting:
-            waiting, self._waiting = self._waiting, []
-            return waiting
-        return self.read_new(timeout_s)
+        waiting, self._waiting = self._waiting, []
+        return waiting or self._read_new(timeout_s)
 
-    def read_new(self, timeout_s: float) -> list[Samples]:
+    def _read_new(self, timeout_s: float) -> list[Samples]:
         """Samples in the socket, or the first that come within `timeout_s`."""
-        if self._socket is None:
-            return []
         samples: list[Samples] = []
         deadline = time.monotonic() + timeout_s
-        while not samples:
+        while not samples and self._socket is not None:
             left = deadline - time.monotonic()
             self._serve(time.monotonic())
-            ready, _, _ = select.select([self._socket], [], [], max(left, 0.0))
-            if ready:
+            if select.select([self._socket], [], [], max(left, 0.0))[0]:
                 samples = self._take(self._receive(self._socket), time.monotonic())
             if left <= 0.0:
                 break
@@ -166,14 +141,14 @@ class DatagramSource(Source):
             except BlockingIOError:
                 break
             except OSError:  # an ICMP reply to another datagram
-                self._count("errors of the socket")
+                self.count("errors of the socket")
                 break
             datagrams.append((datagram, sender[:2]))
         return datagrams
 
     def _tracks(self, sensor: str) -> bool:
-        """Whether a sensor is tracked; where names are found, a new one is from now on."""
-        if self._finds and sensor not in self.sensors and len(self.sensors) < MAX_SENSORS:
+        """Whether a sensor is tracked; where it may have any name, a new one is from now on."""
+        if self._segments is None and sensor not in self.sensors and len(self.sensors) < MAX_SENSORS:
             self.sensors += (sensor,)
         return sensor in self.sensors
 
@@ -182,8 +157,3 @@ class DatagramSource(Source):
         if self._socket is not None:
             self._socket.close()
             self._socket = None
-
-    def _count(self, problem: str, number: int = 1) -> None:
-        if problem not in self.problems and len(self.problems) >= MAX_KINDS:
-            problem = "other problems"
-        self.problems[problem] += number

@@ -12,18 +12,17 @@ import os
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import BadOption, BadSource, how_to_install, one_of
-from ...model import load_table
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
 from ..state import join_names
-from .base import Source
-from .checks import IMPLAUSIBLE, keep_plausible
-from .waiting import Waiting
+from .base import Source, SourceOptions, Waiting
+from .packets import NUMBERS
 
 # Scope of the search → configuration of liblsl. On one machine there is one clock and one loopback.
 _QUIET = "[log]\nlevel = -3\n"
@@ -61,46 +60,46 @@ def find_channels(
     labels: Sequence[str],
     units: Sequence[str],
     count: int,
-    segments: Sequence[str] | None = None,
+    segments: Sequence[str] = NUMBERS,
 ) -> list[SensorChannels]:
     """The sensors of a stream and their channels.
 
     `<name>-<segment>` or `<name>_<segment>` is one sensor: six channels gyro xyz, accel xyz, or any number with labels
     `gyr_x` … `acc_z`. `<name>` itself is one for all, with labels `<segment>_gyr_x` … `<segment>_acc_z`. `segments`:
-    names that sensors may have; None: those of the upper body.
+    names that sensors may have.
 
     Raises
     ------
     BadSource
         An unknown segment, label or unit, or missing channels.
     """
-    where = f"lsl:{name}: stream '{stream}'"
-    segments = tuple(load_table().segments) if segments is None else segments
-    if stream != name:
+    where, known_labels = f"lsl:{name}: stream '{stream}'", list(filter(None, labels))
+    if stream == name:
+        wanted = {
+            segment: [f"{segment}_{signal}" for signal in SIGNALS]
+            for segment in segments
+            if any(label.startswith(f"{segment}_") for label in labels)
+        }
+        if not wanted:
+            raise BadSource(
+                f"{where}: no channel label names a segment, as {segments[0]}_gyr_x; {one_of(known_labels)} "
+                f"(or send one stream a sensor, named {name}-{segments[0]})"
+            )
+    else:
         segment = stream[len(name) + 1 :]
         if segment not in segments:
             raise BadSource(f"{where}: '{segment}' is not a segment; {one_of(segments, segment)}")
-        wanted = {segment: list(SIGNALS)}
-        if not any(labels):
-            if count != len(SIGNALS):
-                raise BadSource(
-                    f"{where}: {count} channels without labels; 6 are gyro xyz and accel xyz, more need labels "
-                    f"{', '.join(SIGNALS)}"
-                )
-            labels = SIGNALS
-    else:
-        there = [segment for segment in segments if any(label.startswith(f"{segment}_") for label in labels)]
-        wanted = {segment: [f"{segment}_{signal}" for signal in SIGNALS] for segment in there}
-        if not wanted:
+        if not known_labels and count != len(SIGNALS):
             raise BadSource(
-                f"{where}: no channel label names a segment, as {segments[0]}_gyr_x; {one_of(filter(None, labels))} "
-                f"(or send one stream a sensor, named {name}-{segments[0]})"
+                f"{where}: {count} channels without labels; 6 are gyro xyz and accel xyz, more need labels "
+                f"{', '.join(SIGNALS)}"
             )
+        labels, wanted = labels if known_labels else SIGNALS, {segment: list(SIGNALS)}
     parts = []
     for segment, names in wanted.items():
         missing = [label for label in names if label not in labels]
         if missing:
-            raise BadSource(f"{where}: no channel labelled '{missing[0]}'; {one_of(filter(None, labels), missing[0])}")
+            raise BadSource(f"{where}: no channel labelled '{missing[0]}'; {one_of(known_labels, missing[0])}")
         channels = [list(labels).index(label) for label in names]
         scale = []
         for k, channel in enumerate(channels):
@@ -112,6 +111,15 @@ def find_channels(
     return parts
 
 
+def open_spec(rest: str, options: SourceOptions) -> LslSource:
+    """The source of ``lsl:NAME[@SCOPE]``."""
+    name, separator, scope = rest.rpartition("@")
+    if separator and scope not in SCOPES:
+        raise BadOption(f"source '{options.spec}': '{scope}' is no reach of a search; {one_of(SCOPES, scope)}")
+    chosen = (name, scope) if separator else (rest, None)
+    return LslSource(chosen[0], options.sensors, chosen[1], options.wait_s, options.segments)
+
+
 class LslSource(Source):
     """Streams called `name`, `name`-segment or `name`_segment; lost ones are reconnected.
 
@@ -120,7 +128,7 @@ class LslSource(Source):
     sensors : to wait for; None: all that are found
     scope : "machine", "link" or "site"; None: this machine, or as the user's own ``LSLAPICFG`` says where it is set
     wait_s : [s] for which `open` searches the streams
-    segments : names that sensors may have; None: those of the upper body
+    segments : names that sensors may have
 
     Notes
     -----
@@ -134,13 +142,12 @@ class LslSource(Source):
         sensors: Sequence[str] | None = None,
         scope: str | None = None,
         wait_s: float = 10.0,
-        segments: Sequence[str] | None = None,
+        segments: Sequence[str] = NUMBERS,
     ) -> None:
         if not name or "'" in name:
             raise BadOption(f"lsl:{name}: a stream's name has at least one letter and no quote, as lsl:wepose")
         super().__init__(sensors or ())
-        self._segments = tuple(load_table().segments if segments is None else segments)
-        self._name, self._scope, self._wait_s = name, scope, wait_s
+        self._segments, self._name, self._scope, self._wait_s = tuple(segments), name, scope, wait_s
         self._streams: dict[str, _Stream] = {}
         self._lock = threading.Lock()
         self._stop = threading.Event()
@@ -163,40 +170,44 @@ class LslSource(Source):
         self._reach = f"on this {scope}" if scope in SCOPES else "where LSLAPICFG looks"
         self._flags = 0 if scope == "machine" else int(self._lsl.proc_clocksync)
         self._stop.clear()
-        present: list[str] = []
-        deadline = time.monotonic() + self._wait_s
-        while not present or any(segment not in present for segment in self.sensors):
-            left = deadline - time.monotonic()
-            if waiting is not None:
-                absent = [name for name in self.sensors if name not in present]
-                if not waiting(f"Waiting for {self.describe_awaited(absent)}."):
-                    return
-                left = COLLECT_S
-            if left <= 0.0:
-                break
-            for stream, info in self._resolve(min(COLLECT_S, left)).items():
-                if stream not in self._streams:
-                    self._streams[stream] = self._subscribe(stream, info)
-            present = [part.sensor for stream in self._streams.values() for part in stream.parts]
+        if not self.wait_for(self._search, self._describe_missing, waiting, self._wait_s, self._refuse):
+            return
+        present = self._present
         twice = {segment for segment in present if present.count(segment) > 1}
-        missing = [segment for segment in self.sensors if segment not in present]
-        if not present or twice or missing:
+        if twice:
             self.close()
-            reach = self._reach
-            if twice:
-                raise BadSource(f"lsl:{self._name}: {min(twice)} is in two streams; stop one of them")
-            problem = (
-                f"{', '.join(missing)} is in none of the streams {reach}" if present else f"no such stream {reach}"
-            )
-            raise BadSource(
-                f"lsl:{self._name}: {problem}, within {self._wait_s:g} s; name streams {self._name}-<segment>, or look "
-                f"further with lsl:{self._name}@site"
-            )
+            raise BadSource(f"lsl:{self._name}: {min(twice)} is in two streams; stop one of them")
         self.sensors = self.sensors or tuple(segment for segment in self._segments if segment in present)
         rates = {stream.rate_hz for stream in self._streams.values()}
         self.rate_hz = rates.pop() if len(rates) == 1 and min(rates) > 0.0 else None
         self._reconnector = threading.Thread(target=self._reconnect, name=f"lsl {self._name}", daemon=True)
         self._reconnector.start()
+
+    @property
+    def _present(self) -> list[str]:
+        """The sensors of the streams that were found."""
+        return [part.sensor for stream in self._streams.values() for part in stream.parts]
+
+    @property
+    def _missing(self) -> list[str]:
+        return [segment for segment in self.sensors if segment not in self._present]
+
+    def _search(self, _timeout_s: float) -> bool:
+        """Search streams; return whether all are there."""
+        for stream, info in self._resolve(min(COLLECT_S, self._wait_s)).items():
+            if stream not in self._streams:
+                self._streams[stream] = self._subscribe(stream, info)
+        return bool(self._present) and not self._missing
+
+    def _describe_missing(self) -> str:
+        return self.describe_awaited(self._missing)
+
+    def _refuse(self) -> str:
+        problem = f"{', '.join(self._missing)} is in none of the streams" if self._present else "no such stream"
+        return (
+            f"lsl:{self._name}: {problem} {self._reach}, within {self._wait_s:g} s; name streams "
+            f"{self._name}-<segment>, or look further with lsl:{self._name}@site"
+        )
 
     def read(self, timeout_s: float) -> list[Samples]:
         """Samples since the last call, one `Samples` a sensor."""
@@ -235,7 +246,7 @@ class LslSource(Source):
             rows, times = stream.inlet.pull_chunk(timeout=0.0, max_samples=MAX_SAMPLES)
         except RuntimeError:  # pylsl's LostError is one
             stream.lost = True
-            self.problems[f"streams lost: {stream.name}"] += 1
+            self.count(f"streams lost: {stream.name}")
             return []
         if not len(times):
             return []
@@ -244,10 +255,7 @@ class LslSource(Source):
         samples = []
         for part in stream.parts:
             if part.sensor in self.sensors:
-                plausible, dropped = keep_plausible(part.sensor, stamps, table[:, part.channels] * part.scale)
-                samples += plausible
-                if dropped:
-                    self.problems[IMPLAUSIBLE] += dropped
+                samples += self.keep_plausible(part.sensor, stamps, table[:, part.channels] * part.scale)
         return samples
 
     def _resolve(self, timeout_s: float) -> dict[str, Any]:
@@ -267,7 +275,9 @@ class LslSource(Source):
             raise BadSource(f"lsl:{self._name}: stream '{stream}' does not answer: {error}") from None
         if full.channel_format() == lsl.cf_string:
             raise BadSource(f"lsl:{self._name}: stream '{stream}' holds text; six channels of numbers a sensor")
-        labels, units = _read_channels(full)
+        labels, units = (
+            [text or "" for text in texts or ()] for texts in (full.get_channel_labels(), full.get_channel_units())
+        )
         parts = find_channels(stream, self._name, labels, units, full.channel_count(), self._segments)
         return _Stream(stream, inlet, parts, float(full.nominal_srate()))
 
@@ -291,25 +301,16 @@ class LslSource(Source):
                         self._streams[name] = fresh
 
 
+@dataclass
 class _Stream:
     """An inlet and its sensors."""
 
-    def __init__(self, name: str, inlet: Any, parts: Sequence[SensorChannels], rate_hz: float) -> None:
-        self.name, self.inlet, self.parts, self.rate_hz = name, inlet, parts, rate_hz
-        self.last_sample = time.monotonic()
-        self.lost = False
-
-
-def _read_channels(info: Any) -> tuple[list[str], list[str]]:
-    """Labels and units of the channels in the description."""
-    labels: list[str] = []
-    units: list[str] = []
-    channel = info.desc().child("channels").child("channel")
-    while not channel.empty() and len(labels) < info.channel_count():
-        labels.append(channel.child_value("label"))
-        units.append(channel.child_value("unit"))
-        channel = channel.next_sibling("channel")
-    return labels, units
+    name: str
+    inlet: Any
+    parts: Sequence[SensorChannels]
+    rate_hz: float
+    last_sample: float = field(default_factory=time.monotonic)
+    lost: bool = False
 
 
 def configure_pylsl(scope: str | None) -> tuple[Any, str]:

@@ -6,19 +6,17 @@ import os
 import select
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from queue import Empty, SimpleQueue
 from types import ModuleType
 from typing import Any
 
-from ...errors import BadSource, how_to_install
+from ...errors import BadOption, BadSource, how_to_install
 from ...recording.arrivals import Samples
 from ..state import join_names
 from . import xbus
-from .base import Source
-from .checks import IMPLAUSIBLE, keep_plausible
+from .base import Source, SourceOptions, Waiting
 from .clocks import HostClock
-from .waiting import Waiting, wait_for
 
 PLAIN_HZ = 100  # that the plain outputs of every MTi have; above, the HR outputs are tried first
 ANSWER_S = 0.5
@@ -27,7 +25,17 @@ SILENT_S = 3.0  # [s] without a byte, after which a port is reopened: not every 
 RETRY_S = 1.0
 WAIT_S = 0.05
 PAUSE_S = 0.002  # [s] between two reads: at 1 kHz two packets come at once, and cost half
-MAX_WAITING = 20_000  # blocks while nobody reads; then the newest are dropped
+MAX_WAITING = 20_000  # blocks while nobody reads; then the oldest are dropped
+
+
+def open_spec(rest: str, options: SourceOptions) -> MTiSource:
+    """The source of ``mti:DEVICE=SEGMENT,…[@RATE]``."""
+    pairs, separator, rate = rest.rpartition("@")
+    if separator and not (rate.isascii() and rate.isdigit() and 0 < int(rate) <= 2000):
+        raise BadOption(f"source '{options.spec}': rate '{rate}'; whole samples a second from 1 to 2000, as @100")
+    devices = options.read_pairs(pairs if separator else rest, "/dev/ttyUSB0")
+    chosen = {name: devices[name] for name in options.choose(devices, "device for")}
+    return MTiSource(chosen, int(rate) if separator else None, options.baud)
 
 
 class MTiSource(Source):
@@ -45,9 +53,8 @@ class MTiSource(Source):
 
     def __init__(self, devices: Mapping[str, str], rate_hz: int | None = None, baud: int = 115200) -> None:
         super().__init__(devices, rate_hz)
-        self._queue: SimpleQueue[Samples | tuple[str, int]] = SimpleQueue()
-        self._devices = [_Device(segment, port, rate_hz, baud, self._queue) for segment, port in devices.items()]
-        self._ports = dict(devices)
+        self._inbox = Inbox()
+        self._devices = [Device(segment, port, rate_hz, baud, self._inbox) for segment, port in devices.items()]
 
     def open(self, waiting: Waiting | None = None) -> None:
         """Open and configure every port, then listen; wait for a port, with `waiting` until that returns False.
@@ -57,32 +64,19 @@ class MTiSource(Source):
         BadSource
             An MTi cannot send at the rate; without `waiting` also: a port cannot be opened, or no MTi answers there.
         """
-        try:
-            for device in self._devices:
-                if waiting is None:
-                    device.open()
-                elif not wait_for(device.try_to_open, device.describe_wait, 0.0, waiting):
-                    self.close()
-                    self.sensors = ()
-                    return
-        except BadSource:
-            self.close()
-            raise
+        for device in self._devices:
+            refuse = device.refuse
+            if not self.wait_for(device.try_to_connect, device.describe_wait, waiting, 0.0, refuse):
+                return
         for device in self._devices:
             device.start()
 
     def read(self, timeout_s: float) -> list[Samples]:
         """Samples since the last call, in the order of arrival."""
-        samples: list[Samples] = []
-        deadline = time.monotonic() + timeout_s
-        while not samples:
-            try:
-                self._dispatch(self._queue.get(timeout=max(deadline - time.monotonic(), 0.0)), samples)
-            except Empty:
-                break
-        for _ in range(self._queue.qsize()):
-            self._dispatch(self._queue.get(), samples)
-        return samples
+        samples, problems = self._inbox.take(timeout_s)
+        for problem, number in problems.items():
+            self.count(problem, number)
+        return [kept for sensor, time_s, values in samples for kept in self.keep_plausible(sensor, time_s, values)]
 
     def close(self) -> None:
         """Stop listening and free the ports."""
@@ -90,20 +84,40 @@ class MTiSource(Source):
             device.close()
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        places = [
-            f"{join_names([name])} at {port}" for name, port in self._ports.items() if name in sensors or not sensors
-        ]
+        places = [device.place for device in self._devices if device.segment in sensors or not sensors]
         return f"MTi sensors: {', '.join(places)}"
 
-    def _dispatch(self, entry: Samples | tuple[str, int], samples: list[Samples]) -> None:
-        """Samples to `samples`, a count to `problems`."""
-        if isinstance(entry, Samples):
-            samples.append(entry)
-        else:
-            self.problems[entry[0]] += entry[1]
+
+class Inbox:
+    """What the threads of all ports have read: samples, with sensor, times and values, and counts of problems."""
+
+    def __init__(self) -> None:
+        self._filled = threading.Condition()
+        self._samples: deque[tuple[str, Any, Any]] = deque(maxlen=MAX_WAITING)
+        self._problems: Counter[str] = Counter()
+
+    def put(self, sensor: str, time_s: Any, values: Any) -> None:
+        """Add samples of a sensor, perhaps none."""
+        if len(time_s):
+            with self._filled:
+                self._samples.append((sensor, time_s, values))
+                self._filled.notify()
+
+    def count(self, problems: Mapping[str, int]) -> None:
+        with self._filled:
+            self._problems.update(problems)
+
+    def take(self, timeout_s: float) -> tuple[list[tuple[str, Any, Any]], Counter[str]]:
+        """All samples and counts since the last call; wait `timeout_s` for a sample."""
+        with self._filled:
+            self._filled.wait_for(lambda: self._samples, timeout_s)
+            samples, problems = list(self._samples), self._problems
+            self._samples.clear()
+            self._problems = Counter()
+        return samples, problems
 
 
-class _NotReady(BadSource):
+class NotReady(BadSource):
     """A port cannot be opened, or no MTi answers there: it may come."""
 
     def __init__(self, path: str, reason: str, remedy: str) -> None:
@@ -111,36 +125,35 @@ class _NotReady(BadSource):
         self.reason = reason
 
 
-class _Device:
+class Device:
     """One port, and the thread that listens to it."""
 
-    def __init__(
-        self, segment: str, path: str, rate_hz: int | None, baud: int, queue: SimpleQueue[Samples | tuple[str, int]]
-    ) -> None:
-        self._segment, self._path, self._rate_hz, self._baud = segment, path, rate_hz, baud
-        self._queue = queue
+    def __init__(self, segment: str, path: str, rate_hz: int | None, baud: int, inbox: Inbox) -> None:
+        self.segment, self.place = segment, f"{join_names([segment])} at {path}"
+        self._path, self._rate_hz, self._baud, self._inbox = path, rate_hz, baud, inbox
         self._serial = _import_pyserial()
         self._port: Any = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._problem = ""  # for which it could not be opened
+        self._error: NotReady | None = None  # for which it could not be connected
 
-    def open(self) -> None:
+    def try_to_connect(self, timeout_s: float) -> bool:
+        """Connect, or wait `timeout_s` and return False where that cannot be done now."""
         self._stop.clear()
-        self.connect()
-
-    def try_to_open(self, timeout_s: float) -> bool:
-        """Open, or wait `timeout_s` and return False where that cannot be done now."""
         try:
-            self.open()
-        except _NotReady as error:
-            self._problem = error.reason
+            self.connect()
+        except NotReady as error:
+            self._error = error
             self._stop.wait(timeout_s)
             return False
         return True
 
     def describe_wait(self) -> str:
-        return f"the MTi of {join_names([self._segment])} at {self._path}: {self._problem}"
+        return f"the MTi of {self.place}: {self._error.reason if self._error else ''}"
+
+    def refuse(self) -> str:
+        """Why it could not be connected."""
+        return str(self._error)
 
     def connect(self) -> None:
         """Open the port and start measurement; raises `BadSource`."""
@@ -151,12 +164,12 @@ class _Device:
                 self._wait_for_data()
             else:
                 self._configure(self._rate_hz)
-            self._reported = self._counts()  # a running stream begins with a partial frame
+            self._frames.problems.clear()  # a running stream begins with a partial frame
         except (OSError, ValueError) as error:  # SerialException is an OSError
             self._disconnect()
             reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
             remedy = "a serial port that is there, may be read and is not in use, as /dev/ttyUSB0"
-            raise _NotReady(self._path, f"cannot open the port ({reason})", remedy) from None
+            raise NotReady(self._path, f"cannot open the port ({reason})", remedy) from None
         except BadSource:
             self._disconnect()
             raise
@@ -211,7 +224,7 @@ class _Device:
                     if frame.mid == xbus.ERROR and mid != xbus.GO_TO_CONFIG:  # then it may be an earlier one
                         raise BadSource(f"mti:{self._path}: the device says: {xbus.describe_error(frame.data)}")
         remedy = "check the cable, the port and the baud rate"
-        raise _NotReady(self._path, f"no MTi answers at {self._baud} baud", remedy)
+        raise NotReady(self._path, f"no MTi answers at {self._baud} baud", remedy)
 
     def _wait_for_data(self) -> None:
         """Wait for data of a device that is not configured; start its measurement where it waits for that."""
@@ -222,7 +235,7 @@ class _Device:
                     return
             self._port.write(xbus.build_frame(xbus.GO_TO_MEASUREMENT))
         remedy = "check cable, port, baud rate and outputs, or name a rate, as @100, for the device to be configured"
-        raise _NotReady(self._path, f"no MTData2 comes at {self._baud} baud", remedy)
+        raise NotReady(self._path, f"no MTData2 comes at {self._baud} baud", remedy)
 
     def _read_bytes(self) -> bytes:
         """Bytes that came, none after a while; past pyserial, whose `read` costs twice as much."""
@@ -242,56 +255,41 @@ class _Device:
             try:
                 if self._port is None:
                     self.connect()
-                    self._put((f"reconnections of {self._segment}", 1))
+                    self._inbox.count({f"reconnections of {self.segment}": 1})
                     last_byte = time.monotonic()
                 data = self._read_bytes()
                 now = time.monotonic()
                 if data:
                     last_byte = now
-                    self._decode(data, now)
+                    self.decode(data, now)
                     time.sleep(PAUSE_S)
                 elif now - last_byte > SILENT_S:
-                    self._report_loss()
+                    raise OSError("nothing comes")
             except BadSource:
                 self._stop.wait(RETRY_S)
             except OSError:  # SerialException is one
-                self._report_loss()
+                self._disconnect()
+                self._inbox.count({f"connections lost to {self.segment}": 1})
 
-    def _report_loss(self) -> None:
-        self._disconnect()
-        self._put((f"connections lost to {self._segment}", 1))
-
-    def _decode(self, data: bytes, arrival: float) -> None:
+    def decode(self, data: bytes, arrival: float) -> None:
+        """Put the samples in bytes that came at a time [s] into the inbox."""
+        problems: Counter[str] = Counter()
         for frame in self._frames.feed(data):
             if frame.mid == xbus.DATA:
                 try:
                     self._joiner.add(xbus.parse_packet(frame.data))
                 except xbus.Malformed:
-                    self._put(("malformed MTData2 packets", 1))
+                    problems["malformed MTData2 packets"] += 1
             elif frame.mid == xbus.ERROR:
-                self._put((f"{self._segment} says: {xbus.describe_error(frame.data)}", 1))
-        self._report_counts()
-        plausible, dropped = keep_plausible(self._segment, *self._joiner.take())
-        if dropped:
-            self._put((IMPLAUSIBLE, dropped))
-        for samples in plausible:
-            self._put(samples._replace(time=self._clock.to_host(samples.time, arrival)))
-
-    def _report_counts(self) -> None:
-        """Put what frames and joiner counted since the last time."""
-        names = ("bytes skipped", "bad checksums", "packets without SampleTimeFine", "rates without an acceleration")
-        now = self._counts()
-        for name, new, old in zip(names, now, self._reported, strict=True):
-            if new > old:
-                self._put((name, new - old))
-        self._reported = now
-
-    def _counts(self) -> tuple[int, ...]:
-        return self._frames.skipped, self._frames.bad_checksums, self._joiner.untimed, self._joiner.unpaired
-
-    def _put(self, entry: Samples | tuple[str, int]) -> None:
-        if self._queue.qsize() < MAX_WAITING:
-            self._queue.put(entry)
+                problems[f"{self.segment} says: {xbus.describe_error(frame.data)}"] += 1
+        for own in (self._frames.problems, self._joiner.problems):
+            problems.update(own)
+            own.clear()
+        if problems:
+            self._inbox.count(problems)
+        time_s, values = self._joiner.take()
+        if len(time_s):
+            self._inbox.put(self.segment, self._clock.to_host(time_s, arrival), values)
 
 
 def _import_pyserial() -> ModuleType:

@@ -6,13 +6,12 @@ import json
 import math
 import struct
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
 from ...errors import one_of
-from ...model import load_table
 from ...readers.device import ACCEL_UNITS, GYRO_UNITS
 
 MAGIC = b"WPIN"
@@ -29,19 +28,6 @@ SI = {"gyro_unit": "rad/s", "accel_unit": "m/s^2"}
 MAX_NAME = 24  # letters of a sensor's name
 
 
-class AnyName(Collection[str]):
-    """All names: the sensors are assigned to segments later."""
-
-    def __contains__(self, name: object) -> bool:
-        return isinstance(name, str)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(())
-
-    def __len__(self) -> int:
-        return 0
-
-
 class Batch(NamedTuple):
     """Samples of one sensor in one datagram, on the sender's clock."""
 
@@ -56,16 +42,15 @@ class _Malformed(Exception):
 
 
 def decode(
-    datagram: bytes, segments: Collection[str] | None = None, units: Mapping[str, str] = SI
+    datagram: bytes, segments: Collection[str] | None = NUMBERS, units: Mapping[str, str] = SI
 ) -> tuple[list[Batch], list[str]]:
     """The batches in a datagram, and a problem for each line that is dropped; raises nothing.
 
     Parameters
     ----------
-    segments : names of sensors in lines of JSON; None: those of the upper body
+    segments : names of sensors in lines of JSON; None: any
     units : as `SI`, of packets and of lines that do not state their own
     """
-    segments = load_table().segments if segments is None else segments
     if datagram[:4] == MAGIC:
         try:
             batch = _decode_binary(datagram)
@@ -116,7 +101,7 @@ def _refuse_constant(text: str) -> NoReturn:
 
 
 def _decode_line(
-    line: bytes, segments: Collection[str], units: Mapping[str, str]
+    line: bytes, segments: Collection[str] | None, units: Mapping[str, str]
 ) -> tuple[str, list[float], list[list[float]], float]:
     """Sensor, times (m), rows of gyro and accel (m, 6), battery; lists, which are faster for a single sample."""
     try:
@@ -126,7 +111,8 @@ def _decode_line(
     if not isinstance(message, dict) or not message.keys() >= {"sensor", "t", "gyro", "accel"}:
         raise _Malformed("JSON lines without sensor, t, gyro and accel")
     sensor = message["sensor"]
-    if not isinstance(sensor, str) or not 0 < len(sensor) <= MAX_NAME or sensor not in segments:
+    is_name = isinstance(sensor, str) and 0 < len(sensor) <= MAX_NAME
+    if not is_name or (segments is not None and sensor not in segments):
         raise _Malformed(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
     time, gyro, accel = message["t"], message["gyro"], message["accel"]
     if not isinstance(time, list):

@@ -4,18 +4,33 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from ...errors import BadOption
+from ...readers import load_session
 from ...recording import OrientationSensor, Recording
 from ...recording.arrivals import Samples, list_numbers
-from .base import Source
-from .waiting import Waiting
+from .base import Source, SourceOptions, Waiting
 
 BLOCK = 64  # samples of every sensor at once, as fast as possible
 # Up to 1 kHz every sample comes when it is due, faster ones come together.
 MIN_SLEEP_S = 0.0005
+
+
+def open_spec(rest: str, options: SourceOptions) -> ReplaySource:
+    """The source of ``replay:PATH``."""
+    try:
+        speed = math.inf if options.speed == "max" else float(options.speed)
+    except ValueError:
+        speed = math.nan
+    if not speed > 0.0:
+        raise BadOption(f"speed: '{options.speed}'; a positive number, 1.0 is the recording's own, or max")
+    recording = load_session(Path(rest), gaps=True)
+    chosen = options.choose(recording.sensors, "sensor")
+    return ReplaySource(replace(recording, sensors={name: recording.sensors[name] for name in chosen}), speed)
 
 
 class ReplaySource(Source):
@@ -30,29 +45,17 @@ class ReplaySource(Source):
     Attributes
     ----------
     recording : that is replayed
-
-    Raises
-    ------
-    BadOption
-        A speed that is not positive.
     """
 
     def __init__(self, recording: Recording, speed: float = 1.0) -> None:
-        if not speed > 0.0:
-            raise BadOption(f"speed: {speed:g}; it must be positive: 1.0 is the recording's own, 4.0 four times that")
         super().__init__(recording.sensors, recording.rate_hz)
-        self._orientations = {
-            segment: sensor.aligned
-            for segment, sensor in recording.sensors.items()
-            if isinstance(sensor, OrientationSensor)
-        }
         self._numbers = dict(zip(recording.sensors, map(list_numbers, recording.sensors.values()), strict=True))
         self.recording = recording
         # Samples are taken as evenly spaced: the jitter of the clock is no motion, and every sample has its own tick.
         self._time = recording.time[0] + np.arange(len(recording)) / recording.rate_hz
-        self._speed = speed
-        self._next = 0
-        self._begin = 0.0
+        self._speed, self._next, self._begin = speed, 0, 0.0
+        sensors = recording.sensors.items()
+        self._orientations = {name: each.aligned for name, each in sensors if isinstance(each, OrientationSensor)}
 
     @property
     def orientations(self) -> dict[str, bool]:
@@ -60,8 +63,7 @@ class ReplaySource(Source):
 
     def open(self, waiting: Waiting | None = None) -> None:  # noqa: ARG002
         """Start: the first sample is due now."""
-        self._next = 0
-        self._begin = time.monotonic()
+        self._next, self._begin = 0, time.monotonic()
 
     def clock(self) -> float:
         """Now [s] on the recording's time; as fast as possible, the time of the newest sample delivered."""
@@ -71,26 +73,26 @@ class ReplaySource(Source):
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         """Samples that became due since the last call, one `Samples` a sensor; None after the last."""
-        recording, time_s, first = self.recording, self._time, self._next
-        if first >= len(recording):
+        first = self._next
+        if first >= len(self.recording):
             return None
         deadline = time.monotonic() + timeout_s
         while (last := self._count_due()) <= first:
-            wait = (float(time_s[first]) - self.clock()) / self._speed
+            wait = (float(self._time[first]) - self.clock()) / self._speed
             left = deadline - time.monotonic()
             if left <= 0.0:
                 return []
             time.sleep(min(max(wait, MIN_SLEEP_S), left))
         self._next = last
         samples = []
-        for segment, sensor in recording.sensors.items():
+        for segment, sensor in self.recording.sensors.items():
             rows: slice | np.ndarray = slice(first, last)
             if sensor.gap is not None and sensor.gap[rows].any():
                 rows = first + np.flatnonzero(~sensor.gap[first:last])
                 if not rows.size:
                     continue
             gyro_S, accel_S = self._numbers[segment]
-            samples.append(Samples(segment, time_s[rows], gyro_S[rows], accel_S[rows]))
+            samples.append(Samples(segment, self._time[rows], gyro_S[rows], accel_S[rows]))
         return samples
 
     def close(self) -> None:

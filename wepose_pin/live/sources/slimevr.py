@@ -12,11 +12,13 @@ import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ...recording.arrivals import Samples, pack_orientations
+from ..addresses import parse_listening_address
+from .base import SourceOptions
 from .datagrams import DatagramSource
 
 PORT = 6969
@@ -32,6 +34,12 @@ HANDSHAKE_ANSWER = (b"\x03Hey OVR =D 5").ljust(64, b"\0")
 HEARTBEAT = HEADER.pack(1, 0)
 ROTATION_1, HANDSHAKE, PING, SENSOR_INFO, ROTATION_2, ROTATION, ROTATION_ACCEL = 1, 3, 10, 15, 16, 17, 23
 BATTERY = 12
+ROTATIONS = {  # kind → places of the sensor's number, None: it is in the kind, and of the rotation; its layout
+    ROTATION_1: (None, 0, QUAT),
+    ROTATION_2: (None, 0, QUAT),
+    ROTATION: (0, 2, QUAT),
+    ROTATION_ACCEL: (0, 1, BUNDLED_QUAT),
+}
 NORMAL = 1  # kind of a rotation; 2 is a correction
 # Packets that hold nothing for us: heartbeat, acceleration, tap, error, signal and others.
 UNUSED = frozenset({0, 2, 4, 10, 11, 13, 14, 18, 19, 20, 21, 22, 26})
@@ -71,17 +79,20 @@ class Tracker:
     battery: float = float("nan")
 
 
-class OrientationSample(NamedTuple):
-    """One orientation of one segment's sensor."""
-
-    segment: str
-    quat: np.ndarray  # (4,) xyzw, not yet of unit length
+def open_spec(rest: str, options: SourceOptions) -> SlimeVrSource:
+    """The source of ``slimevr:[HOST][:PORT][,TRACKER=SEGMENT…]``."""
+    address, _, pairs = rest.partition(",")
+    host, port = parse_listening_address(address, f"source '{options.spec}':", PORT)
+    devices = options.read_pairs(pairs, "4c:11:ae:00:00:01/0") if pairs else {}
+    assigned = {tracker.lower(): segment for segment, tracker in devices.items()}
+    segments = None if options.any_name else options.segments
+    return SlimeVrSource(host, port, options.sensors or list(devices), segments, options.wait_s, assigned=assigned)
 
 
 class SlimeVrSource(DatagramSource):
     """Orientations of SlimeVR trackers; other parameters and errors as `DatagramSource`.
 
-    With `AnyName` a tracker that states no place is ``MAC/SENSOR``.
+    Where sensors may have any name, a tracker that states no place is ``MAC/SENSOR``.
 
     Parameters
     ----------
@@ -131,9 +142,9 @@ class SlimeVrSource(DatagramSource):
             for segment, quat in self._decode(datagram, sender, now):
                 size = float(np.linalg.norm(quat))
                 if not self._tracks(segment):
-                    self._count(f"orientations of {segment}, which is not tracked")
+                    self.count(f"orientations of {segment}, which is not tracked")
                 elif not (math.isfinite(size) and abs(size - 1.0) < UNIT_ERROR):
-                    self._count("orientations that are none")
+                    self.count("orientations that are none")
                 else:
                     by_segment.setdefault(segment, []).append(quat / size)
         return [
@@ -153,11 +164,12 @@ class SlimeVrSource(DatagramSource):
             try:
                 self._socket.sendto(data, to)
             except OSError:
-                self._count("answers that could not be sent")
+                self.count("answers that could not be sent")
 
-    def _decode(self, datagram: bytes, sender: Any, now: float, /) -> Iterator[OrientationSample]:
+    def _decode(self, datagram: bytes, sender: Any, now: float) -> Iterator[tuple[str, np.ndarray]]:
+        """Segment and orientation (4,) xyzw, not yet of unit length, of each sensor in a datagram."""
         if len(datagram) < HEADER.size or datagram[:3] != b"\0\0\0":
-            self._count("datagrams that are none of SlimeVR")
+            self.count("datagrams that are none of SlimeVR")
             return
         kind, number = HEADER.unpack_from(datagram)
         data = datagram[HEADER.size :]
@@ -167,10 +179,10 @@ class SlimeVrSource(DatagramSource):
         tracker = self.trackers.get(sender)
         if tracker is None:
             # It found a server before; without answer for three seconds it looks for one again.
-            self._count("packets of trackers that have not introduced themselves")
+            self.count("packets of trackers that have not introduced themselves")
             return
         if number and number <= tracker.number:
-            self._count("SlimeVR packets that came twice or too late")
+            self.count("SlimeVR packets that came twice or too late")
             return
         tracker.number, tracker.newest_time = max(number, tracker.number), now
         if kind == SENSOR_INFO and len(data) >= 2:
@@ -181,15 +193,15 @@ class SlimeVrSource(DatagramSource):
             self._send(datagram, sender)
         elif kind == BATTERY and len(data) >= 8:
             tracker.battery = float(np.clip(struct.unpack_from(">2f", data)[1], 0.0, 1.0))
-        elif kind in (ROTATION_1, ROTATION_2, ROTATION, ROTATION_ACCEL):
+        elif kind in ROTATIONS:
             yield from self._read_rotation(kind, data, tracker)
         elif kind not in UNUSED:
-            self._count(f"SlimeVR packets of type {kind}, which is not read")
+            self.count(f"SlimeVR packets of type {kind}, which is not read")
 
     def _welcome(self, datagram: bytes, sender: Any, now: float) -> None:
         """Answer a handshake."""
         if len(self.trackers) >= MAX_TRACKERS and sender not in self.trackers:
-            self._count("trackers beyond the number that can be used")
+            self.count("trackers beyond the number that can be used")
             return
         at = _MAC_AT
         if len(datagram) > at:
@@ -199,38 +211,27 @@ class SlimeVrSource(DatagramSource):
         self.trackers[sender] = Tracker(":".join(f"{byte:02x}" for byte in mac), now, places=places)
         self._send(HANDSHAKE_ANSWER, sender)
 
-    def _read_rotation(self, kind: int, data: bytes, tracker: Tracker) -> Iterator[OrientationSample]:
-        sensor, at, layout = 0, 0, QUAT
-        if kind == ROTATION_2:
-            sensor = 1
-        elif kind == ROTATION:
-            at = 2
-        elif kind == ROTATION_ACCEL:
-            at, layout = 1, BUNDLED_QUAT
+    def _read_rotation(self, kind: int, data: bytes, tracker: Tracker) -> Iterator[tuple[str, np.ndarray]]:
+        sensor_at, at, layout = ROTATIONS[kind]
         if len(data) < at + layout.size:
-            self._count("SlimeVR packets of a wrong length")
+            self.count("SlimeVR packets of a wrong length")
             return
-        if at:
-            sensor = data[0]
         if kind == ROTATION and data[1] != NORMAL:
             return
+        sensor = int(kind == ROTATION_2) if sensor_at is None else data[sensor_at]
         quat = np.array(layout.unpack_from(data, at), dtype=float)
-        if layout is BUNDLED_QUAT:
-            quat /= 2.0**15
         segment = self._find_segment(tracker, sensor)
         if segment is None:
-            self._count(f"orientations of {tracker.mac or 'a tracker'}/{sensor}, whose place on the body is not known")
-            return
-        yield OrientationSample(segment, quat)
+            self.count(f"orientations of {tracker.mac or 'a tracker'}/{sensor}, whose place on the body is not known")
+        else:
+            yield segment, quat / (2.0**15 if layout is BUNDLED_QUAT else 1.0)
 
     def _find_segment(self, tracker: Tracker, sensor: int) -> str | None:
         named = f"{tracker.mac}/{sensor}"
         if named in self.sensors:
             return named
-        stated = self._assigned.get(f"{tracker.mac}/{sensor}") or (
-            self._assigned.get(tracker.mac) if not sensor else None
-        )
-        return stated or tracker.places.get(sensor) or (named if self._finds and tracker.mac else None)
+        stated = self._assigned.get(named) or (None if sensor else self._assigned.get(tracker.mac))
+        return stated or tracker.places.get(sensor) or (named if self._segments is None and tracker.mac else None)
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
         known = ", ".join(tracker.mac or address[0] for address, tracker in self.trackers.items())

@@ -9,14 +9,31 @@ from typing import Any
 
 import numpy as np
 
+from ...errors import BadOption, one_of
 from ...recording.arrivals import Samples
-from ..addresses import LOOPBACK
-from .checks import IMPLAUSIBLE, MAX_TIME, keep_plausible
+from ..addresses import LOOPBACK, parse_address
+from .base import IMPLAUSIBLE, MAX_TIME, SourceOptions
 from .clocks import HostClock
 from .datagrams import DatagramSource
-from .packets import SI, Batch, decode
+from .packets import SI, UNITS, Batch, decode
 
 MAX_CLOCKS = 64  # of senders
+
+
+def open_spec(rest: str, options: SourceOptions) -> UdpSource:
+    """The source of ``udp:[HOST:]PORT[,gyro_unit=…][,accel_unit=…]``."""
+    address, *stated = rest.split(",")
+    host, port = parse_address(address, f"source '{options.spec}':", 9000)
+    units: dict[str, str] = {}
+    for option in stated:
+        key, _, unit = option.partition("=")
+        if key not in UNITS:
+            raise BadOption(f"source '{options.spec}': '{option}' is no unit; {one_of(UNITS, key)}, as gyro_unit=deg/s")
+        if unit not in UNITS[key]:
+            raise BadOption(f"source '{options.spec}': {key} '{unit}' is not known; {one_of(UNITS[key], unit)}")
+        units[key] = unit
+    segments = None if options.any_name else options.segments
+    return UdpSource(host, port, options.sensors, segments, options.wait_s, units=units)
 
 
 class UdpSource(DatagramSource):
@@ -48,47 +65,42 @@ class UdpSource(DatagramSource):
 
     def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
         """Each sender's samples together, since its newest one determines its clock best."""
-        came: dict[tuple[str, int], list[Batch]] = {}
+        by_sender: dict[tuple[str, int], list[Batch]] = {}
         for datagram, sender in datagrams:
             batches, problems = decode(datagram, self._segments, self._units)
             for problem in problems:
-                self._count(problem)
+                self.count(problem)
             batches = [batch for batch in batches if self._accepts(batch)]
             if batches:
-                came.setdefault(sender, []).extend(batches)
+                by_sender.setdefault(sender, []).extend(batches)
         parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-        for sender, batches in came.items():
+        for sender, batches in by_sender.items():
             times = self._clock_of(sender).to_host(np.concatenate([batch.time for batch in batches]), now)
             for batch in batches:
                 own, times = times[: len(batch.time)], times[len(batch.time) :]
                 parts.setdefault(batch.sensor, []).append((own, batch.values))
-        return [samples for sensor, own in parts.items() for samples in self._join(sensor, own)]
+        samples: list[Samples] = []
+        for sensor, pieces in parts.items():
+            time, values = (np.concatenate(column) for column in zip(*pieces, strict=True))
+            samples += self.keep_plausible(sensor, time, values)
+        return samples
 
     def _accepts(self, batch: Batch) -> bool:
         """Whether the batch is of a tracked sensor, with times that fit a clock."""
         if not self._tracks(batch.sensor):
-            self._count(f"samples of {batch.sensor}, which is not tracked", len(batch.time))
+            self.count(f"samples of {batch.sensor}, which is not tracked", len(batch.time))
             return False
         if not float(np.abs(batch.time).max()) < MAX_TIME:
-            self._count(IMPLAUSIBLE, len(batch.time))
+            self.count(IMPLAUSIBLE, len(batch.time))
             return False
         if math.isfinite(batch.battery):
             self._batteries[batch.sensor] = batch.battery
         return True
 
-    def _join(self, sensor: str, parts: list[tuple[np.ndarray, np.ndarray]]) -> list[Samples]:
-        """The plausible samples of the parts as one; none where nothing is left."""
-        times, values = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-        samples, dropped = keep_plausible(sensor, times, values)
-        if dropped:
-            self._count(IMPLAUSIBLE, dropped)
-        return samples
-
     def _clock_of(self, sender: tuple[str, int]) -> HostClock:
-        clock = self._clocks.get(sender)
-        if clock is None:
-            clock = self._clocks[sender] = HostClock()
-            if len(self._clocks) > MAX_CLOCKS:
-                self._clocks.popitem(last=False)
+        """The clock of a sender; that of the one that has been silent longest is forgotten."""
+        clock = self._clocks.setdefault(sender, HostClock())
         self._clocks.move_to_end(sender)
+        if len(self._clocks) > MAX_CLOCKS:
+            self._clocks.popitem(last=False)
         return clock

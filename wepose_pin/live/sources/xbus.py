@@ -11,7 +11,7 @@ Documentation (MT0101P).
 from __future__ import annotations
 
 import struct
-from collections import deque
+from collections import Counter, deque
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +37,9 @@ ERRORS = {
     0x29: "too much data for this baud rate",
     0x2A: "its buffer overflowed: too much data for this baud rate",
 }
+SKIPPED, BAD_CHECKSUMS = "bytes skipped", "bad checksums"  # problems
+UNTIMED, UNPAIRED = "packets without SampleTimeFine", "rates without an acceleration"
+Vector = tuple[float, float, float]
 
 
 class Frame(NamedTuple):
@@ -50,10 +53,10 @@ class Packet(NamedTuple):
     """Items of one MTData2 frame, in the sensor's axes; None where it lacks one."""
 
     ticks: int | None  # SampleTimeFine
-    gyro: tuple[float, float, float] | None  # [rad/s]
-    accel: tuple[float, float, float] | None  # [m/s²]
-    gyro_hr: tuple[float, float, float] | None
-    accel_hr: tuple[float, float, float] | None
+    gyro: Vector | None  # [rad/s]
+    accel: Vector | None  # [m/s²]
+    gyro_hr: Vector | None
+    accel_hr: Vector | None
 
 
 class Malformed(ValueError):
@@ -72,49 +75,41 @@ class Frames:
 
     Attributes
     ----------
-    skipped : bytes that were in no frame
-    bad_checksums : of these, beginnings of a frame with a bad checksum
+    problems : `SKIPPED` bytes that were in no frame, and of these the beginnings of frames with `BAD_CHECKSUMS`
     """
 
     def __init__(self) -> None:
         self._buffer = bytearray()
-        self.skipped = 0
-        self.bad_checksums = 0
+        self.problems: Counter[str] = Counter()
 
     def feed(self, data: bytes) -> list[Frame]:
         """The frames that are complete with these bytes."""
-        buffer = self._buffer
+        buffer, frames, at, skipped = self._buffer, list[Frame](), 0, 0
         buffer += data
-        frames: list[Frame] = []
-        at = 0
-        while True:
-            begin = buffer.find(PREAMBLE, at)
-            if begin < 0:
-                self.skipped += len(buffer) - at
-                at = len(buffer)
-                break
-            self.skipped += begin - at
+        while (begin := buffer.find(PREAMBLE, at)) >= 0:
+            skipped += begin - at
             at = begin
-            if len(buffer) - at < 4:
-                break
-            head, length = 4, buffer[at + 3]
-            if length == 0xFF:
-                if len(buffer) - at < 6:
-                    break
+            head, length = 4, buffer[at + 3] if len(buffer) > at + 3 else 0
+            if length == 0xFF and len(buffer) > at + 5:
                 head, length = 6, buffer[at + 4] << 8 | buffer[at + 5]
-            end = at + head + length + 1
-            if buffer[at + 1] != BID or length > MAX_LENGTH:
-                self.skipped += 1
-                at += 1
-            elif end > len(buffer):
+            elif length == 0xFF or len(buffer) < at + 4:
                 break
-            elif sum(buffer[at + 1 : end]) & 0xFF:
-                self.bad_checksums += 1
-                self.skipped += 1
-                at += 1
-            else:
-                frames.append(Frame(buffer[at + 2], bytes(buffer[at + head : end - 1])))
-                at = end
+            end = at + head + length + 1
+            if buffer[at + 1] == BID and length <= MAX_LENGTH:
+                if end > len(buffer):
+                    break
+                if not sum(buffer[at + 1 : end]) & 0xFF:
+                    frames.append(Frame(buffer[at + 2], bytes(buffer[at + head : end - 1])))
+                    at = end
+                    continue
+                self.problems[BAD_CHECKSUMS] += 1
+            skipped += 1
+            at += 1
+        else:
+            skipped += len(buffer) - at
+            at = len(buffer)
+        if skipped:
+            self.problems[SKIPPED] += skipped
         del buffer[:at]
         return frames
 
@@ -128,7 +123,7 @@ def parse_packet(data: bytes) -> Packet:
         An item is cut off, or of a length that its id does not have.
     """
     ticks = None
-    vectors: dict[int, tuple[float, float, float]] = {}
+    vectors: dict[int, Vector] = {}
     at = 0
     while at < len(data):
         if at + 3 > len(data) or at + 3 + data[at + 2] > len(data):
@@ -152,7 +147,7 @@ def parse_packet(data: bytes) -> Packet:
     )
 
 
-def _parse_vector(encoding: int, content: bytes) -> tuple[float, float, float]:
+def _parse_vector(encoding: int, content: bytes) -> Vector:
     """Three numbers; `encoding` is 0 float32, 1 fixed 12.20, 2 fixed 16.32 (fraction first), 3 float64."""
     try:
         if encoding == 2:
@@ -178,28 +173,27 @@ class Joiner:
 
     Attributes
     ----------
-    untimed : packets without SampleTimeFine
-    unpaired : rates without an acceleration
+    problems : `UNTIMED` packets, without SampleTimeFine, and `UNPAIRED` rates, without an acceleration
     """
 
     def __init__(self) -> None:
-        self.untimed = 0
-        self.unpaired = 0
+        self.problems: Counter[str] = Counter()
         self._ticks: int | None = None
-        self._hr = [False, False]
-        self._rates: deque[tuple[float, tuple[float, float, float]]] = deque()
-        self._accels: deque[tuple[float, tuple[float, float, float]]] = deque(maxlen=1024)
+        self._gyro_hr = self._accel_hr = False
+        self._rates: deque[tuple[float, Vector]] = deque()
+        self._accels: deque[tuple[float, Vector]] = deque(maxlen=1024)
         self._time: list[float] = []
         self._values: list[tuple[float, ...]] = []
 
     def add(self, packet: Packet) -> None:
         """Add a packet."""
-        gyro = self._choose(0, packet.gyro, packet.gyro_hr)
-        accel = self._choose(1, packet.accel, packet.accel_hr)
+        self._gyro_hr, self._accel_hr = self._gyro_hr or bool(packet.gyro_hr), self._accel_hr or bool(packet.accel_hr)
+        gyro = packet.gyro_hr if self._gyro_hr else packet.gyro
+        accel = packet.accel_hr if self._accel_hr else packet.accel
         if gyro is None and accel is None:
             return
         if packet.ticks is None:
-            self.untimed += 1
+            self.problems[UNTIMED] += 1
             return
         time = self._seconds(packet.ticks)
         if accel is not None:
@@ -214,22 +208,14 @@ class Joiner:
         self._time, self._values = [], []
         return time, values
 
-    def _choose(
-        self, kind: int, plain: tuple[float, float, float] | None, hr: tuple[float, float, float] | None
-    ) -> tuple[float, float, float] | None:
-        self._hr[kind] = self._hr[kind] or hr is not None
-        return hr if self._hr[kind] else plain
-
     def _seconds(self, ticks: int) -> float:
         """Device time [s] that does not wrap at 2³² ticks."""
-        if self._ticks is None:
-            self._ticks = ticks
-        step = (ticks - self._ticks) & 0xFFFFFFFF
-        step -= (step & 0x80000000) << 1
+        before = ticks if self._ticks is None else self._ticks
+        step = (ticks - before + 0x80000000) % 0x100000000 - 0x80000000
         if step < -RESTART_S * TICKS_HZ:
             self._rates.clear()
             self._accels.clear()
-        self._ticks += step
+        self._ticks = before + step
         return self._ticks / TICKS_HZ
 
     def _join(self) -> None:
@@ -238,29 +224,28 @@ class Joiner:
             time, gyro = rates[0]
             while len(accels) > 1 and accels[1][0] <= time:
                 accels.popleft()
-            accel = None
-            if accels and accels[0][0] == time:
-                accel = accels[0][1]
-            elif accels and accels[0][0] < time:
-                if len(accels) < 2:
-                    if rates[-1][0] - time <= MAX_STEP_S:
-                        return  # the next acceleration is still to come
-                elif accels[1][0] - accels[0][0] <= MAX_STEP_S:
-                    (t0, before), (t1, after) = accels[0], accels[1]
-                    part = (time - t0) / (t1 - t0)
-                    accel = (
-                        before[0] + part * (after[0] - before[0]),
-                        before[1] + part * (after[1] - before[1]),
-                        before[2] + part * (after[2] - before[2]),
-                    )
-            elif not accels and rates[-1][0] - time <= MAX_STEP_S:
-                return
+            awaited = not accels or (len(accels) == 1 and accels[0][0] < time)
+            if awaited and rates[-1][0] - time <= MAX_STEP_S:
+                return  # its acceleration is still to come
             rates.popleft()
+            accel = None if awaited else self._interpolate(time)
             if accel is None:
-                self.unpaired += 1
+                self.problems[UNPAIRED] += 1
             else:
                 self._time.append(time)
                 self._values.append((*gyro, *accel))
+
+    def _interpolate(self, time: float) -> Vector | None:
+        """The acceleration at a time [s] from the first two; None: they are after it, or too far apart."""
+        begin, before = self._accels[0]
+        if begin >= time:
+            return before if begin == time else None
+        end, after = self._accels[1]
+        if end - begin > MAX_STEP_S:
+            return None
+        part = (time - begin) / (end - begin)
+        x, y, z = (a + part * (b - a) for a, b in zip(before, after, strict=True))
+        return x, y, z
 
 
 # Configuration -------------------------------------------------------------------------------------------------------
