@@ -7,15 +7,14 @@ none, and then the newest.
 ``/stream`` is a WebSocket, little endian. The browser answers each message with the text ``taken`` when it is drawn;
 until then no other comes.
 
-- Text: ``{"id": …}`` once (another id means another page to load); then the status as JSON, five times a second, in a
-  guided session ten times, with its instructions under ``guide``; ``{"angles": …}``, joint angles in degrees with their
-  times.
+- Text: ``{"id": …}`` once (another id means another page to load); then each `state.Status` as JSON, five times a
+  second, in a guided session ten times, with its instructions under ``guide``; ``{"angles": …}``, joint angles in
+  degrees with their times.
 - Binary: time (float64, NaN before the start); for each link its rotation row by row and its position [m] (12 float32);
   the points whose paths are drawn (3 float32 each); for each link whether its sensor is lost (1 byte). The names of the
   links are in the page; those of a robot come last.
-- To the server: ``taken``, ``key r``, ``key take``, ``key begin PHASE``, ``key end PHASE``, ``key mark TEXT``, and
-  ``key`` with the name of an action of the guide. It answers only under an address or ``localhost``, and a WebSocket
-  only from its own page.
+- To the server: ``taken``, and each `state.Request` as a JSON object, such as ``{"kind": "mark", "name": "trial 3"}``.
+  It answers only under an address or ``localhost``, and a WebSocket only from its own page.
 """
 
 from __future__ import annotations
