@@ -505,7 +505,7 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None, refused:
     }[quality.quality]
     if quality.quality == "poor" and all(reason.code.startswith("scale-") for reason in quality.reasons):
         sentence = "The proportions are good. One measured length gives the scale too."
-        if calibration.scale_lengths:
+        if calibration.problem.scale_lengths:
             sentence = "The proportions are good. The scale is still uncertain."
     elif quality.quality == "fail":
         actions = (MORE, RESTART) if lacks_motion else (RESTART, MORE)
@@ -534,8 +534,8 @@ def _choose_measurable(guide: Guide, calibration: Calibration) -> str:
     """What to measure next for the scale, where it is uncertain; empty: nothing."""
     if not any(REMEDIES.get(reason.code) == MEASURE for reason in calibration.quality.reasons):
         return ""
-    best = calibration.measured_example.partition("=")[0]
-    choices = (STATURE, best) if calibration.scale_lengths else (best, STATURE)
+    best = calibration.problem.measured_example.partition("=")[0]
+    choices = (STATURE, best) if calibration.problem.scale_lengths else (best, STATURE)
     return next((name for name in choices if name not in {*guide.options.measured, *guide.measured}), "")
 
 
