@@ -187,9 +187,9 @@ import sys
 from wepose_pin.commands import main
 from wepose_pin.live.sources.datagrams import DatagramSource
 find = DatagramSource._find_sensors
-def say(self, waiting):
+def say(self, *arguments):
     print("open", flush=True)
-    find(self, waiting)
+    find(self, *arguments)
 DatagramSource._find_sensors = say
 sys.argv[1:] = ["live", "--source", sys.argv[1], "--subject", "subject.toml", "--no-page"]
 main()
