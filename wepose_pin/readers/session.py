@@ -153,6 +153,7 @@ class _Files:
             else self._take_sensor(table, segment, stated[segment])
             for segment, table in tables.items()
         }
+        self._tables.clear()  # of a day they are gigabytes
         unused = [key for key in _UNUSED if key in self._data and key not in self._used]
         if unused:
             raise BadSession(f"{self._data.at(unused[0])}: {_UNUSED[unused[0]]}; leave it out")

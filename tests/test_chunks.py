@@ -63,8 +63,8 @@ def written(folder: Path, recording: Recording) -> Path:
     return folder
 
 
-def joined(pieces: list[TrackedRecording]) -> pl.DataFrame:
-    return pl.concat([build_pose_table(piece.pose, covariance=True) for piece in pieces])
+def joined(chunks: list[TrackedRecording]) -> pl.DataFrame:
+    return pl.concat([build_pose_table(chunk.pose, covariance=True) for chunk in chunks])
 
 
 def summarize_chunks(recording: Recording, chunks: list[TrackedRecording]) -> TrackSummary:
@@ -78,16 +78,16 @@ def summarize_chunks(recording: Recording, chunks: list[TrackedRecording]) -> Tr
     ("method", "seconds"),
     [("amekf", 7.31), *(pytest.param(*case, marks=pytest.mark.slow) for case in (("smekf", 5.0), ("ncf", 2.0)))],
 )
-def test_pieces_put_together_are_the_whole(made: Simulation, subject: Subject, method: str, seconds: float) -> None:
+def test_chunks_put_together_are_the_whole(made: Simulation, subject: Subject, method: str, seconds: float) -> None:
     recording = made.recording()
     whole = track(recording, subject, method=method)
-    pieces = list(track_chunks(recording, subject, options=TrackOptions(method), chunk_s=seconds))
-    assert len(pieces) > 2
-    assert joined(pieces).equals(build_pose_table(whole.pose, covariance=True))
+    chunks = list(track_chunks(recording, subject, options=TrackOptions(method), chunk_s=seconds))
+    assert len(chunks) > 2
+    assert joined(chunks).equals(build_pose_table(whole.pose, covariance=True))
     assert whole.correction is not None
-    assert pieces[-1].correction is not None
+    assert chunks[-1].correction is not None
     assert max(whole.correction.max_correction_deg.values()) > 0.01  # there was something to hold
-    assert summarize_chunks(recording, pieces).content == summarize(whole).content
+    assert summarize_chunks(recording, chunks).content == summarize(whole).content
 
 
 def test_saturation_and_gaps_are_those_of_the_whole(made: Simulation, subject: Subject) -> None:
@@ -101,9 +101,9 @@ def test_saturation_and_gaps_are_those_of_the_whole(made: Simulation, subject: S
     sensors["right_forearm"] = replace(sensors["right_forearm"], gyro_S=gyro_S)
     recording = replace(recording, sensors=sensors)
     whole = track(recording, subject)
-    pieces = list(track_chunks(recording, subject, chunk_s=6.0))
-    assert joined(pieces).equals(build_pose_table(whole.pose, covariance=True))
-    ours, wanted = summarize_chunks(recording, pieces), summarize(whole)
+    chunks = list(track_chunks(recording, subject, chunk_s=6.0))
+    assert joined(chunks).equals(build_pose_table(whole.pose, covariance=True))
+    ours, wanted = summarize_chunks(recording, chunks), summarize(whole)
     assert ours.content == wanted.content
     assert not any(each.code == "signal-saturated" for each in wanted.diagnostics)
     assert wanted.content["sensors"]["torso"]["gaps"] == 1
@@ -115,9 +115,9 @@ def test_a_late_start_pose_makes_the_first_piece_longer(made: Simulation) -> Non
     late = (float(again.time[-1]) - 4.5, float(again.time[-1]) - 1.0)
     again = replace(again, phases={"static": ((0.5, 4.5),), "start": (late,)})
     whole = track(again)
-    pieces = list(track_chunks(again, chunk_s=3.0))
-    assert pieces[0].time[-1] >= late[1] > pieces[0].time[-1] - 3.0
-    assert joined(pieces).equals(build_pose_table(whole.pose, covariance=True))
+    chunks = list(track_chunks(again, chunk_s=3.0))
+    assert chunks[0].time[-1] >= late[1] > chunks[0].time[-1] - 3.0
+    assert joined(chunks).equals(build_pose_table(whole.pose, covariance=True))
 
 
 def test_the_smoother_takes_the_recording_as_a_whole(made: Simulation) -> None:
@@ -144,13 +144,13 @@ def test_the_command_gives_the_same_folder(session: Path, person_folder: Path, t
     options = [session, "--subject", person_folder, "--covariance"]
     assert run("track", *options, "-o", tmp_path / "whole") == 0
     monkeypatch.setattr("wepose_pin.tracking.CHUNK_S", 10.0)
-    assert run("track", *options, "-o", tmp_path / "pieces") == 0
-    names = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("whole", "pieces")]
+    assert run("track", *options, "-o", tmp_path / "chunks") == 0
+    names = [sorted(path.name for path in (tmp_path / name).iterdir()) for name in ("whole", "chunks")]
     assert names[0] == names[1]
-    whole, pieces = (pl.read_parquet(tmp_path / name / "pose.parquet") for name in ("whole", "pieces"))
-    assert pieces.equals(whole)
-    whole, pieces = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "pieces"))
-    assert pieces | {"provenance": None} == whole | {"provenance": None}
+    whole, chunks = (pl.read_parquet(tmp_path / name / "pose.parquet") for name in ("whole", "chunks"))
+    assert chunks.equals(whole)
+    whole, chunks = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("whole", "chunks"))
+    assert chunks | {"provenance": None} == whole | {"provenance": None}
 
 
 def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monkeypatch) -> None:
