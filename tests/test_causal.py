@@ -161,6 +161,17 @@ def test_causal_chunks_put_together_are_the_whole(recording: Recording) -> None:
         assert table.equals(build_pose_table(whole.pose, covariance=True))
 
 
+def test_chunks_and_samples_in_turn_give_the_bits_of_the_whole(recording: Recording, whole: TrackedRecording) -> None:
+    estimator, begin = started(recording)
+    gyro, accel = columns(recording)
+    stepped = np.array([estimator.step(gyro[k], accel[k]).copy() for k in range(begin, begin + 777)])
+    chunk = estimator.push(recording.cut(slice(begin + 777, 3000)))
+    last = [estimator.step(gyro[k], accel[k]).copy() for k in range(3000, len(recording))]
+    for i, name in enumerate(estimator.names):
+        parts = [stepped[:, i], chunk.quat_WL[name], np.array(last)[:, i]]
+        assert np.array_equal(np.concatenate(parts), whole.quat_WL[name]), name
+
+
 def test_what_comes_later_changes_nothing(recording: Recording, whole: TrackedRecording) -> None:
     part = track(first(recording, 2500), causal=True)
     for name, quat in part.quat_WL.items():

@@ -23,7 +23,6 @@ from ..errors import BadOption, NoSolution, WrongOption
 from ..kinematics import Pose, PosedBody, cut_pose
 from ..model import BodyTable
 from ..recording import Intervals, select_interval
-from ..tracking import TrackedRecording
 from ..writers.joint_motion import JointMotion
 from .collision import CollisionModel
 from .controller import (
@@ -255,7 +254,7 @@ def _select_pose(
     phases: Mapping[str, Intervals] = {}
     table = None
     if isinstance(pose, PosedBody):
-        phases = pose.recording.phases if isinstance(pose, TrackedRecording) else getattr(pose, "phases", {})
+        phases = getattr(pose, "phases", {})
         table, pose = pose.model.table, pose.pose
     selected = select_interval(pose.time, phases, interval, phase)
     return (pose if selected is None else cut_pose(pose, selected)), table

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from ..filters import BEST, OFFLINE, check_method
 from ..filters.static import StaticTest
 from ..kinematics import PosedBody, compute_orientation_residuals
 from ..model.configurations import find_undetermined_joints
-from ..recording import Recording
+from ..recording import Intervals, Recording
 from .headings import HeadingCorrection
 
 
@@ -61,6 +62,11 @@ class TrackedRecording(PosedBody):
     segments: SegmentOrientations
     options: TrackOptions
     correction: HeadingCorrection | None
+
+    @property
+    def phases(self) -> Mapping[str, Intervals]:
+        """Name → intervals [s] of the recording."""
+        return self.recording.phases
 
     def orientation_residual(self) -> dict[str, np.ndarray]:
         """Segment → angle (n,) [rad] between its measured orientation and the model's, where joints are too few."""

@@ -14,7 +14,6 @@ from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, MissingFile, one_of
 from ..kinematics import PosedBody, cut_pose
 from ..recording import select_interval
-from ..tracking.tracked import TrackedRecording
 from .bvh import write_bvh
 from .c3d import write_c3d
 from .joint_motion import (
@@ -300,9 +299,7 @@ def _read_motion(
             f"of that there is: {', '.join(each for each in FORMATS if FORMATS[each].of != PERSON)}"
         )
     if isinstance(result, PosedBody):
-        recorded = result.recording if isinstance(result, TrackedRecording) else result
-        phases = getattr(recorded, "phases", {})
-        selected = select_interval(result.time, phases, interval, phase)
+        selected = select_interval(result.time, getattr(result, "phases", {}), interval, phase)
         pose = result.pose if selected is None else cut_pose(result.pose, selected)
         motion = Motion(pose, result.model, result.name, result.name)
     else:
