@@ -47,7 +47,6 @@ ELSEWHERE = {
     r"--activity tasks --seconds 600": "ten minutes: tests/test_people.py",
     r"panda_2": "several trajectories: tests/test_export_robot.py",
     r"\.rrd": "an extra of 170 MB and its viewer: tests/test_export_ros.py",
-    r"scripts/bvh_to_robot": "another program: tests/test_export_robot.py",
     r"…|examples/": "no whole command; tests/test_examples.py",
 }
 # Their Python runs too; tests/test_api.py has that of the README and docs/python.md.
