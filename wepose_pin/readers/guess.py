@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -139,7 +140,7 @@ def guess_arrays(shapes: Mapping[str, tuple[int, ...]], table: BodyTable | None 
         if signal and len(shape) == 2 and len(ORDER[signal]) in shape:
             by_sensor.setdefault(_find_owner(path, table or load_table()), {}).setdefault(signal, [path])
     times = {
-        path.rpartition("/")[2]: path for path, shape in shapes.items() if max(shape, default=0) == _compute_size(shape)
+        path.rpartition("/")[2]: path for path, shape in shapes.items() if max(shape, default=0) == math.prod(shape)
     }
     guess = _make_guess(list(times), by_sensor, {})
     units = {times.get(name, name): unit for name, unit in guess.units.items()}
@@ -165,13 +166,6 @@ def _split_words(name: str) -> list[str]:
     return re.sub(r"(?<=[a-z])(?=[A-Z])|[\W_]+", " ", name).lower().split()
 
 
-def _compute_size(shape: tuple[int, ...]) -> int:
-    size = 1
-    for k in shape:
-        size *= k
-    return size
-
-
 def _find_owner(stem: str, table: BodyTable) -> str:
     """Return the segment, or the name without its signal, which one sensor's signals have in common."""
     segment = table.guess_segment(stem.replace(HOLE, " "))
@@ -186,15 +180,11 @@ def _find_owner(stem: str, table: BodyTable) -> str:
 def _make_guess(
     names: Sequence[str], by_sensor: Mapping[str, Mapping[str, list[str]]], own_units: Mapping[str, str]
 ) -> Guess:
-    complete = {name: signals for name, signals in by_sensor.items() if "orientation" in signals or len(signals) == 2}
-    sensors = {
-        name: {
-            k: v
-            for k, v in signals.items()
-            if (k == "orientation") == ("gyro" not in signals or "accel" not in signals)
-        }
-        for name, signals in complete.items()
-    }
+    sensors: dict[str, Mapping[str, list[str]]] = {}
+    for name, signals in by_sensor.items():
+        needed = ("gyro", "accel") if {"gyro", "accel"} <= set(signals) else ("orientation",)
+        if set(needed) <= set(signals):
+            sensors[name] = {signal: signals[signal] for signal in signals if signal in needed}
     times = [name for name in names if _is_time(split_unit(name)[0]) or _is_time(name)]
     units = {}
     for name in times:

@@ -128,12 +128,12 @@ def read_live_log(path: Path) -> LiveRecording:
     if not is_live_log(path):
         raise BadData(f"{path}: is not the recording of a live session")
     with library_errors(path, KIND):
-        content = _read_content(path)
-        header, markers = content.header, Markers()
+        header, arrivals, events, poses, is_complete = _read_content(path)
+        markers = Markers()
         synchronizer: StreamSynchronizer | None = None
         start: tuple[int, int] | None = None
         resets = []
-        for event in content.events:
+        for event in events:
             kind = event["kind"]
             if kind == "clock":
                 if not (0.1 <= event["rate_hz"] <= MOST_RATE and 0.0 <= event["wait_s"] <= MOST_WAIT_S):
@@ -146,7 +146,7 @@ def read_live_log(path: Path) -> LiveRecording:
                 resets.append(int(event["tick"]))
             else:
                 markers.add(kind, event)
-        ticks = [] if synchronizer is None else [_make_ticks(path, synchronizer, content.arrivals)]
+        ticks = [] if synchronizer is None else [_make_ticks(path, synchronizer, arrivals)]
         if synchronizer is None or synchronizer.next_tick < 2:
             raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
         resets = [tick for tick in resets if tick < synchronizer.next_tick]
@@ -159,11 +159,11 @@ def read_live_log(path: Path) -> LiveRecording:
             raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
         recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets))
     recording = replace(check_recording(recording), marks=tuple(markers.texts))
-    if not content.is_complete:
+    if not is_complete:
         killed = Diagnostic("live-recording-incomplete", WARNING, path.name, facts={"variant": "killed"})
         recording = replace(recording, diagnostics=(killed,))
-    first = content.first if len(content.quat_WL) else start[1] + 1 if start is not None else 0
-    return LiveRecording(recording, header, first, content.quat_WL)
+    first = int(poses[0, 0]) if len(poses) else start[1] + 1 if start is not None else 0
+    return LiveRecording(recording, header, first, poses[:, 1:].reshape(len(poses), -1, 4).copy())
 
 
 def _make_ticks(path: Path, synchronizer: StreamSynchronizer, arrivals: Arrivals) -> Ticks:
@@ -209,17 +209,6 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     return Device(kind, sensors, since_power_on=False, aligned=aligned, diagnostics=diagnostics)
 
 
-class _Content(NamedTuple):
-    """The messages of a file, in their order."""
-
-    header: dict[str, Any]
-    arrivals: Arrivals
-    events: list[dict[str, Any]]
-    first: int  # tick of the first pose
-    quat_WL: np.ndarray  # (n, k, 4) xyzw
-    is_complete: bool  # nothing is missing at its end
-
-
 def read_messages(path: Path) -> Iterator[tuple[str, bytes]]:
     """Iterate over topic and content of each message, the header first; an empty topic ends a file that is complete."""
     from mcap.records import Channel, Footer, Message, Metadata
@@ -244,9 +233,11 @@ def read_messages(path: Path) -> Iterator[tuple[str, bytes]]:
                 return
 
 
-def _read_content(path: Path) -> _Content:
+def _read_content(path: Path) -> tuple[dict[str, Any], Arrivals, list[dict[str, Any]], np.ndarray, bool]:
+    """Read header, samples, events, a row a pose (its tick and xyzw of each sensor), and whether the end is there."""
     header: dict[str, Any] = {}
-    events, is_complete = [], False
+    events: list[dict[str, Any]] = []
+    is_complete = False
     samples, poses = array("d"), array("d")  # eight numbers a sample, and a tick with four numbers a sensor
     for topic, text in read_messages(path):
         if not topic:
@@ -271,10 +262,8 @@ def _read_content(path: Path) -> _Content:
         raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
     which, time, gyro, accel = np.split(np.array(samples).reshape(-1, 8), [1, 2, 5], axis=1)
     arrivals = Arrivals(which[:, 0].astype(np.uint8), time[:, 0].copy(), gyro.copy(), accel.copy())
-    count = len(header["sensors"])
-    rows = np.array(poses).reshape(-1, 1 + 4 * count)
-    first = int(rows[0, 0]) if len(rows) else 0
-    return _Content(header, arrivals, events, first, rows[:, 1:].reshape(-1, count, 4).copy(), is_complete)
+    rows = np.array(poses).reshape(-1, 1 + 4 * len(header["sensors"]))
+    return header, arrivals, events, rows, is_complete
 
 
 def _cut_spans(phase: str, spans: Sequence[Sequence[float]], time: np.ndarray) -> Intervals:

@@ -11,7 +11,7 @@ joint turns by its channels in their order, each about an axis as turned so far.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -147,17 +147,12 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
     motion, diagnostics = resample_evenly(motion)
     root = build_skeleton(motion)
     columns = [100.0 * _to_file_axes(_root_position(motion, root)), *_rotations(motion, root, None)]
-    save_bvh(path, _hierarchy(root, root.at, 0), columns, motion.rate_hz)
-    return [*diagnostics, *diagnose_gaps(motion)]
-
-
-def save_bvh(path: Path, hierarchy: Iterable[str], columns: Sequence[np.ndarray], rate_hz: float) -> None:
-    """Write the lines of a skeleton, and its channels (n, …) column by column."""
-    lines = ["HIERARCHY", *hierarchy, "MOTION"]
-    lines += [f"Frames: {len(columns[0])}", f"Frame Time: {1.0 / rate_hz:.8f}"]
+    lines = ["HIERARCHY", *_hierarchy(root, root.at, 0), "MOTION"]
+    lines += [f"Frames: {len(columns[0])}", f"Frame Time: {1.0 / motion.rate_hz:.8f}"]
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         np.savetxt(file, np.column_stack(columns), fmt="%.6f")
+    return [*diagnostics, *diagnose_gaps(motion)]
 
 
 def _root_position(motion: Motion, root: Bone) -> np.ndarray:
