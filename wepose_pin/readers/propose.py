@@ -27,7 +27,7 @@ from .arrays import ArrayFile
 from .device import GYRO_UNITS, Device, read_first_lines
 from .guess import Guess
 from .live_log import read_live_log
-from .registry import detect_format, load, read_device
+from .registry import detect_format, look_up_format, read_device
 from .session import read_session
 from .tables import read_columns, read_names, read_table
 
@@ -113,7 +113,7 @@ class Proposal:
 
 def propose_from_device(path: Path, folder: Path, name: str, table: BodyTable) -> Proposal:
     """Propose a session for a file of a known format, with the files beside it where each sensor has one."""
-    format = load(name)
+    format = look_up_format(name)
     device, segments, lacks_rate = _read(path, name, table)
     signals = "gyroscope and accelerometer" if device.kind == "raw" else "orientations, no raw data"
     proposal = Proposal(f"{format.title}, {signals}")
@@ -178,7 +178,7 @@ def _read(path: Path, format: str, table: BodyTable) -> tuple[Device, dict[str, 
 
 def _list_siblings(path: Path, format: str) -> list[Path]:
     """List the file and those of the same format beside it: the files of one recording are in one folder."""
-    if path.is_dir() or (load(format).folder and path.suffix.lower() == ".csv"):
+    if path.is_dir() or (look_up_format(format).folder and path.suffix.lower() == ".csv"):
         own = path if path.is_dir() else path.parent
         beside = [folder for folder in sorted(own.absolute().parent.iterdir()) if folder.is_dir()]
         same = [own if folder == own.absolute() else folder for folder in beside]

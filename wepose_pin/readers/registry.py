@@ -51,8 +51,8 @@ MODULES = {
 }
 
 
-def load(name: str) -> Format:
-    """Load a format by its name, or the path of a description."""
+def look_up_format(name: str) -> Format:
+    """Look up a format by its name, or the path of a description."""
     if name in MODULES:
         return MODULES[name]
     described = load_format(Path(name)) if name.endswith(".toml") else load_formats()[name]
@@ -128,7 +128,7 @@ def read_device(path: Path, name: str, use: str | None = None, rate_hz: float | 
     MissingFile, BadData
         The file is missing, damaged, or of another format.
     """
-    format = load(name)
+    format = look_up_format(name)
     if not (format.folder and path.is_dir()):
         check_file(path, f"a {format.title}")
     device = format.read(path, use, rate_hz)

@@ -60,6 +60,28 @@ class Format(NamedTuple):
     earlier: tuple[str, ...] = ()
 
 
+def write_urdf(file: Path, result: Result) -> list[Diagnostic]:
+    """Write the body of a person or a robot."""
+    if isinstance(result, PosedBody):
+        file.write_text(format_urdf(result.subject, result.model), encoding="utf-8")
+    elif isinstance(result, HasJointMotion):
+        file.write_text(result.joint_motion().urdf, encoding="utf-8")
+    else:
+        folder = Path(str(result))
+        urdf = folder / (ROBOT_URDF if _is_of_robot(result) else SUBJECT_URDF)
+        if not urdf.is_file():
+            raise MissingFile(f"{result}: no {urdf.name} in it; a folder that `wepose track` wrote is wanted here")
+        shutil.copyfile(urdf, file)
+    return []
+
+
+def _is_of_robot(result: Result) -> bool:
+    """Whether a result is a robot's trajectory, and not a person's motion."""
+    if isinstance(result, str | Path):
+        return (Path(result) / TRAJECTORY).is_file()
+    return not isinstance(result, PosedBody)
+
+
 LEROBOT = "lerobot"
 FORMATS = {
     "csv": Format(PERSON, write_csv),
@@ -71,13 +93,12 @@ FORMATS = {
     "bvh": Format(PERSON, write_bvh),
     "c3d": Format(PERSON, write_c3d),
     "scale": Format(PERSON, write_scale, ("osim_model",), ".xml"),
-    "urdf": Format(BODY, lambda path, result: _write_urdf(path, result), ()),
+    "urdf": Format(BODY, write_urdf, ()),
     "rosbag": Format(JOINTS, write_rosbag, suffix="", earlier=("*.db3", "*.mcap", "metadata.yaml")),
     "mcap": Format(JOINTS, write_mcap),
     "rrd": Format(JOINTS, write_rrd),
     LEROBOT: Format(
-        *(JOINTS, write_lerobot, (*MOTION, "episodes", "instruction"), ""),
-        ("data/**/*.parquet", "meta/**/*.*"),
+        JOINTS, write_lerobot, (*MOTION, "episodes", "instruction"), "", ("data/**/*.parquet", "meta/**/*.*")
     ),
 }
 SUFFIXES = {name: format.suffix for name, format in FORMATS.items() if format.suffix is not None}
@@ -249,27 +270,6 @@ def _replaced_folder(out: Path, own: Sequence[str], force: bool) -> Iterator[Pat
         for path in out.glob(pattern):
             if path.relative_to(out) not in written:
                 path.unlink()
-
-
-def _write_urdf(file: Path, result: Result) -> None:
-    """Write the body of a person or a robot."""
-    if isinstance(result, PosedBody):
-        file.write_text(format_urdf(result.subject, result.model), encoding="utf-8")
-    elif isinstance(result, HasJointMotion):
-        file.write_text(result.joint_motion().urdf, encoding="utf-8")
-    else:
-        folder = Path(str(result))
-        urdf = folder / (ROBOT_URDF if _is_of_robot(result) else SUBJECT_URDF)
-        if not urdf.is_file():
-            raise MissingFile(f"{result}: no {urdf.name} in it; a folder that `wepose track` wrote is wanted here")
-        shutil.copyfile(urdf, file)
-
-
-def _is_of_robot(result: Result) -> bool:
-    """Whether a result is a robot's trajectory, and not a person's motion."""
-    if isinstance(result, str | Path):
-        return (Path(result) / TRAJECTORY).is_file()
-    return not isinstance(result, PosedBody)
 
 
 def _read_joint_motion(
