@@ -158,27 +158,6 @@ def dot() -> list[bytes]:
     return [text.encode() for text in texts]
 
 
-def ximu3() -> list[bytes]:
-    first = 52100347 + 10000 * np.arange(N)
-    units = [
-        f"{kind} {axis} {unit}" for kind, unit in (("Gyroscope", "(deg/s)"), ("Accelerometer", "(g)")) for axis in "XYZ"
-    ]
-    inertial = ",".join(["Timestamp (us)", *units]) + "\n" + rows(first, GYRO, ACCEL / 9.8)
-    quaternion = "Timestamp (us),W,X,Y,Z\n" + rows(first, QUAT[:, [3, 0, 1, 2]])
-    return [inertial.encode(), quaternion.encode()]
-
-
-def apdm() -> list[bytes]:
-    kinds, axes = "Accelerometer,,,Gyroscope,,,Orientation,,,", "X,Y,Z,X,Y,Z,S,X,Y,Z"
-    names = f"Format=7,5718,,,Chest,,,,,,,6575,,,Left Wrist{',' * 6}\nTime,{kinds},{kinds}\n,{axes},{axes}\n"
-    values = (ACCEL, GYRO, QUAT[:, [3, 0, 1, 2]])
-    newer = names + rows(1550879504438281 + 10000 * np.arange(N), *values, *values)
-    labels = [f"Chest/{kind}/{axis}" for kind in ("Acceleration", "Angular Velocity") for axis in "XYZ"]
-    units = ["s", *["m/s^2"] * 3, *["deg/s"] * 3]
-    older = f"Test Name:,a,\nSample Rate:,100,Hz\n{','.join(['Time', *labels])}\n{','.join(units)}\n"
-    return [newer.encode(), (older + rows(TIME, ACCEL, GYRO)).encode()]
-
-
 def wild_csv() -> bytes:
     """As a spreadsheet writes it: remarks, semicolons, decimal commas, units in a line of their own."""
     units = ";".join(["s", *["rad/s"] * 3, *["m/s^2"] * 3])
@@ -189,38 +168,9 @@ def tabled(separator: str, decimal: str, *columns: np.ndarray) -> str:
     return rows(*columns).replace(",", separator).replace(".", decimal)
 
 
-def shimmer() -> bytes:
-    names = ["Timestamp_Unix", *(f"{kind}_{a}" for kind in ("Accel_LN", "Accel_WR", "Gyro") for a in "XYZ")]
-    units = ["ms", *["m/(s^2)"] * 6, *["deg/s"] * 3]
-    head = f'"sep=;"\n{";".join(f"Shimmer_1_{name}_CAL" for name in names)}\n{";".join(units)}\n'
-    return (head + tabled(";", ".", 1000 * TIME, ACCEL, ACCEL, GYRO)).encode()
-
-
-def noraxon() -> bytes:
-    segment = "Noraxon MyoMotion-Segments-Upper spine-"
-    names = [
-        f"{segment}{kind}"
-        for kind in (*(f"Gyroscope-{a} (deg/s)" for a in "xyz"), *(f"Acceleration-{a} (mG)" for a in "xyz"))
-    ]
-    return f"time,{','.join(names)}\n{rows(TIME, GYRO, 102.0 * ACCEL)}".encode()
-
-
-def delsys() -> list[bytes]:
-    channels = [*(f"ACC {a} (G)" for a in "XYZ"), *(f"GYRO {a} (deg/s)" for a in "XYZ")]
-    names = ", ".join(f"{channel.partition(' (')[0]} Time Series (s), {channel}" for channel in channels)
-    columns = [column for axis in (*ACCEL.T / 9.8, *GYRO.T) for column in (TIME, axis)]
-    text = f"Application:,a\n\n\nChest (1)\nsensor mode: 1\n{names}\n,1 Hz\n{rows(*columns)}"
-    labels = "".join(
-        f"Label: {kind}1.{a}  Sampling frequency: 100 Unit: g  Domain: T\n" for kind in ("ACC", "GYRO") for a in "XYZ"
-    )
-    labels = labels.replace("GYRO1.X  Sampling frequency: 100 Unit: g", "GYRO1.X  Sampling frequency: 100 Unit: deg/s")
-    names = ",".join(f"X[s],{kind}1.{a}" for kind in ("ACC", "GYRO") for a in "XYZ")
-    return [text.encode(), f"{labels}\n{names}\n{rows(*columns)}".encode()]
-
-
 def descriptions() -> list[bytes]:
     folder = Path(wepose_pin.__file__).parent / "readers" / "formats"
-    return [(folder / "delsys.toml").read_bytes()]
+    return [(folder / "dot.toml").read_bytes()]
 
 
 def sensor_logger() -> bytes:
@@ -388,18 +338,6 @@ def pose_csv() -> bytes:
 
 
 # What comes over a line --------------------------------------------------------------------------------------------
-
-
-def device() -> list[bytes]:
-    """An MTi that is set up at 100 Hz, then sends; and one that is left as it is. Answers are apart by empty lines."""
-    plain = xbus.build_output_items(100, False)
-    answers = (xbus.GO_TO_CONFIG, b""), (xbus.SET_OUTPUT, plain), (xbus.GO_TO_MEASUREMENT, b"")
-    set_up = [xbus.build_frame(mid + 1, data) for mid, data in answers]
-    return [b"\x00" + b"\n\n".join([b"", *set_up, serial()]), b"\x80" + b"\n\n".join([serial(), b"", serial()])]
-
-
-def lsl_rows() -> bytes:
-    return np.hstack([TIME[:, None], GYRO, ACCEL]).astype("<f8").tobytes()
 
 
 def wild() -> bytes:

@@ -6,13 +6,10 @@ import atexit
 import contextlib
 import functools
 import logging
-import os
 import socket
 from collections import deque
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, ClassVar
-from unittest import mock
 
 import numpy as np
 
@@ -87,48 +84,6 @@ def serial(_folder: Path, data: bytes) -> object:
     return joiner.take()
 
 
-class _Port:
-    """A serial port whose device says the next part whenever it is written to, and is unplugged after the last."""
-
-    def __init__(self, parts: list[bytes]) -> None:
-        self._parts, (self._read, self._write) = parts, os.pipe()
-        self.write(b"")
-
-    def fileno(self) -> int:
-        return self._read
-
-    def write(self, _data: bytes) -> None:
-        if self._parts:
-            os.write(self._write, self._parts.pop(0)[:60_000])  # a pipe holds as much
-            if not self._parts:
-                os.close(self._write)
-
-    def close(self) -> None:
-        os.close(self._read)
-        if self._parts:
-            os.close(self._write)
-
-
-def mti(_folder: Path, data: bytes) -> object:
-    """A device from its first answer on: set up as the first byte says, then listened to."""
-    from wepose_pin.live.sources import mti as module
-
-    answers, _, rest = data[1:].rpartition(APART)
-    source = module.MTiSource({"torso": "/dev/fuzz"}, 100 if data[:1] < b"\x80" else None)
-    [device] = source._devices
-    with mock.patch.multiple(module, ANSWER_S=0.002, WAIT_S=0.001):
-        device._serial = SimpleNamespace(Serial=lambda *_, **__: _Port(answers.split(APART)))
-        try:
-            device.connect()
-            for arrival, part in enumerate((rest[: len(rest) // 3], rest[len(rest) // 3 :])):
-                device.decode(part, float(arrival))
-        finally:
-            device.close()
-    came = source.read(0.0)
-    _sound(came)
-    return came
-
-
 def lsl(_folder: Path, data: bytes) -> object:
     """Labels and units of a stream's channels, a line each."""
     from wepose_pin.live.sources.lsl import find_channels
@@ -136,23 +91,6 @@ def lsl(_folder: Path, data: bytes) -> object:
     stream, *rest = data.decode("utf-8", errors="replace").split("\n")
     labels, units = rest[::2], rest[1::2]
     return find_channels(stream, "imu", labels, units, len(labels))
-
-
-def lsl_samples(_folder: Path, data: bytes) -> object:
-    """Numbers of a stream: rows of a time and six channels, eight bytes each."""
-    from wepose_pin.live.sources.lsl import LslSource, SensorChannels, _Stream
-
-    table = np.frombuffer(data[: len(data) // 56 * 56], "<f8").reshape(-1, 7)
-    inlet = SimpleNamespace(pull_chunk=lambda **_: (table[:, 1:].tolist(), table[:, 0].tolist()))
-    source = LslSource("imu", TORSO_HEAD)
-    parts = [
-        SensorChannels("torso", list(range(6)), np.ones(6)),
-        SensorChannels("head", [5, 4, 3, 2, 1, 0], np.full(6, 9.80665)),
-    ]
-    with np.errstate(all="ignore"):
-        came = source._pull(_Stream("imu", inlet, parts, 100.0))
-    _sound(came)
-    return came
 
 
 SAMPLE = np.dtype([("which", "u1"), ("time", "<f8"), ("gyro", "<f4", 3), ("accel", "<f4", 3)])

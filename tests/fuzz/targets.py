@@ -1,5 +1,7 @@
 """Our parsers of others' files, each as a function of bytes: it takes them, or says in one line why not.
 
+All tables of devices go through one engine, so that two of them stand for all.
+
 Parquet, MATLAB, HDF5 and C3D are not here: libraries parse them, and some of these die of a damaged file.
 """
 
@@ -32,10 +34,7 @@ def _described(folder: Path, data: bytes) -> object:
 def _described_seeds() -> list[bytes]:
     """One of each kind."""
     of = {
-        ".csv": [
-            *(seeds.csv(), seeds.wild_csv(), seeds.shimmer(), seeds.noraxon(), *seeds.delsys()),
-            *(*seeds.dot(), *seeds.ximu3(), *seeds.apdm()),
-        ],
+        ".csv": [seeds.csv(), seeds.wild_csv(), *seeds.dot()],
         ".txt": seeds.mt_manager(),
         **{".sto": [seeds.opensim()], ".mvnx": [seeds.mvnx(True)], ".xml": [seeds.mvnx(False)]},
         ".toml": [seeds.subject()],
@@ -101,7 +100,7 @@ def _table(path: Path) -> object:
 def _description(path: Path) -> object:
     from wepose_pin.readers.table_format import load_format, read_table_format
 
-    (path.parent / "a.csv").write_bytes(seeds.delsys()[0])
+    (path.parent / "a.csv").write_bytes(seeds.dot()[1])
     return read_table_format(load_format(path), path.parent / "a.csv")
 
 
@@ -241,11 +240,6 @@ TARGETS = (
     Target("mvnx", lambda: [seeds.mvnx(True), seeds.mvnx(False)], _device("a.mvnx", "mvnx"), XML, "readers.mvnx"),
     Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES, "readers.table_format"),
     Target("dot", seeds.dot, _device("a.csv", "dot"), LINES, "readers.table_format"),
-    Target("ximu3", seeds.ximu3, _device("Inertial.csv", "ximu3"), LINES, "readers.table_format"),
-    Target("apdm", seeds.apdm, _device("a.csv", "apdm"), LINES, "readers.table_format"),
-    Target("shimmer", lambda: [seeds.shimmer()], _device("a.csv", "shimmer"), LINES, "readers.table_format"),
-    Target("noraxon", lambda: [seeds.noraxon()], _device("a.csv", "noraxon"), LINES, "readers.table_format"),
-    Target("delsys", seeds.delsys, _device("a.csv", "delsys"), LINES, "readers.table_format"),
     Target("description", seeds.descriptions, file("lab.toml", _description), TOML, "readers.table_format"),
     Target("phone", lambda: [seeds.sensor_logger()], _device("a.json", "sensor_logger"), JSON, "readers.sensor_logger"),
     Target("xdf", lambda: [seeds.xdf()], _device("a.xdf", "xdf"), (), "readers.xdf"),
@@ -268,9 +262,7 @@ TARGETS = (
     Target("datagram", seeds.datagrams, streams.datagram, JSON, "live.sources.packets"),
     Target("udp", lambda: [streams.APART.join(seeds.datagrams())], streams.udp, JSON, "live.sources.udp"),
     Target("xbus", lambda: [seeds.serial()], streams.serial, (), "live.sources.xbus"),
-    Target("mti", seeds.device, streams.mti, (), "live.sources.mti"),
     Target("lsl", lambda: [LSL], streams.lsl, (), "live.sources.lsl"),
-    Target("lsl_samples", lambda: [seeds.lsl_rows()], streams.lsl_samples, (), "live.sources.lsl"),
     Target("live_loop", lambda: [seeds.wild()], streams.loop, (), "live.loop"),
     Target("live_page", seeds.requests, streams.page, HTTP, "live.server"),
     Target("live_log", lambda: [seeds.live_log()], file("a.mcap", _live), JSON, "readers.live_log"),
