@@ -18,8 +18,17 @@ from wepose_pin.commands.retarget import retarget
 from wepose_pin.commands.track import track
 from wepose_pin.errors import BadOption
 from wepose_pin.kinematics import Pose
-from wepose_pin.retargeting import ROBOTS, Robot, check_limits, find_map, find_self_collisions, load_robot
-from wepose_pin.retargeting.stream import ArmObserver, Command, CommandStream
+from wepose_pin.retargeting import (
+    ROBOTS,
+    ArmObserver,
+    Command,
+    CommandStream,
+    Robot,
+    check_limits,
+    find_map,
+    find_self_collisions,
+    load_robot,
+)
 from wepose_pin.writers import read_result
 
 from .tables import Column, Section, Table

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from wepose_pin import retargeting
 from wepose_pin.kinematics import Pose
 
 UPPER, FORE, HAND = 0.30, 0.27, 0.08  # [m] of the person
@@ -116,6 +117,18 @@ def _joint(name: str, kind: str, parent: str, child: str, at: str, axis: str, li
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><origin xyz="{at}"/>'
         f'<axis xyz="{axis}"/>{limit}</joint>'
     )
+
+
+def is_sound(trajectory: retargeting.Trajectory) -> None:
+    """Limits against the URDF and the map, and no contact; none of it by the solver's code."""
+    robot = trajectory.robot
+    limits = retargeting.check_limits(retargeting.build_table(trajectory), robot.map)
+    assert limits.passed, limits
+    contacts = retargeting.find_self_collisions(robot, trajectory.time, trajectory.joint_position)
+    assert contacts.samples == 0, contacts.first
+    assert contacts.pairs > 1
+    assert contacts.excluded["in collision at rest"] == []
+    assert np.isfinite(trajectory.joint_position).all()
 
 
 def person(

@@ -162,7 +162,7 @@ def live(
     from ..live.session import warm_up
     from ..live.setup import build_subject_model, check_mounts
     from ..live.terminal import TerminalView
-    from ..retargeting.stream import check_segments
+    from ..retargeting.targets import check_person_arms
     from ..subject import load_subject
     from .guide import run_guide
 
@@ -173,7 +173,7 @@ def live(
     # A wrong robot is found before the person does anything.
     following = None if robot is None else read_robot(robot)
     if following is not None and guide:
-        check_segments(following.robot, load_protocol(protocol or GUIDED).needs)
+        check_person_arms(following.robot, load_protocol(protocol or GUIDED).needs)
     if subject is not None and not accept_failed:
         load_subject(subject).check_quality()
     replays = source.startswith("replay:")
@@ -220,6 +220,8 @@ def live(
             if following is not None:
                 factor = float(speed.replace("max", "inf")) if replays else 1.0
                 driven, samples = connect_robot(following, samples, worn, factor, body.table)
+                if not driven.stream.checks_contact:
+                    print_diagnostics([Diagnostic("robot-self-collision-unchecked", WARNING, driven.robot.map.name)])
             if served is not None and (guide or driven is not None):
                 served.set_body(body, None if driven is None else driven.figure(body))
             if driven is not None:

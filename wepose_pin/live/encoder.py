@@ -44,7 +44,7 @@ class RobotFigure:
         shoulders = [find_person_arm(model.table, arm.side).points[0] for arm in robot.arms]
         heights = [data.oMf[model.pin.getFrameId(model.point_frames[point])].translation[2] for point in shoulders]
         self._robot, self._position = robot, position
-        self._root = pin.SE3(*place_beside_person(robot, parts, float(np.mean(heights)), find_floor(model)))
+        self._root = pin.SE3(*place_beside_person(robot, float(np.mean(heights)), find_floor(model)))
         self._joints = sorted({part.joint for part in parts})
         self._data = robot.model.createData()
         self.links = tuple(f"robot {joint}" for joint in self._joints)

@@ -20,7 +20,8 @@ from ..errors import BadOption, WrongOption
 from ..model import BodyModel, BodyTable, load_table
 from ..retargeting import LimitMargins, Robot, find_map, load_robot
 from ..retargeting.maps import list_sides
-from ..retargeting.stream import ArmObserver, Command, CommandStream, StreamOptions, check_segments
+from ..retargeting.stream import STUCK_M, ArmObserver, Command, CommandStream, StreamOptions
+from ..retargeting.targets import check_person_arms
 from ..subject import population_subject
 from .loop import Latencies
 from .outputs import UdpSender
@@ -49,17 +50,19 @@ class RobotSummary(NamedTuple):
     skipped: int  # commands that were due while one took too long
     dropped: int  # that the system did not send
     stopping: int  # steps in which the robot braked, to stay clear of itself
+    stuck: Mapping[str, float]  # side → [m] by which its hand stayed off, as `CommandStream.stuck`
     share: Mapping[str, float]  # state → share of the commands that had a pose
     step: Latencies  # [s] of computing a command
     error: Mapping[str, Latencies]  # side → [m] of the hand while it followed
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
-        """Commands that did not reach the robot, and steps in which it braked to stay clear of itself."""
+        """Commands that did not reach the robot, steps in which it braked to stay clear of itself, hands that stuck."""
         diagnostics = [
             Diagnostic("robot-commands-skipped", WARNING, self.robot, self.skipped),
             Diagnostic("robot-stopped-for-clearance", WARNING, self.robot, self.stopping),
             Diagnostic("robot-commands-dropped", WARNING, self.robot, self.dropped),
+            *(Diagnostic("robot-hand-stuck", WARNING, side, off, STUCK_M) for side, off in self.stuck.items()),
         ]
         return [diagnostic for diagnostic in diagnostics if diagnostic.value]
 
@@ -172,6 +175,7 @@ class RobotOutput(Output):
             self._skipped,
             self._sender.dropped,
             self.stream.stopping,
+            self.stream.stuck,
             {state: count / posed for state, count in self._states.most_common()},
             self._step,
             self._error,
@@ -337,7 +341,7 @@ def connect_robot(
         What is wrong with the options; an arm without sensors.
     """
     if source.sensors:
-        check_segments(options.robot, source.sensors, table)
+        check_person_arms(options.robot, source.sensors, table=table)
     if isinstance(source, ReplaySource) and math.isinf(speed):
         source = TickReplay(source.recording, speed)
     lengths_cov = (setup.subject or population_subject(body=table)).lengths_covariance((table or load_table()).lengths)

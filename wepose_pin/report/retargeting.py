@@ -127,11 +127,13 @@ def _list_hands(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item
 def _list_distances(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item]:
     run, time, contacts = trajectory.run, trajectory.time, summary["self_collisions"]
     rows = []
-    for pair in np.unique(run.nearest_pair[run.nearest_pair >= 0]).tolist():
-        own = np.flatnonzero(run.nearest_pair == pair)
-        least = own[np.argmin(run.hull_distance[own])]
+    for pair in np.unique(run.report.nearest_pair[run.report.nearest_pair >= 0]).tolist():
+        own = np.flatnonzero(run.report.nearest_pair == pair)
+        least = own[np.argmin(run.report.hull_distance[own])]
         share = 100.0 * len(own) / len(time)
-        rows.append((float(run.hull_distance[least]), trajectory.collision.name_pair(pair), float(time[least]), share))
+        rows.append(
+            (float(run.report.hull_distance[least]), trajectory.collision.name_pair(pair), float(time[least]), share)
+        )
     cells = [[name, f"{1e3 * d:.1f}", f"{t:.1f}", f"{share:.0f}"] for d, name, t, share in sorted(rows)[:PAIRS]]
     header = ["pair", "least distance [mm]", "at [s]", "closest pair for [% of the time]"]
     return [
@@ -228,14 +230,14 @@ def draw_hands(trajectory: Trajectory) -> ReportFigure:
 def draw_distances(trajectory: Trajectory) -> ReportFigure:
     """The smallest distance between two parts of the robot, or of one and its table."""
     run, time = trajectory.run, trajectory.time
-    distance = np.where(np.isfinite(run.hull_distance), 1e3 * run.hull_distance, np.nan)
+    distance = np.where(np.isfinite(run.report.hull_distance), 1e3 * run.report.hull_distance, np.nan)
     title = "closest convex hulls [mm]"
     caption = "The smallest distance between two parts of the robot, or of one and its table."
     figure = draw_over_time(time, {title: {title: distance}}, caption, {title: {"color": "black"}})
     [ax] = figure.axes
     ax.set_ylim(0.0, 1e3 * NEAR)
     ax.axhline(1e3 * CLEARANCE, color=COLOURS["left"], linestyle="--", label="clearance")
-    shade(ax, find_spans(time, run.stopping), "braked", COLOURS["right"], alpha=0.4)
+    shade(ax, find_spans(time, run.report.stopping), "braked", COLOURS["right"], alpha=0.4)
     figure.add_legend()
     return figure
 

@@ -140,7 +140,7 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     arms = {arm.side: find_person_arm(model.table, arm.side) for arm in robot.arms}
     shoulder_z = float(np.nanmedian([pose.points[arm.points[0]][:, 2] for arm in arms.values()]))
     floor_z = find_floor(model)
-    R_WB, p_WB = place_beside_person(robot, drawn, shoulder_z, floor_z)
+    R_WB, p_WB = place_beside_person(robot, shoulder_z, floor_z)
     moved = compute_placements(trajectory, drawn, frames, R_WB, p_WB)
     ghosts = compute_target_placements(trajectory, frames, R_WB, p_WB)
     hands = {arm.side: robot.model.frames[arm.hand].parentJoint for arm in robot.arms}

@@ -1,18 +1,17 @@
-"""Checks of a written trajectory that share no code with the controller: limits of URDF and map, coal's shapes."""
+"""Checks of a written trajectory that share no step with the controller: limits of URDF and map, coal's shapes."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 import polars as pl
 from scipy.interpolate import CubicHermiteSpline
 
+from .collision import select_pairs
 from .maps import RobotMap
 from .robot import Robot
-
-DISABLED, ADJACENT, AT_REST = "disabled in the SRDF", "adjacent", "in collision at rest"
 
 
 class LimitCheck(NamedTuple):
@@ -71,12 +70,14 @@ class SelfCollisions(NamedTuple):
 
 
 def find_self_collisions(robot: Robot, time: np.ndarray, u: np.ndarray) -> SelfCollisions:
-    """Check every sample with the robot's own shapes, not their hulls, and with a pair rule of its own.
+    """Check every sample with the robot's own shapes, not their hulls.
 
-    Excluded are shapes of one part or of adjacent parts, pairs that the SRDF disables, and pairs in collision in the
-    rest posture. The controller's rule, by which pairs can collide at all, has no part in it.
+    The pairs are those of `select_pairs`; what the controller leaves out of them has no part in it.
     """
-    shapes, excluded = _select_pairs(robot)
+    pairs, excluded = select_pairs(robot)
+    shapes = pin.GeometryModel(robot.geometry)
+    for i, j in pairs:
+        shapes.addCollisionPair(pin.CollisionPair(i, j))
     data, geometry = robot.model.createData(), shapes.createData()
     boxes = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager(robot.model, shapes, geometry)
     hits = [
@@ -85,48 +86,7 @@ def find_self_collisions(robot: Robot, time: np.ndarray, u: np.ndarray) -> SelfC
     first = ""
     if hits:
         pin.computeCollisions(robot.model, data, shapes, geometry, robot.configuration(u[hits[0]]), True)
-        first = f"{_name_collision(shapes, geometry)} at {float(time[hits[0]]):.2f} s"
-    return SelfCollisions(len(hits), first, len(shapes.collisionPairs), excluded)
-
-
-def _select_pairs(robot: Robot) -> tuple[Any, dict[str, list[str]]]:
-    """The shapes with the pairs to check, and the excluded pairs by reason."""
-    shapes, parents = pin.GeometryModel(robot.geometry), robot.model.parents
-    shapes.addAllCollisionPairs()  # of different parts
-    excluded: dict[str, list[str]] = {DISABLED: [], ADJACENT: [], AT_REST: []}
-
-    def list_pairs() -> list[tuple[int, int]]:
-        return [(pair.first, pair.second) for pair in shapes.collisionPairs]
-
-    def exclude(reason: str, pairs: list[tuple[int, int]]) -> None:
-        for a, b in pairs:
-            excluded[reason].append(" - ".join(shapes.geometryObjects[i].name for i in (a, b)))
-            if shapes.existCollisionPair(pin.CollisionPair(a, b)):
-                shapes.removeCollisionPair(pin.CollisionPair(a, b))
-
-    if robot.map.srdf is not None:
-        before = list_pairs()
-        pin.removeCollisionPairs(robot.model, shapes, str(robot.map.srdf))
-        exclude(DISABLED, sorted(set(before) - set(list_pairs())))
-    joints = [shape.parentJoint for shape in shapes.geometryObjects]
-    parent = {}
-    for joint in joints:
-        parent[joint] = parents[joint]
-        while parent[joint] > 0 and parent[joint] not in joints:  # a part without a shape
-            parent[joint] = parents[parent[joint]]
-    exclude(
-        ADJACENT, [(a, b) for a, b in list_pairs() if joints[a] == parent[joints[b]] or joints[b] == parent[joints[a]]]
-    )
-    geometry = shapes.createData()
-    q = robot.configuration(robot.rest)
-    pin.computeCollisions(robot.model, robot.model.createData(), shapes, geometry, q, False)
-    hits = [result.isCollision() for result in geometry.collisionResults]
-    exclude(AT_REST, [pair for pair, hit in zip(list_pairs(), hits, strict=True) if hit])
-    return shapes, excluded
-
-
-def _name_collision(shapes: Any, geometry: Any) -> str:
-    """The first pair that collides."""
-    k = next(k for k, result in enumerate(geometry.collisionResults) if result.isCollision())
-    pair = shapes.collisionPairs[k]
-    return " and ".join(shapes.geometryObjects[i].name for i in (pair.first, pair.second))
+        pair = next(pairs[k] for k, result in enumerate(geometry.collisionResults) if result.isCollision())
+        names = " and ".join(shapes.geometryObjects[i].name for i in pair)
+        first = f"{names} at {float(time[hits[0]]):.2f} s"
+    return SelfCollisions(len(hits), first, len(pairs), excluded)

@@ -1,18 +1,19 @@
-"""Self-collision: pairs of shapes that may collide, their distances, and the Jacobian of these."""
+"""Self-collision: pairs of shapes that may collide, their distances with Jacobian, whether a way to rest is clear."""
 
 from __future__ import annotations
 
-from itertools import compress, product
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import coal
 import numpy as np
 import pinocchio as pin
 
 from ..compilation import compiled
-from .limits import parse_xml
-from .robot import Robot
+from ..errors import BadModel
+from .robot import TABLE_NAME, Robot
 
 CLEARANCE = 0.02  # [m] that the controller keeps between hulls
 # [m] below which a pair has a constraint: two hands that approach at 2 m/s need it to stop, at the 6 m/s² of joints
@@ -23,10 +24,11 @@ OVERLAP = 0.005  # [m] by which hulls that overlap in the rest posture may overl
 # Relative, of Coal's search for the nearest points. With its own 1e-6 the distance to a cylinder jumps by a micrometre
 # from one posture to the next, however near, and its Jacobian by 0.002 m/rad. At 1e-12 the search fails now and then.
 GJK_TOLERANCE = 1e-10
+DISABLED, ADJACENT, AT_REST = "disabled in the SRDF", "adjacent", "in collision at rest"
 _SAMPLES = 1000  # random configurations that show which pairs collide always, or never; fewer where pairs are many
 _MAX_TESTS = 400_000
-_GRID_JOINTS = 3  # joints between two shapes that can be sampled on a grid
-_GRID = 9  # values of each, with the ends of its range: there links of one arm collide, if anywhere
+_END_SHARE = 0.3  # of the joints in them that are at an end of their range: there links of one arm collide, if anywhere
+_FEW_JOINTS = 3  # between two links of an arm, of which the samples show all that matters
 _ALWAYS = 0.95  # share of the samples in which a pair that always collides does
 
 
@@ -35,24 +37,30 @@ class NearPairs(NamedTuple):
 
     pairs: np.ndarray  # (m,) int, their indices
     distance: np.ndarray  # (m,) [m]
-    jacobian: np.ndarray  # (m, nv) of the distance
+    jacobian: np.ndarray  # (m, n) of the distance
     clearance: np.ndarray  # (m,) [m] to keep
 
 
 class CollisionModel:
     """The robot's shapes, each as its convex hull: fast, and the nearest points move smoothly.
 
-    Pairs are left out that cannot collide or always do: on one joint, of adjacent links, disabled in the SRDF, in
-    collision in the rest posture or in almost any posture, or, few joints apart on one arm, in none.
+    Its pairs are those of `select_pairs`, less those that collide in almost any posture, or, few joints apart on one
+    arm, in none.
+
+    Attributes
+    ----------
+    pairs : indices of two hulls each
+    clearance, least_distance : (pairs,) [m] that tasks leave, and that no step and no stop goes below
     """
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self.hulls, hull_of = build_hulls(robot)
-        self.pairs = sorted({tuple(sorted((hull_of[i], hull_of[j]))) for i, j in find_collision_pairs(robot)})
+        self.hulls, hull_of = _build_hulls(robot)
+        pairs = _leave_out_always_and_never(robot, select_pairs(robot)[0])
+        self.pairs = sorted({tuple(sorted((hull_of[i], hull_of[j]))) for i, j in pairs})
         for i, j in self.pairs:
             self.hulls.addCollisionPair(pin.CollisionPair(i, j))
-        self.data = self.hulls.createData()
+        self.data, self._path_data = self.hulls.createData(), robot.model.createData()
         for request in self.data.distanceRequests:
             request.gjk_tolerance = GJK_TOLERANCE
         self._active = np.ones(len(self.pairs), dtype=bool)
@@ -65,11 +73,12 @@ class CollisionModel:
         self._first, self._second = (np.array([pair[k] for pair in self.pairs], dtype=int) for k in (0, 1))
         self._range = radius[self._first] + radius[self._second] + NEAR
         self._supports = _find_supporting_joints(robot.model)
-        self.clearance = self._compute_clearances()
-        self.least_distance = np.where(
-            self.clearance > 0.0, LEAST_SHARE * self.clearance, self.clearance - OVERLAP
-        )  # (pairs,) [m]
-        self.levers = self._compute_levers(self._centre, radius)
+        # Hulls closer than the clearance in the rest posture keep half of their distance there, or their overlap.
+        rest = self._measure(robot.rest, np.arange(len(self.pairs)))
+        self.clearance = np.minimum(CLEARANCE, np.where(rest > 0.0, 0.5 * rest, rest))
+        overlapping = self.clearance <= 0.0
+        self.least_distance = np.where(overlapping, self.clearance - OVERLAP, LEAST_SHARE * self.clearance)
+        self.levers = self._compute_levers(radius)
         self._none = NearPairs(np.empty(0, dtype=int), np.empty(0), np.empty((0, robot.model.nv)), np.empty(0))
         self._viewed: Any = None
         self._rotations: list[np.ndarray] = []
@@ -85,13 +94,15 @@ class CollisionModel:
             self._translations = [placement.translation for placement in data.oMi]
         R, p = np.array(self._rotations), np.array(self._translations)
         close = _find_close(R, p, self._joint, self._centre, self._first, self._second, self._range)
+        for k in (close != self._active).nonzero()[0].tolist():  # Pinocchio computes the distances of active pairs
+            (self.data.activateCollisionPair if close[k] else self.data.deactivateCollisionPair)(k)
+        self._active = close
         if not close.any():
             return self._none
-        self._activate(close)
         pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
         pin.computeDistances(self.hulls, self.data)
         results = self.data.distanceResults
-        near = [(k, result) for k in np.flatnonzero(close).tolist() if (result := results[k]).min_distance < NEAR]
+        near = [(k, result) for k in close.nonzero()[0].tolist() if (result := results[k]).min_distance < NEAR]
         if not near:
             return self._none
         indices = np.array([k for k, _ in near])
@@ -99,14 +110,9 @@ class CollisionModel:
         a = np.concatenate([result.getNearestPoint1() for _, result in near]).reshape(-1, 3)
         b = np.concatenate([result.getNearestPoint2() for _, result in near]).reshape(-1, 3)
         first, second = self._joint[self._first[indices]], self._joint[self._second[indices]]
-        jacobian = _distance_jacobian(distance, a, b, data.J, self._supports[first], self._supports[second])
+        J = np.ascontiguousarray(data.J)
+        jacobian = _compute_distance_jacobian(distance, a, b, J, self._supports[first], self._supports[second])
         return NearPairs(indices, distance, jacobian, self.clearance[indices])
-
-    def _activate(self, pairs: np.ndarray) -> None:
-        """Let Pinocchio compute the distances of these pairs (pairs,) bool only."""
-        for k in np.flatnonzero(pairs != self._active).tolist():
-            (self.data.activateCollisionPair if pairs[k] else self.data.deactivateCollisionPair)(k)
-        self._active = pairs
 
     def name_pair(self, pair: int) -> str:
         """The names of the two shapes of a pair."""
@@ -117,35 +123,63 @@ class CollisionModel:
         pin.updateGeometryPlacements(self.robot.model, data, self.hulls, self.data)
         return np.array([pin.computeDistance(self.hulls, self.data, k).min_distance for k in pairs.tolist()])
 
-    def _compute_clearances(self) -> np.ndarray:
-        """(pairs,) [m] `CLEARANCE`; for hulls closer in the rest posture half of their distance, or their overlap."""
-        data = self.robot.model.createData()
-        pin.forwardKinematics(self.robot.model, data, self.robot.configuration(self.robot.rest))
-        distances = self.compute_distances(data, np.arange(len(self.pairs)))
-        return np.array([min(CLEARANCE, 0.5 * d if d > 0.0 else d) for d in distances])
+    def is_path_clear(self, distance: np.ndarray, path: np.ndarray, travel: np.ndarray) -> bool:
+        """Whether all pairs keep their least distance on a way to rest.
 
-    def _compute_levers(self, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
+        The way is halved until each part is covered: from the distance of a pair follows how far its joints may move
+        before the hulls can meet, by the length of the links between (as in conservative advancement, Mirtich 1996).
+
+        Parameters
+        ----------
+        distance : (pairs,) [m] at the beginning; a lower bound where a pair is far
+        path : (m, n) joint positions, the first after one step
+        travel : (m, n) largest way of each joint in each step
+        """
+        room_before = distance - self.least_distance
+        critical = (self.levers @ travel.sum(axis=0) >= room_before).nonzero()[0]
+        if not len(critical):
+            return True
+        # Along the way a pair comes nearer by `approach` at most: enough room at both ends of a part covers the part.
+        approach = np.vstack([np.zeros(len(critical)), np.cumsum(travel @ self.levers[critical].T, axis=0)])
+        room = {0: room_before[critical]}
+        parts = [(0, len(path))]
+        while parts:
+            begin, end = parts.pop()
+            for at in (begin, end):
+                if at not in room:
+                    room[at] = self._measure(path[at - 1], critical) - self.least_distance[critical]
+                    if (room[at] < 0.0).any():
+                        return False
+            covered = approach[end] - approach[begin] < room[begin] + room[end]
+            if end - begin > 1 and not covered.all():
+                middle = (begin + end) // 2
+                parts += [(middle, end), (begin, middle)]
+        return True
+
+    def _measure(self, position: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+        """Distances [m] of some pairs at joint positions (n,)."""
+        pin.forwardKinematics(self.robot.model, self._path_data, self.robot.configuration(position))
+        return self.compute_distances(self._path_data, pairs)
+
+    def _compute_levers(self, radius: np.ndarray) -> np.ndarray:
         """(pairs, n) [m per rad or m] by which a pair's distance changes at most where a joint moves.
 
         That is the length of the links from the joint to the far end of the shape, in whatever posture.
         """
-        model, robot = self.robot.model, self.robot
-        moves = np.abs(robot.coupling)
-        largest = np.abs(robot.coupling) @ np.maximum(np.abs(robot.bounds[0]), np.abs(robot.bounds[1]))
-        largest += np.abs(robot.offset)  # [m] of a joint that slides
-        slides = np.array([model.joints[k].shortname().startswith("JointModelP") for k in range(model.njoints)])
-        levers = np.zeros((2, len(self.pairs), model.nv))
-        for end, shapes in enumerate((self._first, self._second)):
-            for row, shape in enumerate(shapes.tolist()):
-                joint, length = int(self._joint[shape]), float(np.linalg.norm(centre[shape]) + radius[shape])
-                while joint > 0:
-                    v = model.idx_vs[joint]
-                    levers[end, row, v] = 1.0 if slides[joint] else length
-                    length += float(np.linalg.norm(model.jointPlacements[joint].translation))
-                    length += largest[v] if slides[joint] else 0.0
-                    joint = model.parents[joint]
-        common = (levers[0] > 0.0) & (levers[1] > 0.0)  # carries both shapes
-        return np.where(common, 0.0, levers.sum(axis=0)) @ moves
+        model = self.robot.model
+        largest = np.maximum(*np.abs(self.robot.bounds))  # [m] of a joint that slides
+        slides = [model.joints[k].shortname().startswith("JointModelP") for k in range(model.njoints)]
+        levers = np.zeros((len(radius), model.nv))
+        for shape, joint in enumerate(self._joint.tolist()):
+            length = float(np.linalg.norm(self._centre[shape]) + radius[shape])
+            while joint > 0:
+                v = model.idx_vs[joint]
+                levers[shape, v] = 1.0 if slides[joint] else length
+                length += float(np.linalg.norm(model.jointPlacements[joint].translation))
+                length += largest[v] if slides[joint] else 0.0
+                joint = model.parents[joint]
+        first, second = levers[self._first], levers[self._second]
+        return np.where((first > 0.0) & (second > 0.0), 0.0, first + second)  # a joint that carries both changes none
 
 
 @compiled
@@ -157,69 +191,47 @@ def _find_close(R, p, joint, centre, first, second, reach):  # type: ignore[no-u
     """
     placed = np.empty(centre.shape)
     for k in range(len(centre)):
-        for i in range(3):
-            placed[k, i] = p[joint[k], i]
-            for j in range(3):
-                placed[k, i] += R[joint[k], i, j] * centre[k, j]
+        placed[k] = R[joint[k]] @ centre[k] + p[joint[k]]
     close = np.empty(len(first), dtype=np.bool_)
     for k in range(len(first)):
-        square = 0.0
-        for i in range(3):
-            square += (placed[first[k], i] - placed[second[k], i]) ** 2
-        close[k] = square < reach[k] ** 2
+        away = placed[first[k]] - placed[second[k]]
+        close[k] = away @ away < reach[k] ** 2
     return close
 
 
 @compiled
-def _distance_jacobian(distance, a, b, J, first, second):  # type: ignore[no-untyped-def]
+def _compute_distance_jacobian(distance, a, b, J, first, second):  # type: ignore[no-untyped-def]
     """(m, nv) of distances between points `a` and `b` (m, 3), moved by the joints `first` and `second` (m, nv)."""
     jacobian = np.empty((len(distance), J.shape[1]))
-    away = np.empty(3)
     for k in range(len(distance)):
-        size = 0.0
-        for i in range(3):
-            away[i] = a[k, i] - b[k, i]
-            size += away[i] ** 2
-        size = max(np.sqrt(size), 1e-9) * (-1.0 if distance[k] < 0.0 else 1.0)
-        for i in range(3):
-            away[i] /= size
-        for j in range(J.shape[1]):
-            linear = away[0] * J[0, j] + away[1] * J[1, j] + away[2] * J[2, j]
-            angular = 0.0  # (a × away) · ω of the first, minus (b × away) · ω of the second
-            other = 0.0
-            for i in range(3):
-                y, z = (i + 1) % 3, (i + 2) % 3
-                angular += (a[k, y] * away[z] - a[k, z] * away[y]) * J[3 + i, j]
-                other += (b[k, y] * away[z] - b[k, z] * away[y]) * J[3 + i, j]
-            jacobian[k, j] = first[k, j] * (linear + angular) - second[k, j] * (linear + other)
+        away = a[k] - b[k]
+        away /= max(np.sqrt(away @ away), 1e-9) * (-1.0 if distance[k] < 0.0 else 1.0)
+        linear = away @ J[:3]
+        jacobian[k] = first[k] * (linear + np.cross(a[k], away) @ J[3:])
+        jacobian[k] -= second[k] * (linear + np.cross(b[k], away) @ J[3:])
     return jacobian
 
 
-def build_hulls(robot: Robot) -> tuple[Any, list[int]]:
+def _build_hulls(robot: Robot) -> tuple[Any, dict[int, int]]:
     """Convex hulls, and the index of its hull for each shape; all shapes rigid with a hand share one hull."""
-    model, hull_of = pin.GeometryModel(), []
-    hand_joints = {int(robot.model.frames[arm.hand].parentJoint) for arm in robot.arms}
-    hands: dict[int, list[Any]] = {}
-    for shape in robot.geometry.geometryObjects:
-        joint, geometry, name = shape.parentJoint, shape.geometry, shape.name
-        if joint in hand_joints:
-            name = f"hand {joint}"
-            hands.setdefault(joint, []).append(shape)
-            if len(hands[joint]) > 1:
-                hull_of.append(model.getGeometryId(name))
-                continue
+    hands = {int(robot.model.frames[arm.hand].parentJoint) for arm in robot.arms}
+    shapes, groups = list(robot.geometry.geometryObjects), dict[tuple[bool, str], list[int]]()
+    for k, shape in enumerate(shapes):
+        is_hand = shape.parentJoint in hands
+        groups.setdefault((is_hand, f"hand {shape.parentJoint}" if is_hand else shape.name), []).append(k)
+    model, hull_of = pin.GeometryModel(), dict[int, int]()
+    for (is_hand, name), own in groups.items():
+        shape = shapes[own[0]]
+        geometry, placement = shape.geometry, shape.placement
+        if is_hand:
+            corners = coal.StdVec_Vec3s()
+            corners.extend(list(np.vstack([list_corners(shapes[k]) for k in own])))
+            geometry, placement = coal.Convex.convexHull(corners, True, "Qt"), pin.SE3.Identity()
         elif hasattr(geometry, "buildConvexHull"):
             geometry.buildConvexHull(True, "Qt")
             geometry = geometry.convex
-        hull_of.append(
-            model.addGeometryObject(pin.GeometryObject(name, joint, shape.parentFrame, shape.placement, geometry))
-        )
-    for joint, shapes in hands.items():
-        hull = model.geometryObjects[model.getGeometryId(f"hand {joint}")]
-        corners = coal.StdVec_Vec3s()
-        corners.extend(list(np.vstack([list_corners(shape) for shape in shapes])))
-        hull.geometry = coal.Convex.convexHull(corners, True, "Qt")
-        hull.placement = pin.SE3.Identity()
+        hull = pin.GeometryObject(name, shape.parentJoint, shape.parentFrame, placement, geometry)
+        hull_of |= dict.fromkeys(own, model.addGeometryObject(hull))
     return model, hull_of
 
 
@@ -235,73 +247,68 @@ def list_corners(shape: Any) -> np.ndarray:
     return points @ shape.placement.rotation.T + shape.placement.translation
 
 
-def find_collision_pairs(robot: Robot) -> list[tuple[int, int]]:
-    """Pairs of shapes that must not collide."""
-    objects, full = robot.geometry.geometryObjects, robot.full
-    links = [full.frames[full.getFrameId(_link_name(shape.name))].name for shape in objects]
-    excluded = _find_adjacent_links(full, set(links))
-    if robot.map.srdf is not None:
-        excluded |= _read_disabled_pairs(robot.map.srdf)
-    candidates = [
-        (i, j)
-        for i in range(len(objects))
-        for j in range(i + 1, len(objects))
-        if objects[i].parentJoint != objects[j].parentJoint and frozenset((links[i], links[j])) not in excluded
-    ]
-    if not candidates:
+def select_pairs(robot: Robot) -> tuple[list[tuple[int, int]], dict[str, list[str]]]:
+    """Return the pairs of the robot's shapes that must not collide, and reason → names of the pairs that are left out.
+
+    Left out are shapes of one part, and for a reason pairs that the SRDF disables, adjacent links, and what collides in
+    the rest posture.
+
+    Raises
+    ------
+    BadModel
+        A part is in the table in the rest posture; the SRDF is not XML.
+    """
+    shapes = pin.GeometryModel(robot.geometry)
+    shapes.addAllCollisionPairs()  # of different parts
+    names = [shape.name for shape in shapes.geometryObjects]
+    links = [name.rpartition("_")[0] for name in names]  # Pinocchio names a shape after its link: LINK_0, LINK_1, …
+    disabled = set() if robot.map.srdf is None else _read_disabled_pairs(robot.map.srdf)
+    adjacent = _find_adjacent_links(robot.full, set(links))
+    data, q = shapes.createData(), robot.configuration(robot.rest)
+    pin.computeCollisions(robot.model, robot.model.createData(), shapes, data, q, False)
+    pairs = []
+    excluded: dict[str, list[str]] = {DISABLED: [], ADJACENT: [], AT_REST: []}
+    for pair, result in zip(shapes.collisionPairs, data.collisionResults, strict=True):
+        own = (names[pair.first], names[pair.second])
+        ends = frozenset((links[pair.first], links[pair.second]))
+        if result.isCollision() and TABLE_NAME in own:
+            raise BadModel(
+                f"{robot.map.where}: rest, table: {own[own[0] == TABLE_NAME]} is in the table in the rest posture; "
+                "give a rest above it, or another table"
+            )
+        if ends in disabled or ends in adjacent or result.isCollision():
+            reason = DISABLED if ends in disabled else ADJACENT if ends in adjacent else AT_REST
+            excluded[reason].append(" - ".join(own))
+        else:
+            pairs.append((pair.first, pair.second))
+    return pairs, excluded
+
+
+def _leave_out_always_and_never(robot: Robot, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """The pairs without those that collide in almost any posture, or, few joints apart on one arm, in none."""
+    if not pairs:
         return []
     shapes = pin.GeometryModel(robot.geometry)
-    for i, j in candidates:
+    for i, j in pairs:
         shapes.addCollisionPair(pin.CollisionPair(i, j))
     data, geometry = robot.model.createData(), shapes.createData()
-
-    def find_hits(u: np.ndarray) -> np.ndarray:
-        pin.computeCollisions(robot.model, data, shapes, geometry, robot.configuration(u), False)
-        return np.array([result.isCollision() for result in geometry.collisionResults])
-
-    rng = np.random.default_rng(0)
-    hits, samples = np.zeros(len(candidates)), min(_SAMPLES, _MAX_TESTS // len(candidates))
+    rng, ends, n = np.random.default_rng(0), np.array(robot.bounds), len(robot.names)
+    hits, samples = np.zeros(len(pairs)), min(_SAMPLES, _MAX_TESTS // len(pairs))
     for _ in range(samples):
-        hits += find_hits(rng.uniform(*robot.bounds))
-    checked = (hits < _ALWAYS * samples) & ~find_hits(robot.rest)
-    seldom = {pair for pair, count in zip(candidates, hits, strict=True) if count == 0}
-    never = _find_never_colliding(robot, shapes, seldom.intersection(compress(candidates, checked)))
-    return [pair for pair, check in zip(candidates, checked, strict=True) if check and pair not in never]
+        at_end = ends[rng.integers(0, 2, n), np.arange(n)]
+        u = np.where(rng.random(n) < _END_SHARE, at_end, rng.uniform(*ends))
+        pin.computeCollisions(robot.model, data, shapes, geometry, robot.configuration(u), False)
+        hits += [result.isCollision() for result in geometry.collisionResults]
+    joints = [shape.parentJoint for shape in shapes.geometryObjects]
+    near = [_are_few_joints_apart(robot.model, *sorted((joints[i], joints[j]))) for i, j in pairs]
+    kept = (hits < _ALWAYS * samples) & ((hits > 0) | ~np.array(near))
+    return [pair for pair, keep in zip(pairs, kept, strict=True) if keep]
 
 
-def _find_never_colliding(robot: Robot, shapes: Any, pairs: set[tuple[int, int]]) -> set[tuple[int, int]]:
-    """Pairs with few joints of one arm between them that collide in no posture on a grid of these joints."""
-    by_joints: dict[tuple[int, ...], set[tuple[int, int]]] = {}
-    for pair in pairs:
-        joints = _find_joints_between(robot, *sorted(int(shapes.geometryObjects[k].parentJoint) for k in pair))
-        if joints is not None:
-            by_joints.setdefault(joints, set()).add(pair)
-    low, high = robot.bounds
-    data, geometry = robot.model.createData(), shapes.createData()
-    for joints, clear in by_joints.items():
-        indices = {pair: shapes.findCollisionPair(pin.CollisionPair(*pair)) for pair in clear}
-        u = robot.rest.copy()
-        for values in product(*(np.linspace(low[j], high[j], _GRID) for j in joints)):
-            u[list(joints)] = values
-            pin.updateGeometryPlacements(robot.model, data, shapes, geometry, robot.configuration(u))
-            clear -= {pair for pair in clear if pin.computeCollision(shapes, geometry, indices[pair])}
-            if not clear:
-                break
-    return set().union(*by_joints.values())
-
-
-def _find_joints_between(robot: Robot, a: int, b: int) -> tuple[int, ...] | None:
-    """The joints (of `Robot.names`) between two joints of the model; None where these are not on one arm, or many."""
-    between, count = np.zeros(len(robot.names), dtype=bool), 0
-    while b > a:
-        between |= robot.coupling[robot.model.idx_vs[b]] != 0.0
-        b, count = robot.model.parents[b], count + 1
-    return tuple(np.flatnonzero(between).tolist()) if b == a and count <= _GRID_JOINTS else None
-
-
-def _link_name(shape: str) -> str:
-    """Pinocchio names a shape after its link: LINK_0, LINK_1, …"""
-    return shape.rpartition("_")[0]
+def _are_few_joints_apart(model: Any, a: int, b: int) -> bool:
+    for _ in range(_FEW_JOINTS):
+        b = model.parents[b] if b > a else b
+    return b == a
 
 
 def _find_adjacent_links(full: Any, shaped: set[str]) -> set[frozenset[str]]:
@@ -315,21 +322,22 @@ def _find_adjacent_links(full: Any, shaped: set[str]) -> set[frozenset[str]]:
         top, parent = joint, full.parents[joint]
         while parent > 0 and parent not in links_of:
             top, parent = parent, full.parents[parent]
-        parents = links_of[parent] if parent > 0 else [full.frames[_find_root_link(full, top)].name]
+        if parent > 0:
+            parents = links_of[parent]
+        else:  # of the root only the link that carries the joint
+            frame = full.frames[full.getFrameId(full.names[top], pin.FrameType.JOINT)]
+            while frame.type != pin.FrameType.BODY:
+                frame = full.frames[frame.parentFrame]
+            parents = [frame.name]
         pairs |= {frozenset((a, b)) for a in links_of.get(joint, []) for b in parents}
     return pairs
 
 
-def _find_root_link(full: Any, joint: int) -> int:
-    """The link of the root that carries a joint."""
-    frame = full.frames[full.getFrameId(full.names[joint])].parentFrame
-    while full.frames[frame].type != pin.FrameType.BODY:
-        frame = full.frames[frame].parentFrame
-    return int(frame)
-
-
 def _read_disabled_pairs(srdf: Path) -> set[frozenset[str]]:
-    root = parse_xml(srdf)
+    try:
+        root = ElementTree.parse(srdf).getroot()
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise BadModel(f"{srdf}: not valid XML: {error}") from error
     return {frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in root.iter("disable_collisions")}
 
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from .controller import HandTarget
 from .reconfiguration import LOST_M, LOST_S, PostureSearch, find_lasting, find_lost
+from .targets import HandTarget
 from .trajectory import Trajectory
 
 FAR = 0.02  # [m] off the target: above it the error is attributed
@@ -40,13 +40,13 @@ def find_error_causes(trajectory: Trajectory, arm: int) -> np.ndarray:
     joints, target = robot.arms[arm].joints, trajectory.targets[arm]
     u = run.joint_position[:, joints]
     at_limit = (u - robot.lower[joints] < AT_LIMIT) | (robot.upper[joints] - u < AT_LIMIT)
-    active, half = run.active.joints[:, joints], round(0.5 * CATCH_UP_S / float(trajectory.time[1]))
+    active, half = run.report.limited[:, joints], round(0.5 * CATCH_UP_S / float(trajectory.time[1]))
     holds = np.stack(
         [
             target.lost,
             trajectory.find_changes()[:, arm],
             np.linalg.norm(target.position - target.unclamped, axis=1) > CLAMPED,
-            run.active.arms_near_contact[:, arm],
+            run.report.near_contact[:, joints].any(axis=1),
             (active & at_limit).any(axis=1),
             maximum_filter1d(active.any(axis=1), 2 * half + 1, origin=half),
             np.ones(len(u), dtype=bool),
@@ -102,10 +102,7 @@ def find_missed_targets(trajectory: Trajectory) -> list[MissedTarget]:
 def _find_distance(trajectory: Trajectory, search: PostureSearch, k: int, rng: np.random.Generator) -> np.ndarray:
     """Return the distance (arms,) [m] that the best posture found at sample `k` leaves; inf where none is clear."""
     robot = trajectory.robot
-    targets = tuple(
-        HandTarget(path.position[k], np.zeros(3), path.rotation[k], np.zeros(3), path.swivel[k], 1.0)
-        for path in trajectory.targets
-    )
+    targets = tuple(HandTarget(*path[: len(HandTarget._fields)]).sample(k) for path in trajectory.targets)
     best, distance = np.full(len(robot.arms), np.inf), np.full(len(robot.arms), np.inf)
     others = rng.uniform(*robot.bounds, (_RANDOM_POSTURES, len(robot.names)))
     for start in (trajectory.joint_position[k], robot.rest, *others):

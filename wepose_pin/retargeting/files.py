@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import polars as pl
 from scipy.spatial.transform import Rotation
 
@@ -17,14 +16,14 @@ from ..model.meshes import resolve_meshes
 from ..recording import format_span, format_time
 from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY, JointMotion
 from ..writers.result import write_table
-from .checks import AT_REST, LimitCheck, SelfCollisions
-from .collision import CLEARANCE, list_corners
+from .checks import LimitCheck, SelfCollisions
+from .collision import AT_REST, CLEARANCE
 from .error_attribution import CLAMPED, FAR, MissedTarget, assess_reachability, attribute_errors, find_missed_targets
 from .reconfiguration import LOST_M
 from .robot import Robot
 from .targets import compute_target_reach
 from .trajectory import Trajectory
-from .visuals import STANDING_HEIGHT, find_missing_visuals
+from .visuals import find_missing_visuals, place_root
 
 DIGITS = 8  # of angles in text
 MAX_MOMENTS = 6  # that a diagnostic names
@@ -77,7 +76,7 @@ def _format_joint_trajectory(trajectory: Trajectory) -> str:
 def build_joint_motion(trajectory: Trajectory) -> JointMotion:
     """Return the trajectory as writers of other programs' files take it, the robot standing on the floor."""
     robot, urdf = trajectory.robot, trajectory.robot.map.urdf
-    placement = place_root(robot)
+    R_WB, p_WB = place_root(robot)
     return JointMotion(
         name=robot.map.name,
         where=robot.map.name,
@@ -88,8 +87,8 @@ def build_joint_motion(trajectory: Trajectory) -> JointMotion:
         position=trajectory.joint_position,
         velocity=trajectory.run.joint_velocity,
         posture=_list_posture(robot),
-        p_WB=placement[:3],
-        quat_WB=placement[3:],
+        p_WB=p_WB,
+        quat_WB=Rotation.from_matrix(R_WB).as_quat(),
         recorded_time=trajectory.recorded_time,
         begin=trajectory.approach_samples,
     )
@@ -106,22 +105,6 @@ def _list_posture(robot: Robot) -> dict[str, float]:
     return posture
 
 
-def place_root(robot: Robot) -> np.ndarray:
-    """Position [m] and xyzw (7,) of the root in W: where a standing robot is on the floor, else at its origin."""
-    R_WB = robot.R_BT.T
-    data, height = robot.model.createData(), 0.0
-    pin.forwardKinematics(robot.model, data, robot.configuration(robot.rest))
-    lowest = [
-        (R_WB @ data.oMi[shape.parentJoint].act(corner))[2]
-        for shape in robot.geometry.geometryObjects
-        for corner in list_corners(shape)
-    ]
-    shoulder = np.mean([arm.shoulder for arm in robot.arms], axis=0)
-    if lowest and (R_WB @ shoulder)[2] - min(lowest) > STANDING_HEIGHT:
-        height = -min(lowest)
-    return np.concatenate([[0.0, 0.0, height], Rotation.from_matrix(R_WB).as_quat()])
-
-
 def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:
     """Contents of ``summary.json``."""
     robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
@@ -130,20 +113,21 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         arm.side: _summarize_arm(trajectory, i, frames - begin, 1e3 * reached[:, i]) for i, arm in enumerate(robot.arms)
     }
     ms, dt = 1e3 * run.solve_s, float(trajectory.time[1] - trajectory.time[0])
-    counts, steps = trajectory.counts, max(trajectory.counts.steps, 1)
     recorded_time, limiting = trajectory.recorded_time, trajectory.limiting_joint
     recorded_s = float(recorded_time[-1] - recorded_time[begin])
     shown_s = float(trajectory.time[np.argmax(recorded_time)] - trajectory.time[begin])
     slowdown = shown_s / recorded_s if recorded_s else None
-    nearest = float(run.hull_distance.min())
+    nearest = float(run.report.hull_distance.min())
     jerk = np.abs(np.diff(run.joint_acceleration, axis=0)) / dt
     missed = find_missed_targets(trajectory)
+    R_WB, p_WB = place_root(robot)
+    root = (*p_WB.tolist(), *Rotation.from_matrix(R_WB).as_quat().tolist())
     return {
         "robot": robot.map.name,
         "urdf": robot.map.urdf.name,
         "joints": list(robot.names),
         "posture": _list_posture(robot),
-        "root": dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), place_root(robot).tolist(), strict=True)),
+        "root": dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), root, strict=True)),
         "description": robot.map.description,
         "rate_hz": round(1.0 / dt, 3),
         "duration_s": round(float(trajectory.time[-1]), 3),
@@ -151,8 +135,8 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "recorded_s": round(recorded_s, 3),
         "slowdown": None if slowdown is None else round(slowdown, 3),
         "slowest": None if limiting is None else limiting._asdict(),
-        "contact_times_s": list(trajectory.contact_times),
-        "posture_change_times_s": _list_change_times(trajectory),
+        "contact_times_s": trajectory.contact_times,
+        "posture_change_times_s": trajectory.change_times,
         "missed_targets": [target._asdict() for target in missed],
         "arms": arms,
         "within_limits": limits.passed,
@@ -175,10 +159,10 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
             "clearance_mm": 1e3 * CLEARANCE,
         },
         "steps": {
-            "all": counts.steps,
-            "singular_share": round(counts.singular / (steps * len(robot.arms)), 4),
-            "near_clearance_share": round(counts.near_clearance / steps, 4),
-            "stopping_share": round(counts.stopping / steps, 4),
+            "all": len(trajectory.time),
+            "singular_share": _share(run.report.singular),
+            "near_clearance_share": _share(run.report.near_clearance),
+            "stopping_share": _share(run.report.stopping),
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
         "diagnostics": [
@@ -213,14 +197,6 @@ def _summarize_arm(trajectory: Trajectory, i: int, frames: np.ndarray, reached: 
     }
 
 
-def _list_change_times(trajectory: Trajectory) -> list[float]:
-    """When [s] of the recording an arm leaves its path for another posture."""
-    begin = trajectory.approach_samples
-    changes = trajectory.find_changes()[begin:].any(axis=1)
-    starts = begin + np.flatnonzero(np.diff(changes, prepend=False) & changes)
-    return np.round(trajectory.recorded_time[starts], 2).tolist()
-
-
 def diagnose_trajectory(
     trajectory: Trajectory,
     limits: LimitCheck,
@@ -250,7 +226,7 @@ def diagnose_trajectory(
         error = max(target.error for target in missed if target.side == side)
         moments = ", ".join(spans[:MAX_MOMENTS])
         diagnostics.append(Diagnostic("reachable-target-missed", ERROR, side, error, LOST_M, {"moments": moments}))
-    if changes := _list_change_times(trajectory):
+    if changes := trajectory.change_times:
         facts = {"moments": f"{', '.join(map(format_time, changes[:MAX_MOMENTS]))} s"}
         diagnostics.append(Diagnostic("robot-posture-changed", WARNING, name, len(changes), facts=facts))
     limiting = trajectory.limiting_joint
@@ -261,9 +237,8 @@ def diagnose_trajectory(
             "quantity": limiting.quantity,
         }
         diagnostics.append(Diagnostic("trajectory-slowed", INFO, name, slowdown, facts=moment))
-    if trajectory.contact_times:
-        moments = ", ".join(map(format_time, trajectory.contact_times[:MAX_MOMENTS]))
-        diagnostics.append(Diagnostic("trajectory-slowed-for-contact", INFO, name, facts={"moments": f"{moments} s"}))
+    if stopping := int(trajectory.run.report.stopping.sum()):
+        diagnostics.append(Diagnostic("robot-stopped-for-clearance", WARNING, name, stopping))
     return diagnostics
 
 

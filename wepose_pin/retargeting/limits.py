@@ -1,4 +1,4 @@
-"""Joint limits: read from the URDF itself, and the accelerations that never lead to a violation of them.
+"""Joint limits: the accelerations that never lead to a violation of them, and the stop within them.
 
 Over a step the jerk is constant: the acceleration is linear, the velocity quadratic, the position cubic. Three bounds
 on the acceleration at the end of a step follow; the tightest counts:
@@ -15,77 +15,20 @@ The bounds of both sides agree where a brake can be released within the joint's 
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import NamedTuple
-from xml.etree import ElementTree
-
 import numpy as np
 
 from ..compilation import compiled, inlined, kernel
-from ..errors import BadModel, MissingFile
-
-
-class JointLimit(NamedTuple):
-    """Limits of one joint in a URDF [rad or m, s]."""
-
-    kind: str  # "revolute", "continuous", "prismatic"
-    lower: float  # −inf for a continuous joint
-    upper: float
-    velocity: float
-    mimic: tuple[str, float, float] | None  # joint, multiplier, offset: value = multiplier * its value + offset
-
-
-def read_joint_limits(path: Path) -> dict[str, JointLimit]:
-    """Limits of every movable joint; NaN where the URDF has none.
-
-    Read from the XML alone, so that a check against them shares no code with the controller.
-
-    Raises
-    ------
-    MissingFile, BadModel
-        Not there; not XML.
-    """
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file")
-    limits = {}
-    for joint in parse_xml(path).iter("joint"):
-        kind = joint.get("type", "")
-        if kind not in ("revolute", "continuous", "prismatic"):
-            continue
-        limit, mimic = joint.find("limit"), joint.find("mimic")
-        velocity = _read_number(limit, "velocity", np.nan)
-        absent = np.nan if limit is None else 0.0  # URDF: an attribute that is left out is zero
-        lower, upper = (_read_number(limit, key, absent) for key in ("lower", "upper"))
-        if kind == "continuous":
-            lower, upper = -np.inf, np.inf
-        source = None
-        if mimic is not None:
-            factor, offset = _read_number(mimic, "multiplier", 1.0), _read_number(mimic, "offset", 0.0)
-            source = mimic.get("joint", ""), factor, offset
-        limits[joint.get("name", "")] = JointLimit(kind, lower, upper, velocity, source)
-    return limits
-
-
-def parse_xml(path: Path) -> ElementTree.Element:
-    """The root of an XML file; raises `BadModel` where it is none."""
-    try:
-        return ElementTree.parse(path).getroot()
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise BadModel(f"{path}: not valid XML: {error}") from error
-
-
-def _read_number(element: ElementTree.Element | None, key: str, absent: float) -> float:
-    try:
-        value = float(element.get(key, "nan")) if element is not None else np.nan
-    except ValueError:
-        value = np.nan
-    return absent if np.isnan(value) else value
-
 
 LAND_A, LAND_J = 0.7, 0.5  # share of acceleration and jerk used to land; the rest is a reserve for coming in too fast
 MAX_APPROACH_GAIN = 8.0  # [1/s] of the last approach of two shapes, whatever the joints' braking allows
+MAX_BRAKE_SHARE = 0.9  # of the range of joint velocities in a step, used at most to keep two shapes apart
 _BISECTIONS = 30
 _ROUNDING = 1e-9  # [rad or m, s] tolerance on a bound
+STOP_S = 0.06  # [s] time constant with which a low velocity decays; at a higher one joints brake at their limits
+STOP_RISES = 1.5  # least time constant, in times that a joint needs to reach its full acceleration
+STOP_SHARE = 0.02  # of the velocity that one step can brake: below it the velocity goes to zero at once
+STATIC_SPEED = 1e-9  # [rad/s or m/s] below it a joint is at rest
+MAX_STOP_S = 5.0  # [s]; a stop that takes longer counts as none
 
 
 @inlined
@@ -181,35 +124,87 @@ def compute_acceleration_bounds(u, v, a, lower, upper, v_max, a_max, j_max, dt, 
 
 
 @compiled
-def compute_separation_bounds(jacobian, distance, clearance, v, a, a_max, j_max, dt):  # type: ignore[no-untyped-def]
+def compute_separation_bounds(jacobian, distance, clearance, v, a, low, high, a_max, j_max, dt):  # type: ignore[no-untyped-def]
     """(m,) lowest rate [m/s] of distances half a step ahead, from which approaching shapes still stop in time.
 
     Bound 3 for several joints at once. It uses half of what all joints together can brake; the other half is a reserve
-    for their own limits. The change of the acceleration within the coming step is subtracted.
+    for their own limits. The change of the acceleration within the coming step is subtracted. What joints cannot brake
+    is not asked for; at rest it is enough not to approach.
 
     Parameters
     ----------
     jacobian : (m, n) of the distances [m/rad]
     distance, clearance : (m,) [m]
-    v, a, a_max, j_max : (n,)
+    v, a, low, high, a_max, j_max : (n,); `low` and `high` are the bounds of `compute_acceleration_bounds`
     """
     bounds = np.empty(len(distance))
+    static = not (v.any() or a.any())
     for k in range(len(distance)):
-        brake, jerk, closing, closing_a, ahead = 1e-9, 1e-9, 0.0, 0.0, 0.0
+        brake, jerk, closing, closing_a, ahead, most = 1e-9, 1e-9, 0.0, 0.0, 0.0, 0.0
         for j in range(len(v)):
-            g = jacobian[k, j]
+            g, v_mid = jacobian[k, j], v[j] + 0.5 * dt * a[j]
             brake += 0.5 * abs(g) * a_max[j]
             jerk += 0.5 * abs(g) * j_max[j]
-            closing -= g * (v[j] + 0.5 * dt * a[j])
+            closing -= g * v_mid
             closing_a -= g * a[j]
             ahead += g * (1.5 * v[j] + 0.5 * dt * a[j])
+            most += g * (v_mid + dt * (high[j] if g > 0.0 else low[j]))
+            most -= (1.0 - MAX_BRAKE_SHARE) * abs(g) * dt * (high[j] - low[j])
         room = distance[k] - clearance[k] + dt * ahead
         gain = min(0.5 * jerk / brake, 0.3 / dt, MAX_APPROACH_GAIN)
         knee = LAND_A * brake / gain**2
         slow = gain * room if room < knee else np.sqrt(2.0 * LAND_A * brake * (room - 0.5 * knee))
         excess = max(closing_a - jerk * dt + min(gain * max(closing, 0.0), LAND_A * brake), 0.0)
-        bounds[k] = 0.5 * excess**2 / (LAND_J * jerk) - slow
+        bounds[k] = min(0.5 * excess**2 / (LAND_J * jerk) - slow, most)
+        if static:
+            bounds[k] = min(bounds[k], 0.0)
     return bounds
+
+
+@compiled
+def compute_stop(u, v, a, lower, upper, v_max, a_max, j_max, dt):  # type: ignore[no-untyped-def]
+    """Return states (m, 3, n) from the present one to rest, and each joint's largest travel (m, n) in the step after.
+
+    A state is position, velocity and acceleration, here `u`, `v`, `a` (n,) [rad or m, s]. Each joint brakes as hard as
+    it can, within its limits if the present state keeps them in the sense of `compute_acceleration_bounds`. The last
+    state is not at rest where that takes longer than `MAX_STOP_S`.
+    """
+    n = len(u)
+    steps = int(MAX_STOP_S / dt)
+    states, travel, length = np.zeros((steps, 3, n)), np.zeros((steps, n)), 1
+    for j in range(n):
+        place, speed, accel, k = u[j], v[j], a[j], 0
+        states[0, 0, j], states[0, 1, j], states[0, 2, j] = place, speed, accel
+        j_step = j_max[j] * dt
+        fade = max(STOP_S, STOP_RISES * a_max[j] / j_max[j])
+        peak = abs(speed) + abs(accel) * (dt + 0.5 * abs(accel) / j_max[j])
+        far = peak * (2.0 * a_max[j] / j_max[j] + 2.0 * dt + fade) + 0.5 * peak * peak / a_max[j]
+        free = upper[j] - place > far and place - lower[j] > far  # no limit is near
+        while k + 1 < steps and (abs(speed) > STATIC_SPEED or abs(accel) > STATIC_SPEED / dt):
+            after = -speed / fade
+            if abs(speed) < STOP_SHARE * a_max[j] * dt:  # in two steps to zero
+                after = -speed / dt - 0.5 * accel
+            after = min(max(min(max(after, -a_max[j]), a_max[j]), accel - j_step), accel + j_step)
+            if not free:
+                up, down = upper[j] - place, place - lower[j]
+                fits = _keeps_bound(False, after, speed, accel, up, v_max[j], a_max[j], j_max[j], dt)
+                fits &= _keeps_bound(False, -after, -speed, -accel, down, v_max[j], a_max[j], j_max[j], dt)
+                if not fits:
+                    high, _ = _bound_acceleration(speed, accel, up, v_max[j], a_max[j], j_max[j], dt)
+                    low, _ = _bound_acceleration(-speed, -accel, down, v_max[j], a_max[j], j_max[j], dt)
+                    after = min(max(after, -low), high)
+            faster = max(abs(speed), abs(speed + 0.5 * dt * (accel + after)))
+            travel[k, j] = dt * (faster + 0.125 * dt * abs(after - accel))
+            place += dt * (speed + dt * (accel / 3.0 + after / 6.0))
+            speed += 0.5 * dt * (accel + after)
+            accel = after
+            k += 1
+            states[k, 0, j], states[k, 1, j], states[k, 2, j] = place, speed, accel
+        length = max(length, k + 1)
+        states[k:, 0, j] = place
+        if k + 1 < steps:  # below `STATIC_SPEED`
+            states[k, 1, j] = states[k, 2, j] = 0.0
+    return states[:length], travel[:length]
 
 
 def reduce_acceleration_limits(

@@ -1,8 +1,8 @@
-"""A robot's map (TOML): the links that are shoulder, elbow and hand, its mount, its limits."""
+"""A robot's map (TOML): the links that are shoulder, elbow and hand, its mount, its limits; and those of its URDF."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -12,8 +12,8 @@ import numpy as np
 from ..assets import asset
 from ..documents import TomlTable, is_number, read_toml
 from ..errors import BadModel, MissingFile, one_of
+from ..model import read_urdf
 from ..model.meshes import find_example_data
-from .limits import JointLimit, read_joint_limits
 
 ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1", "alex")
 SIDES = ("left", "right")
@@ -22,61 +22,52 @@ MAX_VALUE = 1e6  # of a number in a map
 RISE_S = 0.02  # [s] to the full acceleration, from which the jerk limit follows where the map has none
 
 
-class MapKey(NamedTuple):
-    """One key of a map, or all of one kind: JOINT and LINK stand for a name, SIDE for left or right."""
+class JointLimit(NamedTuple):
+    """Limits of one joint [rad or m, s]."""
 
-    unit: str  # or type
-    default: str  # what holds without it; empty: it is required
-    meaning: str
-
-
-KEYS = {
-    "format": MapKey("1", "", "version of the map's format"),
-    "urdf": MapKey("file", "", "beside the map, or a path in example-robot-data"),
-    "srdf": MapKey("file", "none", "`disable_collisions` are not checked, as pairs that collide at rest, or always"),
-    "description": MapKey("text", "none", "in the report and in `summary.json`"),
-    "base": MapKey("link", "the root", "`up`, `forward` and `table` are in its frame"),
-    "up": MapKey("axis", "", "of the base, points up: `+x`, `-x`, …, `-z`"),
-    "forward": MapKey("axis", "", "of the base, points where the person faces"),
-    "table": MapKey("m", "there is none", "height above the base's origin of the table on which it stands"),
-    "rest.JOINT": MapKey("rad or m", "0", "posture where the motion begins, and to which free joints tend"),
-    "limits.source": MapKey("text", "none", "where the limits are from"),
-    "limits.acceleration": MapKey("rad/s² or m/s²", "", "of all arm joints, or a table with one for each"),
-    "limits.jerk": MapKey("rad/s³ or m/s³", "the full acceleration in 20 ms", "the same"),
-    "limits.velocity": MapKey("rad/s or m/s", "the URDF's", "the same"),
-    "limits.position.JOINT": MapKey("rad or m", "the URDF's", "lower and upper limit"),
-    "collision.LINK.xyz": MapKey("m", "0, 0, 0", "origin of the link's collision shape, in place of the URDF's"),
-    "collision.LINK.rpy": MapKey("rad", "0, 0, 0", "its roll, pitch and yaw"),
-    "arms.SIDE.joints": MapKey("joints", "", "from the shoulder to the hand; all others stay at rest"),
-    "arms.SIDE.shoulder.link": MapKey("link", "", "the person's shoulder; does not move"),
-    "arms.SIDE.shoulder.offset": MapKey("m", "0, 0, 0", "in the link's frame"),
-    "arms.SIDE.elbow.link": MapKey("link", "the elbow is free", "the person's elbow"),
-    "arms.SIDE.elbow.offset": MapKey("m", "0, 0, 0", "in the link's frame"),
-    "arms.SIDE.hand.link": MapKey("link", "", "the person's palm"),
-    "arms.SIDE.hand.offset": MapKey("m", "0, 0, 0", "in the link's frame"),
-    "arms.SIDE.hand.fingers": MapKey("axis", "", "of the link, along the fingers"),
-    "arms.SIDE.hand.thumb": MapKey("axis", "", "of the link, to the thumb's side"),
-    "arms.SIDE.reach": MapKey("m", "95 % of what the joints allow", "what a straight arm becomes"),
-}  # of a map
+    kind: str  # "revolute", "continuous", "prismatic"
+    lower: float  # −inf for a continuous joint
+    upper: float
+    velocity: float
+    mimic: tuple[str, float, float] | None  # joint, multiplier, offset: value = multiplier * its value + offset
 
 
-def list_keys(table: str = "") -> tuple[str, ...]:
-    """Return the keys of one of a map's tables, such as ``arms.SIDE``; of the map itself without a name."""
-    prefix = f"{table}." if table else ""
-    inside = [name.removeprefix(prefix) for name in KEYS if name.startswith(prefix)]
-    return tuple(dict.fromkeys(name.partition(".")[0] for name in inside))
+def read_joint_limits(path: Path) -> dict[str, JointLimit]:
+    """Limits of every movable joint of a URDF; NaN where it has none.
+
+    Read without Pinocchio, so that a check against them shares no code with the controller.
+
+    Raises
+    ------
+    MissingFile, BadModel
+        Not there; not a URDF.
+    """
+    limits = {}
+    for joint in read_urdf(path).joints:
+        if joint.type not in ("revolute", "continuous", "prismatic"):
+            continue
+        limit, mimic = joint.limit, joint.mimic
+        if limit is None:
+            lower, upper, velocity = np.nan, np.nan, np.nan
+        else:  # an attribute that is left out is zero
+            lower, upper, velocity = limit.lower or 0.0, limit.upper or 0.0, limit.velocity or 0.0
+        if joint.type == "continuous":
+            lower, upper = -np.inf, np.inf
+        source = None if mimic is None else (mimic.joint, mimic.multiplier, mimic.offset)
+        limits[joint.name] = JointLimit(joint.type, lower, upper, velocity, source)
+    return limits
 
 
 class LinkPoint(NamedTuple):
     """A point of the robot, at `offset` [m] in the frame of a link."""
 
     link: str
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    offset: tuple[float, ...] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class ArmMap:
-    """One arm of the robot: the keys of ``arms.SIDE``, as `KEYS` has them."""
+    """One arm of the robot: the keys of ``arms.SIDE``."""
 
     joints: tuple[str, ...]
     shoulder: LinkPoint
@@ -95,7 +86,7 @@ class ArmMap:
 
 @dataclass(frozen=True)
 class RobotMap:
-    """What retargeting needs of a robot beyond its URDF: the keys of its map, as `KEYS` has them, and the map's file.
+    """What retargeting needs of a robot beyond its URDF: the keys of its map, as docs/robot-maps.md has them.
 
     `where` is the file's name, for error messages; `description` has the source of the limits too; `collision` is x, y,
     z [m], roll, pitch, yaw [rad] of a link's shape.
@@ -112,7 +103,7 @@ class RobotMap:
     acceleration: Mapping[str, float]
     jerk: Mapping[str, float]
     velocity: Mapping[str, float]
-    position: Mapping[str, tuple[float, float]]
+    position: Mapping[str, tuple[float, ...]]
     arms: Mapping[str, ArmMap]
     table: float | None = None
     description: str = ""
@@ -129,16 +120,17 @@ class RobotMap:
         limits = read_joint_limits(self.urdf)
         for key, values in (("velocity", self.velocity), ("position", self.position)):
             for name in values:
-                if name not in limits:
-                    raise BadModel(
-                        f"{self.where}: limits.{key}.{name}: no joint that moves in {self.urdf.name}; "
-                        f"{one_of(limits, name)}"
-                    )
+                self.check_name(f"limits.{key}", "moving joint", name, limits)
         for name, velocity in self.velocity.items():
             limits[name] = limits[name]._replace(velocity=velocity)
         for name, (lower, upper) in self.position.items():
             limits[name] = limits[name]._replace(lower=lower, upper=upper)
         return limits
+
+    def check_name(self, key: str, kind: str, name: str, known: Collection[str]) -> None:
+        """Raise `BadModel` where the link or joint that a key names is not among those of the URDF."""
+        if name not in known:
+            raise BadModel(f"{self.where}: {key}: no {kind} '{name}' in {self.urdf.name}; {one_of(known, name)}")
 
 
 def find_map(robot: str) -> RobotMap:
@@ -176,7 +168,10 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         As `find_map`.
     """
     top = TomlTable(read_toml(path, "a robot's map (docs/robot-maps.md)", BadModel), path.name, error=BadModel)
-    top.allow(*list_keys())
+    top.allow(
+        *("format", "urdf", "srdf", "description", "base", "up", "forward", "table"),
+        *("rest", "limits", "collision", "arms"),
+    )
     if top.values.get("format") != 1:
         raise BadModel(f"{top.at('format')} = {top.values.get('format')!r}; this version reads format = 1")
     up, forward = _read_axes(top, "up", "forward")
@@ -184,9 +179,8 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
     if not tables:
         raise BadModel(f"{top.at('arms')}: at least one of [arms.left] and [arms.right] is needed")
     arms = {side: _read_arm(tables[side]) for side in SIDES if side in tables}
-    limits = top.table("limits", {})
-    limits.allow(*list_keys("limits"))
-    origins = top.table("collision", {})
+    limits, origins = top.table("limits", {}), top.table("collision", {})
+    limits.allow("source", "acceleration", "jerk", "velocity", "position")
     joints = [name for arm in arms.values() for name in arm.joints]
     acceleration = _read_joint_values(limits, "acceleration", joints)
     jerk = {name: limit / RISE_S for name, limit in acceleration.items()}
@@ -238,25 +232,25 @@ def _read_text(table: TomlTable, key: str) -> str:
 
 
 def _read_arm(table: TomlTable) -> ArmMap:
-    table.allow(*list_keys("arms.SIDE"))
+    table.allow("joints", "shoulder", "elbow", "hand", "reach")
     joints = table.values.get("joints")
     if not isinstance(joints, list) or not joints or not all(isinstance(name, str) for name in joints):
         raise BadModel(f"{table.at('joints')} = {joints!r}; a list of joints from the shoulder to the hand is needed")
     fingers, thumb = _read_axes(table.table("hand"), "fingers", "thumb")
     return ArmMap(
         joints=tuple(joints),
-        shoulder=_read_point(table.table("shoulder"), "shoulder"),
-        elbow=_read_point(table.table("elbow"), "elbow") if "elbow" in table else None,
-        hand=_read_point(table.table("hand"), "hand"),
+        shoulder=_read_point(table.table("shoulder")),
+        elbow=_read_point(table.table("elbow")) if "elbow" in table else None,
+        hand=_read_point(table.table("hand"), "fingers", "thumb"),
         fingers=fingers,
         thumb=thumb,
         reach=table.number("reach", None, positive=True),
     )
 
 
-def _read_point(table: TomlTable, key: str) -> LinkPoint:
-    """A point of an arm."""
-    table.allow(*list_keys(f"arms.SIDE.{key}"))
+def _read_point(table: TomlTable, *axes: str) -> LinkPoint:
+    """A point of an arm, in a table that may also hold `axes`."""
+    table.allow("link", "offset", *axes)
     link = table.text("link", None)
     if link is None:
         raise BadModel(f"{table.at('link')} is missing; the name of a link is needed")
@@ -265,16 +259,21 @@ def _read_point(table: TomlTable, key: str) -> LinkPoint:
 
 def _read_origin(table: TomlTable) -> tuple[float, ...]:
     """x, y, z [m], roll, pitch, yaw [rad]."""
-    table.allow(*list_keys("collision.LINK"))
+    table.allow("xyz", "rpy")
     return (*_read_triple(table, "xyz", "metres"), *_read_triple(table, "rpy", "radians"))
 
 
-def _read_triple(table: TomlTable, key: str, unit: str) -> tuple[float, float, float]:
+def _read_triple(table: TomlTable, key: str, unit: str) -> tuple[float, ...]:
     """Three numbers; zeros where the key is missing."""
     value = table.values.get(key, [0.0, 0.0, 0.0])
-    if not isinstance(value, list) or len(value) != 3 or not all(is_number(number, MAX_VALUE) for number in value):
+    if not _is_list(value, 3):
         raise BadModel(f"{table.at(key)} = {value!r}; three numbers in {unit} are needed")
-    return float(value[0]), float(value[1]), float(value[2])
+    return tuple(map(float, value))
+
+
+def _is_list(value: object, size: int) -> bool:
+    """Whether a value is a list of so many numbers."""
+    return isinstance(value, list) and len(value) == size and all(is_number(number, MAX_VALUE) for number in value)
 
 
 def _read_axes(table: TomlTable, first: str, second: str) -> tuple[str, str]:
@@ -297,15 +296,12 @@ def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[s
     return _read_numbers(limits.table(key, {}))
 
 
-def _read_ranges(table: TomlTable) -> dict[str, tuple[float, float]]:
+def _read_ranges(table: TomlTable) -> dict[str, tuple[float, ...]]:
     """Joint → lower and upper limit."""
-    ranges = {}
     for name, value in table.values.items():
-        is_pair = isinstance(value, list) and len(value) == 2 and all(is_number(end, MAX_VALUE) for end in value)
-        if not is_pair or not value[0] < value[1]:
+        if not _is_list(value, 2) or not value[0] < value[1]:
             raise BadModel(f"{table.at(name)} = {value!r}; [lower, upper] in rad or m is needed, the first smaller")
-        ranges[name] = (float(value[0]), float(value[1]))
-    return ranges
+    return {name: tuple(map(float, value)) for name, value in table.values.items()}
 
 
 def _read_numbers(table: TomlTable) -> dict[str, float]:

@@ -13,12 +13,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from .collision import CollisionModel
-from .controller import ControllerParams, HandTarget, JointState, QpController, sample_hand_targets
+from .controller import ControllerParams, JointState, QpController
 from .robot import Robot
-from .targets import ArmTargets, HandPath, differentiate
+from .targets import ArmTargets, HandPath, HandTarget
 
 # [m] of a hand's position; its rotation counts as the tasks weigh it: 8 and 20 deg as much. Beyond the first a posture
 # to begin with is compared with others; beyond the second the arm leaves its path for another posture.
@@ -50,28 +51,20 @@ class PostureSearch:
     """Moves the robot as near to targets as joints and clearances allow, without limits of time."""
 
     def __init__(self, robot: Robot, collision: CollisionModel, params: ControllerParams) -> None:
-        params = replace(
-            params,
-            task_gain=40.0,
-            max_correction_deceleration=1e9,
-            joint_velocity_change=0.0,
-            posture=1e-5,
-            joint_velocity=1e-4,
-        )
+        weights = {"joint_velocity_change": 0.0, "posture": 1e-5, "joint_velocity": 1e-4}
+        params = replace(params, task_gain=40.0, max_correction_deceleration=1e9, **weights)
         self.controller = QpController(robot, collision, 0.01, params, limit_factor=1e4, guarded=False)
 
     def search(self, targets: tuple[HandTarget, ...], start: np.ndarray) -> Posture | None:
         """Return the posture that is found from `start` (n,); None where links are too near each other in it."""
-        targets = tuple(
-            target._replace(velocity=np.zeros(3), angular_velocity=np.zeros(3), weight=1.0) for target in targets
-        )
+        rest = np.zeros(3)
+        targets = tuple(target._replace(velocity=rest, angular_velocity=rest, weight=1.0) for target in targets)
         state = JointState.at_rest(start)
         for _ in range(SEARCH_STEPS):
             state = self.controller.step(state, targets)
         if not self.is_clear(state.position):
             return None
-        distance, cost = measure_errors(self.controller, targets)
-        return Posture(state.position, distance, cost)
+        return Posture(state.position, *measure_errors(self.controller, targets))
 
     def is_clear(self, position: np.ndarray) -> bool:
         """Whether all pairs of links keep their clearance at joint positions (n,)."""
@@ -82,13 +75,14 @@ class PostureSearch:
 
 def measure_errors(controller: QpController, targets: tuple[HandTarget, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return distance [m] and cost (arms,) of the hands against their targets, at the controller's joint positions."""
-    distance, cost = np.empty(len(targets)), np.empty(len(targets))
-    for i, target in enumerate(targets):
-        pose = controller.get_arm_pose(i)
-        distance[i] = np.linalg.norm(pose.hand - target.position)
-        angle = Rotation.from_matrix(pose.rotation.T @ target.rotation).magnitude()
-        cost[i] = controller.params.position * distance[i] ** 2 + controller.params.orientation * angle**2
-    return distance, cost
+    poses = [controller.get_arm_pose(i) for i in range(len(targets))]
+    distance, angle = np.array(
+        [
+            (np.linalg.norm(pose.hand - target.position), np.linalg.norm(pin.log3(pose.rotation.T @ target.rotation)))
+            for pose, target in zip(poses, targets, strict=True)
+        ]
+    ).T
+    return distance, _compute_cost(controller.params, distance, angle)
 
 
 def find_lost(
@@ -99,14 +93,8 @@ def find_lost(
     for target, at, turned in zip(targets, hand, rotation, strict=True):
         distance = np.linalg.norm(at - target.position, axis=1)
         angle = (Rotation.from_matrix(turned).inv() * Rotation.from_matrix(target.rotation)).magnitude()
-        cost = params.position * distance**2 + params.orientation * angle**2
-        lost.append((cost > limit_cost(params, error_m)) & is_certain(target))
+        lost.append((_compute_cost(params, distance, angle) > _limit_cost(params, error_m)) & _is_certain(target))
     return np.stack(lost, axis=1)
-
-
-def is_certain(target: HandPath) -> np.ndarray:
-    """Return (n,) bool: the target is measured, and not so uncertain that its error does not count."""
-    return np.asarray((target.weight >= MIN_WEIGHT) & ~target.lost)
 
 
 def find_lasting(lost: np.ndarray, samples: int) -> list[tuple[int, int]]:
@@ -115,17 +103,18 @@ def find_lasting(lost: np.ndarray, samples: int) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= samples]
 
 
-def limit_cost(params: ControllerParams, error_m: float) -> float:
+def _is_certain(target: HandPath) -> np.ndarray:
+    """Return (n,) bool: the target is measured, and not so uncertain that its error does not count."""
+    return np.asarray((target.weight >= MIN_WEIGHT) & ~target.lost)
+
+
+def _compute_cost(params: ControllerParams, distance: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    return params.position * distance**2 + params.orientation * angle**2
+
+
+def _limit_cost(params: ControllerParams, error_m: float) -> float:
     """Return the cost of a hand that is `error_m` off, or rotated by what the tasks weigh alike."""
     return error_m**2 * (params.position or 1.0)
-
-
-class PlannedMotion(NamedTuple):
-    """The targets and the joints' path to follow; while a hand's weight is 0 its arm changes its posture."""
-
-    motion: ArmTargets
-    path: np.ndarray  # (n, joints)
-    approach_samples: int
 
 
 class _Run(NamedTuple):
@@ -134,14 +123,6 @@ class _Run(NamedTuple):
     first: int  # that sample
     position: np.ndarray  # (m, joints)
     lost: np.ndarray  # (m, arms) bool: the hand is farther off than allowed
-
-
-class _Failure(NamedTuple):
-    """Samples of the motion, `begin` to `end`, in which arms are lost."""
-
-    begin: int
-    end: int
-    arms: np.ndarray  # (arms,) bool
 
 
 class _Part(NamedTuple):
@@ -169,65 +150,72 @@ class Planner:
     def __post_init__(self) -> None:
         self._robot, dt = self.controller.robot, self.controller.dt
         self._search = PostureSearch(self._robot, self.controller.collision, self.controller.params)
-        self._certain = np.stack([is_certain(hand) for hand in self.motion.hands], axis=1)
+        self._targets = [hand.compute_step_targets(dt) for hand in self.motion.hands]
+        self._certain = np.stack([_is_certain(hand) for hand in self.motion.hands], axis=1)
         self._lasting, self._horizon = round(LOST_S / dt), round(HORIZON_S / dt)
 
-    def plan(self, path: np.ndarray, hand: np.ndarray, rotation: np.ndarray) -> PlannedMotion:
-        """Return the motion and the joints' path to follow; those given where no change of posture helps.
+    def plan(self, path: np.ndarray, hand: np.ndarray, rotation: np.ndarray) -> tuple[ArmTargets, np.ndarray, int]:
+        """Return the motion, the joints' path to follow (n, joints), and the number of samples of the approach.
+
+        Those given where no change of posture helps. While an arm changes its posture, its hand's weight is 0.
 
         Parameters
         ----------
         path, hand, rotation : (n, joints), (arms, n, 3), (arms, n, 3, 3), as the controller followed the motion
         """
         n, begin, approach_samples = len(path), self.approach_samples, self.approach_samples
-        run = _Run(0, path, find_lost(self.controller.params, self.motion.hands, hand, rotation, BEGIN_LOST_M))
-        failure = self._find_failure(run, begin)
-        if failure is None:
-            return PlannedMotion(self.motion, path, approach_samples)
+        lost = [find_lost(self.controller.params, self.motion.hands, hand, rotation, m) for m in (BEGIN_LOST_M, LOST_M)]
+        everywhere = np.ones(len(self._robot.arms), dtype=bool)
         parts: list[_Part] = []
-        change = self._choose(begin, self._robot.rest, failure.arms, run.lost[begin:], BEGIN_LOST_M)
-        if change is not None:  # another posture to begin with
-            parts.append(_Part(np.full(len(change), begin), change, np.ones_like(failure.arms)))
-            run, approach_samples = self._follow(change[-1], begin, n), len(change)
-        else:
-            run = _Run(0, path, find_lost(self.controller.params, self.motion.hands, hand, rotation, LOST_M))
-        while (failure := self._find_failure(run, begin)) is not None:
-            at = failure.begin - run.first
-            change = self._choose(failure.begin, run.position[at], failure.arms, run.lost[at:][: self._horizon])
-            begin = failure.end
+        run = _Run(0, path, lost[1])
+        failure = self._find_failure(_Run(0, path, lost[0]), begin)
+        if failure is not None:  # another posture to begin with
+            change = self._choose(begin, self._robot.rest, failure[2], lost[0][begin:], BEGIN_LOST_M)
             if change is not None:
-                parts.append(_Part(np.arange(run.first, failure.begin), run.position[:at], np.zeros_like(failure.arms)))
-                parts.append(_Part(np.full(len(change), failure.begin), change, failure.arms))
-                run, begin = self._follow(change[-1], failure.begin, n), failure.begin
+                parts.append(_Part(np.full(len(change), begin), change, everywhere))
+                run, approach_samples = self._follow(change[-1], begin, n), len(change)
+        while (failure := self._find_failure(run, begin)) is not None:
+            first, last, arms = failure
+            at = first - run.first
+            change = self._choose(first, run.position[at], arms, run.lost[at:][: self._horizon])
+            begin = last
+            if change is not None:
+                parts.append(_Part(np.arange(run.first, first), run.position[:at], ~everywhere))
+                parts.append(_Part(np.full(len(change), first), change, arms))
+                run, begin = self._follow(change[-1], first, n), first
         if not parts:
-            return PlannedMotion(self.motion, path, approach_samples)
-        parts.append(_Part(np.arange(run.first, n), run.position, np.zeros(len(self._robot.arms), dtype=bool)))
-        path = np.concatenate([part.position for part in parts])
-        return PlannedMotion(self._rearrange_motion(parts), path, approach_samples)
+            return self.motion, path, approach_samples
+        parts.append(_Part(np.arange(run.first, n), run.position, ~everywhere))
+        motion = self.motion.select(np.concatenate([part.samples for part in parts]), self.controller.dt)
+        changing = np.concatenate([np.tile(part.changing, (len(part.samples), 1)) for part in parts])
+        hands = tuple(
+            path._replace(weight=np.where(changing[:, i], 0.0, path.weight)) for i, path in enumerate(motion.hands)
+        )
+        return replace(motion, hands=hands), np.concatenate([part.position for part in parts]), approach_samples
 
     def _follow(
         self, position: np.ndarray, begin: int, end: int, error_m: float = LOST_M, most: float = np.inf
     ) -> _Run:
         """Follow the motion from rest at `position` (n,), from sample `begin` to `end`, or until `most` are lost."""
         state, positions, lost = JointState.at_rest(position), [], []
+        limit = _limit_cost(self.controller.params, error_m)
         for k in range(begin, end):
             positions.append(state.position)
-            targets = sample_hand_targets(self.motion.hands, k, self.controller.dt)
+            targets = tuple(target.sample(k) for target in self._targets)
             state = self.controller.step(state, targets)
-            _, cost = measure_errors(self.controller, targets)
-            lost.append((cost > limit_cost(self.controller.params, error_m)) & self._certain[k])
+            lost.append((measure_errors(self.controller, targets)[1] > limit) & self._certain[k])
             most -= lost[-1].any()
             if most < 0:
                 break
         return _Run(begin, np.array(positions), np.array(lost))
 
-    def _find_failure(self, run: _Run, begin: int) -> _Failure | None:
-        """Return the first time from sample `begin` on in which an arm is lost for `LOST_S`."""
+    def _find_failure(self, run: _Run, begin: int) -> tuple[int, int, np.ndarray] | None:
+        """Return the first samples from `begin` on in which an arm is lost for `LOST_S`, and which arms are (arms,)."""
         spans = [span for lost in run.lost.T for span in find_lasting(lost[begin - run.first :], self._lasting)]
         if not spans:
             return None
         first, last = (begin + k for k in min(spans))
-        return _Failure(first, last, np.any(run.lost[first - run.first : last - run.first], axis=0))
+        return first, last, np.any(run.lost[first - run.first : last - run.first], axis=0)
 
     def _choose(
         self, k: int, start: np.ndarray, arms: np.ndarray, lost: np.ndarray, error_m: float = LOST_M
@@ -254,9 +242,9 @@ class Planner:
 
     def _find_postures(self, k: int, start: np.ndarray, arms: np.ndarray) -> list[np.ndarray]:
         """Return postures that reach the targets of sample `k`; only the joints of `arms` may differ much."""
-        robot, targets = self._robot, sample_hand_targets(self.motion.hands, k, self.controller.dt)
+        robot, targets = self._robot, tuple(target.sample(k) for target in self._targets)
         joints = np.concatenate([arm.joints for arm, moves in zip(robot.arms, arms, strict=True) if moves])
-        rng, limit = np.random.default_rng(0), limit_cost(self.controller.params, REACHED_M)
+        rng, limit = np.random.default_rng(0), _limit_cost(self.controller.params, REACHED_M)
         starts = np.tile(start, (RANDOM_STARTS + 3, 1))
         others = [robot.rest, self._unwind(start), *rng.uniform(*robot.bounds, (RANDOM_STARTS, len(start)))]
         starts[1:, joints] = np.array(others)[:, joints]
@@ -279,13 +267,11 @@ class Planner:
 
     def _find_way(self, start: np.ndarray, end: np.ndarray) -> np.ndarray | None:
         """Return positions (m, joints) on the way, in a straight line or over the rest posture; None: links meet."""
+        shares = np.linspace(0.0, 1.0, CHANGE_CHECKS)[1:]
         for stops in ((start, end), (start, self._robot.rest, end)):
-            if all(self._is_clear(a, b) for a, b in pairwise(stops)):
+            if all(self._search.is_clear(a + x * (b - a)) for a, b in pairwise(stops) for x in shares):
                 return np.concatenate([self._interpolate(a, b) for a, b in pairwise(stops)])
         return None
-
-    def _is_clear(self, start: np.ndarray, end: np.ndarray) -> bool:
-        return all(self._search.is_clear(start + x * (end - start)) for x in np.linspace(0.0, 1.0, CHANGE_CHECKS)[1:])
 
     def _interpolate(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Return positions (m, joints) from rest to rest."""
@@ -295,15 +281,3 @@ class Planner:
         steps = max(1, round(float(np.maximum(by_velocity, by_acceleration).max()) / dt))
         x = np.minimum(np.arange(steps + round(CHANGE_REST_S / dt)) / steps, 1.0)[:, None]
         return start + x**3 * (10.0 - 15.0 * x + 6.0 * x**2) * (end - start)
-
-    def _rearrange_motion(self, parts: list[_Part]) -> ArmTargets:
-        """Return the motion of the parts; the targets rest while an arm changes its posture, and its weight is 0."""
-        samples = np.concatenate([part.samples for part in parts])
-        hands = []
-        for i, hand in enumerate(self.motion.hands):
-            changing = np.concatenate([np.full(len(part.samples), part.changing[i]) for part in parts])
-            path = HandPath(*(values[samples] for values in hand))
-            path = path._replace(weight=np.where(changing, 0.0, path.weight))
-            hands.append(differentiate(path, np.arange(len(samples)) * self.controller.dt))
-        motion = self.motion
-        return replace(motion, time=motion.time[samples], hands=tuple(hands), slowdown=motion.slowdown[samples])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import coal
 import numpy as np
@@ -13,8 +13,7 @@ from scipy.optimize import minimize
 
 from ..errors import BadModel, WrongOption, native_stderr_muted, one_of
 from ..model.meshes import package_folders
-from .limits import JointLimit
-from .maps import AXES, ArmMap, LinkPoint, RobotMap
+from .maps import AXES, ArmMap, JointLimit, LinkPoint, RobotMap
 
 MIN_LIMIT_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
 MAX_SPEED_SCALE = 0.999  # of velocity, acceleration and jerk limits, for the same reason
@@ -46,11 +45,6 @@ class LimitMargins:
         if not 0.0 <= self.limit_margin < np.pi:
             raise WrongOption("limit-margin", f"{self.limit_margin:g}", "radians, at least 0, are needed")
 
-    def find_position_margin(self, limit: JointLimit) -> float:
-        """[rad or m] to the position limits of a joint."""
-        scale = SLIDE_M_PER_RAD if limit.kind == "prismatic" else 1.0
-        return max(scale * self.limit_margin, MIN_LIMIT_MARGIN)
-
 
 @dataclass(frozen=True)
 class Arm:
@@ -74,13 +68,12 @@ class Arm:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot as the controller needs it: values `u` (n,) of the independent joints, in the order of `names`.
+    """A robot as the controller needs it: values `u` (n,) of the joints of its arms, in the order of `names`.
 
     Parameters
     ----------
     full, model : Pinocchio's model of the whole robot, and of its arms' joints only
     geometry : collision geometry on `model`
-    coupling, offset : joints of `model` = coupling @ u + offset; a joint that mimics another has a row of its own
     lower, upper, v_max, a_max, j_max : (n,) limits [rad or m, s], inside those of URDF and map by `margins`
     rest, rest_full : (n,) rest posture, and as a configuration of `full`
     R_BT : maps coordinates in the person's torso to B
@@ -91,8 +84,6 @@ class Robot:
     full: Any
     model: Any
     geometry: Any
-    coupling: np.ndarray
-    offset: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
     v_max: np.ndarray
@@ -105,13 +96,12 @@ class Robot:
     margins: LimitMargins
 
     def configuration(self, u: np.ndarray) -> np.ndarray:
-        """Pinocchio's configuration `q` of `model`."""
-        values = self.coupling @ u + self.offset
+        """Pinocchio's configuration `q` of `model`: a continuous joint has cosine and sine there."""
         if self.model.nq == self.model.nv:
-            return values
+            return u
         q = pin.neutral(self.model)
-        for k, (first, size) in enumerate(self._slots):
-            q[first : first + size] = values[k] if size == 1 else (np.cos(values[k]), np.sin(values[k]))
+        for value, (first, size) in zip(u, self._slots, strict=True):
+            q[first : first + size] = value if size == 1 else (np.cos(value), np.sin(value))
         return q
 
     @cached_property
@@ -143,71 +133,42 @@ def load_robot(robot: RobotMap, sides: tuple[str, ...] | None = None, margins: L
     limits = robot.read_joint_limits()
     try:
         with native_stderr_muted():  # urdfdom repeats the exception's text
-            full = _distinguish_frames(pin.buildModelFromUrdf(str(robot.urdf)))
+            full = pin.buildModelFromUrdf(str(robot.urdf))
     except Exception as error:  # what C++ throws
         raise BadModel(f"{robot.urdf}: Pinocchio cannot build it: {_first_line(error)}") from error
-    joints = [name for arm in maps.values() for name in arm.joints]
+    links = {frame.name for frame in full.frames if frame.type == pin.FrameType.BODY}
+    for frame in full.frames:  # Pinocchio finds frames by name, and a fixed joint may have that of a link
+        if frame.type == pin.FrameType.FIXED_JOINT and frame.name in links:
+            frame.name = f"{frame.name} (fixed joint)"
     _check_map(robot, maps, full, limits)
-    rest_full = _rest_configuration(robot, full, limits)
-    R_BT = _torso_rotation(robot, full, rest_full)
+    rest_full = _build_rest_configuration(robot, full, limits)
+    base = _find_base(robot, full, rest_full)
+    R_BT = np.asarray(base.rotation @ _build_rotation(AXES[robot.forward], AXES[robot.up]))
     geometry = _load_collision_geometry(robot, full)
-    if robot.table is not None:
-        geometry.addGeometryObject(_build_table(robot, full, rest_full, R_BT))
-    moving = [name for name in full.names[1:] if name in joints or _mimics_any(limits[name], joints)]
-    locked = [full.getJointId(name) for name in full.names[1:] if name not in moving]
+    if robot.table is not None:  # a box whose upper side is so far above the base's origin
+        below = pin.SE3(np.eye(3), np.array([0.0, 0.0, robot.table - 0.5 * TABLE_SIZE[2]]))
+        box = coal.Box(*TABLE_SIZE)
+        geometry.addGeometryObject(pin.GeometryObject(TABLE_NAME, 0, 0, pin.SE3(R_BT, base.translation) * below, box))
+    joints = {name for arm in maps.values() for name in arm.joints}
+    locked = [full.getJointId(name) for name in full.names[1:] if name not in joints]
     model, geometry = pin.buildReducedModel(full, geometry, locked, rest_full)
-    names = [name for name in model.names[1:] if name in joints and not _mimics_any(limits[name], joints)]
-    coupled = _couple_joints(list(model.names[1:]), names, limits, margins)
+    names = tuple(model.names[1:])
+    lower, upper = np.array([_narrow_range(name, limits[name], margins) for name in names]).T
     scale = min(margins.speed_scale, MAX_SPEED_SCALE)
-    a_max, j_max = (scale * np.array([values[name] for name in names]) for values in (robot.acceleration, robot.jerk))
-    built = Robot(
-        map=robot,
-        names=tuple(names),
-        full=full,
-        model=model,
-        geometry=geometry,
-        coupling=coupled.coupling,
-        offset=coupled.offset,
-        lower=coupled.lower,
-        upper=coupled.upper,
-        v_max=scale * coupled.velocity,
-        a_max=a_max,
-        j_max=j_max,
-        rest=np.clip(
-            [robot.rest.get(name, 0.0) for name in names], coupled.lower + REST_MARGIN, coupled.upper - REST_MARGIN
-        ),
-        rest_full=rest_full,
-        R_BT=R_BT,
-        arms=(),
-        margins=margins,
+    velocity = {name: limits[name].velocity for name in names}
+    v_max, a_max, j_max = (
+        scale * np.array([values[name] for name in names]) for values in (velocity, robot.acceleration, robot.jerk)
     )
-    _check_table(built)
+    rest = np.clip([robot.rest.get(name, 0.0) for name in names], lower + REST_MARGIN, upper - REST_MARGIN)
+    built = Robot(
+        robot, names, full, model, geometry, lower, upper, v_max, a_max, j_max, rest, rest_full, R_BT, (), margins
+    )  # fmt: skip
     return replace(built, arms=tuple(_build_arm(built, side, arm) for side, arm in maps.items()))
 
 
-def _distinguish_frames(model: pin.Model) -> pin.Model:
-    """The model with other names for fixed joints that have the name of a link: Pinocchio finds frames by name."""
-    links = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
-    for frame in model.frames:
-        if frame.type == pin.FrameType.FIXED_JOINT and frame.name in links:
-            frame.name = f"{frame.name} (fixed joint)"
-    return model
-
-
-def _build_arm(robot: Robot, side: str, arm: ArmMap) -> Arm:
-    """An arm, whose points become frames of the robot's model."""
-    model = robot.model
-    shoulder = _add_frame(model, arm.shoulder, f"shoulder {side}")
-    hand = _add_frame(model, arm.hand, f"hand {side}", _hand_rotation(arm))
-    elbow = _add_frame(model, arm.elbow, f"elbow {side}") if arm.elbow else -1
-    joints = np.array([robot.names.index(name) for name in arm.joints if name in robot.names])
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, robot.configuration(robot.rest))
-    p_shoulder = data.oMf[shoulder].translation.copy()
-    built = Arm(side, joints, p_shoulder, hand, elbow, _find_reach(robot, joints, p_shoulder, hand))
-    if any(name in robot.map.rest for name in arm.joints):
-        _check_rest(robot, built, data.oMf[hand].translation)
-    return built
+def find_link(model: Any, name: str) -> Any:
+    """The frame of a link."""
+    return model.frames[model.getFrameId(name)]
 
 
 def _first_line(error: Exception) -> str:
@@ -217,36 +178,25 @@ def _first_line(error: Exception) -> str:
 def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict[str, JointLimit]) -> None:
     """Raise `BadModel` for a link or joint that the URDF lacks, and for a joint without limits."""
     links = [frame.name for frame in full.frames if frame.type == pin.FrameType.BODY]
-    joints = [name for arm in arms.values() for name in arm.joints]
     for side, arm in arms.items():
-        where = f"{robot.where}: arms.{side}"
+        where = f"arms.{side}.joints"
         for key, point in arm.points.items():
-            if point.link not in links:
-                raise BadModel(
-                    f"{where}.{key}: no link '{point.link}' in {robot.urdf.name}; {one_of(links, point.link)}"
-                )
+            robot.check_name(f"arms.{side}.{key}", "link", point.link, links)
         for name in arm.joints:
-            if name not in limits:
+            robot.check_name(where, "moving joint", name, limits)
+            if problem := _find_joint_problem(full, name, arm.hand.link, limits):
                 raise BadModel(
-                    f"{where}.joints: no joint '{name}' that moves in {robot.urdf.name}; {one_of(limits, name)}"
+                    f"{robot.where}: {where}: '{name}' is no joint of the arm: it {problem}; leave it out, it stays "
+                    "where `rest` has it"
                 )
-            problem = _find_joint_problem(full, name, arm.hand.link, limits)
-            if problem:
-                raise BadModel(
-                    f"{where}.joints: '{name}' is no joint of the arm: it {problem}; leave it out, it stays where "
-                    f"`rest` has it"
-                )
-            _check_limits(robot, name, limits[name], _mimics_any(limits[name], joints))
+            _check_limits(robot, name, limits[name])
     for name in robot.rest:
-        if name not in limits:
-            raise BadModel(
-                f"{robot.where}: rest.{name}: no joint that moves in {robot.urdf.name}; {one_of(limits, name)}"
-            )
-    if robot.base and robot.base not in links:
-        raise BadModel(f"{robot.where}: base: no link '{robot.base}' in {robot.urdf.name}; {one_of(links, robot.base)}")
+        robot.check_name("rest", "moving joint", name, limits)
+    if robot.base:
+        robot.check_name("base", "link", robot.base, links)
 
 
-def _check_limits(robot: RobotMap, name: str, limit: JointLimit, mimics: bool) -> None:
+def _check_limits(robot: RobotMap, name: str, limit: JointLimit) -> None:
     """Raise `BadModel` where the URDF or the map lacks a limit of a joint."""
     if limit.kind != "continuous" and not limit.lower < limit.upper:
         raise BadModel(
@@ -258,8 +208,6 @@ def _check_limits(robot: RobotMap, name: str, limit: JointLimit, mimics: bool) -
             f"{robot.urdf}: joint '{name}' has no velocity limit ({limit.velocity:g}); write <limit velocity=\"…\"/>, "
             "or limits.velocity in the map"
         )
-    if mimics:
-        return
     for key, values, unit in (("acceleration", robot.acceleration, "rad/s²"), ("jerk", robot.jerk, "rad/s³")):
         value = values.get(name)
         if value is None or not value > 0.0:
@@ -271,46 +219,22 @@ def _check_limits(robot: RobotMap, name: str, limit: JointLimit, mimics: bool) -
 
 
 def _find_joint_problem(full: Any, name: str, hand: str, limits: dict[str, JointLimit]) -> str:
-    """Why a joint is not between the root and the hand's link; empty where it is."""
-    joint = full.getJointId(name)
-    chain = [full.frames[full.getFrameId(hand)].parentJoint]
+    """Why a joint cannot be one of the arm; empty where it can."""
+    joint, chain = full.getJointId(name), [find_link(full, hand).parentJoint]
     while chain[-1] > 0:
         chain.append(full.parents[chain[-1]])
     if joint not in chain:
         return f"does not move the hand's link '{hand}'"
-    for other in full.names[1:]:
-        if other in limits and _mimics_any(limits[other], [name]) and full.getJointId(other) not in chain:
-            return f"is copied by '{other}', which does not move the hand, as a gripper's fingers are"
-    siblings = [k for k in range(1, full.njoints) if k != joint and full.parents[k] == full.parents[joint]]
-    slides = [full.joints[k].shortname().startswith("JointModelP") for k in (joint, *siblings)]
-    if slides[0] and any(slides[1:]):
-        return f"slides beside '{full.names[siblings[slides.index(True, 1) - 1]]}' as a gripper's fingers do"
+    for other, limit in limits.items():
+        if limit.mimic is not None and name in (other, limit.mimic[0]):
+            return f"copies '{limit.mimic[0]}'" if other == name else f"is copied by '{other}', as a gripper's are"
     return ""
 
 
-def _check_rest(robot: Robot, arm: Arm, hand: np.ndarray) -> None:
-    """Raise `BadModel` where the hand, at `hand` (3,) [m] in B, is neither below nor ahead in the rest posture."""
-    offset = robot.R_BT.T @ (hand - arm.shoulder)
-    angle = np.degrees(np.arccos((offset[0] - offset[2]) / np.sqrt(2.0) / max(np.linalg.norm(offset), 1e-9)))
-    if angle > MAX_REST_ANGLE_DEG:
-        x, y, z = offset
-        raise BadModel(
-            f"{robot.map.where}: rest: the {arm.side} hand is {x:+.2f} m ahead of its shoulder, {y:+.2f} m to the left "
-            f"and {z:+.2f} m up, with base, up and forward as they are: {angle:.0f} deg off ahead and below, at most "
-            f"{MAX_REST_ANGLE_DEG:g}; give a rest for this mount, the arm hanging, the forearm ahead, or none"
-        )
-
-
-def _mimics_any(limit: JointLimit, joints: list[str]) -> bool:
-    return limit.mimic is not None and limit.mimic[0] in joints
-
-
-def _rest_configuration(robot: RobotMap, full: Any, limits: dict[str, JointLimit]) -> np.ndarray:
+def _build_rest_configuration(robot: RobotMap, full: Any, limits: dict[str, JointLimit]) -> np.ndarray:
     q = pin.neutral(full)
-    for name in full.names[1:]:
-        joint = full.getJointId(name)
-        value = robot.rest.get(name, 0.0)
-        limit = limits.get(name)
+    for joint, name in enumerate(full.names):
+        limit, value = limits.get(name), robot.rest.get(name, 0.0)
         if limit is None or full.nvs[joint] != 1:
             continue
         if limit.mimic is not None:
@@ -334,85 +258,27 @@ def _load_collision_geometry(robot: RobotMap, full: Any) -> Any:
         )
     except Exception as error:  # what C++ throws
         raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {_first_line(error)}") from error
-    names = [shape.name for shape in geometry.geometryObjects]
     for link, (x, y, z, *rpy) in robot.collision.items():
-        own = [k for k, name in enumerate(names) if name.rpartition("_")[0] == link]
+        own = [shape for shape in geometry.geometryObjects if shape.name.rpartition("_")[0] == link]
         if len(own) != 1:
             raise BadModel(
                 f"{robot.where}: collision.{link}: the link has {len(own)} collision shapes in {robot.urdf.name}, "
                 "one is needed"
             )
-        placement = full.frames[full.getFrameId(link)].placement
-        geometry.geometryObjects[own[0]].placement = placement * pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
+        origin = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
+        own[0].placement = find_link(full, link).placement * origin
     return geometry
 
 
-class _CoupledJoints(NamedTuple):
-    """`Robot.coupling` and `.offset`, and the independent joints' limits, which keep those of joints that mimic."""
-
-    coupling: np.ndarray
-    offset: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    velocity: np.ndarray
-
-
-def _couple_joints(
-    names: list[str], independent: list[str], limits: dict[str, JointLimit], margins: LimitMargins
-) -> _CoupledJoints:
-    n = len(independent)
-    coupling, offset = np.zeros((len(names), n)), np.zeros(len(names))
-    lower, upper, velocity = np.full(n, -np.inf), np.full(n, np.inf), np.full(n, np.inf)
-    for k, name in enumerate(names):
-        limit, factor, j = limits[name], 1.0, 0
-        if name not in independent and limit.mimic is not None:
-            source, factor, offset[k] = limit.mimic
-            j = independent.index(source)
-        else:
-            j = independent.index(name)
-        coupling[k, j] = factor
-        if factor == 0.0:
-            continue
-        margin = margins.find_position_margin(limit)
-        ends = [(value - offset[k]) / factor for value in (limit.lower + margin, limit.upper - margin)]
-        ends = ends if factor > 0.0 else ends[::-1]
-        lower[j], upper[j] = max(lower[j], ends[0]), min(upper[j], ends[1])
-        if upper[j] - lower[j] < 2.0 * REST_MARGIN:
-            raise WrongOption(
-                "limit-margin",
-                f"{margins.limit_margin:g}",
-                f"joint '{name}' moves from {limit.lower:g} to {limit.upper:g} only",
-            )
-        if limit.velocity > 0.0:
-            velocity[j] = min(velocity[j], limit.velocity / abs(factor))
-    return _CoupledJoints(coupling, offset, lower, upper, velocity)
-
-
-def _build_table(robot: RobotMap, full: Any, rest_full: np.ndarray, R_BT: np.ndarray) -> Any:
-    """A box whose upper side is `RobotMap.table` above the base's origin."""
-    placement = pin.SE3(R_BT, _find_base(robot, full, rest_full).translation)
-    below = pin.SE3(np.eye(3), np.array([0.0, 0.0, float(robot.table or 0.0) - 0.5 * TABLE_SIZE[2]]))
-    return pin.GeometryObject(TABLE_NAME, 0, 0, placement * below, coal.Box(*TABLE_SIZE))
-
-
-def _check_table(robot: Robot) -> None:
-    """Raise `BadModel` where a part that moves is in the table in the rest posture."""
-    if robot.map.table is None:
-        return
-    shapes = pin.GeometryModel(robot.geometry)
-    table = shapes.getGeometryId(TABLE_NAME)
-    moving = [k for k, shape in enumerate(shapes.geometryObjects) if shape.parentJoint > 0]
-    for k in moving:
-        shapes.addCollisionPair(pin.CollisionPair(k, table))
-    data = shapes.createData()
-    pin.computeCollisions(robot.model, robot.model.createData(), shapes, data, robot.configuration(robot.rest), False)
-    for k, result in zip(moving, data.collisionResults, strict=True):
-        if result.isCollision():
-            name = shapes.geometryObjects[k].name
-            raise BadModel(
-                f"{robot.map.where}: rest, table: {name} is in the table in the rest posture; "
-                "give a rest above it, or another table"
-            )
+def _narrow_range(name: str, limit: JointLimit, margins: LimitMargins) -> tuple[float, float]:
+    """The position limits of a joint, less its margins [rad or m]."""
+    scale = SLIDE_M_PER_RAD if limit.kind == "prismatic" else 1.0
+    margin = max(scale * margins.limit_margin, MIN_LIMIT_MARGIN)
+    lower, upper = limit.lower + margin, limit.upper - margin
+    if upper - lower < 2.0 * REST_MARGIN:
+        text = f"joint '{name}' moves from {limit.lower:g} to {limit.upper:g} only"
+        raise WrongOption("limit-margin", f"{margins.limit_margin:g}", text)
+    return lower, upper
 
 
 def _find_base(robot: RobotMap, full: Any, rest_full: np.ndarray) -> Any:
@@ -424,41 +290,58 @@ def _find_base(robot: RobotMap, full: Any, rest_full: np.ndarray) -> Any:
     return data.oMf[full.getFrameId(robot.base)]
 
 
-def _torso_rotation(robot: RobotMap, full: Any, rest_full: np.ndarray) -> np.ndarray:
-    """R_BT."""
-    return np.asarray(_find_base(robot, full, rest_full).rotation @ _rotation_of(AXES[robot.forward], AXES[robot.up]))
+def _build_arm(robot: Robot, side: str, arm: ArmMap) -> Arm:
+    """An arm, whose points become frames of the robot's model."""
+    model = robot.model
+    shoulder = _add_frame(model, arm.shoulder, f"shoulder {side}")
+    # The hand's frame as a person's: x to the side of the thumb and -z along the fingers.
+    hand = _add_frame(model, arm.hand, f"hand {side}", _build_rotation(AXES[arm.thumb], -AXES[arm.fingers]))
+    elbow = _add_frame(model, arm.elbow, f"elbow {side}") if arm.elbow else -1
+    joints = np.array([robot.names.index(name) for name in arm.joints])
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, robot.configuration(robot.rest))
+    p_shoulder = data.oMf[shoulder].translation.copy()
+    if any(name in robot.map.rest for name in arm.joints):
+        _check_rest(robot, side, robot.R_BT.T @ (data.oMf[hand].translation - p_shoulder))
+    return Arm(side, joints, p_shoulder, hand, elbow, _find_reach(robot, joints, p_shoulder, hand))
 
 
-def _hand_rotation(arm: ArmMap) -> np.ndarray:
-    """R_LH: the hand's frame as a person's, x to the side of the thumb and -z along the fingers."""
-    return _rotation_of(AXES[arm.thumb], -AXES[arm.fingers])
-
-
-def _rotation_of(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+def _build_rotation(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     """The rotation with these first and third columns."""
     return np.column_stack([x, np.cross(z, x), z])
 
 
 def _add_frame(model: Any, point: LinkPoint, name: str, R: np.ndarray | None = None) -> int:
-    link = model.frames[model.getFrameId(point.link)]
+    link = find_link(model, point.link)
     placement = link.placement * pin.SE3(np.eye(3) if R is None else R, np.array(point.offset))
     return int(model.addFrame(pin.Frame(f"wepose_{name}", link.parentJoint, placement, pin.FrameType.OP_FRAME)))
 
 
+def _check_rest(robot: Robot, side: str, offset: np.ndarray) -> None:
+    """Raise `BadModel` where the hand, `offset` (3,) [m] from its shoulder in T, is neither below nor ahead at rest."""
+    x, y, z = offset
+    angle = np.degrees(np.arccos((x - z) / np.sqrt(2.0) / max(np.linalg.norm(offset), 1e-9)))
+    if angle > MAX_REST_ANGLE_DEG:
+        raise BadModel(
+            f"{robot.map.where}: rest: the {side} hand is {x:+.2f} m ahead of its shoulder, {y:+.2f} m to the left "
+            f"and {z:+.2f} m up, with base, up and forward as they are: {angle:.0f} deg off ahead and below, at most "
+            f"{MAX_REST_ANGLE_DEG:g}; give a rest for this mount, the arm hanging, the forearm ahead, or none"
+        )
+
+
 def _find_reach(robot: Robot, joints: np.ndarray, shoulder: np.ndarray, hand: int) -> float:
     """[m] largest of several local maxima from random postures: joint limits may keep an arm from being straight."""
-    rng, data = np.random.default_rng(0), robot.model.createData()
+    rng, data, u = np.random.default_rng(0), robot.model.createData(), robot.rest.copy()
     low, high = (limit[joints] for limit in robot.bounds)
-    u = robot.rest.copy()
 
-    def distance(values: np.ndarray) -> tuple[float, np.ndarray]:
+    def compute_distance(values: np.ndarray) -> tuple[float, np.ndarray]:
         u[joints] = values
         pin.computeJointJacobians(robot.model, data, robot.configuration(u))
         p = pin.updateFramePlacement(robot.model, data, hand).translation - shoulder
         far = float(np.linalg.norm(p))
         J = pin.getFrameJacobian(robot.model, data, hand, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:3]
-        return -far, -(p / far) @ J @ robot.coupling[:, joints]
+        return -far, -(p / far) @ J[:, joints]
 
     starts = rng.uniform(low, high, (_REACH_STARTS, len(joints)))
     bounds = list(zip(low, high, strict=True))
-    return -min(float(minimize(distance, x, jac=True, bounds=bounds, method="L-BFGS-B").fun) for x in starts)
+    return -min(float(minimize(compute_distance, x, jac=True, bounds=bounds, method="L-BFGS-B").fun) for x in starts)

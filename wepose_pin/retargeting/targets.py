@@ -14,7 +14,6 @@ from ..errors import BadData, WrongOption
 from ..filters.butterworth import low_pass
 from ..kinematics import Pose, compute_axis_std
 from ..model import BodyTable, Limb, load_table
-from .maps import SIDES
 from .robot import Arm, Robot
 
 REACH_SHARE = 0.95  # of the robot's reach for a straight arm: its elbow stays flexed, far from the singularity
@@ -30,17 +29,50 @@ JUMP_S = 0.25  # [s] bridged on each side of a jump
 LINKS = 3  # of an arm: upper arm, forearm, hand
 
 
-class HandPath(NamedTuple):
-    """Target of one hand over time, in B; arrays (n, …)."""
+class HandTarget(NamedTuple):
+    """Target of one hand in B, at one moment or over time (n, …)."""
 
-    position: np.ndarray  # (n, 3) [m], inside the reach
-    velocity: np.ndarray  # (n, 3) [m/s]
+    position: np.ndarray  # (3,) [m], inside the reach
+    velocity: np.ndarray  # (3,) [m/s]
+    rotation: np.ndarray  # (3, 3)
+    angular_velocity: np.ndarray  # (3,) [rad/s]
+    swivel: np.ndarray  # (3,) [m] elbow swivel direction: perpendicular from the line shoulder-hand to the elbow
+    weight: np.ndarray | float  # 0 to 1, from the uncertainty of the hand
+
+    def sample(self, k: int) -> HandTarget:
+        """Return the target at sample `k`."""
+        return HandTarget(*(values[k] for values in self))  # type: ignore[index]
+
+
+class HandPath(NamedTuple):
+    """Target of one hand over time, in B; the first fields as in `HandTarget`."""
+
+    position: np.ndarray  # (n, 3)
+    velocity: np.ndarray  # (n, 3)
     rotation: np.ndarray  # (n, 3, 3)
-    angular_velocity: np.ndarray  # (n, 3) [rad/s]
-    swivel: np.ndarray  # (n, 3) [m] elbow swivel direction: perpendicular from the line shoulder-hand to the elbow
+    angular_velocity: np.ndarray  # (n, 3)
+    swivel: np.ndarray  # (n, 3)
+    weight: np.ndarray  # (n,)
     unclamped: np.ndarray  # (n, 3) [m] position before it was clamped to the reach
-    weight: np.ndarray  # (n,) 0 to 1, from the uncertainty of the hand
     lost: np.ndarray  # (n,) bool: not measured, bridged
+
+    def differentiate(self, clock: np.ndarray) -> HandPath:
+        """Return the path with the velocities of its positions and rotations on `clock` [s]."""
+        R = Rotation.from_matrix(self.rotation)
+        between = (R[1:] * R[:-1].inv()).as_rotvec() / np.diff(clock)[:, None]
+        angular_velocity = np.vstack([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
+        velocity = np.gradient(self.position, clock, axis=0)
+        return self._replace(velocity=velocity, angular_velocity=angular_velocity)
+
+    def compute_step_targets(self, dt: float) -> HandTarget:
+        """Return the target (n, …) of the step from each sample: positions amid it, velocities half a step after."""
+        last = len(self.weight) - 1
+        following, after = (np.minimum(np.arange(last + 1) + k, last) for k in (1, 2))
+        velocity, angular_velocity = (
+            0.5 * (rate[following] + rate[after]) for rate in (self.velocity, self.angular_velocity)
+        )
+        position = self.position + 0.5 * dt * self.velocity
+        return HandTarget(position, velocity, self.rotation, angular_velocity, self.swivel, self.weight)
 
 
 @dataclass(frozen=True)
@@ -60,6 +92,52 @@ class ArmTargets:
     slowdown: np.ndarray
     scale: dict[str, float]
 
+    def resample(self, moments: np.ndarray, clock: np.ndarray) -> ArmTargets:
+        """Return the targets at times `moments` [s] of the recording, with velocities on the robot's time `clock`."""
+        time, inside = self.time, np.clip(moments, self.time[0], self.time[-1])
+        hands = []
+        for hand in self.hands:
+            position, swivel, unclamped = (
+                CubicSpline(time, values)(inside) for values in (hand.position, hand.swivel, hand.unclamped)
+            )
+            rotation = Slerp(time, Rotation.from_matrix(hand.rotation))(inside).as_matrix()
+            weight = np.interp(moments, time, hand.weight)
+            lost = np.interp(moments, time, hand.lost.astype(float)) > 0.5
+            path = HandPath(position, position, rotation, position, swivel, weight, unclamped, lost)
+            hands.append(path.differentiate(clock))
+        return replace(self, time=moments, hands=tuple(hands), slowdown=np.interp(moments, time, self.slowdown))
+
+    def select(self, samples: np.ndarray, dt: float) -> ArmTargets:
+        """Return some samples (m,) int as a motion of their own, `dt` [s] apart."""
+        clock = np.arange(len(samples)) * dt
+        hands = (HandPath(*(values[samples] for values in hand)).differentiate(clock) for hand in self.hands)
+        return replace(self, time=self.time[samples], hands=tuple(hands), slowdown=self.slowdown[samples])
+
+
+class ArmMotion(NamedTuple):
+    """One arm of the person in B, scaled; at one moment or over time (n, …)."""
+
+    offset: np.ndarray  # (3,) [m] shoulder to hand
+    upper: np.ndarray  # (3,) [m] shoulder to elbow
+    rotation: np.ndarray  # (3, 3) of the hand
+
+
+def map_arm(robot: Robot, scale: float, quat_WT: np.ndarray, quat_WH: np.ndarray, points: np.ndarray) -> ArmMotion:
+    """Map a person's arm to the robot: relative to its shoulder and to the segment that carries this, and scaled.
+
+    So leaning and walking do not move the robot's base. Orientations are not scaled.
+
+    Parameters
+    ----------
+    scale : metres of the robot for one of the person
+    quat_WT, quat_WH : (…, 4) xyzw of the segment that carries the arm, and of the hand
+    points : (4, …, 3) [m] in W: shoulder, elbow, wrist, hand
+    """
+    R_WT, R_WH = (Rotation.from_quat(quat).as_matrix() for quat in (quat_WT, quat_WH))
+    R_BW = robot.R_BT @ np.swapaxes(R_WT, -1, -2)
+    offset, upper = (scale * np.einsum("...ij,...j->...i", R_BW, points[k] - points[0]) for k in (3, 1))
+    return ArmMotion(offset, upper, R_BW @ R_WH)
+
 
 def find_person_arm(table: BodyTable, side: str) -> Limb:
     """The limb of a person that the robot's arm of this side ("left" or "right") follows: the first one of that side.
@@ -75,6 +153,42 @@ def find_person_arm(table: BodyTable, side: str) -> Limb:
     raise BadData(f"{table.name} has no {side} arm of {LINKS} segments, as shoulder, elbow, wrist and palm bound them")
 
 
+def find_hand_segment(limb: Limb, measured: Collection[str]) -> str:
+    """The segment whose orientation a hand has: its own, or that above where the hand is not measured."""
+    return limb.segments[-1] if limb.segments[-1] in measured else limb.segments[-2]
+
+
+def check_person_arms(
+    robot: Robot, segments: Collection[str], points: Collection[str] | None = None, table: BodyTable | None = None
+) -> None:
+    """Raise `BadData` where an arm that the robot follows is not measured, with the advice what to do.
+
+    Parameters
+    ----------
+    segments, points : that are measured, and known; None: all points
+    table : of the person's body; None: the upper body
+    """
+    table, missing = table or load_table(), {}
+    sides = {arm.side for arm in robot.arms} | {table.side(tip) for tip in table.drawn_limbs}
+    for side in sides.intersection(robot.map.arms):
+        limb = find_person_arm(table, side)
+        needed = (str(limb.base), *limb.segments[:-1])
+        missing[side] = [name for name in needed if name not in segments]
+        missing[side] += [name for name in limb.points if points is not None and name not in points]
+    lacking = [arm.side for arm in robot.arms if missing[arm.side]]
+    if not lacking:
+        return
+    text = "; ".join(
+        f"{robot.map.name}'s {side} arm follows {', '.join(missing[side])}, which the sensors do not measure"
+        for side in lacking
+    )
+    usable = next((side for side in missing if not missing[side]), None)
+    if usable is not None:
+        raise BadData(f"{text}; choose arm {usable}")
+    names = [table.shared_name(name).replace("_", " ") for name in needed]
+    raise BadData(f"{text}; an arm needs sensors on {', '.join(names[:-1])} and {names[-1]}")
+
+
 def compute_arm_targets(
     pose: Pose,
     robot: Robot,
@@ -83,11 +197,9 @@ def compute_arm_targets(
     scale: float | None = None,
     smoothing_hz: float = SMOOTHING_HZ,
 ) -> ArmTargets:
-    """Targets of the robot's hands for a person's pose.
+    """Targets of the robot's hands for a person's pose, by `map_arm`.
 
-    Each hand is taken relative to its shoulder and to the segment that carries this, so leaning and walking do not move
-    the robot's base. Distances are scaled by the ratio of the reaches, orientations are not. NaN, gaps and jumps are
-    bridged and count as poor tracking.
+    NaN, gaps and jumps are bridged and count as poor tracking.
 
     Parameters
     ----------
@@ -107,28 +219,30 @@ def compute_arm_targets(
     if len(time) < 10:
         raise BadData(f"{len(time)} samples in the pose; a motion has at least 10")
     table = table or load_table()
-    _check_arms(pose, robot, table)
-    R_BT = Rotation.from_matrix(robot.R_BT)  # T: the segment that carries the arms
+    check_person_arms(robot, pose.quat_WL, pose.points, table)
     hands, scales, slowdown = [], {}, np.ones(len(time))
     for arm in robot.arms:
-        side, limb = arm.side, find_person_arm(table, arm.side)
-        shoulder, elbow, wrist, hand = (pose.points[name] for name in limb.points)
-        R_TW = Rotation.from_quat(pose.quat_WL[str(limb.base)]).inv()
-        links = (elbow - shoulder, wrist - elbow, hand - wrist)
-        if not all(np.isfinite(link).all(axis=1).any() for link in links):
-            raise BadData(f"the {side} arm is not known anywhere in the pose: its points are missing")
-        length = sum(float(np.nanmedian(np.linalg.norm(link, axis=1))) for link in links)
-        factor = scales[side] = scale or compute_target_reach(robot, arm) / length
-        offset = factor * (R_BT * R_TW).apply(hand - shoulder)
-        upper = factor * (R_BT * R_TW).apply(elbow - shoulder)
-        rotation = R_BT * R_TW * Rotation.from_quat(pose.quat_WL[find_hand_segment(limb, pose.quat_WL)])
-        known = np.isfinite(offset).all(axis=1) & np.isfinite(upper).all(axis=1)
-        known &= np.isfinite(rotation.as_quat()).all(axis=1) & ~_find_gaps(pose, limb)
-        known &= ~_find_jumps(time, offset / factor)
+        limb = find_person_arm(table, arm.side)
+        points = np.stack([pose.points[name] for name in limb.points])
+        lengths = np.linalg.norm(np.diff(points, axis=0), axis=2)
+        if not np.isfinite(lengths).any(axis=1).all():
+            raise BadData(f"the {arm.side} arm is not known anywhere in the pose: its points are missing")
+        factor = scales[arm.side] = scale or compute_target_reach(robot, arm) / sum(np.nanmedian(lengths, axis=1))
+        quat_WH = pose.quat_WL[find_hand_segment(limb, pose.quat_WL)]
+        motion = map_arm(robot, factor, pose.quat_WL[str(limb.base)], quat_WH, points)
+        known = ~_find_jumps(time, motion.offset / factor)
+        for values in motion:
+            known &= np.isfinite(values.reshape(len(time), -1)).all(axis=1)
+        for segment in (str(limb.base), *limb.segments):
+            if segment in pose.gap:
+                known &= ~np.asarray(pose.gap[segment], dtype=bool)
         if known.sum() < 2:
-            raise BadData(f"the {side} arm is not known anywhere in the pose: its orientations are missing, or lost")
-        measured = _MeasuredArm(time, offset, upper, rotation, known, _hand_std(pose, limb, known))
-        hands.append(_smooth(measured, arm, smoothing_hz))
+            text = "its orientations are missing, or lost"
+            raise BadData(f"the {arm.side} arm is not known anywhere in the pose: {text}")
+        cov = pose.point_cov.get(limb.tip)
+        std = np.zeros(len(time)) if cov is None else np.nan_to_num(compute_axis_std(cov), nan=STD_POOR)
+        std = np.where(known, std, STD_POOR)
+        hands.append(_smooth(time, motion, known, compute_weight(std), arm, smoothing_hz))
         slowdown = np.maximum(slowdown, 1.0 + (MAX_SLOWDOWN - 1.0) * (1.0 - hands[-1].weight))
     return ArmTargets(time, tuple(hands), slowdown, scales)
 
@@ -143,8 +257,13 @@ def check_scale_and_smoothing(scale: float | None, smoothing_hz: float) -> None:
 
 def compute_target_reach(robot: Robot, arm: Arm) -> float:
     """The distance [m] from the robot's shoulder to its hand that a straight arm of the person becomes."""
-    reach = robot.map.arms[arm.side].reach
-    return REACH_SHARE * arm.reach if reach is None else min(reach, REACH_SHARE * arm.reach)
+    return min(robot.map.arms[arm.side].reach or np.inf, REACH_SHARE * arm.reach)
+
+
+def compute_weight(std: np.ndarray | float) -> np.ndarray:
+    """Weight (…) of a hand's tasks, `WEIGHT_POOR` to 1, from its standard deviation [m]."""
+    poorness = np.clip((std - STD_GOOD) / (STD_POOR - STD_GOOD), 0.0, 1.0)
+    return np.asarray(1.0 - (1.0 - WEIGHT_POOR) * poorness**2 * (3.0 - 2.0 * poorness))
 
 
 def clamp_to_reach(offset: np.ndarray, reach: float) -> np.ndarray:
@@ -165,116 +284,29 @@ def compute_swivel(upper: np.ndarray, offset: np.ndarray) -> np.ndarray:
     return upper - axis * np.sum(upper * axis, axis=-1, keepdims=True)
 
 
-def resample_targets(targets: ArmTargets, moments: np.ndarray, clock: np.ndarray) -> ArmTargets:
-    """The targets at the times `moments` [s] of the recording, with velocities on the robot's time `clock` [s]."""
-    time, inside = targets.time, np.clip(moments, targets.time[0], targets.time[-1])
-    hands = []
-    for hand in targets.hands:
-        position, swivel, unclamped = (
-            CubicSpline(time, values)(inside) for values in (hand.position, hand.swivel, hand.unclamped)
-        )
-        rotation = Slerp(time, Rotation.from_matrix(hand.rotation))(inside).as_matrix()
-        weight = np.interp(moments, time, hand.weight)
-        lost = np.interp(moments, time, hand.lost.astype(float)) > 0.5
-        path = HandPath(position, position, rotation, position, swivel, unclamped, weight, lost)  # without velocities
-        hands.append(differentiate(path, clock))
-    return replace(targets, time=moments, hands=tuple(hands), slowdown=np.interp(moments, time, targets.slowdown))
-
-
-def differentiate(path: HandPath, clock: np.ndarray) -> HandPath:
-    """The path with the velocities of its positions and rotations on `clock` [s]."""
-    R = Rotation.from_matrix(path.rotation)
-    between = (R[1:] * R[:-1].inv()).as_rotvec() / np.diff(clock)[:, None]
-    angular_velocity = np.vstack([between[:1], 0.5 * (between[1:] + between[:-1]), between[-1:]])
-    return path._replace(velocity=np.gradient(path.position, clock, axis=0), angular_velocity=angular_velocity)
-
-
-class _MeasuredArm(NamedTuple):
-    """One arm of the person in B, scaled."""
-
-    time: np.ndarray  # (n,) [s]
-    offset: np.ndarray  # (n, 3) [m] shoulder to hand
-    upper: np.ndarray  # (n, 3) [m] shoulder to elbow
-    rotation: Rotation  # (n,) of the hand
-    known: np.ndarray  # (n,) bool
-    std: np.ndarray  # (n,) [m] of the hand
-
-
-def _smooth(measured: _MeasuredArm, arm: Arm, smoothing_hz: float) -> HandPath:
+def _smooth(
+    time: np.ndarray, motion: ArmMotion, known: np.ndarray, weight: np.ndarray, arm: Arm, smoothing_hz: float
+) -> HandPath:
     """The path of a hand: bridged, low-passed, clamped to the reach."""
-    time, known = measured.time, measured.known
     t = time[known]
     offset, upper = (
         interp1d(t, x[known], axis=0, fill_value=(x[known][0], x[known][-1]), bounds_error=False)(time)
-        for x in (measured.offset, measured.upper)
+        for x in (motion.offset, motion.upper)
     )
-    rotation = Slerp(t, measured.rotation[known])(np.clip(time, t[0], t[-1]))
+    R = Slerp(t, Rotation.from_matrix(motion.rotation[known]))(np.clip(time, t[0], t[-1])).as_matrix()
     rate_hz = (len(time) - 1) / (time[-1] - time[0])
     if 0.0 < smoothing_hz < 0.45 * rate_hz and len(time) > 30:
-        offset, upper, matrices = (
-            low_pass(values, smoothing_hz, rate_hz) for values in (offset, upper, rotation.as_matrix().reshape(-1, 9))
+        offset, upper, R = (
+            low_pass(x.reshape(len(time), -1), smoothing_hz, rate_hz).reshape(x.shape) for x in (offset, upper, R)
         )
-        rotation = Rotation.from_matrix(_nearest_rotations(matrices))
-    poorness = np.clip((measured.std - STD_GOOD) / (STD_POOR - STD_GOOD), 0.0, 1.0)
-    weight = 1.0 - (1.0 - WEIGHT_POOR) * poorness**2 * (3.0 - 2.0 * poorness)
+        U, _, Vt = np.linalg.svd(R)  # the nearest rotations
+        U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+        R = U @ Vt
     width = max(1, int(0.2 * rate_hz))
     weight = np.convolve(np.pad(weight, width, mode="edge"), np.ones(2 * width + 1) / (2 * width + 1), "valid")
     position, unclamped = arm.shoulder + clamp_to_reach(offset, arm.reach), arm.shoulder + offset
-    swivel = compute_swivel(upper, offset)
-    path = HandPath(position, position, rotation.as_matrix(), position, swivel, unclamped, weight, ~known)
-    return differentiate(path, time)  # fills in the velocities
-
-
-def _nearest_rotations(matrices: np.ndarray) -> np.ndarray:
-    """Rotations (n, 3, 3) nearest to matrices (n, 9)."""
-    U, _, Vt = np.linalg.svd(matrices.reshape(-1, 3, 3))
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    return U @ Vt
-
-
-def find_hand_segment(limb: Limb, measured: Collection[str]) -> str:
-    """The segment whose orientation a hand has: its own, or that above where the hand is not measured."""
-    return limb.segments[-1] if limb.segments[-1] in measured else limb.segments[-2]
-
-
-def list_needed_segments(limb: Limb) -> tuple[str, ...]:
-    """The segments that must be measured for an arm to be followed, from the body on."""
-    return (str(limb.base), *limb.segments[:-1])
-
-
-def _check_arms(pose: Pose, robot: Robot, table: BodyTable) -> None:
-    """Raise `BadData` where the pose lacks an arm of the robot's."""
-    followed = {arm.side for arm in robot.arms}
-    sides = [side for side in SIDES if side in followed or side in {table.side(tip) for tip in table.drawn_limbs}]
-    limbs = {side: find_person_arm(table, side) for side in sides}
-    missing = {side: _missing_names(pose, limb) for side, limb in limbs.items()}
-    lacking = [arm.side for arm in robot.arms if missing[arm.side]]
-    if not lacking:
-        return
-    text = "; ".join(f"the {side} arm is not in the pose: {', '.join(missing[side])} is missing" for side in lacking)
-    usable = next((side for side in robot.map.arms if not missing[side]), None)
-    if usable is not None:
-        raise BadData(f"{text}; --arm {usable} takes the other")
-    present = next((side for side in missing if not missing[side]), None)
-    if present is not None:
-        raise BadData(f"{text}; {robot.map.name} has no arm for the {present} one, which is there")
-    needed = [table.shared_name(name).replace("_", " ") for name in list_needed_segments(limbs[lacking[0]])]
-    raise BadData(f"{text}; an arm needs sensors on {', '.join(needed[:-1])} and {needed[-1]}")
-
-
-def _missing_names(pose: Pose, limb: Limb) -> list[str]:
-    """Segments and points of an arm that the pose lacks."""
-    segments = [name for name in list_needed_segments(limb) if name not in pose.quat_WL]
-    return segments + [name for name in limb.points if name not in pose.points]
-
-
-def _find_gaps(pose: Pose, limb: Limb) -> np.ndarray:
-    """(n,) bool: a sensor of the arm has a gap."""
-    gaps = np.zeros(len(pose.time), dtype=bool)
-    for segment in (str(limb.base), *limb.segments):
-        if segment in pose.gap:
-            gaps |= np.asarray(pose.gap[segment], dtype=bool)
-    return gaps
+    path = HandPath(position, position, R, position, compute_swivel(upper, offset), weight, unclamped, ~known)
+    return path.differentiate(time)  # fills in the velocities
 
 
 def _find_jumps(time: np.ndarray, offset: np.ndarray) -> np.ndarray:
@@ -285,10 +317,3 @@ def _find_jumps(time: np.ndarray, offset: np.ndarray) -> np.ndarray:
         near |= np.abs(time - 0.5 * (time[k] + time[k + 1])) < JUMP_S
     near[[0, -1]] = False
     return near
-
-
-def _hand_std(pose: Pose, limb: Limb, known: np.ndarray) -> np.ndarray:
-    """(n,) [m] of the hand; poor where it is not known."""
-    cov = pose.point_cov.get(limb.tip)
-    std = np.zeros(len(known)) if cov is None else np.nan_to_num(compute_axis_std(cov), nan=STD_POOR)
-    return np.where(known, std, STD_POOR)

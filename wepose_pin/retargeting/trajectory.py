@@ -25,31 +25,16 @@ from ..model import BodyTable
 from ..recording import Intervals, select_interval
 from ..writers.joint_motion import JointMotion
 from .collision import CollisionModel
-from .controller import (
-    ActiveConstraints,
-    ControllerParams,
-    JointState,
-    PostureReference,
-    QpController,
-    StepCounts,
-    sample_hand_targets,
-)
+from .controller import ControllerParams, JointState, PostureReference, QpController, StepReport
+from .limits import MAX_STOP_S
 from .maps import find_map, list_sides
-from .reconfiguration import Planner
+from .reconfiguration import QUINTIC_PEAK_SPEED, Planner
 from .robot import LimitMargins, Robot, load_robot
-from .targets import (
-    SMOOTHING_HZ,
-    WEIGHT_POOR,
-    ArmTargets,
-    HandPath,
-    compute_arm_targets,
-    compute_swivel,
-    differentiate,
-    resample_targets,
-)
+from .targets import SMOOTHING_HZ, WEIGHT_POOR, ArmTargets, HandPath, compute_arm_targets, compute_swivel
 
 RATE_HZ = 100.0
 MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 2000.0
+PLAN_STEP_S = 0.01  # [s] of the first run at least, whatever the rate of the trajectory: coarser, the robot shakes
 WIDE_LIMIT_FACTOR = 8.0  # on the limits of the first run
 MAX_SLOWDOWN = 6.0  # largest time scaling of a sample; the robot lags behind a motion that needs more
 # Fractions of the limits that the time scaling uses. The rest is a reserve to catch up.
@@ -57,19 +42,16 @@ VELOCITY_FRACTION, ACCELERATION_FRACTION, JERK_FRACTION = 0.85, 0.6, 0.6
 SLOWDOWN_SPREAD_S = 0.15  # [s] by which a slowdown extends to both sides
 PATH_SMOOTHING_S = 0.03  # [s] of the first run's joint path
 APPROACH_SPEED, APPROACH_ANGULAR_SPEED = 0.25, 0.6  # [m/s], [rad/s] largest of the hands on their way from rest
-QUINTIC_PEAK_SPEED = 1.9  # a quintic from rest to rest is 1.875 times as fast in its middle as on average
 APPROACH_MIN_S = 2.0  # [s] of the approach at least
 SETTLE_S = 1.0  # [s] in which the targets rest, after the approach and at the end
 END_S = 0.5  # [s] at the end of the motion that are stretched to twice their duration, to end at rest
-HALT_S = 0.3  # [s] at the very end, in which the remaining velocity decays to zero
-SETTLED = 1e-9  # [rad or m, s] below it a joint's last velocity and acceleration count as zero
-CONTACT_BEFORE_S, CONTACT_AFTER_S = 0.3, 0.1  # [s] about such a sample that take twice as long, in each run
-CONTACT_RUNS = 5  # further runs at most, to slow such samples
+SETTLED = 1e-3  # [rad/s or m/s] below it all joints have settled at the end, and brake to rest
+MAX_LAG_S = 5.0  # [s] for which the end waits until they have
 TRACKING_POSTURE_FACTOR, TRACKING_POSTURE_GAIN = 50.0, 8.0  # of the second run: weight, gain [1/s] of its posture
 MAX_STRICT_RATIO = 1.02  # of what a joint needs to its limit; above it `strict` refuses the motion
 PROGRESS_STEPS = 64  # steps between two calls of `progress`
 QUANTITIES = ("velocity", "acceleration", "jerk")
-STAGES = ("solving with wide limits", "solving with the robot's limits")  # of `progress`; the second may be repeated
+STAGES = ("solving with wide limits", "solving with the robot's limits")  # of `progress`
 SELF_CONTACT = "the robot could not stop before its links touch"
 
 
@@ -91,10 +73,7 @@ class ControllerRun(NamedTuple):
     hand: np.ndarray  # (arms, n, 3) [m] in B
     rotation: np.ndarray  # (arms, n, 3, 3) of the hand
     swivel: np.ndarray  # (arms, n, 3) [m] elbow swivel direction
-    hull_distance: np.ndarray  # (n,) [m] between convex hulls; inf where none were near
-    nearest_pair: np.ndarray  # (n,) int, of `CollisionModel.pairs`, to which that belongs; -1: none
-    stopping: np.ndarray  # (n,) bool: no step kept all limits and clearances, the robot braked
-    active: ActiveConstraints  # in the step from each sample
+    report: StepReport  # of the step from each sample
     solve_s: np.ndarray  # (n,) [s] of each step
 
 
@@ -111,9 +90,7 @@ class Trajectory:
     approach_samples : number of samples from rest to the first pose of the recording
     targets : (arms,) paths of the hands, at `time`
     run : joints, hands and constraints at `time`; any denser rate keeps the same limits
-    counts : of the controller's steps
     limiting_joint : None where nothing had to be slowed for a limit
-    contact_times : [s] of the recording at which the motion was slowed to avoid self-collision
     """
 
     robot: Robot
@@ -125,9 +102,7 @@ class Trajectory:
     approach_samples: int
     targets: tuple[HandPath, ...]
     run: ControllerRun
-    counts: StepCounts
     limiting_joint: LimitingJoint | None
-    contact_times: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         return f"Trajectory({self.robot.map.name!r}: {self.time[-1]:.1f} s, {len(self.robot.names)} joints)"
@@ -137,14 +112,29 @@ class Trajectory:
         """(n, joints) [rad or m]."""
         return self.run.joint_position
 
-    def find_changes(self) -> np.ndarray:
-        """Return (n, arms) bool: the arm is on its way to another posture, off the hand's path."""
-        return np.stack([target.weight < 0.5 * WEIGHT_POOR for target in self.targets], axis=1)
-
     @property
     def hand(self) -> dict[str, np.ndarray]:
         """Side → position (n, 3) [m] of the hand in B."""
         return {arm.side: self.run.hand[i] for i, arm in enumerate(self.robot.arms)}
+
+    @property
+    def contact_times(self) -> list[float]:
+        """[s] of the recording at which the robot braked, since no step kept all limits and left it a way to stop."""
+        return self._find_begins(self.run.report.stopping)
+
+    @property
+    def change_times(self) -> list[float]:
+        """[s] of the recording at which an arm leaves its path for another posture."""
+        after_approach = np.arange(len(self.time)) >= self.approach_samples
+        return self._find_begins(np.any(self.find_changes(), axis=1) & after_approach)
+
+    def find_changes(self) -> np.ndarray:
+        """Return (n, arms) bool: the arm is on its way to another posture, off the hand's path."""
+        return np.stack([target.weight < 0.5 * WEIGHT_POOR for target in self.targets], axis=1)
+
+    def _find_begins(self, states: np.ndarray) -> list[float]:
+        """[s] of the recording at which each run of true values (n,) begins."""
+        return np.round(self.recorded_time[states & ~np.roll(states, 1)], 2).tolist()
 
     def joint_motion(self) -> JointMotion:
         """Return the motion as `export` takes it."""
@@ -268,71 +258,54 @@ def _compute_trajectory(
     strict: bool,
     progress: Callable[[str, float], None],
 ) -> Trajectory:
-    """Solve the motion with wide limits, slow it, and solve it with the robot's; where it brakes, slower again."""
+    """Solve the motion with wide limits, slow it, and solve it with the robot's."""
     collision = CollisionModel(robot)
-    uniform_time = np.arange(0.0, arm_targets.time[-1] - arm_targets.time[0] + 0.5 * dt, dt)
-    motion = resample_targets(arm_targets, arm_targets.time[0] + uniform_time, uniform_time)
-    motion, approach_samples = _prepend_approach(QpController(robot, collision, dt, params), motion)
-    wide_controller = QpController(robot, collision, dt, params, WIDE_LIMIT_FACTOR, guarded=False)
-    wide_run = _run_controller(wide_controller, motion, None, 0, lambda fraction: progress(STAGES[0], fraction))
-    planner = Planner(wide_controller, motion, approach_samples)
-    motion, path, approach_samples = planner.plan(wide_run.joint_position, wide_run.hand, wide_run.rotation)
-    n = len(motion.time)
-    path = gaussian_filter1d(path, PATH_SMOOTHING_S / dt, axis=0, mode="nearest")
-    slowdown, limiting = _compute_slowdown(path, robot, dt, motion, approach_samples)
+    step = max(dt, PLAN_STEP_S)
+    clock = np.arange(0.0, arm_targets.time[-1] - arm_targets.time[0] + 0.5 * step, step)
+    motion = arm_targets.resample(arm_targets.time[0] + clock, clock)
+    wide = QpController(robot, collision, step, params, WIDE_LIMIT_FACTOR, guarded=False)
+    motion, approach_samples = _prepend_approach(wide, motion)
+    run = _run_controller(wide, motion.hands, None, None, lambda fraction: progress(STAGES[0], fraction))
+    planner = Planner(wide, motion, approach_samples)
+    motion, path, approach_samples = planner.plan(run.joint_position, run.hand, run.rotation)
+    path = gaussian_filter1d(path, PATH_SMOOTHING_S / step, axis=0, mode="nearest")
+    slowdown, limiting = _compute_slowdown(path, robot, step, motion, approach_samples)
     if strict and limiting is not None and limiting.factor > MAX_STRICT_RATIO:
         reason = f"{limiting.joint} would need {limiting.factor:.1f} times its {limiting.quantity} limit"
         raise _build_too_fast_error(robot, limiting.time, reason)
-    posture_at = CubicSpline(np.arange(n) * dt, path)
-    tracking_params = replace(
-        params, posture=TRACKING_POSTURE_FACTOR * params.posture, posture_gain=TRACKING_POSTURE_GAIN
+    # The motion's own time, its samples on the robot's time, and the moments of the motion at the robot's times.
+    clock = np.arange(len(path)) * step
+    sample_time = _stretch_end(np.concatenate([[0.0], np.cumsum(0.5 * (slowdown[1:] + slowdown[:-1])) * step]))
+    robot_time = np.arange(0.0, sample_time[-1] + SETTLE_S + MAX_LAG_S + MAX_STOP_S, dt)
+    moments = np.interp(robot_time, sample_time, clock)
+    recorded_time = np.interp(moments, clock, motion.time)
+    targets = replace(motion, time=clock).resample(moments, robot_time)
+    posture = CubicSpline(clock, path)(moments)
+    posture_weight = TRACKING_POSTURE_FACTOR * params.posture
+    tracking_params = replace(params, posture=posture_weight, posture_gain=TRACKING_POSTURE_GAIN)
+    run = _run_controller(
+        QpController(robot, collision, dt, tracking_params),
+        targets.hands,
+        posture,
+        int((sample_time[-1] + SETTLE_S) / dt),
+        lambda fraction: progress(STAGES[1], fraction),
     )
-    contact_times: tuple[float, ...] = ()
-    contact_slowdown = np.ones(n)
-    settle_s = SETTLE_S
-    for attempt in range(1 + CONTACT_RUNS):
-        sample_time = np.concatenate([[0.0], np.cumsum(0.5 * (slowdown[1:] + slowdown[:-1])) * dt])
-        sample_time = _stretch_end(sample_time)  # of the motion's samples, on the robot's time
-        robot_time = np.arange(0.0, sample_time[-1] + settle_s + HALT_S, dt)
-        index = np.interp(robot_time, sample_time, np.arange(n))
-        targets = _resample_motion(motion, index, robot_time, dt)
-        posture = posture_at(np.minimum(index, n - 1) * dt)
-        controller = QpController(robot, collision, dt, tracking_params)
-        halt_steps = round(HALT_S / dt)
-        pace = np.interp(index, np.arange(n), 1.0 / contact_slowdown)
-        run = _run_controller(
-            controller, targets, posture, halt_steps, lambda fraction: progress(STAGES[1], fraction), pace
-        )
-        near_contact = np.flatnonzero(run.stopping)
-        # A robot that lags far behind needs longer to come to rest.
-        settled = float(np.abs([run.joint_velocity[-1], run.joint_acceleration[-1]]).max()) < SETTLED
-        if (settled and not len(near_contact)) or attempt == CONTACT_RUNS:
-            break
-        if not settled:
-            settle_s += SETTLE_S
-            contact_slowdown[-1] *= 2.0
-        if not len(near_contact):
-            continue
-        begins = index[near_contact[np.diff(near_contact, prepend=-2) > 1]].astype(int)
-        if strict:
-            raise _build_too_fast_error(robot, motion.time[begins[0]], SELF_CONTACT)
-        contact_times = tuple(sorted({*contact_times, *np.round(motion.time[begins], 2).tolist()}))
-        slower = _compute_contact_slowdown(index[near_contact], n, dt)
-        slowdown, contact_slowdown = slowdown * slower, contact_slowdown * slower
-    return Trajectory(
+    n = len(run.joint_position)
+    trajectory = Trajectory(
         robot=robot,
         collision=collision,
         params=params,
         arm_targets=arm_targets,
-        time=robot_time,
-        recorded_time=targets.time,
+        time=robot_time[:n],
+        recorded_time=recorded_time[:n],
         approach_samples=int(np.searchsorted(robot_time, sample_time[approach_samples])),
-        targets=targets.hands,
+        targets=tuple(HandPath(*(values[:n] for values in hand)) for hand in targets.hands),
         run=run,
-        counts=controller.counts,
         limiting_joint=limiting,
-        contact_times=contact_times,
     )
+    if strict and trajectory.contact_times:
+        raise _build_too_fast_error(robot, trajectory.contact_times[0], SELF_CONTACT)
+    return trajectory
 
 
 def check_rate(rate_hz: float) -> None:
@@ -344,91 +317,85 @@ def check_rate(rate_hz: float) -> None:
 def _build_too_fast_error(robot: Robot, time_s: float, reason: str) -> NoSolution:
     return NoSolution(
         f"{robot.map.name}: too fast at {time_s:.2f} s of the recording: {reason}; "
-        "without --strict the motion is slowed there"
+        "without --strict the motion is slowed, or brakes, there"
     )
 
 
 def _run_controller(
     controller: QpController,
-    targets: ArmTargets,
+    hands: tuple[HandPath, ...],
     posture: np.ndarray | None,
-    halt_steps: int,
+    settle: int | None,
     progress: Callable[[float], None],
-    pace: np.ndarray | None = None,
 ) -> ControllerRun:
-    """Follow the targets from rest; come to rest in the last `halt_steps`.
+    """Follow the hands from rest.
 
-    `posture` (n, joints) is a posture reference, `pace` (n,) that of corrections.
+    Parameters
+    ----------
+    posture : (n, joints) reference of the posture; None: the rest posture
+    settle : sample from which on the robot comes to rest as soon as it has settled; None: it does not
     """
-    robot, n = controller.robot, len(targets.time)
-    arms, joints = len(robot.arms), len(robot.names)
-    run = ControllerRun(
-        np.zeros((n, joints)), np.zeros((n, joints)), np.zeros((n, joints)), np.empty((arms, n, 3)),
-        np.empty((arms, n, 3, 3)), np.empty((arms, n, 3)), np.full(n, np.inf), np.full(n, -1),
-        np.zeros(n, dtype=bool),
-        ActiveConstraints(np.zeros((n, joints), dtype=bool), np.zeros((n, arms), dtype=bool)), np.zeros(n),
-    )  # fmt: skip
-    state = JointState.at_rest(robot.rest)
-    velocity = np.gradient(posture, controller.dt, axis=0) if posture is not None else None
+    robot, n, dt = controller.robot, len(hands[0].weight), controller.dt
+    state, states, poses, reports, solve_s = JointState.at_rest(robot.rest), [], [], [], []
+    rate = np.gradient(posture, dt, axis=0) if posture is not None else None
+    targets = [hand.compute_step_targets(dt) for hand in hands]
+    latest, brakes = n - round(MAX_STOP_S / dt), False
     for k in range(n):
-        run.joint_position[k], run.joint_velocity[k] = state.position, state.velocity
-        run.joint_acceleration[k] = state.acceleration
         begin = time.perf_counter()
-        if posture is not None and velocity is not None:
-            controller.posture_reference = PostureReference(posture[k], velocity[min(k + 1, n - 1)])
-        controller.pace = 1.0 if pace is None else float(pace[k])
-        steps_left = n - 1 - k
-        if steps_left < halt_steps:
+        if posture is not None and rate is not None:
+            controller.posture_reference = PostureReference(posture[k], rate[min(k + 1, n - 1)])
+        brakes |= settle is not None and k >= settle and (k >= latest or np.abs(state.velocity).max() < SETTLED)
+        ends = brakes and state.is_static
+        states.append(state)
+        if brakes:
             state = controller.brake(state)
         else:
-            state = controller.step(state, sample_hand_targets(targets.hands, k, controller.dt))
-        run.solve_s[k] = time.perf_counter() - begin
-        run.hull_distance[k], run.nearest_pair[k] = controller.min_distance, controller.nearest_pair
-        run.stopping[k] = controller.stopping
-        run.active.joints[k], run.active.arms_near_contact[k] = controller.active
-        for i in range(arms):
-            run.hand[i, k], run.rotation[i, k], run.swivel[i, k] = controller.get_arm_pose(i)
+            state = controller.step(state, tuple(target.sample(k) for target in targets))
+        solve_s.append(time.perf_counter() - begin)
+        reports.append(controller.report)
+        poses.append([controller.get_arm_pose(i) for i in range(len(hands))])
+        if ends:
+            break
         if k % PROGRESS_STEPS == 0:
             progress(k / n)
-    for i, arm in enumerate(robot.arms):  # run.swivel holds the elbows' positions up to here
-        run.swivel[i] = compute_swivel(run.swivel[i] - arm.shoulder, run.hand[i] - arm.shoulder)
-    return run
+    hand, rotation, elbow = (
+        np.array([[pose[key] for pose in arms] for arms in zip(*poses, strict=True)]) for key in range(3)
+    )
+    shoulders = np.array([arm.shoulder for arm in robot.arms])[:, None]
+    swivel = compute_swivel(elbow - shoulders, hand - shoulders)
+    report = StepReport(*map(np.array, zip(*reports, strict=True)))
+    position, velocity, acceleration = np.array(states).swapaxes(0, 1)
+    return ControllerRun(position, velocity, acceleration, hand, rotation, swivel, report, np.array(solve_s))
 
 
 def _prepend_approach(controller: QpController, motion: ArmTargets) -> tuple[ArmTargets, int]:
     """Prepend a smooth approach of each hand from rest; return the motion and the number of samples of the approach."""
-    robot, dt = controller.robot, controller.dt
+    robot, dt, longest = controller.robot, controller.dt, APPROACH_MIN_S
     controller.update_kinematics(robot.rest)
-    poses = [controller.get_arm_pose(i) for i in range(len(robot.arms))]
-    longest = APPROACH_MIN_S
-    for pose, path in zip(poses, motion.hands, strict=True):
-        distance = float(np.linalg.norm(path.position[0] - pose.hand))
-        angle = (Rotation.from_matrix(pose.rotation).inv() * Rotation.from_matrix(path.rotation[0])).magnitude()
-        longest = max(
-            longest,
-            QUINTIC_PEAK_SPEED * distance / APPROACH_SPEED,
-            QUINTIC_PEAK_SPEED * float(angle) / APPROACH_ANGULAR_SPEED,
+    ends = []
+    for i, path in enumerate(motion.hands):
+        pose = controller.get_arm_pose(i)
+        ends.append((pose, Rotation.from_matrix(np.stack([pose.rotation, path.rotation[0]]))))
+        distance, angle = (
+            np.linalg.norm(path.position[0] - pose.hand),
+            (ends[i][1][0].inv() * ends[i][1][1]).magnitude(),
         )
-    n = round(longest / dt)
-    x = np.minimum(np.arange(n + round(SETTLE_S / dt)) / n, 1.0)
+        needed = distance / APPROACH_SPEED, angle / APPROACH_ANGULAR_SPEED
+        longest = max(longest, QUINTIC_PEAK_SPEED * float(max(needed)))
+    steps = round(longest / dt)
+    x = np.minimum(np.arange(steps + round(SETTLE_S / dt)) / steps, 1.0)
     blend = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
-    count = len(blend)
-    hands = []
-    for pose, path, arm in zip(poses, motion.hands, robot.arms, strict=True):
-        position = pose.hand + blend[:, None] * (path.position[0] - pose.hand)
-        ends = Rotation.from_matrix(np.stack([pose.rotation, path.rotation[0]]))
-        rotation = Slerp([0.0, 1.0], ends)(blend).as_matrix()
-        swivel = np.zeros(3)
-        if arm.elbow >= 0:
-            swivel = compute_swivel(pose.elbow - arm.shoulder, pose.hand - arm.shoulder)
-        swivels = swivel + blend[:, None] * (path.swivel[0] - swivel)
-        lost = np.zeros(count, dtype=bool)
-        before = HandPath(position, position, rotation, position, swivels, position, np.ones(count), lost)
-        whole = HandPath(*(np.concatenate([a, b]) for a, b in zip(before, path, strict=True)))
-        hands.append(differentiate(whole, np.arange(len(whole.weight)) * dt))
-    recorded_time = np.concatenate([np.full(count, motion.time[0]), motion.time])
-    slowdown = np.concatenate([np.ones(count), motion.slowdown])
-    return replace(motion, time=recorded_time, hands=tuple(hands), slowdown=slowdown), count
+    count, hands = len(blend), []
+    motion = motion.select(np.maximum(np.arange(count + len(motion.time)) - count, 0), dt)
+    for (pose, rotations), path, arm in zip(ends, motion.hands, robot.arms, strict=True):
+        swivel = compute_swivel(pose.elbow - arm.shoulder, pose.hand - arm.shoulder) if arm.elbow >= 0 else np.zeros(3)
+        for values, start in ((path.position, pose.hand), (path.unclamped, pose.hand), (path.swivel, swivel)):
+            values[:count] = start + blend[:, None] * (values[count] - start)
+        path.rotation[:count] = Slerp([0.0, 1.0], rotations)(blend).as_matrix()
+        path.weight[:count], path.lost[:count] = 1.0, False
+        hands.append(path.differentiate(np.arange(len(path.weight)) * dt))
+    motion.slowdown[:count] = 1.0
+    return replace(motion, hands=tuple(hands)), count
 
 
 def _compute_slowdown(
@@ -458,22 +425,7 @@ def _compute_slowdown(
     return np.asarray(gaussian_filter1d(wide, 0.5 * width, mode="nearest")), limiting
 
 
-def _compute_contact_slowdown(near: np.ndarray, n: int, dt: float) -> np.ndarray:
-    """Return a time scaling (n,) from 1 to 2, above 1 about the samples `near`."""
-    slow = np.zeros(n, dtype=bool)
-    for k in np.unique(near.astype(int)).tolist():
-        slow[max(0, k - round(CONTACT_BEFORE_S / dt)) : k + round(CONTACT_AFTER_S / dt) + 1] = True
-    return 1.0 + np.asarray(gaussian_filter1d(slow.astype(float), 0.5 * SLOWDOWN_SPREAD_S / dt, mode="nearest"))
-
-
 def _stretch_end(time: np.ndarray) -> np.ndarray:
     """Return the times (n,) [s] with the last `END_S` stretched, so that its speed falls linearly to zero."""
     phase = np.clip((time - (time[-1] - END_S)) / END_S, 0.0, 1.0)
     return time + END_S * (2.0 * (1.0 - np.sqrt(1.0 - phase)) - phase)
-
-
-def _resample_motion(motion: ArmTargets, index: np.ndarray, robot_time: np.ndarray, dt: float) -> ArmTargets:
-    """Return the motion at fractional samples `index`, velocities on `robot_time` [s], `time` on the recording's."""
-    uniform_time = np.arange(len(motion.time)) * dt
-    recorded_time = np.interp(index * dt, uniform_time, motion.time)
-    return replace(resample_targets(replace(motion, time=uniform_time), index * dt, robot_time), time=recorded_time)

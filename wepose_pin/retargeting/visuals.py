@@ -10,6 +10,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..model.meshes import find_mesh, package_folders, reduce_triangles, triangulate
+from .collision import list_corners
 from .robot import Robot
 from .trajectory import Trajectory
 
@@ -38,19 +39,19 @@ def build_parts(robot: Robot) -> list[MeshPart]:
                 link.remove(visual)
     text, folders = ElementTree.tostring(root, encoding="unicode"), package_folders(robot.map.urdf)
     whole = pin.buildGeomFromUrdfString(robot.full, text, pin.GeometryType.VISUAL, package_dirs=folders)
-    moving = set(robot.model.names[1:])
-    locked = [robot.full.getJointId(name) for name in robot.full.names[1:] if name not in moving]
+    locked = [robot.full.getJointId(name) for name in robot.full.names[1:] if name not in robot.names]
     _, shapes = pin.buildReducedModel(robot.full, whole, locked, robot.rest_full)
-    joints, meshes = [], []
+    parts: dict[int, list[int]] = {}  # joint → its meshes
+    meshes: list[tuple[np.ndarray, np.ndarray]] = []
     for shape in shapes.geometryObjects:
         vertices, triangles = triangulate(shape.geometry)
         if len(triangles):
-            joints.append(int(shape.parentJoint))
+            parts.setdefault(int(shape.parentJoint), []).append(len(meshes))
             meshes.append((vertices @ shape.placement.rotation.T + shape.placement.translation, triangles))
-    reduced = list(zip(joints, reduce_triangles(meshes), strict=True))
+    reduced = reduce_triangles(meshes)
     return [
-        MeshPart(joint, *_join([mesh for own, mesh in reduced if own == joint]), _choose_colour(robot, joint))
-        for joint in sorted(set(joints))
+        MeshPart(joint, *_join([reduced[k] for k in own]), _choose_colour(robot, joint))
+        for joint, own in sorted(parts.items())
     ]
 
 
@@ -61,22 +62,30 @@ def find_missing_visuals(robot: Robot) -> list[str]:
     return list(dict.fromkeys(name for mesh in meshes if find_mesh(name := mesh.get("filename", ""), urdf) is None))
 
 
-def place_beside_person(
-    robot: Robot, parts: list[MeshPart], shoulder_z: float, floor_z: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """R_WB (3, 3) and p_WB (3,) [m]: the root in W, beside the person and facing the same way."""
-    R = robot.R_BT.T
-    shoulder = R @ np.mean([arm.shoulder for arm in robot.arms], axis=0)
-    data = robot.model.createData()
+def place_root(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """R_WB (3, 3) and p_WB (3,) [m] of the root in W: where a standing robot is on the floor, else at its origin."""
+    R_WB, data, p_WB = robot.R_BT.T, robot.model.createData(), np.zeros(3)
     pin.forwardKinematics(robot.model, data, robot.configuration(robot.rest))
-    lowest = 0.0
-    roots = [part for part in parts if part.joint == 0]
-    if roots:
-        root = data.oMi[0]
-        lowest = min(((part.vertices @ root.rotation.T + root.translation) @ R.T)[:, 2].min() for part in roots)
-    standing = shoulder[2] - lowest > STANDING_HEIGHT
-    z = floor_z - lowest if standing else shoulder_z - shoulder[2]
-    return R, np.array([-shoulder[0], SIDE_DISTANCE - shoulder[1], z])
+    lowest = [
+        (R_WB @ data.oMi[shape.parentJoint].act(corner))[2]
+        for shape in robot.geometry.geometryObjects
+        for corner in list_corners(shape)
+    ]
+    if lowest and _find_shoulder(robot)[2] - min(lowest) > STANDING_HEIGHT:
+        p_WB[2] = -min(lowest)
+    return R_WB, p_WB
+
+
+def _find_shoulder(robot: Robot) -> np.ndarray:
+    """(3,) [m] the middle of the shoulders, from the root along the axes of W."""
+    return np.asarray(robot.R_BT.T @ np.mean([arm.shoulder for arm in robot.arms], axis=0))
+
+
+def place_beside_person(robot: Robot, shoulder_z: float, floor_z: float) -> tuple[np.ndarray, np.ndarray]:
+    """R_WB (3, 3) and p_WB (3,) [m]: the root in W, beside the person and facing the same way."""
+    (R_WB, (_, _, height)), shoulder = place_root(robot), _find_shoulder(robot)
+    z = floor_z + height if height else shoulder_z - shoulder[2]
+    return R_WB, np.array([-shoulder[0], SIDE_DISTANCE - shoulder[1], z])
 
 
 def compute_placements(

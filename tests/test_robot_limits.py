@@ -1,4 +1,4 @@
-"""The stop that each step of a robot leaves open: within limits, clear of the robot itself, taken where no step is."""
+"""Limits: bounds on the acceleration that never lead to a violation, the stop that each step of a robot leaves open."""
 
 from __future__ import annotations
 
@@ -9,21 +9,67 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from arms import person, write_arm
-from test_live_robot import Session, keeps_its_limits, live_poses, stream_info
+from test_live_robot import Session, keeps_its_limits, live_poses
 
-from wepose_pin.errors import BadModel
+from wepose_pin import errors, retargeting
 from wepose_pin.kinematics import Pose
-from wepose_pin.retargeting import Robot, find_map, find_self_collisions, load_robot, retarget
+from wepose_pin.retargeting import limits
 from wepose_pin.retargeting.collision import NEAR, CollisionModel
-from wepose_pin.retargeting.limits import compute_acceleration_bounds, reduce_acceleration_limits
-from wepose_pin.retargeting.stopping import StopCheck, balance_braking, compute_stop
 
 pytest.importorskip("daqp")
 
 
 @pytest.fixture(scope="module")
-def arm(tmp_path_factory: pytest.TempPathFactory) -> Robot:
-    return load_robot(find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
+def arm(tmp_path_factory: pytest.TempPathFactory) -> retargeting.Robot:
+    return retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path_factory.mktemp("arm")))))
+
+
+def ridden(share, dt: float, seconds: float, n: int = 60):
+    """Joints that take `share` of what the bounds leave at each step; where they were, between the samples too."""
+    rng = np.random.default_rng(3)
+    lower, upper = -rng.uniform(0.05, 2.0, n), rng.uniform(0.05, 2.0, n)  # at most 14 s from end to end
+    v_max, a_max = rng.uniform(0.3, 4.0, n), rng.uniform(0.5, 30.0, n)
+    j_max = a_max * rng.choice([10.0, 20.0, 50.0, 500.0], n)
+    a_max = limits.reduce_acceleration_limits(a_max, v_max, j_max, upper - lower, dt)
+    u, v, a, low, high = np.zeros(n), np.zeros(n), np.zeros(n), np.empty(n), np.empty(n)
+    t = np.linspace(0.0, dt, 11)[:, None, None]
+    times = np.arange(round(seconds / dt)) * dt
+    for block in np.array_split(times, len(times) // 500 + 1):  # checked together, which is faster
+        steps = np.empty((len(block), 5, n))
+        for row, now in zip(steps, block, strict=True):
+            limits.compute_acceleration_bounds(u, v, a, lower, upper, v_max, a_max, j_max, dt, low, high)
+            after = low + share(now, rng, n) * (high - low)
+            jerk = (after - a) / dt
+            row[:] = u, v, a, jerk, high - low
+            u, v, a = u + dt * (v + dt * (a / 2.0 + dt * jerk / 6.0)), v + dt * (a + 0.5 * dt * jerk), after
+        us, vs, accelerations, jerks, room = steps.swapaxes(0, 1)
+        places = us + t * (vs + t * (accelerations / 2.0 + t * jerks / 6.0))
+        speeds = vs + t * (accelerations + 0.5 * t * jerks)
+        ends = accelerations + dt * jerks
+        assert (room >= 0.0).all()
+        assert (np.abs(jerks) <= j_max * (1.0 + 1e-9)).all()
+        assert (np.abs(ends) <= a_max + 1e-9).all()
+        assert (np.abs(speeds) <= v_max + 1e-8).all()
+        assert (places >= lower - 1e-8).all()
+        assert (places <= upper + 1e-8).all()
+        yield from zip(upper - places.max(axis=0), speeds[-1], ends, strict=True)
+
+
+@pytest.mark.parametrize("dt", [pytest.param(0.002, marks=pytest.mark.slow), 0.01, 0.05])
+def test_whoever_goes_as_fast_as_the_bounds_allow_still_keeps_every_limit(dt: float) -> None:
+    def mood(time: float, rng: np.random.Generator, n: int) -> np.ndarray:
+        return (np.zeros(n), np.ones(n), rng.uniform(0.0, 1.0, n), rng.integers(0, 2, n))[int(time // 15.0) % 4]
+
+    nearest = np.min([room for room, _, _ in ridden(mood, dt, 60.0)], axis=0)
+    assert (nearest < 1e-3).all()  # and the bounds do not hold it off the limit
+
+
+@pytest.mark.parametrize("dt", [pytest.param(0.002, marks=pytest.mark.slow), 0.01, 0.05])
+def test_a_joint_that_is_pushed_against_its_limit_lies_still_there(dt: float) -> None:
+    """Braking at full strength up to the limit would bounce off it: a brake cannot be let go at once."""
+    end = list(ridden(lambda _time, _rng, n: np.ones(n), dt, 25.0))[-round(1.0 / dt) :]
+    assert max(np.abs(v).max() for _, v, _ in end) < 1e-4
+    assert max(np.abs(a).max() for _, _, a in end) < 1e-3
 
 
 @pytest.mark.parametrize("dt", [0.002, 0.01])
@@ -33,20 +79,20 @@ def test_a_stop_keeps_the_limits_and_ends_at_rest(dt: float) -> None:
     lower, upper = -rng.uniform(0.05, 1.5, n), rng.uniform(0.05, 1.5, n)
     v_max, a_max = rng.uniform(0.3, 4.0, n), rng.uniform(0.5, 30.0, n)
     j_max = a_max * rng.choice([10.0, 20.0, 50.0, 500.0], n)
-    a_max = reduce_acceleration_limits(a_max, v_max, j_max, upper - lower, dt)
-    limits = lower, upper, v_max, a_max, j_max
+    a_max = limits.reduce_acceleration_limits(a_max, v_max, j_max, upper - lower, dt)
+    ranges = lower, upper, v_max, a_max, j_max
     u, v, a, low, high = np.zeros(n), np.zeros(n), np.zeros(n), np.empty(n), np.empty(n)
     share = np.ones(n)
     for k in range(round(6.0 / dt)):
-        compute_acceleration_bounds(u, v, a, *limits, dt, low, high)
+        limits.compute_acceleration_bounds(u, v, a, *ranges, dt, low, high)
         if k % round(0.4 / dt) == 0:
             share = rng.choice([0.0, 1.0, rng.uniform()], n)
         after = low + share * (high - low)
         u, v, a = u + dt * (v + dt * (a / 3.0 + after / 6.0)), v + 0.5 * dt * (a + after), after
         if k % round(0.05 / dt):
             continue
-        braking = rng.choice([a_max, balance_braking(v, a_max)])
-        path, velocity, acceleration, travel = compute_stop(u, v, a, *limits, braking, dt)
+        states, travel = limits.compute_stop(u, v, a, *ranges, dt)
+        path, velocity, acceleration = states.swapaxes(0, 1)
         assert not velocity[-1].any()
         assert not acceleration[-1].any()
         assert (path >= lower - 1e-7).all()
@@ -54,15 +100,15 @@ def test_a_stop_keeps_the_limits_and_ends_at_rest(dt: float) -> None:
         assert (np.abs(velocity) <= v_max + 1e-7).all()
         assert (np.abs(acceleration) <= a_max + 1e-7).all()
         # The very last step, below 1e-9 rad/s, is a jump to rest.
-        assert (np.abs(np.diff(np.vstack([a, acceleration]), axis=0)) <= dt * j_max + 1e-6).all()
-        assert (np.abs(np.diff(np.vstack([u, path]), axis=0)) <= travel + 1e-12).all()
+        assert (np.abs(np.diff(acceleration, axis=0)) <= dt * j_max + 1e-6).all()
+        assert (np.abs(np.diff(path, axis=0)) <= travel[:-1] + 1e-12).all()
         assert len(path) * dt < 3.0
 
 
-def test_the_way_to_rest_is_as_clear_as_a_dense_search_finds(arm: Robot) -> None:
+def test_the_way_to_rest_is_as_clear_as_a_dense_search_finds(arm: retargeting.Robot) -> None:
     """Straight ways between random postures: one is refused where some sample of it is too near, and seldom else."""
     collision = CollisionModel(arm)
-    check, every = StopCheck(arm, collision), np.arange(len(collision.pairs))
+    every = np.arange(len(collision.pairs))
     rng, data = np.random.default_rng(1), arm.model.createData()
     share = np.linspace(0.0, 1.0, 41)[:, None]
     refused = 0
@@ -77,7 +123,7 @@ def test_the_way_to_rest_is_as_clear_as_a_dense_search_finds(arm: Robot) -> None
         if room[0].min() < 0.0:
             continue
         travel = np.abs(np.diff(path, axis=0))
-        clear = check.find_shortfall(np.minimum(rooms[0], NEAR), path[1:], travel) is None
+        clear = collision.is_path_clear(np.minimum(rooms[0], NEAR), path[1:], travel)
         assert clear == (room.min() >= 0.0) or abs(room.min()) < 1e-3
         refused += not clear
         moved = np.abs(np.diff(np.array(rooms), axis=0))
@@ -95,18 +141,19 @@ def pushed(seconds: float, hz: float) -> Pose:
 
 
 @pytest.mark.parametrize("guarded", [True, False])
-def test_live_a_robot_that_is_driven_into_itself_stops_short_of_it(arm: Robot, guarded: bool) -> None:
+def test_live_a_robot_that_is_driven_into_itself_stops_short_of_it(
+    arm: retargeting.Robot, guarded: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """By the check of its stops alone: the constraints that keep shapes apart are taken away."""
     pose = pushed(7.0, 0.6)
-    session = Session(arm, stream_info(pose))
+    session = Session(arm, pose)
     controller = session.stream._controller
     controller.guarded = guarded
-    constrain = controller._constrain_distances
-    controller._constrain_distances = lambda *near: (constrain(*near)[0], np.full(len(near[1].distance), -1e30))
+    monkeypatch.setattr("wepose_pin.retargeting.controller.compute_separation_bounds", lambda _, d, *__: 0.0 * d - 1e30)
     session.run(live_poses(pose))
     clock, u = (np.array([getattr(command, key) for command in session.commands]) for key in ("clock", "u"))
     keeps_its_limits(session.messages(), arm)
-    contacts = find_self_collisions(arm, clock, u).samples
+    contacts = retargeting.find_self_collisions(arm, clock, u).samples
     if not guarded:
         assert contacts > 10
         return
@@ -120,11 +167,11 @@ def test_live_a_robot_that_is_driven_into_itself_stops_short_of_it(arm: Robot, g
 
 
 def test_no_step_that_keeps_all_the_robot_stands_and_goes_on_when_there_is_one(
-    arm: Robot, monkeypatch: pytest.MonkeyPatch
+    arm: retargeting.Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A solver that finds nothing for a second: the robot brakes within its limits, waits, and follows again."""
     pose = person(10.0)
-    session = Session(arm, stream_info(pose))
+    session = Session(arm, pose)
     session.run(live_poses(pose)[:600])
     with monkeypatch.context() as nothing:
         nothing.setattr(session.stream._controller, "_solve_qp", lambda *_: None)
@@ -141,16 +188,19 @@ def test_nothing_of_a_robot_on_a_table_goes_below_it(tmp_path: Path) -> None:
     urdf = write_arm(tmp_path)
     said = urdf.with_suffix(".toml").read_text()
     urdf.with_suffix(".toml").write_text(said.replace('forward = "+x"', 'forward = "+x"\ntable = -0.6'))
-    robot = load_robot(find_map(str(urdf)))
-    with pytest.raises(BadModel, match="rest, table: forearm_0 is in the table in the rest posture"):
-        load_robot(replace(robot.map, table=-0.4))
+    robot = retargeting.load_robot(retargeting.find_map(str(urdf)))
+    with pytest.raises(errors.BadModel, match="rest, table: forearm_0 is in the table in the rest posture"):
+        retargeting.retarget(person(2.0), retargeting.load_robot(replace(robot.map, table=-0.4)))
     pose = person(4.0, flexion=15.0)  # the hand hangs 0.6 m below the shoulder
     lowest = {}
-    for name, own in (("table", robot), ("none", load_robot(replace(find_map(str(urdf)), table=None)))):
-        trajectory = retarget(pose, own)
+    for name, own in (
+        ("table", robot),
+        ("none", retargeting.load_robot(replace(retargeting.find_map(str(urdf)), table=None))),
+    ):
+        trajectory = retargeting.retarget(pose, own)
         base = own.full.frames[own.full.getFrameId("base")].placement
         height = [base.actInv(hand)[2] for hand in trajectory.hand["right"]]
         lowest[name] = min(height)
-        assert find_self_collisions(own, trajectory.time, trajectory.joint_position).samples == 0
+        assert retargeting.find_self_collisions(own, trajectory.time, trajectory.joint_position).samples == 0
     assert lowest["none"] < -0.65
     assert lowest["table"] > -0.63  # its point is 0.03 m ahead of its shape

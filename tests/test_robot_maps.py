@@ -1,0 +1,197 @@
+"""Maps of robots, and what is refused of a robot: each in a line that says where."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arms import JOINTS, person, write_arm
+
+from wepose_pin import errors, retargeting
+from wepose_pin.kinematics import Pose
+
+pytest.importorskip("daqp")
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> retargeting.Robot:
+    return load(write_arm(tmp_path_factory.mktemp("arm")))
+
+
+def load(urdf: Path) -> retargeting.Robot:
+    return retargeting.load_robot(retargeting.find_map(str(urdf)))
+
+
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        ("elbow.limit", "joint 'elbow' has no position limits"),
+        ("elbow.velocity", "joint 'elbow' has no velocity limit"),
+        ("pitch.acceleration", "limits.acceleration: joint 'pitch' has none"),
+    ],
+)
+def test_a_robot_without_limits_is_refused_with_the_joint_named(tmp_path: Path, key: str, text: str) -> None:
+    with pytest.raises(errors.BadModel, match=text):
+        load(write_arm(tmp_path, without=key))
+
+
+PAGE = (Path(__file__).parents[1] / "docs" / "robot-maps.md").read_text(encoding="utf-8")
+REQUIRED = {key: "**required**" in rest for key, rest in re.findall(r"(?m)^\| `([\w.]+)` \|.*?\|(.*?)\|", PAGE)}
+STATED = {
+    "format": "1",
+    "urdf": '"arm.urdf"',
+    "srdf": '"arm.srdf"',
+    "description": '"a test"',
+    "base": '"base"',
+    "up": '"+z"',
+    "forward": '"+x"',
+    "table": "-2.0",
+    "rest.JOINT": "-1.2",
+    "limits.source": '"nobody"',
+    "limits.acceleration": "12.0",
+    "limits.jerk": "600.0",
+    "limits.velocity": "2.0",
+    "limits.position.JOINT": "[-2.0, -0.1]",
+    "collision.LINK.xyz": "[0.0, 0.0, -0.2]",
+    "collision.LINK.rpy": "[0.0, 0.5, 0.0]",
+    "arms.SIDE.joints": json.dumps(JOINTS),
+    "arms.SIDE.shoulder.link": '"upper_arm"',
+    "arms.SIDE.shoulder.offset": "[0.0, 0.0, 0.0]",
+    "arms.SIDE.elbow.link": '"forearm"',
+    "arms.SIDE.elbow.offset": "[0.0, 0.0, 0.0]",
+    "arms.SIDE.hand.link": '"hand"',
+    "arms.SIDE.hand.offset": "[0.0, 0.0, -0.1]",
+    "arms.SIDE.hand.fingers": '"-z"',
+    "arms.SIDE.hand.thumb": '"+x"',
+    "arms.SIDE.reach": "0.6",
+}  # a map with every key
+
+
+@pytest.mark.parametrize("without", ["nothing", *STATED])
+def test_a_map_needs_the_keys_that_its_table_calls_required(tmp_path: Path, without: str) -> None:
+    urdf = write_arm(tmp_path)
+    (tmp_path / "arm.srdf").write_text("<robot name='arm'/>")
+    left_out = "arms.SIDE.elbow" if without == "arms.SIDE.elbow.link" else without  # an elbow has a link
+    lines = [f"{key} = {value}" for key, value in STATED.items() if not key.startswith(left_out)]
+    text = "\n".join(lines).replace("SIDE", "right").replace("JOINT", "elbow").replace("LINK", "forearm")
+    urdf.with_suffix(".toml").write_text(text)
+    if without != "nothing" and REQUIRED[without]:
+        with pytest.raises(errors.BadModel):
+            retargeting.load_robot(retargeting.read_map(tmp_path / "arm.toml"))
+        return
+    robot = retargeting.load_robot(retargeting.read_map(tmp_path / "arm.toml"))
+    shape = next(shape for shape in robot.geometry.geometryObjects if shape.name == "forearm_0")
+    stated = {key: not key.startswith(left_out) for key in STATED}
+    assert shape.placement.translation[2] == (-0.2 if stated["collision.LINK.xyz"] else 0.0)
+    assert shape.placement.rotation[0, 0] == pytest.approx(np.cos(0.5 if stated["collision.LINK.rpy"] else 0.0))
+
+
+def test_the_page_has_the_keys_that_are_tested() -> None:
+    assert set(STATED) == set(REQUIRED)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("format = 1", "format = 2", "format = 2; this version reads format = 1"),
+        ('up = "+z"', 'up = "z"', r"arm.toml: up = 'z' is not known; .*there is: \+x, -x"),
+        ('up = "+z"', 'up = "+x"', r"arm.toml: up, forward: \+x and \+x lie on one line"),
+        (
+            'link = "forearm"',
+            'link = "foream"',
+            "arms.right.elbow: no link 'foream' in arm.urdf; did you mean 'forearm'",
+        ),
+        ('"yaw"]', '"jaw"]', "arms.right.joints: no moving joint 'jaw' in arm.urdf; did you mean 'yaw'"),
+        ("[arms.right]", "[arms.middle]", "arms.middle is not a side"),
+        ("shoulder =", "schoulder =", "arms.right.schoulder is not a known key; did you mean 'shoulder'"),
+        ("elbow = -1.2", "elbow = 1.2", "rest.elbow = 1.2 is outside its limits, -2.6 to -0.02"),
+        ("elbow = -1.2", "elbo = -1.2", "rest: no moving joint 'elbo' in arm.urdf; did you mean 'elbow'"),
+        ("offset = [0.0, 0.0, -0.1]", "offset = [0.0, 0.0]", r"hand.offset = \[0.0, 0.0\]; three numbers in metres"),
+        ("yaw = 12.0", "yaw = 12.0\n[limits.jerk]\nyaw = -5.0", "limits.jerk: joint 'yaw' is -5"),
+        (
+            "[limits.acceleration]",
+            "[limits]\njerk = 'high'\n[limits.acceleration]",
+            "limits.jerk = 'high'; a number for",
+        ),
+        ("[rest]", "[limits.velocity]\njaw = 1.0\n[rest]", "limits.velocity: no moving joint 'jaw' in arm.urdf"),
+        (
+            "[rest]",
+            "[limits.position]\nyaw = [1.0, -1.0]\n[rest]",
+            r"limits.position.yaw = \[1.0, -1.0\]; \[lower, upper\]",
+        ),
+        ("yaw = 12.0", "yaw = -1.0", "limits.acceleration: joint 'yaw' is -1; no URDF holds it"),
+        ("[rest]", "[rest", "not valid TOML"),
+    ],
+)
+def test_a_map_that_is_wrong_says_where(tmp_path: Path, old: str, new: str, text: str) -> None:
+    urdf = write_arm(tmp_path)
+    said = urdf.with_suffix(".toml").read_text()
+    assert old in said
+    urdf.with_suffix(".toml").write_text(said.replace(old, new, 1))
+    with pytest.raises(errors.BadModel, match=text):
+        load(urdf)
+
+
+def test_a_joint_that_fingers_copy_is_no_joint_of_the_arm(tmp_path: Path) -> None:
+    """A gripper of joints that rotate, one finger of which bears the hand."""
+    urdf = write_arm(tmp_path)
+    fingers = "".join(
+        f'<link name="finger_{k}"/><joint name="knuckle_{k}" type="revolute"><parent link="hand"/>'
+        f'<child link="finger_{k}"/><axis xyz="1 0 0"/><limit lower="0" upper="0.8" velocity="2" effort="1"/>'
+        + ('<mimic joint="knuckle_1" multiplier="-1"/></joint>' if k == 2 else "</joint>")
+        for k in (1, 2)
+    )
+    urdf.write_text(urdf.read_text().replace("</robot>", f"{fingers}</robot>"))
+    said = urdf.with_suffix(".toml").read_text().replace('"yaw"]', '"yaw", "knuckle_1"]')
+    said = said.replace("yaw = 12.0", "yaw = 12.0\nknuckle_1 = 1.0").replace('{ link = "hand"', '{ link = "finger_1"')
+    urdf.with_suffix(".toml").write_text(said)
+    with pytest.raises(errors.BadModel, match="'knuckle_1' is no joint of the arm: it is copied by 'knuckle_2'"):
+        load(urdf)
+
+
+@pytest.mark.parametrize(("up", "forward"), [("-z", "+x"), ("+z", "-x"), ("+x", "+y")])
+def test_a_rest_of_another_mount_is_refused(tmp_path: Path, up: str, forward: str) -> None:
+    urdf = write_arm(tmp_path, up=up, forward=forward)
+    with pytest.raises(errors.BadModel, match=r"arm.toml: rest: the right hand is .* give a rest for this mount"):
+        load(urdf)
+    text = urdf.with_suffix(".toml").read_text()
+    urdf.with_suffix(".toml").write_text(text.replace("[rest]\nelbow = -1.2", ""))
+    load(urdf)
+
+
+def test_of_an_arm_that_is_not_there_the_message_says_what_to_do(arm) -> None:
+    pose = person(2.0)
+
+    def without(*parts: str) -> Pose:
+        quat = {name: quat for name, quat in pose.quat_WL.items() if name not in parts}
+        return replace(pose, quat_WL=quat, points={n: p for n, p in pose.points.items() if "torso" not in parts})
+
+    with pytest.raises(
+        errors.BadData, match="right_forearm, which the sensors do not measure; an arm needs sensors on torso, upper"
+    ):
+        retargeting.retarget(without("right_forearm"), arm)
+    with pytest.raises(errors.BadData, match="torso, right_shoulder"):
+        retargeting.retarget(without("torso"), arm)
+    with pytest.raises(
+        errors.BadData, match=r"right arm follows right_.*; an arm needs sensors on torso, upper arm and forearm"
+    ):
+        retargeting.retarget(person(2.0, side="left"), arm)
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    urdf = write_arm(tmp_path)
+    with pytest.raises(errors.BadModel, match="--robot pandas: not known; did you mean 'panda'"):
+        retargeting.find_map("pandas")
+    with pytest.raises(errors.BadOption, match=r"--arm left: arm has no left arm; there is: right"):
+        retargeting.load_robot(retargeting.find_map(str(urdf)), ("left",))
+    text = urdf.with_suffix(".toml").read_text()
+    urdf.with_suffix(".toml").write_text(f"{text}[collision.w1]\nxyz = [0.0, 0.0, 0.1]\n")
+    with pytest.raises(errors.BadModel, match=r"arm.toml: collision.w1: the link has 0 collision shapes in arm.urdf"):
+        load(urdf)
+    urdf.with_suffix(".toml").unlink()
+    with pytest.raises(errors.MissingFile, match=r"no arm.toml beside it; a map says which links"):
+        retargeting.find_map(str(urdf))
