@@ -1,4 +1,4 @@
-"""The reference of a hand: it moves from the robot's hand to its target, and then with it. Live and recorded alike."""
+"""The reference of a live hand: it moves from the robot's hand to its target, and then with it."""
 
 from __future__ import annotations
 
