@@ -145,5 +145,4 @@ def pose(problem: CalibrationProblem) -> Posed:
     observations, _ = problem.observe()
     prior = build_prior(problem, observations)
     guess, contact = find_initial_guess(observations, prior.mean, lambda some: build_prior(problem, some).mean)
-    weights = solve_reweighted(observations, prior, guess, contact).weights
-    return Posed(LeastSquares(observations, prior, weights), guess)
+    return Posed(solve_reweighted(observations, prior, guess, contact).fit.problem, guess)

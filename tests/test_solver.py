@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from bodies import LENGTHS
@@ -34,7 +32,7 @@ def test_a_length_stays_above_its_bound(cases: dict[str, Posed]) -> None:
     k = len(LENGTHS) - 1
     mean[k] = -0.05
     information[k, :], information[:, k], information[k, k] = 0.0, 0.0, 1e8
-    problem = replace(problem, prior=Gaussian(mean, information))
+    problem = problem._replace(prior=Gaussian(mean, information))
     assert solve_without_bounds(problem, start).x[k] < 0.0
     estimate = solve(problem, start)
     assert estimate.x[k] == pytest.approx(MIN_LENGTH, abs=1e-6)

@@ -15,7 +15,7 @@ import numpy as np
 from ..diagnostics import WARNING, Diagnostic
 from .equations import Layout
 from .initial_headings import find_distinct_headings
-from .least_squares import Estimate, Gaussian, LeastSquares, Observations, solve
+from .least_squares import Estimate, Gaussian, LeastSquares, solve
 from .priors import place_points
 from .weights import WeightedFit
 
@@ -34,26 +34,24 @@ class Alternative(NamedTuple):
 
 
 def find_alternatives(
-    observations: Observations,
-    prior_at: Callable[[np.ndarray], Gaussian],
-    result: WeightedFit,
-    stated: Mapping[str, float],
+    result: WeightedFit, prior_at: Callable[[np.ndarray], Gaussian], stated: Mapping[str, float]
 ) -> list[Alternative]:
     """Solutions with other headings, the likeliest first, down to `LEAST_WEIGHT`.
 
     Parameters
     ----------
-    prior_at : x (m,) → what is known without the closure, where headings without a stated mount are those of x
     result : the best solution
+    prior_at : x (m,) → what is known without the closure, where headings without a stated mount are those of x
     stated : sensor → ψ [rad] of its stated mount; where all sensors have one there is nothing to search
     """
-    layout, fit = observations.layout, result.fit
+    fit, (observations, _, weights) = result.fit, result.fit.problem
+    layout = observations.layout
     unknown = np.array([name not in stated for name in layout.sensors])
     if not observations.closed.any() or not unknown.any():
         return []
     stride = max(1, len(observations) // COMPARED_SAMPLES)
     few = np.concatenate([np.arange(len(observations))[span][::stride] for _, span in observations.spans()])
-    some, weights = observations.take(few), stride * result.weights[few]
+    some, weights = observations.take(few), stride * weights[few]
     rows = layout.heading
 
     def solve_from(psi: np.ndarray) -> Estimate:

@@ -84,8 +84,7 @@ class Observations:
         return np.asarray(self.residuals(x)[1]).T
 
 
-@dataclass(frozen=True)
-class LeastSquares:
+class LeastSquares(NamedTuple):
     """½ Σ w r(x)² + ½ (x − c)ᵀ Λ (x − c), to be made least.
 
     Parameters
@@ -148,8 +147,7 @@ class Estimate:
     def information(self) -> np.ndarray:
         """JᵀWJ + Λ (m, m)."""
         J = self.jacobian.reshape(-1, len(self.x))
-        weights = np.broadcast_to(self.problem.weights, self.residuals.shape)
-        return (J.T * weights.ravel()) @ J + self.problem.prior.information
+        return (J.T * self.problem.weights.ravel()) @ J + self.problem.prior.information
 
     @cached_property
     def covariance(self) -> np.ndarray:
@@ -191,14 +189,14 @@ def solve(problem: LeastSquares, start: np.ndarray, steps: int = STEPS, *, stric
     NoSolution
         It did not converge.
     """
-    observations, (mean, information) = problem.observations, problem.prior
+    observations, (mean, information), weights = problem
     start = np.maximum(start, problem.lower_bounds)
     # In units of the prior's standard deviations the gradient says how far there is to go.
     scale = np.diag(information) ** -0.5
     z = ca.MX.sym("z", len(start))
     x = start + scale * z
-    off, weights = x - mean, np.broadcast_to(problem.weights, (len(observations), observations.layout.residuals))
-    cost = 0.5 * ca.dot(ca.DM(weights.T), observations.residuals(x)[0] ** 2) + 0.5 * ca.bilin(information, off, off)
+    squares = ca.dot(ca.DM(weights.T), observations.residuals(x)[0] ** 2)
+    cost = 0.5 * squares + 0.5 * ca.bilin(information, x - mean, x - mean)
     JT = scale * observations.jacobian(x)
     hessian = ca.mtimes(JT @ ca.diag(ca.DM(weights.ravel())), JT.T, _BLAS)
     hessian += np.outer(scale, scale) * information

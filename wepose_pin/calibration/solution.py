@@ -16,7 +16,7 @@ from .conditions import find_hinges, is_scale_observed
 from .contact import find_initial_guess
 from .equations import HINGE_STD
 from .joints import add_couplings
-from .least_squares import MIN_LENGTH, Gaussian, Observations
+from .least_squares import MIN_LENGTH, Gaussian
 from .observability import diagnose_closures, diagnose_lengths, diagnose_mounts
 from .priors import build_prior, place_points
 from .problem import LOOSE, CalibrationProblem
@@ -37,7 +37,6 @@ QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be a
 class _Solution(NamedTuple):
     """The solved least squares."""
 
-    observations: Observations
     samples: np.ndarray  # (n,) of the recording
     prior: Gaussian  # without what accelerations show
     result: WeightedFit
@@ -52,7 +51,7 @@ def solve_quickly(problem: CalibrationProblem) -> Calibration:
     if problem.is_free_motion:
         prior = add_couplings(prior, observations.layout, problem.couplings, prior.mean)
     result = solve_reweighted(observations, prior, prior.mean, np.ones(len(samples)), quick=True)
-    return _describe(problem, _Solution(observations, samples, prior, result, result.fit.covariance, []))
+    return _describe(problem, _Solution(samples, prior, result, result.fit.covariance, []))
 
 
 def solve_fully(problem: CalibrationProblem) -> Calibration:
@@ -77,7 +76,7 @@ def solve_fully(problem: CalibrationProblem) -> Calibration:
         mean[free] = x[free]
         return add_couplings(Gaussian(mean, prior.information), layout, problem.couplings, x)
 
-    alternatives = find_alternatives(observations, prior_at, result, headings)
+    alternatives = find_alternatives(result, prior_at, headings)
     lengths = result.fit.x[layout.length]
     if np.min(lengths, initial=np.inf) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
         raise NoSolution(
@@ -85,14 +84,15 @@ def solve_fully(problem: CalibrationProblem) -> Calibration:
             f"mm); check that the points do in the phase what the protocol says, and that every sensor sits where the "
             f"session says"
         )
-    covariance = widen_covariance(estimate_covariance(observations, result, coupled.information), alternatives, layout)
-    return _describe(problem, _Solution(observations, samples, prior, result, covariance, alternatives))
+    covariance = widen_covariance(estimate_covariance(result), alternatives, layout)
+    return _describe(problem, _Solution(samples, prior, result, covariance, alternatives))
 
 
 def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
     """The calibration that a solution makes."""
-    observations, samples, prior, result, x_cov, alternatives = solution
-    layout, fit = observations.layout, result.fit
+    samples, prior, result, x_cov, alternatives = solution
+    fit, observations = result.fit, result.fit.problem.observations
+    layout = observations.layout
     lengths, covariance = fit.x[layout.length], x_cov[np.ix_(layout.length, layout.length)]
     scale_std = float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1) if len(lengths) else float("nan")
     scale_observed = is_scale_observed(problem.conditions)
@@ -135,13 +135,14 @@ def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
         start_pose_offset={name: offset.tilt for name, offset in subject.start_pose_offset.items()},
         heading_drift={name: drift.rate for name, drift in subject.heading_drift.items()},
         hinge_rms=hinge_rms,
-        posed=compare_posed(observations, result, phases, loose),
+        posed=compare_posed(fit, phases, loose),
     )
 
 
 def _make_subject(problem: CalibrationProblem, solution: _Solution) -> tuple[Subject, dict[str, float]]:
     """The subject of a solution, and joint → the rms [rad] by which its segment leaves the plane across its hinge."""
-    layout, x, filtered = solution.observations.layout, solution.result.fit.x, problem.filtered
+    fit, filtered = solution.result.fit, problem.filtered
+    layout, x = fit.problem.observations.layout, fit.x
     mounts, offsets, drifts = {}, {}, {}
     std = np.sqrt(np.diag(solution.covariance))
     for name, tilt, heading, drift in zip(layout.sensors, layout.tilt, layout.heading, layout.drift, strict=True):
@@ -175,12 +176,13 @@ def _make_subject(problem: CalibrationProblem, solution: _Solution) -> tuple[Sub
 
 def _estimate_hinges(problem: CalibrationProblem, solution: _Solution) -> Mapping[str, tuple[Hinge, float]]:
     """Joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it."""
-    layout, fit, hinges = solution.observations.layout, solution.result.fit, {}
-    bending = fit.hinge[solution.observations.bending]
+    fit, hinges = solution.result.fit, {}
+    observations = fit.problem.observations
+    bending = fit.hinge[observations.bending]
     if not len(bending):
         return {}
     terms = find_hinges(problem.model, problem.start_pose, problem.sensors)
-    for term, (across, tilted), residuals in zip(terms, fit.x[layout.hinge], bending.T, strict=True):
+    for term, (across, tilted), residuals in zip(terms, fit.x[observations.layout.hinge], bending.T, strict=True):
         axis = np.array(term.axis) + across * np.array(term.across) + tilted * np.array(term.tilted)
         axis_L = problem.start_rotation(term.on).inv().apply(axis / np.linalg.norm(axis))
         rms = float(HINGE_STD * np.sqrt(np.mean(residuals**2)))

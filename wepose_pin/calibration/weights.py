@@ -43,7 +43,6 @@ class WeightedFit(NamedTuple):
     """A solution with the weights that its own residuals give."""
 
     fit: Estimate
-    weights: np.ndarray  # (n, k) of the residuals
     contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
     effective_sample_size: float  # effective sample size of the gap
 
@@ -75,7 +74,7 @@ def solve_reweighted(
     effective = float(closed.sum())
     if not closed.any():
         fit = solve(LeastSquares(observations, prior, weights), x, steps, strict=not quick)
-        return WeightedFit(fit, weights, contact, effective)
+        return WeightedFit(fit, contact, effective)
     for k in rounds:
         # The last solve is the strict one.
         fit = solve(LeastSquares(observations, prior, weights), x, steps if k == 0 else ROUND_STEPS, strict=False)
@@ -90,7 +89,7 @@ def solve_reweighted(
         if observations.layout.hinges and not quick:
             weights[closed, GAP_ROWS:] = _weigh(fit.hinge[closed], np.ones(int(closed.sum())), correlation)
     fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, strict=not quick)
-    return WeightedFit(fit, weights, contact, effective)
+    return WeightedFit(fit, contact, effective)
 
 
 def _measure_bend(observations: Observations, span: slice, level: Level) -> float:
@@ -135,7 +134,7 @@ def count_correlated_samples(r: np.ndarray, least: float) -> float:
     return max(float(1.0 + 2.0 * rho[1:crossing].sum()), least)
 
 
-def estimate_covariance(observations: Observations, result: WeightedFit, prior_information: np.ndarray) -> np.ndarray:
+def estimate_covariance(result: WeightedFit) -> np.ndarray:
     """Covariance (m, m) of x under errors that are correlated over time.
 
     The weights count as many samples as one as the errors last. That is right where the motion is as slow as the
@@ -143,12 +142,10 @@ def estimate_covariance(observations: Observations, result: WeightedFit, prior_i
     sample and cancels. So the gradient's covariance is that of sums over windows of the errors' duration,
     C (Λ + Σ (Σ w J)ᵀ σ² (Σ w J) / duration) C, as of Newey and West 1987 with their triangle of weights.
     """
-    fit, contact = result.fit, result.contact
-    C = fit.covariance
-    J, r, least = fit.jacobian, fit.residuals, min_correlation(observations)
-    weights = np.broadcast_to(result.weights, r.shape)
+    fit, contact, (observations, prior, weights) = result.fit, result.contact, result.fit.problem
+    J, r, C, least = fit.jacobian, fit.residuals, fit.covariance, min_correlation(observations)
     hinges = list(range(GAP_ROWS, observations.layout.residuals))
-    gradient = prior_information.copy()
+    gradient = prior.information.copy()
     for condition, span in observations.spans():
         parts = [(list(range(condition.rows)), contact[span])] if condition.rows else []
         if isinstance(condition, Loop | Moving) and hinges:
@@ -190,9 +187,7 @@ def compare_measured(
     return compared
 
 
-def compare_posed(
-    observations: Observations, result: WeightedFit, phases: Sequence[str], loose: Mapping[str, float]
-) -> dict[str, float]:
+def compare_posed(fit: Estimate, phases: Sequence[str], loose: Mapping[str, float]) -> dict[str, float]:
     """By how many standard deviations each phase of poses deviates from what is known without it.
 
     A pose has no residual that would show how it was held, as a closure has: only the other conditions can.
@@ -202,7 +197,7 @@ def compare_posed(
     phases : of the conditions, in their order
     loose : phases that are not used → factor by which the standard deviations of their poses are too large
     """
-    fit, deviations = result.fit, {}
+    (observations, _, weights), deviations = fit.problem, {}
     spans = [
         (phase, condition, span)
         for (condition, span), phase in zip(observations.spans(), phases, strict=True)
@@ -212,7 +207,7 @@ def compare_posed(
         own = [(condition, span) for name, condition, span in spans if name == phase]
         information, pull, mean_r, mean_J, degrees = 0.0, 0.0, [], [], 0
         for condition, span in own:
-            r, J, w = fit.closure[span], fit.jacobian[span, :GAP_ROWS], result.weights[span, :GAP_ROWS]
+            r, J, w = fit.closure[span], fit.jacobian[span, :GAP_ROWS], weights[span, :GAP_ROWS]
             information = information + np.einsum("nk,nki,nkj->ij", w, J, J)
             pull = pull + np.einsum("nk,nki,nk->i", w, J, r)
             whiten = loose.get(phase, 1.0) * np.sqrt(w.sum(axis=0))
