@@ -308,26 +308,6 @@ def find_girdles(model: BodyModel, start: StartPose, sensors: Collection[str]) -
     return tuple(terms)
 
 
-def find_closure_lengths(protocol: Protocol, model: BodyModel) -> tuple[str, ...]:
-    """The lengths in some closure of a protocol."""
-    names: dict[str, None] = {}
-    for closure in protocol.closures:
-        total: dict[str, np.ndarray] = {}
-        for point, sign in (signed for way in closure.ways for signed in way):
-            for link, part in model.reaches.get(point, {}).items():
-                total[link] = total.get(link, 0.0) + sign * part.by_length
-                if closure.kind == "plane":
-                    names |= dict.fromkeys(_find_lengths_in(model, part.by_length))
-        for by_length in total.values():
-            names |= dict.fromkeys(_find_lengths_in(model, by_length))
-    return tuple(name for name in model.lengths if name in names)
-
-
-def _find_lengths_in(model: BodyModel, by_length: np.ndarray) -> list[str]:
-    """The lengths on which a vector with these derivatives (3, lengths) depends."""
-    return [name for name, column in zip(model.lengths, by_length.T, strict=True) if np.abs(column).max() > ZERO_LENGTH]
-
-
 def find_segments(protocol: Protocol, model: BodyModel) -> frozenset[str]:
     """The segments whose orientation some condition of a protocol uses where all of them have sensors."""
     used = {condition.segment for condition in protocol.conditions if isinstance(condition, Direction | Axis)}

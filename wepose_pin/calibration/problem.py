@@ -25,9 +25,9 @@ from .conditions import (
     Moving,
     Pointing,
     StartPose,
-    find_closure_lengths,
     find_girdles,
     find_hinges,
+    group_lengths,
     resolve_conditions,
 )
 from .equations import Layout
@@ -99,7 +99,8 @@ class CalibrationProblem:
     @cached_property
     def lengths_in_closures(self) -> tuple[str, ...]:
         """The names of the lengths that some closure contains."""
-        return find_closure_lengths(self.protocol, self.model)
+        groups = group_lengths(self.conditions, self.model.lengths).values()
+        return tuple(name for name in self.model.lengths if any(name in group for group in groups))
 
     @property
     def scale_lengths(self) -> tuple[str, ...]:

@@ -161,9 +161,7 @@ def calibrate(
         failures: list[Diagnostic] = []
         if report:
             progress("writing the report", 2 / 3)
-            failures = write_calibration_page(
-                out, calibration, recording, method=method, protocol=steps, quality=calibration.quality
-            )
+            failures = write_calibration_page(out, calibration, recording, method=method)
     print_diagnostics([*calibration.quality.further, *failures])
     _print_lengths_and_gap(calibration, steps, earlier or calibration.problem.prior)
     if report:

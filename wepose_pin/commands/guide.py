@@ -99,9 +99,7 @@ def run_guide(
         out = path.with_suffix("")
         with result_folder(out, force=True) as partial:
             write_calibration(partial, calibration, collect_provenance("calibrate", options))
-        write_calibration_page(
-            out, calibration, recording, method=method, protocol=load_protocol(steps), quality=calibration.quality
-        )
+        write_calibration_page(out, calibration, recording, method=method)
         return Calibrated(calibration, out)
 
     def estimate(recording: Recording) -> Calibration:

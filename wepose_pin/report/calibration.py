@@ -10,9 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..calibration import Calibration, CalibrationQuality
-from ..calibration.conditions import find_closure_lengths
 from ..calibration.observability import find_intervals
-from ..calibration.protocols import Protocol, load_protocol
 from ..calibration.result import MIN_CONTACT, Check
 from ..diagnostics import WARNING, Diagnostic, lines, quantity
 from ..errors import WeposeError, reason
@@ -42,16 +40,12 @@ def write_calibration_page(
     recording: Recording,
     *,
     method: str,
-    protocol: Protocol,
-    quality: CalibrationQuality,
 ) -> list[Diagnostic]:
     """Write ``report.html`` beside a calibration's result; what cannot be made, as of `write_track_pages`."""
     writer = PageWriter(folder, ["report.html"])
     writer.write(
         "report.html",
-        lambda failures: render_calibration_report(
-            calibration, recording, method=method, protocol=protocol, quality=quality, failures=failures
-        ),
+        lambda failures: render_calibration_report(calibration, recording, method=method, failures=failures),
     )
     writer.save_diagnostics("calibration.json")
     return writer.diagnostics
@@ -61,22 +55,19 @@ def render_calibration_report(
     calibration: Calibration,
     recording: Recording,
     *,
-    quality: CalibrationQuality | None = None,
     tracked: TrackedRecording | None = None,
     method: str = BEST,
-    protocol: str | Path | Protocol = "clasp",
     failures: list[str] | None = None,
 ) -> str:
     """``report.html``: one page that opens offline and prints; equal arguments give equal text.
 
     Parameters
     ----------
-    quality : of `assess`; None: the page has none
     tracked : the recording tracked with the calibrated subject, for the hands and the 3D view; None: it is tracked here
-    method, protocol : as the calibration was run
+    method : as the calibration was run
     failures : takes a line for each section that cannot be made; the page has the line in its place
     """
-    contact = _describe_contact(protocol if isinstance(protocol, Protocol) else load_protocol(protocol), calibration)
+    contact = _describe_contact(calibration)
     untracked: list[Diagnostic] = []
     if tracked is None:
         try:
@@ -90,7 +81,7 @@ def render_calibration_report(
                 failures.append(f"the motion cannot be tracked: {reason(error)}")
     page = Page(f"Calibration of {recording.name or 'a recording'}", failures)
     page.add("What can be relied on", lambda: [_describe_reliance(calibration, contact)], heading=False)
-    page.add("The quality", lambda: _list_diagnostics(calibration, quality, untracked), heading=False)
+    page.add("The quality", lambda: _list_diagnostics(calibration.quality, untracked), heading=False)
     page.add("Lengths", lambda: _list_lengths(calibration, contact))
     page.add("Sensors", lambda: _list_sensors(calibration, recording))
     page.add(f"{capital(contact.gap)} over time", lambda: _list_gap(calibration, contact))
@@ -99,7 +90,7 @@ def render_calibration_report(
     joints = dict.fromkeys(plural(plain(table.shared_name(name))) for name in calibration.hinge_rms)
     page.add(f"The {listed([*joints])} as hinges", lambda: _list_hinges(calibration))
     page.add("The motion in 3D", lambda: _list_view(calibration, recording, tracked))
-    page.add("Behind the quality", lambda: _list_checks(quality, contact))
+    page.add("Behind the quality", lambda: _list_checks(calibration.quality, contact))
     page.add("What was run", lambda: _list_run(calibration, recording, contact, method))
     return page.html()
 
@@ -112,8 +103,9 @@ class _Contact(NamedTuple):
     chain: tuple[str, ...]  # lengths in it
 
 
-def _describe_contact(protocol: Protocol, calibration: Calibration) -> _Contact:
-    chain, table = find_closure_lengths(protocol, calibration.problem.model), calibration.problem.model.table
+def _describe_contact(calibration: Calibration) -> _Contact:
+    protocol, chain = calibration.problem.protocol, calibration.problem.lengths_in_closures
+    table = calibration.problem.model.table
     points = dict.fromkeys(point for closure in protocol.closures for point in closure.points)
     if not points:
         return _Contact(protocol.name, "gap", chain)
@@ -146,15 +138,10 @@ def _describe_reliance(calibration: Calibration, contact: _Contact) -> str:
     return text
 
 
-def _list_diagnostics(
-    calibration: Calibration, quality: CalibrationQuality | None, untracked: Sequence[Diagnostic]
-) -> list[Item]:
-    items: list[Item] = []
-    further = calibration.remarks if quality is None else quality.further
-    if quality is not None:
-        items.append(Banner(quality.quality, QUALITIES[quality.quality], lines(quality.reasons, titled=True)))
-    entries = lines([*further, *untracked], titled=True)
-    return items + ([Banner("info", "What to know", entries)] if entries else [])
+def _list_diagnostics(quality: CalibrationQuality, untracked: Sequence[Diagnostic]) -> list[Item]:
+    banner = Banner(quality.quality, QUALITIES[quality.quality], lines(quality.reasons, titled=True))
+    entries = lines([*quality.further, *untracked], titled=True)
+    return [banner, Banner("info", "What to know", entries)] if entries else [banner]
 
 
 def _list_lengths(calibration: Calibration, contact: _Contact) -> list[Item]:
@@ -349,9 +336,7 @@ def _list_run(calibration: Calibration, recording: Recording, contact: _Contact,
     return [Facts(rows)]
 
 
-def _list_checks(quality: CalibrationQuality | None, contact: _Contact) -> list[Item]:
-    if quality is None:
-        return []
+def _list_checks(quality: CalibrationQuality, contact: _Contact) -> list[Item]:
     rows = []
     for check in quality.checks:
         if np.isfinite(check.value):
