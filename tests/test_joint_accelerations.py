@@ -112,7 +112,7 @@ def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_jo
     names = ("torso", "head")
     pair = JointPair(*names, np.zeros(6), 0.01, False)
     zeros = np.zeros(2)
-    same = AboutVertical(*np.zeros((6, 2)))
+    same = AboutVertical(*np.zeros((3, 2)))
     problem = HeadingProblem(
         names, load_model(), population_subject(), (pair,), (), (), PERSON_NOISE, knot_s, samples, zeros,
         np.full(2, 1e-4), np.deg2rad([0.1, 20.0]) ** 2, zeros, 0.0,

@@ -95,7 +95,7 @@ class Orientation(NamedTuple):
         has none
     noise : of gyroscope and accelerometer in the static phase
     diagnostics : what the user should know
-    about_vertical : (n, 6), as `base.AboutVertical`; None where the filter has no covariance
+    about_vertical : (n, 3), as `base.AboutVertical`; None where the filter has no covariance
     """
 
     quat_WS: np.ndarray

@@ -38,7 +38,6 @@ from .base import (
     FilterRun,
     OneSample,
     add_correction,
-    integrate_corrections,
     make_run,
     prepare_samples,
 )
@@ -533,13 +532,12 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
         else:
             at, axes, variance = POSITION, 2, model.position_var
             variance += _compute_added_variance(state, at, variance)
-        before = compute_vertical_bias_var(P, state.R_WS)
         heading, rate = block.correction[2], compute_vertical_bias(block.correction, state.R_WS)
         for i in range(axes):
             state.measured[i] = sums.gyro[i] / count if axes == 3 else 0.0
         _correct(state, at, axes, state.measured, variance)
         heading, rate = block.correction[2] - heading, compute_vertical_bias(block.correction, state.R_WS) - rate
-        add_correction(state.about_vertical, heading, rate, before, compute_vertical_bias_var(P, state.R_WS))
+        add_correction(state.about_vertical, heading, rate, compute_vertical_bias_var(P, state.R_WS))
     for i in range(VELOCITY, STATES):
         x[i] += block.correction[i]
     rotate_by_world_vector(state.quat_WS, block.correction[0], block.correction[1], block.correction[2])
@@ -642,7 +640,6 @@ def _compute_horizontal_acceleration(state, model, ax, ay, az):  # type: ignore[
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Filter one sample, gyro [rad/s], accel [m/s²]; records of `STATE` and `MODEL`. Return whether a block ended."""
     dt, x, sums, R = model.dt, state.x, state.sums, state.R_WS
-    integrate_corrections(state.about_vertical, dt)
     wx, wy, wz, ux, uy, uz = _correct_rate(state, model, gx, gy, gz, static)
     sums.rate_squared += wx * wx + wy * wy + wz * wz
     rotate_unit_by_rate(state.quat_WS, wx, wy, wz, dt)

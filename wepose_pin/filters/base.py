@@ -29,42 +29,27 @@ class AboutVertical(NamedTuple):
     ----------
     heading : [rad] sum of the corrections of its heading
     rate : [rad/s] sum of the corrections of the gyroscope's bias, each at the attitude that the sensor had then
-    drift : [rad] integral of `rate` over time
-    seconds : [s] this time, since the start
-    information : [s²/rad²] sum of what each correction adds to the inverse of `rate_var`
     rate_var : [rad²/s²] variance of the bias now
     """
 
     heading: np.ndarray
     rate: np.ndarray
-    drift: np.ndarray
-    seconds: np.ndarray
-    information: np.ndarray
     rate_var: np.ndarray
 
 
 VERTICAL_COLUMNS = len(AboutVertical._fields)
-HEADING, RATE, DRIFT, SECONDS, INFORMATION, RATE_VAR = range(VERTICAL_COLUMNS)
+HEADING, RATE, RATE_VAR = range(VERTICAL_COLUMNS)
 
 
 @inlined
-def add_correction(sums, heading, rate, before, after):  # type: ignore[no-untyped-def]
-    """Add a correction by `heading` [rad] and `rate` [rad/s] to `sums` (6,), a row of `AboutVertical`.
+def add_correction(sums, heading, rate, rate_var):  # type: ignore[no-untyped-def]
+    """Add a correction by `heading` [rad] and `rate` [rad/s] to `sums` (3,), a row of `AboutVertical`.
 
-    `before` and `after` [rad²/s²] are the variances of the bias.
+    `rate_var` [rad²/s²] is the variance of the bias now.
     """
     sums[HEADING] += heading
     sums[RATE] += rate
-    if before > after > 0.0:
-        sums[INFORMATION] += 1.0 / after - 1.0 / before
-    sums[RATE_VAR] = after
-
-
-@inlined
-def integrate_corrections(sums, dt):  # type: ignore[no-untyped-def]
-    """Integrate the correction of the rate in `sums` (6,), a row of `AboutVertical`, over a sample of `dt` [s]."""
-    sums[DRIFT] += sums[RATE] * dt
-    sums[SECONDS] += dt
+    sums[RATE_VAR] = rate_var
 
 
 class FilterRun(NamedTuple):
@@ -73,7 +58,7 @@ class FilterRun(NamedTuple):
     quat_WS: np.ndarray  # (n, 4) xyzw, orientation after the sample
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
     attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²] of the error on the right, in S; None: the filter has none
-    about_vertical: np.ndarray | None = None  # (n, 6) as `AboutVertical`; None: the filter has no covariance
+    about_vertical: np.ndarray | None = None  # (n, 3) as `AboutVertical`; None: the filter has no covariance
 
     def part(self, rows: slice) -> FilterRun:
         """Return views of the samples `rows`."""

@@ -156,7 +156,7 @@ class SensorFilters:
 
     @property
     def about_vertical(self) -> np.ndarray | None:
-        """(k, 6) as `AboutVertical`; a view. None: the filters have no covariance."""
+        """(k, 3) as `AboutVertical`; a view. None: the filters have no covariance."""
         return None if self._step is None else np.asarray(self._states["about_vertical"])
 
 

@@ -33,7 +33,6 @@ from .base import (
     FilterRun,
     OneSample,
     add_correction,
-    integrate_corrections,
     make_run,
     prepare_samples,
 )
@@ -240,7 +239,6 @@ def _model(noise: SensorNoise, dt: float, params: SmekfParams, first_order: bool
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Take one sample of one sensor: records of `STATE` and `MODEL`, gyro [rad/s], accel [m/s²]."""
     dt, bias, held = model.dt, state.gyro_bias, state.held_rate
-    integrate_corrections(state.about_vertical, dt)
     is_measured = gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
     lost_var = 0.0
     if is_measured:
@@ -363,7 +361,6 @@ def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-unty
     two S of (3, 3) in place of one of (6, 6).
     """
     bias, up = state.gyro_bias, (R[6], R[7], R[8])
-    before = compute_variance_along(P[2], up[0], up[1], up[2])
     # gyro: H P = [P_ba, P_bb], S = P_bb + Σ_ω
     Q = model.static_gyro_cov
     _, b, c = P
@@ -406,7 +403,7 @@ def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-unty
     bias[2] += bz
     a, b, c = P
     after = compute_variance_along(c, up[0], up[1], up[2])
-    add_correction(state.about_vertical, tz, dot(up[0], bx, up[1], by, up[2], bz), before, after)
+    add_correction(state.about_vertical, tz, dot(up[0], bx, up[1], by, up[2], bz), after)
     return ((a[0], a[1], a[2], a[3], a[4], a[5] + model.static_turn), b, c), after_R
 
 

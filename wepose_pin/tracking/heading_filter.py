@@ -2,9 +2,7 @@
 
 δ_i is the heading error of segment i, on the left in W: R_WL,true = Rz(δ_i) R_WL. It changes by a random walk, whose
 step variance is the growth of the orientation filter's heading variance, and by a rate that changes slowly: the bias
-that the orientation filter has not found. The heading is that of the filter without its own corrections of the heading
-(`heading_observations.undo_corrections`), so that it does not jump. Where the filter corrects its bias by Δb the rate
-changes by Δb, and what it learned by that is an observation of the rate. Differences of two or more δ are observed by:
+that the orientation filter has not found. Differences of two or more δ are observed by:
 
 - the acceleration of a joint, which two sensors measure (`joint_accelerations`), with their levers as unknowns;
 - a hinge with the axis n on the segment O: the long axis e of the segment M below stays in the plane across n, so that
@@ -24,15 +22,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit, logit
 
-from ..filters import AboutVertical
 from .heading_observations import OUTLIER_STDS, ClaspDetector, build_gap_rows, correct_headings, linearize_hinge
 from .heading_problem import HeadingProblem, Knot
 from .joint_accelerations import JointMisfit, linearize_joint
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
-MIN_RATE_VAR = 1e-18  # [rad²/s²] so that it can be inverted
-LEAST_INFORMATION = 1e-6  # relative to what a filter knew of its bias, below which a correction tells nothing
 # The heading variance of an orientation filter leaps where a knot adds more than this many times the largest recent
 # growth; that is forgotten with a time constant [s].
 LEAP_RATIO, GROWTH_MEMORY_S = 10.0, 60.0
@@ -49,29 +44,21 @@ _JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
 
 
 class KnotChange(NamedTuple):
-    """How headings and their rates change within a knot, by what the orientation filters did; (k,) each.
+    """How headings and their rates change within a knot, beside what the rates themselves add; (k,) each.
 
     Parameters
     ----------
-    drift : [rad] change of a heading as its filter corrects the bias within the knot
-    heading_var : [rad²] growth of a heading's variance apart from that by its rate
-    rate : [rad/s] correction of the filter's bias about the vertical
-    rate_var : [rad²/s²] growth of a rate's variance as the sensor turns another axis to the vertical
-    information : [s²/rad²] of the filter's corrections about its bias
-    prior_var : [rad²/s²] of this bias without these corrections
-    heading : [rad] correction of the filter's heading
-    unobserved, unobserved_rate : variance of a heading and of its rate, as a share of that by the filter alone
+    heading, rate : [rad], [rad/s] by what the orientation filters have corrected
+    heading_var : [rad²] growth of a heading's variance
+    rate_var : [rad²/s²] growth of a rate's variance
+    rate_share : of a rate's error that is left, as its sensor's filter knows the bias better than that
     """
 
-    drift: np.ndarray
-    heading_var: np.ndarray
-    rate: np.ndarray
-    rate_var: np.ndarray
-    information: np.ndarray
-    prior_var: np.ndarray
     heading: np.ndarray
-    unobserved: np.ndarray
-    unobserved_rate: np.ndarray
+    rate: np.ndarray
+    heading_var: np.ndarray
+    rate_var: np.ndarray
+    rate_share: np.ndarray
 
 
 class HeadingFilter:
@@ -138,7 +125,6 @@ class HeadingFilter:
         """Predict to the end of a knot and update by its observations; return the change of the prediction."""
         change = self.find_change(knot)
         self.predict(change)
-        self._learn_from_filters(change)
         for _ in self.update(knot):
             pass
         return change
@@ -147,7 +133,6 @@ class HeadingFilter:
         """Do as `step`, in parts of a millisecond or two; the state is valid after the last one."""
         change = self.find_change(knot)
         self.predict(change)
-        self._learn_from_filters(change)
         yield
         yield from self.update(knot)
 
@@ -156,8 +141,12 @@ class HeadingFilter:
 
         The heading variance of an orientation filter grows by the bias too, which is a rate here. So its growth counts
         up to `drift_psd`. As a whole it counts where it leaps: samples were lost, or the gyroscope was saturated.
+
+        What the filter has corrected of its heading and its bias is believed as far as nothing but the filter knows
+        them, and may be wrong by that much. The rest is taken back, in δ and in its rate. A rate is never less certain
+        than the filter's bias.
         """
-        knot_s, k = self.problem.knot_s, len(self.problem.names)
+        noise, knot_s, k = self.problem.noise, self.problem.knot_s, len(self.problem.names)
         now, last = knot.filters, self._last or knot.filters
         self._last = now
         gained = np.maximum(now.var - last.var, MIN_DRIFT_PSD * knot_s)
@@ -168,35 +157,24 @@ class HeadingFilter:
         self._recent_growth = np.maximum(remembered, np.where(known, gained, 0.0))
         limited = np.where(leaps, gained, np.minimum(gained, self.problem.drift_psd * knot_s))
         drift_var = np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k))
-        differences = [np.nan_to_num(a - b) for a, b in zip(now.about_vertical, last.about_vertical, strict=True)]
-        added = AboutVertical(*differences)
-        # The prediction integrates the rate of the knot's begin; corrections within the knot come on top of it.
-        drift = added.drift - np.nan_to_num(last.about_vertical.rate) * added.seconds
-        unobserved = np.diag(self.P)[:k] / (np.nan_to_num(last.var) + self.problem.start_var + self.problem.mount_var)
-        prior_var = self._find_prior_bias_var(now.about_vertical, last.about_vertical, added)
-        rates, alone = np.diag(self.P)[k : 2 * k], prior_var + self.problem.noise.rate_std**2
+        heading = np.nan_to_num(now.about_vertical.heading - last.about_vertical.heading)
+        rate = np.nan_to_num(now.about_vertical.rate - last.about_vertical.rate)
+        headings, rates = np.diag(self.P)[:k], np.diag(self.P)[k : 2 * k]
+        alone = np.nan_to_num(last.var) + self.problem.start_var + self.problem.mount_var
+        believed = np.minimum(1.0, headings / alone)
+        rate_alone = np.nan_to_num(now.about_vertical.rate_var, nan=np.inf) + noise.rate_std**2
+        rate_before = np.nan_to_num(last.about_vertical.rate_var, nan=np.inf) + noise.rate_std**2
+        rate_believed = np.minimum(1.0, rates / rate_before)
+        unknown_again = self._find_new_axis_share(knot) * np.nan_to_num(np.maximum(rate_alone - rates, 0.0), posinf=0.0)
+        grown = noise.rate_change_psd * knot_s + (rate_believed * rate) ** 2 + unknown_again
+        share = np.sqrt(np.minimum(1.0, rate_alone / (rates + grown)))
         return KnotChange(
-            drift=drift,
-            heading_var=drift_var,
-            rate=added.rate,
-            rate_var=self._find_new_axis_share(knot) * np.maximum(alone - rates, 0.0),
-            information=added.information,
-            prior_var=prior_var,
-            heading=added.heading,
-            unobserved=np.minimum(unobserved, 1.0),
-            unobserved_rate=np.minimum(rates / alone, 1.0),
+            heading=(believed - 1.0) * heading,
+            rate=(1.0 - rate_believed) * rate,
+            heading_var=drift_var + (believed * heading) ** 2,
+            rate_var=share**2 * grown,
+            rate_share=share,
         )
-
-    def _find_prior_bias_var(self, now: AboutVertical, last: AboutVertical, added: AboutVertical) -> np.ndarray:
-        """Find the variances (k,) [rad²/s²] of the biases about the present vertical without a knot's corrections.
-
-        They are at most the largest of those at the start and after the knot before, and the correction's own size:
-        more would be rounding of the sum of information, or the growth of the variance between corrections.
-        """
-        most_var = np.fmax.reduce([now.rate_var, last.rate_var, self.problem.rate_std**2, 4.0 * added.rate**2])
-        most_var = np.maximum(most_var, MIN_RATE_VAR)
-        rate_var = np.maximum(now.rate_var, MIN_RATE_VAR)
-        return np.nan_to_num(1.0 / np.maximum(1.0 / rate_var - added.information, 1.0 / most_var))
 
     def _find_new_axis_share(self, knot: Knot) -> np.ndarray:
         """Find the share (k,) of the variance of the bias about the vertical that the bias about the last one leaves.
@@ -215,57 +193,24 @@ class HeadingFilter:
         self._last_up = np.where(is_turned[:, None], up, last_up)
         return np.where(is_turned, 1.0 - cosine**2, 0.0)
 
-    def advance(self, values: np.ndarray) -> np.ndarray:
+    def advance(self, values: np.ndarray, change: KnotChange) -> np.ndarray:
         """Return F v of one knot for v (n,) or (n, m): correlated states decay, headings change by their rates."""
         k = len(self.problem.names)
         advanced = np.asarray((self._decay * values.T).T)
         advanced[:k] += self.problem.knot_s * values[k : 2 * k]
+        advanced[k : 2 * k] = (change.rate_share * advanced[k : 2 * k].T).T
         return advanced
 
     def predict(self, change: KnotChange) -> None:
         """Predict state and covariance at the end of the next knot."""
+        self.x = self.advance(self.x, change)
+        grown = self._process_var.copy()
         k = len(self.problem.names)
-        self.x = self.advance(self.x)
-        self.x[:k] += change.drift
+        self.x[:k] += change.heading
         self.x[k : 2 * k] += change.rate
-        self.P = self.advance(self.advance(self.P).T).T + np.diag(self._process_var)
-        self.P[np.arange(k), np.arange(k)] += change.heading_var
-        rates = np.arange(k, 2 * k)
-        self.P[rates, rates] += self.problem.noise.rate_change_psd * self.problem.knot_s + change.rate_var
-
-    def _learn_from_filters(self, change: KnotChange) -> None:
-        """Update the rates by what the orientation filters have learned of their biases in a knot.
-
-        A filter that knew its bias to the variance p and has corrected it by Δb with the information i has measured,
-        with the variance 1/i, that the rate is now −Δb/(p i). A rate has other parts than the bias (`noise.rate_std`);
-        this observes nothing of them. The filters' information has one common limit: how much the person moves while
-        they take it for static. So all of them together know no more than one.
-
-        The filter's correction of its heading, which was undone, follows from that as far as the heading was wrong by
-        the bias about the present vertical. The rest comes from a bias about an axis that was vertical before, or from
-        the gyroscope's scale. It is applied as far as nothing else has observed the heading; the same holds for the
-        rate.
-        """
-        k = len(change.rate)
-        before = self.x[: 2 * k]
-        # What was learned corrects by some √(p² i / (1 + p i)); more is by another axis that is vertical now.
-        known = change.information * change.prior_var
-        is_learned = change.rate**2 * (1.0 + known) < OUTLIER_STDS**2 * change.prior_var * known
-        at = np.flatnonzero(is_learned & (known > LEAST_INFORMATION))
-        if len(at):
-            rates, prior_var = k + at, change.prior_var[at]
-            share = prior_var / (prior_var + self.problem.noise.rate_std**2)  # of a rate's variance: the bias's
-            correction, var = change.rate[at], 1.0 / change.information[at]
-            innovation = -correction * var / prior_var - correction - share * (self.x[rates] - correction)
-            by_state = share * self.P[:, rates]
-            covariance = share[:, None] * by_state[rates] + np.diag((1.0 - share) * prior_var + var)
-            covariance += (1.0 - 1.0 / len(at)) * np.sqrt(np.outer(var, var))
-            gain = np.linalg.solve(covariance, by_state.T).T
-            self.P = _symmetric(self.P - gain @ by_state.T)
-            self.x = self.x + gain @ innovation
-        rest = np.concatenate([change.heading - change.drift, -change.rate]) - (self.x[: 2 * k] - before)
-        self.x = self.x.copy()
-        self.x[: 2 * k] += np.concatenate([change.unobserved, change.unobserved_rate]) * rest
+        grown[:k] += change.heading_var
+        grown[k : 2 * k] += change.rate_var
+        self.P = self.advance(self.advance(self.P, change).T, change).T + np.diag(grown)
 
     def update(self, knot: Knot) -> Iterator[None]:
         """Update by a knot's observations, then by the points that are found to coincide in it; yield between parts."""
@@ -455,7 +400,7 @@ def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> tuple[HeadingEstim
     for i in range(len(knots) - 2, -1, -1):
         forward.x, forward.P = filtered[i]
         forward.predict(changes[i + 1])
-        gain = np.linalg.solve(forward.P, forward.advance(filtered[i][1])).T
+        gain = np.linalg.solve(forward.P, forward.advance(filtered[i][1], changes[i + 1])).T
         x = filtered[i][0] + gain @ (x - forward.x)
         P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)
         estimates.append(stance.estimate(x, P))

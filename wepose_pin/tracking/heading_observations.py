@@ -16,18 +16,6 @@ from .heading_problem import CoincidentPoints, HeadingProblem, HingeAxis, Knot
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 
 
-@kernel
-def undo_corrections(quat_VS, corrections, at_start):  # type: ignore[no-untyped-def]
-    """Turn orientations (n, k, 4) xyzw in place by Rz(−c), c [rad] the corrections (n, k) since the start (k,)."""
-    for n in range(len(quat_VS)):
-        for k in range(quat_VS.shape[1]):
-            angle = at_start[k] - corrections[n, k]
-            s, c = np.sin(0.5 * angle), np.cos(0.5 * angle)
-            x, y, z, w = quat_VS[n, k, 0], quat_VS[n, k, 1], quat_VS[n, k, 2], quat_VS[n, k, 3]
-            quat_VS[n, k, 0], quat_VS[n, k, 1] = c * x - s * y, c * y + s * x
-            quat_VS[n, k, 2], quat_VS[n, k, 3] = c * z + s * w, c * w - s * z
-
-
 def correct_headings(quat_WL: np.ndarray, headings: np.ndarray) -> np.ndarray:
     """Return Rz(δ) R_WL (k, n, 3, 3) for orientations (n, k, 4) xyzw and headings δ (k,) or more [rad]."""
     R = np.empty((quat_WL.shape[1], len(quat_WL), 3, 3))

@@ -33,7 +33,7 @@ from ..model.start_pose import orient_links
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..subject import Subject
 from .heading_filter import HeadingFilter, StanceEstimator, smooth
-from .heading_observations import correct_headings, linearize_hinge, move_all_girdles, undo_corrections
+from .heading_observations import correct_headings, linearize_hinge, move_all_girdles
 from .heading_problem import (
     MECHANISM_NOISE,
     PERSON_NOISE,
@@ -332,7 +332,6 @@ class HeadingCorrector:
         offsets = np.array([orientations.heading_offset[name] for name in self._names])
         self._reader = KnotReader(mounts, offsets, chunk.rate_hz, problem)
         self._knots: list[Knot] = []
-        self._at_start = np.zeros(len(self._names))  # [rad] corrections of the filters' headings up to the start pose
         self._corrected_samples = 0  # of the second pass so far
         self._gaps = {stage: _RmsAccumulator() for stage in ("before", "after")}
         self._hinge_rms = {
@@ -346,12 +345,9 @@ class HeadingCorrector:
         if first == len(chunk):
             return
         quat_VS, accel_S = _stack_samples(chunk, orientations, self._names)
-        sums = stack_heading_corrections(orientations.orientation, self._names, len(chunk))
         if not (self._knots or self._reader.count):
-            self._at_start = sums[first]
             start = read_filter_headings(orientations.orientation, self._names, first)
             self._problem = replace(self._problem, start=start)
-        undo_corrections(quat_VS, sums, self._at_start)
         begin = first
         while begin < len(chunk):
             end = min(len(chunk), begin + self._reader.remaining)
@@ -379,10 +375,8 @@ class HeadingCorrector:
     def correct(self, chunk: Recording, orientations: SegmentOrientations) -> SegmentOrientations:
         """Return the chunk's orientations with corrected headings, in the second pass, and add up its residuals."""
         corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
-        sums = stack_heading_corrections(orientations.orientation, self._names, len(chunk)) - self._at_start
-        sums[chunk.time < self._start_end] = 0.0
         for i, name in enumerate(self._names):
-            delta = np.interp(chunk.time, self._knot_times, self._smoothed.errors[:, i]) - sums[:, i]
+            delta = np.interp(chunk.time, self._knot_times, self._smoothed.errors[:, i])
             corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
             self._max_correction_deg[name] = max(self._max_correction_deg[name], float(np.degrees(np.abs(delta).max())))
             filter_cov = _compute_filter_covariance(orientations, name)
@@ -458,9 +452,7 @@ class CausalHeadings:
     ----------
     offset : (k,) ψ [rad] to which corrections are added
     variance : (k,) [rad²] each after the last knot: variances of each segment's heading and of its filter's alone, and
-        the squared correction of the filters' headings since the start or the last reset
-    at_start : (k,) [rad] what the filters have corrected of their headings up to the end of the start pose; what they
-        correct later is undone before samples are pushed (`undo_corrections`)
+        the squared correction of the headings since the start or the last reset
     """
 
     def __init__(self, recording: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
@@ -478,8 +470,6 @@ class CausalHeadings:
         self._begin, self._end, self._at_reset = np.zeros((3, len(problem.names)))
         self._measured = find_measured_headings(recording, problem.names)
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
-        self.at_start = np.nan_to_num(start.about_vertical.heading)
-        self._undone = np.zeros(len(problem.names))  # [rad] what the filters have corrected since, at the last knot
         self._knot_filters: FilterHeadings | None = None  # of the last complete knot
         self._var_at_knot = np.zeros(len(problem.names))  # [rad²] of the filters, at the last knot that is applied
         self._estimate = self._stance.estimate(self._filter.x, self._filter.P)
@@ -567,12 +557,11 @@ class CausalHeadings:
             pass
         self._solving = None
         self._var_at_knot = np.nan_to_num(self._knot_filters.var)
-        self._undone = np.nan_to_num(self._knot_filters.about_vertical.heading - self.at_start)
         self._begin, self._end = self._end, self._estimate.errors.copy()
         if self._measured.any() and not self._corrects_measured:
             self._corrects_measured = exceed_uncertainty(self._end[None], self._estimate.covariance[None])
             self._end[self._measured] *= self._corrects_measured
-        self._max_correction = np.maximum(self._max_correction, np.abs(self._end - self._undone))
+        self._max_correction = np.maximum(self._max_correction, np.abs(self._end))
         self.variance = self._find_variances()
 
     def reset(self, heading_offset: np.ndarray) -> None:
@@ -584,7 +573,7 @@ class CausalHeadings:
         self._estimate = self._stance.estimate(self._filter.x, self._filter.P)
         self._corrects_measured = True
         self._begin = self._end = error
-        self._at_reset = error - self._undone
+        self._at_reset = error
         self.variance = self._find_variances()
 
     def _find_variances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -592,7 +581,7 @@ class CausalHeadings:
         return (
             np.diag(self._estimate.segment_covariance),
             self._var_at_knot,
-            (self._end - self._undone - self._at_reset) ** 2,
+            (self._end - self._at_reset) ** 2,
         )
 
     def summarize(self) -> HeadingCorrection:
@@ -642,16 +631,6 @@ def _stack_samples(
         quats.append(filtered.quat_WS)
         accels.append(find_specific_force(chunk, name))
     return np.stack(quats, axis=1), np.stack(accels, axis=1)
-
-
-def stack_heading_corrections(orientation: Mapping[str, Orientation], names: Sequence[str], samples: int) -> np.ndarray:
-    """Stack the sums (n, k) [rad] of what each filter has corrected of its heading; zero: it does not say."""
-    sums = np.zeros((samples, len(names)))
-    for i, name in enumerate(names):
-        about_vertical = orientation[name].about_vertical if name in orientation else None
-        if about_vertical is not None:
-            sums[:, i] = about_vertical[:, 0]
-    return sums
 
 
 def find_specific_force(chunk: Recording, name: str) -> np.ndarray:

@@ -36,7 +36,6 @@ from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
 from ..subject import Subject
-from .heading_observations import undo_corrections
 from .heading_problem import FilterHeadings, HeadingProblem
 from .headings import (
     CausalHeadings,
@@ -44,7 +43,6 @@ from .headings import (
     find_specific_force,
     read_filter_headings,
     replace_heading_variance,
-    stack_heading_corrections,
 )
 
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
@@ -131,7 +129,6 @@ class SegmentEstimator:
         self._oldest = 0  # row of `_recent` with the oldest sample
         self.quat_WL = np.zeros((len(self.names), 4))
         self._uncorrected = np.zeros(len(self.names))
-        self._filter_corrections = np.zeros((1, len(self.names)))  # [rad] of the last step, contiguous as in a chunk
         # [rad²] `CausalHeadings.variance` at the last step
         self._variance = (np.full(len(self.names), np.nan),) * 3
         self._var_at_reset: np.ndarray | None = None  # (k,) [rad²] of heading that a reset took away
@@ -166,9 +163,6 @@ class SegmentEstimator:
         else:
             self._recent[self._oldest] = self._filters.step(gyro_S, accel_S)
         newest = self._recent[self._oldest : self._oldest + 1]
-        if self.headings is not None and self._filters.about_vertical is not None:
-            self._filter_corrections[0, ~self._measured] = self._filters.about_vertical[:, 0]
-            undo_corrections(newest, self._filter_corrections, self.headings.at_start)
         _place_segments(self._quat_WV, self._correction(), newest, self._quat_LS, self.quat_WL, self.quat_WL[None])
         self._oldest = (self._oldest + 1) % len(self._recent)
         if self.headings is not None:
@@ -214,9 +208,6 @@ class SegmentEstimator:
     def _place_chunk(self, chunk: Recording, orientation: Mapping[str, Orientation]) -> SegmentOrientations:
         """Return the segment orientations of a filtered chunk without resets."""
         quat_VS = self._stack_orientations(chunk, orientation)
-        if self.headings is not None:
-            corrections = stack_heading_corrections(orientation, self.names, len(chunk))
-            undo_corrections(quat_VS, corrections, self.headings.at_start)
         quat_WL = np.empty(quat_VS.shape)
         variance = self._place(chunk, orientation, quat_VS, quat_WL)
         size = len(self._recent) or max(1, round(RESET_S * self.rate_hz))
