@@ -14,7 +14,7 @@ import wepose_pin as wp
 from wepose_pin.alignment import (
     MOUNT_MOVED_STDS,
     N_POSE,
-    check_mounts,
+    collect_nominal_mounts,
     compute_heading_offset,
     compute_soft_tissue_covariances,
 )
@@ -245,7 +245,7 @@ def test_an_unknown_mount_beside_a_subject_that_has_none_for_it(simulation: Simu
     known = {name: quat for name, quat in simulation.quat_LS.items() if name != segment}
     subject = replace(population_subject(), name="anna", mounts=known)
     with pytest.raises(BadSession, match=rf"sensors\.{segment}\.mount is not known.*'anna' has none for it") as raised:
-        check_mounts(recording, subject, N_POSE)
+        collect_nominal_mounts(recording, subject, N_POSE)
     assert ("no calibration finds" in str(raised.value)) == (segment in ("head", "pelvis"))
     assert "\n" not in str(raised.value)
 

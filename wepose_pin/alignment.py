@@ -139,11 +139,6 @@ def join_segments(parts: Sequence[SegmentOrientations]) -> SegmentOrientations:
     )
 
 
-def check_mounts(recording: Recording, subject: Subject | None, start_frames: StartFrames) -> None:
-    """Raise `BadSession` where neither the subject nor the session has the mount of a sensor."""
-    collect_nominal_mounts(recording, subject, start_frames)
-
-
 def collect_nominal_mounts(
     recording: Recording, subject: Subject | None, start_frames: StartFrames
 ) -> dict[str, np.ndarray]:

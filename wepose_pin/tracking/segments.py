@@ -18,7 +18,7 @@ from ..alignment import (
     SegmentOrientations,
     StartFrames,
     align_sensors,
-    check_mounts,
+    collect_nominal_mounts,
     compute_heading_offset,
     compute_heading_variance,
     compute_measured_covariance,
@@ -109,7 +109,7 @@ class SegmentEstimator:
 
     def _begin(self, first: Recording) -> SegmentOrientations:
         """Filter and align the first chunk."""
-        check_mounts(first, self._subject, self._start_frames)
+        collect_nominal_mounts(first, self._subject, self._start_frames)  # an error before anything is filtered
         self._filters = filters = SensorFilters(
             first, method=self._method, static_test=self._static_test, sways=self._start_frames.sways
         )
