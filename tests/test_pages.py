@@ -165,7 +165,7 @@ def test_a_motion_that_cannot_be_assessed_is_written_all_the_same(
     monkeypatch.setattr("wepose_pin.tracking.summary.diagnose_pose", fails)
     assert run("track", session, "-o", tmp_path / "assessed") == 0
     assert names(tmp_path / "assessed") == RESULT | {"view.html", "report.html"}
-    assert "signs of wrong mounts" in capsys.readouterr().err
+    assert "not checked for wrong mounts" in capsys.readouterr().err
     monkeypatch.setattr("wepose_pin.tracking.summary.measure", fails)
     assert run("track", session, "-o", tmp_path / "gathered") == 0
     assert names(tmp_path / "gathered") == RESULT | {"view.html"}
