@@ -68,7 +68,9 @@ def known_words() -> frozenset[str]:
                 words |= {node.value, *re.findall(r"[\w.]+", node.value)}
     for path in [ROOT / "pyproject.toml", *(ROOT / "calibration").glob("*.toml"), ROOT / "wepose_pin/diagnostics.toml"]:
         words |= set(re.findall(r"^\W*([\w.-]+)", path.read_text(encoding="utf-8"), re.MULTILINE))
-        words |= set(re.findall(r"\w+", path.read_text(encoding="utf-8"))) if path.name == "pyproject.toml" else set()
+        words |= (
+            set(re.findall(r"[\w.]+|\w+", path.read_text(encoding="utf-8"))) if path.name == "pyproject.toml" else set()
+        )
     return frozenset(words)
 
 

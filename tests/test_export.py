@@ -388,7 +388,7 @@ def test_a_sample_without_orientation_is_named(tmp_path: Path, pose: Pose) -> No
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["-o", "x.dat"], "-o x.dat: '.dat' is no format's suffix; state it by --format; there is: csv, parquet, mot"),
+        (["-o", "x.dat"], "-o x.dat: '.dat' is no format's suffix; state it by --format; there is: bvh, c3d, csv"),
         (["-o", "x.trc", "--format", "tcr"], "--format tcr: not known; did you mean 'trc'?"),
         (["-o", "x.dat", "--format", "c3d"], "name it x.c3d"),
         (["-o", "x.txt", "--format", "placement"], "name it x.sto"),

@@ -94,13 +94,14 @@ def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest
     file.write_bytes(b"something")
     replay = f"replay:{session}"
     for arguments, said in (
-        (["--source", "telepathy:9"], "source 'telepathy:9' is none; there is: replay:PATH"),
+        (["--source", "telepathy:9"], "source 'telepathy:9' is none; there is: "),
         (["--source", "replay:nowhere"], "nowhere: no such file"),
         (["--source", replay, "--speed", "-1"], "speed: '-1'; a positive number"),
         (["--source", replay, "--record", str(file)], "there.mcap: exists; --force replaces it"),
         (["--source", replay, "--record", str(tmp_path / "no" / "a.mcap")], "a.mcap: cannot be written"),
         (["--source", replay, "--subject", str(tmp_path / "none")], "none: no such file"),
         (["--source", replay, "--udp", "somewhere"], "--udp somewhere: a port or HOST:PORT is needed"),
+        (["--source", replay, "--output", "osc:9000"], "--output osc:9000: 'osc' is none; there is: lsl, udp"),
         (["--source", replay, "--port", "70000"], "the live page: port 70000; a number from 1 to 65535"),
         (["--source", replay, "--method", "smoother"], "smoother"),
     ):

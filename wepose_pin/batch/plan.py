@@ -168,12 +168,12 @@ def _resolve_option(value: Any, path: Path) -> Any:
 
 
 def _check_formats(keys: TomlTable) -> None:
-    from ..writers.export import FORMATS, LEROBOT, REMOVED
+    from ..writers.export import LEROBOT, REMOVED, list_formats
 
     formats = keys.values.get("formats")
     if not isinstance(formats, list) or not formats:
         raise BadPlan(f'{keys.at("formats")} = {formats!r} is not a list of formats, such as ["trc", "mot"]')
-    persons = [name for name in FORMATS if name != LEROBOT]  # a robot's alone
+    persons = [name for name in list_formats() if name != LEROBOT]  # a robot's alone
     for each in formats:
         if each in REMOVED:
             raise BadPlan(f"{keys.at('formats')}: '{each}' is no longer written; {REMOVED[each]}")

@@ -17,7 +17,6 @@ from ..writers.result import as_json
 from .plan import STEPS, Item, write_words
 
 Row = dict[str, Any]
-_WITH_MODEL = ("sto", "scale")  # formats that take OpenSim's model
 
 
 def run_steps(item: Item, session: Path, subject: Path | None, folder: Path) -> Row:
@@ -71,15 +70,15 @@ def _describe_calibration(calibration: Any) -> Row:
 
 def _export(places: list[str], options: Mapping[str, Any], folder: Path) -> int:
     """Write all formats; the number of their diagnostics."""
-    from ..writers.export import SUFFIXES, WITHOUT_MOTION
+    from ..writers.export import list_formats
 
     folder.mkdir()
     count = 0
     for format in options["formats"]:
-        file = folder / (f"{format}{SUFFIXES[format]}" if format in SUFFIXES else f"motion.{format}")
+        kind = list_formats()[format]
+        file = folder / (f"motion.{format}" if kind.suffix is None else f"{format}{kind.suffix}")
         # What is given for another of the formats is left out.
-        others = {"formats": True, "names": format != "mot", "osim_model": format not in _WITH_MODEL}
-        others["rate_hz"] = format in WITHOUT_MOTION
+        others = {"formats": True, **{name: name not in kind.options for name in ("names", "osim_model", "rate_hz")}}
         own = {name: value for name, value in options.items() if not others.get(name)}
         count += len(_run("export", places, own | {"out": file, "format": format}).diagnostics)
     return count

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from cyclopts import Group, Parameter
 
+from ..assets import find_plugins, load_plugin
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..errors import BadOption
+from ..errors import BadOption, one_of
 from .options import (
     MORE,
     RESEARCH,
@@ -64,6 +65,7 @@ def live(
     robot: Robot | None = None,
     udp: Address | None = None,
     lsl: Name | None = None,
+    output: Annotated[tuple[str, ...] | None, Parameter(metavar="NAME:ARGUMENT"), MORE] = None,
     page: bool = True,
     open: bool = True,
     force: bool = False,
@@ -117,6 +119,9 @@ def live(
         Send each pose as JSON to this UDP port (docs/live-outputs.md). Without HOST to this machine.
     lsl
         Send each pose as a Lab Streaming Layer stream of this name; liblsl then listens on every interface.
+    output
+        Send each pose by this output, of this package (udp, lsl) or of a plug-in, with its argument, such as udp:9001;
+        may be given several times.
     page
         Serve the page that shows the pose (which only this machine can open).
     open
@@ -169,6 +174,8 @@ def live(
     for option, given in {"out": out, "measured": measured, "stature": stature}.items():
         if given is not None and not guide:
             raise BadOption(f"--{option}: goes with --guide, which is not given")
+    usual = {"udp": udp, "lsl": lsl}
+    senders = [f"{name}:{given}" for name, given in usual.items() if given is not None] + list(output or ())
     announce_compilation()  # a stream is waiting
     # A wrong robot is found before the person does anything.
     following = None if robot is None else read_robot(robot)
@@ -226,7 +233,7 @@ def live(
                 served.set_body(body, None if driven is None else driven.figure(body))
             if driven is not None:
                 outputs.insert(0, driven)
-            outputs += _open_senders(udp, lsl)
+            outputs += _open_senders(senders)
             if driven is not None:
                 warm_up(method)  # compiles before commands are due
                 driven.open()
@@ -241,8 +248,8 @@ def live(
                 until=should_stop,
             )
     finally:
-        for output in outputs:
-            output.close()
+        for each in outputs:
+            each.close()
     ended = Live(summary, None if driven is None else driven.summary())
     _print_end(ended, record)
     return ended
@@ -300,17 +307,14 @@ def _open_page(model: BodyModel, title: str, host: str | None, port: int, in_bro
     return page
 
 
-def _open_senders(udp: str | None, lsl: str | None) -> list[Output]:
-    """Outputs for other programs."""
+def _open_senders(named: Sequence[str]) -> list[Output]:
+    """Outputs for other programs, each ``NAME:ARGUMENT``."""
     senders: list[Output] = []
-    if udp is not None:
-        from ..live.outputs import UdpOutput
-
-        senders.append(UdpOutput(udp))
-    if lsl is not None:
-        from ..live.outputs import LslOutput
-
-        senders.append(LslOutput(lsl))
+    for text in named:
+        name, _, argument = text.partition(":")
+        if name not in find_plugins("outputs"):
+            raise BadOption(f"--output {text}: '{name}' is none; {one_of(find_plugins('outputs'), name)}")
+        senders.append(load_plugin("outputs", name)(argument))
     return senders
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..assets import find_plugins, load_plugin
 from ..errors import BadData, BadSession, WeposeError, one_of
 from .device import Device, read_first_lines
 from .libraries import check_file
@@ -29,38 +30,60 @@ class Format(NamedTuple):
     Parameters
     ----------
     title : what a file of it is called
+    detects : path, which may be a folder, and the first lines of a text → whether it is of this format
     read : path, "raw" or "orientation" or None, and a rate [Hz] or None → the contents
     whole : all sensors of a recording are in one file
     folder : a recording may be a folder
     """
 
     title: str
+    detects: Callable[[Path, str], bool]
     read: Callable[[Path, str | None, float | None], Device]
     whole: bool = False
     folder: bool = False
 
 
-# Formats that are no tables of one kind.
-MODULES = {
-    "mvnx": Format("Xsens MVNX", read_mvnx, whole=True),
-    "sensor_logger": Format("recording of Sensor Logger", read_sensor_logger, folder=True),
-    "rosbag": Format("ROS bag", read_rosbag, whole=True, folder=True),
-    "xdf": Format("XDF", read_xdf, whole=True),
-    "opensim": Format("OpenSim table of IMU orientations", read_opensim, whole=True),
-    "wepose_live": Format("recording of wepose live", read_live_device),
-}
+TEXTS = (".json", ".csv", ".tsv", ".txt", ".xml")  # whose first lines may tell the format
+
+# Formats that are no tables of one kind; pyproject.toml registers them as those of other distributions.
+MVNX = Format("Xsens MVNX", lambda path, start: _has_suffix(path, ".mvnx") or "<mvnx" in start, read_mvnx, whole=True)
+SENSOR_LOGGER = Format(
+    "recording of Sensor Logger",
+    lambda path, _: (path.is_dir() or _has_suffix(path, ".zip", *TEXTS)) and is_sensor_logger(path),
+    read_sensor_logger,
+    folder=True,
+)
+ROSBAG = Format(
+    "ROS bag",
+    lambda path, _: (_has_suffix(path, *ROSBAGS) and not is_live_log(path)) or (path.is_dir() and is_rosbag(path)),
+    read_rosbag,
+    whole=True,
+    folder=True,
+)
+XDF = Format("XDF", lambda path, _: is_xdf(path), read_xdf, whole=True)
+OPENSIM = Format(
+    "OpenSim table of IMU orientations", lambda path, _: _has_suffix(path, ".sto"), read_opensim, whole=True
+)
+WEPOSE_LIVE = Format("recording of wepose live", lambda path, _: is_live_log(path), read_live_device)
+
+
+def _has_suffix(path: Path, *suffixes: str) -> bool:
+    return path.suffix.lower() in suffixes
 
 
 def look_up_format(name: str) -> Format:
     """Look up a format by its name, or the path of a description."""
-    if name in MODULES:
-        return MODULES[name]
+    if name in find_plugins("readers"):
+        return load_plugin("readers", name)
     described = load_format(Path(name)) if name.endswith(".toml") else load_formats()[name]
 
     def read(path: Path, use: str | None, rate_hz: float | None) -> Device:
         return read_table_format(described, path, use, rate_hz)
 
-    return Format(described.title, read, described.whole, bool(described.files))
+    def is_one(path: Path, start: str) -> bool:
+        return detects(described, path, start)
+
+    return Format(described.title, is_one, read, described.whole, bool(described.files))
 
 
 def find_format(name: str, folder: Path, place: str) -> str:
@@ -74,7 +97,7 @@ def find_format(name: str, folder: Path, place: str) -> str:
     if name.endswith(".toml"):
         load_format(folder / name)
         return str(folder / name)
-    known = [*MODULES, *load_formats()]
+    known = [*find_plugins("readers"), *load_formats()]
     if name not in known:
         raise BadSession(f"{place} = '{name}' is not known; {one_of(known, name)}; or a description, such as lab.toml")
     return name
@@ -92,20 +115,11 @@ def detect_format(path: Path) -> str | None:
     """
     if not (path.is_file() or path.is_dir()) and path.exists():
         return None
-    suffix = path.suffix.lower()
-    if is_live_log(path):
-        return "wepose_live"
-    by_suffix = {".mvnx": "mvnx", ".sto": "opensim", **dict.fromkeys(ROSBAGS, "rosbag")}
-    if suffix in by_suffix or is_xdf(path):
-        return by_suffix.get(suffix, "xdf")
-    if path.is_dir() and is_rosbag(path):
-        return "rosbag"
-    if path.is_dir() or suffix in (".zip", ".json", ".csv", ".tsv", ".txt", ".xml"):
-        start = "" if path.is_dir() or suffix == ".zip" else "\n".join(read_first_lines(path, 40))
-        if "<mvnx" in start:
-            return "mvnx"
-        return "sensor_logger" if is_sensor_logger(path) else _detect_table(path, start)
-    return None
+    start = "\n".join(read_first_lines(path, 40)) if not path.is_dir() and _has_suffix(path, *TEXTS) else ""
+    for name in find_plugins("readers"):
+        if look_up_format(name).detects(path, start):
+            return name
+    return _detect_table(path, start) if path.is_dir() or _has_suffix(path, ".zip", *TEXTS) else None
 
 
 def _detect_table(path: Path, start: str) -> str | None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..arguments import check_arguments
+from ..assets import find_plugins, load_plugin
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, MissingFile, one_of
@@ -82,27 +84,22 @@ def _is_of_robot(result: Result) -> bool:
     return not isinstance(result, PosedBody)
 
 
+# pyproject.toml registers them as those of other distributions.
+CSV = Format(PERSON, write_csv)
+PARQUET = Format(PERSON, write_parquet)
+MOT = Format(PERSON, write_mot, (*MOTION, "names"))
+STO = Format(PERSON, write_sto, (*MOTION, "osim_model"))
+PLACEMENT = Format(PERSON, write_placement, (), ".sto")
+TRC = Format(PERSON, write_trc)
+BVH = Format(PERSON, write_bvh)
+C3D = Format(PERSON, write_c3d)
+SCALE = Format(PERSON, write_scale, ("osim_model",), ".xml")
+URDF = Format(BODY, write_urdf, ())
+ROSBAG = Format(JOINTS, write_rosbag, suffix="", earlier=("*.db3", "*.mcap", "metadata.yaml"))
+MCAP = Format(JOINTS, write_mcap)
+RRD = Format(JOINTS, write_rrd)
+EPISODES = Format(JOINTS, write_lerobot, (*MOTION, "episodes", "instruction"), "", ("data/**/*.parquet", "meta/**/*.*"))
 LEROBOT = "lerobot"
-FORMATS = {
-    "csv": Format(PERSON, write_csv),
-    "parquet": Format(PERSON, write_parquet),
-    "mot": Format(PERSON, write_mot, (*MOTION, "names")),
-    "sto": Format(PERSON, write_sto, (*MOTION, "osim_model")),
-    "placement": Format(PERSON, write_placement, (), ".sto"),
-    "trc": Format(PERSON, write_trc),
-    "bvh": Format(PERSON, write_bvh),
-    "c3d": Format(PERSON, write_c3d),
-    "scale": Format(PERSON, write_scale, ("osim_model",), ".xml"),
-    "urdf": Format(BODY, write_urdf, ()),
-    "rosbag": Format(JOINTS, write_rosbag, suffix="", earlier=("*.db3", "*.mcap", "metadata.yaml")),
-    "mcap": Format(JOINTS, write_mcap),
-    "rrd": Format(JOINTS, write_rrd),
-    LEROBOT: Format(
-        JOINTS, write_lerobot, (*MOTION, "episodes", "instruction"), "", ("data/**/*.parquet", "meta/**/*.*")
-    ),
-}
-SUFFIXES = {name: format.suffix for name, format in FORMATS.items() if format.suffix is not None}
-WITHOUT_MOTION = tuple(name for name, format in FORMATS.items() if "rate_hz" not in format.options)
 # Format that was written before → what to do instead.
 _OF_ROBOTS = "trajectory.csv of `wepose retarget` has the joints, and lerobot, mcap and rosbag are written"
 REMOVED = {
@@ -113,12 +110,18 @@ REMOVED = {
 }
 
 
+@functools.cache
+def list_formats() -> dict[str, Format]:
+    """Name → format, ours first."""
+    return {name: load_plugin("writers", name) for name in find_plugins("writers")}
+
+
 class Exported(NamedTuple):
     """What `export` wrote.
 
     Parameters
     ----------
-    format : one of `FORMATS`
+    format : one of `list_formats`
     diagnostics : what of the result the format cannot hold
     """
 
@@ -157,9 +160,9 @@ def export(
     file : str or Path
         The file to write; of "lerobot" and "rosbag" the folder.
     format : str, optional
-        One of `FORMATS`. Of a person: "csv", "parquet", "mot", "sto", "placement", "scale", "trc", "c3d", "bvh". Of
-        either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot". None: by the suffix of `file`; a stated format
-        needs a file with its own suffix.
+        One of `list_formats`, to which plug-ins add. Of a person: "csv", "parquet", "mot", "sto", "placement", "scale",
+        "trc", "c3d", "bvh". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot". None: by the suffix of
+        `file`; a stated format needs a file with its own suffix.
     names : str, optional
         Of a .mot's columns: only the angles of the ISB, "isb", or only the coordinates of OpenSim's model, "opensim";
         None: both, the ISB's first.
@@ -207,7 +210,7 @@ def export(
     results = [result] if isinstance(result, Result) else list(result)
     file = Path(file)
     name = _choose_format(file, format)
-    kind = FORMATS[name]
+    kind = list_formats()[name]
     stated: dict[str, Any] = {"names": names, "rate_hz": rate_hz, "interval": interval, "phase": phase}
     stated |= {"episodes": episodes, "instruction": instruction, "osim_model": osim_model}
     _check_options(name, {option: value for option, value in stated.items() if value is not None})
@@ -250,11 +253,11 @@ def _check_options(name: str, stated: Mapping[str, Any]) -> None:
         text = f"--{option.replace('_', '-')} {f'{value:g}' if option == 'rate_hz' else value}"
         if option == "rate_hz":
             check_rate(value)
-        if option in FORMATS[name].options:
+        if option in list_formats()[name].options:
             continue
         if option in MOTION:
             raise BadOption(f"{text}: there is no motion in a file of format {name}")
-        having = " and ".join(each for each, format in FORMATS.items() if option in format.options)
+        having = " and ".join(each for each, format in list_formats().items() if option in format.options)
         raise BadOption(f"{text}: only of format {having}, and the format is {name}")
     if stated.get("names", "isb") not in NAMES:
         raise BadOption(f"--names {stated['names']}: not known; {one_of(NAMES, stated['names'])}")
@@ -296,7 +299,7 @@ def _read_motion(
     if _is_of_robot(result):
         raise BadOption(
             f"--format {format}: is of a person's motion, and this is a robot's trajectory; "
-            f"of that there is: {', '.join(each for each in FORMATS if FORMATS[each].of != PERSON)}"
+            f"of that there is: {', '.join(each for each, format in list_formats().items() if format.of != PERSON)}"
         )
     if isinstance(result, PosedBody):
         selected = select_interval(result.time, getattr(result, "phases", {}), interval, phase)
@@ -313,18 +316,19 @@ def _read_motion(
 
 def _choose_format(file: Path, name: str | None) -> str:
     """Choose the format that is stated, or that of the file's suffix."""
+    formats = list_formats()
     if name is None:
         name = file.suffix.lower().removeprefix(".")
-        if name not in FORMATS and name not in REMOVED:
+        if name not in formats and name not in REMOVED:
             raise BadOption(
-                f"-o {file}: '{file.suffix}' is no format's suffix; state it by --format; {one_of(FORMATS)}"
+                f"-o {file}: '{file.suffix}' is no format's suffix; state it by --format; {one_of(formats)}"
             )
     if name in REMOVED:
         raise BadOption(f"--format {name}: no longer written; {REMOVED[name]}")
-    if name not in FORMATS:
-        raise BadOption(f"--format {name}: not known; {one_of(FORMATS, name)}")
-    suffix = SUFFIXES.get(name, f".{name}")
-    if not suffix and file.suffix.lower().removeprefix(".") in (*FORMATS, "bag", "db3"):
+    if name not in formats:
+        raise BadOption(f"--format {name}: not known; {one_of(formats, name)}")
+    suffix = f".{name}" if formats[name].suffix is None else formats[name].suffix
+    if not suffix and file.suffix.lower().removeprefix(".") in (*formats, "bag", "db3"):
         raise BadOption(
             f"-o {file}: format {name} is a folder; name it {file.stem}"
         )  # readers would take it for a file

@@ -1,21 +1,14 @@
-"""Sources of live samples: one file a kind, one protocol (`base.Source`)."""
+"""Sources of live samples: one file a kind, one protocol (`base.Source`); pyproject.toml registers the kinds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import import_module
 
+from ...assets import find_plugins, load_plugin
 from ...errors import BadOption, one_of
 from ...model import load_table
 from .base import Source, SourceOptions
 
-FORMS = {  # kind, and module with its `open_spec` → what it takes
-    "replay": "replay:PATH",
-    "lsl": "lsl:NAME[@machine|link|site]",
-    "udp": "udp:[HOST:]PORT[,gyro_unit=deg/s][,accel_unit=g]",
-    "mti": "mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]",
-    "slimevr": "slimevr:[HOST][:PORT][,TRACKER=SEGMENT...]",
-}
 REMOVED = {  # kind → what to do instead
     "mvn": "export the trial of MVN as .mvnx, which `wepose track` reads",
     "ximu3": "send its samples to udp:PORT, or read the CSV of the x-IMU3 GUI",
@@ -36,8 +29,8 @@ def open_source(
 
     Parameters
     ----------
-    spec : one of `FORMS`, as ``replay:PATH`` (a session.toml or its folder) or ``udp:PORT``; docs/live-sources.md says
-        what each takes
+    spec : as the form of a kind says, such as ``replay:PATH`` (a session.toml or its folder) or ``udp:PORT``;
+        docs/live-sources.md says what each takes
     sensors : to take; None: all that the source has. A UDP or LSL source waits for its sensors in `open`
     segments : names that sensors of a stream may have, those of the body; None: the upper body's. A replay has its own
     speed, baud, wait_s, any_name : as in `SourceOptions`
@@ -50,13 +43,15 @@ def open_source(
     kind, colon, rest = spec.partition(":")
     if kind in REMOVED:
         raise BadOption(f"source '{spec}' is none any more: {REMOVED[kind]}")
-    if kind not in FORMS or not colon or not (rest or kind == "slimevr"):
-        raise BadOption(f"source '{spec}' is none; {one_of(FORMS.values(), kind)}")
+    kinds = find_plugins("sources")
+    if kind not in kinds or not colon or not (rest or kind == "slimevr"):
+        forms = [load_plugin("sources", name).form for name in kinds]
+        raise BadOption(f"source '{spec}' is none; {one_of(forms, kind)}")
     names = tuple(load_table().segments if segments is None else segments)
     chosen = None if sensors is None else tuple(sensors)
     options = SourceOptions(spec, chosen, names, any_name, speed, baud, wait_s)
     if kind != "replay":
         for name in chosen or ():
             options.check_segment(name)
-    source: Source = import_module(f".{kind}", __name__).open_spec(rest, options)
+    source: Source = load_plugin("sources", kind).open_spec(rest, options)
     return source

@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -74,6 +75,19 @@ class SourceOptions:
             if name not in present:
                 raise BadOption(f"source '{self.spec}': no {kind} {name}; {one_of(present, name)}")
         return present if self.sensors is None else self.sensors
+
+
+class SourceKind(NamedTuple):
+    """A kind of sources, which an entry point of `wepose.sources` names.
+
+    Parameters
+    ----------
+    form : what to write, as ``udp:PORT``
+    open_spec : what stands after the colon, and options → the source, not yet opened
+    """
+
+    form: str
+    open_spec: Callable[[str, SourceOptions], Source]
 
 
 class Source(ABC):

@@ -21,7 +21,7 @@ from ...errors import BadOption, BadSource, how_to_install, one_of
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
 from ..state import join_names
-from .base import Source, SourceOptions, Waiting
+from .base import Source, SourceKind, SourceOptions, Waiting
 from .packets import NUMBERS
 
 # Scope of the search → configuration of liblsl. On one machine there is one clock and one loopback.
@@ -330,3 +330,6 @@ def configure_pylsl(scope: str | None) -> tuple[Any, str]:
     elif _scope != wanted:
         raise BadOption(f"lsl: scope {wanted} after {_scope}; liblsl keeps the first of a process: start a new one")
     return pylsl, wanted
+
+
+KIND = SourceKind("lsl:NAME[@machine|link|site]", open_spec)

@@ -15,7 +15,7 @@ from ...errors import BadOption, BadSource, how_to_install
 from ...recording.arrivals import Samples
 from ..state import join_names
 from . import xbus
-from .base import Source, SourceOptions, Waiting
+from .base import Source, SourceKind, SourceOptions, Waiting
 from .clocks import HostClock
 
 PLAIN_HZ = 100  # that the plain outputs of every MTi have; above, the HR outputs are tried first
@@ -299,3 +299,6 @@ def _import_pyserial() -> ModuleType:
         raise BadSource(f"mti: needs pyserial: {how_to_install('pyserial')}") from None
     module: ModuleType = serial
     return module
+
+
+KIND = SourceKind("mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]", open_spec)

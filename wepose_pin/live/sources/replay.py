@@ -13,7 +13,7 @@ from ...errors import BadOption
 from ...readers import load_session
 from ...recording import OrientationSensor, Recording
 from ...recording.arrivals import Samples, list_numbers
-from .base import Source, SourceOptions, Waiting
+from .base import Source, SourceKind, SourceOptions, Waiting
 
 BLOCK = 64  # samples of every sensor at once, as fast as possible
 # Up to 1 kHz every sample comes when it is due, faster ones come together.
@@ -103,3 +103,6 @@ class ReplaySource(Source):
         if math.isinf(self._speed):
             return min(self._next + BLOCK, len(self.recording))
         return int(np.searchsorted(self._time, self.clock(), side="right"))
+
+
+KIND = SourceKind("replay:PATH", open_spec)

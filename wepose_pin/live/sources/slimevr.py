@@ -18,7 +18,7 @@ import numpy as np
 
 from ...recording.arrivals import Samples, pack_orientations
 from ..addresses import parse_listening_address
-from .base import SourceOptions
+from .base import SourceKind, SourceOptions
 from .datagrams import DatagramSource
 
 PORT = 6969
@@ -237,3 +237,6 @@ class SlimeVrSource(DatagramSource):
         known = ", ".join(tracker.mac or address[0] for address, tracker in self.trackers.items())
         text = super().describe_awaited(sensors)
         return f"{text}; connected: {known}" if known else text
+
+
+KIND = SourceKind("slimevr:[HOST][:PORT][,TRACKER=SEGMENT...]", open_spec)

@@ -12,7 +12,7 @@ import numpy as np
 from ...errors import BadOption, one_of
 from ...recording.arrivals import Samples
 from ..addresses import LOOPBACK, parse_address
-from .base import IMPLAUSIBLE, MAX_TIME, SourceOptions
+from .base import IMPLAUSIBLE, MAX_TIME, SourceKind, SourceOptions
 from .clocks import HostClock
 from .datagrams import DatagramSource
 from .packets import SI, UNITS, Batch, decode
@@ -104,3 +104,6 @@ class UdpSource(DatagramSource):
         if len(self._clocks) > MAX_CLOCKS:
             self._clocks.popitem(last=False)
         return clock
+
+
+KIND = SourceKind("udp:[HOST:]PORT[,gyro_unit=deg/s][,accel_unit=g]", open_spec)
