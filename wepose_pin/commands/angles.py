@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from ..errors import BadOption, WrongOption
-from .options import MORE, Angle, Hz, Interval, Out, Phase
+from .options import MORE, Angle, Force, Hz, Interval, Out, Phase, PhaseName
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ def angles(
     interval: Interval | None = None,
     phase: Phase | None = None,
     low_pass_hz: Hz | None = None,
-    force: bool = False,
-    repetitions: Annotated[Phase | None, MORE] = None,
+    force: Force = False,
+    repetitions: Annotated[PhaseName | None, MORE] = None,
     main_angle: Annotated[Angle | None, MORE] = None,
     cycles: Annotated[bool, MORE] = False,
     shoulder: Annotated[Literal["YXY", "XZY", "ZXY"], MORE] = "YXY",
@@ -50,15 +50,9 @@ def angles(
         phases.csv (the same in the whole time and in each phase), summary.csv (mean and standard deviation over
         repetitions), curves.csv (0 to 100 %), comparison.csv (of several results), sessions.csv, definitions.csv
         (sequences and signs), the figures as .svg, and angles.html, which shows all of it.
-    interval
-        Use only this time of each recording, in seconds.
-    phase
-        Use only this phase of each recording. Of a phase with several intervals NAME:2 is the second.
     low_pass_hz
         Low-pass the orientations at this frequency (Butterworth, second order, forwards and backwards; half the
         amplitude at HZ). Without it they are not filtered.
-    force
-        Replace the files of an earlier run in DIR.
     repetitions
         Take each interval of this phase as a repetition. Without it repetitions are found.
     main_angle

@@ -7,7 +7,19 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic, lines
 from ..errors import WrongOption, one_of
-from .options import RESEARCH, Formulation, Measured, Method, Model, Out, ProtocolName, Stature, Subject
+from .options import (
+    RESEARCH,
+    Force,
+    Formulation,
+    Gaps,
+    Measured,
+    MethodOption,
+    Model,
+    Out,
+    ProtocolName,
+    Stature,
+    Subject,
+)
 from .output import print_diagnostics, print_lengths, print_table, progress_bar, say, say_indented, say_pages
 
 if TYPE_CHECKING:
@@ -47,10 +59,10 @@ def calibrate(
     protocol: ProtocolName | None = None,
     model: Model | None = None,
     prior: Subject | None = None,
-    gaps: bool = False,
+    gaps: Gaps = False,
     report: bool = True,
-    force: bool = False,
-    method: Annotated[Method, RESEARCH] = "amekf",
+    force: Force = False,
+    method: Annotated[MethodOption, RESEARCH] = "amekf",
     formulation: Annotated[Formulation, RESEARCH] = "full",
 ) -> Calibrated:
     """Calibrate lengths and sensor mounts from a recording of a protocol, such as joined hands.
@@ -95,18 +107,9 @@ def calibrate(
         lengths and shoulders with their covariance, so that each session adds to what is known. Its mounts are used
         too, unless the sensors were taken off: a session with remounted = true uses none of them. Of an Xsens .mvnx
         only the lengths are used.
-    gaps
-        Accept gaps of more than 50 ms and bridge them. Without it such a gap is an error.
     report
         Write report.html, which shows the quality and what to do about it, lengths, mounts and the gap between the
         palms.
-    force
-        Replace the files of an earlier run in DIR.
-    method
-        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
-        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases, with an
-        exact covariance and two more conditions of the static test), smekf_published (the same as published), ncf
-        (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011).
     formulation
         Estimate by this formulation: full (lengths, mounts, headings, their drift and soft tissue together, with
         priors) or paper (Lisini Baldi et al. 2019: the lengths alone, by plain least squares of the gap between the

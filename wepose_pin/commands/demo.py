@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .options import Number, Out
+from .options import Force, Number, Out
 from .output import mean_std, print_diagnostics, print_lengths, print_table, progress_bar, say, say_pages
 from .simulate import PROTOCOL, check_seed
 
@@ -13,7 +13,7 @@ def demo(
     *,
     out: Out = Path("wepose-demo"),
     seed: Number = 1,
-    force: bool = False,
+    force: Force = False,
 ) -> None:
     """Run the whole chain on a simulated recording: simulate, calibrate, track, evaluate, view.
 
@@ -30,8 +30,6 @@ def demo(
         Write session/, subject/, result/ with its page, and demo.json with all numbers to this folder.
     seed
         Sample the person and the motion by this seed.
-    force
-        Replace the files of an earlier run in DIR.
     """
     options = dict(locals())
     import json

@@ -47,10 +47,6 @@ def evaluate(
     truth
         Table (.parquet or .csv) with the columns of pose.parquet, or a session that names one (data.truth); markers or
         rotations (.c3d), markers (.trc), an Xsens MVNX.
-    interval
-        Compare only this time of the recording, in seconds.
-    phase
-        Compare only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
     align
         Bring a file of another system to the clock and the world of the result.
     fit

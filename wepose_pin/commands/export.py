@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from .options import MORE, ExportHz, File, Interval, Name, OutFile, Phase, Text
+from .options import MORE, ExportHz, File, Force, Interval, Name, OutFile, Phase, PhaseName, Text
 from .output import print_diagnostics, progress_bar, say
 
 
@@ -18,10 +18,10 @@ def export(
     rate_hz: ExportHz | None = None,
     interval: Interval | None = None,
     phase: Phase | None = None,
-    force: bool = False,
+    force: Force = False,
     names: Annotated[Literal["isb", "opensim"] | None, MORE] = None,
     osim_model: Annotated[File | None, MORE] = None,
-    episodes: Annotated[Phase | None, MORE] = None,
+    episodes: Annotated[PhaseName | None, MORE] = None,
     instruction: Annotated[Text | None, MORE] = None,
 ) -> Any:  # an Exported, whose room loads late
     """Write the motion of a person or of a robot for other programs: OpenSim, BVH, C3D, LeRobot, ROS 2 and others.
@@ -47,12 +47,6 @@ def export(
         units of LeRobot's drivers).
     rate_hz
         Resample the motion at this rate.
-    interval
-        Write only this time of the recording, in seconds.
-    phase
-        Write only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
-    force
-        Replace an existing file.
     names
         Only for .mot: write only the joint angles of the International Society of Biomechanics (isb), or only the
         coordinates of OpenSim's Rajagopal model (opensim). Without it both, the ISB's first.

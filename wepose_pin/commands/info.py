@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import BadOption
-from .options import Model, OutFile
+from .options import Force, Model, OutFile
 from .output import print_diagnostics, print_table, progress_bar, say
 
 
@@ -16,7 +16,7 @@ def info(
     write: bool = False,
     out: OutFile | None = None,
     model: Model | None = None,
-    force: bool = False,
+    force: Force = False,
 ) -> None:
     """Describe a file, its sensors, rates and gaps, and propose a session file for it.
 
@@ -38,8 +38,6 @@ def info(
     model
         Propose the segments of this body: a URDF, a TOML that names one, or the name of a body of the package, such as
         whole_body (docs/models.md). Without it those of the upper body.
-    force
-        Replace an existing session.
     """
     from ..documents import check_file, whole_file
     from ..model import load_model

@@ -16,10 +16,12 @@ from ..errors import BadOption, one_of
 from .options import (
     MORE,
     RESEARCH,
+    AcceptFailed,
     Address,
     File,
     Folder,
-    LiveMethod,
+    Force,
+    LiveMethodOption,
     Measured,
     Model,
     Name,
@@ -68,7 +70,7 @@ def live(
     output: Annotated[tuple[str, ...] | None, Parameter(metavar="NAME:ARGUMENT"), MORE] = None,
     page: bool = True,
     open: bool = True,
-    force: bool = False,
+    force: Force = False,
     stature: Annotated[Stature | None, GUIDE] = None,
     measured: Annotated[Measured | None, GUIDE] = None,
     protocol: Annotated[ProtocolName | None, GUIDE] = None,
@@ -76,8 +78,8 @@ def live(
     port: Annotated[Number, MORE] = 0,
     model: Annotated[Model | None, MORE] = None,
     speed: Annotated[Speed, MORE] = "1",
-    accept_failed: Annotated[bool, MORE] = False,
-    method: Annotated[LiveMethod, RESEARCH] = "amekf",
+    accept_failed: Annotated[AcceptFailed, MORE] = False,
+    method: Annotated[LiveMethodOption, RESEARCH] = "amekf",
     views: Annotated[Sequence[Any] | None, UNSEEN] = None,
     until: Annotated[Callable[[], bool] | None, UNSEEN] = None,
 ) -> Live:
@@ -126,8 +128,6 @@ def live(
         Serve the page that shows the pose (which only this machine can open).
     open
         Open the page in the browser.
-    force
-        Replace the file of --record.
     stature
         With --guide: narrow the population prior to people of this body height.
     measured
@@ -147,13 +147,6 @@ def live(
     speed
         With --source replay: replay at this speed; 1 is that of the recording, 4 is four times that, max is as fast as
         possible.
-    accept_failed
-        Use a subject whose calibration failed (quality = "fail" in subject.toml), which is refused otherwise.
-    method
-        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smekf (Kalman filter of
-        Lisini Baldi et al. 2019, corrected in static phases, with an exact covariance and two more conditions of the
-        static test), smekf_published (the same as published), ncf (complementary filter, Mahony et al. 2008), gdc
-        (gradient descent, Madgwick et al. 2011).
     views
         Outputs that show the pose and the state; None: the terminal.
     until

@@ -47,6 +47,33 @@ def _checked_by(place: str) -> Parameter:
     return Parameter(validator=check)
 
 
+# Options of several commands, with their help ------------------------------------------------------------------------
+
+Force = Annotated[bool, Parameter(help="Replace the files of an earlier run.")]
+AcceptFailed = Annotated[bool, Parameter(help="Use a subject even if its calibration failed, which is else refused.")]
+_GAPS = "Accept gaps of more than 50 ms: bridge them, and mark them in pose.parquet. Without it such a gap is an error."
+Gaps = Annotated[bool, Parameter(help=_GAPS)]
+Interval = Annotated[
+    tuple[float, float],
+    Parameter(metavar="FROM TO", help="Use only this time of the recording, in seconds.", validator=_check_interval),
+]
+Phase = Annotated[
+    str,
+    Parameter(
+        metavar="NAME",
+        help="Use only this phase of the recording. Of a phase with several intervals NAME:2 is the second.",
+    ),
+]
+_FILTERS = (
+    "Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), {}smekf (Kalman filter of "
+    "Lisini Baldi et al. 2019, corrected in static phases, with an exact covariance and two more conditions of the "
+    "static test), smekf_published (the same as published), ncf (complementary filter, Mahony et al. 2008), gdc "
+    "(gradient descent, Madgwick et al. 2011)."
+)
+MethodOption = Annotated[Method, Parameter(help=_FILTERS.format("smoother (the same forward and backward in time), "))]
+LiveMethodOption = Annotated[LiveMethod, Parameter(help=_FILTERS.format(""))]
+
+
 # Values --------------------------------------------------------------------------------------------------------------
 
 
@@ -93,8 +120,7 @@ Text = Annotated[str, Parameter(metavar="TEXT")]
 Angle = Annotated[str, Parameter(metavar="ANGLE")]
 Address = Annotated[str, Parameter(metavar="ADDRESS")]
 Folder = Annotated[Path, Parameter(metavar="DIR")]
-Phase = Annotated[str, Parameter(metavar="PHASE")]
-Interval = Annotated[tuple[float, float], Parameter(metavar="FROM TO", validator=_check_interval)]
+PhaseName = Annotated[str, Parameter(metavar="PHASE")]
 Stature = Annotated[float, Parameter(metavar="METRES"), _checked_by("model.anthropometry:check_stature")]
 ProtocolName = Annotated[str, Parameter(metavar="NAME|FILE.toml"), _checked_by("calibration:load_protocol")]
 Robot = Annotated[str, Parameter(metavar="NAME|FILE")]

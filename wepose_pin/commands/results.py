@@ -85,12 +85,7 @@ class TrackResult(PosedBody):
         return build_pose_table(self.pose)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return the table of `to_dataframe` as pandas has it.
-
-        Raises
-        ------
-        WeposeError
-            pandas is not installed.
+        """Return the table of `to_dataframe` as pandas has it; raises `WeposeError` where pandas is not installed.
 
         Examples
         --------
@@ -107,11 +102,8 @@ class TrackResult(PosedBody):
     def plot(self) -> Figures:
         """Draw the report's figures: paths and reach of the hands, joint angles.
 
-        Returns
-        -------
-        Figures
-            Name → `matplotlib.figure.Figure`, to be changed as you like and saved by its ``savefig``. A notebook shows
-            them; ``figures.save(folder)`` writes an SVG each.
+        Name → `matplotlib.figure.Figure`, to be changed as you like and saved by its ``savefig``. A notebook shows
+        them; ``figures.save(folder)`` writes an SVG each.
 
         Examples
         --------
@@ -126,17 +118,9 @@ class TrackResult(PosedBody):
         return draw_figures(self)
 
     def show(self, open: bool = True) -> ViewPage:
-        """Show the motion in 3D: in a notebook in its cell, else in the browser.
+        """Show the motion in 3D: in a notebook in its cell, else in the browser unless `open` is false.
 
-        Parameters
-        ----------
-        open : bool
-            Open the browser; a notebook never does.
-
-        Returns
-        -------
-        ViewPage
-            The page; ``page.save(path)`` writes it to a file, which opens offline.
+        ``page.save(path)`` writes the page that it gives to a file, which opens offline.
 
         Examples
         --------
@@ -153,27 +137,11 @@ class TrackResult(PosedBody):
         return page
 
     def save(self, folder: str | Path, force: bool = False) -> Path:
-        """Write what `wepose track -o` writes: pose, subject, summary, view and report.
+        """Write what `wepose track -o` writes, whole or not at all, and return the folder.
 
         The summary says what made it: versions, options, and the file of the recording with its hash where it was read
-        from one. Of a result that `load_result` read, its files are copied.
-
-        Parameters
-        ----------
-        folder : str or Path
-            It is written whole or not at all.
-        force : bool
-            Replace the files of an earlier result in it.
-
-        Returns
-        -------
-        Path
-            The folder.
-
-        Raises
-        ------
-        ExistingOutput
-            The folder is not empty and `force` is not given, or it cannot be written.
+        from one. Of a result that `load_result` read, its files are copied. `force` replaces an earlier result there;
+        without it a folder that is not empty is `ExistingOutput`.
 
         Examples
         --------

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic, from_json
-from .options import MORE, Arms, Factor, Hz, Interval, Out, Phase, Radians, RobotHz, RobotName, Share
+from .options import MORE, Arms, Factor, Force, Hz, Interval, Out, Phase, Radians, RobotHz, RobotName, Share
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def retarget(
     phase: Phase | None = None,
     view: bool = True,
     report: bool = True,
-    force: bool = False,
+    force: Force = False,
     task: Annotated[Literal["both", "position", "orientation"], MORE] = "both",
     scale: Annotated[Factor | None, MORE] = None,
     smoothing_hz: Annotated[Hz, MORE] = 6.0,
@@ -76,16 +76,10 @@ def retarget(
         Move only this arm of the robot, or both. Without it all arms that the robot has.
     rate_hz
         Sample the trajectory at this rate, 10 to 2000 Hz: that of the robot's own controller.
-    interval
-        Follow only this time of the recording, in seconds.
-    phase
-        Follow only this phase of the recording. Of a phase with several intervals NAME:2 is the second.
     view
         Write view.html, the animation of the robot beside the person.
     report
         Write report.html, which shows the errors of the hands with their causes, distances and joint limits.
-    force
-        Replace the files of an earlier run in DIR.
     task
         Follow the position of the person's hands, their orientation, or both.
     scale

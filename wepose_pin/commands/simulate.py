@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..errors import BadOption, one_of
-from .options import MORE, RESEARCH, Hz, Imperfection, Number, Out, ProtocolName, Seconds
+from .options import MORE, RESEARCH, Force, Hz, Imperfection, Number, Out, ProtocolName, Seconds
 from .output import progress_bar, say
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def simulate(
     protocol: ProtocolName | None = None,
     activity: Literal["walk", "sit", "tasks", "run", "throw"] | None = None,
     preset: Literal["ideal", "mild", "people"] = "ideal",
-    force: bool = False,
+    force: Force = False,
     rate_hz: Annotated[Hz, MORE] = 100.0,
     imperfection: Annotated[Imperfection | None, RESEARCH] = None,
 ) -> None:
@@ -63,8 +63,6 @@ def simulate(
         errors (mild), or all of these and more at the sizes of people in the literature (people): soft tissue that
         follows the joints, shoulders that move with the arms, start poses as people hold them, wrists that bend. Sizes
         and sources are in wepose_pin/simulation/imperfections.py.
-    force
-        Replace the files of an earlier run in DIR.
     rate_hz
         Sample the sensors at this rate, 20 to 2000 Hz.
     imperfection

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 from ..diagnostics import Diagnostic, from_json
-from .options import MORE, RESEARCH, Method, Model, Out, Subject
+from .options import MORE, RESEARCH, AcceptFailed, Force, Gaps, MethodOption, Model, Out, Subject
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
 
@@ -24,13 +24,13 @@ def track(
     *,
     out: Out,
     subject: Subject | None = None,
-    method: Method | None = None,
+    method: MethodOption | None = None,
     model: Model | None = None,
-    gaps: bool = False,
+    gaps: Gaps = False,
     view: bool = True,
     report: bool = True,
-    force: bool = False,
-    accept_failed: Annotated[bool, MORE] = False,
+    force: Force = False,
+    accept_failed: Annotated[AcceptFailed, MORE] = False,
     covariance: Annotated[bool, MORE] = False,
     error_budget: Annotated[bool, MORE] = False,
     torques: Annotated[bool, MORE] = False,
@@ -61,27 +61,14 @@ def track(
         Use the lengths and mounts of this subject.toml, or of the one in this folder, as `wepose calibrate` writes it;
         or the lengths in an Xsens .mvnx. Without it lengths are those of the population prior, and mounts those that
         the session states.
-    method
-        Estimate orientations by this filter: amekf (Kalman filter, corrected in motion too), smoother (the same forward
-        and backward in time), smekf (Kalman filter of Lisini Baldi et al. 2019, corrected in static phases, with an
-        exact covariance and two more conditions of the static test), smekf_published (the same as published), ncf
-        (complementary filter, Mahony et al. 2008), gdc (gradient descent, Madgwick et al. 2011). Without it amekf, or
-        the method of the live session.
     model
         Use this body: a URDF, a TOML that names a URDF and its links, or the name of a body of the package, such as
         whole_body (docs/models.md). A URDF without such a TOML, as a robot's, is a mechanism: its sensors are named by
         its links. Without it the body that the session names, else the upper body.
-    gaps
-        Accept gaps of more than 50 ms: bridge them and mark them in pose.parquet (<segment>_gap). Without it such a gap
-        is an error.
     view
         Write view.html, the animation of the motion.
     report
         Write report.html, which shows diagnostics and what to do about them, noise, drift, hands and joint angles.
-    force
-        Replace the files of an earlier run in DIR.
-    accept_failed
-        Use a subject whose calibration failed (quality = "fail" in subject.toml), which is refused otherwise.
     covariance
         Write the covariance of each orientation and point too, not only the standard deviations.
     error_budget

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadOption, MissingFile
-from .options import MORE, Interval, OutFile, Phase
+from .options import MORE, Force, Interval, OutFile, Phase
 from .output import print_diagnostics, progress_bar, say
 
 
@@ -17,7 +17,7 @@ def view(
     *,
     out: OutFile | None = None,
     open: bool = True,
-    force: bool = False,
+    force: Force = False,
     interval: Annotated[Interval | None, MORE] = None,
     phase: Annotated[Phase | None, MORE] = None,
 ) -> Path:
@@ -33,12 +33,6 @@ def view(
         Write the page to this file. Without it view.html in RESULT is used, and written if it is missing.
     open
         Open the page in the browser.
-    force
-        Write the page again if it exists.
-    interval
-        Show only this time of the recording, in seconds; needs --out.
-    phase
-        Show only this phase of the recording; needs --out. Of a phase with several intervals NAME:2 is the second.
     """
     import webbrowser
 
