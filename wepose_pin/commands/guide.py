@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from ..errors import ExistingOutput
 
@@ -45,6 +45,7 @@ def run_guide(
     protocol: str | None,
     measured: Mapping[str, float],
     stature: float | None,
+    sex: Literal["f", "m"] | None,
     subject: Path | None,
     setup_folder: Path | None,
     method: str,
@@ -55,7 +56,7 @@ def run_guide(
     ----------
     source : not open; it stays open where there is an outcome
     views : stay open
-    out, force, protocol, measured, stature, subject, setup_folder, method : options of `wepose live`
+    out, force, protocol, measured, stature, sex, subject, setup_folder, method : options of `wepose live`
 
     Raises
     ------
@@ -81,7 +82,7 @@ def run_guide(
     joined = protocol or choose_protocol(source, setup, model)
     parts = split_protocol(joined)
     earlier = None if subject is None else read_subject(subject)
-    prior = earlier or population_subject(stature, None, model)
+    prior = earlier or population_subject(stature, sex, model)
 
     def calibrate_file(path: Path, told: Mapping[str, float]) -> Calibrated:
         lengths = {**measured, **told}
@@ -92,6 +93,7 @@ def run_guide(
             measured={name: value for name, value in lengths.items() if name != STATURE},
             prior=earlier,
             stature=lengths.get(STATURE, stature),
+            sex=sex,
             protocol=steps,
             method=method,
         )

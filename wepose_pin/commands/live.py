@@ -6,7 +6,7 @@ import contextlib
 import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from cyclopts import Group, Parameter
 
@@ -72,6 +72,7 @@ def live(
     open: bool = True,
     force: Force = False,
     stature: Annotated[Stature | None, GUIDE] = None,
+    sex: Annotated[Literal["f", "m"] | None, GUIDE] = None,
     measured: Annotated[Measured | None, GUIDE] = None,
     protocol: Annotated[ProtocolName | None, GUIDE] = None,
     host: Annotated[Address | None, MORE] = None,
@@ -130,6 +131,8 @@ def live(
         Open the page in the browser.
     stature
         With --guide: narrow the population prior to people of this body height.
+    sex
+        With --guide: narrow the population prior to women or men.
     measured
         With --guide: use this measured length, such as shoulder_width=0.385; may be given several times.
     protocol
@@ -164,7 +167,7 @@ def live(
     from ..subject import load_subject
     from .guide import run_guide
 
-    for option, given in {"out": out, "measured": measured, "stature": stature}.items():
+    for option, given in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():
         if given is not None and not guide:
             raise BadOption(f"--{option}: goes with --guide, which is not given")
     usual = {"udp": udp, "lsl": lsl}
@@ -208,6 +211,7 @@ def live(
                     protocol=protocol,
                     measured=measured or {},
                     stature=stature,
+                    sex=sex,
                     subject=subject,
                     setup_folder=setup,
                     method=method,

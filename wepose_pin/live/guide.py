@@ -138,7 +138,7 @@ class Guide:
     @property
     def sending(self) -> list[str]:
         """Sensors that have sent something."""
-        return list(self.monitor.newest)
+        return self.monitor.sending
 
     @property
     def silent(self) -> list[str]:

@@ -185,6 +185,7 @@ class LiveLoop(Stage):
         self._heading_reset_time = 0.0
         self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
         self._covariance: Iterator[np.ndarray | None] = iter(())  # computed in parts, one or more with each tick
+        self._covariance_ticks, self._covariance_parts = 1, 1  # from one to the next, and parts with a tick
         self._latency = Latencies()
         self._recent_latencies: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s] of displayed poses
         self._poses, self._first_pose, self._last_pose = 0, 0.0, 0.0
@@ -247,6 +248,8 @@ class LiveLoop(Stage):
         """The search of the start pose, which begins with the ticks; None before them."""
         if self._search is None and self._stream.synchronizer is not None:
             self._search = StartPoseSearch(self._stream, next(iter(self.setup.phases.get("start", ())), None))
+            self._covariance_ticks = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))
+            self._covariance_parts = math.ceil((len(self.source.sensors) + 2) / self._covariance_ticks)
         return self._search
 
     def _track(self, ticks: Ticks) -> LivePose | None:
@@ -281,10 +284,9 @@ class LiveLoop(Stage):
 
     def _update_std(self, estimator: SegmentEstimator, tick: int) -> None:
         """Compute some of the covariances; by ticks, so that a recording reproduces the values."""
-        period = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))
-        if tick % period == 0:
+        if tick % self._covariance_ticks == 0:
             self._covariance = estimator.covariance_gradually()
-        for covariance in itertools.islice(self._covariance, math.ceil((len(self.source.sensors) + 2) / period)):
+        for covariance in itertools.islice(self._covariance, self._covariance_parts):
             if covariance is not None:
                 self._std, self._heading_std = compute_axis_std(covariance), np.sqrt(covariance[:, 2, 2])
 
@@ -420,7 +422,7 @@ class LiveLoop(Stage):
             sentences = self._describe_lost(lost, frozen) or "Tracking.", *(each.describe() for each in self.outputs)
             return "ready", " ".join(filter(None, sentences)), 1.0
         if self._search is None:
-            missing_sensors = [name for name in self.source.sensors if name not in self._monitor.newest]
+            missing_sensors = [name for name in self.source.sensors if name not in self._monitor.sending]
             if not missing_sensors:
                 return "waiting", "Measuring the sampling rate.", 0.0
             awaited = self.source.describe_awaited(missing_sensors)

@@ -29,18 +29,11 @@ JUMP_S = 60.0  # [s] between two samples from which on the clock was set and not
 
 
 class SensorMonitor:
-    """Watches what comes from each sensor.
-
-    Attributes
-    ----------
-    newest : sensor → time [s] of its newest sample
-    """
+    """Watches what comes from each sensor."""
 
     def __init__(self) -> None:
-        self.newest: dict[str, float] = {}
-        self._even: dict[str, EvenTimes] = {}
+        self._even: dict[str, EvenTimes] = {}  # of the sensors that have sent something
         self._recent: dict[str, deque[Samples]] = {}
-        self._totals: dict[str, int] = {}
         self._history: deque[tuple[float, dict[str, int]]] = deque()  # time [s], and samples by then
         self._wrong_unit, self._checked = "", -math.inf  # and the time [s] of the newest sample then
 
@@ -50,30 +43,35 @@ class SensorMonitor:
             name = chunk.sensor
             if not len(chunk.time):
                 continue
-            self.newest[name] = max(self.newest.get(name, -math.inf), float(chunk.time[-1]))
-            self._totals[name] = self._totals.get(name, 0) + len(chunk.time)
-            if name not in self._even:
-                self._even[name] = EvenTimes()
-            self._even[name].push(chunk.time)
+            even = self._even.get(name)
+            if even is None:
+                even = self._even[name] = EvenTimes()
+            even.push(chunk.time)
             if name not in unchecked:
                 recent = self._recent.setdefault(name, deque())
                 recent.append(chunk)
                 while recent[0].time[-1] < recent[-1].time[-1] - UNIT_WINDOW_S:
                     recent.popleft()
 
+    @property
+    def sending(self) -> list[str]:
+        """Sensors that have sent something."""
+        return list(self._even)
+
     def list_silent(self, sensors: Iterable[str], now: float, silence_s: float) -> list[str]:
         """The sensors without a sample for longer than `silence_s` [s]."""
-        return [name for name in sensors if now - self.newest.get(name, -math.inf) > silence_s]
+        return [name for name in sensors if name not in self._even or now - self._even[name].newest > silence_s]
 
     def measure_rates(self, now: float) -> dict[str, float]:
         """Samples a second [Hz] of each sensor over the last second; called a few times a second."""
-        self._history.append((now, dict(self._totals)))
+        totals = {name: even.total for name, even in self._even.items()}
+        self._history.append((now, totals))
         while self._history[0][0] < now - RATE_WINDOW_S and len(self._history) > 2:
             self._history.popleft()
         begin, before = self._history[0]
         return {
             name: (count - before.get(name, 0)) / (now - begin) if now > begin else 0.0
-            for name, count in self._totals.items()
+            for name, count in totals.items()
         }
 
     def count_missing(self, sensor: str, now: float) -> int:
@@ -82,7 +80,7 @@ class SensorMonitor:
 
     def describe_wrong_unit(self, source: Source) -> str:
         """Describe the sensors whose rates contradict gravity, and what to do; empty: there is none."""
-        newest = max(self.newest.values(), default=-math.inf)
+        newest = max((even.newest for even in self._even.values()), default=-math.inf)
         if not abs(newest - self._checked) < UNIT_PERIOD_S:
             self._wrong_unit, self._checked = self._find_wrong_unit(source), newest
         return self._wrong_unit
@@ -118,9 +116,16 @@ def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
 
 
 class EvenTimes:
-    """The times at which one sensor's samples are due, which jitter and drift: those that never came are counted."""
+    """The times at which one sensor's samples are due, which jitter and drift: those that never came are counted.
+
+    Attributes
+    ----------
+    total : number of samples so far
+    newest : time [s] of the newest one; −inf before the first
+    """
 
     def __init__(self) -> None:
+        self.total, self.newest = 0, -math.inf
         self._first: list[float] = []  # times [s], until the step is known
         self._step = math.nan  # [s]
         self._due = 0.0  # [s] of the newest sample, on the even times
@@ -129,6 +134,9 @@ class EvenTimes:
     def push(self, time_s: np.ndarray) -> None:
         """Take the times (m,) [s] of samples in their order of arrival."""
         times = time_s.tolist()
+        self.total += len(times)
+        if times[-1] > self.newest:
+            self.newest = times[-1]
         if math.isnan(self._step):
             self._first += times
             if len(self._first) < FIRST_SAMPLES:
