@@ -7,9 +7,7 @@ import contextlib
 import http.client
 import json
 import math
-import os
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -24,6 +22,7 @@ import pinocchio as pin
 import pytest
 from arms import write_arm
 from browser import BROWSER, Browser, pixels
+from listening import NO_PROC, list_listening
 from scipy.spatial.transform import Rotation
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
@@ -161,29 +160,7 @@ def test_joint_angles_are_those_of_the_poses(person: Person) -> None:
 # The server ---------------------------------------------------------------------------------------------------------
 
 
-def listening(pid: int) -> set[str]:
-    """Addresses that a process listens on, TCP and UDP, as /proc has them."""
-    inodes = set()
-    for entry in Path(f"/proc/{pid}/fd").iterdir():
-        try:
-            target = os.readlink(entry)
-        except OSError:
-            continue
-        if target.startswith("socket:["):
-            inodes.add(target[8:-1])
-    sockets = set()
-    for table in ("tcp", "tcp6", "udp", "udp6"):
-        for line in Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]:
-            columns = line.split()
-            if columns[9] in inodes and (table.startswith("udp") or columns[3] == "0A"):
-                address = bytes.fromhex(columns[1].split(":")[0])
-                words = [address[k : k + 4][::-1] for k in range(0, len(address), 4)]  # of this machine's byte order
-                family = socket.AF_INET6 if table.endswith("6") else socket.AF_INET
-                sockets.add(socket.inet_ntop(family, b"".join(words)))
-    return sockets
-
-
-@pytest.mark.skipif(not Path("/proc/self/net/tcp").exists() or sys.byteorder != "little", reason="reads Linux's /proc")
+@pytest.mark.skipif(NO_PROC, reason="reads Linux's /proc")
 def test_nothing_listens_but_on_loopback() -> None:
     """In a process of its own: other tests' sockets are not this page's."""
     code = (
@@ -197,7 +174,7 @@ def test_nothing_listens_but_on_loopback() -> None:
     assert run.stdout is not None
     assert run.stdout.readline().startswith("http://127.0.0.1:")
     # A socket that only sends is 0.0.0.0:0 until it has; ours has not and is not in the table.
-    assert listening(run.pid) == {"127.0.0.1"}
+    assert list_listening(run.pid) == {"127.0.0.1"}
     run.communicate("", timeout=30)
     assert run.returncode == 0
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+from listening import NO_PROC, list_listening
 
 from wepose_pin.errors import BadOption, BadSource
 from wepose_pin.live.sources import lsl, open_source
@@ -199,26 +200,11 @@ while True:
 """
 
 
-def bound() -> set[tuple[str, str, str]]:
-    """Protocol, address and inode of this process's sockets that listen (TCP) or are bound (UDP); Linux."""
-    mine = {link.readlink().name for link in Path("/proc/self/fd").iterdir() if link.is_symlink()}
-    sockets = set()
-    for protocol in ("tcp", "tcp6", "udp", "udp6"):
-        for line in Path(f"/proc/self/net/{protocol}").read_text().splitlines()[1:]:
-            fields = line.split()
-            if f"socket:[{fields[9]}]" in mine and (protocol[:3] == "udp" or fields[3] == "0A"):
-                sockets.add((protocol, fields[1].split(":")[0], fields[9]))
-    return sockets
-
-
-LOOPBACK = "{:08X}".format(int.from_bytes(socket.inet_aton("127.0.0.1"), sys.byteorder))
-
-
-@pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="reads /proc")
+@pytest.mark.skipif(NO_PROC, reason="reads Linux's /proc")
 @pytest.mark.usefixtures("pylsl")
 def test_sources_listen_on_loopback_only() -> None:
     """A reading LSL source has no socket that listens; a UDP source the one that is asked for, on 127.0.0.1."""
-    before = bound()
+    before = list_listening(os.getpid())
     with subprocess.Popen([sys.executable, "-c", SENDER], stdout=subprocess.PIPE, text=True) as sender:
         try:
             assert sender.stdout is not None
@@ -226,7 +212,7 @@ def test_sources_listen_on_loopback_only() -> None:
             source = open_source("lsl:far", wait_s=5.0)
             source.open()
             assert len(collect(source, 10)["torso"].time) >= 10
-            assert bound() - before == set()
+            assert list_listening(os.getpid()) <= before
             source.close()
         finally:
             sender.kill()
@@ -236,5 +222,5 @@ def test_sources_listen_on_loopback_only() -> None:
     udp = open_source(f"udp:{port}", sensors=["torso"])
     assert isinstance(udp, UdpSource)
     udp.open()
-    assert {(protocol, address) for protocol, address, _ in bound() - before} == {("udp", LOOPBACK)}
+    assert list_listening(os.getpid()) - before <= {"127.0.0.1"}
     udp.close()
