@@ -123,12 +123,9 @@ class _OneByOne(ReplaySource):
     """A replay, a sample of each sensor a read, that notes the processor time from one read to the next."""
 
     def __init__(self, recording: Recording) -> None:
-        super().__init__(recording, math.inf)
+        super().__init__(recording, math.inf, block=1)
         self.busy_s: list[float] = []
         self._since: float | None = None
-
-    def _count_due(self) -> int:
-        return min(self._next + 1, len(self.recording))
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         if self._since is not None:

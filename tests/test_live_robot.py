@@ -28,9 +28,10 @@ import wepose_pin as wp
 from wepose_pin import retargeting
 from wepose_pin.commands import main
 from wepose_pin.kinematics import Pose
-from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, TickReplay, command_json
+from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, command_json
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup
+from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.live.state import LivePose, StreamInfo
 from wepose_pin.retargeting.approach import APPROACH_SPEED
 from wepose_pin.simulation import Simulation
@@ -487,7 +488,7 @@ def test_the_same_recording_gives_the_same_commands(
     def commands(recording: Any, record: Path | None = None) -> list[bytes]:
         sent.clear()
         out = RobotOutput(retargeting.CommandStream(arm), speed=math.inf)
-        source = TickReplay(recording, math.inf)
+        source = ReplaySource(recording, math.inf, block=1)
         run_session(source, SensorSetup.from_recording(recording), method=METHOD, record=record, outputs=[out])
         return list(sent)
 

@@ -23,7 +23,7 @@ from ..model.start_pose import compute_start_configuration
 from ..model.table import NEUTRAL_POSE
 from ..readers.live_log import LONGEST_TEXT, build_recording
 from ..recording import Intervals
-from ..recording.arrivals import COUNTS, CUT_OFF, DUPLICATE, LATE, WAIT_S, Samples, Ticks
+from ..recording.arrivals import COUNTS, CUT_OFF, DUPLICATE, LATE, Samples, Ticks
 from ..tracking import Tracker, TrackOptions
 from ..tracking.segments import SegmentEstimator
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates
@@ -163,7 +163,6 @@ class LiveLoop(Stage):
         open_log: Callable[[], LiveLog] | None = None,
         outputs: Sequence[Output] = (),
         begin: float | None = None,
-        wait_s: float = WAIT_S,
     ) -> None:
         super().__init__(source, outputs)
         self.method, self.log, self._open_log, self.setup = method, log, open_log, setup.as_recorded()
@@ -177,7 +176,7 @@ class LiveLoop(Stage):
         if self.model.table.is_mechanism:
             self._instruction = f"{self.model.table.name} must stand still in its start configuration"
         self._monitor = SensorMonitor()
-        self._stream = TickStream(source.sensors, source.rate_hz, begin, wait_s, log, source.orientations)
+        self._stream = TickStream(source.sensors, source.rate_hz, begin, log, source.orientations)
         self._search: StartPoseSearch | None = None  # from when the ticks begin
         self._stood_s = 0.0  # [s] longest time that the person stood still before tracking
         self._estimator: SegmentEstimator | None = None  # from when the start pose is found

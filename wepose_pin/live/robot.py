@@ -270,13 +270,6 @@ class RobotOutput(Output):
             raise self._failure
 
 
-class TickReplay(ReplaySource):
-    """A replay as fast as possible, one tick a read: the robot gets every pose."""
-
-    def _count_due(self) -> int:
-        return min(self._next + 1, len(self.recording))
-
-
 @dataclass(frozen=True)
 class RobotOptions:
     """A robot that follows.
@@ -343,7 +336,7 @@ def connect_robot(
     if source.sensors:
         check_person_arms(options.robot, source.sensors, table=table)
     if isinstance(source, ReplaySource) and math.isinf(speed):
-        source = TickReplay(source.recording, speed)
+        source = ReplaySource(source.recording, speed, block=1)  # the robot gets every pose
     lengths_cov = (setup.subject or population_subject(body=table)).lengths_covariance((table or load_table()).lengths)
     stream = CommandStream(options.robot, options.stream)
     return RobotOutput(stream, options.to, lengths_cov=lengths_cov, speed=speed, table=table), source

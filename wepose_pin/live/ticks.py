@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Sequence
 import numpy as np
 
 from ..errors import BadData
-from ..recording.arrivals import JUMP_S, WAIT_S, Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
+from ..recording.arrivals import JUMP_S, Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
 from ..writers.live_log import LiveLog
 from .monitor import measure_step
 
@@ -39,7 +39,6 @@ class TickStream:
         sensors: Sequence[str],
         rate_hz: float | None = None,
         begin: float | None = None,
-        wait_s: float = WAIT_S,
         log: LiveLog | None = None,
         orientations: Collection[str] = (),
     ) -> None:
@@ -47,7 +46,7 @@ class TickStream:
         self.measured = np.array([name in orientations for name in self.sensors], dtype=np.bool_)
         self.synchronizer: StreamSynchronizer | None = None
         self.history: list[Arrivals] | None = [] if log is None else None
-        self._orientations, self._rate_hz, self._begin, self._wait_s = orientations, rate_hz, begin, wait_s
+        self._orientations, self._rate_hz, self._begin = orientations, rate_hz, begin
         self._history_size = 0  # samples
         self._waiting: list[Arrivals] = []
 
@@ -96,7 +95,7 @@ class TickStream:
             rate = max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ
         # A time-stamp outlier must not put all other sensors before the beginning.
         begin = self._begin if self._begin is not None else float(first[first < np.median(first) + JUMP_S].max())
-        self.synchronizer = StreamSynchronizer(self.sensors, rate, begin, self._wait_s, self._orientations)
+        self.synchronizer = StreamSynchronizer(self.sensors, rate, begin, orientations=self._orientations)
         self._record_clock()
 
     def record(self, log: LiveLog) -> None:
@@ -112,4 +111,4 @@ class TickStream:
     def _record_clock(self) -> None:
         if self.log is not None and self.synchronizer is not None:
             clock = self.synchronizer
-            self.log.event("clock", rate_hz=clock.rate_hz, begin=clock.begin, wait_s=self._wait_s)
+            self.log.event("clock", rate_hz=clock.rate_hz, begin=clock.begin, wait_s=clock.wait_s)

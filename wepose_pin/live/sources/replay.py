@@ -15,7 +15,6 @@ from ...recording import OrientationSensor, Recording
 from ...recording.arrivals import Samples, list_numbers
 from .base import Source, SourceKind, SourceOptions, Waiting
 
-BLOCK = 64  # samples of every sensor at once, as fast as possible
 # Up to 1 kHz every sample comes when it is due, faster ones come together.
 MIN_SLEEP_S = 0.0005
 
@@ -41,19 +40,20 @@ class ReplaySource(Source):
     Parameters
     ----------
     speed : 1.0 its own, ``math.inf`` as fast as possible
+    block : samples of every sensor at once, as fast as possible
 
     Attributes
     ----------
     recording : that is replayed
     """
 
-    def __init__(self, recording: Recording, speed: float = 1.0) -> None:
+    def __init__(self, recording: Recording, speed: float = 1.0, block: int = 64) -> None:
         super().__init__(recording.sensors, recording.rate_hz)
         self._numbers = dict(zip(recording.sensors, map(list_numbers, recording.sensors.values()), strict=True))
         self.recording = recording
         # Samples are taken as evenly spaced: the jitter of the clock is no motion, and every sample has its own tick.
         self._time = recording.time[0] + np.arange(len(recording)) / recording.rate_hz
-        self._speed, self._next, self._begin = speed, 0, 0.0
+        self._speed, self._block, self._next, self._begin = speed, block, 0, 0.0
         sensors = recording.sensors.items()
         self._orientations = {name: each.aligned for name, each in sensors if isinstance(each, OrientationSensor)}
 
@@ -101,7 +101,7 @@ class ReplaySource(Source):
     def _count_due(self) -> int:
         """One past the last sample that is due."""
         if math.isinf(self._speed):
-            return min(self._next + BLOCK, len(self.recording))
+            return min(self._next + self._block, len(self.recording))
         return int(np.searchsorted(self._time, self.clock(), side="right"))
 
 
