@@ -113,7 +113,7 @@ class Session:
     def _moments(self) -> Iterator[Moment]:
         guide = self.guide
         while guide.accepted is None:
-            guide.push(self.source.read(0.1), self.source.clock())
+            guide.process(self.source.read(0.1))
             view, step = guide.view(), guide.step.name
             self.person.follow(step, self.obeys(step, view), view.countdown)
             yield Moment(self.source.clock(), step, view)

@@ -66,10 +66,9 @@ def run_guide(
     from ..calibration import calibrate, load_protocol
     from ..calibration.protocols import split_protocol
     from ..live.assignment import read_segments, write_segments
-    from ..live.guide import Calibrated, GuideOptions
-    from ..live.guided import GuidedSession
+    from ..live.guide import Calibrated, Guide, GuideOptions
     from ..live.session import open_and_wait, warm_up
-    from ..live.steps import STATURE
+    from ..live.steps import STATURE, make_steps
     from ..readers import load_session
     from ..readers.subject import read_subject
     from ..report import write_calibration_page
@@ -129,18 +128,18 @@ def run_guide(
     threading.Thread(target=warm_up, args=(method,), daemon=True).start()  # tracking begins without a wait then
     if not open_and_wait(source, views, until):
         return None
-    session = GuidedSession(source, options, views)
-    calibrated = session.run(until)
+    guide = Guide(source, options, make_steps(options.protocol), views)
+    calibrated = guide.run(until)
     if calibrated is None:
         source.close()
         return None
     for name in SUBJECT_FILES:
         if (calibrated.folder / name).is_file():
             shutil.copyfile(calibrated.folder / name, folder / name)
-    write_segments(folder, session.guide.segments)
+    write_segments(folder, guide.segments)
     subject_text = (folder / "subject.toml").read_text(encoding="utf-8")
     tracked = replace(setup, subject=load_subject(folder), subject_text=subject_text, remounted=False, mounts={})
-    return GuidedOutcome(session.guide.assigned(), tracked, folder, calibrated)
+    return GuidedOutcome(guide.assigned(), tracked, folder, calibrated)
 
 
 def _make_folder(out: Path | None, force: bool) -> Path:

@@ -7,6 +7,8 @@ attributes. Steps can be repeated, and all but the start pose skipped. Times are
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,10 +21,12 @@ from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks
 from ..writers.live_log import LiveLog
 from .assignment import AssignedSource
+from .demonstration import RATE_HZ, Demonstration
 from .monitor import SensorMonitor
 from .setup import SensorSetup
 from .sources.base import Source
-from .state import GuideStep, GuideView, Request, join_names
+from .stage import Stage
+from .state import GuideStep, GuideView, Output, Request, SensorStatus, Status, join_names
 from .ticks import TickStream
 
 SILENCE_S = 1.0  # [s] without a sample after which a sensor counts as silent
@@ -86,12 +90,12 @@ class Step(NamedTuple):
     records: bool = True  # the attempt goes on recording; else its samples wait for the next step
 
 
-class Guide:
+class Guide(Stage):
     """Leads a person from sensors that send to an accepted calibration.
 
     Parameters
     ----------
-    source : open
+    source, outputs : open; they stay so
     steps : the table; one of them is named "start"
 
     Attributes
@@ -104,9 +108,15 @@ class Guide:
     accepted : the calibration that the person accepted; None before
     """
 
-    def __init__(self, source: Source, options: GuideOptions, steps: Sequence[Step]) -> None:
-        self.source, self.options, self.steps = source, options, tuple(steps)
-        self.monitor = SensorMonitor()
+    READ_TIMEOUT_S = 0.02  # [s]; the figure moves meanwhile
+    STATUS_PERIOD_S = 0.1  # [s]
+
+    def __init__(
+        self, source: Source, options: GuideOptions, steps: Sequence[Step], outputs: Sequence[Output] = ()
+    ) -> None:
+        super().__init__(source, outputs)
+        self.options, self.steps, self.monitor = options, tuple(steps), SensorMonitor()
+        self._figure, self._figure_due = Demonstration(options.model, options.protocol) if outputs else None, 0.0
         self.now = 0.0
         self.samples: Sequence[Samples] = ()
         self.ticks: list[Ticks] = []
@@ -145,9 +155,23 @@ class Guide:
         """Sensors that have sent nothing for a while."""
         return self.monitor.list_silent(self.segments or self.sending, self.now, SILENCE_S)
 
-    def push(self, samples: Sequence[Samples], now: float) -> None:
-        """Take what came since the last call, up to the time `now` [s]."""
-        self.now, self.samples, self.ticks = now, samples, []
+    def run(self, should_stop: Callable[[], bool] = lambda: False) -> Calibrated | None:
+        """Lead the person until a calibration is accepted; None: the person, the source or `should_stop` ended it."""
+        try:
+            self.loop(should_stop)
+        finally:
+            self.close()
+        if self.is_over:
+            self.send_status()
+        return self.accepted
+
+    @property
+    def is_over(self) -> bool:
+        return self.accepted is not None
+
+    def process(self, samples: list[Samples]) -> None:
+        """Guide the person by what came since the last call, and move the figure."""
+        self.now, self.samples, self.ticks = self.source.clock(), samples, []
         self.monitor.push(samples, self.source.orientations)
         if self.attempt is None:
             self._postponed = []
@@ -158,6 +182,12 @@ class Guide:
                 self.ticks = [ticks for each in postponed for ticks in self.attempt.push(each)]
                 self.attempt.log.flush_if_due()
         self._go_on(NOTHING)
+        now = time.monotonic()
+        if self._figure is not None and now >= self._figure_due:
+            self._figure_due = now + 1.0 / RATE_HZ
+            pose = self._figure.pose(self._view, now)
+            for output in self.outputs:
+                output.demonstrate(pose, self._figure.segments)
 
     def ask(self, request: Request) -> None:
         """Do what the person asks for; what the step does not offer is ignored."""
@@ -229,6 +259,23 @@ class Guide:
             state = "ahead" if k > self._index else "now" if k == self._index else "done"
             steps.append(GuideStep(step.name, step.title, "skipped" if step.name in self._skipped else state))
         return self._view._replace(steps=tuple(steps))
+
+    def build_status(self) -> Status:
+        """The state of the guide and of each sensor now."""
+        view, rates, batteries = self.view(), self.monitor.measure_rates(self.now), self.source.batteries
+        sensors = []
+        for name in sorted(rates):
+            segment = self.segments.get(name, "")
+            label = f"{segment} ({name})" if segment and segment != name else name
+            missing, battery = self.monitor.count_missing(name, self.now), batteries.get(name, math.nan)
+            sensors.append(SensorStatus(label, rates[name], name in self.silent, missing=missing, battery=battery))
+        state, message = "guide", view.sentence
+        if self.is_over:
+            state, message = "waiting", "The subject is saved. Tracking begins."
+        return Status(
+            state, message, view.progress, self.now, tuple(sensors), (math.nan, math.nan), 0.0,
+            dict(self.source.problems), guide=None if self.is_over else view,
+        )  # fmt: skip
 
     def describe_problems(self) -> str:
         """A sentence on sensors that send nothing, else on rates in another unit; empty: there are none."""
