@@ -163,7 +163,7 @@ def read_live_log(path: Path) -> LiveRecording:
         killed = Diagnostic("live-recording-incomplete", WARNING, path.name, facts={"variant": "killed"})
         recording = replace(recording, diagnostics=(killed,))
     first = int(poses[0, 0]) if len(poses) else start[1] + 1 if start is not None else 0
-    return LiveRecording(recording, header, first, poses[:, 1:].reshape(len(poses), -1, 4).copy())
+    return LiveRecording(recording, header, first, poses[:, 1:].reshape(len(poses), len(header["sensors"]), 4).copy())
 
 
 def _make_ticks(path: Path, synchronizer: StreamSynchronizer, arrivals: Arrivals) -> Ticks:
