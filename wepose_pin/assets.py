@@ -26,8 +26,15 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
     """Name → what distributions register as entry points ``wepose.GROUP``: "readers", "writers", "sources", "outputs".
 
     What this package brings is registered in the same way, in pyproject.toml. It stands first, and its names are taken.
+
+    Raises
+    ------
+    BadOption
+        This package's own are missing: it was not installed, or before it registered them.
     """
     found = sorted(entry_points(group=f"wepose.{group}"), key=lambda each: not each.value.startswith("wepose_pin."))
+    if not found or not found[0].value.startswith("wepose_pin."):
+        raise BadOption(f"no {group} of wepose-pin are registered: install it again, in a clone by pip install -e .")
     plugins: dict[str, EntryPoint] = {}
     for each in found:
         plugins.setdefault(each.name, each)
