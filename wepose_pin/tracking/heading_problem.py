@@ -72,6 +72,7 @@ class HeadingNoise:
 
 PERSON_NOISE = HeadingNoise()
 MECHANISM_NOISE = HeadingNoise(
+    rate_std=float(np.deg2rad(0.2)),
     joint_std=float(np.deg2rad(0.5)),
     girdle_std=float(np.deg2rad(0.5)),
     twist_std=float(np.deg2rad(0.5)),
