@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from reading import BROWSER, browse
 
 from wepose_pin.report.viewer import pose_html
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track
 
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome")
 
 
@@ -28,29 +26,9 @@ def page(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return path
 
 
-def browse(page: Path, at: str, *options: str, milliseconds: int = 3000) -> str:
-    """What Chromium prints of the page at an address such as ``#t=12``, after so much of the page's own time."""
-    assert BROWSER is not None
-    return subprocess.run(
-        [
-            BROWSER,
-            *"--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking".split(),
-            *"--use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=600,450".split(),
-            f"--user-data-dir={page.parent / 'profile'}",
-            f"--virtual-time-budget={milliseconds}",
-            *options,
-            page.as_uri() + at,
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    ).stdout
-
-
 def picture(page: Path, at: str) -> np.ndarray:
     file = page.with_name(f"{re.sub(r'[^0-9]', '', at)}.png")
-    browse(page, at, f"--screenshot={file}")
+    browse(page, f"--screenshot={file}", at=at)
     return np.asarray(Image.open(file).convert("RGB")).astype(int)
 
 
@@ -71,7 +49,7 @@ def test_it_draws_the_person_and_the_motion(page: Path, simulation: Simulation) 
 
 def test_it_plays_by_itself_and_stands_still_at_an_address(page: Path) -> None:
     def now(at: str, milliseconds: int) -> float:
-        dump = browse(page, at, "--dump-dom", milliseconds=milliseconds)
+        dump = browse(page, "--dump-dom", at=at, milliseconds=milliseconds)
         assert 'data-wepose-ready="true"' in dump
         match = re.search(r'id="now"[^>]*>\s*([0-9.]+)', dump)
         assert match is not None

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
-import subprocess
 from collections.abc import Mapping
 from dataclasses import replace
 from html import unescape
@@ -16,7 +14,7 @@ import numpy as np
 import pytest
 from bodies import TABLE
 from PIL import Image
-from reading import captions, headings, rows, text_of, without_frame
+from reading import BROWSER, browse, captions, headings, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.commands import main
@@ -26,7 +24,6 @@ from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.plausibility import find_cut_off
 from wepose_pin.report import render_track_report
 from wepose_pin.report.figures import COLUMNS, envelope
-from wepose_pin.report.words import listed, signed, whole
 from wepose_pin.simulation import Simulation, simulate, simulate_person
 from wepose_pin.subject import Hinge, Subject, population_subject
 from wepose_pin.tracking import TrackedRecording, TrackOptions, summarize, track
@@ -39,13 +36,11 @@ from wepose_pin.tracking.measures import (
 )
 from wepose_pin.writers import write_session
 
-BUDGET = "What the ± of the points is made of"
 POINTS = ("left_palm", "right_palm")
 SECTIONS = [
     "What was recorded",
     "Drift of the headings",
     "The hands",
-    BUDGET,
     "Joint angles",
     "The motion in 3D",
     "What was run",
@@ -115,7 +110,7 @@ def test_it_gives_the_sensors_and_joints_in_numbers(page: str, pose: TrackedReco
         assert f"{orientation.noise.gravity:.3f} m/s²" in cells
     std = {name: np.degrees(np.sqrt(cov[:, 2, 2])) for name, cov in pose.pose.segment_cov.items()}
     elbow = np.hypot(std["right_upper_arm"], std["right_forearm"])[pose.time >= pose.segments.start[1]]
-    assert ["right elbow", f"{np.median(elbow):.1f}°", f"{elbow.max():.1f}°"] in table
+    assert ["right elbow", f"{np.median(elbow):.1f}°", f"{elbow.max():.1f}°"] in [row[:3] for row in table]
 
 
 def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedRecording, page: str) -> None:
@@ -162,7 +157,7 @@ def test_it_does_not_grow_with_the_recording() -> None:
 
 def test_without_a_covariance_it_says_so(simulation: Simulation) -> None:
     page = render_track_report(summarize(track(simulation.recording("ncf"), method="ncf")))
-    assert headings(page) == [name for name in SECTIONS if name != BUDGET]
+    assert headings(page) == SECTIONS
     assert "The filter ncf states no uncertainty" in text_of(page)
     assert "± nan" not in page
 
@@ -191,7 +186,7 @@ def test_a_torso_alone_has_no_hands(simulation: Simulation) -> None:
             track(replace(recording, sensors={"head": recording.sensors["torso"]}, phases={"start": ((0.5, 4.5),)}))
         )
     )
-    assert headings(head) == [name for name in SECTIONS if name not in ("The hands", "Joint angles", BUDGET)]
+    assert headings(head) == [name for name in SECTIONS if name not in ("The hands", "Joint angles")]
 
 
 # What it warns of -----------------------------------------------------------------------------------------------------
@@ -268,11 +263,6 @@ def test_a_person_who_never_rests(pose: TrackedRecording) -> None:
     assert longest_run_s(np.array([True, False, True, True, True, False]), 2.0) == 1.5
 
 
-def test_a_late_start_pose(pose: TrackedRecording) -> None:
-    late = replace(pose, segments=replace(pose.segments, start=(40.0, 44.0)))
-    assert the("start-pose-late", late).value == pytest.approx(40.0)
-
-
 def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
     drifting = {
         name: of._replace(attitude_cov=100.0 * of.attitude_cov) for name, of in pose.segments.orientation.items()
@@ -326,19 +316,12 @@ def test_elbows_that_cannot_be(pose: TrackedRecording) -> None:
     assert "by 15° in the first half of the recording and by 45° in the second" in render(drifting).what
 
 
-def test_an_elbow_that_is_folded_too_far_and_drifts_out_of_its_plane(pose: TrackedRecording) -> None:
-    n = len(pose.time)
-    flexion = np.where(np.arange(n) < n // 4, 170.0, 90.0)
-    tracked = with_elbow(pose, flexion, np.linspace(0.0, 60.0, n))
-    assert the("hinge-overflexed", tracked).facts.get("variant") is None
-    assert the("hinge-out-of-plane", tracked).facts["variant"] == "drifting"
-    assert render(the("hinge-overflexed", tracked)).what
-
-
-def test_new_strapping(simulation: Simulation, pose: TrackedRecording) -> None:
+def test_new_strapping_and_a_late_start_pose(simulation: Simulation, pose: TrackedRecording) -> None:
     known: Subject = replace(pose.subject, mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])})
     anew = track(replace(simulation.recording("new"), remounted=True), known)
     assert the("sensors-remounted", anew).severity == INFO
+    late = replace(pose, segments=replace(pose.segments, start=(40.0, 44.0)))
+    assert the("start-pose-late", late).value == pytest.approx(40.0)
 
 
 # Its sums -------------------------------------------------------------------------------------------------------------
@@ -394,7 +377,6 @@ def test_heading_budgets_are_those_of_the_covariance(pose: TrackedRecording) -> 
         R = Rotation.from_quat(of.quat_WS).as_matrix()
         cov = R @ of.attitude_cov @ R.swapaxes(1, 2)
         std = np.sqrt(cov[:, 2, 2])
-        assert budget.filter_end == pytest.approx(std[-1], rel=1e-9)
         np.testing.assert_allclose(budget.drift, std, rtol=1e-6)
         np.testing.assert_allclose(budget.std, np.sqrt(pose.pose.segment_cov[name][:, 2, 2]), rtol=1e-12)
         held = compute_heading_uncertainties(pose)[name].drift  # by the other sensors
@@ -436,22 +418,6 @@ def test_an_envelope_keeps_the_extremes_and_the_holes() -> None:
     np.testing.assert_array_equal(envelope(time[:10], values[:10])[1], values[:10])
 
 
-def test_what_is_cut_off() -> None:
-    wave = 5.0 * np.sin(np.linspace(0.0, 20.0, 4000))
-    values = np.column_stack([np.clip(wave, -3.0, 3.0), wave, np.clip(wave, -9.0, 2.5)])
-    cut = find_cut_off(values, 2.0)
-    np.testing.assert_array_equal(cut[:, 0], np.abs(wave) >= 3.0)
-    assert not cut[:, 1].any()
-    np.testing.assert_array_equal(cut[:, 2], wave >= 2.5)
-    assert not find_cut_off(values, 4.0)[:, 0].any()
-
-
-def test_words() -> None:
-    assert [listed(parts) for parts in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == ["", "a", "a and b", "a, b and c"]
-    assert [whole(value) for value in (-0.4, -1.6, 12.5)] == ["0", "−2", "12"]
-    assert signed(-0.04) == "0.0"
-
-
 # The command and the browser ------------------------------------------------------------------------------------------
 
 
@@ -470,28 +436,6 @@ def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.Captu
         assert [each["code"] for each in saved] == ["population-lengths"]  # of the motion, with a report or without
         assert f"info: {saved[0]['text']['what']}" in captured.err
     assert "Motion of short" in (tmp_path / "with" / "report.html").read_text(encoding="utf-8")
-
-
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-
-
-def browse(page: Path, *options: str) -> str:
-    assert BROWSER is not None
-    return subprocess.run(
-        [
-            BROWSER,
-            *"--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking".split(),
-            *"--use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=1000,700".split(),
-            f"--user-data-dir={page.parent / 'profile'}",
-            "--virtual-time-budget=3000",
-            *options,
-            page.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    ).stdout
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no chromium or google-chrome")

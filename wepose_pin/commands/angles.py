@@ -101,11 +101,10 @@ def angles(
             figures = draw_figures(movements)
             for figure_name, figure in figures.items():
                 (folder / f"{figure_name}.svg").write_text(figure.svg(), encoding="utf-8")
-            files = sorted(path.name for path in folder.iterdir())
             write_provenance(folder, collect_provenance("angles", options))
         progress("making the page", 0.9)
         writer = PageWriter(out, [PAGE])
-        writer.write(PAGE, lambda failures: render_angles_page(movements, figures, files, failures))
+        writer.write(PAGE, lambda failures: render_angles_page(movements, figures, failures))
     lock = {each.place: each for movement in movements for each in diagnose_lock(movement.angles)}
     print_diagnostics([*lock.values(), *writer.diagnostics])
     for movement in movements:

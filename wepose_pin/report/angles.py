@@ -22,35 +22,31 @@ from ..angles.movement import (
 )
 from ..angles.repetitions import list_angles
 from .figures import BAND, SESSION_COLOURS, SHADE, SOFT, Figures, ReportFigure, envelope, shade, styled
-from .page import MOST_FIGURES, Bullets, Item, Page, Table
-from .words import intervals, listed, plain, signed, versions
+from .page import MOST_FIGURES, Item, Page, Table
+from .words import intervals, listed, plain, signed
 
 HEADINGS = ("lowest [°]", "highest [°]", "range [°]", "peak rate [°/s]")  # of MEASURES
 CLEAR = 2.0  # standard deviations that the poses state; a smaller difference may be an error that a session shares
 MOST_CURVES = 60  # of single repetitions that are drawn behind their mean
 
 
-def render_angles_page(
-    movements: Sequence[Movement], figures: Figures, files: Sequence[str], failures: list[str] | None = None
-) -> str:
+def render_angles_page(movements: Sequence[Movement], figures: Figures, failures: list[str] | None = None) -> str:
     """Return the text of ``angles.html``, one page that opens offline and can be printed. It is deterministic.
 
     Parameters
     ----------
     figures : of `draw_figures`; the page shows the first of them
-    files : that lie beside the page
     failures : gets a line for each section that cannot be made
     """
     page = Page(f"Joint angles of {' and '.join(movement.name for movement in movements)}", failures)
     shown = dict([*figures.items()][:MOST_FIGURES])
     over_time = [shown.pop("repetitions")] if "repetitions" in shown else []
-    reasons = [
+    repetitions: list[Item] = [
         f"{movement.name}: no repetitions{_by(movement)}: {movement.repetitions.reason}."
         for movement in movements
         if movement.repetitions.reason
     ]
-    repetitions: list[Item] = [Bullets(reasons), ADVICE] if reasons else []
-    repetitions += over_time
+    repetitions += [*([ADVICE] if repetitions else []), *over_time]
     page.add("What can be relied on", lambda: [_describe_reliance(movements)], heading=False)
     page.add("Sessions", lambda: [_tabulate_sessions(movements), _describe(movements)], heading=False)
     page.add("Repetitions", lambda: repetitions)
@@ -63,7 +59,6 @@ def render_angles_page(
         page.add("Sessions compared", lambda: [COMPARISON, *_tabulate_comparisons(movements)])
     page.add("All of the time", lambda: [WHOLE_TIME, *_tabulate_whole_time(movements)])
     page.add("What the angles are", lambda: [DEFINITIONS, _tabulate_definitions(movements)])
-    page.add("Files", lambda: [Bullets(files), f"Made with {versions()}."])
     return page.html()
 
 
@@ -116,20 +111,17 @@ def _describe_reliance(movements: Sequence[Movement]) -> str:
 def _describe(movements: Sequence[Movement]) -> str:
     cutoff = movements[0].cutoff_hz
     text = (
-        f"Orientations were low-passed at {cutoff:g} Hz: a Butterworth filter of second order, forwards and backwards, "
-        "without delay; at the cut-off the amplitude is half (−6 dB)."
+        f"Orientations were low-passed at {cutoff:g} Hz: a Butterworth filter of second order, forwards and backwards; "
+        "at the cut-off the amplitude is half (−6 dB)."
         if cutoff
         else "Orientations were not low-passed."
     )
     text += " Rates are means over 0.05 s. ± between repetitions is one standard deviation, with n − 1."
-    if any(joint.std is not None for movement in movements for joint in movement.angles.joints.values()):
+    if any(movement.isotropic for movement in movements):
         text += (
-            " The ± that the pose states for one repetition is in square brackets, from the orientations' covariance"
+            " The poses state one number for all axes of a segment, so that their ± is rough for a single angle; "
+            "`wepose track --covariance` writes all of it."
         )
-        if any(movement.isotropic for movement in movements):
-            text += ", here of one number for all axes of a segment, so that it is rough for a single angle; "
-            text += "`wepose track --covariance` writes all of it"
-        text += "."
     return f"{text} CMC is the coefficient of multiple correlation of the curves (Kadaba et al. 1989), at most 1."
 
 

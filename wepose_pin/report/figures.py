@@ -29,7 +29,7 @@ DASHES = {  # by the place among the lines of a side
     "right": ((0, (4, 1.5)), (0, (5, 1, 1, 1)), (0, (10, 3))),
     "other": ("-", (0, (2, 1)), (0, (6, 1))),
 }
-SHADE, BAND, SOFT = "#e9eef4", "#cdd9e5", "#8794a3"
+SHADE, BAND, SOFT, ALARM = "#e9eef4", "#cdd9e5", "#8794a3", "#b23a48"
 STYLE: Any = {
     "font.family": ["sans-serif"],
     "font.sans-serif": ["DejaVu Sans", "Helvetica", "Arial"],

@@ -49,11 +49,6 @@ class Table(NamedTuple):
         return any(len(cell) > 40 for row in self.rows for cell in row)
 
 
-class Bullets(NamedTuple):
-    items: Sequence[str]
-    macro: str = "bullets"
-
-
 class Facts(NamedTuple):
     """Names and values."""
 
@@ -62,11 +57,10 @@ class Facts(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A page in the page, for screens only."""
+    """A view of a motion in the page, for screens only; `more` follows the caption."""
 
-    title: str
-    caption: str
     page: str
+    more: str = ""
     macro: str = "frame"
 
 
@@ -78,7 +72,7 @@ class _Picture(NamedTuple):
     macro: str = "picture"
 
 
-Item: TypeAlias = "str | Banner | Table | Bullets | Facts | Frame | ReportFigure"  # a text is a paragraph
+Item: TypeAlias = "str | Banner | Table | Facts | Frame | ReportFigure"  # a text is a paragraph
 
 
 class Page:
@@ -160,6 +154,7 @@ def _environment() -> Environment:
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     environment.filters |= {"inline": inline, "slug": words.slug}
     environment.globals["file"] = lambda name: Markup((PACKAGE / name).read_text(encoding="utf-8"))
+    environment.globals["versions"] = words.versions
     return environment
 
 

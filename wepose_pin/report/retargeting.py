@@ -12,6 +12,7 @@ from ..retargeting import Trajectory
 from ..retargeting.collision import CLEARANCE, NEAR
 from ..retargeting.error_attribution import CAUSES, FAR, find_error_causes
 from .figures import (
+    ALARM,
     COLOURS,
     SESSION_COLOURS,
     SOFT,
@@ -24,9 +25,9 @@ from .figures import (
     styled,
 )
 from .page import Facts, Frame, Item, Page, Table, show_diagnostics
-from .words import plain, versions, whole
+from .words import plain, whole
 
-CAUSE_COLOURS = ("#b23a48", *SESSION_COLOURS, SOFT, COLOURS["other"])  # of `CAUSES`
+CAUSE_COLOURS = (ALARM, *SESSION_COLOURS, SOFT, COLOURS["other"])  # of `CAUSES`
 PAIRS = 8  # that are listed, the closest ones
 
 
@@ -54,8 +55,8 @@ def render_retargeting_report(
     page.add("The hands against their targets", lambda: _list_hands(trajectory, summary))
     page.add("The robot's parts against each other", lambda: _list_distances(trajectory, summary))
     page.add("The joints against their limits", lambda: _list_joints(trajectory))
-    caption = "Drag to rotate, scroll to zoom, space to pause. Translucent: the targets of the hands."
-    page.add("The motion in 3D", lambda: [] if view is None else [Frame("The motion in 3D", caption, view)])
+    ghosts = " Translucent: the targets of the hands."
+    page.add("The motion in 3D", lambda: [] if view is None else [Frame(view, ghosts)])
     page.add("What was run", lambda: _list_run(summary))
     return page.html()
 
@@ -189,7 +190,6 @@ def _list_run(summary: Mapping[str, Any]) -> list[Item]:
                 ("rate", f"{summary['rate_hz']:g} Hz"),
                 ("of the limits", f"{100.0 * summary['speed_scale']:g} % of velocity, acceleration and jerk"),
                 ("steps near a singularity", f"{100.0 * summary['steps']['singular_share']:.1f} %"),
-                ("made with", versions()),
             ]
         )
     ]

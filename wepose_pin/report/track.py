@@ -29,6 +29,7 @@ from ..tracking.measures import (
 )
 from ..tracking.pose_diagnostics import GRAVITY_OFF, describe_heading_remedy
 from .figures import (
+    ALARM,
     COLOURS,
     SOFT,
     ReportFigure,
@@ -41,11 +42,9 @@ from .figures import (
     styled,
 )
 from .page import Facts, Frame, Item, Page, Table, show_diagnostics
-from .viewer import pose_html
-from .words import capital, degrees, intervals, listed, plain, plural, versions, whole
+from .viewer import show_motion
+from .words import capital, degrees, intervals, kinds, listed, plain, plural, whole
 
-FRAMES_A_SECOND = 20.0  # of the 3D view
-MOST_FRAMES = 5000  # of the 3D view
 LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 PATH_POINTS = 1000
 FULL_TURN = 2.0 * np.pi - 1e-9
@@ -79,8 +78,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
     page.add("In short", lambda: _list_facts(tracked, measures), heading=False)
     page.add("What was recorded", lambda: _list_recorded(tracked, measures))
     page.add("Drift of the headings", lambda: _list_drift(tracked, measures.budgets))
-    page.add(f"The {_name_tips(table)}", lambda: _list_tips(tracked, measures.tips))
-    page.add("What the ± of the points is made of", lambda: _list_error_budget(measures.error_budget))
+    page.add(f"The {_name_tips(table)}", lambda: _list_tips(tracked, measures))
     page.add("Joint angles", lambda: _list_angles(tracked, find_angles()))
     page.add("The motion in 3D", lambda: _list_view(tracked, view))
     page.add("What was run", lambda: _list_run(tracked))
@@ -136,7 +134,7 @@ def _explain_no_covariance(tracked: TrackedRecording) -> str:
 
 
 def _list_diagnostics(diagnostics: Sequence[Diagnostic], table: BodyTable) -> list[Item]:
-    checked = listed(["Rates", "ranges", "static phases", "headings", *_name_hinges(table)])
+    checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
     return [show_diagnostics(diagnostics, f"**No warnings.** {checked} are within their limits.")]
 
 
@@ -152,7 +150,7 @@ def _list_facts(tracked: TrackedRecording, measures: Measures) -> list[Item]:
             f" Angles and positions are shown for {len(recording)} samples, one in "
             f"{measures.samples / len(recording):.0f}; extremes, static phases and losses include all samples."
         )
-    before = _find_time_before(tracked)
+    before = float(tracked.time[np.argmax(find_samples_after_start(tracked))] - tracked.time[0])
     if before >= 1.0:
         text += (
             f" Each ± is of the time after the start pose; the {_format_duration(before)} before its end are left out."
@@ -161,46 +159,36 @@ def _list_facts(tracked: TrackedRecording, measures: Measures) -> list[Item]:
 
 
 def _list_recorded(tracked: TrackedRecording, measures: Measures) -> list[Item]:
-    recording = tracked.recording
-    rows, noise = [], []
-    for name, signal in measures.signals.items():
-        lost = signal.gap if recording.sensors[name].gap is not None else np.zeros(1, bool)
-        rows.append(
-            [
-                plain(name),
-                f"{np.degrees(signal.rate.max()):.0f} °/s",
-                f"{signal.peak_accel:.0f} m/s²" if np.isfinite(signal.peak_accel) else "",
-                _format_seconds(signal.cut, recording.rate_hz),
-                _format_seconds(lost, recording.rate_hz),
-                f"{100 * float(signal.static.mean()):.0f} %" if signal.static is not None else "not measured",
-                f"{longest_run_s(~signal.static, recording.rate_hz):.0f} s" if signal.static is not None else "",
-            ]
-        )
-        if signal.bias is not None:
-            begin, end = (_format_axes(np.degrees(bias)) for bias in signal.bias)
-            noises = [f"{np.degrees(signal.gyro_noise):.3f}", f"{signal.accel_noise:.3f}"]
-            noise.append([plain(name), begin, end, *noises, f"{signal.gravity:.3f} m/s²"])
-    header = ["sensor", "fastest rotation", "largest acceleration", "saturated", "lost", "static"]
-    recorded = Table([*header, "longest motion without static phase"], rows)
-    header = ["sensor", "bias in the static phase, x / y / z [°/s]", "bias at the end [°/s]"]
-    noises = ["gyroscope's noise [°/s]", "accelerometer's noise [m/s²]", "gravity"]
+    recording, rate_hz = tracked.recording, tracked.recording.rate_hz
     low, high = (f"{step:.2f}" for step in measures.steps_ms)
     phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())
-    items: list[Item] = [
+    rows = []
+    for name, signal in measures.signals.items():
+        lost = np.count_nonzero(signal.gap) / rate_hz if recording.sensors[name].gap is not None else 0.0
+        static = signal.static
+        cells = [
+            f"{np.degrees(signal.rate.max()):.0f} °/s",
+            f"{np.count_nonzero(signal.cut) / rate_hz:.2f} s",
+            f"{lost:.2f} s",
+            f"{100 * float(static.mean()):.0f} %" if static is not None else "",
+            f"{longest_run_s(~static, rate_hz):.0f} s" if static is not None else "",
+        ]
+        if signal.bias is not None:
+            cells += [f"{np.degrees(np.linalg.norm(bias)):.2f} °/s" for bias in signal.bias]
+            cells.append(f"{signal.gravity:.3f} m/s²")
+        rows.append([plain(name), *cells])
+    header = ["sensor", "fastest rotation", "saturated", "lost", "static", "longest motion"]
+    if any(signal.bias is not None for signal in measures.signals.values()):
+        header += ["bias in the static phase", "bias at the end", "gravity"]
+    return [
         f"{measures.samples} samples at {measures.rate_hz:g} Hz, one every {low if low == high else f'{low} to {high}'}"
         f" ms.{f' Phases: {phases}.' if phases else ''}",
         draw_timeline(tracked, measures.signals),
-        recorded,
-        "Acceleration includes gravity. Saturated: an axis was at the end of its range, and the orientation lacks the "
-        "rotation beyond it. While a sensor is static its gyroscope measures its bias, and the heading does not drift.",
+        Table(header, [row + [""] * (len(header) - len(row)) for row in rows]),
+        "Saturated: an axis was at the end of its range, and the orientation lacks the rotation beyond it. While a "
+        "sensor is static its gyroscope measures its bias, and the heading does not drift. An error of 0.1 °/s in the "
+        f"bias rotates the heading by 6° in a minute. Gravity should measure 9.81 m/s², to {100 * GRAVITY_OFF:.0f} %.",
     ]
-    if noise:
-        items += [
-            Table([*header, *noises], noise),
-            "From the static phase, noise of one axis. An error of 0.1 °/s in the bias rotates the heading by 6° in a "
-            f"minute. Gravity should measure 9.81 m/s², to {100 * GRAVITY_OFF:.0f} %.",
-        ]
-    return items
 
 
 def _list_drift(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> list[Item]:
@@ -221,8 +209,9 @@ def _list_drift(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> lis
         )
     has_clasp = correction is not None and (correction.gap_rms_mm is not None or bool(correction.found_clasps))
     if correction is not None:
+        table = tracked.model.table
         sources = ["accelerations of the joints"] * bool(correction.joint_accelerations)
-        sources += [f"{name}' hinges" for name in _name_hinges(tracked.model.table)] + ["the joined hands"] * has_clasp
+        sources += [f"{name}' hinges" for name in kinds(table, table.hinges)] + ["the joined hands"] * has_clasp
         if sources:
             text += (
                 f" The {listed(sources)} corrected the headings, by up to "
@@ -233,49 +222,32 @@ def _list_drift(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> lis
     text += f" The filter states no uncertainty: {listed(unknown)}." if unknown else ""
     if has_stated_mounts(tracked):
         text += " A mount that is stated and not calibrated is as uncertain as people are off the start pose."
-    header = [
-        "segment, ±",
-        "largest",
-        "at the end",
-        "at the end, filter alone",
-        "growth per minute of motion, filter alone",
-    ]
-    segments = [
-        [
-            plain(name),
-            *(
-                degrees(float(np.degrees(v)))
-                for v in (finite_max(each.std[after_start]), each.std[-1], each.filter_end)
-            ),
-            f"{np.degrees(each.growth):.2f} °/min" if np.isfinite(each.growth) else "never in motion",
-        ]
-        for name, each in budgets.items()
-    ]
-    joints = [
-        [plain(joint), *(degrees(float(np.degrees(pick(std[after_start])))) for pick in (finite_median, finite_max))]
-        for joint, std in compute_joint_heading_stds(budgets, tracked.model).items()
-    ]
+    stds = {name: budget.std for name, budget in budgets.items()}
+    rows = []
+    for name, std in [*stds.items(), *compute_joint_heading_stds(budgets, tracked.model).items()]:
+        ends = finite_median(std[after_start]), finite_max(std[after_start]), std[-1]
+        rate = ""
+        if name in budgets:
+            rate = f"{np.degrees(growth[name]):.2f} °/min" if name in growth else "never in motion"
+        rows.append([plain(name), *(degrees(float(np.degrees(each))) for each in ends), rate])
+    header = ["segment or joint", "median ±", "largest ±", "± at the end", "growth in motion, filter alone"]
     figure = draw_over_time(
         tracked.time,
-        {"heading, ± [°]": {name: np.degrees(budget.std) for name, budget in budgets.items()}},
+        {"heading, ± [°]": {name: np.degrees(std) for name, std in stds.items()}},
         "Uncertainty of each heading: one standard deviation, with mounts, start pose and soft tissue.",
         _style_segments(budgets, tracked.model.table),
         spans=("hands joined", recording.phases.get("clasp", ()) if has_clasp else ()),
     )
-    items: list[Item] = [text, figure, Table(header, segments)]
-    if joints:
-        items += ["The angles of a joint have the errors of both segments, here taken as independent:"]
-        items += [Table(["joint, ±", "median", "largest"], joints)]
-    return items
+    text += " A joint has the errors of both its segments, here taken as independent."
+    return [text, figure, Table(header, rows)]
 
 
-def _list_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> list[Item]:
+def _list_tips(tracked: TrackedRecording, measures: Measures) -> list[Item]:
     table, after_start = tracked.model.table, find_samples_after_start(tracked)
-    groups = group_tips(tips, table, tracked.subject.lengths)
+    groups = group_tips(measures.tips, table, tracked.subject.lengths)
     if not groups:
         return []
     items: list[Item] = list(draw_tips(tracked.time, groups, table).values())
-    rigid = dict[str, list[str]]()
     for group in groups:
         rows = []
         for name, tip in group.tips.items():
@@ -286,32 +258,23 @@ def _list_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> list
             ranges = [f"{whole(a)} to {whole(b)}" for a, b in zip(low, high, strict=True)]
             known = [f"± {whole(1e3 * std)} mm" if np.isfinite(std) else "not known" for std in stds]
             rows.append([plain(name), *ranges, f"{tip.peak_speed:.1f} m/s", *known])
-            segments = table.drawn_limbs[name].segments
-            if len(segments) > 1 and segments[-1] not in tracked.quat_WL:
-                end, above = (plain(table.shared_name(segment)) for segment in (segments[-1], segments[-2]))
-                rigid.setdefault(f"A {end} without a sensor is assumed rigid with its {above}", []).append(plain(name))
         points = capital(listed([plain(name) for name in group.tips]))
         items.append(f"{points}, from {group.start} along {group.frame}:")
         header = ["", "forwards [cm]", "to the left [cm]", f"above {group.origin} [cm]"]
         items.append(Table([*header, "highest speed", "median ±", "largest ±"], rows))
-    assumed = "".join(f" {text}: {listed(names)}." for text, names in rigid.items())
-    return [
-        *items,
+    items.append(
         "Ranges hold 98 % of the time; the highest speed is the mean of a tenth of a second. The ± is of one axis, "
-        f"relative to {_name_root(table)}, and includes the lean and the lengths of all that lies between.{assumed}",
-    ]
-
-
-def _list_error_budget(budget: Mapping[str, Mapping[str, float]]) -> list[Item]:
-    rows = {point: group_by_source(parts) for point, parts in budget.items()}
-    if not rows:
-        return []
-    header = ["", *(f"{source} [mm]" for source in next(iter(rows.values())))]
-    return [
-        "Root mean square over the recording; the parts add up in squares. Soft tissue, start poses and the "
-        "shoulder girdle are as in the literature, not measured on this person.",
-        Table(header, [[plain(point), *(whole(1e3 * v) for v in row.values())] for point, row in rows.items()]),
-    ]
+        f"relative to {_name_root(table)}, and includes the lean and the lengths of all that lies between."
+    )
+    sources = {point: group_by_source(parts) for point, parts in measures.error_budget.items()}
+    if sources:
+        header = ["", *(f"{source} [mm]" for source in next(iter(sources.values())))]
+        rows = [[plain(point), *(whole(1e3 * std) for std in each.values())] for point, each in sources.items()]
+        items += [
+            "Of this, root mean square over the recording, with parts that add up in squares:",
+            Table(header, rows),
+        ]
+    return items
 
 
 def _list_angles(tracked: TrackedRecording, angles: Angles | None) -> list[Item]:
@@ -352,14 +315,9 @@ def _list_angles(tracked: TrackedRecording, angles: Angles | None) -> list[Item]
 
 
 def _list_view(tracked: TrackedRecording, view: str | None) -> list[Item]:
-    fps = min(FRAMES_A_SECOND, MOST_FRAMES / max(float(tracked.time[-1] - tracked.time[0]), 1e-3))
-    rate = ""
-    if view is None or len(view) > LARGEST_VIEW:
-        phases = tracked.recording.phases
-        view = pose_html(tracked.model, tracked.pose, phases=phases, title=tracked.recording.name, fps=fps)
-        rate = f" Here at {fps:.1f} frames a second." if fps < FRAMES_A_SECOND else ""
-    caption = "Drag to rotate, scroll to zoom, space to pause. `view.html` beside this page shows it larger."
-    return [Frame("The motion in 3D", caption + rate, view)]
+    if view is not None and len(view) <= LARGEST_VIEW:
+        return [Frame(view)]
+    return [show_motion(tracked.model, tracked.pose, tracked.recording.phases, tracked.recording.name)]
 
 
 def _list_run(tracked: TrackedRecording) -> list[Item]:
@@ -376,12 +334,11 @@ def _list_run(tracked: TrackedRecording) -> list[Item]:
     ]
     if tracked.q is not None:
         residuals = compute_orientation_residuals(tracked.model, tracked.q, tracked.quat_WL)
-        why = "(the joints have too few axes, or reach their limits)"
         rows += [
-            (f"{plain(name)}, orientation residual", f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}° {why}")
+            (f"{plain(name)}, orientation residual", f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}°")
             for name, angle in residuals.items()
         ]
-    rows += [("points", listed([plain(name) for name in tracked.points]) or "none"), ("made with", versions())]
+    rows.append(("points", listed([plain(name) for name in tracked.points]) or "none"))
     return [Facts(rows)]
 
 
@@ -404,29 +361,19 @@ def draw_timeline(tracked: TrackedRecording, signals: Mapping[str, Signal]) -> R
     ax.set_yticks(-np.arange(len(signals)), [plain(name) for name in signals])
     ax.set_xlabel("time [s]")
     ax.grid(axis="y", visible=False)
-    for name, spans in tracked.recording.phases.items():
+    for spans in tracked.recording.phases.values():
         shade(ax, spans, "phase")
-        for begin, end in spans:
-            if 110.0 * (end - begin) / (time[-1] - time[0]) > len(name):  # as many letters are as wide as the plot
-                ax.text(begin, 1.02, f" {name}", fontsize=8)
-    labels = {"static": "static", "gap": "lost and interpolated", "cut": "saturated"}
     for row, (name, signal) in enumerate(signals.items()):
         at, rate = envelope(time, np.degrees(signal.rate))
         ax.fill_between(at, -row, 0.85 * rate / most - row, color=COLOURS[table.side(name) or "other"], linewidth=0)
-        if signal.static is not None and signal.static.any():
-            begin, end = find_spans(time, signal.static).T
-            ax.hlines(
-                np.full(len(begin), -row - 0.06), begin, end, "black", linewidth=2.5, label=labels.pop("static", None)
-            )
-        if signal.gap.any():
-            bars = [(a, b - a) for a, b in find_spans(time, signal.gap)]
-            hatched: dict[str, Any] = {"facecolor": "none", "edgecolor": SOFT, "hatch": "////", "linewidth": 0}
-            ax.broken_barh(bars, (-row, 0.85), label=labels.pop("gap", None), **hatched)
-        if signal.cut.any():
-            first = find_spans(time, signal.cut)[:, 0]
-            ax.plot(
-                first, np.full(len(first), 0.85 - row), "v", color="black", markersize=4, label=labels.pop("cut", None)
-            )
+        for mask, label, low, height, look in (
+            (signal.static, "static", -0.1, 0.07, {"facecolor": "black"}),
+            (signal.gap, "lost and interpolated", 0.0, 0.85, {"facecolor": "none", "edgecolor": SOFT, "hatch": "////"}),
+            (signal.cut, "saturated", 0.85, 0.1, {"facecolor": ALARM, "edgecolor": ALARM, "linewidth": 1.0}),
+        ):
+            if mask is not None and mask.any():
+                bars = [(begin, end - begin) for begin, end in find_spans(time, mask)]
+                ax.broken_barh(bars, (low - row, height), label=label, **{"linewidth": 0, **look})
     figure.add_legend()
     return figure
 
@@ -458,7 +405,7 @@ def group_tips(tips: Mapping[str, TipMotion], table: BodyTable, lengths: Mapping
     for origin in dict.fromkeys(limbs[name].origin for name in tips):
         names = [name for name in tips if limbs[name].origin == origin]
         width, trunk = (lengths.get(table.find_length(*points) or "") for points in (origin, (ROOT, *origin)))
-        nouns = (table.shared_name((limbs[name].segments or (name,))[-1]) for name in names)
+        nouns = listed(kinds(table, [(limbs[name].segments or (name,))[-1] for name in names]))
         hangs_at, start = plain(table.shared_name(origin[0])), "the "
         if len(origin) > 1:
             hangs_at, start = plural(hangs_at), "the middle of the "
@@ -466,7 +413,7 @@ def group_tips(tips: Mapping[str, TipMotion], table: BodyTable, lengths: Mapping
         groups.append(
             TipGroup(
                 {name: tips[name] for name in names},
-                listed([plural(plain(noun)) for noun in dict.fromkeys(nouns)]),
+                nouns,
                 hangs_at,
                 start + hangs_at,
                 f"the {plain(base)}'s own axes" if base else "the axes of W",
@@ -546,13 +493,7 @@ def _find_joint_angles(tracked: TrackedRecording) -> Angles | None:
 
 def _name_tips(table: BodyTable) -> str:
     """Return what the points whose path is drawn are on, as "hands"."""
-    ends = ((limb.segments or (name,))[-1] for name, limb in table.drawn_limbs.items())
-    return listed([plural(name) for name in dict.fromkeys(plain(table.shared_name(end)) for end in ends)])
-
-
-def _name_hinges(table: BodyTable) -> list[str]:
-    """Return the joints that are hinges, as "elbows"."""
-    return [plural(name) for name in dict.fromkeys(plain(table.shared_name(hinge)) for hinge in table.hinges)]
+    return listed(kinds(table, [(limb.segments or (name,))[-1] for name, limb in table.drawn_limbs.items()]))
 
 
 def _name_root(table: BodyTable) -> str:
@@ -562,16 +503,3 @@ def _name_root(table: BodyTable) -> str:
 
 def _format_duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.1f} min"
-
-
-def _format_seconds(mask: np.ndarray, rate_hz: float) -> str:
-    return f"{np.count_nonzero(mask) / rate_hz:.2f} s" if mask.any() else "0 s"
-
-
-def _format_axes(values: np.ndarray) -> str:
-    return " / ".join(f"{value:+.2f}".replace("-", "−") if abs(value) >= 0.005 else "0.00" for value in values)
-
-
-def _find_time_before(tracked: TrackedRecording) -> float:
-    """The time [s] before the end of the start pose, which the summaries leave out."""
-    return float(tracked.time[np.argmax(find_samples_after_start(tracked))] - tracked.time[0])

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from ..kinematics import Pose, compute_link_placements, find_known_links, solve_configuration
 from ..model import BodyModel, Visual
-from .page import load_template
+from .page import Frame, load_template
 
 if TYPE_CHECKING:
     from ..retargeting import Trajectory
@@ -31,6 +31,7 @@ FEET_Z = -0.6  # [m] below which a point of a person is at a foot
 GRID_CELL = 0.25  # [m]
 GRID_RADIUS = 3.0  # [m] where the grid has faded away
 CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
+FRAMES_A_SECOND, MOST_FRAMES = 20.0, 5000  # of a motion inside a report
 _SPARSE = 30  # frames a sample, on average, from which on all samples are frames
 MOST_POSES = 150  # by which the camera is placed
 FIELD_OF_VIEW_DEG = 28.0  # a long lens: near hands do not look larger than they are
@@ -106,6 +107,13 @@ def pose_html(
         fps=fps,
         floor_z=find_floor(model),
     )
+
+
+def show_motion(model: BodyModel, pose: Pose, phases: Mapping[str, Sequence[tuple[float, float]]], title: str) -> Frame:
+    """A motion inside a report, in fewer frames a second where it is long; parameters as `pose_html`."""
+    fps = min(FRAMES_A_SECOND, MOST_FRAMES / max(float(pose.time[-1] - pose.time[0]), 1e-3))
+    rate = f" Here at {fps:.1f} frames a second." if fps < FRAMES_A_SECOND else ""
+    return Frame(pose_html(model, pose, phases=phases, title=title, fps=fps), rate)
 
 
 def find_floor(model: BodyModel) -> float:

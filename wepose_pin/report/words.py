@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from ..model import BodyTable
 from ..recording import format_span
 from ..writers.result import versions as package_versions
 
@@ -28,6 +29,11 @@ def plain(name: str) -> str:
 def plural(noun: str) -> str:
     """The plural of a segment's or point's name."""
     return {"foot": "feet"}.get(noun, f"{noun}s")
+
+
+def kinds(table: BodyTable, names: Iterable[str]) -> list[str]:
+    """What segments or points of a body are, without their sides: "left_elbow", "right_elbow" → "elbows"."""
+    return [plural(name) for name in dict.fromkeys(plain(table.shared_name(name)) for name in names)]
 
 
 def listed(parts: Sequence[str]) -> str:

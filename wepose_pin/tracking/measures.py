@@ -110,7 +110,6 @@ class Budget(NamedTuple):
 
     std: np.ndarray  # (n,) with start pose, soft tissue and the heading correction
     drift: np.ndarray  # (n,) of the filter alone; with a heading correction at most what that leaves
-    filter_end: float  # of the filter alone, at the end
     growth: float  # of the filter's, a minute of motion; NaN where it was never in motion
 
 
@@ -129,7 +128,7 @@ def compute_heading_uncertainties(tracked: TrackedRecording) -> dict[str, Budget
         if correction is not None and len(correction.time) and name in correction.segments:
             i = correction.segments.index(name)
             drift = np.minimum(drift, np.sqrt(np.interp(tracked.time, correction.time, correction.covariance[:, i, i])))
-        budgets[name] = Budget(np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), drift, last, growth)
+        budgets[name] = Budget(np.sqrt(np.maximum(cov_W[:, 2, 2], 0.0)), drift, growth)
     return budgets
 
 
