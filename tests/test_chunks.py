@@ -171,7 +171,6 @@ def test_a_decimated_report_keeps_extremes(session: Path, subject: Subject, monk
         ours = totals.signals[name]
         bins = [signal.rate[first : first + 18].max() for first in range(0, 5698, 18)]
         np.testing.assert_allclose(ours.rate, bins, rtol=1e-12)
-        assert ours.peak_accel == signal.peak_accel
         assert ours.static is not None
         assert signal.static is not None
         np.testing.assert_array_equal(ours.static, [signal.static[k : k + 18].all() for k in range(0, 5698, 18)])

@@ -164,12 +164,10 @@ def _list_recorded(tracked: TrackedRecording, measures: Measures) -> list[Item]:
     phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())
     rows = []
     for name, signal in measures.signals.items():
-        lost = np.count_nonzero(signal.gap) / rate_hz if recording.sensors[name].gap is not None else 0.0
         static = signal.static
         cells = [
             f"{np.degrees(signal.rate.max()):.0f} °/s",
-            f"{np.count_nonzero(signal.cut) / rate_hz:.2f} s",
-            f"{lost:.2f} s",
+            *(f"{np.count_nonzero(mask) / rate_hz:.2f} s" for mask in (signal.cut, signal.gap)),
             f"{100 * float(static.mean()):.0f} %" if static is not None else "",
             f"{longest_run_s(~static, rate_hz):.0f} s" if static is not None else "",
         ]
@@ -271,7 +269,8 @@ def _list_tips(tracked: TrackedRecording, measures: Measures) -> list[Item]:
         header = ["", *(f"{source} [mm]" for source in next(iter(sources.values())))]
         rows = [[plain(point), *(whole(1e3 * std) for std in each.values())] for point, each in sources.items()]
         items += [
-            "Of this, root mean square over the recording, with parts that add up in squares:",
+            "What it is made of, root mean square over the recording; the parts add up in squares. Soft tissue, start "
+            "poses and the shoulder girdle are as in the literature, not measured on this person.",
             Table(header, rows),
         ]
     return items

@@ -29,12 +29,9 @@ class Signal(NamedTuple):
     """One sensor's signal."""
 
     rate: np.ndarray  # (n,) [rad/s], how fast it turns
-    peak_accel: float  # [m/s²], NaN for measured orientations
     cut: np.ndarray  # (n,) bool, an axis is cut off at the end of its range
     gap: np.ndarray  # (n,) bool, bridged over a long gap
     static: np.ndarray | None  # (n,) bool by the filter's test; None for measured orientations
-    gyro_noise: float  # [rad/s], root mean square of an axis in the static phase
-    accel_noise: float  # [m/s²], the same
     gravity: float  # [m/s²]
     bias: tuple[np.ndarray, np.ndarray] | None  # (3,) [rad/s] at the beginning and at the end
 
@@ -56,17 +53,13 @@ def measure_signal(
     gap = np.logical_or.reduceat(sensor.gap if sensor.gap is not None else nothing, bins)
     if isinstance(sensor, OrientationSensor) or orientation is None or static is None:
         rate = np.linalg.norm(compute_rate(sensor, recording.rate_hz), axis=1)
-        nan = float("nan")
-        return Signal(np.maximum.reduceat(rate, bins), nan, nothing[bins], gap, None, nan, nan, nan, None)
+        return Signal(np.maximum.reduceat(rate, bins), nothing[bins], gap, None, float("nan"), None)
     cut = find_cut_off(sensor.gyro_S, NARROWEST_GYRO_RANGE) | find_cut_off(sensor.accel_S, NARROWEST_ACCEL_RANGE)
     return Signal(
         np.maximum.reduceat(np.linalg.norm(sensor.gyro_S, axis=1), bins),
-        float(np.linalg.norm(sensor.accel_S, axis=1).max()),
         np.logical_or.reduceat(cut.any(axis=1), bins),
         gap,
         np.logical_and.reduceat(static, bins),
-        _rms(orientation.noise.gyro_cov),
-        orientation.noise.gravity * _rms(orientation.noise.accel_cov),
         orientation.noise.gravity,
         (orientation.noise.gyro_bias, orientation.gyro_bias[-1]),
     )
@@ -307,7 +300,3 @@ def measure(
 def _rotations(quat: np.ndarray, known: np.ndarray) -> Rotation:
     """Rotations of quaternions (n, 4), the identity where they are not `known`."""
     return Rotation.from_quat(np.where(known[:, None], quat, [0.0, 0.0, 0.0, 1.0]))
-
-
-def _rms(cov: np.ndarray) -> float:
-    return float(np.sqrt(np.trace(cov) / 3.0))
