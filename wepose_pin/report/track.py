@@ -177,7 +177,7 @@ def _list_recorded(tracked: TrackedRecording, measures: Measures) -> list[Item]:
         rows.append([plain(name), *cells])
     header = ["sensor", "fastest rotation", "saturated", "lost", "static", "longest motion"]
     if any(signal.bias is not None for signal in measures.signals.values()):
-        header += ["bias in the static phase", "bias at the end", "gravity"]
+        header += ["bias at first", "bias at the end", "gravity"]
     return [
         f"{measures.samples} samples at {measures.rate_hz:g} Hz, one every {low if low == high else f'{low} to {high}'}"
         f" ms.{f' Phases: {phases}.' if phases else ''}",
@@ -360,8 +360,11 @@ def draw_timeline(tracked: TrackedRecording, signals: Mapping[str, Signal]) -> R
     ax.set_yticks(-np.arange(len(signals)), [plain(name) for name in signals])
     ax.set_xlabel("time [s]")
     ax.grid(axis="y", visible=False)
-    for spans in tracked.recording.phases.values():
+    for name, spans in tracked.recording.phases.items():
         shade(ax, spans, "phase")
+        for begin, end in spans:
+            if 110.0 * (end - begin) / (time[-1] - time[0]) > len(name):  # as many letters are as wide as the plot
+                ax.text(begin, 1.02, f" {name}", fontsize=8)
     for row, (name, signal) in enumerate(signals.items()):
         at, rate = envelope(time, np.degrees(signal.rate))
         ax.fill_between(at, -row, 0.85 * rate / most - row, color=COLOURS[table.side(name) or "other"], linewidth=0)
