@@ -11,16 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from ..errors import BadData
 from ..kinematics import Pose
 from ..recording import AXES, format_span
+from ..rotations import multiply
+from .sampling import sample_orientations, sample_points
 
 FITTED = 1.0 / 3.0  # share of the time that is not scored
 SHORTEST_S = 2.0  # [s] of it
@@ -28,7 +29,6 @@ STEP_S = 0.02  # [s] of the speeds that are correlated
 TURN_S = 0.1  # [s] over which a speed is taken
 LEAST_CORRELATION = 0.5
 UPRIGHT = np.cos(np.radians(30.0))  # of the axis that is up to the vertical
-LONGEST_GAP_S = 0.2  # [s] between known samples of the reference, beyond which it is not interpolated
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,6 @@ class Registration:
     frames_deg: Mapping[str, float] = field(default_factory=dict)
 
 
-class _Common(NamedTuple):
-    """What pose and reference have in common."""
-
-    segments: list[str]
-    points: list[str]
-
-
 def register(
     pose: Pose, truth: Pose, *, up: str | None = None, frames: bool = False, offset_s: float | None = None
 ) -> tuple[Pose, Registration]:
@@ -79,21 +72,21 @@ def register(
     BadData
         Nothing in common; too little time or motion; no axis of the reference's world is up.
     """
-    common = _Common(
-        [name for name in pose.quat_WL if _is_known(truth.quat_WL.get(name))],
-        [name for name in pose.points if _is_known(truth.points.get(name))],
-    )
-    if not common.segments and len(common.points) < 3:
+    segments = [name for name in pose.quat_WL if _is_known(truth.quat_WL.get(name))]
+    names = [name for name in pose.points if _is_known(truth.points.get(name))]
+    if not segments and len(names) < 3:
         raise BadData(
-            f"pose and reference have {', '.join(common.points) or 'nothing'} in common; a segment with its "
-            f"orientation, or three points, are needed to align them"
+            f"pose and reference have {', '.join(names) or 'nothing'} in common; a segment with its orientation, or "
+            f"three points, are needed to align them"
         )
+    pose = Pose(pose.time, {s: pose.quat_WL[s] for s in segments}, {p: pose.points[p] for p in names})
+    common = Pose(truth.time, {s: truth.quat_WL[s] for s in segments}, {p: truth.points[p] for p in names})
     begin, end = float(pose.time[0]), float(pose.time[-1])
     fit_end = begin + FITTED * (end - begin)
     correlation = float("nan")
     if offset_s is None:
-        offset_s, correlation = _find_offset(pose, truth, common, (begin, fit_end))
-    truth = replace(truth, time=truth.time + offset_s)
+        offset_s, correlation = _find_offset(pose, common, (begin, fit_end))
+    truth, common = (replace(each, time=truth.time + offset_s) for each in (truth, common))
     first, last = max(begin, float(truth.time[0])), min(end, float(truth.time[-1]))
     fit_end = max(fit_end, first + FITTED * (last - first))
     if fit_end - first < SHORTEST_S or last - fit_end < SHORTEST_S:
@@ -102,23 +95,21 @@ def register(
             f"aligns the reference and is not scored: {3.0 * SHORTEST_S:g} s are needed, or --no-align"
         )
     time = pose.time[(pose.time >= first) & (pose.time <= fit_end)]
-    A_WV, axis, heading = _find_world(pose, truth, common, time, up, frames)
-    quat = {name: _turn(A_WV, quat_VT) for name, quat_VT in truth.quat_WL.items()}
+    R_WV, axis, heading = _find_world(pose, common, time, up, frames)
+    quat_WT = {name: multiply(R_WV.as_quat(), quat_VT) for name, quat_VT in truth.quat_WL.items()}
     turned: dict[str, float] = {}
-    if frames:
-        for name in common.segments:
-            estimated, true = _sample(pose, name, time), _sample(replace(truth, quat_WL=quat), name, time)
-            both = np.isfinite(estimated).all(axis=1) & np.isfinite(true).all(axis=1)
-            if both.any():
-                R_TL = (Rotation.from_quat(true[both]).inv() * Rotation.from_quat(estimated[both])).mean()
-                quat[name] = _turn(Rotation.identity(), quat[name], R_TL)
-                turned[name] = float(np.degrees(R_TL.magnitude()))
-    points = {name: p_V @ A_WV.as_matrix().T for name, p_V in truth.points.items()}
+    for name in segments if frames else ():
+        R_WL, R_WT = _sample_both(pose, replace(truth, quat_WL=quat_WT), name, time)
+        if len(R_WL):
+            R_TL = (R_WT.inv() * R_WL).mean()
+            quat_WT[name] = multiply(quat_WT[name], R_TL.as_quat())
+            turned[name] = float(np.degrees(R_TL.magnitude()))
+    points = {name: p_V @ R_WV.as_matrix().T for name, p_V in truth.points.items()}
     shift = np.zeros(3)
-    if common.points:
+    if names:
         off = [
-            _interpolate(pose.time, pose.points[name], time) - _interpolate(truth.time, points[name], time)
-            for name in common.points
+            sample_points(pose.time, pose.points[name], time) - sample_points(truth.time, points[name], time)
+            for name in names
         ]
         known = np.isfinite(off).all(axis=(0, 2))
         shift = np.median(np.mean(off, axis=0)[known], axis=0) if known.any() else shift
@@ -126,29 +117,28 @@ def register(
     registration = Registration(
         offset_s, correlation, axis, heading, (x, y, z), (first, float(fit_end)), (float(fit_end), last), turned
     )
-    return replace(truth, quat_WL=quat, points={name: p + shift for name, p in points.items()}), registration
+    return replace(truth, quat_WL=quat_WT, points={name: p + shift for name, p in points.items()}), registration
 
 
 def _is_known(values: np.ndarray | None) -> bool:
     return values is not None and bool(np.isfinite(values).all(axis=1).sum() > 1)
 
 
-def _turn(R_WV: Rotation, quat_VT: np.ndarray, R_TL: Rotation | None = None) -> np.ndarray:
-    """Rotate orientations (n, 4) in their world, and their frames; NaN stay."""
-    good = np.isfinite(quat_VT).all(axis=1)
-    turned = np.full(quat_VT.shape, np.nan)
-    R_WT = R_WV * Rotation.from_quat(quat_VT[good])
-    turned[good] = (R_WT if R_TL is None else R_WT * R_TL).as_quat()
-    return turned
+def _sample_both(pose: Pose, truth: Pose, segment: str, time: np.ndarray) -> tuple[Rotation, Rotation]:
+    """Sample the orientations of a segment in both at those of the times (n,) [s] at which both are known."""
+    sampled = [sample_orientations(each.time, each.quat_WL[segment], time) for each in (pose, truth)]
+    known = np.isfinite(sampled).all(axis=(0, 2))
+    ours, theirs = (Rotation.from_quat(quat[known]) for quat in sampled)
+    return ours, theirs
 
 
 # Clock -------------------------------------------------------------------------------------------------------------
 
 
-def _find_offset(pose: Pose, truth: Pose, common: _Common, fitted: tuple[float, float]) -> tuple[float, float]:
+def _find_offset(pose: Pose, truth: Pose, fitted: tuple[float, float]) -> tuple[float, float]:
     """Find the offset [s] to add to the reference's times, and the correlation of the speeds at it."""
-    ours = _compute_speeds(pose, common, *fitted)
-    theirs = _compute_speeds(truth, common, float(truth.time[0]), float(truth.time[-1]))
+    ours = _compute_speeds(pose, *fitted)
+    theirs = _compute_speeds(truth, float(truth.time[0]), float(truth.time[-1]))
     least = max(SHORTEST_S / STEP_S, 0.5 * ours.shape[1])
     if ours.shape[1] * STEP_S < SHORTEST_S:
         raise BadData(
@@ -170,7 +160,7 @@ def _find_offset(pose: Pose, truth: Pose, common: _Common, fitted: tuple[float, 
 
     def compute_loss(offset: float) -> float:
         """1 less the mean correlation, without the samples' steps."""
-        shifted = _compute_speeds(truth, common, fitted[0] - offset, fitted[1] - offset)
+        shifted = _compute_speeds(truth, fitted[0] - offset, fitted[1] - offset)
         return 1.0 - float(np.mean([_compare(a, b) for a, b in zip(ours, shifted[:, : ours.shape[1]], strict=True)]))
 
     minimum = minimize_scalar(
@@ -179,13 +169,13 @@ def _find_offset(pose: Pose, truth: Pose, common: _Common, fitted: tuple[float, 
     return float(minimum.x), 1.0 - float(minimum.fun)
 
 
-def _compute_speeds(pose: Pose, common: _Common, begin: float, end: float) -> np.ndarray:
+def _compute_speeds(pose: Pose, begin: float, end: float) -> np.ndarray:
     """Compute speeds (k, n) every `STEP_S`: of segments [rad/s], or of points about the first [m/s]; NaN: unknown."""
     grid = begin + STEP_S * np.arange(int((end - begin) / STEP_S) + 1)
     ends = grid - 0.5 * TURN_S, grid + 0.5 * TURN_S
     speeds = []
-    for name in common.segments:
-        quats = [_sample(pose, name, time) for time in ends]
+    for quat in pose.quat_WL.values():
+        quats = [sample_orientations(pose.time, quat, time) for time in ends]
         good = np.isfinite(quats).all(axis=(0, 2))
         speed = np.full(len(grid), np.nan)
         if good.any():
@@ -193,11 +183,10 @@ def _compute_speeds(pose: Pose, common: _Common, begin: float, end: float) -> np
             speed[good] = turn.magnitude() / TURN_S
         speeds.append(speed)
     if not speeds:
-        first, *others = common.points
-        for name in others:
-            about = pose.points[name] - pose.points[first]
-            moved = _interpolate(pose.time, about, ends[1]) - _interpolate(pose.time, about, ends[0])
-            speeds.append(np.linalg.norm(moved, axis=1) / TURN_S)
+        first, *others = pose.points.values()
+        for point in others:
+            before, after = (sample_points(pose.time, point - first, time) for time in ends)
+            speeds.append(np.linalg.norm(after - before, axis=1) / TURN_S)
     return np.array(speeds)
 
 
@@ -230,31 +219,24 @@ def _compare(a: np.ndarray, b: np.ndarray) -> float:
 # World -------------------------------------------------------------------------------------------------------------
 
 
-def _find_world(
-    pose: Pose, truth: Pose, common: _Common, time: np.ndarray, up: str | None, frames: bool
-) -> tuple[Rotation, str, float]:
+def _find_world(pose: Pose, truth: Pose, time: np.ndarray, up: str | None, frames: bool) -> tuple[Rotation, str, float]:
     """Find the rotation of the reference's world to W, the axis that is up, and the heading [deg]."""
     cross = np.zeros((3, 3))  # the sum of (what W sees) (what V sees)ᵀ
-    for name in common.segments:
-        ours, theirs = _sample(pose, name, time), _sample(truth, name, time)
-        good = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
-        if good.sum() < 2:
+    for name in pose.quat_WL:
+        R_WL, R_VT = _sample_both(pose, truth, name, time)
+        if len(R_WL) < 2:
             continue
-        R_WL, R_VT = Rotation.from_quat(ours[good]), Rotation.from_quat(theirs[good])
         if frames:  # turns in the world do not depend on the frame
             n = max(1, round(0.5 / float(np.median(np.diff(time)))))
             turns = [(R[n:] * R[:-n].inv()).as_rotvec() for R in (R_WL, R_VT)]
             cross += turns[0].T @ turns[1] / len(time)
         else:
             cross += np.einsum("nij,nkj->ik", R_WL.as_matrix(), R_VT.as_matrix()) / len(time)
-    if not common.segments:
-        ours_p, theirs_p = (
-            np.stack([_interpolate(each.time, each.points[name], time) for name in common.points])
-            for each in (pose, truth)
-        )
-        known = np.isfinite(ours_p).all(axis=(0, 2)) & np.isfinite(theirs_p).all(axis=(0, 2))
-        about = [p[:, known] - p[:, known].mean(axis=0) for p in (ours_p, theirs_p)]
-        cross = np.einsum("pni,pnj->ij", *about)
+    if not pose.quat_WL:
+        sampled = [[sample_points(each.time, p, time) for p in each.points.values()] for each in (pose, truth)]
+        ours, theirs = (p - p.mean(axis=0) for p in np.array(sampled))  # about the middle of the points
+        known = np.isfinite(ours).all(axis=(0, 2)) & np.isfinite(theirs).all(axis=(0, 2))
+        cross = np.einsum("pni,pnj->ij", ours[:, known], theirs[:, known])
     left, sizes, right = np.linalg.svd(cross)
     if sizes[1] < 1e-6 * max(sizes[0], 1e-300):
         raise BadData(
@@ -282,35 +264,3 @@ def _raise_axis(up: np.ndarray) -> Rotation:
     if not across.any():
         return Rotation.from_rotvec([0.0 if up[2] > 0.0 else np.pi, 0.0, 0.0])
     return Rotation.from_rotvec(0.5 * np.pi * across)
-
-
-# Samples -----------------------------------------------------------------------------------------------------------
-
-
-def _sample(pose: Pose, segment: str, time: np.ndarray) -> np.ndarray:
-    """Sample the orientation (n, 4) of a segment on the rotation; NaN beyond what is known, and in long gaps."""
-    good = np.isfinite(pose.quat_WL[segment]).all(axis=1)
-    known, sampled = pose.time[good], np.full((len(time), 4), np.nan)
-    inside = _is_spanned(known, time)
-    if inside.any():
-        sampled[inside] = Slerp(known, Rotation.from_quat(pose.quat_WL[segment][good]))(time[inside]).as_quat()
-    return sampled
-
-
-def _interpolate(own: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Interpolate values (m, 3) at `own` to `time` (n,); NaN beyond what is known, and in long gaps."""
-    good = np.isfinite(values).all(axis=1)
-    inside = _is_spanned(own[good], time)
-    sampled = np.full((len(time), 3), np.nan)
-    if inside.any():
-        sampled[inside] = np.column_stack([np.interp(time[inside], own[good], axis) for axis in values[good].T])
-    return sampled
-
-
-def _is_spanned(known: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Mask of the times between two known ones that are not far apart."""
-    if len(known) < 2:
-        return np.zeros(len(time), dtype=bool)
-    after = np.clip(np.searchsorted(known, time), 1, len(known) - 1)
-    near = known[after] - known[after - 1] <= max(LONGEST_GAP_S, 2.0 * float(np.median(np.diff(known))))
-    return (time >= known[0]) & (time <= known[-1]) & near

@@ -7,7 +7,7 @@ from html import escape
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..angles import euler, joint_angles
@@ -19,6 +19,7 @@ from ..model import BodyTable, load_table
 from ..recording import format_span
 from .agreement import Agreement, compute_agreement
 from .registration import Registration
+from .sampling import sample_orientations, sample_points
 
 SINGULAR = 1e-12  # ratio of a covariance's least variance to its largest, below which it states no error in a direction
 
@@ -170,46 +171,36 @@ def evaluate(
             + (f" within the interval {format_span(interval)}" if interval else "")
         )
     time = np.clip(pose.time[inside], truth.time[0], truth.time[-1])
-    attitude, position = {}, {}
-    true_WL: dict[str, np.ndarray] = {}  # on the pose's times, NaN where it is missing
-    attitude_uncertainty, position_uncertainty = {}, {}
+    attitude, attitude_uncertainty = {}, {}
+    true_WL: dict[str, np.ndarray] = {}  # on the pose's times, NaN where one of the two is missing
     for segment in [s for s in pose.quat_WL if s in truth.quat_WL]:
-        finite = np.isfinite(truth.quat_WL[segment]).all(axis=1)
-        if finite.sum() < 2:
-            continue
-        known = _is_near(time, truth.time[finite]) & np.isfinite(pose.quat_WL[segment][inside]).all(axis=1)
-        reference = Slerp(truth.time[finite], Rotation.from_quat(truth.quat_WL[segment][finite]))
-        clipped = np.clip(time[known], truth.time[finite][0], truth.time[finite][-1])
+        estimated = pose.quat_WL[segment][inside]
+        true = sample_orientations(truth.time, truth.quat_WL[segment], time)
+        known = np.isfinite(estimated).all(axis=1) & np.isfinite(true).all(axis=1)
         if known.any():
-            estimated = Rotation.from_quat(pose.quat_WL[segment][inside][known])
-            true = reference(clipped)
-            attitude[segment] = attitude_error(estimated, true, clipped)
-            true_WL[segment] = np.full((len(time), 4), np.nan)
-            true_WL[segment][known] = true.as_quat()
+            R_estimated, R_true = Rotation.from_quat(estimated[known]), Rotation.from_quat(true[known])
+            attitude[segment] = attitude_error(R_estimated, R_true, time[known])
+            true_WL[segment] = np.where(known[:, None], true, np.nan)
             if segment in pose.segment_cov:
-                turn = (true * estimated.inv()).as_rotvec()
+                turn = (R_true * R_estimated.inv()).as_rotvec()
                 attitude_uncertainty[segment] = uncertainty(turn, pose.segment_cov[segment][inside][known])
     table = table or load_table()
-    on_limb = {}
+    position, position_on_limb, position_uncertainty = {}, {}, {}
     for point in [p for p in pose.points if p in truth.points]:
-        finite = np.isfinite(truth.points[point]).all(axis=1)
-        known = _is_near(time, truth.time[finite]) & np.isfinite(pose.points[point][inside]).all(axis=1)
+        difference = pose.points[point][inside] - sample_points(truth.time, truth.points[point], time)
+        known = np.isfinite(difference).all(axis=1)
         if not known.any():
             continue
-        difference = pose.points[point][inside][known] - _interpolate(
-            time[known], truth.time, truth.points[point], finite
-        )
-        position[point] = position_error(difference)
+        position[point] = position_error(difference[known])
         if point in pose.point_cov:
-            position_uncertainty[point] = uncertainty(difference, pose.point_cov[point][inside][known])
+            position_uncertainty[point] = uncertainty(difference[known], pose.point_cov[point][inside][known])
         limb = table.find_limb(point)
-        middle = [_find_middle(of, limb.origin) for of in (pose, truth)] if limb is not None else [None, None]
-        if middle[0] is not None and middle[1] is not None:
-            known_middle = np.isfinite(middle[1]).all(axis=1)
-            both = _is_near(time[known], truth.time[known_middle])
-            shift = middle[0][inside][known] - _interpolate(time[known], truth.time, middle[1], known_middle)
-            if both.any():
-                on_limb[point] = position_error((difference - shift)[both])
+        if limb is not None:
+            estimated, true = (_find_middle(each, limb.origin) for each in (pose, truth))
+            on_limb = difference - (estimated[inside] - sample_points(truth.time, true, time))
+            known = np.isfinite(on_limb).all(axis=1)
+            if known.any():
+                position_on_limb[point] = position_error(on_limb[known])
     for kind, common, errors in (
         ("orientation of a segment", pose.quat_WL.keys() & truth.quat_WL.keys(), attitude),
         ("position of a point", pose.points.keys() & truth.points.keys(), position),
@@ -228,7 +219,7 @@ def evaluate(
         attitude,
         joints,
         position,
-        on_limb,
+        position_on_limb,
         attitude_uncertainty,
         position_uncertainty,
         (float(time[0]), float(time[-1])),
@@ -273,25 +264,10 @@ def _joint_errors(
     return errors, agreement
 
 
-def _find_middle(pose: Pose, points: tuple[str, ...]) -> np.ndarray | None:
-    """Middle of points (n, 3) [m]; None where one is not known."""
-    if not set(points) <= set(pose.points):
-        return None
-    return np.asarray(np.mean([pose.points[point] for point in points], axis=0))
-
-
-def _interpolate(time: np.ndarray, known: np.ndarray, points: np.ndarray, finite: np.ndarray) -> np.ndarray:
-    return np.column_stack([np.interp(time, known[finite], axis) for axis in points[finite].T])
-
-
-def _is_near(time: np.ndarray, known: np.ndarray, reach_s: float = 0.1) -> np.ndarray:
-    """Mask of the times between two known ones at most `reach_s` apart, or on one: no error within a gap."""
-    if len(known) < 2:
-        return np.zeros(len(time), dtype=bool)
-    after = np.clip(np.searchsorted(known, time - 1e-9), 0, len(known) - 1)
-    before = np.clip(np.searchsorted(known, time + 1e-9, side="right") - 1, 0, len(known) - 1)
-    spanned = (known[before] <= time + 1e-9) & (known[after] >= time - 1e-9)
-    return spanned & (known[after] - known[before] <= max(reach_s, 2.0 * float(np.median(np.diff(known)))))
+def _find_middle(pose: Pose, points: tuple[str, ...]) -> np.ndarray:
+    """Middle of points (n, 3) [m]; NaN where one is not known."""
+    missing = np.full((len(pose.time), 3), np.nan)
+    return np.asarray(np.mean([pose.points.get(point, missing) for point in points], axis=0))
 
 
 def attitude_error(estimated: Rotation, true: Rotation, time: np.ndarray) -> AttitudeError:
