@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,27 +10,23 @@ import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
-import wepose_pin as wp
 from wepose_pin.angles import (
-    ISB_AXES,
     JOINTS,
     NEAR_LOCK,
-    RATE_WINDOW_S,
     SHOULDER_SEQUENCES,
     Angles,
     angle_table,
-    compose,
+    diagnose_lock,
     joint_angles,
     summary,
     summary_table,
 )
 from wepose_pin.angles.euler import UNKNOWN, decompose, follow, wrap
-from wepose_pin.angles.joints import diagnose_lock
+from wepose_pin.angles.joints import ISB_AXES
+from wepose_pin.angles.tables import RATE_WINDOW_S
 from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.kinematics import Pose
-from wepose_pin.simulation import Person, Simulation
-from wepose_pin.subject import population_subject
 
 ARM = ("upper_arm", "forearm", "hand")
 LEG = ("thigh", "shank", "foot")
@@ -81,7 +76,7 @@ def test_angles_give_the_rotation_back_near_the_lock_and_in_it(name: str) -> Non
         name, np.column_stack([rng.uniform(-3, 3, second.size), second, rng.uniform(-3, 3, second.size)])
     )
     for values in (decomposed := decompose(R.as_quat(), name)).values, follow(decomposed, name, NEAR_LOCK):
-        back = Rotation.from_quat(compose(values, name))
+        back = Rotation.from_euler(name, values)
         assert (back.inv() * R).magnitude().max() < 1e-12
     assert decomposed.gimbal.min() < 1e-15
     assert decomposed.gimbal.max() > 0.5
@@ -110,16 +105,6 @@ def test_a_motion_straight_through_the_lock_keeps_its_angles(name: str, side: st
     assert shoulder.near_lock.any()
 
 
-def test_angles_do_not_stop_at_a_half_turn() -> None:
-    angles = np.column_stack([np.linspace(0.0, 9.0, 500), np.full(500, -1.0), np.linspace(0.0, -7.0, 500)])
-    shoulder = joint_angles(pose_with(arm_of("right", Rotation.from_euler("YXY", angles).as_matrix())))[
-        "right_shoulder"
-    ]
-    shift = shoulder.values - angles
-    np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=1e-9)
-    same_angles(shoulder.values, angles, 1e-9)
-
-
 @pytest.mark.parametrize("side", ["left", "right"])
 @pytest.mark.parametrize("seed", range(10))
 def test_what_a_hanging_arm_does_decides_nothing_about_the_motions_after_it(side: str, seed: int) -> None:
@@ -139,7 +124,7 @@ def test_what_a_hanging_arm_does_decides_nothing_about_the_motions_after_it(side
     jumps = np.abs(np.diff(shoulder.values, axis=0)).max(axis=1) > np.radians(60.0)
     assert not np.any(jumps & ~(shoulder.near_lock[1:] & shoulder.near_lock[:-1]))
     assert (
-        Rotation.from_quat(compose(shoulder.values, "YXY")).inv() * Rotation.from_quat(shoulder.quat)
+        Rotation.from_euler("YXY", shoulder.values).inv() * Rotation.from_quat(shoulder.quat)
     ).magnitude().max() < 1e-12
 
 
@@ -161,7 +146,7 @@ def test_full_turns_do_not_add_up_while_an_arm_hangs(raised: str) -> None:
     assert np.abs(np.diff(plane + internal)).max() < 5.0  # how far the arm is turned about its length
     clear = np.abs(np.diff(plane)) > 60.0
     assert not np.any(clear & ~(shoulder.near_lock[1:] & shoulder.near_lock[:-1]))
-    turned_back = Rotation.from_quat(compose(shoulder.values, "YXY")).inv() * Rotation.from_quat(shoulder.quat)
+    turned_back = Rotation.from_euler("YXY", shoulder.values).inv() * Rotation.from_quat(shoulder.quat)
     assert turned_back.magnitude().max() < 1e-12
     [hangs] = diagnose_lock(Angles(np.arange(1.0), {"right_shoulder": shoulder}))
     assert (hangs.code, hangs.place) == ("angles-near-lock", "right_shoulder")
@@ -324,18 +309,20 @@ def test_plain_poses_have_the_angles_of_the_isb_on_both_sides(pose: str, side: s
             assert np.degrees(joint_angle.values[0, joint_angle.names.index(name)]) == pytest.approx(value, abs=1e-9)
 
 
-def test_the_thorax_extends_bends_right_and_turns_left_in_the_positive() -> None:
+@pytest.mark.parametrize(
+    ("segment", "joint", "names"),
+    [
+        ("torso", "thorax", ("extension", "lateral_flexion_right", "axial_rotation_left")),
+        ("pelvis", "pelvis_in_world", ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")),
+    ],
+)
+def test_a_trunk_leans_back_and_right_and_turns_left_in_the_positive(
+    segment: str, joint: str, names: tuple[str, ...]
+) -> None:
     for k, turn in enumerate((turned(y=-20.0), turned(x=20.0), turned(z=20.0))):
-        thorax = joint_angles(pose_with({"torso": turn}))["thorax"]
-        np.testing.assert_allclose(np.degrees(thorax.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
-    assert thorax.names == ("extension", "lateral_flexion_right", "axial_rotation_left")
-
-
-def test_the_pelvis_tilts_back_drops_on_the_right_and_turns_left_in_the_positive() -> None:
-    for k, turn in enumerate((turned(y=-20.0), turned(x=20.0), turned(z=20.0))):
-        pelvis = joint_angles(pose_with({"pelvis": turn}))["pelvis_in_world"]
-        np.testing.assert_allclose(np.degrees(pelvis.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
-    assert pelvis.names == ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")
+        angles = joint_angles(pose_with({segment: turn}))[joint]
+        np.testing.assert_allclose(np.degrees(angles.values[0]), 20.0 * np.eye(3)[k], atol=1e-9)
+        assert angles.names == names
 
 
 @pytest.mark.parametrize("name", ["XZY", "ZXY"])
@@ -346,31 +333,6 @@ def test_the_other_sequences_of_the_shoulder_name_what_they_turn(name: str) -> N
         shoulder = joint_angles(pose_with({"right_upper_arm": turn}), name)["right_shoulder"]
         assert shoulder.names == names
         np.testing.assert_allclose(np.degrees(shoulder.values[0]), [30.0 * (n == angle) for n in names], atol=1e-9)
-
-
-@pytest.mark.parametrize("name", SHOULDER_SEQUENCES)
-def test_a_mirrored_person_has_the_same_angles_on_the_other_side(name: str) -> None:
-    rng = np.random.default_rng(4)
-    quat_WL = {s: Rotation.from_rotvec(rng.normal(scale=0.4, size=(50, 3))).as_quat() for s in SEGMENTS}
-    root = rng.normal(scale=0.02, size=(len(SEGMENTS), 3, 3))
-    cov = {s: np.tile(a @ a.T, (50, 1, 1)) for s, a in zip(SEGMENTS, root, strict=True)}
-
-    def other(segment: str) -> str:
-        side, _, part = segment.partition("_")
-        return f"{'right' if side == 'left' else 'left'}_{part}" if part else segment
-
-    mirrored = {
-        other(s): Rotation.from_matrix(MIRROR @ Rotation.from_quat(q).as_matrix() @ MIRROR).as_quat()
-        for s, q in quat_WL.items()
-    }
-    axial = np.linalg.det(MIRROR) * MIRROR  # of a vector that stands for a turn
-    mirrored_cov = {other(s): axial @ c @ axial.T for s, c in cov.items()}
-    here = joint_angles(pose_with(quat_WL, segment_cov=cov), name)
-    there = joint_angles(pose_with(mirrored, segment_cov=mirrored_cov), name)
-    for joint in here.joints:
-        if joint not in ("thorax", "pelvis_in_world"):
-            np.testing.assert_allclose(here[joint].values, there[other(joint)].values, atol=1e-12)
-            np.testing.assert_allclose(here[joint].std, there[other(joint)].std, atol=1e-12)
 
 
 # Uncertainty ------------------------------------------------------------------------------------------------------
@@ -535,22 +497,8 @@ def test_the_table_is_in_degrees_and_keeps_the_rotation() -> None:
     assert (Rotation.from_quat(quat).inv() * Rotation.from_euler("ZXY", values)).magnitude().max() < 1e-12
 
 
-def test_of_a_tracked_person_the_angles_are_within_their_deviations(simulation: Simulation, person: Person) -> None:
-    pose = wp.track(simulation.recording(), replace(population_subject(), lengths=person.lengths)).pose
-    estimated, true = wp.joint_angles(pose), wp.joint_angles(simulation.truth())
-    for joint in ("right_elbow", "left_elbow", "thorax"):
-        assert estimated[joint].std is not None
-        error = wrap(estimated[joint].values - true[joint].values)[~estimated[joint].near_lock]
-        normalised = error / estimated[joint].std[~estimated[joint].near_lock]
-        assert np.sqrt(np.mean(np.square(normalised))) < 1.5
-        assert np.degrees(np.sqrt(np.mean(np.square(error)))) < 1.5
-
-
-def test_the_page_shows_every_axis_and_angle() -> None:
+def test_the_page_shows_every_axis() -> None:
     page = (Path(__file__).resolve().parent.parent / "docs" / "angles.md").read_text(encoding="utf-8")
-    for joint in JOINTS.values():
-        assert all(f"`{name}`" in page for name in joint.names)
-    assert all(f"`{name}`" in page for names in SHOULDER_SEQUENCES.values() for name in names)
     _, _, section = page.partition("## The ISB's axes")
     for segment, axes in ISB_AXES.items():
         row = next(line for line in section.splitlines() if line.startswith(f"| `{segment}`"))

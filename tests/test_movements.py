@@ -102,12 +102,6 @@ def test_the_low_pass_is_that_of_the_angle_also_through_full_turns() -> None:
     np.testing.assert_allclose((smooth - turns)[50:-50], expected[50:-50], atol=2e-4)
 
 
-def test_at_the_cut_off_half_of_the_amplitude_is_left_and_nothing_is_late() -> None:
-    t = np.arange(2000) / RATE
-    smooth = angle_about(smooth_pose(pose_about(0.1 * np.sin(2.0 * np.pi * 6.0 * t)), 6.0))[300:-300]
-    np.testing.assert_allclose(smooth, 0.05 * np.sin(2.0 * np.pi * 6.0 * t)[300:-300], atol=2e-4)
-
-
 def test_the_low_pass_keeps_what_is_not_known_and_stops_at_a_gap_in_time() -> None:
     angle = np.where(np.arange(400) < 200, 0.0, 1.0)
     pose = pose_about(angle)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.spatial.transform import Rotation
 
-from wepose_pin.angles.torques import derivatives, joint_torques, torque_table
+from wepose_pin.angles.torques import joint_torques, torque_table
 from wepose_pin.errors import BadData, BadModel, BadOption
 from wepose_pin.model import load_model
 from wepose_pin.simulation import Simulation
@@ -35,12 +34,6 @@ def test_a_pendulum_is_driven_as_its_equation_says() -> None:
     true = -MASS * LENGTH**2 * w**2 * phi + MASS * 9.81 * LENGTH * np.sin(phi)
     inside = slice(200, -200)  # a second from each end
     assert np.abs(tau - true)[inside].max() < 2e-3 * np.abs(true).max()
-
-
-def test_at_rest_a_torque_is_the_weight_times_its_lever() -> None:
-    t = np.arange(300) / RATE
-    tau = joint_torques(pendulum(), t, np.full((300, 1), np.pi / 2.0)).torque["hinge"]
-    np.testing.assert_allclose(tau, MASS * 9.81 * LENGTH, rtol=1e-9)
 
 
 def swing(model: pin.Model, t: np.ndarray, seed: int) -> np.ndarray:
@@ -72,15 +65,6 @@ def test_the_power_of_all_joints_is_the_growth_of_energy() -> None:
     assert np.ptp(left) < 2e-3 * np.ptp(energy[inside])
 
 
-def test_derivatives_of_a_steady_turn() -> None:
-    model = pin.Model()
-    model.addJoint(0, pin.JointModelSpherical(), pin.SE3.Identity(), "ball")
-    rate = np.array([0.3, -0.5, 1.1])
-    v, a = derivatives(model, Rotation.from_rotvec(np.outer(np.arange(50) / RATE, rate)).as_quat(), RATE)
-    np.testing.assert_allclose(v, np.tile(rate, (50, 1)), atol=1e-10)
-    np.testing.assert_allclose(a, 0.0, atol=1e-7)
-
-
 def test_signs_and_whole_turns_do_not_matter() -> None:
     model = load_model().pin
     t = np.arange(400) / RATE
@@ -95,17 +79,6 @@ def test_signs_and_whole_turns_do_not_matter() -> None:
     wrapped = (phi + np.pi) % (2.0 * np.pi) - np.pi
     for one, two in zip(*(joint_torques(hinge, t, x[:, None]).torque["hinge"] for x in (phi, wrapped)), strict=True):
         np.testing.assert_allclose(one, two, atol=1e-6)
-
-
-def test_noise_is_smoothed_away_below_the_cut_off() -> None:
-    t = np.arange(0.0, 10.0, 1.0 / RATE)
-    phi = 0.5 * np.sin(2.0 * np.pi * 0.5 * t)
-    noisy = phi + np.deg2rad(0.2) * np.random.default_rng(0).normal(size=len(t))
-    clean, rough, smooth = (
-        joint_torques(pendulum(), t, x[:, None], cutoff_hz=hz).torque["hinge"][200:-200]
-        for x, hz in ((phi, 6.0), (noisy, 50.0), (noisy, 6.0))
-    )
-    assert np.std(smooth - clean) < 0.02 * np.std(rough - clean)
 
 
 def test_a_hanging_arm_bears_nothing_and_a_raised_one_its_weight(simulation: Simulation) -> None:

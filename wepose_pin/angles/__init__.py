@@ -11,11 +11,8 @@ three-dimensional motions: application to the knee", Journal of Biomechanical En
 axes and sequence, and carries the uncertainty; `tables` gives ranges, rates and the columns of a file.
 """
 
-from .euler import compose
 from .joints import (
-    ISB_AXES,
     JOINTS,
-    KNEE_AXES,
     NEAR_LOCK,
     SHOULDER_SEQUENCES,
     Angles,
@@ -24,20 +21,15 @@ from .joints import (
     group_sides,
     joint_angles,
 )
-from .tables import RATE_WINDOW_S, JointSummary, angle_table, summary, summary_table
+from .tables import angle_table, summary, summary_table
 
 __all__ = [
-    "ISB_AXES",
     "JOINTS",
-    "KNEE_AXES",
     "NEAR_LOCK",
-    "RATE_WINDOW_S",
     "SHOULDER_SEQUENCES",
     "Angles",
     "JointAngles",
-    "JointSummary",
     "angle_table",
-    "compose",
     "diagnose_lock",
     "group_sides",
     "joint_angles",

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .euler import wrap
+from .euler import round_to_turns, wrap
 from .joints import Angles
 
 POINTS = 101  # 0, 1, … 100 %
@@ -83,5 +83,4 @@ def _same_turn(curves: np.ndarray) -> np.ndarray:
     known = np.flatnonzero(np.isfinite(means))
     if not len(known):
         return curves
-    turns = np.round(np.nan_to_num((means - wrap(means[known[0]])) / (2.0 * np.pi)))
-    return curves - 2.0 * np.pi * turns[:, None]
+    return curves - round_to_turns(np.nan_to_num(means - wrap(means[known[0]])))[:, None]

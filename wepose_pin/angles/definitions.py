@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from .joints import Angles, group_sides
@@ -65,11 +66,13 @@ class Definition(NamedTuple):
     positive: str
 
 
-def define_angles(angles: Angles) -> list[Definition]:
-    """Return the definition of each angle that there is."""
-    definitions = []
-    for group, members in group_sides(angles.joints).items():
-        joint = angles[next(iter(members.values()))]
-        for axis, name in zip(joint.sequence, joint.names, strict=True):
-            definitions.append(Definition(group, ROTATIONS[group], joint.sequence, axis, name, POSITIVE[group, name]))
-    return definitions
+def define_angles(sessions: Iterable[Angles]) -> list[Definition]:
+    """Return the definition of each angle that there is in a session, once."""
+    definitions: dict[Definition, None] = {}
+    for angles in sessions:
+        for group, members in group_sides(angles.joints).items():
+            joint = angles[next(iter(members.values()))]
+            for axis, name in zip(joint.sequence, joint.names, strict=True):
+                definition = Definition(group, ROTATIONS[group], joint.sequence, axis, name, POSITIVE[group, name])
+                definitions[definition] = None
+    return list(definitions)

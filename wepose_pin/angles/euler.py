@@ -18,6 +18,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ..recording.gaps import find_runs
@@ -31,7 +32,6 @@ _LOCKED = 1e-13
 class Sequence(NamedTuple):
     """The axes of a sequence as indices, and its constants in the formulas."""
 
-    name: str
     i: int
     j: int
     k: int
@@ -51,12 +51,7 @@ def sequence(name: str) -> Sequence:
     i, j, last = ("XYZ".index(letter) for letter in name)
     k = 3 - i - j
     eps = 1.0 if (i + 1) % 3 == j else -1.0
-    return Sequence(name, i, j, k, eps, 0.0 if last == i else eps * np.pi / 2.0)
-
-
-def compose(values: np.ndarray, name: str) -> np.ndarray:
-    """The rotation (n, 4) xyzw of three angles (n, 3) [rad]."""
-    return Rotation.from_euler(name, values).as_quat()
+    return Sequence(i, j, k, eps, 0.0 if last == i else eps * np.pi / 2.0)
 
 
 def decompose(quat: np.ndarray, name: str) -> Angles3:
@@ -96,7 +91,12 @@ def _fill_free(first: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 def wrap(angle: np.ndarray) -> np.ndarray:
     """Wrap into [−π, π]; angles that are in it keep their bits."""
-    return angle - 2.0 * np.pi * np.round(angle / (2.0 * np.pi))
+    return angle - round_to_turns(angle)
+
+
+def round_to_turns(angle: ArrayLike) -> np.ndarray:
+    """The nearest multiples of 2π."""
+    return np.asarray(2.0 * np.pi * np.round(np.asarray(angle) / (2.0 * np.pi)))
 
 
 def follow(angles: Angles3, name: str, near_lock: float) -> np.ndarray:

@@ -13,15 +13,15 @@ from ..errors import WrongOption, one_of
 from ..kinematics import Pose, find_samples
 from ..recording import Intervals
 from .curves import MeanCurve, compute_mean_curves
-from .euler import wrap
+from .euler import round_to_turns, wrap
 from .joints import Angles, JointAngles, joint_angles
 from .repetitions import Repetitions, find_repetitions
 from .smoothing import smooth_pose
 from .tables import summarize_joint
 from .uncertainty import compute_summary_std
 
-MEASURES = ("lowest", "highest", "range", "peak_rate")
-UNITS = ("deg", "deg", "deg", "deg_s")
+MEASURES = {"lowest": "deg", "highest": "deg", "range": "deg", "peak_rate": "deg_s"}  # units in a file
+RANGE = 2  # place of the range among them
 CONFIDENCE = 0.95  # of the interval of a difference
 
 
@@ -53,6 +53,10 @@ class Measures(NamedTuple):
     near_lock: np.ndarray  # (s,) share of the samples
     gap: np.ndarray  # (s,) share of the samples
 
+    def statistics(self, k: int) -> list[Statistics]:
+        """Statistics of each of `MEASURES` of the k-th angle over the spans."""
+        return [compute_statistics(self.values[:, k, m], self.std[:, k, m]) for m in range(len(MEASURES))]
+
 
 @dataclass(frozen=True)
 class Movement:
@@ -68,7 +72,6 @@ class Movement:
     measures : joint → those of the repetitions
     curves : joint → its three mean curves; empty without repetitions
     cutoff_hz : of the low-pass; None: there is none
-    isotropic : the pose states one standard deviation a segment, and no covariance
     """
 
     name: str
@@ -79,12 +82,12 @@ class Movement:
     measures: Mapping[str, Measures]
     curves: Mapping[str, tuple[MeanCurve, MeanCurve, MeanCurve]]
     cutoff_hz: float | None
-    isotropic: bool
 
     @property
-    def durations(self) -> np.ndarray:
-        """(r,) [s] of the repetitions."""
-        return np.diff(self.repetitions.spans, axis=1)[:, 0]
+    def duration(self) -> Statistics:
+        """[s], of the repetitions."""
+        seconds = np.diff(self.repetitions.spans, axis=1)[:, 0]
+        return compute_statistics(seconds, np.full(len(seconds), np.nan))
 
 
 def analyze_movement(name: str, pose: Pose, phases: Mapping[str, Intervals], options: MovementOptions) -> Movement:
@@ -116,7 +119,6 @@ def analyze_movement(name: str, pose: Pose, phases: Mapping[str, Intervals], opt
         measure_spans(pose, angles, repetitions.spans),
         compute_mean_curves(angles, repetitions.spans) if len(repetitions.spans) else {},
         options.cutoff_hz,
-        all(np.array_equal(cov, cov[:, :1, :1] * np.eye(3)) for cov in pose.segment_cov.values()),
     )
 
 
@@ -190,8 +192,8 @@ def _count_turns(values: np.ndarray) -> np.ndarray:
         known = np.flatnonzero(np.isfinite(middle[:, k]))
         if len(known):
             least = middle[known[np.argmin(np.ptp(values[known, k, :2], axis=1))], k]
-            turns[known, k] = np.round((middle[known, k] - wrap(least)) / (2.0 * np.pi))
-    return 2.0 * np.pi * turns
+            turns[known, k] = round_to_turns(middle[known, k] - wrap(least))
+    return turns
 
 
 class Statistics(NamedTuple):
@@ -238,6 +240,14 @@ def compare_statistics(first: Statistics, second: Statistics) -> Difference:
     return Difference(value, low, high, float(np.hypot(first.std, second.std)))
 
 
+def compare_measures(first: Measures, second: Measures, k: int) -> list[tuple[Statistics, Statistics, Difference]]:
+    """Of each of `MEASURES` of the k-th angle both sessions' statistics, after the full turns between these."""
+    one, two = first.statistics(k), second.statistics(k)
+    turns = np.nan_to_num(round_to_turns(0.5 * (two[0].mean + two[1].mean - one[0].mean - one[1].mean)))
+    two[:2] = [each._replace(mean=float(each.mean - turns)) for each in two[:2]]  # lowest and highest
+    return [(a, b, compare_statistics(a, b)) for a, b in zip(one, two, strict=True)]
+
+
 class CurveDifference(NamedTuple):
     """Of two mean curves, the second less the first; NaN where they have no point in common."""
 
@@ -252,6 +262,6 @@ def compare_curves(first: MeanCurve, second: MeanCurve) -> CurveDifference:
     known = np.isfinite(difference)
     if not known.any():
         return CurveDifference(*[float("nan")] * 3)
-    difference = difference - 2.0 * np.pi * np.round(difference[known].mean() / (2.0 * np.pi))
+    difference = difference - round_to_turns(difference[known].mean())
     worst = int(np.nanargmax(np.abs(difference)))
     return CurveDifference(float(np.sqrt(np.mean(difference[known] ** 2))), float(difference[worst]), float(worst))

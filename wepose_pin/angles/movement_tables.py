@@ -10,21 +10,12 @@ import polars as pl
 
 from .curves import PERCENT
 from .definitions import SOURCE, define_angles
-from .movement import (
-    MEASURES,
-    UNITS,
-    Measures,
-    Movement,
-    compare_curves,
-    compare_statistics,
-    compute_statistics,
-    measure_spans,
-)
+from .movement import MEASURES, Measures, Movement, compare_curves, compare_measures, measure_spans
 
 
 def build_definition_table(movements: Sequence[Movement]) -> pl.DataFrame:
     """What each angle is: sequence, axis, where it is positive, and the source."""
-    definitions = dict.fromkeys(each for movement in movements for each in define_angles(movement.angles))
+    definitions = define_angles(movement.angles for movement in movements)
     return pl.DataFrame([{**each._asdict(), "source": SOURCE} for each in definitions]).rename({"group": "joint"})
 
 
@@ -33,7 +24,6 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
     rows = []
     for movement in movements:
         time, repetitions = movement.angles.time, movement.repetitions
-        duration = compute_statistics(movement.durations, np.full(len(movement.durations), np.nan))
         rows.append(
             {
                 "session": movement.name,
@@ -43,8 +33,8 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
                 "repetitions_by": repetitions.source,
                 "first": {None: "", True: "rising", False: "falling"}[repetitions.rising],
                 "n": len(repetitions.spans),
-                "duration_mean_s": duration.mean,
-                "duration_sd_s": duration.sd,
+                "duration_mean_s": movement.duration.mean,
+                "duration_sd_s": movement.duration.sd,
                 "cmc": repetitions.cmc,
                 "left_out": repetitions.left_out,
                 "why_none": repetitions.reason,
@@ -83,9 +73,9 @@ def _list_measures(movement: Movement, measures: Mapping[str, Measures], row: in
         joint_measures = measures[name]
         for k, angle in enumerate(joint.names):
             cells: dict[str, Any] = {"joint": name, "angle": angle, "sequence": joint.sequence}
-            for m, (measure, unit) in enumerate(zip(MEASURES, UNITS, strict=True)):
-                cells[f"{measure}_{unit}"] = float(np.degrees(joint_measures.values[row, k, m]))
-                cells[f"{measure}_std_{unit}"] = float(np.degrees(joint_measures.std[row, k, m]))
+            values, stds = np.degrees(joint_measures.values[row, k]), np.degrees(joint_measures.std[row, k])
+            for (measure, unit), value, std in zip(MEASURES.items(), values.tolist(), stds.tolist(), strict=True):
+                cells |= {f"{measure}_{unit}": value, f"{measure}_std_{unit}": std}
             yield {**cells, "near_lock": float(joint_measures.near_lock[row]), "gap": float(joint_measures.gap[row])}
 
 
@@ -94,12 +84,10 @@ def build_summary_table(movements: Sequence[Movement]) -> pl.DataFrame:
     rows = []
     for movement in (movement for movement in movements if movement.curves):
         for name, joint in movement.angles.joints.items():
-            joint_measures = movement.measures[name]
             for k, angle in enumerate(joint.names):
                 cells: dict[str, Any] = {"session": movement.name, "joint": name, "angle": angle}
                 cells |= {"sequence": joint.sequence, "repetitions": len(movement.repetitions.spans)}
-                for m, (measure, unit) in enumerate(zip(MEASURES, UNITS, strict=True)):
-                    each = compute_statistics(joint_measures.values[:, k, m], joint_measures.std[:, k, m])
+                for (measure, unit), each in zip(MEASURES.items(), movement.measures[name].statistics(k), strict=True):
                     cells |= {f"{measure}_n": each.n} if measure in ("range", "peak_rate") else {}
                     for part in ("mean", "sd", "std"):
                         cells[f"{measure}_{part}_{unit}"] = float(np.degrees(getattr(each, part)))
@@ -132,12 +120,8 @@ def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
         for name in (name for name in first.curves if name in movement.curves):
             for k, angle in enumerate(first.angles[name].names):
                 about = {"session": movement.name, "against": first.name, "joint": name, "angle": angle}
-                values, others = (each.measures[name].values[:, k] for each in (first, movement))
-                others = others - np.append(_count_turns(values, others), np.zeros(len(MEASURES) - 2))
-                for m, (measure, unit) in enumerate(zip(MEASURES, UNITS, strict=True)):
-                    one = compute_statistics(values[:, m], first.measures[name].std[:, k, m])
-                    two = compute_statistics(others[:, m], movement.measures[name].std[:, k, m])
-                    difference = compare_statistics(one, two)
+                compared = compare_measures(first.measures[name], movement.measures[name], k)
+                for (measure, unit), (one, two, difference) in zip(MEASURES.items(), compared, strict=True):
                     numbers = {"first_mean": one.mean, "first_sd": one.sd, "mean": two.mean, "sd": two.sd}
                     numbers |= {"difference": difference.value, "ci95_low": difference.low}
                     numbers |= {"ci95_high": difference.high, "difference_std": difference.std}
@@ -147,11 +131,3 @@ def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
                 for measure, value in (("curve_rms", curve.rms), ("curve_largest", curve.largest)):
                     rows.append({**about, "measure": measure, "unit": "deg", "difference": float(np.degrees(value))})
     return pl.DataFrame(rows, infer_schema_length=None)
-
-
-def _count_turns(values: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Full turns [rad] (2,) between least and most of one session's repetitions and another's, (r, measures)."""
-    middles = [each[:, :2][np.isfinite(each[:, :2])] for each in (values, others)]
-    if not all(map(len, middles)):
-        return np.zeros(2)
-    return np.full(2, 2.0 * np.pi * np.round((middles[1].mean() - middles[0].mean()) / (2.0 * np.pi)))

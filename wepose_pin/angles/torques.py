@@ -115,11 +115,10 @@ def pose_torques(tracked: TrackedRecording, cutoff_hz: float = CUTOFF_HZ) -> Tor
 
     Masses are the model's, stretched with the subject's lengths (`BodyModel.with_lengths`), not the person's.
     """
-    model = tracked.model.pin
-    if tracked.model.table.is_mechanism:
-        return joint_torques(model, tracked.time, tracked.q, cutoff_hz)
-    moved = {joint for name, chain in tracked.model.chains.items() if name in tracked.quat_WL for joint in chain.joints}
-    return joint_torques(model, tracked.time, tracked.q, cutoff_hz, moved)
+    model = tracked.model
+    moved = {joint for name, chain in model.chains.items() if name in tracked.quat_WL for joint in chain.joints}
+    joints = None if model.table.is_mechanism else moved
+    return joint_torques(model.pin, tracked.time, tracked.q, cutoff_hz, joints)
 
 
 def derivatives(model: pin.Model, q: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:

@@ -164,7 +164,7 @@ def _print_repetitions(movement: Movement) -> None:
 def _print_ranges(movements: Sequence[Movement]) -> None:
     import numpy as np
 
-    from ..angles.movement import compute_statistics
+    from ..angles.movement import RANGE
 
     repeated = [movement for movement in movements if movement.curves]
     rows = []
@@ -176,9 +176,7 @@ def _print_ranges(movements: Sequence[Movement]) -> None:
                     cells.append("")
                     continue
                 name = movement.angles[joint].names[k]
-                each = compute_statistics(
-                    movement.measures[joint].values[:, k, 2], movement.measures[joint].std[:, k, 2]
-                )
+                each = movement.measures[joint].statistics(k)[RANGE]
                 mean, sd = np.degrees(each.mean), np.degrees(each.sd)
                 cells.append(f"{mean:.1f} ± {sd:.1f}" if np.isfinite(sd) else "")
             rows.append((f"{joint} {name}", *cells))

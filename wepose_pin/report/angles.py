@@ -12,15 +12,16 @@ from ..angles import group_sides
 from ..angles.curves import PERCENT, MeanCurve
 from ..angles.definitions import define_angles
 from ..angles.movement import (
-    MEASURES,
+    RANGE,
+    Difference,
     Movement,
     Statistics,
     compare_curves,
-    compare_statistics,
-    compute_statistics,
+    compare_measures,
     measure_spans,
 )
 from ..angles.repetitions import list_angles
+from ..kinematics import Pose
 from .figures import BAND, SESSION_COLOURS, SHADE, SOFT, Figures, ReportFigure, envelope, shade, styled
 from .page import MOST_FIGURES, Item, Page, Table
 from .words import intervals, listed, plain, signed
@@ -93,7 +94,7 @@ def _describe_reliance(movements: Sequence[Movement]) -> str:
     """Two sentences: what the pose states of a range, and how far the repetitions differ."""
     stated, between = {}, {}
     for movement, joint, k, angle in _list_angles(movements):
-        each = compute_statistics(movement.measures[joint].values[:, k, 2], movement.measures[joint].std[:, k, 2])
+        each = movement.measures[joint].statistics(k)[RANGE]
         stated[angle] = float(np.degrees(each.std))
         between[f"{angle}{f' ({movement.name})' if len(movements) > 1 else ''}"] = float(np.degrees(each.sd))
     stated, between = ({name: v for name, v in each.items() if np.isfinite(v)} for each in (stated, between))
@@ -117,7 +118,7 @@ def _describe(movements: Sequence[Movement]) -> str:
         else "Orientations were not low-passed."
     )
     text += " Rates are means over 0.05 s. ± between repetitions is one standard deviation, with n − 1."
-    if any(movement.isotropic for movement in movements):
+    if any(_is_isotropic(movement.pose) for movement in movements):
         text += (
             " The poses state one number for all axes of a segment, so that their ± is rough for a single angle; "
             "`wepose track --covariance` writes all of it."
@@ -125,11 +126,17 @@ def _describe(movements: Sequence[Movement]) -> str:
     return f"{text} CMC is the coefficient of multiple correlation of the curves (Kadaba et al. 1989), at most 1."
 
 
+def _is_isotropic(pose: Pose) -> bool:
+    """Whether the pose states one standard deviation a segment, and no covariance."""
+    covariances = pose.segment_cov.values()
+    return bool(covariances) and all(np.array_equal(cov, cov[:, :1, :1] * np.eye(3)) for cov in covariances)
+
+
 def _tabulate_sessions(movements: Sequence[Movement]) -> Table:
     rows = []
     for movement in movements:
         time, repetitions = movement.angles.time, movement.repetitions
-        lasting = compute_statistics(movement.durations, np.full(len(movement.durations), np.nan))
+        lasting = movement.duration
         rows.append(
             [
                 movement.name,
@@ -152,10 +159,7 @@ def _by(movement: Movement) -> str:
 def _tabulate_measures(movements: Sequence[Movement]) -> Table:
     rows = []
     for movement, joint, k, angle in _list_angles(movements):
-        each = movement.measures[joint]
-        cells = [
-            _with_stated(compute_statistics(each.values[:, k, m], each.std[:, k, m])) for m in range(len(MEASURES))
-        ]
+        cells = [_with_stated(each) for each in movement.measures[joint].statistics(k)]
         curve = movement.curves[joint][k]
         rows.append([angle, *_name(movements, movement), *cells, f"{curve.cmc:.2f}" if np.isfinite(curve.cmc) else ""])
     header = ["angle", *(["session"] if len(movements) > 1 else []), *HEADINGS, "CMC"]
@@ -197,19 +201,15 @@ def _tabulate_comparisons(movements: Sequence[Movement]) -> list[Table]:
         rows = []
         for joint in (joint for joint in first.curves if joint in other.curves):
             for k, angle in enumerate(first.angles[joint].names):
-                cells = [_difference(first, other, joint, k, m) for m in range(len(MEASURES))]
+                compared = compare_measures(first.measures[joint], other.measures[joint], k)
+                cells = [_describe_difference(difference) for _, _, difference in compared]
                 cells += _curve_difference(first.curves[joint][k], other.curves[joint][k])
                 rows.append([f"{plain(joint)}, {plain(angle)}", *cells])
         tables.append(Table(header, rows, f"{other.name} less {first.name}"))
     return tables
 
 
-def _difference(first: Movement, other: Movement, joint: str, k: int, m: int) -> str:
-    one, two = (
-        compute_statistics(each.measures[joint].values[:, k, m], each.measures[joint].std[:, k, m])
-        for each in (first, other)
-    )
-    difference = compare_statistics(one, two)
+def _describe_difference(difference: Difference) -> str:
     if not np.isfinite(difference.value):
         return ""
     value, low, high = (signed(float(np.degrees(each))) for each in difference[:3])
@@ -250,7 +250,7 @@ def _span_cells(values: np.ndarray, stds: np.ndarray) -> list[str]:
 
 
 def _tabulate_definitions(movements: Sequence[Movement]) -> Table:
-    definitions = dict.fromkeys(each for movement in movements for each in define_angles(movement.angles))
+    definitions = define_angles(movement.angles for movement in movements)
     return Table(
         ["joint", "rotation", "sequence", "axis", "angle", "positive"],
         [[plain(e.group), e.rotation, "-".join(e.sequence), e.axis, plain(e.angle), e.positive] for e in definitions],
