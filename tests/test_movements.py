@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from commands import run
 from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 from scipy.stats import ttest_ind
@@ -30,7 +31,6 @@ from wepose_pin.angles.movement_tables import build_comparison_table
 from wepose_pin.angles.smoothing import smooth_pose
 from wepose_pin.angles.tables import summarize_joint
 from wepose_pin.angles.uncertainty import compute_summary_std
-from wepose_pin.commands import main
 from wepose_pin.errors import WrongOption
 from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import load_model
@@ -211,17 +211,11 @@ def test_sessions_are_compared_after_the_full_turns_between_them() -> None:
 # The command ------------------------------------------------------------------------------------------------------
 
 
-def run(*words: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main(["angles", *map(str, words)])
-    return int(stop.value.code or 0)
-
-
 def test_two_sessions_become_tables_figures_and_a_page(
     results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "angles"
-    assert run(*results, "-o", out, "--low-pass-hz", 6) == 0
+    assert run("angles", *results, "-o", out, "--low-pass-hz", 6) == 0
     printed = capsys.readouterr().out
     assert "before: 7 repetitions by right_elbow_flexion, rising first; CMC 1.00" in printed
     assert "low-passed at 6 Hz" in printed
@@ -260,12 +254,12 @@ def test_two_sessions_become_tables_figures_and_a_page(
     ):
         assert words in page
     assert "cannot be made" not in page
-    assert run(*results, "-o", out) == 2  # nothing is overwritten
+    assert run("angles", *results, "-o", out) == 2  # nothing is overwritten
     assert "--force" in capsys.readouterr().err
 
 
 def test_a_phase_marks_the_repetitions(results: tuple[Path, Path], tmp_path: Path) -> None:
-    assert run(results[0], "-o", tmp_path / "a", "--repetitions", "bend", "--interval", 3, 9) == 0
+    assert run("angles", results[0], "-o", tmp_path / "a", "--repetitions", "bend", "--interval", 3, 9) == 0
     table = pl.read_csv(tmp_path / "a" / "repetitions.csv").unique("repetition", maintain_order=True)
     assert table.select("from_s", "to_s").rows() == [(4.0, 6.0), (6.0, 8.0)]
     assert not (tmp_path / "a" / "repetitions.svg").exists()
@@ -275,7 +269,7 @@ def test_a_phase_marks_the_repetitions(results: tuple[Path, Path], tmp_path: Pat
 def test_where_nothing_repeats_there_are_phases_all_the_same(
     results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(results[0], "-o", tmp_path / "a", "--phase", "start") == 0
+    assert run("angles", results[0], "-o", tmp_path / "a", "--phase", "start") == 0
     assert "no repetitions by right_elbow_flexion: the angle goes out and back" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "a").iterdir()} == {
         *("sessions.csv", "phases.csv", "definitions.csv", "repetitions.svg", "angles.html", "provenance.json"),
@@ -299,7 +293,7 @@ def test_where_nothing_repeats_there_are_phases_all_the_same(
 def test_a_mistake_is_one_line_and_exit_2(
     results: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, said: str
 ) -> None:
-    assert run(results[0], "-o", tmp_path / "a", *words.split()) == 2
+    assert run("angles", results[0], "-o", tmp_path / "a", *words.split()) == 2
     line = capsys.readouterr().err
     assert said in line
     assert line.count("\n") == 1

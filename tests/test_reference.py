@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run
 from scipy.spatial.transform import Rotation, Slerp
 from test_info import info
 from test_mvnx import mvnx, turning
 
-from wepose_pin.commands import main
 from wepose_pin.errors import BadData, WeposeError
 from wepose_pin.evaluation import compute_agreement, compute_icc, evaluate, register
 from wepose_pin.kinematics import Pose, build_pose_table
@@ -284,11 +284,10 @@ def test_what_cannot_be_aligned_is_said(pose: Pose) -> None:
 # The command ------------------------------------------------------------------------------------------------------
 
 
-def run(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main(["evaluate", *map(str, argv)])
+def run_evaluate(capsys: pytest.CaptureFixture[str], *argv: object, code: int = 0) -> str:
+    ended = run("evaluate", *argv)
     out, err = capsys.readouterr()
-    assert stop.value.code == code, err
+    assert ended == code, err
     return out if code == 0 else err
 
 
@@ -318,13 +317,13 @@ def test_wepose_evaluate_says_what_was_fitted(
     time, quats, points = in_laboratory(whole)
     build_pose_table(Pose(time + LATE_S, quats, points)).write_parquet(tmp_path / "laboratory.parquet")
     build_pose_table(whole).write_parquet(tmp_path / "truth.parquet")
-    aligned = run(capsys, result, tmp_path / "laboratory.parquet", "--fit", "world", "--interval", "20", "40")
+    aligned = run_evaluate(capsys, result, tmp_path / "laboratory.parquet", "--fit", "world", "--interval", "20", "40")
     assert "The reference was aligned by 2 to 16." in aligned
     assert "s, which are not scored:" in aligned
     assert "its clock -3.217 s (speeds correlate by " in aligned
     assert "its world: +y is up, rotated by +" in aligned
     assert "Agreement of joint angles [deg]: Bland-Altman" in aligned
-    plain = run(capsys, result, tmp_path / "truth.parquet", "--interval", "20", "40")
+    plain = run_evaluate(capsys, result, tmp_path / "truth.parquet", "--interval", "20", "40")
     assert "aligned" not in plain
     assert "Agreement" not in plain
     rows_of = [
@@ -332,7 +331,9 @@ def test_wepose_evaluate_says_what_was_fitted(
         for out in (aligned, plain)
     ]
     assert rows_of[0].split()[-4:] == rows_of[1].split()[-4:]
-    stated = run(capsys, result, tmp_path / "laboratory.parquet", "--fit", "world", "--time-offset", f"{-LATE_S}")
+    stated = run_evaluate(
+        capsys, result, tmp_path / "laboratory.parquet", "--fit", "world", "--time-offset", f"{-LATE_S}"
+    )
     assert "its clock -3.217 s (stated)" in stated
 
 
@@ -347,7 +348,7 @@ def test_wepose_evaluate_says_what_was_fitted(
 def test_options_that_do_not_go_together(
     options: tuple[str, ...], says: str, result: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert says in run(capsys, result, result / "pose.parquet", *options, code=2)
+    assert says in run_evaluate(capsys, result, result / "pose.parquet", *options, code=2)
 
 
 def test_a_table_of_markers_of_ones_own(brief: Pose, tmp_path: Path) -> None:
@@ -389,13 +390,12 @@ def test_a_real_mvnx_agrees_with_what_is_tracked_of_it(
     }
     sensors = "".join(f'[sensors.{segment}]\nlabel = "{label}"\n' for label, segment in labels.items())
     (tmp_path / "session.toml").write_text(f"[data]\nfile = '{file}'\nuse = 'orientation'\n{sensors}")
-    with pytest.raises(SystemExit) as stop:
-        main(["track", str(tmp_path / "session.toml"), "--subject", str(file), "-o", str(tmp_path / "result")])
-    assert stop.value.code == 0, capsys.readouterr().err
+    ended = run("track", tmp_path / "session.toml", "--subject", file, "-o", tmp_path / "result")
+    assert ended == 0, capsys.readouterr().err
     capsys.readouterr()
-    out = run(capsys, tmp_path / "result", file, "--no-align")
+    out = run_evaluate(capsys, tmp_path / "result", file, "--no-align")
     assert "right_elbow" in out
-    assert "6 s are needed, or --no-align" in run(capsys, tmp_path / "result", file, code=2)
+    assert "6 s are needed, or --no-align" in run_evaluate(capsys, tmp_path / "result", file, code=2)
 
 
 # Files that are wrong -----------------------------------------------------------------------------------------------

@@ -274,9 +274,9 @@ def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngl
     std = None
     if all(segment in pose.segment_cov for segment in members):
         cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)
-        if left:
-            cov_W = cov_W * np.outer(_MIRRORED_TURN, _MIRRORED_TURN)
-        std = _spread(values, joint.sequence, quat_WP, cov_W)
+        rows = _gradients(values, joint.sequence, quat_WP, left)
+        variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
+        std = np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN)
     gap = np.any([~known, *(pose.gap[segment] for segment in members if segment in pose.gap)], axis=0)
     gimbal = _expand(known, angles.gimbal, n)
     return JointAngles(
@@ -300,16 +300,16 @@ def compute_gradients(pose: Pose, name: str, joint: JointAngles, samples: np.nda
     quat_WL = {segment: quat[samples] for segment, quat in pose.quat_WL.items() if segment == proximal}
     part = Pose(pose.time[samples], quat_WL, {})
     quat_WP = _joint_frame(part, JOINTS[name], proximal, left, np.ones(len(samples), dtype=bool))
-    rows = _gradients(joint.values[samples], joint.sequence, quat_WP)
-    return rows * _MIRRORED_TURN if left else rows
+    return _gradients(joint.values[samples], joint.sequence, quat_WP, left)
 
 
-def _gradients(values: np.ndarray, sequence: str, quat_WP: np.ndarray) -> np.ndarray:
-    """Derivatives (n, 3, 3) of angles by the turn between the segments, in W.
+def _gradients(values: np.ndarray, sequence: str, quat_WP: np.ndarray, left: bool) -> np.ndarray:
+    """Derivatives (n, 3, 3) of angles by the turn between the segments, in W; of a left joint not mirrored.
 
     With ``exp(e_W) R_WL`` for each segment the rotation between two is turned on its left by ``R_WPᵀ (e_D − e_P)``.
     """
-    return euler.gradients(values, sequence) @ np.swapaxes(Rotation.from_quat(quat_WP).as_matrix(), -1, -2)
+    rows = euler.gradients(values, sequence) @ np.swapaxes(Rotation.from_quat(quat_WP).as_matrix(), -1, -2)
+    return rows * _MIRRORED_TURN if left else rows
 
 
 def _joint_frame(pose: Pose, joint: Joint, segment: str, left: bool, known: np.ndarray) -> np.ndarray:
@@ -323,15 +323,6 @@ def _joint_frame(pose: Pose, joint: Joint, segment: str, left: bool, known: np.n
         return np.tile(quat_LI, (int(np.count_nonzero(known)), 1))
     quat_WL = pose.quat_WL[segment][known]
     return multiply(quat_WL * _MIRRORED_QUAT if left else quat_WL, quat_LI)
-
-
-def _spread(values: np.ndarray, sequence: str, quat_WP: np.ndarray, cov_W: np.ndarray) -> np.ndarray:
-    """Standard deviations (n, 3) [rad] of angles from the covariance (n, 3, 3) of the turn between segments, in W."""
-    if not len(values):
-        return values
-    rows = _gradients(values, sequence, quat_WP)
-    variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
-    return np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN)
 
 
 def _expand(known: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
