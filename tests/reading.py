@@ -37,6 +37,19 @@ def captions(page: str) -> list[tuple[str, str]]:
     return [(unescape(label), unescape(caption)) for label, caption in pairs]
 
 
+def is_self_contained(page: str) -> bool:
+    """Whether a page opens offline, runs nothing outside its view, and shows no number that is missing as NaN."""
+    own = without_frame(page)
+    loads = any(
+        re.search(r"""(src|href)\s*=\s*["']?\s*(https?:)?//|@import|url\((?!#)""", text.split("<script>")[0])
+        for text in (own, unescape(page))
+    )
+    shown = re.sub(r'"data:[^"]*"', "", own).split("</style>")[1]
+    return (
+        "default-src 'none'" in page.split("<title>")[0] and not loads and "<script" not in own and "nan" not in shown
+    )
+
+
 def browse(page: Path, *options: str, at: str = "", milliseconds: int = 3000) -> str:
     """What a headless browser prints of a page at an address such as ``#t=12``, after so many milliseconds."""
     assert BROWSER is not None

@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 from bodies import TABLE
 from PIL import Image
-from reading import BROWSER, browse, captions, headings, rows, text_of, without_frame
+from reading import BROWSER, browse, captions, headings, is_self_contained, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.commands import main
@@ -30,7 +29,6 @@ from wepose_pin.tracking import TrackedRecording, TrackOptions, summarize, track
 from wepose_pin.tracking.measures import (
     compute_heading_uncertainties,
     compute_joint_heading_stds,
-    longest_run_s,
     measure_hinge,
     measure_tips,
 )
@@ -130,12 +128,8 @@ def test_a_known_person_and_nothing_to_say(pose: TrackedRecording) -> None:
     assert "No warnings." in text_of(render_track_report(summarize(quiet)))
 
 
-def test_it_opens_offline_prints_and_has_no_nan(page: str) -> None:
-    assert "default-src 'none'" in page.split("<title>")[0]
-    for text in (without_frame(page), unescape(page)):
-        assert not re.search(r"""(src|href)\s*=\s*["']?\s*(https?:)?//""", text.split("<script>")[0])
-    assert without_frame(page).count("<script") == 0
-    assert "nan" not in re.sub(r'"data:[^"]*"', "", without_frame(page)).split("</style>")[1]
+def test_it_opens_offline_and_has_a_dark_side(page: str) -> None:
+    assert is_self_contained(page)
     assert "@media screen and (prefers-color-scheme: dark)" in page
 
 
@@ -172,8 +166,7 @@ def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedRec
     assert headings(page) == SECTIONS
     assert "The device states no uncertainty" in text_of(page)
     assert the("measured-orientations", ready).facts["segments"] == "torso, right_upper_arm, right_forearm"
-    assert "Those of torso, right upper arm" not in text_of(page)
-    assert not any(row[0] == "left hand" for row in rows(page))
+    assert not any(row[0] == "left palm" for row in rows(page))
 
 
 def test_a_torso_alone_has_no_hands(simulation: Simulation) -> None:
@@ -260,7 +253,6 @@ def test_a_person_who_never_rests(pose: TrackedRecording) -> None:
         ]
         assert [d.place for d in rare] == list(restless)
         assert {d.severity for d in rare} == {severity}
-    assert longest_run_s(np.array([True, False, True, True, True, False]), 2.0) == 1.5
 
 
 def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
@@ -304,14 +296,13 @@ def with_elbow(
 def test_elbows_that_cannot_be(pose: TrackedRecording) -> None:
     n = len(pose.time)
     usual = {each.code for each in summarize(with_elbow(pose, np.linspace(-10.0, 140.0, n))).diagnostics}
-    assert not usual & {"hinge-hyperextended", "hinge-overflexed", "hinge-out-of-plane"}
+    assert not any(code.startswith("hinge-") for code in usual)
     back = the("hinge-hyperextended", with_elbow(pose, np.full(n, -30.0)))
     assert (back.severity, back.place, back.value) == (WARNING, "left_elbow", pytest.approx(np.deg2rad(30.0)))
     folded = the("hinge-overflexed", with_elbow(pose, np.full(n, 170.0)))
     assert (folded.severity, folded.place, folded.value) == (WARNING, "left_elbow", pytest.approx(np.deg2rad(170.0)))
     turned = the("hinge-out-of-plane", with_elbow(pose, np.full(n, 90.0), 40.0))
     assert turned.value == pytest.approx(np.deg2rad(40.0))
-    assert "variant" not in turned.facts
     drifting = the("hinge-out-of-plane", with_elbow(pose, np.full(n, 90.0), np.linspace(0.0, 60.0, n)))
     assert "by 15° in the first half of the recording and by 45° in the second" in render(drifting).what
 
@@ -481,4 +472,6 @@ def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackedRecording) -> 
 
 
 def rows_of_hands(page: str) -> list[list[str]]:
-    return [row for row in rows(page) if row[0] in ("left hand", "right hand") and len(row) == 7 and "m/s" in row[4]]
+    found = [row for row in rows(page) if row[0] in ("left palm", "right palm") and row[-1].endswith("mm")]
+    assert len(found) == 2
+    return found

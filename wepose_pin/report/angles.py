@@ -1,4 +1,4 @@
-"""The page of `wepose angles`: repetitions, mean curves, tables and definitions, as a paper has them."""
+"""The page of `wepose angles`: repetitions, mean curves and tables, as a paper has them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from matplotlib.axes import Axes
 
 from ..angles import group_sides
 from ..angles.curves import PERCENT, MeanCurve
-from ..angles.definitions import define_angles
 from ..angles.movement import (
     RANGE,
     Difference,
     Movement,
     Statistics,
-    compare_curves,
     compare_measures,
     measure_spans,
 )
@@ -59,7 +57,6 @@ def render_angles_page(movements: Sequence[Movement], figures: Figures, failures
     if len([movement for movement in movements if movement.curves]) > 1:
         page.add("Sessions compared", lambda: [COMPARISON, *_tabulate_comparisons(movements)])
     page.add("All of the time", lambda: [WHOLE_TIME, *_tabulate_whole_time(movements)])
-    page.add("What the angles are", lambda: [DEFINITIONS, _tabulate_definitions(movements)])
     return page.html()
 
 
@@ -80,10 +77,6 @@ COMPARISON = (
 WHOLE_TIME = (
     "± is what the pose states. Samples in gaps count nowhere, those near gimbal lock only in the range of the second "
     "angle. `phases.csv` has the same for each phase."
-)
-DEFINITIONS = (
-    "After the International Society of Biomechanics: Wu et al. 2005 for thorax and arm, 2002 for pelvis, hip and "
-    "ankle; the knee after Grood and Suntay 1983. Left joints are mirrored: both sides have the same signs."
 )
 
 
@@ -123,7 +116,11 @@ def _describe(movements: Sequence[Movement]) -> str:
             " The poses state one number for all axes of a segment, so that their ± is rough for a single angle; "
             "`wepose track --covariance` writes all of it."
         )
-    return f"{text} CMC is the coefficient of multiple correlation of the curves (Kadaba et al. 1989), at most 1."
+    return (
+        f"{text} CMC is the coefficient of multiple correlation of the curves (Kadaba et al. 1989), at most 1. Angles "
+        "are after the International Society of Biomechanics, with the same signs left and right; `definitions.csv` "
+        "has the axes."
+    )
 
 
 def _is_isotropic(pose: Pose) -> bool:
@@ -195,7 +192,7 @@ def _pair(mean: float, sd: float, digits: int = 1) -> str:
 def _tabulate_comparisons(movements: Sequence[Movement]) -> list[Table]:
     """A table of each further session against the first."""
     first, *others = [movement for movement in movements if movement.curves]
-    header = ["angle", *HEADINGS, "curve, rms [°]", "curve, largest [°]"]
+    header = ["angle", *HEADINGS]
     tables = []
     for other in others:
         rows = []
@@ -203,7 +200,6 @@ def _tabulate_comparisons(movements: Sequence[Movement]) -> list[Table]:
             for k, angle in enumerate(first.angles[joint].names):
                 compared = compare_measures(first.measures[joint], other.measures[joint], k)
                 cells = [_describe_difference(difference) for _, _, difference in compared]
-                cells += _curve_difference(first.curves[joint][k], other.curves[joint][k])
                 rows.append([f"{plain(joint)}, {plain(angle)}", *cells])
         tables.append(Table(header, rows, f"{other.name} less {first.name}"))
     return tables
@@ -218,13 +214,6 @@ def _describe_difference(difference: Difference) -> str:
     text = f"{value} ({low} to {high})"
     excludes_zero = difference.low > 0.0 or difference.high < 0.0
     return f"**{text}**" if excludes_zero and abs(difference.value) > CLEAR * np.nan_to_num(difference.std) else text
-
-
-def _curve_difference(first: MeanCurve, other: MeanCurve) -> list[str]:
-    curve = compare_curves(first, other)
-    if not np.isfinite(curve.rms):
-        return ["", ""]
-    return [f"{np.degrees(curve.rms):.1f}", f"{signed(float(np.degrees(curve.largest)))} at {curve.percent:.0f} %"]
 
 
 def _tabulate_whole_time(movements: Sequence[Movement]) -> list[Table]:
@@ -247,14 +236,6 @@ def _span_cells(values: np.ndarray, stds: np.ndarray) -> list[str]:
         _pair(float(np.degrees(value)), float(np.degrees(std))) if np.isfinite(value) else ""
         for value, std in zip(values, stds, strict=True)
     ]
-
-
-def _tabulate_definitions(movements: Sequence[Movement]) -> Table:
-    definitions = define_angles(movement.angles for movement in movements)
-    return Table(
-        ["joint", "rotation", "sequence", "axis", "angle", "positive"],
-        [[plain(e.group), e.rotation, "-".join(e.sequence), e.axis, plain(e.angle), e.positive] for e in definitions],
-    )
 
 
 # Figures --------------------------------------------------------------------------------------------------------------

@@ -232,7 +232,7 @@ def _list_run(calibration: Calibration, recording: Recording, method: str) -> li
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
         ("sensors", f"{', '.join(map(plain, recording.sensors))} ({', '.join(raw)})"),
         ("length", f"{recording.time[-1] - recording.time[0]:.1f} s at {recording.rate_hz:g} Hz"),
-        *((f"phase {name}", intervals(spans)) for name, spans in recording.phases.items()),
+        ("phases", "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())),
         ("protocol", f"{calibration.problem.protocol.name}, {len(calibration.time)} samples of it"),
         ("filter", method),
         ("measured lengths", ", ".join(measured) or "none"),

@@ -51,10 +51,9 @@ def render_retargeting_report(
     page = Page(f"Motion of {title or 'a robot'}", failures)
     page.add("What can be relied on", lambda: [_describe_reliance(trajectory, summary)], heading=False)
     page.add("Diagnostics", lambda: _list_diagnostics(summary), heading=False)
-    page.add("In short", lambda: [_describe_limits(summary)], heading=False)
     page.add("The hands against their targets", lambda: _list_hands(trajectory, summary))
     page.add("The robot's parts against each other", lambda: _list_distances(trajectory, summary))
-    page.add("The joints against their limits", lambda: _list_joints(trajectory))
+    page.add("The joints against their limits", lambda: _list_joints(trajectory, summary))
     ghosts = " Translucent: the targets of the hands."
     page.add("The motion in 3D", lambda: [] if view is None else [Frame(view, ghosts)])
     page.add("What was run", lambda: _list_run(summary))
@@ -99,14 +98,12 @@ def _list_diagnostics(summary: Mapping[str, Any]) -> list[Item]:
 
 def _describe_limits(summary: Mapping[str, Any]) -> str:
     unused = summary["limit_margins"]
-    slowed = f", {summary['slowdown']:.2f} times as long" if summary["slowdown"] is not None else ""
     return (
-        f"{summary['duration_s']:.1f} s, of which {summary['approach_s']:.1f} s are the approach; "
-        f"{summary['recorded_s']:.1f} s recorded{slowed}. Never used: {100 * unused['velocity_share']:.1f} % of the "
-        f"velocity limits, {100 * unused['acceleration_share']:.1f} % of those of acceleration, "
-        f"{100 * unused['jerk_share']:.1f} % of those of jerk; {unused['position_rad']:.3f} rad to the nearest "
-        f"position limit. In {100 * summary['steps']['stopping_share']:.2f} % of the steps the robot braked: no other "
-        "kept all limits and left it a way to stop."
+        f"Never used: {100 * unused['velocity_share']:.1f} % of the velocity limits, "
+        f"{100 * unused['acceleration_share']:.1f} % of those of acceleration, {100 * unused['jerk_share']:.1f} % of "
+        f"those of jerk; {unused['position_rad']:.3f} rad to the nearest position limit. In "
+        f"{100 * summary['steps']['stopping_share']:.2f} % of the steps the robot braked: no other kept all limits and "
+        "left it a way to stop."
     )
 
 
@@ -145,7 +142,7 @@ def _list_distances(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[
     ]
 
 
-def _list_joints(trajectory: Trajectory) -> list[Item]:
+def _list_joints(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item]:
     robot, run = trajectory.robot, trajectory.run
     limits, dt = robot.map.read_joint_limits(), float(trajectory.time[1] - trajectory.time[0])
     jerk = np.abs(np.diff(run.joint_acceleration, axis=0)) / dt
@@ -167,6 +164,7 @@ def _list_joints(trajectory: Trajectory) -> list[Item]:
     return [
         draw_joints(trajectory),
         Table(["joint", "least distance to a position limit", "largest velocity", "acceleration", "jerk"], rows),
+        _describe_limits(summary),
         f"Limits are those of the robot's map, else of its URDF. {100 * margins.speed_scale:g} % of those of velocity, "
         f"acceleration and jerk are used (`--speed-scale`), and {margins.limit_margin:g} rad are left to each position "
         "limit (`--limit-margin`).",
@@ -182,13 +180,18 @@ def _format_share(value: float, limit: float) -> str:
 
 
 def _list_run(summary: Mapping[str, Any]) -> list[Item]:
+    slowed = f"; {summary['slowdown']:.2f} times as long as recorded" if summary["slowdown"] is not None else ""
     return [
         Facts(
             [
                 ("robot", f"{summary['robot']}, {summary['urdf']}"),
                 ("mount and limits", summary["description"] or "as the map has them"),
                 ("rate", f"{summary['rate_hz']:g} Hz"),
-                ("of the limits", f"{100.0 * summary['speed_scale']:g} % of velocity, acceleration and jerk"),
+                ("recorded", f"{summary['recorded_s']:.1f} s"),
+                (
+                    "lasts",
+                    f"{summary['duration_s']:.1f} s, of which {summary['approach_s']:.1f} s are the approach{slowed}",
+                ),
                 ("steps near a singularity", f"{100.0 * summary['steps']['singular_share']:.1f} %"),
             ]
         )

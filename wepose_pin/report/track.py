@@ -9,9 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..angles import Angles, JointAngles, group_sides, joint_angles, summary
-from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..kinematics import compute_orientation_residuals
 from ..model import ROOT, BodyTable
 from ..tracking import TrackedRecording, TrackSummary
 from ..tracking.error_budget import group_by_source
@@ -72,9 +70,11 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
         raise BadData("the motion could not be measured")
     table = tracked.model.table
     find_angles = cache(lambda: _find_joint_angles(tracked))
+    checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
+    reliable = f"**No warnings.** {checked} are within their limits."
     page = Page(f"Motion of {tracked.recording.name or 'a recording'}", failures)
     page.add("What can be relied on", lambda: _list_reliance(tracked, measures, find_angles()), heading=False)
-    page.add("Diagnostics", lambda: _list_diagnostics(summary.diagnostics, table), heading=False)
+    page.add("Diagnostics", lambda: [show_diagnostics(summary.diagnostics, reliable)], heading=False)
     page.add("In short", lambda: _list_facts(tracked, measures), heading=False)
     page.add("What was recorded", lambda: _list_recorded(tracked, measures))
     page.add("Drift of the headings", lambda: _list_drift(tracked, measures.budgets))
@@ -89,10 +89,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
 
 
 def _list_reliance(tracked: TrackedRecording, measures: Measures, angles: Angles | None) -> list[Item]:
-    """Return what the motion is good for: the usual uncertainty of hinges, hands and rotations, and the least certain.
-
-    Hinges are what people look for first, as the elbows; the worst instant of a heading stands with the headings.
-    """
+    """Return what the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
     after_start, table = find_samples_after_start(tracked), tracked.model.table
     stds = _find_angle_stds(angles, after_start) if angles is not None else {}
     tips = [finite_median(tip.std[after_start]) for tip in measures.tips.values() if tip.std is not None]
@@ -131,11 +128,6 @@ def _explain_no_covariance(tracked: TrackedRecording) -> str:
         f"{source} states no uncertainty, so that this page cannot say how far angles and positions may be off. "
         f"The methods {METHODS_WITH_COVARIANCE} state it."
     )
-
-
-def _list_diagnostics(diagnostics: Sequence[Diagnostic], table: BodyTable) -> list[Item]:
-    checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
-    return [show_diagnostics(diagnostics, f"**No warnings.** {checked} are within their limits.")]
 
 
 def _list_facts(tracked: TrackedRecording, measures: Measures) -> list[Item]:
@@ -331,13 +323,6 @@ def _list_run(tracked: TrackedRecording) -> list[Item]:
         ("mounts", "as the session states them" if has_stated_mounts(tracked) else "as calibrated"),
         ("body model", tracked.model.robot.name),
     ]
-    if tracked.q is not None:
-        residuals = compute_orientation_residuals(tracked.model, tracked.q, tracked.quat_WL)
-        rows += [
-            (f"{plain(name)}, orientation residual", f"{np.degrees(np.sqrt(np.mean(angle**2))):.1f}°")
-            for name, angle in residuals.items()
-        ]
-    rows.append(("points", listed([plain(name) for name in tracked.points]) or "none"))
     return [Facts(rows)]
 
 

@@ -87,16 +87,11 @@ def pose_html(
     known is not drawn.
     """
     frames = frame_indices(pose.time, fps)
-    if pose.q is not None:
-        q = pose.q[frames]
-    else:
-        q = solve_configuration(model, {segment: quat_WL[frames] for segment, quat_WL in pose.quat_WL.items()})
-    known = set(find_known_links(model, pose.quat_WL))
-    visuals = [visual for visual in model.visuals if visual.link in known]
+    visuals, placed = _place_body(model, pose, frames)
     return view_html(
         visuals,
         pose.time[frames],
-        compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals)),
+        placed,
         trails={
             name: Trail(pose.points[name][frames], choose_trail_colour(name, model))
             for name in model.table.paths
@@ -107,6 +102,18 @@ def pose_html(
         fps=fps,
         floor_z=find_floor(model),
     )
+
+
+def _place_body(
+    model: BodyModel, pose: Pose, samples: np.ndarray
+) -> tuple[list[Visual], dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """The visuals of the links that are known, and link → its orientations and positions in W at these samples."""
+    q = pose.q[samples] if pose.q is not None else None
+    if q is None:
+        q = solve_configuration(model, {segment: quat_WL[samples] for segment, quat_WL in pose.quat_WL.items()})
+    known = set(find_known_links(model, pose.quat_WL))
+    visuals = [visual for visual in model.visuals if visual.link in known]
+    return visuals, compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals))
 
 
 def show_motion(model: BodyModel, pose: Pose, phases: Mapping[str, Sequence[tuple[float, float]]], title: str) -> Frame:
@@ -139,10 +146,7 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
 
     frames = frame_indices(trajectory.time, fps)
     nearest = np.abs(pose.time[:, None] - trajectory.recorded_time[frames][None, :]).argmin(axis=0)
-    q = solve_configuration(model, {segment: quat_WL[nearest] for segment, quat_WL in pose.quat_WL.items()})
-    known = set(find_known_links(model, pose.quat_WL))
-    visuals = [visual for visual in model.visuals if visual.link in known]
-    placed = compute_link_placements(model, q, dict.fromkeys(visual.link for visual in visuals))
+    visuals, placed = _place_body(model, pose, nearest)
     robot = trajectory.robot
     drawn = build_parts(robot)
     arms = {arm.side: find_person_arm(model.table, arm.side) for arm in robot.arms}
@@ -189,35 +193,22 @@ def view_html(
     fps: float = 30.0,
     floor_z: float = FLOOR_Z,
 ) -> str:
-    """The page that plays a motion; write it to a file and open it in any browser.
+    """The page that plays a motion, to open in any browser; equal arguments give equal text.
 
     `#t=12.3` at the end of its address opens it paused at that time, `#t=12.3&play` plays on from there.
 
     Parameters
     ----------
-    visuals
-        The shapes of the body. A link without a placement is not drawn, nor is a visual of kind ``"mesh"``.
-    time
-        (n,) [s], n >= 1, rising.
-    placements
-        Link -> (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]). A link is hidden while its placement is NaN.
-    meshes
-        More shapes of links.
-    trails
-        Point -> its way.
-    phases
-        Name -> spans (begin, end) [s] on the same time axis as `time`.
-    title
-        Plain text; shown, and the name of the window.
-    fps
-        Frames a second in the page: the nearest samples, none made up; a slower recording stays as it is.
-    floor_z
-        Height [m] of the ground grid in W.
+    visuals : the shapes of the body; a link without a placement is not drawn, nor is a visual of kind ``"mesh"``
+    time : (n,) [s], n >= 1, rising
+    placements : link → (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]); a link is hidden while its placement is NaN
+    meshes : more shapes of links
+    trails : point → its way
+    phases : name → spans (begin, end) [s]
+    title : plain text; shown, and the name of the window
+    fps : frames a second in the page: the nearest samples, none made up; a slower recording stays as it is
+    floor_z : height [m] of the ground grid in W
 
-    Returns
-    -------
-    str
-        The whole page; equal arguments give equal text.
     """
     time = np.asarray(time, dtype=float)
     frames = frame_indices(time, fps)
@@ -372,16 +363,12 @@ def view(
 
 def _corners(visual: Visual) -> np.ndarray:
     """(8, 3) [m] of the box around a visual, in its link."""
-    corners_V = np.array(list(product((-1.0, 1.0), repeat=3))) * _half_edges(visual)
-    return Rotation.from_quat(visual.quat_LV).apply(corners_V) + visual.p_LV
-
-
-def _half_edges(visual: Visual) -> np.ndarray:
-    """(3,) [m] of the box around a visual."""
-    if visual.kind == "box":
-        return np.array(visual.size) / 2.0
     radius = visual.size[0]
-    return np.array([radius, radius, visual.size[1] / 2.0 if visual.kind == "cylinder" else radius])
+    half_edges = np.array([radius, radius, visual.size[1] / 2.0 if visual.kind == "cylinder" else radius])
+    if visual.kind == "box":
+        half_edges = np.array(visual.size) / 2.0
+    corners_V = np.array(list(product((-1.0, 1.0), repeat=3))) * half_edges
+    return Rotation.from_quat(visual.quat_LV).apply(corners_V) + visual.p_LV
 
 
 def choose_trail_colour(point: str, model: BodyModel) -> str:
