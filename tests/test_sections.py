@@ -10,7 +10,6 @@ import pytest
 from wepose_pin.diagnostics import render
 from wepose_pin.report.figures import draw_over_time
 from wepose_pin.report.page import Banner, Facts, Frame, Item, Page, PageWriter, Table, inline
-from wepose_pin.report.words import capital, slug
 
 NASTY = '<script>alert("x")</script> & {{ 7 * 7 }} ](javascript:x)'
 
@@ -89,8 +88,3 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     (diagnostic,) = writer.diagnostics
     assert (diagnostic.code, diagnostic.place) == ("page-incomplete", "b.html")
     assert "ZeroDivisionError" in render(diagnostic).what
-
-
-def test_names() -> None:
-    assert slug("Upper body, realistic!") == "upper-body-realistic"
-    assert capital("") == ""
