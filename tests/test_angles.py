@@ -59,10 +59,6 @@ def arm_of(side: str, matrix_I: np.ndarray) -> dict[str, np.ndarray]:
     return {f"{side}_upper_arm": Rotation.from_matrix(matrix).as_quat()}
 
 
-def same_angles(values: np.ndarray, expected: np.ndarray, atol: float) -> None:
-    np.testing.assert_allclose(wrap(values - expected), 0.0, atol=atol)
-
-
 # Apart and together -----------------------------------------------------------------------------------------------
 
 
