@@ -69,7 +69,10 @@ TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
         GOOD + HINGE.replace('moves = "forearm_link"', 'moves = "wrist_1_link"'),
         ("hinges.bend", "wrist_1_link hangs on forearm_link", "not on upper_arm_link"),
     ),
-    "a hinge without an axis": (GOOD + HINGE.replace("[0.0, 1.0, 0.0]", "[0, 0, 0]"), ("hinges.bend", "[0, 0, 0]")),
+    "a hinge without an axis": (
+        GOOD + HINGE.replace("[0.0, 1.0, 0.0]", "[0, 0, 0]"),
+        ("hinges.bend", "[0.0, 0.0, 0.0]"),
+    ),
     "a hinge on nothing": (
         GOOD + HINGE.replace('on = "upper_arm_link"', 'on = "uper_arm_link"'),
         ("hinges.bend.on", "uper_arm_link", "did you mean 'upper_arm_link'"),
@@ -90,18 +93,18 @@ TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
         GOOD + '[draw]\nlimbs = [["base"]]\n',
         ("draw.limbs", "['base'] is no line", "two different points"),
     ),
-    "a point in millimetres": (GOOD.replace("0.15", "150.0"), ("points.tip.at", "150.0", "10 m at most")),
+    "a point in millimetres": (GOOD.replace("0.15", "150.0"), ("points.tip.at", "150.0", "numbers [m] from -10 to 10")),
     "a girdle of a point that is none": (
         GOOD + GIRDLE.replace("girdles.elbow", "girdles.elbov"),
         ("girdles.elbov", "'elbov' is no point", "did you mean 'elbow'"),
     ),
     "a girdle with two joints": (
         GOOD + GIRDLE.replace(', "elbow_joint"', ""),
-        ("girdles.elbow", "['shoulder_pan_joint', 'shoulder_lift_joint']", "three joints"),
+        ("girdles.elbow", "['shoulder_pan_joint', 'shoulder_lift_joint']", "three names"),
     ),
     "a girdle of a segment on itself": (
         GOOD + GIRDLE.replace('moves = "forearm_link"', 'moves = "upper_arm_link"'),
-        ("girdles.elbow", "moves = 'upper_arm_link'", "two different segments"),
+        ("girdles.elbow.moves = 'upper_arm_link'", "two different segments"),
     ),
     "a girdle with a joint that is none": (
         GOOD + GIRDLE.replace("shoulder_pan_joint", "shoulder_pan"),
@@ -110,19 +113,19 @@ TABLES: dict[str, tuple[str, tuple[str, ...]]] = {
     "a girdle with joints that turn": (GOOD + GIRDLE, ("girdles.elbow", "shoulder_pan_joint", "does not slide")),
     "a girdle whose sides are more than alike": (
         GOOD + GIRDLE + "alike = 1.5\n",
-        ("girdles.elbow", "alike = 1.5", "between -1 and 1"),
+        ("girdles.elbow.alike = 1.5", "from -0.999 to 0.999"),
     ),
     "a girdle whose law is less than certain": (
         GOOD + GIRDLE + "law_std = -0.5\n",
-        ("girdles.elbow", "law_std = -0.5", "from 0 on"),
+        ("girdles.elbow.law_std = -0.5", "from 0 on"),
     ),
     "a girdle with a spread below zero": (
         GOOD + GIRDLE + "rest_std_mm = [1.0, -2.0, 3.0]\n",
-        ("girdles.elbow.rest_std_mm", "-2", "at least 0 mm"),
+        ("girdles.elbow.rest_std_mm", "-2", "[mm] from 0 on"),
     ),
     "a girdle with two spreads": (
         GOOD + GIRDLE + "raised_std_mm = [1.0, 2.0]\n",
-        ("girdles.elbow.raised_std_mm", "[1.0, 2.0]", "3 numbers"),
+        ("girdles.elbow.raised_std_mm", "[1.0, 2.0]", "three numbers"),
     ),
     "soft tissue with an unknown key": (
         GOOD.replace(
@@ -173,17 +176,17 @@ points = ["tip"]
 """
 PROTOCOLS: dict[str, tuple[str, tuple[str, ...]]] = {
     "a point that is none": (PROTOCOL.replace('["tip"]', '["tipp"]'), ("'tipp'", "did you mean 'tip'")),
-    "an unknown kind": (PROTOCOL.replace("fixed_point", "fixed"), ("closure 1: kind", "'fixed'", "fixed_point")),
-    "two points of one": (PROTOCOL.replace('["tip"]', '["tip", "elbow"]'), ("closure 1: points", "elbow", "takes 1")),
-    "a key of another kind": (PROTOCOL + 'distance = "base"\n', ("closure 1", "'distance'", "fixed_point")),
-    "a place that is none": (PROTOCOL + "at = [1.0, 2.0]\n", ("closure 1: at", "[1.0, 2.0]", "three numbers")),
+    "an unknown kind": (PROTOCOL.replace("fixed_point", "fixed"), ("closure 1.kind", "'fixed'", "fixed_point")),
+    "two points of one": (PROTOCOL.replace('["tip"]', '["tip", "elbow"]'), ("closure 1.points", "elbow", "takes 1")),
+    "a key of another kind": (PROTOCOL + 'distance = "base"\n', ("closure 1.distance", "is not a known key", "points")),
+    "a place that is none": (PROTOCOL + "at = [1.0, 2.0]\n", ("closure 1.at", "[1.0, 2.0]", "three numbers")),
     "an origin that is none": (
         PROTOCOL.replace("fixed_point", "recorded") + 'origin = "bass"\n',
         ("'bass'", "did you mean 'base'"),
     ),
     "an origin that is the point": (
         PROTOCOL.replace("fixed_point", "recorded") + 'origin = "tip"\n',
-        ("closure 1: origin", "'tip'", "another one"),
+        ("closure 1.origin", "'tip'", "another one"),
     ),
     "recorded places without a truth": (
         PROTOCOL.replace("fixed_point", "recorded"),

@@ -74,6 +74,8 @@ def check_fields(value: Any, place: str, kind: type | None = None) -> None:
 
 def check_value(place: str, value: Any, hint: Any) -> None:
     """Check a value and its contents against an annotation; `place` begins the error's text."""
+    if get_origin(hint) is Annotated and not isinstance(get_args(hint)[1], Range):  # it says how a file has the value
+        hint = get_args(hint)[0]
     if type(value) is hint and hint in _PLAIN and value == value:  # the usual case, ten times as fast
         return
     if not _fits(value, hint):

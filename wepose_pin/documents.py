@@ -9,20 +9,24 @@ from __future__ import annotations
 import contextlib
 import errno
 import json
+import math
 import re
 import shutil
 import signal
 import tempfile
 import threading
 import tomllib
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from types import FrameType
-from typing import Any, TypeGuard
+from types import FrameType, UnionType
+from typing import Annotated, Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
 from .errors import BadSession, ExistingOutput, MissingFile, WeposeError, one_of
+
+R = TypeVar("R")
 
 # Reading -----------------------------------------------------------------------------------------------------------
 
@@ -105,6 +109,13 @@ class TomlTable:
             raise self.error(f"{self.at(key)} = {value!r} is not a table; write [{self.place}{key}]")
         return replace(self, values=value, place=f"{self.place}{key}.")
 
+    def entries(self, key: str) -> list[TomlTable]:
+        """Return the tables of a list ``[[key]]``; none where the key is missing."""
+        value = self.values.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(each, Mapping) for each in value):
+            raise self.error(f"{self.at(key)} = {value!r} is no list of tables; write [[{self.place}{key}]]")
+        return [replace(self, values=each, place=f"{self.place}{key} {k + 1}.") for k, each in enumerate(value)]
+
     def tables(self, names: Collection[str], kind: str) -> dict[str, TomlTable]:
         """Return name → table of all its tables; a name that is not in `names` is not a `kind`."""
         for name in self.values:
@@ -118,6 +129,14 @@ class TomlTable:
         if value is not None and (not isinstance(value, str) or not value):
             raise self.error(f"{self.at(key)} = {value!r} is not a text; write it in quotes")
         return value
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """Return a list of texts, or the one that stands in its place; empty where the key is missing."""
+        value = self.values.get(key) or ()
+        value = (value,) if isinstance(value, str) else value
+        if not isinstance(value, list | tuple) or not all(isinstance(each, str) for each in value):
+            raise self.error(f"{self.at(key)} = {value!r}; a name is wanted, or a list of names")
+        return tuple(value)
 
     def choice(self, key: str, choices: Iterable[str], default: str | None = None) -> str:
         """Return one of the choices."""
@@ -205,6 +224,140 @@ def toml_strings(texts: Iterable[str]) -> str:
 def toml_key(name: str) -> str:
     """Format a key for TOML: names of links and joints in a URDF may have any characters."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_string(name)
+
+
+# Records -----------------------------------------------------------------------------------------------------------
+
+_COUNTS = ("", "a number", "two numbers", "three numbers")
+# Unit in a file → to SI, and back.
+_UNITS: dict[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
+    "deg": (math.radians, math.degrees),
+    "mm": (lambda value: 1e-3 * value, lambda value: 1e3 * value),
+}
+
+
+@dataclass(frozen=True)
+class Key:
+    """How a field of a NamedTuple is written in a TOML table, as in ``softness: Annotated[float, Key(unit="deg")]``.
+
+    A field without it has a key of its own name. Fields are texts, numbers, flags, tuples of texts or of up to three
+    numbers, and other such NamedTuples.
+
+    Parameters
+    ----------
+    name : of the key; empty: that of the field and the unit, ``softness_deg``
+    unit : of the file's numbers; of deg and mm, the field is in rad and m
+    least, most : limits of each number, in the file's unit
+    of : what texts name; `read_record` is given the names that there are
+    words : text in the file → value of the field
+    omit_zero : zeros are not written
+    """
+
+    name: str = ""
+    unit: str = ""
+    least: float = -1e6
+    most: float = 1e6
+    of: str = ""
+    words: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    omit_zero: bool = False
+
+
+@cache
+def _find_keys(kind: Callable[..., Any]) -> dict[str, tuple[Any, Key]]:
+    """Return field → its type, without None, and its key."""
+    keys = {}
+    for name, hint in get_type_hints(kind, include_extras=True).items():
+        value_type, key = get_args(hint) if get_origin(hint) is Annotated else (hint, Key())
+        value_type = get_args(value_type)[0] if isinstance(value_type, UnionType) else value_type
+        keys[name] = value_type, replace(key, name=key.name or "_".join(filter(None, (name, key.unit))))
+    return keys
+
+
+def read_record(
+    kind: Callable[..., R],
+    table: TomlTable,
+    known: Mapping[str, Collection[str]] | None = None,
+    base: Any = None,
+    others: Collection[str] = (),
+) -> R:
+    """Read a NamedTuple from a table; its errors are those of the table.
+
+    Parameters
+    ----------
+    known : what texts name → the names that there are
+    base : of the same kind, with the values of keys that the table lacks; None: the defaults
+    others : further keys that the table may have
+    """
+    record: Any = kind if base is None else base
+    values = dict(record._field_defaults if base is None else record._asdict())
+    keys = _find_keys(kind)
+    table.allow(*(key.name for _, key in keys.values()), *others)
+    for name, (value_type, key) in keys.items():
+        if table.values.get(key.name) is not None:
+            values[name] = _read_value(value_type, table, key, known or {}, values.get(name))
+        elif name not in values:
+            raise table.error(f"{table.at(key.name)} is missing; {_describe(value_type, key, known or {})} needed")
+    return kind(**values)
+
+
+def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]]) -> str:
+    """Describe what is right, with its verb, as "two numbers [mm] from 0 to 90 are"."""
+    parts = get_args(value_type) or (value_type,)
+    if parts[0] is not float:
+        choices = f" ({one_of(known.get(key.of, key.words))})" if key.of or key.words else ""
+        one = "a table" if hasattr(value_type, "_fields") else "a list of names" if ... in parts else "a text"
+        return "three names are" if len(parts) == 3 else f"{one}{choices} is"
+    unit = f" [{key.unit}]" if key.unit else ""
+    limits = f" from {key.least:g}{f' to {key.most:g}' if key.most < 1e6 else ' on'}" if key.least > -1e6 else ""
+    return f"{_COUNTS[len(parts)]}{unit}{limits} {'are' if len(parts) > 1 else 'is'}"
+
+
+def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str, Collection[str]], base: Any) -> Any:
+    if hasattr(value_type, "_fields"):
+        return read_record(value_type, table.table(key.name), known, base)
+    if key.words:
+        return key.words[table.choice(key.name, key.words)]
+    if value_type is bool:
+        return table.flag(key.name)
+    if value_type is str:
+        return table.choice(key.name, known[key.of]) if key.of else table.text(key.name, None)
+    value, parts = table.values[key.name], get_args(value_type)
+    if str in parts:
+        texts = table.texts(key.name)
+        for text in texts if key.of else ():
+            if text not in known[key.of]:
+                raise table.error(f"{table.at(key.name)}: '{text}' is not known; {one_of(known[key.of], text)}")
+        if ... in parts or len(texts) == len(parts):
+            return texts
+    else:
+        numbers = value if parts else [value]
+        is_right = isinstance(numbers, list | tuple) and len(numbers) == max(len(parts), 1)
+        if is_right and all(is_number(number) and key.least <= number <= key.most for number in numbers):
+            to_si = _UNITS[key.unit][0] if key.unit in _UNITS else float
+            return tuple(map(to_si, numbers)) if parts else to_si(value)
+    raise table.error(f"{table.at(key.name)} = {_format_value(value)}; {_describe(value_type, key, known)} needed")
+
+
+def format_record(record: Any) -> list[str]:
+    """Return the lines of a NamedTuple in a TOML file; None, false and what is empty are left out."""
+    lines = []
+    for name, (_, key) in _find_keys(record.__class__).items():
+        value = getattr(record, name)
+        if not (value is None or value is False or value in ("", ()) or (key.omit_zero and not any(value))):
+            lines.append(f"{key.name} = {_format_field(key, value)}")
+    return lines
+
+
+def _format_field(key: Key, value: Any) -> str:
+    if key.words:
+        return toml_string(next(word for word, meaning in key.words.items() if meaning == value))
+    if hasattr(value, "_fields"):
+        return f"{{ {', '.join(format_record(value))} }}"
+    if isinstance(value, tuple):
+        return f"[{', '.join(_format_field(key, each) for each in value)}]"
+    if isinstance(value, float) and key.unit in _UNITS:
+        value = round(_UNITS[key.unit][1](value), 6)
+    return toml_string(value) if isinstance(value, str) else _format_value(value)
 
 
 # Atomic output -------------------------------------------------------------------------------------------------------

@@ -215,7 +215,7 @@ class CalibrationProblem:
     def loosen_phase(self, phase: str) -> CalibrationProblem:
         """Return the same problem with poses of this phase that tell next to nothing."""
         conditions = tuple(
-            replace(condition, std=LOOSE * condition.std)
+            condition._replace(std=LOOSE * condition.std)
             if isinstance(condition, Direction | Axis) and condition.phase == phase
             else condition
             for condition in self.protocol.conditions

@@ -22,13 +22,13 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from ..alignment import PALM_SLIP_STD
 from ..assets import asset
-from ..documents import is_number, read_toml
+from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, one_of
 from ..model import BodyTable, list_breadths
 
@@ -50,17 +50,13 @@ REMOVED = {
 DEFAULT = "clasp"
 GUIDED, BOW = "clasp+t_pose", "bow"  # the best of docs/validation.md in a minute; for whom hands alone are not enough
 ALSO = ("t_pose", BOW)  # what makes it better within the same minute, by phases of their names
-# How many points each kind takes, and the keys that are its own.
+# How many points each kind takes, and the kinds of the keys that not all of them have.
 KINDS = {"coincide": (2,), "fixed_point": (1,), "plane": (1, 2, 3), "recorded": (1,)}
-_KEYS = ("phase", "kind", "points", "slip", "in_front_of")
-_OWN_KEYS: dict[str, tuple[str, ...]] = {
-    "fixed_point": ("at", "at_std", "origin"),
-    "recorded": ("origin",),
-}
+_KINDS_OF_KEYS = {"at": ("fixed_point",), "at_std": ("fixed_point",), "origin": ("fixed_point", "recorded")}
+PoseStd = Annotated[float, Key("std_deg", "deg", 0.1, 45.0)]
 
 
-@dataclass(frozen=True)
-class Closure:
+class Closure(NamedTuple):
     """Points that stay together, at a point of W, on a level plane, or where they were recorded.
 
     Parameters
@@ -75,11 +71,11 @@ class Closure:
     """
 
     phase: str
-    kind: str
+    kind: Annotated[str, Key(of="kinds")]
     points: tuple[str, ...]
-    slip: float = PALM_SLIP_STD
-    at: tuple[float, float, float] | None = None
-    at_std: float = 0.005
+    slip: Annotated[float, Key("slip", "m", 1e-4, 0.1)] = PALM_SLIP_STD
+    at: Annotated[tuple[float, float, float] | None, Key("at", "m", -100.0, 100.0)] = None
+    at_std: Annotated[float, Key("at_std", "m", 1e-5, 1.0)] = 0.005
     origin: str = ""
     in_front_of: str = ""
 
@@ -98,8 +94,7 @@ class Closure:
         return tuple(((point, 1.0),) for point in self.points)
 
 
-@dataclass(frozen=True)
-class Direction:
+class Direction(NamedTuple):
     """A segment's long axis points along `direction` (3,) of the body's first segment, to within `std` [rad]."""
 
     phase: str
@@ -108,17 +103,15 @@ class Direction:
     std: float
 
 
-@dataclass(frozen=True)
-class Axis:
+class Axis(NamedTuple):
     """The segment bends forwards about a level axis that is within `std` [rad] of its own y."""
 
     phase: str
     segment: str
-    std: float
+    std: PoseStd
 
 
-@dataclass(frozen=True)
-class FreeMotion:
+class FreeMotion(NamedTuple):
     """Limbs move freely.
 
     Parameters
@@ -129,15 +122,21 @@ class FreeMotion:
     phase: str
 
 
+class _Pose(NamedTuple):
+    """What the directions of a pose share."""
+
+    phase: str
+    std: PoseStd
+
+
 Condition = Closure | Direction | Axis | FreeMotion
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """What the person does, for how long [s]."""
 
     phase: str
-    seconds: float
+    seconds: Annotated[float, Key("seconds", "s", 0.0, 3600.0)]
     do: str
 
 
@@ -225,7 +224,45 @@ def _load_packaged(name: str) -> Protocol:
 
 
 def _read_protocol(path: Path) -> Protocol:
-    return _protocol(read_toml(path, "a protocol", BadOption), path)
+    top = TomlTable(read_toml(path, "a protocol", BadOption), str(path), error=BadOption)
+    top.allow("name", "title", "needs", "measured_example", "step", "closure", "pose", "axis", "motion")
+    conditions: list[Condition] = [_read_closure(entry) for entry in top.entries("closure")]
+    for entry in top.entries("pose"):
+        pose, directions = read_record(_Pose, entry, others=("directions",)), entry.table("directions")
+        for segment, value in directions.values.items():
+            numbers = isinstance(value, list) and len(value) == 3 and all(is_number(v, 1e6) for v in value)
+            length = float(np.linalg.norm(value)) if numbers else 0.0
+            if not length > 1e-6:
+                raise BadOption(f"{directions.at(segment)} = {value}; three numbers are needed: x, y, z")
+            x, y, z = (float(v) / length for v in value)
+            conditions.append(Direction(pose.phase, segment, (x, y, z), pose.std))
+    conditions += [read_record(Axis, entry) for entry in top.entries("axis")]
+    conditions += [read_record(FreeMotion, entry, base=FreeMotion("")) for entry in top.entries("motion")]
+    if not conditions:
+        raise BadOption(f"{path}: no [[closure]], [[pose]], [[axis]] or [[motion]]; a protocol needs one at least")
+    name = top.text("name", path.stem) or ""
+    return Protocol(
+        name,
+        top.text("title", name) or "",
+        top.texts("needs"),
+        tuple(read_record(Step, entry) for entry in top.entries("step")),
+        tuple(conditions),
+        top.text("measured_example", None) or "",
+    )
+
+
+def _read_closure(entry: TomlTable) -> Closure:
+    closure = read_record(Closure, entry, {"kinds": KINDS})
+    kind, points = closure.kind, closure.points
+    if len(points) not in KINDS[kind] or len(set(points)) < len(points):
+        counts = " or ".join(map(str, KINDS[kind]))
+        raise BadOption(f"{entry.at('points')} = {list(points)}; kind '{kind}' takes {counts} different ones")
+    for key, kinds in _KINDS_OF_KEYS.items():
+        if key in entry and kind not in kinds:
+            raise BadOption(f"{entry.at(key)} is no key of kind '{kind}'; it is of {' and '.join(kinds)}")
+    if closure.origin in points:
+        raise BadOption(f"{entry.at('origin')} = {closure.origin!r} is the point itself; another one is needed")
+    return closure
 
 
 def split_protocol(name: str | Path) -> list[str]:
@@ -244,105 +281,3 @@ def _join_protocols(name: str, protocols: list[Protocol]) -> Protocol:
         tuple(condition for protocol in protocols for condition in protocol.conditions),
         next((protocol.measured_example for protocol in protocols if protocol.measured_example), ""),
     )
-
-
-def _protocol(table: dict[str, Any], path: Path) -> Protocol:
-    lists = ("step", "closure", "pose", "axis", "motion")
-    known = ("name", "title", "needs", "measured_example", *lists)
-    for key, value in table.items():
-        if key not in known:
-            raise BadOption(f"{path}: '{key}' is no key of a protocol; {one_of(known, key)}")
-        tables = isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
-        if key in lists and not tables:
-            raise BadOption(f"{path}: {key} = {value!r} is no list of tables; write [[{key}]]")
-    conditions: list[Condition] = []
-    for i, entry in enumerate(table.get("closure", [])):
-        conditions.append(_closure(entry, f"{path}: closure {i + 1}"))
-    for i, entry in enumerate(table.get("pose", [])):
-        place = f"{path}: pose {i + 1}"
-        std = np.deg2rad(_number(entry, "std_deg", place, 0.1, 45.0))
-        directions = _get(entry, "directions", place)
-        if not isinstance(directions, dict):
-            raise BadOption(f"{place}: directions = {directions!r}; of each segment x, y, z, as in directions.torso")
-        for segment, value in directions.items():
-            numbers = isinstance(value, list) and len(value) == 3 and all(is_number(v, 1e6) for v in value)
-            length = float(np.linalg.norm(value)) if numbers else 0.0
-            if not length > 1e-6:
-                raise BadOption(f"{place}: directions.{segment} = {value}; three numbers are needed: x, y, z")
-            x, y, z = (float(v) / length for v in value)
-            conditions.append(Direction(str(_get(entry, "phase", place)), segment, (x, y, z), std))
-    for i, entry in enumerate(table.get("axis", [])):
-        place = f"{path}: axis {i + 1}"
-        segment = str(_get(entry, "segment", place))
-        std = np.deg2rad(_number(entry, "std_deg", place, 0.1, 45.0))
-        conditions.append(Axis(str(_get(entry, "phase", place)), segment, std))
-    for i, entry in enumerate(table.get("motion", [])):
-        place = f"{path}: motion {i + 1}"
-        for key in entry:
-            if key != "phase":
-                raise BadOption(f"{place}: '{key}' is no key of a motion; {one_of(('phase',), key)}")
-        conditions.append(FreeMotion(str(entry.get("phase", ""))))
-    if not conditions:
-        raise BadOption(f"{path}: no [[closure]], [[pose]], [[axis]] or [[motion]]; a protocol needs one at least")
-    needs = tuple(str(segment) for segment in _list({"needs": [], **table}, "needs", str(path)))
-    steps = []
-    for i, entry in enumerate(table.get("step", [])):
-        place = f"{path}: step {i + 1}"
-        seconds = _number(entry, "seconds", place, 0.0, 3600.0)
-        steps.append(Step(str(_get(entry, "phase", place)), seconds, str(_get(entry, "do", place))))
-    name = str(table.get("name", path.stem))
-    measured_example = str(table.get("measured_example", ""))
-    title = str(table.get("title", name))
-    return Protocol(name, title, needs, tuple(steps), tuple(conditions), measured_example)
-
-
-def _closure(entry: dict[str, Any], place: str) -> Closure:
-    kind = _among(_get(entry, "kind", place), KINDS, f"{place}: kind")
-    points = tuple(str(point) for point in _list(entry, "points", place))
-    if len(points) not in KINDS[kind] or len(set(points)) < len(points):
-        counts = " or ".join(map(str, KINDS[kind]))
-        raise BadOption(f"{place}: points = {list(points)}; kind '{kind}' takes {counts} different ones")
-    known = (*_KEYS, *_OWN_KEYS.get(kind, ()))
-    for key in entry:
-        if key not in known:
-            raise BadOption(f"{place}: '{key}' is no key of kind '{kind}'; {one_of(known, key)}")
-    more: dict[str, Any] = {"in_front_of": str(entry.get("in_front_of", ""))}
-    if kind in ("recorded", "fixed_point"):
-        more["origin"] = str(entry.get("origin", ""))
-        if more["origin"] in points:
-            raise BadOption(f"{place}: origin = {more['origin']!r} is the point itself; another one is needed")
-    if kind == "fixed_point" and "at" in entry:
-        at = entry["at"]
-        if not isinstance(at, list) or len(at) != 3 or not all(is_number(v, 100.0) for v in at):
-            raise BadOption(f"{place}: at = {at!r}; three numbers [m] are needed")
-        more["at"] = (float(at[0]), float(at[1]), float(at[2]))
-        more["at_std"] = _number({"at_std": Closure.at_std, **entry}, "at_std", place, 1e-5, 1.0)
-    if "slip" in entry:
-        more["slip"] = _number(entry, "slip", place, 1e-4, 0.1)
-    return Closure(str(_get(entry, "phase", place)), kind, points, **more)
-
-
-def _get(table: dict[str, Any], key: str, place: str) -> Any:
-    if key not in table:
-        raise BadOption(f"{place}: no '{key}'; it has: {', '.join(table)}")
-    return table[key]
-
-
-def _list(table: dict[str, Any], key: str, place: str) -> list[Any]:
-    value = _get(table, key, place)
-    if not isinstance(value, list):
-        raise BadOption(f'{place}: {key} = {value!r}; a list of names is needed, as in {key} = ["name"]')
-    return value
-
-
-def _number(table: dict[str, Any], key: str, place: str, least: float, most: float) -> float:
-    value = _get(table, key, place)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not least <= value <= most:
-        raise BadOption(f"{place}: {key} = {value!r}; a number between {least:g} and {most:g} is needed")
-    return float(value)
-
-
-def _among(name: Any, choices: Any, place: str) -> str:
-    if not isinstance(name, str) or name not in choices:
-        raise BadOption(f"{place}: {name!r} is not known; {one_of(choices, str(name))}")
-    return name

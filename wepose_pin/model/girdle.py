@@ -15,9 +15,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
+
+from ..documents import Key
+from ..recording.sensors import AXES
 
 if TYPE_CHECKING:
     from .body import BodyModel
@@ -30,6 +33,13 @@ MEAN_RAISED = 0.55
 _LEAST_SINE = 1e-9  # squared; keeps the slope finite at rest, where the law is below a micrometre
 # The functions of `displace` for numbers, some ten times as fast as NumPy's.
 SCALARS = SimpleNamespace(sqrt=math.sqrt, arctan2=math.atan2, fmin=min, exp=math.exp)
+
+Direction = Annotated[
+    tuple[float, float, float], Key(words={name: tuple(map(float, axis)) for name, axis in AXES.items()})
+]
+SegmentName = Annotated[str, Key(of="segments")]
+_Pair = Annotated[tuple[float, float], Key(unit="mm", least=-1e3)]
+_Std = Annotated[tuple[float, float, float], Key(unit="mm", least=0.0)]
 
 
 class Girdle(NamedTuple):
@@ -51,21 +61,21 @@ class Girdle(NamedTuple):
     residual_std : (3,) [m] by which the point leaves law and parameters
     """
 
-    on: str
-    moves: str
+    on: SegmentName
+    moves: SegmentName
     joints: tuple[str, str, str]
-    outward: tuple[float, float, float]
-    up: tuple[float, float]
-    middle: tuple[float, float]
-    back: tuple[float, float]
-    back_angle: float
-    scaled_by: str = ""
-    scale: float = 1.0
-    law_std: float = 0.0
-    rest_std: tuple[float, ...] = (0.0, 0.0, 0.0)
-    raised_std: tuple[float, ...] = (0.0, 0.0, 0.0)
-    alike: float = 0.0
-    residual_std: tuple[float, ...] = (0.0, 0.0, 0.0)
+    outward: Direction
+    up: _Pair
+    middle: _Pair
+    back: _Pair
+    back_angle: Annotated[float, Key(unit="deg", least=0.01)]
+    scaled_by: Annotated[str, Key(of="lengths")] = ""
+    scale: Annotated[float, Key("scale", "m", least=1e-3)] = 1.0
+    law_std: Annotated[float, Key(least=0.0)] = 0.0
+    rest_std: _Std = (0.0, 0.0, 0.0)
+    raised_std: _Std = (0.0, 0.0, 0.0)
+    alike: Annotated[float, Key(least=-0.999, most=0.999)] = 0.0
+    residual_std: _Std = (0.0, 0.0, 0.0)
 
     @property
     def parameter_std(self) -> np.ndarray:

@@ -11,12 +11,13 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
+from ..documents import Key
 from ..errors import one_of
-from .girdle import Girdle
+from .girdle import Direction, Girdle, SegmentName
 
 DEFAULT_BODY = "upper_body"
 ROOT = "root"  # the origin of W, as the end of a length
@@ -24,6 +25,11 @@ PERSON, MECHANISM = "person", "mechanism"
 NEUTRAL_POSE = "n_pose"
 # Regular expressions of the side in a sensor's name, in English and German.
 _SIDES = {"left": "left|lt?|link(s|e[rsmn]?)", "right": "right|rt?|recht(s|e[rsmn]?)"}
+
+Vector = tuple[float, float, float]
+ZERO: Vector = (0.0, 0.0, 0.0)
+Angle = Annotated[float, Key(unit="deg", least=0.0, most=180.0)]
+Angles = Annotated[Vector, Key(unit="deg", least=0.0)]
 
 
 class SoftTissue(NamedTuple):
@@ -41,12 +47,12 @@ class SoftTissue(NamedTuple):
     per_raised : (3,) [rad/rad] per mean angle of their long axes off hanging
     """
 
-    std: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    std: Angles = ZERO
     relative_to: str = ""
-    per_tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    per_tilt: Annotated[Vector, Key(least=0.0)] = ZERO
     per_twist: float = 0.0
     raised: tuple[str, ...] = ()
-    per_raised: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    per_raised: Annotated[Vector, Key(least=0.0, omit_zero=True)] = ZERO
 
 
 def _same(degrees: float) -> tuple[float, float, float]:
@@ -79,16 +85,16 @@ class Segment(NamedTuple):
     link: str
     up: str | None = None
     forward: str | None = None
-    along: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    along: Direction = (0.0, 0.0, -1.0)
     spine: bool = False
-    rigid_without_sensor: bool = False
+    rigid_without_sensor: Annotated[bool, Key("without_sensor", words={"rigid": True, "unknown": False})] = False
     labels: str = ""
     joint: str = ""
-    soft_tissue_std: tuple[float, float, float] = _same(0.6)
+    soft_tissue_std: Annotated[Vector, Key("soft_tissue_deg", "deg", least=0.0)] = _same(0.6)
     soft_tissue: SoftTissue = SoftTissue(_same(1.5))
-    start_mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    start_std: tuple[float, float, float] = _same(4.0)
-    repeat_std: tuple[float, float, float] = _same(2.0)
+    start_mean: Annotated[Vector, Key(unit="deg")] = ZERO
+    start_std: Angles = _same(4.0)
+    repeat_std: Angles = _same(2.0)
 
     @classmethod
     def of_mechanism(cls, link: str) -> Segment:
@@ -108,15 +114,16 @@ class Point(NamedTuple):
     """The link on which a point lies, and where [m] in the link."""
 
     link: str
-    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    at: Annotated[Vector, Key("at", "m", -10.0, 10.0, omit_zero=True)] = ZERO
 
 
 class Stretch(NamedTuple):
     """A part of a length, which scales a segment along the line between two places."""
 
-    segment: str
-    start: tuple[str, ...]  # a point, or two in whose middle the line begins, with all joints at zero
-    end: tuple[str, ...]  # the same of its end
+    segment: SegmentName
+    # A point, or two in whose middle the line begins or ends, with all joints at zero.
+    start: Annotated[tuple[str, ...], Key("from", of="points")]
+    end: Annotated[tuple[str, ...], Key("to", of="points")]
 
 
 class Length(NamedTuple):
@@ -149,14 +156,14 @@ class HingeJoint(NamedTuple):
     tilt_std : of the axis's rotation about the direction across both, the long axis and itself
     """
 
-    on: str
-    moves: str
-    axis: tuple[float, float, float]
-    range: tuple[float, float] = (-np.pi, np.pi)
-    softness: float = float(np.deg2rad(2.0))
-    common_std: float = float(np.deg2rad(5.0))
-    mirror_std: float = float(np.deg2rad(20.0))
-    tilt_std: float = float(np.deg2rad(5.0))
+    on: SegmentName
+    moves: SegmentName
+    axis: Vector
+    range: Annotated[tuple[float, float], Key(unit="deg")] = (-np.pi, np.pi)
+    softness: Angle = float(np.deg2rad(2.0))
+    common_std: Angle = float(np.deg2rad(5.0))
+    mirror_std: Angle = float(np.deg2rad(20.0))
+    tilt_std: Angle = float(np.deg2rad(5.0))
 
 
 class Limb(NamedTuple):

@@ -148,8 +148,8 @@ def load_format(path: Path) -> TableFormat:
         *("sensors_line", "sensor_begins", "axes_line", "units_line", "units_before", "label_line"),
         *("label_in_name", "sync_line"),
     )
-    signals = {signal: tuple(_read_signal(table, signal) for table in _tables(keys, signal)) for signal in AXES}
-    clocks = tuple(_read_clock(table) for table in _tables(keys, "clock"))
+    signals = {signal: tuple(_read_signal(table, signal) for table in keys.entries(signal)) for signal in AXES}
+    clocks = tuple(_read_clock(table) for table in keys.entries("clock"))
     lacking = next((signal for signal in NEEDED["raw"] if not signals[signal]), None)
     if lacking and (any(signals[signal] for signal in NEEDED["raw"]) or not signals["orientation"]):
         raise BadSession(f"{keys.at(lacking)} is missing; [[gyro]] and [[accel]], or [[orientation]] alone are needed")
@@ -161,8 +161,8 @@ def load_format(path: Path) -> TableFormat:
         name=path.stem,
         title=keys.text("title", path.stem) or path.stem,
         needs=keys.text("needs", " and ".join(signal for signal in AXES if signals[signal])) or "",
-        detect=tuple(_compile(keys.at("detect"), text, flags=re.S | re.M) for text in _texts(keys, "detect")),
-        suffixes=tuple(_texts(keys, "suffixes")),
+        detect=tuple(_compile(keys.at("detect"), text, flags=re.S | re.M) for text in keys.texts("detect")),
+        suffixes=keys.texts("suffixes"),
         whole=keys.flag("whole"),
         files={kind: files.text(kind, None) or "" for kind in files.values},
         clocks=clocks,
@@ -183,20 +183,6 @@ def load_format(path: Path) -> TableFormat:
 def load_formats() -> Mapping[str, TableFormat]:
     """Load the descriptions in the package: name → description."""
     return {path.stem: load_format(path) for path in sorted(FOLDER.glob("*.toml"))}
-
-
-def _tables(keys: TomlTable, key: str) -> list[TomlTable]:
-    value = keys.values.get(key, [])
-    if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
-        raise BadSession(f"{keys.at(key)} is no list of tables; write [[{key}]]")
-    return [replace(keys, values=each, place=f"{key}[{k}].") for k, each in enumerate(value)]
-
-
-def _texts(keys: TomlTable, key: str) -> list[str]:
-    value = keys.values.get(key, [])
-    if not isinstance(value, list) or not all(isinstance(each, str) and each for each in value):
-        raise BadSession(f"{keys.at(key)} = {value!r} is no list of texts")
-    return value
 
 
 def _read_line(keys: TomlTable, key: str) -> int:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from ..assets import asset
-from ..documents import TomlTable, is_number, read_toml
+from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadModel, MissingFile, one_of
 from ..model import read_urdf
 from ..model.meshes import find_example_data
@@ -62,7 +62,14 @@ class LinkPoint(NamedTuple):
     """A point of the robot, at `offset` [m] in the frame of a link."""
 
     link: str
-    offset: tuple[float, ...] = (0.0, 0.0, 0.0)
+    offset: Annotated[tuple[float, float, float], Key("offset", "m")] = (0.0, 0.0, 0.0)
+
+
+class _Origin(NamedTuple):
+    """Where the shape of a link is on it."""
+
+    xyz: Annotated[tuple[float, float, float], Key("xyz", "m")] = (0.0, 0.0, 0.0)
+    rpy: Annotated[tuple[float, float, float], Key("rpy", "rad")] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -239,41 +246,18 @@ def _read_arm(table: TomlTable) -> ArmMap:
     fingers, thumb = _read_axes(table.table("hand"), "fingers", "thumb")
     return ArmMap(
         joints=tuple(joints),
-        shoulder=_read_point(table.table("shoulder")),
-        elbow=_read_point(table.table("elbow")) if "elbow" in table else None,
-        hand=_read_point(table.table("hand"), "fingers", "thumb"),
+        shoulder=read_record(LinkPoint, table.table("shoulder")),
+        elbow=read_record(LinkPoint, table.table("elbow")) if "elbow" in table else None,
+        hand=read_record(LinkPoint, table.table("hand"), others=("fingers", "thumb")),
         fingers=fingers,
         thumb=thumb,
         reach=table.number("reach", None, positive=True),
     )
 
 
-def _read_point(table: TomlTable, *axes: str) -> LinkPoint:
-    """A point of an arm, in a table that may also hold `axes`."""
-    table.allow("link", "offset", *axes)
-    link = table.text("link", None)
-    if link is None:
-        raise BadModel(f"{table.at('link')} is missing; the name of a link is needed")
-    return LinkPoint(link, _read_triple(table, "offset", "metres"))
-
-
 def _read_origin(table: TomlTable) -> tuple[float, ...]:
-    """x, y, z [m], roll, pitch, yaw [rad]."""
-    table.allow("xyz", "rpy")
-    return (*_read_triple(table, "xyz", "metres"), *_read_triple(table, "rpy", "radians"))
-
-
-def _read_triple(table: TomlTable, key: str, unit: str) -> tuple[float, ...]:
-    """Three numbers; zeros where the key is missing."""
-    value = table.values.get(key, [0.0, 0.0, 0.0])
-    if not _is_list(value, 3):
-        raise BadModel(f"{table.at(key)} = {value!r}; three numbers in {unit} are needed")
-    return tuple(map(float, value))
-
-
-def _is_list(value: object, size: int) -> bool:
-    """Whether a value is a list of so many numbers."""
-    return isinstance(value, list) and len(value) == size and all(is_number(number, MAX_VALUE) for number in value)
+    xyz, rpy = read_record(_Origin, table)
+    return (*xyz, *rpy)
 
 
 def _read_axes(table: TomlTable, first: str, second: str) -> tuple[str, str]:
@@ -299,7 +283,8 @@ def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[s
 def _read_ranges(table: TomlTable) -> dict[str, tuple[float, ...]]:
     """Joint → lower and upper limit."""
     for name, value in table.values.items():
-        if not _is_list(value, 2) or not value[0] < value[1]:
+        is_pair = isinstance(value, list) and len(value) == 2 and all(is_number(each, MAX_VALUE) for each in value)
+        if not is_pair or not value[0] < value[1]:
             raise BadModel(f"{table.at(name)} = {value!r}; [lower, upper] in rad or m is needed, the first smaller")
     return {name: tuple(map(float, value)) for name, value in table.values.items()}
 
