@@ -57,7 +57,7 @@ def make_options(
 ) -> GuideOptions:
     """A guide whose clasp is short, and which estimates nothing on the way."""
     protocol, model = load_protocol(protocol_name), load_model()
-    steps = tuple(replace(step, seconds=CLASP_S) if step.phase == "clasp" else step for step in protocol.steps)
+    steps = tuple(step._replace(seconds=CLASP_S) if step.phase == "clasp" else step for step in protocol.steps)
 
     def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
         return Calibrated(calibrate(load_session(path), measured={**MEASURED, **measured}), folder)
