@@ -137,7 +137,10 @@ def _list_lengths(calibration: Calibration) -> list[Item]:
             for person in (subject, problem.prior)
         )
         measured = f"{1e3 * problem.measured[name][0]:.0f} mm" if name in problem.measured else ""
-        cells.append([plain(name), f"**{estimated}**", before, measured])
+        of_scale = calibration.scale_std * subject.lengths[name]
+        proportion = 1e3 * np.sqrt(max(subject.std(name) ** 2 - of_scale**2, 0.0))
+        in_chain = name in problem.lengths_in_closures and np.isfinite(proportion)
+        cells.append([plain(name), f"**{estimated}**", f"± {proportion:.0f} mm" if in_chain else "", before, measured])
     text = "± is one standard deviation throughout: two times out of three the truth lies within."
     if problem.lengths_in_closures and np.isfinite(calibration.scale_std):
         measured = listed([plain(name) for name in problem.scale_lengths])
@@ -152,7 +155,7 @@ def _list_lengths(calibration: Calibration) -> list[Item]:
     return [
         draw_lengths(calibration),
         text,
-        Table(["length", "estimated", "prior, before the motion", "measured"], cells),
+        Table(["length", "estimated", "its proportion alone", "prior, before the motion", "measured"], cells),
     ]
 
 
