@@ -21,12 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import wepose_pin as wp
-from wepose_pin import rotations
 from wepose_pin.errors import how_to_install
 from wepose_pin.filters import METHODS, OFFLINE, FilterSettings, run_filter
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.sensors import SensorFilters
-from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import simulate, simulate_paper_dynamic, simulate_person
 
@@ -121,17 +119,18 @@ def _batch_peers(data: Sample) -> dict[str, Callable[[], Any]]:
 def _live_filters(data: Sample) -> dict[str, Callable[[], Any]]:
     """Loops over the samples, ours with its static detector; a Python call each, arrays made beforehand."""
     rows = list(zip(data.gyro_S, data.accel_S, strict=True))
-    start = rotations.quat_from_gravity(data.accel_S[: StaticTest().samples(data.rate_hz)].mean(axis=0))
+    start = repeated_trial(STATIC_S[1])
 
-    def ours(make: Any) -> Callable[[], Any]:
+    def ours(method: str) -> Callable[[], Any]:
+        filters = _start_filters(start, 1, method)
+
         def loop() -> None:
-            filter_, detector = make(data.noise, data.rate_hz, start), StaticDetector(data.noise, data.rate_hz)
             for gyro, accel in rows:
-                filter_.update(gyro, accel, detector.update(gyro, accel))
+                filters.step(gyro[None], accel[None])
 
         return loop
 
-    cases = {name: ours(make) for name, make in METHODS.items() if name not in OFFLINE}
+    cases = {name: ours(name) for name in METHODS if name not in OFFLINE}
     return cases | _live_peers(data, rows)
 
 
@@ -226,9 +225,8 @@ def live(effort: Effort) -> Table:
     """Sample by sample, one sensor: a Python call a sample for the filter and one for its detector."""
     data = repeated_trial(effort.live_seconds)
     table = Table(
-        "Live: one sensor, a call a sample for the filter and one for its detector",
+        "Live: one sensor, a call of SensorFilters.step a sample, detector and filter",
         (Column("ns", "a sample [ns]", 0), Column("ratio", "ratio to VQF", 2, True)),
-        notes=["SensorFilters, below, make one call for all sensors."],
     )
     for name, timing in time_in_turn(_live_filters(data), effort.rounds, "VQF").items():
         table.rows[name] = {"ns": 1e9 * timing.median / len(data.gyro_S), "ratio": timing.ratio}
@@ -268,14 +266,14 @@ def bank(effort: Effort) -> Table:
     return _noted(table)
 
 
-def _start_filters(data: Sample, count: int) -> SensorFilters:
+def _start_filters(data: Sample, count: int, method: str = "smekf") -> SensorFilters:
     """Return the filters of as many sensors after the static phase."""
     n = round(STATIC_S[1] * data.rate_hz)
     sensor = ImuSensor(data.gyro_S[:n], data.accel_S[:n])
     sensors = {f"sensor_{i}": sensor for i in range(count)}
     time = np.arange(n) / data.rate_hz
     start = Recording("trial", time, data.rate_hz, sensors, {"start": (STATIC_S,)})
-    filters = SensorFilters(start, method="smekf")
+    filters = SensorFilters(start, method=method)
     filters.push(start)
     return filters
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfiltfilt
 
-from wepose_pin.filters.butterworth import _design_band_pass, _design_low_pass, band_pass, low_pass
+from wepose_pin.filters.butterworth import band_pass, low_pass
 
 SIGNAL = np.random.default_rng(0).normal(size=(4000, 2, 3)).cumsum(axis=0)
 
@@ -18,7 +18,6 @@ SIGNAL = np.random.default_rng(0).normal(size=(4000, 2, 3)).cumsum(axis=0)
 @pytest.mark.parametrize("cutoff_hz", [0.05, 1.5, 6.0, 8.0])
 def test_low_pass(cutoff_hz: float, rate_hz: float) -> None:
     sos = butter(2, cutoff_hz, fs=rate_hz, output="sos")
-    np.testing.assert_allclose(_design_low_pass(cutoff_hz, rate_hz), sos, rtol=1e-11)
     for pad in (None, 10, 3999):
         expected = sosfiltfilt(sos, SIGNAL, axis=0, padlen=pad)
         np.testing.assert_allclose(low_pass(SIGNAL, cutoff_hz, rate_hz, pad), expected, atol=1e-9 * np.ptp(SIGNAL))
@@ -27,7 +26,6 @@ def test_low_pass(cutoff_hz: float, rate_hz: float) -> None:
 @pytest.mark.parametrize("rate_hz", [20.0, 59.94, 100.0, 2000.0])
 def test_band_pass(rate_hz: float) -> None:
     sos = butter(2, (0.1, 1.5), "band", fs=rate_hz, output="sos")
-    np.testing.assert_allclose(_design_band_pass((0.1, 1.5), rate_hz), sos, rtol=1e-11)
     expected = sosfiltfilt(sos, SIGNAL, axis=0)
     np.testing.assert_allclose(band_pass(SIGNAL, (0.1, 1.5), rate_hz), expected, atol=1e-9 * np.ptp(SIGNAL))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from wepose_pin.errors import BadData, BadOption, BadPhase
 from wepose_pin.filters import (
     METHODS,
     OFFLINE,
+    AmekfParams,
     FilterSettings,
     Gdc,
     GdcParams,
@@ -27,7 +28,6 @@ from wepose_pin.filters import (
 )
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.sensors import SensorFilters
-from wepose_pin.filters.static import StaticTest
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import quat_from_gravity
 from wepose_pin.simulation import simulate_paper_dynamic
@@ -172,48 +172,9 @@ def test_F_is_the_derivative_of_the_prediction(omega: tuple[float, float, float]
         np.testing.assert_allclose(filter_.state.P, expected @ P0 @ expected.T, rtol=1e-7, atol=1e-12)
 
 
-def test_a_fast_rotation_leaves_the_covariance_as_it_is() -> None:
-    """720 deg/s for 20 s at 100 Hz: to first order the attitude's standard deviation grows to more than 10⁶ deg."""
-    gyro, accel = np.tile([0.0, 0.0, 4.0 * np.pi], (2000, 1)), np.tile([0.0, 0.0, GRAVITY], (2000, 1))
-    std = {}
-    for kind in (Smekf, PublishedSmekf):
-        filter_ = kind(without_noise(), RATE, np.array([0.0, 0.0, 0.0, 1.0]), SmekfParams(1e-4, 0.0))
-        run = filter_.run(gyro, accel, np.zeros(len(gyro), dtype=bool))
-        assert run.attitude_cov is not None
-        std[kind] = np.degrees(np.sqrt(np.linalg.eigvalsh(run.attitude_cov[-1])))
-    np.testing.assert_allclose(std[Smekf], np.degrees(0.01), rtol=1e-9)
-    assert std[PublishedSmekf].max() > 1e6
-
-
 def without_noise() -> SensorNoise:
     zero = np.zeros((3, 3))
     return SensorNoise(np.zeros(3), zero, zero, zero, zero, GRAVITY)
-
-
-def test_correction_brings_the_bias_home_and_stops_the_heading() -> None:
-    """Recordings hardly show it: 60 s, a rest of 2 s in every 10 s, the bias at the start wrong by 0.3 deg/s."""
-    rows = []
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        gyro, accel, true, _ = measured(rng, 60.0, tilt=0.15)
-        noise = estimate_noise(gyro[:180], accel[:180], RATE)
-        wrong = np.deg2rad([0.0, 0.0, 0.3])
-        noise = replace(noise, gyro_bias=wrong, gyro_bias_cov=noise.gyro_bias_cov + np.diag(wrong**2))
-        row = []
-        for first, test in ((200, StaticTest()), (0, StaticTest(alpha=0.0))):
-            out = run_filter(gyro, accel, RATE, noise, FilterSettings("smekf", static_test=test))
-            drift = heading_error_deg(out.quat_WS, true)
-            row += [np.rad2deg(np.abs(out.gyro_bias[-1]).max()), np.abs(drift[first:] - drift[first]).max()]
-        rows.append(row)
-    bias, drift, bias_without, drift_without = np.array(rows).T
-    print(f"corrected: bias within {bias.max():.4f} deg/s, heading after the first rest within {drift.max():.2f} deg")
-    print(
-        f"not: bias {bias_without.min():.2f} deg/s, heading {drift_without.min():.1f} to {drift_without.max():.1f} deg"
-    )
-    assert bias.max() < 0.02
-    assert drift.max() < 2.0
-    assert bias_without.min() > 0.29
-    assert drift_without.min() > 17.0
 
 
 def test_the_exact_covariance_keeps_the_heading_through_wild_motion() -> None:
@@ -230,46 +191,6 @@ def test_the_exact_covariance_keeps_the_heading_through_wild_motion() -> None:
     print(f"largest heading error [deg], mean of 8: {mean}")
     assert mean["smekf"] < 0.7
     assert mean["smekf"] < 0.6 * mean["smekf_published"]
-
-
-@pytest.mark.slow
-def test_nees_is_right_when_the_filter_is_told_the_truth() -> None:
-    """Data from the filter's own model, P₀ as drawn: the normalised attitude error averages to its three states."""
-    rng = np.random.default_rng(7)
-    rate, dt, n = 200.0, 1 / 200.0, 1200
-    gyro_std, step_std, accel_std, bias0_std, tilt0_std = 2e-3, 2e-4, 5e-3, 1e-3, 5e-3
-    noise = SensorNoise(
-        np.zeros(3),
-        np.eye(3) * bias0_std**2,
-        np.eye(3) * gyro_std**2,
-        np.eye(3) * accel_std**2,
-        np.eye(3) * step_std**2,
-        GRAVITY,
-    )
-    omega = 0.8 * np.sin(np.linspace(0, 9, n))[:, None] * [1.0, -0.6, 0.4]
-    static = np.zeros(n, dtype=bool)
-    static[400:500] = static[900:1000] = True
-    omega[static] = 0.0
-    nees = []
-    for _ in range(60):
-        start = Rotation.from_rotvec([0.2, 0.4, 0.0])
-        rotation = start * Rotation.from_rotvec(rng.normal(scale=tilt0_std, size=3))
-        bias = rng.normal(scale=bias0_std, size=3)
-        gyro, accel, true = np.empty((n, 3)), np.empty((n, 3)), []
-        for k in range(n):
-            rotation = rotation * Rotation.from_rotvec(omega[k] * dt)
-            bias = bias + dt * rng.normal(scale=step_std, size=3)
-            gyro[k] = omega[k] + bias + rng.normal(scale=gyro_std, size=3)
-            accel[k] = GRAVITY * (rotation.as_matrix()[2] + rng.normal(scale=accel_std, size=3))
-            true.append(rotation.as_quat())
-        params = SmekfParams(tilt0_std**2, bias0_std**2)
-        run = Smekf(noise, rate, start.as_quat(), params).run(gyro, accel, static)
-        error = (Rotation.from_quat(run.quat_WS).inv() * Rotation.from_quat(np.array(true))).as_rotvec()
-        assert run.attitude_cov is not None
-        nees.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(run.attitude_cov), error))
-    average = float(np.mean(nees))
-    print(f"NEES {average:.3f} (3 is right)")
-    assert abs(average - 3) < 0.3
 
 
 def test_the_heading_of_a_sensor_that_turns_round_and_round_is_as_uncertain_as_its_scale() -> None:
@@ -416,30 +337,21 @@ def test_gdc_is_madgwicks_equations() -> None:
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in OFFLINE])
-@pytest.mark.parametrize("cut", [1, 333, 999])
-def test_a_run_cut_in_two_and_one_by_one_give_the_same_bits(method: str, cut: int) -> None:
+def test_any_cut_and_one_by_one_give_the_same_bits_with_bad_samples_too(method: str) -> None:
     gyro, accel, _, rest = measured(np.random.default_rng(3), 10.0, bias=(0.02, 0.0, -0.01))
     noise = estimate_noise(gyro[:180], accel[:180], RATE)
+    gyro[[3, 310, 311, 312], 0] = np.nan
+    accel[[7, 500], 2] = np.inf
+    params = {"amekf": AmekfParams(gyro_range=3.0, accel_range=15.0), "smekf": SmekfParams(gyro_range=3.0)}.get(method)
     start = Rotation.from_rotvec([0.3, -0.5, 0.1]).as_quat()
-    whole = METHODS[method](noise, RATE, start).run(gyro, accel, rest)
-    filter_ = METHODS[method](noise, RATE, start)
-    parts = [filter_.run(gyro[:cut], accel[:cut], rest[:cut]), filter_.run(gyro[cut:], accel[cut:], rest[cut:])]
-    for k, name in enumerate(whole._fields):
-        if whole[k] is not None:
-            np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), whole[k], err_msg=name)
-    filter_ = METHODS[method](noise, RATE, start)
-    single = [filter_.update(g, a, s) for g, a, s in zip(gyro, accel, rest, strict=True)]
-    np.testing.assert_array_equal(single, whole.quat_WS)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_every_filter_follows_a_motion_with_rests(method: str) -> None:
-    gyro, accel, true, _ = measured(np.random.default_rng(4), 30.0, bias=(0.01, 0.02, -0.01))
-    out = estimate_orientation(gyro, accel, RATE, method=method, static=(0.0, 1.8))
-    error = Rotation.from_quat(out.quat_WS) * Rotation.from_quat(true).inv()
-    aligned = error[:150].mean().inv() * error
-    assert np.degrees(aligned.magnitude()).mean() < 3.0
-    np.testing.assert_allclose(np.linalg.norm(out.quat_WS, axis=1), 1.0, atol=1e-12)
+    whole = METHODS[method](noise, RATE, start, params).run(gyro, accel, rest)
+    for edges in ([0, 1, 24, 25, 26, 311, 700, 1000], range(1001)):
+        filter_ = METHODS[method](noise, RATE, start, params)
+        parts = [filter_.run(gyro[a:b], accel[a:b], rest[a:b]) for a, b in pairwise(edges)]
+        for k, name in enumerate(whole._fields):
+            if whole[k] is not None:
+                assert np.isfinite(whole[k]).all()
+                np.testing.assert_array_equal(np.concatenate([part[k] for part in parts]), whole[k], err_msg=name)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -484,16 +396,10 @@ def test_wrong_input_is_named() -> None:
 # Live, in threads, and with samples missing ---------------------------------------------------------------------------
 
 
-def sensors(count: int, seconds: float = 20.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gyro (n, k, 3), accel (n, k, 3) and true quaternions (n, k, 4)."""
-    drawn = [measured(np.random.default_rng(seed), seconds, bias=(0.01, -0.02, 0.005)) for seed in range(count)]
-    gyro, accel, true = (np.stack([sensor[i] for sensor in drawn], axis=1) for i in range(3))
-    return gyro, accel, true
-
-
 @pytest.mark.parametrize("method", ["amekf", "smekf", "ncf"])
 def test_steps_of_many_sensors_give_the_bits_of_chunks(method: str) -> None:
-    gyro, accel, _ = sensors(5)
+    drawn = [measured(np.random.default_rng(seed), 20.0, bias=(0.01, -0.02, 0.005)) for seed in range(5)]
+    gyro, accel = (np.stack([sensor[i] for sensor in drawn], axis=1) for i in range(2))
     gap = np.zeros((len(gyro), 5), dtype=bool)
     gap[700:703, 2] = gap[1400, 4] = True  # one sensor's samples do not come
     recording = Recording(
@@ -528,7 +434,7 @@ def test_steps_of_many_sensors_give_the_bits_of_chunks(method: str) -> None:
 @pytest.mark.parametrize("method", ["smekf", "ncf", "gdc"])
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -1e300])
 def test_a_sample_that_is_no_number_does_not_stay(method: str, wrong: float) -> None:
-    """One in motion, three at rest, one at the very start; batch and sample by sample alike."""
+    """One in motion, three at rest, one at the very start."""
     gyro, accel, _, rest = measured(np.random.default_rng(9), 20.0)
     noise = estimate_noise(gyro[:180], accel[:180], RATE)
     start = quat_from_gravity(accel[:50].mean(axis=0))
@@ -540,11 +446,6 @@ def test_a_sample_that_is_no_number_does_not_stay(method: str, wrong: float) -> 
     turned = np.degrees((Rotation.from_quat(run.quat_WS).inv() * Rotation.from_quat(clean.quat_WS)).magnitude())
     assert turned[:500].max() < 0.3
     assert turned.max() < 3.0
-    filter_ = METHODS[method](noise, RATE, start)
-    single = [
-        filter_.update(g, a, s) for g, a, s in zip(gyro, accel, rest & np.isfinite(accel).all(axis=1), strict=True)
-    ]
-    np.testing.assert_array_equal(single, run.quat_WS)
 
 
 @pytest.mark.parametrize("gap", [1, 3, 10, 50, 200])

@@ -258,15 +258,6 @@ def _check_values(name: str, values: np.ndarray, most: float, unit: str) -> None
     )
 
 
-def add_range(method: str, params: Any, gyro_range: float) -> Any:
-    """Add the range [rad/s] at which gyro saturates to a filter's parameters, where the filter has such a parameter."""
-    kinds: dict[str, type] = {"amekf": AmekfParams, "smoother": AmekfParams, "smekf": SmekfParams}
-    if method not in kinds:
-        return params
-    params = params or kinds[method]()
-    return replace(params, gyro_range=min(gyro_range, params.gyro_range))
-
-
 @dataclass(frozen=True)
 class FilterSettings:
     """How a filter runs on a sensor.
@@ -371,13 +362,15 @@ class SensorRun:
         return FilterRun(run.quat_WS[::-1], -run.gyro_bias[::-1], cov, vertical), static[::-1]
 
     def _create_filter(self, method: str, noise: SensorNoise, start: StartTilt) -> Any:
-        params = self._settings.params
-        if params is None and method in ("amekf", "smoother") and self._settings.start is not None:
-            params = AmekfParams(tilt_std=start.tilt_std)
-        if params is None and method == "smekf" and self._settings.measured_start:
-            params = starting_params(noise, self._rate_hz, start.quat_WS, start.tilt_std)
-        if np.isfinite(self._settings.gyro_range):
-            params = add_range(method, params, self._settings.gyro_range)
+        params, gyro_range = self._settings.params, self._settings.gyro_range
+        if params is None and method in ("amekf", "smoother"):
+            params = AmekfParams() if self._settings.start is None else AmekfParams(tilt_std=start.tilt_std)
+        if params is None and method == "smekf":
+            params = SmekfParams()
+            if self._settings.measured_start:
+                params = starting_params(noise, self._rate_hz, start.quat_WS, start.tilt_std)
+        if method in ("amekf", "smoother", "smekf") and gyro_range < params.gyro_range:
+            params = replace(params, gyro_range=gyro_range)
         return METHODS[method](noise, self._rate_hz, start.quat_WS, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:

@@ -20,7 +20,6 @@ velocity is zero and the gyroscope measures its bias.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -33,15 +32,16 @@ from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import fill_matrix, rotate_by_world_vector, rotate_unit_by_rate
 from .base import (
     RATE_VAR,
+    START_HEADING_STD,
     STATIC_TURN_NOISE,
     VERTICAL_COLUMNS,
     FilterRun,
-    OneSample,
     add_correction,
     make_run,
     prepare_samples,
+    store_sample,
 )
-from .covariance import fill_symmetric, into_sensor
+from .covariance import into_sensor
 from .noise import SensorNoise
 from .static import static_step
 
@@ -68,7 +68,6 @@ VELOCITY, POSITION, GYRO_BIAS = ERROR.velocity.start, ERROR.position.start, ERRO
 MOTION_BIAS = ERROR.motion_bias.start
 
 HELD_RATE_FADE_S = 0.1  # [s] in which the last rate before a lost sample fades
-START_HEADING_STD = 1e-5  # [rad] the start defines the heading; above zero, so that P can be inverted
 MAX_LOST_ROTATION_STD = 4.0  # [rad] beyond which the uncertainty of a lost rotation is not increased
 # Squared Mahalanobis distance beyond which an innovation of two or three axes is an outlier: χ² quantiles of 0.9973,
 # which is 3 σ of one axis.
@@ -189,9 +188,7 @@ class AmekfParams:
     motion_bias_walk: float = 5e-5  # [rad/s/√s]
     accel_bias_std: float = 0.03  # [m/s²], 3 mg
     accel_bias_walk: float = 1e-4  # [m/s²/√s]
-    gyro_range: float = (
-        np.inf
-    )  # [rad/s] full scale; a saturated sample counts, its rotation is as uncertain as a lost one
+    gyro_range: float = np.inf  # [rad/s] full scale; a saturated sample's rotation is as uncertain as a lost one
     accel_range: float = np.inf  # [m/s²]
     lost_rate_std: float = 2.0  # [rad/s] of the unknown rate while gyro is lost (NaN) or saturated
     lost_force_std: float = 5.0  # [m/s²] of the unknown acceleration while accel is lost or saturated
@@ -247,56 +244,31 @@ class Amekf:
         self.model = _build_model(noise, rate_hz, self.block_samples, self.params)
         self.state = AmekfState(np.zeros(1, STATE))
         self.state.quat_WS[:], self.state.gyro_bias[:] = quat_WS, noise.gyro_bias
-        self._initialize_errors()
-        self._one = OneSample()
-
-    def _initialize_errors(self) -> None:
-        """Set the states and their covariance at the start."""
         p, x, std = self.params, self.state.x, np.zeros(STATES)
-        x[ERROR.gyro_bias], x[ERROR.gyro_matrix] = self.noise.gyro_bias, p.gyro_matrix.ravel()
+        x[ERROR.gyro_bias], x[ERROR.gyro_matrix] = noise.gyro_bias, p.gyro_matrix.ravel()
         x[ERROR.accel_bias] = p.accel_bias
         std[ERROR.attitude] = p.tilt_std, p.tilt_std, START_HEADING_STD
         std[ERROR.velocity], std[ERROR.position] = p.speed_std, p.position_std
         std[ERROR.gyro_matrix], std[ERROR.accel_bias] = p.gyro_matrix_std, p.accel_bias_std
         std[ERROR.motion_bias] = p.motion_bias_std
         np.fill_diagonal(self.state.P, std**2)
-        self.state.P[ERROR.gyro_bias, ERROR.gyro_bias] = self.noise.gyro_bias_cov
-        self.state.record["about_vertical"][0, RATE_VAR] = (
-            float(np.trace(self.noise.gyro_bias_cov)) / 3.0 + p.motion_bias_std**2
-        )
-
-    @property
-    def bank_kernel(self) -> Callable[..., None]:
-        """The kernel that steps many sensors at a time (`sensors.SensorFilters`)."""
-        return _step_bank
+        self.state.P[ERROR.gyro_bias, ERROR.gyro_bias] = noise.gyro_bias_cov
+        bias_var = float(np.trace(noise.gyro_bias_cov)) / 3.0
+        self.state.record["about_vertical"][0, RATE_VAR] = bias_var + p.motion_bias_std**2
 
     def run(
-        self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
-    ) -> FilterRun:
-        """Filter samples (n, 3), (n, 3), (n,); the state continues from the run before."""
-        return self.run_with_blocks(gyro_S, accel_S, static, _NO_BLOCKS, out)
-
-    def run_with_blocks(
         self,
         gyro_S: np.ndarray,
         accel_S: np.ndarray,
         static: np.ndarray | bool,
-        blocks: np.ndarray,
         out: FilterRun | None = None,
+        blocks: np.ndarray = _NO_BLOCKS,
     ) -> FilterRun:
-        """Filter as `run`, and fill one of `blocks`, an array of `BLOCK`, at the end of each block."""
+        """Filter as `base.OrientationFilter`, and fill one of `blocks`, an array of `BLOCK`, at the end of each."""
         gyro, accel, is_static = prepare_samples(gyro_S, accel_S, static)
         out = out or make_run(len(gyro))
         _run(self.state.record, self.model, gyro, accel, is_static, blocks, *out)
         return out
-
-    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
-        """Filter one sample (3,), (3,); return `quat_WS` (4,) xyzw after it."""
-        one = self._one
-        sample = one.fill(gyro_S, accel_S, static)
-        out = one.quat_WS, one.gyro_bias, one.attitude_cov, one.about_vertical
-        _run(self.state.record, self.model, *sample, _NO_BLOCKS, *out)
-        return one.quat_WS[0].copy()
 
 
 def _build_model(noise: SensorNoise, rate_hz: float, block_samples: int, p: AmekfParams) -> np.ndarray:
@@ -681,17 +653,11 @@ def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, ou
                     state.block.P_smoothed_rows[n, j] = state.P[SMOOTHED_STATES[n], j]
             blocks[row] = state.block
             row += 1
-        for i in range(4):
-            out_quat[k, i] = state.quat_WS[i]
-        for i in range(VERTICAL_COLUMNS):
-            out_vertical[k, i] = state.about_vertical[i]
-        for i in range(3):
-            out_bias[k, i] = state.gyro_bias[i]
-        fill_symmetric(state.attitude_cov, out_cov[k])
+        store_sample(state, k, out_quat, out_bias, out_cov, out_vertical)
 
 
 @kernel
-def _step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+def step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
     """Detect and filter one sample of each of k sensors; the arrays of `SensorFilters` have one row per sensor."""
     for i in range(len(states)):
         gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]

@@ -6,18 +6,21 @@ import math
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from ..compilation import inlined
 from ..errors import BadData
+from .covariance import fill_symmetric
 from .noise import SensorNoise
 
 T = TypeVar("T")
 
 # [rad/√s] by which a static sensor may rotate about the vertical undetected: 0.01 deg/s for 10 s at a time
 STATIC_TURN_NOISE = 8e-4
+START_HEADING_STD = 1e-5  # [rad] the start defines the heading; above zero, so that P can be inverted
 
 
 class AboutVertical(NamedTuple):
@@ -83,24 +86,29 @@ def make_run(n: int, *, covariance: bool = True) -> FilterRun:
     return FilterRun(*arrays, *([] if covariance else [None]))
 
 
+@dataclass
+class FilterState:
+    """State of a filter without covariance."""
+
+    quat_WS: np.ndarray  # (4,) xyzw
+    gyro_bias: np.ndarray  # (3,) [rad/s]
+
+
 class OrientationFilter(Protocol):
     """A filter made for one sensor: ``Filter(noise, rate_hz, quat_WS, params)``.
 
     W is here the sensor's own world, called V outside of the filters: z up, heading of the `quat_WS` from which the
-    filter starts. `update` and `run` use the same compiled code: a run, the same run cut in two, and a run sample by
-    sample are bit-identical.
+    filter starts. A run, the same run cut in two, and a run sample by sample are bit-identical.
     """
 
     def __init__(self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray) -> None: ...
 
-    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
-        """Take one sample, `gyro_S` (3,) [rad/s], `accel_S` (3,) [m/s²]; returns `quat_WS` (4,) xyzw after it."""
-        ...
-
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray, out: FilterRun | None = None
     ) -> FilterRun:
-        """Take samples (n, 3), (n, 3), `static` (n,) bool; the state continues from the run before.
+        """Take samples, `gyro_S` (n, 3) [rad/s], `accel_S` (n, 3) [m/s²], `static` (n,) bool, or one without the n.
+
+        The state continues from the run before.
 
         The result fills `out` and is `out`, where it is given.
         """
@@ -111,9 +119,9 @@ def prepare_samples(
     gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return one sample or many as the contiguous arrays that the compiled steps take: (n, 3), (n, 3), (n,)."""
-    gyro = np.ascontiguousarray(np.reshape(gyro_S, (-1, 3)), dtype=float)
-    accel = np.ascontiguousarray(np.reshape(accel_S, (-1, 3)), dtype=float)
-    is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
+    gyro = np.ascontiguousarray(gyro_S, dtype=float).reshape(-1, 3)
+    accel = np.ascontiguousarray(accel_S, dtype=float).reshape(-1, 3)
+    is_static = np.ascontiguousarray(static, dtype=np.bool_).reshape(-1)
     if not len(gyro) == len(accel) == len(is_static):  # the compiled steps would read beyond an array's end
         raise BadData(
             f"{len(gyro)} rows of gyro_S, {len(accel)} of accel_S, {len(is_static)} of static: they must be as many"
@@ -121,19 +129,16 @@ def prepare_samples(
     return gyro, accel, is_static
 
 
-class OneSample:
-    """Arrays for one sample and its results, so that `update` calls the run's kernel and allocates little."""
-
-    def __init__(self) -> None:
-        self.inputs = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1, dtype=np.bool_)
-        self.quat_WS, self.gyro_bias, self.attitude_cov = np.zeros((1, 4)), np.zeros((1, 3)), np.zeros((1, 3, 3))
-        self.about_vertical = np.zeros((1, VERTICAL_COLUMNS))
-
-    def fill(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the sample as arrays of one row, which the next call overwrites."""
-        gyro, accel, is_static = self.inputs
-        gyro[0], accel[0], is_static[0] = gyro_S, accel_S, static
-        return self.inputs
+@inlined
+def store_sample(state, k, quat_WS, gyro_bias, attitude_cov, about_vertical):  # type: ignore[no-untyped-def]
+    """Fill row `k` of the arrays of a `FilterRun` from the record of a filter with covariance."""
+    for i in range(4):
+        quat_WS[k, i] = state.quat_WS[i]
+    for i in range(3):
+        gyro_bias[k, i] = state.gyro_bias[i]
+    fill_symmetric(state.attitude_cov, attitude_cov[k])
+    for i in range(VERTICAL_COLUMNS):
+        about_vertical[k, i] = state.about_vertical[i]
 
 
 def run_in_parallel(function: Callable[..., T], *columns: Iterable[Any], threads: int | None = None) -> list[T]:

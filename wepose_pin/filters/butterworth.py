@@ -68,56 +68,25 @@ def _filter_both_ways(sections: np.ndarray, values: np.ndarray, pad: int | None 
     if n <= pad:
         raise ValueError(f"{n} samples, and more than {pad} are needed")
     first, last = 2.0 * columns[0] - columns[pad:0:-1], 2.0 * columns[-1] - columns[-2 : -pad - 2 : -1]
-    signals = np.ascontiguousarray(np.concatenate((first, columns, last)).T)
-    settled = _find_settled_state(sections)
+    signals = np.concatenate((first, columns, last))
     for _ in range(2):
-        _filter(sections, settled, signals)
-        signals = np.ascontiguousarray(signals[:, ::-1])
-    return np.ascontiguousarray(signals[:, pad : pad + n].T).reshape(values.shape)
+        _filter(sections, _find_settled_state(sections, signals[0]), signals)
+        signals = np.ascontiguousarray(signals[::-1])
+    return signals[pad : pad + n].reshape(values.shape)
 
 
-def _find_settled_state(sections: np.ndarray) -> np.ndarray:
-    """State (k, 2) of each section after a long time of ones."""
+def _find_settled_state(sections: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """State (k, c, 2) of each section after a long time of the values `first` (c,)."""
     states, gain = [], 1.0
     for b0, b1, b2, _, a1, a2 in sections:
         state = (b1 + b2 - (a1 + a2) * b0) / (1.0 + a1 + a2)
         states.append((gain * state, gain * ((1.0 + a1) * state - b1 + a1 * b0)))
         gain *= (b0 + b1 + b2) / (1.0 + a1 + a2)
-    return np.array(states)
+    return np.array(states)[:, None] * first[:, None]
 
 
 @kernel
-def _filter(sections: np.ndarray, settled: np.ndarray, signals: np.ndarray) -> None:
-    """Filter signals (c, n) in place, each from the state settled at its first sample; direct form II transposed."""
-    for signal in signals:
-        begin = signal[0]
-        for k in range(len(sections)):
-            b0, b1, b2, _, a1, a2 = sections[k]
-            one, two = settled[k, 0] * begin, settled[k, 1] * begin
-            for i in range(len(signal)):
-                x = signal[i]
-                y = b0 * x + one
-                one = b1 * x - a1 * y + two
-                two = b2 * x - a2 * y
-                signal[i] = y
-
-
-class BandPass:
-    """A band-pass filter of signals that come in chunks, from the state settled at `first` (c,)."""
-
-    def __init__(self, band_hz: tuple[float, float], rate_hz: float, first: np.ndarray) -> None:
-        self._sections = _design_band_pass(band_hz, rate_hz)
-        self._state = _find_settled_state(self._sections)[:, None] * first[:, None]  # (k, c, 2)
-
-    def push(self, values: np.ndarray) -> np.ndarray:
-        """Return the filtered chunk (n, c)."""
-        signals = np.array(values, dtype=float)
-        _filter_on(self._sections, self._state, signals)
-        return signals
-
-
-@kernel
-def _filter_on(sections: np.ndarray, state: np.ndarray, signals: np.ndarray) -> None:
+def _filter(sections: np.ndarray, state: np.ndarray, signals: np.ndarray) -> None:
     """Filter signals (n, c) in place and keep the state (k, c, 2); direct form II transposed."""
     for k in range(len(sections)):
         b0, b1, b2, _, a1, a2 = sections[k]
@@ -128,3 +97,17 @@ def _filter_on(sections: np.ndarray, state: np.ndarray, signals: np.ndarray) -> 
                 state[k, c, 0] = b1 * x - a1 * y + state[k, c, 1]
                 state[k, c, 1] = b2 * x - a2 * y
                 signals[i, c] = y
+
+
+class BandPass:
+    """A band-pass filter of signals that come in chunks, from the state settled at `first` (c,)."""
+
+    def __init__(self, band_hz: tuple[float, float], rate_hz: float, first: np.ndarray) -> None:
+        self._sections = _design_band_pass(band_hz, rate_hz)
+        self._state = _find_settled_state(self._sections, first)
+
+    def push(self, values: np.ndarray) -> np.ndarray:
+        """Return the filtered chunk (n, c)."""
+        signals = np.array(values, dtype=float)
+        _filter(self._sections, self._state, signals)
+        return signals

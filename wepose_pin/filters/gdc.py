@@ -14,7 +14,7 @@ import numpy as np
 from ..compilation import inlined, kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import derivative, up_in_sensor
-from .base import FilterRun, OneSample, make_run, prepare_samples
+from .base import FilterRun, FilterState, make_run, prepare_samples
 from .noise import SensorNoise
 
 
@@ -25,12 +25,6 @@ class GdcParams:
     gain: float = 0.033  # [1/s] β
 
 
-@dataclass
-class GdcState:
-    quat_WS: np.ndarray  # (4,) xyzw
-    gyro_bias: np.ndarray  # (3,) [rad/s]
-
-
 class Gdc:
     """GDC of one sensor; the bias is the static phase's mean. A sample that is no number is passed over."""
 
@@ -39,8 +33,7 @@ class Gdc:
     ) -> None:
         self.params = params or GdcParams()
         self.rate_hz = rate_hz
-        self.state = GdcState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
-        self._one = OneSample()
+        self.state = FilterState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
@@ -50,12 +43,6 @@ class Gdc:
         out.gyro_bias[:] = self.state.gyro_bias
         _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, self.params.gain, out.quat_WS)
         return out
-
-    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
-        one = self._one
-        gyro, accel, _ = one.fill(gyro_S, accel_S, static)
-        _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, self.params.gain, one.quat_WS)
-        return one.quat_WS[0].copy()
 
 
 @kernel

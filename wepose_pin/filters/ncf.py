@@ -13,7 +13,7 @@ import numpy as np
 from ..compilation import kernel
 from ..recording.limits import HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, up_in_sensor
-from .base import FilterRun, OneSample, make_run, prepare_samples
+from .base import FilterRun, FilterState, make_run, prepare_samples
 from .noise import SensorNoise
 
 
@@ -25,12 +25,6 @@ class NcfParams:
     integral: float = 0.0012  # [1/s²] k_I
 
 
-@dataclass
-class NcfState:
-    quat_WS: np.ndarray  # (4,) xyzw
-    gyro_bias: np.ndarray  # (3,) [rad/s]
-
-
 class Ncf:
     """NCF of one sensor; the bias starts at the static phase's mean. A sample that is no number is passed over."""
 
@@ -39,26 +33,16 @@ class Ncf:
     ) -> None:
         self.params = params or NcfParams()
         self.rate_hz = rate_hz
-        self.state = NcfState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
-        self._one = OneSample()
+        self.state = FilterState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
     ) -> FilterRun:
         gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
         out = out or make_run(len(gyro), covariance=False)
-        self._go(gyro, accel, out.quat_WS, out.gyro_bias)
+        state, gains = self.state, (self.params.proportional, self.params.integral)
+        _run(state.quat_WS, state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, *gains, out.quat_WS, out.gyro_bias)
         return out
-
-    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
-        one = self._one
-        gyro, accel, _ = one.fill(gyro_S, accel_S, static)
-        self._go(gyro, accel, one.quat_WS, one.gyro_bias)
-        return one.quat_WS[0].copy()
-
-    def _go(self, gyro: np.ndarray, accel: np.ndarray, quat: np.ndarray, bias: np.ndarray) -> None:
-        gains = self.params.proportional, self.params.integral
-        _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, *gains, quat, bias)
 
 
 @kernel

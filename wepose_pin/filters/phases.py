@@ -37,21 +37,21 @@ FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 def find_reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[Diagnostic]]:
     """Find the intervals [s] of the start pose and of noise and bias; with the recording's diagnostics and theirs."""
     diagnostics = list(recording.diagnostics)
-    if recording.phases.get("start"):
-        start = recording.phases["start"][0]
-        if len(recording.phases["start"]) > 1:
-            diagnostics.append(_report_ignored_intervals("start", start))
-        if recording.start_is_guessed:
-            diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
-    elif recording.phases.get("static"):
+    stated, static = recording.phases.get("start", ()), recording.phases.get("static", ())
+    is_guessed = not stated or recording.start_is_guessed
+    if stated:
+        start = stated[0]
+    elif static:
         raise BadPhase(
             f"{recording.where()}: phases.static without phases.start; name the seconds of the start pose, "
             f"start = [[from, to]]"
         )
     else:
         start = find_static_window(recording)
+    if len(stated) > 1:
+        diagnostics.append(_report_ignored_intervals("start", start))
+    if is_guessed:
         diagnostics.append(Diagnostic("start-pose-guessed", WARNING, facts={"start": start[0], "end": start[1]}))
-    static = recording.phases.get("static", ())
     if len(static) > 1:
         diagnostics.append(_report_ignored_intervals("static", static[0]))
     for name, interval in (("start", start), *(("static", span) for span in static[:1])):
@@ -66,7 +66,7 @@ def find_reference_phases(recording: Recording) -> tuple[tuple[float, float], tu
                     f"{place}: sensors.{segment} is lost in {samples - measured} of its {samples} samples: its tilt "
                     f"is not known; name seconds in which it measures, or take [sensors.{segment}] out"
                 )
-    if recording.phases.get("start") and not recording.start_is_guessed:
+    if not is_guessed:
         start, moved = _find_static_part(recording, start, "start")
         diagnostics += moved
     if not static:

@@ -11,12 +11,15 @@ from scipy.spatial.transform import Rotation
 from ..diagnostics import Diagnostic
 from ..errors import BadData, WeposeError
 from ..recording import OrientationSensor, Recording
-from . import BEST, OFFLINE, FilterSettings, Orientation, SensorRun, check_method
-from .base import run_in_parallel
+from . import BEST, OFFLINE, FilterSettings, Orientation, SensorRun, amekf, check_method, smekf
+from .base import FilterRun, run_in_parallel
 from .covariance import symmetric
 from .noise import SensorNoise, estimate_noise
 from .phases import check_common_rotation, check_motion, find_reference_phases
 from .static import StaticState, StaticTest
+
+# Kernels that take a sample of each sensor, static detector and filter together.
+STEPS = {"amekf": amekf.step_bank, "smekf": smekf.step_bank, "smekf_published": smekf.step_bank}
 
 
 class FilteredRecording(NamedTuple):
@@ -33,9 +36,8 @@ class FilteredRecording(NamedTuple):
 class SensorFilters:
     """The filters of a recording: `push` takes chunks, `step` a sample of each sensor, with bit-identical results.
 
-    After the first chunk the states of all sensors share memory, so that `step` is one compiled call for all of them,
-    static detector and filter together. It allocates nothing: the next one overwrites its result and the arrays named
-    here.
+    After the first chunk the states of all sensors share memory, so that `step` of a method in `STEPS` is one compiled
+    call for all of them, which allocates nothing. The next `step` overwrites its result and the arrays named here.
 
     Parameters
     ----------
@@ -91,7 +93,7 @@ class SensorFilters:
             )
             for segment, noise in noises.items()
         ]
-        self._step: Any = None  # the kernel for all sensors; None: the filters have none
+        self._step: Any = STEPS.get(method) if self.names else None
         self._method, self._is_begun = method, False
 
     def push(self, chunk: Recording) -> dict[str, Orientation]:
@@ -116,7 +118,6 @@ class SensorFilters:
         k = len(filters)
         self.static = np.zeros(k, dtype=np.bool_)
         self.quat_WS, self.gyro_bias = np.empty((k, 4)), np.empty((k, 3))
-        self._step = getattr(filters[0], "bank_kernel", None) if k else None
         if self._step is not None:
             self._states = np.concatenate([filter_.state.record for filter_ in filters])
             self._models = np.concatenate([filter_.model for filter_ in filters])
@@ -145,8 +146,10 @@ class SensorFilters:
             self._step(self._states, self._models, *self._detector_states, gyro, accel, self.static)
             return self.quat_WS
         for i, run in enumerate(self._runs):
-            self.static[i] = run.detector.update(gyro[i], accel[i])
-            run.filter.update(gyro[i], accel[i], bool(self.static[i]))
+            one = slice(i, i + 1)
+            self.static[one] = run.detector.run(gyro[one], accel[one])
+            out = FilterRun(self.quat_WS[one], self.gyro_bias[one], None)
+            run.filter.run(gyro[one], accel[one], self.static[one], out)
         return self.quat_WS
 
     @property

@@ -16,7 +16,6 @@ first sample.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,21 +27,21 @@ from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
 from ..rotations import rotate_by_vector, rotation_terms, up_in_sensor
 from .base import (
     RATE_VAR,
+    START_HEADING_STD,
     STATIC_TURN_NOISE,
     VERTICAL_COLUMNS,
     FilterRun,
-    OneSample,
     add_correction,
     make_run,
     prepare_samples,
+    store_sample,
 )
-from .covariance import fill_symmetric, symmetric
+from .covariance import symmetric
 from .noise import SWAY_CORRELATION_S, SensorNoise
 from .start import ACCEL_BIAS_STD
 from .static import static_step
 
 GYRO_SCALE_STD = 0.002  # of a calibrated MEMS gyroscope, as in `amekf.AmekfParams.gyro_matrix_std`
-HEADING_FLOOR = 1e-5  # [rad] keeps P₀ positive definite about the vertical
 
 
 @dataclass(frozen=True)
@@ -53,11 +52,8 @@ class SmekfParams:
     the start phase. Their Σ_b is some 2 Σ_ω, orders of magnitude above the drift of a real bias, so that each static
     phase forgets the ones before and the covariance is too large.
 
-    Over two minutes of simulated motion with static phases (`tests/test_filters.py`) the normalised estimation error
-    squared, which is 3 for a right covariance and less for one that is too large, and the rms heading error are: 1.9
-    and 0.57 deg with the paper's P₀, Σ_b and first order; 0.5 and 0.10 deg exact and with `starting_params`; 0.7 and
-    0.08 deg with the Σ_b of a bias that drifts by 10 deg/h as well. The simulated accelerometer has no bias and the
-    gyroscope no wrong scale, which `starting_params` allows for.
+    Over two minutes of simulated motion with static phases the rms heading error is 0.57 deg with the paper's P₀, Σ_b
+    and first order, and 0.10 deg exact and with `starting_params`.
     """
 
     attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
@@ -84,7 +80,7 @@ def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, til
     up_S = np.array(up_in_sensor(quat_WS))
     across = np.eye(3) - np.outer(up_S, up_S)
     return SmekfParams(
-        attitude_cov0=tilt_std**2 * across + HEADING_FLOOR**2 * np.eye(3),
+        attitude_cov0=tilt_std**2 * across + START_HEADING_STD**2 * np.eye(3),
         bias_cov0=noise.gyro_bias_cov,
         static_gyro_cov=noise.gyro_cov + noise.sway_density(rate_hz) * rate_hz * np.eye(3),
         static_accel_cov=noise.accel_cov + ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz * np.eye(3),
@@ -154,7 +150,7 @@ class Smekf:
     """sMEKF of one sensor. Σ_ω, Σ_g, Σ_b, the first bias and the size of gravity come from `noise`.
 
     Missing samples are NaN: the last rate is held and fades, and `attitude_cov` grows by the motion that may have been
-    missed (HOLD_S, LOST_RATE_STD). `run` and `update` are those of `base.OrientationFilter`.
+    missed (HOLD_S, LOST_RATE_STD). `run` is that of `base.OrientationFilter`.
     """
 
     first_order = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
@@ -174,12 +170,6 @@ class Smekf:
         record["P_bb"] = _matrix(self.params.bias_cov0)[_UPPER]
         record["about_vertical"][0, RATE_VAR] = float(np.trace(_matrix(self.params.bias_cov0))) / 3.0
         self.state = SmekfState(record)
-        self._one = OneSample()
-
-    @property
-    def bank_kernel(self) -> Callable[..., None]:
-        """The kernel that steps many sensors at a time (`sensors.SensorFilters`)."""
-        return _step_bank
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
@@ -188,13 +178,6 @@ class Smekf:
         out = out or make_run(len(gyro))
         _run(self.state.record, self.model, gyro, accel, is_static, *out)
         return out
-
-    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:
-        one = self._one
-        sample = one.fill(gyro_S, accel_S, static)
-        out = one.quat_WS, one.gyro_bias, one.attitude_cov, one.about_vertical
-        _run(self.state.record, self.model, *sample, *out)
-        return one.quat_WS[0].copy()
 
 
 class PublishedSmekf(Smekf):
@@ -209,8 +192,6 @@ class PublishedSmekf(Smekf):
 def _matrix(cov: float | np.ndarray) -> np.ndarray:
     """A covariance (3, 3) that may be given as one variance."""
     array = np.asarray(cov, dtype=float)
-    if array.ndim == 0 and 0.0 <= array < np.inf:
-        return array * np.eye(3)
     matrix = array if array.ndim == 2 else array * np.eye(3)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] < -1e-15:
         raise BadOption(f"covariance {cov!r}: a variance from 0 on is needed, or a positive semidefinite (3, 3)")
@@ -557,17 +538,11 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
     for k in range(len(gyro_S)):
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         step(state, model, gx, gy, gz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2], static[k])
-        for i in range(4):
-            out_quat[k, i] = state.quat_WS[i]
-        for i in range(VERTICAL_COLUMNS):
-            out_vertical[k, i] = state.about_vertical[i]
-        for i in range(3):
-            out_bias[k, i] = state.gyro_bias[i]
-        fill_symmetric(state.attitude_cov, out_cov[k])
+        store_sample(state, k, out_quat, out_bias, out_cov, out_vertical)
 
 
 @kernel
-def _step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+def step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
     """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `SensorFilters` has them."""
     for i in range(len(states)):
         gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]

@@ -16,7 +16,6 @@ from __future__ import annotations
 import numpy as np
 
 from ..compilation import compiled, inlined
-from ..errors import BadOption
 from ..rotations import fill_matrix, rotate_by_world_vector
 from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, Amekf, AmekfParams
 from .base import RATE_VAR, VERTICAL_COLUMNS, FilterRun
@@ -48,20 +47,10 @@ class Smoother:
         is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
         P_rows = np.ascontiguousarray(amekf.state.P[list(SMOOTHED_STATES)])
         blocks = np.empty(len(is_static) // amekf.block_samples, BLOCK)
-        run = amekf.run_with_blocks(gyro_S, accel_S, is_static, blocks, out)
+        run = amekf.run(gyro_S, accel_S, is_static, out, blocks)
         smoothed = _backward(blocks, P_rows, self.noise.gravity)
         _interpolate(blocks, *smoothed, float(np.trace(P_rows[:3, :3])), amekf.block_samples, is_static, *run)
         return run
-
-    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray, static: bool) -> np.ndarray:  # noqa: ARG002
-        """There is none.
-
-        Raises
-        ------
-        BadOption
-            Always: what comes later is needed.
-        """
-        raise BadOption("method 'smoother' needs the whole recording and has no live update; take 'amekf' for that")
 
 
 @compiled

@@ -140,9 +140,8 @@ class StaticState(NamedTuple):
 class StaticDetector:
     """Decides for each sample whether the window that ends there is static.
 
-    `update` for one sample and `run` for an array go through the same compiled code; a run cut in two gives the same
-    answer to the last bit. Until the first window is full the answer is no, and so it is while a sample that is no
-    number lies in the window.
+    A run cut in two gives the same answer to the last bit. Until the first window is full the answer is no, and so it
+    is while a sample that is no number lies in the window.
 
     The cost per sample does not grow with the window: the window is the sums of the current block of N samples and
     those of the rest of the block before, which are made backwards once a block. Nothing is ever subtracted from a sum,
@@ -155,7 +154,6 @@ class StaticDetector:
     def __init__(self, noise: SensorNoise, rate_hz: float, test: StaticTest | None = None) -> None:
         self.test = test or USUAL_TEST
         self.state = _first_state(noise, rate_hz, self.test)
-        self._one = np.zeros((1, 3)), np.zeros((1, 3)), np.zeros(1, dtype=np.bool_)
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """`static` (n,) bool for `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²]."""
@@ -165,13 +163,6 @@ class StaticDetector:
         static = np.empty(len(gyro), dtype=np.bool_)
         _run(*self.state, gyro, accel, static)
         return static
-
-    def update(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> bool:
-        """Whether the window that ends with this sample, `gyro_S` (3,), `accel_S` (3,), is static."""
-        gyro, accel, static = self._one
-        gyro[0], accel[0] = gyro_S, accel_S
-        _run(*self.state, gyro, accel, static)
-        return bool(static[0])
 
 
 def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> StaticState:
