@@ -299,7 +299,7 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
         (["-o", "x.mcap", "--instruction", "go"], "--instruction go: only of format lerobot, and the format is mcap"),
         (
             ["-o", "x.trc"],
-            "--format trc: is of a person's motion, and this is a robot's trajectory; of that there is: urdf",
+            "--format trc: is of a person's motion, and this is a robot's trajectory; of that there is: lerobot, mcap",
         ),
         (["-o", "x.bin", "--format", "mcap"], "name it x.mcap"),
         (["-o", "x.pkl"], "--format pkl: no longer written; trajectory.csv of `wepose retarget` has the joints"),

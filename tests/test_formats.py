@@ -637,9 +637,9 @@ def test_a_description_beside_the_session_is_read(stated: str, tmp_path: Path) -
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("[xyz]", "[xyz"), r"lab\.toml: gyro\[0\]\.columns = .* is no regular expression"),
-        (("(?P<axis>[xyz])", "[xyz]"), r"gyro\[0\]\.columns = .* has no group \(\?P<axis>…\)"),
-        (("unit_s", "unit"), r"clock\[0\]\.unit is not a known key; did you mean 'unit_s'"),
+        (("[xyz]", "[xyz"), r"lab\.toml: gyro 1\.columns = .* is no regular expression"),
+        (("(?P<axis>[xyz])", "[xyz]"), r"gyro 1\.columns = .* has no group \(\?P<axis>…\)"),
+        (("unit_s", "unit"), r"clock 1\.unit is not a known key; did you mean 'unit_s'"),
         (("[[clock]]", "[[accel]]"), "is not a known key|clock is missing"),
         (("[[gyro]]", "[[orientation]]"), r"lab\.toml: gyro is missing"),
         (('"mg"', '"furlong"'), r"'chest fx' is in 'furlong'; there is: m/s\^2, g, mg"),

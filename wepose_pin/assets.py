@@ -34,7 +34,7 @@ def find_plugins(group: str) -> dict[str, EntryPoint]:
     """
     found = sorted(entry_points(group=f"wepose.{group}"), key=lambda each: not each.value.startswith("wepose_pin."))
     if not found or not found[0].value.startswith("wepose_pin."):
-        raise BadOption(f"no {group} of wepose-pin are registered: install it again, in a clone by pip install -e .")
+        raise BadOption(f"no {group} of wepose-pin are registered: install the package again")
     plugins: dict[str, EntryPoint] = {}
     for each in found:
         plugins.setdefault(each.name, each)

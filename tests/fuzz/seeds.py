@@ -67,7 +67,7 @@ ARM = """<robot name="arm">
 <joint name="j2" type="continuous"><parent link="upper"/><child link="fore"/><origin xyz="0 0 -0.3"/>
 <axis xyz="0 1 0"/><limit velocity="3" effort="9"/></joint>
 <joint name="j3" type="revolute"><parent link="fore"/><child link="hand"/><origin xyz="0 0 -0.3"/><axis xyz="1 0 0"/>
-<limit lower="-1" upper="1" velocity="3" effort="9"/><mimic joint="j1" multiplier="0.5"/></joint></robot>
+<limit lower="-1" upper="1" velocity="3" effort="9"/></joint></robot>
 """
 ARM_MAP = b"""format = 1
 urdf = "arm.urdf"
@@ -79,6 +79,7 @@ j1 = 0.1
 [limits.acceleration]
 j1 = 9.0
 j2 = 9.0
+j3 = 9.0
 [arms.right]
 joints = ["j1", "j2", "j3"]
 shoulder = { link = "upper" }
