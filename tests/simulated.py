@@ -78,20 +78,3 @@ def check_accel(sim: Simulation, segment: str, R_WS: Rotation, start: float, sto
     integrated = truth(t[0]) + truth(t[0], 1) * (t - t[0])[:, None] + CubicSpline(t, accel_W).antiderivative(2)(t)
     assert np.abs(integrated - position[k]).max() < 1e-3
     return np.ptp(position[k], axis=0)
-
-
-def check_lengths(sim: Simulation, *, rigid_hands: bool) -> None:
-    """Upper arms, forearms and hands keep their lengths along −z of their segments; rigid hands along the forearm's."""
-    for side in SIDES:
-        for part, a, b in (
-            ("upper_arm", "shoulder", "elbow"),
-            ("forearm", "elbow", "wrist"),
-            ("hand", "wrist", "palm"),
-        ):
-            length = SUBJECT[f"{side}_{part}"]
-            p_W = sim.points[f"{side}_{b}"] - sim.points[f"{side}_{a}"]
-            np.testing.assert_allclose(np.linalg.norm(p_W, axis=1), length, rtol=0, atol=1e-12)
-            if part != "hand" or rigid_hands:
-                segment = f"{side}_{'forearm' if part == 'hand' else part}"
-                p_L = Rotation.from_quat(sim.quat_WL[segment]).inv().apply(p_W)
-                assert np.abs(p_L - [0.0, 0.0, -length]).max() < 1e-12

@@ -12,7 +12,6 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from simulated import SIDES, SUBJECT, G, check_gyro, in_torso, multiply, within
 
-from wepose_pin.errors import BadSession
 from wepose_pin.readers import load_session
 from wepose_pin.recording import ImuSensor, Recording, compute_mount
 from wepose_pin.simulation import (
@@ -20,17 +19,13 @@ from wepose_pin.simulation import (
     MILD_PRESET,
     NOISE_FREE,
     SEGMENTS,
-    Device,
     Imperfections,
     Simulation,
     SingleSensor,
     simulate,
     simulate_paper_drift,
     simulate_paper_dynamic,
-    simulate_person,
 )
-from wepose_pin.subject import population_subject
-from wepose_pin.tracking import track
 from wepose_pin.writers import write_session
 
 # The subject's own imperfections, with perfect sensors.
@@ -74,14 +69,13 @@ def rms(vectors: np.ndarray) -> float:
         ({"gyro_range_deg_s": 0.0}, "gyro_range_deg_s"),
         ({"dropped": 0.5}, r"dropped 0\.5"),
         ({"sway_deg_s": np.nan}, "sway_deg_s = nan"),
+        ({"girdle": -1.0}, "girdle -1"),
+        ({"forearm_place": 1.5}, r"forearm_place 1\.5"),
     ],
 )
 def test_wrong_sizes_are_named(wrong: dict, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         Imperfections(**wrong)
-
-
-def test_too_much_jitter_is_named() -> None:
     with pytest.raises(ValueError, match="clock_jitter"):
         simulate(SUBJECT, seed=0, imperfections=Imperfections(clock_jitter=0.01), clasp_s=5.0, circles=0)
 
@@ -109,9 +103,6 @@ def test_soft_tissue_has_its_rms(body: Simulation) -> None:
         assert rms(soft_deg[moving]) == pytest.approx(1.5, rel=0.1)
         np.testing.assert_allclose(np.sqrt(np.mean(soft_deg[moving] ** 2, axis=0)), 0.87, rtol=0.12)
         assert rms(soft_deg[within(body, "start")]) < 0.3  # the strap's place is that of the start pose
-        R_WS = Rotation.from_quat(body.quat_WL[segment]) * Rotation.from_rotvec(body.soft_tissue[segment])
-        R_WS = R_WS * Rotation.from_quat(body.quat_LS[segment])
-        assert (R_WS.inv() * Rotation.from_quat(body.quat_WS[segment])).magnitude().max() < 1e-9
         assert np.abs(np.diff(soft_deg, axis=0)).max() < 0.5  # smooth: 50 deg/s at the very most
 
 
@@ -131,11 +122,6 @@ def test_soft_tissue_follows_the_movement_and_is_still_at_rest() -> None:
         for phase in ("start", "rest"):
             assert np.abs(sim.gyro_S[segment][within(sim, phase)]).max() < 1e-9
     assert 0.4 < np.mean(explained) < 0.75
-    # The same at another rate: it is a function of time.
-    slow = simulate(SUBJECT, seed=6, rate_hz=50.0, noise=NOISE_FREE, imperfections=Imperfections(soft_tissue_deg=1.5))
-    for segment in SEGMENTS:
-        n = len(slow.time)
-        np.testing.assert_allclose(slow.soft_tissue[segment], sim.soft_tissue[segment][::2][:n], atol=1e-9)
 
 
 def test_palms_slip_by_as_much_as_stated(body: Simulation) -> None:
@@ -188,20 +174,6 @@ def test_start_pose_is_off_as_stated() -> None:
 # Sensors ---------------------------------------------------------------------------------------------------------
 
 
-def test_devices_err_as_stated() -> None:
-    rng = np.random.default_rng(0)
-    devices = [Device.sample(rng, MILD_PRESET, rng) for _ in range(400)]
-    gyro, accel = (
-        np.stack([getattr(d, name) for d in devices]) - np.eye(3) for name in ("gyro_matrix", "accel_matrix")
-    )
-    diagonal = np.eye(3, dtype=bool)
-    assert gyro[:, diagonal].std() == pytest.approx(0.001, rel=0.1)
-    assert accel[:, diagonal].std() == pytest.approx(0.005, rel=0.1)
-    for matrix in (gyro, accel):
-        assert np.rad2deg(matrix[:, ~diagonal].std()) == pytest.approx(0.05, rel=0.1)
-    assert np.rad2deg(np.stack([d.g_matrix for d in devices]).std()) * G == pytest.approx(0.001, rel=0.1)
-
-
 def test_data_are_the_device_times_the_truth() -> None:
     options = {"seed": 2, "noise": NOISE_FREE, "clasp_s": 10.0, "circles": 1}
     clean = simulate(SUBJECT, **options)
@@ -234,11 +206,6 @@ def test_quantisation_and_range() -> None:
             expected = np.clip(getattr(clean, name)[segment], -limit, limit)
             assert np.array_equal(getattr(cut, name)[segment], expected)
     assert np.sum(np.abs(cut.gyro_S["left_forearm"]) == np.deg2rad(90.0)) > 10
-    # the largest number of 16 bits is one step below the full scale
-    device = Device.sample(np.random.default_rng(0), IDEAL_PRESET, np.random.default_rng(0))
-    full = np.array([[1e3, -1e3, 0.0]])
-    readings = device.measure(full, full, 100.0, NOISE_FREE, digital.imperfections, np.random.default_rng(0))
-    np.testing.assert_allclose(readings.gyro_S, [[(2**15 - 1) * gyro_step, -np.deg2rad(2000.0), 0.0]])
 
 
 def test_clocks_shift_the_samples_in_the_data() -> None:
@@ -280,7 +247,7 @@ def test_lost_samples_are_bridged_as_in_a_users_file(realistic: Simulation, tmp_
         assert not np.array_equal(sensor.gyro_S, realistic.gyro_S[segment])
 
 
-def test_mounts_at_any_rotation_need_a_subject() -> None:
+def test_mounts_are_at_any_rotation() -> None:
     sizes = Imperfections(mount="any")
     mounts = []
     for seed in range(30):
@@ -289,14 +256,6 @@ def test_mounts_at_any_rotation_need_a_subject() -> None:
         mounts += list(sim.quat_LS.values())
     # 150 uniform rotations: each entry of the mean matrix has the standard deviation sqrt(1/3/150)
     assert np.abs(Rotation.from_quat(mounts).as_matrix().mean(axis=0)).max() < 4 * np.sqrt(1 / 450)
-    with pytest.raises(BadSession, match="mount is not known"):
-        track(sim.recording())
-    sim = simulate(SUBJECT, seed=1, imperfections=sizes, clasp_s=5.0, circles=1)
-    pose = track(sim.recording(), replace(population_subject(), lengths=SUBJECT, mounts=sim.quat_LS))
-    assert np.linalg.norm(pose.points["right_palm"] - sim.points["right_palm"], axis=1).mean() < 0.02
-
-
-# Noise -----------------------------------------------------------------------------------------------------------
 
 
 # Switches --------------------------------------------------------------------------------------------------------
@@ -305,7 +264,7 @@ def test_mounts_at_any_rotation_need_a_subject() -> None:
 def off(name: str) -> Imperfections:
     if name.endswith(("range_deg_s", "range_g")):  # bits need a range
         return replace(MILD_PRESET, **{name: np.inf, "bits": 0})
-    return replace(MILD_PRESET, **{name: getattr(IDEAL_PRESET, name)})
+    return replace(MILD_PRESET, **{name: "any" if name == "mount" else getattr(IDEAL_PRESET, name)})
 
 
 def sensor_draws(sim: Simulation) -> dict[str, np.ndarray]:
@@ -325,7 +284,7 @@ def sensor_draws(sim: Simulation) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("name", IN_MILD)
+@pytest.mark.parametrize("name", [*IN_MILD, "mount"])
 def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, name: str) -> None:
     without = simulate(SUBJECT, seed=5, imperfections=off(name), **SHORTER)
     less = sensor_draws(without)
@@ -350,13 +309,6 @@ def test_switching_one_off_leaves_the_others_as_they_are(realistic: Simulation, 
     elif name not in (*IN_BODY, "clock_jitter", "clock_offset"):
         for segment in SEGMENTS:
             assert np.array_equal(without.soft_tissue[segment], realistic.soft_tissue[segment])
-
-
-def test_mount_is_a_stream_of_its_own(realistic: Simulation) -> None:
-    loose = simulate(SUBJECT, seed=5, imperfections=replace(MILD_PRESET, mount="any"), **SHORTER)
-    for name, values in sensor_draws(loose).items():
-        assert np.array_equal(values, sensor_draws(realistic)[name]) == (name != "mount")
-    assert np.array_equal(loose.points["left_palm"], realistic.points["left_palm"])
 
 
 # One sensor ------------------------------------------------------------------------------------------------------
@@ -389,11 +341,3 @@ def test_single_sensor(make: Callable[..., SingleSensor], moving: tuple, rate_pe
         for values, peak in ((one.gyro_S, rate_peak), (accel_W, accel_peak)):
             assert peak[0] * 0.97 < np.linalg.norm(values, axis=1).max() < peak[1] * 1.03
         assert np.abs(one.p_WS).max() < 0.8  # within reach of an arm
-
-
-def test_realistic_people_are_tracked() -> None:
-    person = simulate_person(1)
-    sim = simulate(person.lengths, seed=1, imperfections=MILD_PRESET, clasp_s=5.0, circles=1)
-    pose = track(sim.recording(), replace(person.prior, lengths=person.lengths))
-    error = np.linalg.norm(pose.points["right_palm"] - sim.points["right_palm"], axis=1)
-    assert 0.005 < error.mean() < 0.12

@@ -21,12 +21,14 @@ from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import evaluate
 from wepose_pin.kinematics import Pose, parse_pose_table
 from wepose_pin.model import load_model
-from wepose_pin.simulation import NOISE_FREE, Imperfections, Simulation, simulate_activity
+from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Imperfections, Simulation, simulate_activity
 from wepose_pin.simulation.activities import ACTIVITIES
+from wepose_pin.simulation.motion import Flaws
 from wepose_pin.simulation.subject import spawn_streams
 
 URDF = Path(__file__).resolve().parent.parent / "urdf"
 SIDES = ("left", "right")
+IDEAL_MOTION = Flaws(IDEAL_PRESET, spawn_streams(0))
 
 
 def parts(name: str) -> dict[tuple[str, str | None], ET.Element]:
@@ -119,7 +121,7 @@ def test_left_and_right_leg_mirror_each_other() -> None:
 
 
 def test_the_true_pose_has_the_angles_of_the_activity(activity: str) -> None:
-    motion = ACTIVITIES[activity](load_model("whole_body"), np.random.default_rng(1), 10.0)
+    motion = ACTIVITIES[activity](load_model("whole_body"), np.random.default_rng(1), 10.0, IDEAL_MOTION)
     t = np.arange(0.0, 17.0, 0.013)
     R_WL = motion(t, ()).R_WL
     angles = joint_angles(Pose(t, {segment: R.as_quat() for segment, R in R_WL.items()}, {}))
@@ -143,7 +145,9 @@ def test_the_true_pose_has_the_angles_of_the_activity(activity: str) -> None:
 
 
 def test_points_and_sensors_are_where_the_segments_put_them(activity: str, made: Simulation) -> None:
-    motion = ACTIVITIES[activity](load_model("whole_body", made.lengths), spawn_streams(2)["motion"], 10.0)
+    motion = ACTIVITIES[activity](
+        load_model("whole_body", made.lengths), spawn_streams(2)["motion"], 10.0, IDEAL_MOTION
+    )
     root = motion.root(made.time)
     lengths, R_WL = made.lengths, {segment: Rotation.from_quat(quat) for segment, quat in made.quat_WL.items()}
     for side, y in (("left", 1.0), ("right", -1.0)):

@@ -31,7 +31,6 @@ from wepose_pin.angles.movement_tables import build_comparison_table
 from wepose_pin.angles.smoothing import smooth_pose
 from wepose_pin.angles.tables import summarize_joint
 from wepose_pin.angles.uncertainty import compute_summary_std
-from wepose_pin.errors import WrongOption
 from wepose_pin.kinematics import Pose, compute_pose
 from wepose_pin.model import load_model
 from wepose_pin.report.angles import draw_figures
@@ -112,12 +111,6 @@ def test_the_low_pass_keeps_what_is_not_known_and_stops_at_a_gap_in_time() -> No
     known = np.isfinite(smooth).all(axis=1)
     np.testing.assert_allclose(smooth[known], pose.quat_WL["torso"][known], atol=1e-9)
     assert np.abs(smooth_pose(pose, 5.0).quat_WL["torso"][199, 2]) > 0.1  # without the gap the step is smoothed
-
-
-@pytest.mark.parametrize("cutoff_hz", [0.0, -1.0, 45.0, np.inf])
-def test_a_cut_off_that_is_none_is_named(cutoff_hz: float) -> None:
-    with pytest.raises(WrongOption, match=r"--low-pass-hz .*above 0 and below 45 Hz"):
-        smooth_pose(pose_about(np.zeros(100)), cutoff_hz)
 
 
 # What the pose states ---------------------------------------------------------------------------------------------

@@ -8,50 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from simulated import SUBJECT, within
 
 from wepose_pin.assets import asset
-from wepose_pin.calibration import Calibration, assess, calibrate, load_protocol
+from wepose_pin.calibration import assess, calibrate, load_protocol
 from wepose_pin.calibration.protocols import choose_protocol
 from wepose_pin.errors import BadOption, BadPhase
-from wepose_pin.recording import Recording
 from wepose_pin.simulation import (
     IDEAL_PRESET,
     MILD_PRESET,
     NOISE_FREE,
-    Person,
-    Simulation,
     simulate,
     simulate_activity,
     simulate_person,
 )
 
 ANY = replace(IDEAL_PRESET, mount="any")
-
-
-def simulated(protocol: str, seed: int = 3, **options: object) -> tuple[Person, Simulation]:
-    person = simulate_person(seed)
-    options = {"rate_hz": 50.0, "noise": NOISE_FREE, "imperfections": ANY, "clasp_s": 40.0} | options
-    return person, simulate(person.lengths, seed=seed, circles=0, protocol=protocol, **options)
-
-
-@pytest.fixture(scope="module")
-def joined() -> tuple[Person, Simulation]:
-    return simulated("clasp+t_pose+bow", clasp_s=60.0)
-
-
-def rows_of(simulation: Simulation, phase: str) -> np.ndarray:
-    [(begin, end)] = simulation.phases[phase]
-    return np.flatnonzero((simulation.time >= begin) & (simulation.time <= end))
-
-
-def heading_errors(calibration: Calibration, simulation: Simulation) -> np.ndarray:
-    """Of all sensors [deg]."""
-    return np.array(
-        [
-            (Rotation.from_quat(quat) * Rotation.from_quat(simulation.quat_LS[name]).inv()).as_rotvec(degrees=True)[2]
-            for name, quat in calibration.subject.mounts.items()
-        ]
-    )
 
 
 def test_protocols_join(tmp_path: Path) -> None:
@@ -67,18 +39,19 @@ def test_protocols_join(tmp_path: Path) -> None:
     with pytest.raises(BadOption, match="protocol 't_poes' is not known; did you mean 't_pose'"):
         load_protocol("clasp+t_poes")
     with pytest.raises(BadOption, match=r"protocol 'clasp\+table' is not simulated"):
-        simulated("clasp+table")
+        simulate(SUBJECT, seed=3, protocol="clasp+table")
 
 
-def test_parts_are_done_as_they_say(joined: tuple[Person, Simulation]) -> None:
+def test_parts_are_done_as_they_say() -> None:
     """Palms stay together, arms are level, the torso bends forwards."""
-    _, simulation = joined
-    clasp, up = rows_of(simulation, "clasp"), np.array((0.0, 0.0, 1.0))
+    options = {"rate_hz": 50.0, "noise": NOISE_FREE, "clasp_s": 60.0, "circles": 0}
+    simulation = simulate(SUBJECT, seed=3, protocol="clasp+t_pose+bow", **options)
+    clasp, up = within(simulation, "clasp"), np.array((0.0, 0.0, 1.0))
     assert np.ptp(simulation.points["left_palm"][clasp] - simulation.points["right_palm"][clasp]) < 1e-9
     for side in ("left", "right"):
-        raised = Rotation.from_quat(simulation.quat_WL[f"{side}_upper_arm"][rows_of(simulation, "t_pose")[50:-50]])
+        raised = Rotation.from_quat(simulation.quat_WL[f"{side}_upper_arm"][within(simulation, "t_pose")][50:-50])
         assert abs(np.degrees(np.arcsin(raised.apply(-up) @ up)).mean() + 3.0) < 0.5  # as people hold it
-    torso = Rotation.from_quat(simulation.quat_WL["torso"][rows_of(simulation, "bow")])
+    torso = Rotation.from_quat(simulation.quat_WL["torso"][within(simulation, "bow")])
     assert np.degrees(np.arccos(torso.apply(up) @ up)).max() == pytest.approx(45.0, abs=0.5)
 
 
@@ -87,7 +60,13 @@ def test_free_motion_shows_headings_and_keeps_lengths() -> None:
     simulation = simulate_activity("tasks", seed=4, imperfections=ANY, seconds=40.0, lengths=person.lengths)
     recording = simulation.recording()
     calibration = calibrate(recording, prior=person.prior, protocol="free")
-    errors = heading_errors(calibration, simulation)
+    mounts = {name: Rotation.from_quat(quat) for name, quat in calibration.subject.mounts.items()}
+    errors = np.array(
+        [
+            (R * Rotation.from_quat(simulation.quat_LS[name]).inv()).as_rotvec(degrees=True)[2]
+            for name, R in mounts.items()
+        ]
+    )
     std = max(calibration.subject.std(f"mounts.{name}.z") for name in calibration.subject.mounts)
     assert np.abs(errors).max() < 2.0 * np.degrees(std) < 40.0
     assert np.ptp(errors) < 4.0  # against each other by the accelerations of the joints
@@ -100,26 +79,10 @@ def test_free_motion_shows_headings_and_keeps_lengths() -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.fixture(scope="module")
-def sessions() -> list[Recording]:
+def test_an_earlier_calibration_adds_what_it_knows() -> None:
     person = simulate_person(11)
-    made = [
-        simulate(
-            person.lengths,
-            seed=11,
-            session=session,
-            circles=0,
-            clasp_s=20.0,
-            rate_hz=50.0,
-            imperfections=replace(MILD_PRESET, mount="any"),
-        )
-        for session in range(2)
-    ]
-    return [simulation.recording(f"session {k}") for k, simulation in enumerate(made)]
-
-
-def test_an_earlier_calibration_adds_what_it_knows(sessions: list[Recording]) -> None:
-    person = simulate_person(11)
+    options = {"circles": 0, "clasp_s": 20.0, "rate_hz": 50.0, "imperfections": replace(MILD_PRESET, mount="any")}
+    sessions = [simulate(person.lengths, seed=11, session=k, **options).recording() for k in range(2)]
     first, second = (calibrate(each, measured=person.measured).subject for each in sessions)
     both = calibrate(replace(sessions[1], remounted=True), prior=first, measured=person.measured).subject
     names = tuple(person.lengths)

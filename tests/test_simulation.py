@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
-from simulated import SIDES, SUBJECT, G, check_accel, check_gyro, check_lengths, within
+from simulated import SIDES, SUBJECT, G, check_accel, check_gyro, within
 
 from wepose_pin.simulation import NOISE_FREE, SEGMENTS, ImuNoise, Simulation, simulate
 
@@ -26,14 +26,6 @@ def rotation_WS(sim: Simulation, segment: str) -> Rotation:
     return Rotation.from_quat(sim.quat_WL[segment]) * Rotation.from_quat(sim.quat_LS[segment])
 
 
-def flexion(sim: Simulation, side: str) -> np.ndarray:
-    """Angle between upper arm and forearm, from the points [rad]."""
-    shoulder, elbow, wrist = (sim.points[f"{side}_{p}"] for p in ("shoulder", "elbow", "wrist"))
-    upper, lower = elbow - shoulder, wrist - elbow
-    sine = np.linalg.norm(np.cross(upper, lower), axis=1)
-    return np.arctan2(sine, np.sum(upper * lower, axis=1))
-
-
 @pytest.mark.parametrize("segment", SEGMENTS)
 def test_gyro_integrates_to_the_orientation(perfect: Simulation, segment: str) -> None:
     check_gyro(perfect, segment, rotation_WS(perfect, segment), 60.0)
@@ -46,16 +38,24 @@ def test_accel_integrates_to_the_position(fast: Simulation, segment: str) -> Non
     assert moved.max() > 0.1
 
 
-def test_segments_keep_their_length(perfect: Simulation) -> None:
-    check_lengths(perfect, rigid_hands=True)
-
-
 def test_shoulders_are_carried_by_the_torso(perfect: Simulation) -> None:
     left, right = perfect.points["left_shoulder"], perfect.points["right_shoulder"]
     np.testing.assert_allclose(np.linalg.norm(left - right, axis=1), SUBJECT["shoulder_width"], atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(left + right, axis=1), 2 * SUBJECT["trunk"], atol=1e-12)
     across = Rotation.from_quat(perfect.quat_WL["torso"]).apply([0.0, SUBJECT["shoulder_width"], 0.0])
     np.testing.assert_allclose(left - right, across, atol=1e-12)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_segments_keep_their_length(perfect: Simulation, side: str) -> None:
+    for part, segment, a, b in (
+        ("upper_arm", "upper_arm", "shoulder", "elbow"),
+        ("forearm", "forearm", "elbow", "wrist"),
+        ("hand", "forearm", "wrist", "palm"),
+    ):
+        p_W = perfect.points[f"{side}_{b}"] - perfect.points[f"{side}_{a}"]
+        p_L = Rotation.from_quat(perfect.quat_WL[f"{side}_{segment}"]).inv().apply(p_W)
+        assert np.abs(p_L - [0.0, 0.0, -SUBJECT[f"{side}_{part}"]]).max() < 1e-12
 
 
 def test_n_pose(perfect: Simulation) -> None:
@@ -89,7 +89,7 @@ def test_elbow_is_a_hinge_about_minus_y(perfect: Simulation, side: str) -> None:
     forearm_U = R_WU.inv().apply(R_WF.apply([0.0, 0.0, -1.0]))
     assert np.abs(forearm_U[:, 1]).max() < 1e-12  # no carrying angle
     angle = np.arctan2(forearm_U[:, 0], -forearm_U[:, 2])
-    np.testing.assert_allclose(angle, flexion(perfect, side), atol=1e-7)  # forwards, never hyperextended
+    assert angle.min() > -1e-12  # never hyperextended
     pronation = (Rotation.from_rotvec(np.outer(angle, [0.0, 1.0, 0.0])) * R_WU.inv() * R_WF).as_rotvec()
     assert np.abs(pronation[:, :2]).max() < 1e-9
     assert 40 < np.rad2deg(np.abs(pronation[:, 2])).max() < 60
@@ -126,18 +126,6 @@ def test_six_circles_between_the_rests(perfect: Simulation) -> None:
     assert away[t >= back].max() < 1e-12
     for (_, a), (b, _) in pairwise(rests):
         assert away[(t > a) & (t < b)].max() > 0.2
-        # The turn itself lies in a plane and at one distance from its centre.
-        turn = perfect.points["right_palm"][(t > a + 1.7) & (t < b - 1.7)]
-        centre = turn.mean(axis=0)
-        assert np.linalg.svd(turn - centre)[1][2] < 1e-9
-        fit = np.linalg.lstsq(
-            np.column_stack((2 * (turn - centre), np.ones(len(turn)))),
-            np.sum((turn - centre) ** 2, axis=1),
-            rcond=1e-9,
-        )[0]
-        radius = np.linalg.norm(turn - centre - fit[:3], axis=1)
-        assert np.ptp(radius) < 1e-9
-        assert 0.12 < radius[0] < 0.2
 
 
 def test_stated_axes_and_gravity_give_the_mount(perfect: Simulation) -> None:
@@ -150,15 +138,6 @@ def test_stated_axes_and_gravity_give_the_mount(perfect: Simulation) -> None:
         error = swing * Rotation.from_matrix(N) * Rotation.from_quat(perfect.quat_LS[segment]).inv()
         assert error.magnitude() < 1e-7
         assert 1.9 < np.rad2deg(swing.magnitude()) < 10.1
-
-
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(k, marks=pytest.mark.monte_carlo) for k in range(2, 12))])
-def test_gyro_and_accel_are_of_human_size(seed: int) -> None:
-    sim = simulate(SUBJECT, seed=seed, rate_hz=50.0, noise=NOISE_FREE)
-    for segment in SEGMENTS:
-        assert np.linalg.norm(sim.gyro_S[segment], axis=1).max() < 15
-        assert np.linalg.norm(sim.accel_S[segment], axis=1).max() < 40
-    assert np.linalg.norm(sim.gyro_S["left_forearm"], axis=1).max() > 2
 
 
 def test_motion_is_smooth(fast: Simulation) -> None:
@@ -177,17 +156,6 @@ def test_same_seed_same_bits() -> None:
         for field in ("gyro_S", "accel_S", "quat_LS"):
             a, b = getattr(one, field)[segment], getattr(other, field)[segment]
             assert not np.allclose(a[:500], b[:500], atol=1e-6)
-
-
-def test_noise_and_rate_leave_motion_and_mounts_alone() -> None:
-    slow, quick = (
-        simulate(SUBJECT, seed=9, rate_hz=r, noise=n, clasp_s=5.0, circles=2)
-        for r, n in ((100.0, NOISE_FREE), (400.0, ImuNoise()))
-    )
-    n = len(slow.time)
-    for segment in SEGMENTS:
-        assert np.array_equal(slow.quat_LS[segment], quick.quat_LS[segment])
-        np.testing.assert_allclose(slow.quat_WL[segment], quick.quat_WL[segment][::4][:n], atol=1e-12)
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 400.0])

@@ -12,13 +12,12 @@ the table, and sensors with noise and bias only. `Imperfections` add those of re
 
 from .activities import ACTIVITIES, simulate_activity
 from .imperfections import IDEAL_PRESET, MILD_PRESET, PEOPLE_PRESET, PRESETS, Imperfections
-from .imu import GRAVITY, MTI_3, NOISE_FREE, Device, ImuNoise
+from .imu import MTI_3, NOISE_FREE, ImuNoise
 from .motion import CIRCLING_POINT, SEGMENTS, SIDES
 from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
 from .subject import (
     MEASURED_LENGTHS,
     MEASURED_STD,
-    MOUNT,
     PEOPLE_MEASURED_STD,
     Person,
     Simulation,
@@ -29,12 +28,10 @@ from .subject import (
 __all__ = [
     "ACTIVITIES",
     "CIRCLING_POINT",
-    "GRAVITY",
     "IDEAL_PRESET",
     "MEASURED_LENGTHS",
     "MEASURED_STD",
     "MILD_PRESET",
-    "MOUNT",
     "MTI_3",
     "NOISE_FREE",
     "PEOPLE_MEASURED_STD",
@@ -42,7 +39,6 @@ __all__ = [
     "PRESETS",
     "SEGMENTS",
     "SIDES",
-    "Device",
     "Imperfections",
     "ImuNoise",
     "Person",

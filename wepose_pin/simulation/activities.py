@@ -25,16 +25,11 @@ from ..model import BodyModel, load_model
 from ..model.girdle import PARAMETERS
 from ..rotations import compose, turn_about
 from .arm_tasks import ArmTasks
-from .girdle import Girdle
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
-from .motion import ARM, E_Z, MARGIN_S, SIDES, STAND_S, BodyMotion, BodyPose, Flaws, place_arm, place_sensors
+from .motion import ARM, E_Z, RAMP_S, SIDES, STAND_S, Activity, BodyPose, Flaws, place_arm, place_shoulder
 from .signals import integrate_pulse, make_pulse, make_step
 from .subject import Simulation, measure_motion, spawn_streams
-
-WHOLE_BODY = "whole_body"
-_RAMP_S = 2.0  # a walk grows and dies away over this time
-_END_S = 2.0  # the person stands still at the end
 
 
 class LegAngles(NamedTuple):
@@ -53,23 +48,20 @@ class TrunkAngles(NamedTuple):
     head: np.ndarray
 
 
-class Activity(BodyMotion):
+class WholeBodyActivity(Activity):
     """An activity of a body with legs, with a sensor on each segment."""
 
-    phase = ""
-    body = WHOLE_BODY
+    body = "whole_body"
 
-    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws | None = None) -> None:
-        self.model = model
-        self.flaws = flaws
-        self.lengths = model.lengths
-        self.p_LS = _place_sensors(self.lengths, flaws.sizes if flaws else IDEAL_PRESET)
-        self.seconds = seconds
-        self.prepare(rng)
-
-    @abstractmethod
-    def prepare(self, rng: np.random.Generator) -> None:
-        """Draw what is this person's own."""
+    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws) -> None:
+        super().__init__(model, rng, seconds, flaws)
+        lengths = self.lengths
+        self.p_LS |= {"pelvis": np.array((-0.1, 0.0, 0.02)), "head": np.array((-0.1, 0.0, 0.15))}
+        for side, y in SIDES.items():
+            self.p_LS[f"{side}_hand"] = np.array((0.0, 0.02 * y, -lengths[f"{side}_hand"]))
+            self.p_LS[f"{side}_thigh"] = np.array((0.0, 0.07 * y, -0.7 * lengths[f"{side}_thigh"]))
+            self.p_LS[f"{side}_shank"] = np.array((0.06, 0.0, -0.36 * lengths[f"{side}_shank"]))
+            self.p_LS[f"{side}_foot"] = np.array((0.4 * lengths[f"{side}_foot"], 0.0, 0.0))
 
     @abstractmethod
     def leg(self, side: str, t: np.ndarray) -> LegAngles:
@@ -91,23 +83,8 @@ class Activity(BodyMotion):
         """Compute where the root is at times (n,) [s]: (n, 3) [m] in a world at rest; None: it does not move."""
         return None
 
-    @property
-    def span(self) -> tuple[float, float]:
-        return STAND_S, STAND_S + self.seconds + _END_S
-
-    def activity(self, t: np.ndarray) -> np.ndarray:
-        return make_pulse(t, STAND_S, STAND_S + self.seconds, _RAMP_S)
-
     def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
-        return integrate_pulse(t, STAND_S, STAND_S + self.seconds, _RAMP_S)
-
-    def phases(self) -> dict[str, list[tuple[float, float]]]:
-        stop = STAND_S + self.seconds
-        return {
-            "start": [(0.5, STAND_S - 0.5)],
-            self.phase: [(STAND_S + MARGIN_S, stop - MARGIN_S)],
-            "rest": [(stop + MARGIN_S, stop + _END_S - MARGIN_S)],
-        }
+        return integrate_pulse(t, STAND_S, self.stop, RAMP_S)
 
     def __call__(self, t: np.ndarray, _segments: Collection[str] = ()) -> BodyPose:
         """Return the exact pose of all segments at the times `t` (n,) [s]."""
@@ -117,47 +94,36 @@ class Activity(BodyMotion):
         _, p_W = compute_link_poses(self.model, q, [*R_WL, *frames.values()], rotations=False)
         origins = {segment: p_W[:, k] for k, segment in enumerate(R_WL)}
         points = {point: p_W[:, len(R_WL) + k] for k, point in enumerate(frames)}
-        if self.flaws and self.flaws.girdle.moves:
-            points |= self._move_shoulders(self.flaws.girdle, t, R_WL, origins)
+        pose = BodyPose(R_WL, points, origins)
+        if self.flaws.girdle.moves:
+            self._move_shoulders(pose, t)
         root = self.root(t)
         if root is not None:
-            origins = {segment: origin + root for segment, origin in origins.items()}
-        return BodyPose(R_WL, points, origins)
+            pose = pose._replace(origins={segment: origin + root for segment, origin in origins.items()})
+        return pose
 
-    def _move_shoulders(
-        self, girdle: Girdle, t: np.ndarray, R_WL: dict[str, Rotation], origins: dict[str, np.ndarray]
-    ) -> dict[str, np.ndarray]:
-        """Place the arms' points (n, 3) [m] on shoulders that move, and correct the arms' `origins`."""
-        R_WT = R_WL["torso"]
-        points: dict[str, np.ndarray] = {}
+    def _move_shoulders(self, pose: BodyPose, t: np.ndarray) -> None:
+        """Place the arms of a pose on shoulders that move."""
+        girdle, R_WT = self.flaws.girdle, pose.R_WL["torso"]
         for side, y in SIDES.items():
-            along_T = compose(R_WT.inv(), R_WL[f"{side}_upper_arm"]).apply(-E_Z)
-            shoulder_T = np.array((0.0, 0.5 * y * self.lengths["shoulder_width"], self.lengths["trunk"]))
-            shoulder_T = shoulder_T + girdle.place(y, self.moving_time(t))
+            R_arm = tuple(pose.R_WL[f"{side}_{part}"] for part in ARM)
+            along_T = compose(R_WT.inv(), R_arm[0]).apply(-E_Z)
+            shoulder_T = place_shoulder(side, self.lengths) + girdle.place(y, self.moving_time(t))
             shoulder_T = shoulder_T + girdle.displace(along_T, y, np.zeros_like(t))
-            shoulder_W = origins["torso"] + R_WT.apply(shoulder_T)
-            R_arm = (R_WL[f"{side}_upper_arm"], R_WL[f"{side}_forearm"], R_WL[f"{side}_hand"])
-            points |= place_arm(shoulder_W, side, R_arm, self.lengths)
-            for part, start in zip(ARM, ("shoulder", "elbow", "wrist"), strict=True):
-                origins[f"{side}_{part}"] = points[f"{side}_{start}"]
-        return points
+            place_arm(pose, side, pose.origins["torso"] + R_WT.apply(shoulder_T), R_arm, self.lengths)
 
     def _orientations(self, t: np.ndarray) -> dict[str, Rotation]:
         R_WL = {name: Rotation.from_rotvec(turn) for name, turn in self.trunk(t)._asdict().items()}
-        start = self.flaws.start_pose if self.flaws else None
-        if start is not None and (start.torso.any() or start.head.any()):
+        start = self.flaws.start_pose
+        if start.torso.any() or start.head.any():
             R_WL["torso"] = R_WL["torso"] * Rotation.from_rotvec(start.torso)
             R_WL["head"] = R_WL["head"] * Rotation.from_rotvec(start.head)
         for side, y in SIDES.items():
-            elbow = self.arm(side, t)[:, 1]
             R_WU = compose(R_WL["torso"], self.shoulder(side, t))
-            if self.flaws is None or start is None:
-                R_WF = compose(R_WU, turn_about("Y", -elbow[:, None]))
-            else:
-                if start.upper_arm[side].any():
-                    R_WU = R_WU * Rotation.from_rotvec(start.upper_arm[side])
-                flexion, pronation = elbow + start.flexion[side], np.full_like(t, start.pronation[side])
-                R_WF = R_WU * self.flaws.elbow_joint.rotate(y, flexion, pronation)
+            if start.upper_arm[side].any():
+                R_WU = R_WU * Rotation.from_rotvec(start.upper_arm[side])
+            flexion = self.arm(side, t)[:, 1] + start.flexion[side]
+            R_WF = R_WU * self.flaws.elbow_joint.rotate(y, flexion, np.full_like(t, start.pronation[side]))
             leg = self.leg(side, t)
             # A right leg, y = −1: flexion about −y, adduction about x, internal rotation about z. Its knee: y, x, −z.
             R_WT = compose(R_WL["pelvis"], turn_about("YXZ", leg.hip * (-1.0, -y, -y)))
@@ -168,7 +134,7 @@ class Activity(BodyMotion):
         return R_WL
 
 
-class Walk(Activity):
+class Walk(WholeBodyActivity):
     """Walking: each leg the other half a stride later, the arms against the legs, torso against pelvis.
 
     Hip, knee and ankle in the sagittal plane: Perry & Burnfield 2010, "Gait Analysis: Normal and Pathological
@@ -192,6 +158,11 @@ class Walk(Activity):
         ]
     )
     _STRIDE_S = 1.06  # 113 steps a minute, Perry & Burnfield 2010
+    # Right side down and up, mean of forward and its change, turn. At the right foot's first contact the right side of
+    # the pelvis is in front; then its left side drops.
+    _PELVIS_DEG, _TORSO_DEG = (-4.0, 0.0, 2.0, 5.0), (2.0, 1.0, 1.0, -5.0)
+    _HEAD_SHARE = 0.3  # of the torso's
+    _ARM_DEG = np.array(((-24.0, 20.0), (32.0, 24.0)))  # flexion of shoulder and elbow: behind, and from there forward
 
     def prepare(self, rng: np.random.Generator) -> None:
         self.stride_s = self._STRIDE_S * rng.uniform(0.92, 1.08)
@@ -216,19 +187,22 @@ class Walk(Activity):
     def trunk(self, t: np.ndarray) -> TrunkAngles:
         angle = 2.0 * np.pi * self._cycle(t, "right")
         size = np.radians(self.activity(t))[:, None]
-        # At the right foot's first contact the right side of the pelvis is in front; then its left side drops.
-        pelvis = np.column_stack((-4.0 * np.sin(angle), 2.0 * np.sin(2.0 * angle), 5.0 * np.cos(angle)))
-        torso = np.column_stack((2.0 * np.sin(angle), 1.0 + np.sin(2.0 * angle), -5.0 * np.cos(angle)))
-        return TrunkAngles(size * torso, size * pelvis, size * 0.3 * torso)
+
+        def sway(side: float, mean: float, forward: float, turn: float) -> np.ndarray:
+            pitch = mean + forward * np.sin(2.0 * angle)
+            return np.column_stack((side * np.sin(angle), pitch, turn * np.cos(angle)))
+
+        torso, pelvis = sway(*self._TORSO_DEG), sway(*self._PELVIS_DEG)
+        return TrunkAngles(size * torso, size * pelvis, size * self._HEAD_SHARE * torso)
 
     def arm(self, side: str, t: np.ndarray) -> np.ndarray:
         forward = 0.5 - 0.5 * np.cos(2.0 * np.pi * self._cycle(t, side))  # 0 at the first contact of its own foot
-        degrees = np.column_stack((-24.0 + 32.0 * forward, 20.0 + 24.0 * forward))
-        return self.activity(t)[:, None] * np.radians(degrees)
+        back, swing = self._ARM_DEG
+        return self.activity(t)[:, None] * np.radians(back + swing * forward[:, None])
 
 
 class Run(Walk):
-    """Running straight on at 3 m/s with 2.6 to 3 steps/s and arms that swing; it begins and ends within `_RAMP_S`.
+    """Running straight on at 3 m/s with 2.6 to 3 steps/s and arms that swing; it begins and ends within `RAMP_S`.
 
     All sizes are assumptions; hip, knee and ankle are near those of Novacheck 1998, Gait & Posture 7, 77-95. The trunk
     has 2 g at mid-stance, another g of impact at the contact, and brakes before it pushes off.
@@ -248,18 +222,11 @@ class Run(Walk):
         ]
     )
     _STRIDE_S = 0.72
+    _PELVIS_DEG, _TORSO_DEG = (-5.0, 8.0, 3.0, 8.0), (3.0, 10.0, 2.0, -12.0)
+    _HEAD_SHARE = 0.2
+    _ARM_DEG = np.array(((-50.0, 75.0), (75.0, 25.0)))
     _SPEED = 3.0  # [m/s]
     _BOUNCE, _BRAKING, _IMPACT = 0.035, 0.008, 0.0012  # [m]
-
-    def trunk(self, t: np.ndarray) -> TrunkAngles:
-        angle, size = 2.0 * np.pi * self._cycle(t, "right"), np.radians(self.activity(t))[:, None]
-        pelvis = np.column_stack((-5.0 * np.sin(angle), 8.0 + 3.0 * np.sin(2.0 * angle), 8.0 * np.cos(angle)))
-        torso = np.column_stack((3.0 * np.sin(angle), 10.0 + 2.0 * np.sin(2.0 * angle), -12.0 * np.cos(angle)))
-        return TrunkAngles(size * torso, size * pelvis, size * 0.2 * torso)
-
-    def arm(self, side: str, t: np.ndarray) -> np.ndarray:
-        forward = 0.5 - 0.5 * np.cos(2.0 * np.pi * self._cycle(t, side))
-        return self.activity(t)[:, None] * np.radians(np.column_stack((-50.0 + 75.0 * forward, 75.0 + 25.0 * forward)))
 
     def root(self, t: np.ndarray, /) -> np.ndarray:
         after = 4.0 * np.pi * self._cycle(t, "right")  # [rad] since a foot's contact, a turn is a step
@@ -270,7 +237,7 @@ class Run(Walk):
         return steps + np.outer(self._SPEED * self.moving_time(t), np.eye(3)[0])
 
 
-class Throw(Activity):
+class Throw(WholeBodyActivity):
     """Overhand throws from where the person stands: one arm throws, the other hangs.
 
     The upper arm is cocked, turns by 110° about its long axis and by 75° forward in `_THROW_S`, at 15 to 20 rad/s, and
@@ -324,7 +291,7 @@ class Throw(Activity):
         return turn_about("ZXZ", SIDES[side] * np.column_stack((-plane, elevation, external)))
 
 
-class Sit(Activity):
+class Sit(WholeBodyActivity):
     """Sitting down and standing up again, some times; the trunk leans forward while the body moves.
 
     Seated, the hips and knees are bent to 90°, the elbows to 75°, and the pelvis is upright. The feet stay level to a
@@ -340,10 +307,11 @@ class Sit(Activity):
         times = int(self.seconds // (2.0 * self._MOVE_S + sum(self._PAUSE_S)))
         if times < 1:
             raise BadOption(f"seconds {self.seconds:g}: sitting down and standing up once takes 8")
+        up = self._MOVE_S + self._PAUSE_S[1]  # from the beginning of the way down to that of the way up
+        self.ways: list[tuple[float, float]] = []  # down and up begin [s]
         start = STAND_S + self._PAUSE_S[0]
-        self.down: list[float] = []
         for _ in range(times):
-            self.down.append(start)
+            self.ways.append((start, start + up))
             start += 2.0 * self._MOVE_S + sum(self._PAUSE_S)
         self.lean = np.radians(35.0 * rng.uniform(0.85, 1.15))
         self.tilt = 0.6 * self.lean  # of the pelvis, forward
@@ -351,20 +319,13 @@ class Sit(Activity):
 
     def _seated(self, t: np.ndarray) -> np.ndarray:
         """Share (n,): 0 standing, 1 seated."""
-        return sum(
-            (make_pulse(t, at, at + self._up + self._MOVE_S, self._MOVE_S) for at in self.down), np.zeros_like(t)
-        )
+        move = self._MOVE_S
+        return sum((make_pulse(t, down, up + move, move) for down, up in self.ways), np.zeros_like(t))
 
     def _moving(self, t: np.ndarray) -> np.ndarray:
         """Share (n,): 1 in the middle of each way down or up."""
-        half = 0.5 * self._MOVE_S
-        ways = [way for at in self.down for way in (at, at + self._up)]
-        return sum((make_pulse(t, way, way + self._MOVE_S, half) for way in ways), np.zeros_like(t))
-
-    @property
-    def _up(self) -> float:
-        """Time [s] from the beginning of the way down to that of the way up."""
-        return self._MOVE_S + self._PAUSE_S[1]
+        move = self._MOVE_S
+        return sum((make_pulse(t, at, at + move, 0.5 * move) for way in self.ways for at in way), np.zeros_like(t))
 
     def leg(self, side: str, t: np.ndarray) -> LegAngles:
         seated, moving = self._seated(t), self._moving(t)
@@ -393,7 +354,7 @@ class Sit(Activity):
         return self._moving(t)[:, None] * reach + self._seated(t)[:, None] * rest
 
 
-ACTIVITIES: dict[str, type[Activity | ArmTasks]] = {
+ACTIVITIES: dict[str, type[Activity]] = {
     "walk": Walk,
     "sit": Sit,
     "tasks": ArmTasks,
@@ -441,17 +402,3 @@ def simulate_activity(
     flaws = Flaws(imperfections, rngs, model.lengths["shoulder_width"])
     motion = ACTIVITIES[activity](model, rngs["motion"], seconds, flaws)
     return measure_motion(motion, rngs, rate_hz, noise, imperfections)
-
-
-def _place_sensors(lengths: Mapping[str, float], sizes: Imperfections) -> dict[str, np.ndarray]:
-    """Place each sensor in L [m]: the upper body's, and those of head, hands, pelvis and legs."""
-    places = place_sensors(lengths, sizes) | {
-        "pelvis": np.array((-0.1, 0.0, 0.02)),
-        "head": np.array((-0.1, 0.0, 0.15)),
-    }
-    for side, y in SIDES.items():
-        places[f"{side}_hand"] = np.array((0.0, 0.02 * y, -lengths[f"{side}_hand"]))
-        places[f"{side}_thigh"] = np.array((0.0, 0.07 * y, -0.7 * lengths[f"{side}_thigh"]))
-        places[f"{side}_shank"] = np.array((0.06, 0.0, -0.36 * lengths[f"{side}_shank"]))
-        places[f"{side}_foot"] = np.array((0.4 * lengths[f"{side}_foot"], 0.0, 0.0))
-    return places

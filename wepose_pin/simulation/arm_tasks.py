@@ -8,19 +8,17 @@ to 23 deg of lean, 32 of turn and 59 of bend (Gates 2016, Am J Occup Ther 70); s
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..model import DEFAULT_BODY, BodyModel
+from ..model import DEFAULT_BODY
 from ..rotations import compose, turn_about
-from .motion import E_Z, MARGIN_S, SEGMENTS, SIDES, STAND_S, BodyMotion, BodyPose, Flaws, place_arm, place_sensors
+from .motion import E_Z, END_S, RAMP_S, SEGMENTS, SIDES, STAND_S, Activity, BodyPose, place_arm, place_shoulder
 from .signals import Process, make_pulse, make_step
 
-_END_S = 2.0  # the person stands still at the end
-_RAMP_S = 2.0
 _RATE_STEP_S = 0.02  # for the rate of elevation
 _TYPING_S = (2.0, 8.0)
 _TYPING = np.deg2rad((0.0, 0.0, 1.0, 0.7, 1.5))  # [rad] rms of each angle of the arm
@@ -54,25 +52,36 @@ _TRUNK_MEAN = np.deg2rad((0.0, 10.0, 0.0))
 _TRUNK_MOST = np.deg2rad((23.0, 59.0, 32.0))
 
 
+class _Move(NamedTuple):
+    """A move to a posture."""
+
+    posture: np.ndarray  # (k,)
+    duration: float  # [s]
+    hold: float  # [s] for which the posture is held
+    typing: bool = False  # meanwhile
+
+
 class _Path:
     """Values (n, k) that go from posture to posture, standing still between them, and the time spent moving."""
 
-    def __init__(self, first: np.ndarray) -> None:
-        self.postures, self.start, self.duration = [first], [0.0], [1.0]
+    def __init__(self, rest: np.ndarray, stop: float, draw: Callable[[np.ndarray], _Move]) -> None:
+        """Go from `rest` (k,) and be back at `stop` [s]; `draw` draws the next move from a posture."""
+        postures, start, duration, at = [rest, rest], [0.0], [1.0], STAND_S
         self.typing: list[tuple[float, float]] = []
-
-    def move(self, posture: np.ndarray, start: float, duration: float) -> None:
-        """Append a move."""
-        self.postures.append(posture)
-        self.start.append(start)
-        self.duration.append(duration)
-
-    def close(self) -> None:
-        """Freeze the path."""
-        self._values = np.array([self.postures[0], *self.postures])
-        self._start, self._duration = np.array(self.start), np.array(self.duration)
+        while True:
+            move = draw(postures[-1])
+            arrived = at + move.duration
+            if arrived + move.hold > stop - RAMP_S:
+                break
+            postures.append(move.posture)
+            start.append(at)
+            duration.append(move.duration)
+            if move.typing:
+                self.typing.append((arrived, arrived + move.hold))
+            at += move.duration + move.hold
+        self._start, self._duration = np.array([*start, stop - RAMP_S]), np.array([*duration, RAMP_S])
         moved = np.concatenate(([0.0, 0.0], np.cumsum(self._duration[1:])))
-        self._values = np.column_stack((self._values, moved))
+        self._values = np.column_stack((np.array([*postures, rest]), moved))
 
     def __call__(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the values (n, k) and the time (n,) [s] spent moving at the times `t` (n,) [s]."""
@@ -82,54 +91,29 @@ class _Path:
         return values[:, :-1], values[:, -1]
 
 
-class ArmTasks(BodyMotion):
+class ArmTasks(Activity):
     """Random reaches, rests and typing of both arms, while the trunk leans and turns."""
 
     phase = "tasks"
     body = DEFAULT_BODY
 
-    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws) -> None:
-        self.flaws, self.lengths, self.seconds = flaws, model.lengths, seconds
-        self.p_LS = place_sensors(self.lengths, flaws.sizes)
-        self.trunk = self._draw_trunk(rng)
+    def prepare(self, rng: np.random.Generator) -> None:
+        self.trunk = _Path(self.flaws.start_pose.torso, self.stop, lambda _: self._draw_trunk(rng))
         self.arms = {side: self._draw_arm(rng, side) for side in SIDES}
         self.tremble = {side: Process(rng, _TYPING_CORRELATION_S, 5) for side in SIDES}
-        grid = np.arange(*self.span, 0.1)
-        if flaws.wrists.bend:
+        if self.flaws.wrists.bend:
+            grid = np.arange(*self.span, 0.1)
             distance = np.column_stack([self._distance(grid, side) for side in SIDES])
-            flaws.wrists.fit(grid, self.activity(grid), distance)
-
-    @property
-    def span(self) -> tuple[float, float]:
-        return STAND_S, STAND_S + self.seconds + _END_S
-
-    def activity(self, t: np.ndarray) -> np.ndarray:
-        return make_pulse(t, STAND_S, STAND_S + self.seconds, _RAMP_S)
+            self.flaws.wrists.fit(grid, self.activity(grid), distance)
 
     def moving_time(self, t: np.ndarray, segment: str = "", /) -> np.ndarray:
         return self.arms.get(segment.partition("_")[0], self.trunk)(t)[1]
 
-    def phases(self) -> dict[str, list[tuple[float, float]]]:
-        stop = STAND_S + self.seconds
-        return {
-            "start": [(0.5, STAND_S - 0.5)],
-            self.phase: [(STAND_S + MARGIN_S, stop - MARGIN_S)],
-            "rest": [(stop + MARGIN_S, stop + _END_S - MARGIN_S)],
-        }
-
-    def _draw_trunk(self, rng: np.random.Generator) -> _Path:
-        """Draw the path of the trunk's rotation vector (3,) [rad], from the start pose and back to it."""
-        start = self.flaws.start_pose.torso
-        path, at, stop = _Path(start), STAND_S, STAND_S + self.seconds
-        while True:
-            posture = np.clip(_TRUNK_MEAN + _TRUNK_STD * rng.standard_normal(3), -_TRUNK_MOST, _TRUNK_MOST)
-            duration, hold = rng.uniform(1.0, 2.5), rng.exponential(3.0)
-            if at + duration + hold > stop - _RAMP_S:
-                path.move(start, stop - _RAMP_S, _RAMP_S)
-                path.close()
-                return path
-            path.move(posture, at, duration)
-            at += duration + hold
+    @staticmethod
+    def _draw_trunk(rng: np.random.Generator) -> _Move:
+        """Draw a move of the trunk's rotation vector (3,) [rad]."""
+        posture = np.clip(_TRUNK_MEAN + _TRUNK_STD * rng.standard_normal(3), -_TRUNK_MOST, _TRUNK_MOST)
+        return _Move(posture, rng.uniform(1.0, 2.5), rng.exponential(3.0))
 
     def _draw_arm(self, rng: np.random.Generator, side: str) -> _Path:
         """Draw the path of an arm, from the start pose and back to it.
@@ -137,9 +121,8 @@ class ArmTasks(BodyMotion):
         Values: rotation vector of the elevation about x and y of the torso, twist, elbow flexion, pronation [rad].
         """
         y, pose = SIDES[side], self.flaws.start_pose
-        start = np.array((*pose.upper_arm[side], pose.flexion[side], pose.pronation[side]))
-        path, at, stop, before = _Path(start), STAND_S, STAND_S + self.seconds, start
-        while True:
+
+        def draw(before: np.ndarray) -> _Move:
             kind = _KINDS[rng.choice(len(_KINDS), p=[kind.share for kind in _KINDS])]
             drawn = np.deg2rad(np.array(kind.mean) + np.array(kind.std) * rng.standard_normal(5))
             elevation, plane, twist, flexion, pronation = np.clip(drawn, *_RANGE)
@@ -148,16 +131,9 @@ class ArmTasks(BodyMotion):
             duration = max(_SHORTEST_S, np.abs(posture - before).max() / _SPEED * rng.uniform(0.7, 1.5))
             hold, rest = rng.exponential(_PAUSE_S), rng.exponential(_REST_S)
             rests, types = rng.uniform() < _REST_SHARE, rng.uniform(*_TYPING_S)
-            hold = types if kind.typing else rest if rests else hold
-            if at + duration + hold > stop - _RAMP_S:
-                path.move(start, stop - _RAMP_S, _RAMP_S)
-                path.close()
-                return path
-            path.move(posture, at, duration)
-            if kind.typing:
-                path.typing.append((at + duration, at + duration + hold))
-            at += duration + hold
-            before = posture
+            return _Move(posture, duration, types if kind.typing else rest if rests else hold, kind.typing)
+
+        return _Path(np.array((*pose.upper_arm[side], pose.flexion[side], pose.pronation[side])), self.stop, draw)
 
     def _angles(self, t: np.ndarray, side: str) -> np.ndarray:
         """Return the arm's values (n, 5) [rad], as `_draw_arm` has them."""
@@ -186,18 +162,18 @@ class ArmTasks(BodyMotion):
         lean = self.trunk(t)[0]
         lean[:, :2] += sway * flaws.sway["torso"](t) + tilt * flaws.tilt(t)
         R_WT = Rotation.from_rotvec(lean)
-        R_WL, origins = {"torso": R_WT}, {"torso": np.zeros(3)}
-        points: dict[str, np.ndarray] = {}
+        pose = BodyPose({"torso": R_WT}, {}, {"torso": np.zeros(3)})
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
             y, angles = SIDES[side], self._angles(t, side)
             swing = np.pad(angles[:, :2], ((0, 0), (0, 1)))
             R_TU = compose(Rotation.from_rotvec(swing), turn_about("Z", angles[:, 2:3]))
-            hanging = make_pulse(t, -10.0, STAND_S + 0.5, 0.5) + make_step(t, self.span[1] - _END_S - 0.5, 0.5)
+            hanging = make_pulse(t, -10.0, STAND_S + 0.5, 0.5) + make_step(t, self.span[1] - END_S - 0.5, 0.5)
             swaying = sway * hanging[:, None] * np.pad(flaws.sway[side](t), ((0, 0), (0, 1)))
             R_TU = compose(R_TU, Rotation.from_rotvec(swaying))
             along_T = R_TU.apply(-E_Z)
-            shoulder_T = np.array((0.0, 0.5 * y * self.lengths["shoulder_width"], self.lengths["trunk"]))
-            shoulder_T = shoulder_T + flaws.girdle.place(y, self.moving_time(t, f"{side}_upper_arm"))
+            shoulder_T = place_shoulder(side, self.lengths) + flaws.girdle.place(
+                y, self.moving_time(t, f"{side}_upper_arm")
+            )
             raising = self._raising(t, side) if sizes.girdle_hysteresis else np.zeros_like(t)
             shoulder_T = shoulder_T + flaws.girdle.displace(along_T, y, raising)
             R_WU = compose(R_WT, R_TU)
@@ -206,7 +182,5 @@ class ArmTasks(BodyMotion):
             if flaws.wrists.bend:
                 none = np.zeros_like(t)
                 R_WH = compose(R_WF, flaws.wrists.rotate(y, t, self.activity(t), none, self._distance(t, side)))
-            R_WL[f"{side}_upper_arm"], R_WL[f"{side}_forearm"] = R_WU, R_WF
-            points |= place_arm(R_WT.apply(shoulder_T), side, (R_WU, R_WF, R_WH), self.lengths)
-            origins |= {f"{side}_upper_arm": points[f"{side}_shoulder"], f"{side}_forearm": points[f"{side}_elbow"]}
-        return BodyPose(R_WL, points, origins)
+            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, R_WH), self.lengths)
+        return pose

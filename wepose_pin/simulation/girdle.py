@@ -77,7 +77,7 @@ class Girdle:
         self.sizes = sizes
         self.scale = shoulder_width / _WIDTH
         draws = np.clip(rngs["girdle_person"].standard_normal((2, 3)), -2.5, 2.5)
-        wander = Process(rngs["girdle_wander"], _WANDER_S, 6)
+        self.wander = Process(rngs["girdle_wander"], _WANDER_S, 6)
         common, left, right = np.clip(rngs["girdle_rest"].standard_normal((3, 3)), -2.5, 2.5)
         both = [np.sqrt(_REST_CORRELATION) * common + np.sqrt(1.0 - _REST_CORRELATION) * own for own in (left, right)]
         rest = sizes.girdle_rest * _REST * np.array(both)  # y is outwards here
@@ -85,7 +85,6 @@ class Girdle:
         rest[:, 1], rest[:, 2] = shift, (tilt, -tilt)
         self.rest = {1.0: rest[0], -1.0: rest[1]}  # y of the side -> (3,) [m] in T
         self.person = {1.0: draws[0], -1.0: draws[1]}
-        self.wander = wander
 
     @property
     def moves(self) -> bool:
@@ -103,22 +102,15 @@ class Girdle:
         raising : (n,) rate of elevation [deg/s]
         """
         sizes = self.sizes
-        moved = np.zeros_like(along_T)
-        if sizes.girdle:
-            gain = 1.0 + sizes.girdle_hysteresis * np.tanh(raising / _HYSTERESIS_RATE)
-            moved = moved + sizes.girdle * self.scale * compute_girdle(along_T, side, gain)
-        if sizes.girdle_person:
-            horizontal = np.hypot(along_T[:, 0], along_T[:, 1])
-            # An angle from hanging has a kink there: rounded off within a few degrees.
-            elevation = np.hypot(np.arctan2(horizontal, -along_T[:, 2]), _ROUND) - _ROUND
-            share = elevation / (0.5 * np.pi)
-            moved = moved + sizes.girdle_person * share[:, None] * _PERSON * self.person[side]
-        return moved
+        gain = 1.0 + sizes.girdle_hysteresis * np.tanh(raising / _HYSTERESIS_RATE)
+        law = sizes.girdle * self.scale * compute_girdle(along_T, side, gain)
+        horizontal = np.hypot(along_T[:, 0], along_T[:, 1])
+        # An angle from hanging has a kink there: rounded off within a few degrees.
+        elevation = np.hypot(np.arctan2(horizontal, -along_T[:, 2]), _ROUND) - _ROUND
+        share = elevation / (0.5 * np.pi)
+        return law + sizes.girdle_person * share[:, None] * _PERSON * self.person[side]
 
     def place(self, side: float, moving_time: np.ndarray) -> np.ndarray:
         """Displacement (n, 3) [m] in T of a shoulder whatever its arm does, after that time of motion (n,) [s]."""
-        place = np.tile(self.rest[side], (len(moving_time), 1))
-        if self.sizes.girdle_wander:
-            first = 0 if side > 0.0 else 3
-            place += self.sizes.girdle_wander * _WANDER * self.wander(moving_time)[:, first : first + 3]
-        return place
+        own = slice(0, 3) if side > 0.0 else slice(3, 6)
+        return self.rest[side] + self.sizes.girdle_wander * _WANDER * self.wander(moving_time, own)

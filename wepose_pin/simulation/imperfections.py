@@ -78,7 +78,7 @@ class Imperfections:
     carrying_angle : of the elbow, times 11.6 (3.2) deg for men and 16.7 (2.6) for women (Van Roy 2005, Ergonomics 48,
         1645), half in the humerus and half in the forearm. People: 1
     elbow_abduction_deg : what else the elbow does beside a hinge, rms over flexion. People: 1.5 [assumption]
-    start_pose : offsets of the start pose, times those of `people.START_POSE`. People: 1
+    start_pose : offsets of the start pose, times `people.TRUNK_POSE` and `people.ARM_POSE`. People: 1
     start_heading_deg : the torso's heading against W in the start pose, standard deviation. W's x is then where
         the feet point, no longer where the torso faces. People: 4 [assumption]
     sway_tilt_deg : the slow part of a standing person's sway, rms about x and y together. People: 0.22, with which the

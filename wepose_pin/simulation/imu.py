@@ -96,18 +96,9 @@ class Device:
         gyro_bias = _draw_bias(rng, (n, 3), noise.gyro_bias_std, noise.gyro_bias_instability, decay)
         accel_bias = _draw_bias(rng, (n, 3), noise.accel_bias_std, noise.accel_bias_instability, decay)
         white = rng.standard_normal((2, n, 3)) * np.sqrt(rate_hz)
-        gyro_S, accel_S = rate_S, force_S
-        # A product with the identity, or with zeros, would not keep the last bit.
-        if imperfections.gyro_scale or imperfections.misalignment_deg:
-            gyro_S = rate_S @ self.gyro_matrix.T
-        if imperfections.g_sensitivity_deg_s:
-            gyro_S = gyro_S + force_S @ self.g_matrix.T
-        if imperfections.accel_scale or imperfections.misalignment_deg:
-            accel_S = force_S @ self.accel_matrix.T
-        if self.warm_up.any():
-            gyro_bias = gyro_bias + np.minimum(np.arange(n) / (rate_hz * _WARM_UP_S), 1.0)[:, None] * self.warm_up
-        gyro_S = gyro_S + gyro_bias + noise.gyro_density * white[0]
-        accel_S = accel_S + accel_bias + noise.accel_density * white[1]
+        gyro_bias += np.minimum(np.arange(n) / (rate_hz * _WARM_UP_S), 1.0)[:, None] * self.warm_up
+        gyro_S = rate_S @ self.gyro_matrix.T + force_S @ self.g_matrix.T + gyro_bias + noise.gyro_density * white[0]
+        accel_S = force_S @ self.accel_matrix.T + accel_bias + noise.accel_density * white[1]
         return Readings(
             _quantise(gyro_S, np.deg2rad(imperfections.gyro_range_deg_s), imperfections.bits),
             _quantise(accel_S, imperfections.accel_range_g * GRAVITY, imperfections.bits),

@@ -7,7 +7,7 @@ frame T has the origin of W: the torso rotates about it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadOption
+from ..model import BodyModel
 from ..rotations import compose, log, quat_from_matrix, turn_about
 from .girdle import Girdle
 from .imperfections import IDEAL_PRESET, Imperfections
@@ -30,7 +31,8 @@ ARM = ("upper_arm", "forearm", "hand")
 E_Z = np.array((0.0, 0.0, 1.0))
 STAND_S = 5.0  # N-pose at the start
 _BLEND_S = 2.5  # N-pose to clasp, clasp to table
-_RAMP_S = 2.0  # the clasp motion grows and dies away over this time
+RAMP_S = 2.0  # a motion grows and dies away over this time
+END_S = 2.0  # after an activity the person stands still
 _REST_S = (2.5, 2.0)  # first rest on the table, each later one
 LIFT_S = 1.5  # table to circle, circle to table
 MARGIN_S = 0.1  # the stated phases keep this distance from the motion beside them
@@ -68,7 +70,7 @@ class BodyMotion(ABC):
     """
 
     lengths: Mapping[str, float]
-    p_LS: Mapping[str, np.ndarray]
+    p_LS: dict[str, np.ndarray]
 
     @property
     @abstractmethod
@@ -115,17 +117,48 @@ class Flaws:
         self.start = {name: turn * rngs["start_segment"].standard_normal(3) for name in SEGMENTS[1:]}  # (3,) [rad]
         self.sway = {name: Sway(rngs["sway"]) for name in ("torso", *SIDES)}
         # The arms need slack for palm slip and shoulder motion.
-        self.slack = max(0.012, sizes.palm_slip + sizes.shoulder_wander) if self.stretches else 0.0
+        wander = sizes.palm_slip + sizes.shoulder_wander
+        self.slack = max(0.012, wander) if wander else 0.0
 
     @property
     def iterates(self) -> bool:
         """True where the place of a hand follows from the arm's angles in steps only."""
         return self.girdle.moves or self.wrists.bend or not self.elbow_joint.is_ideal
 
+
+class Activity(BodyMotion):
+    """An activity of some seconds, after standing in the N-pose and before standing still."""
+
+    phase: str
+    body: str  # the model's name
+
+    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws) -> None:
+        self.model, self.lengths, self.flaws, self.seconds = model, model.lengths, flaws, seconds
+        self.p_LS = place_sensors(self.lengths, flaws.sizes)
+        self.prepare(rng)
+
+    @abstractmethod
+    def prepare(self, rng: np.random.Generator) -> None:
+        """Draw what is this person's own."""
+
     @property
-    def stretches(self) -> bool:
-        """True where palms or shoulders deviate from the ideal motion."""
-        return self.sizes.palm_slip > 0.0 or self.sizes.shoulder_wander > 0.0
+    def stop(self) -> float:
+        """Time [s] at which the activity ends."""
+        return STAND_S + self.seconds
+
+    @property
+    def span(self) -> tuple[float, float]:
+        return STAND_S, self.stop + END_S
+
+    def activity(self, t: np.ndarray) -> np.ndarray:
+        return make_pulse(t, STAND_S, self.stop, RAMP_S)
+
+    def phases(self) -> dict[str, list[tuple[float, float]]]:
+        return {
+            "start": [(0.5, STAND_S - 0.5)],
+            self.phase: [(STAND_S + MARGIN_S, self.stop - MARGIN_S)],
+            "rest": [(self.stop + MARGIN_S, self.stop + END_S - MARGIN_S)],
+        }
 
 
 @dataclass(frozen=True)
@@ -233,7 +266,7 @@ class Motion(BodyMotion):
             self.rest.append((circle.stop, circle.stop + _REST_S[1]))
         # The slip's gains [m]: the stated rms on each axis over the clasp, whatever the sampling rate.
         grid = np.arange(*self.clasp, 0.05)
-        gate = make_pulse(grid, *self.clasp, _RAMP_S)
+        gate = make_pulse(grid, *self.clasp, RAMP_S)
         rms = np.array([np.sqrt(np.mean((gate * wander(grid)) ** 2)) for wander in flaws.slip])
         self.slip_gain = flaws.sizes.palm_slip / np.sqrt(3.0) / rms
 
@@ -265,13 +298,19 @@ class Motion(BodyMotion):
                 break
         self.least_flexion, self.most_missing = _LEAST_FLEXION, np.inf
 
+    def protocol_pulses(self) -> list[tuple[float, float, float]]:
+        """Return where the protocol moves the person: begin, end and ramp [s] of each pulse of motion."""
+        return [(*self.clasp, RAMP_S)]
+
     def activity(self, t: np.ndarray) -> np.ndarray:
-        moving = make_pulse(t, *self.clasp, _RAMP_S)
-        return moving + sum((make_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
+        return self._sum_pulses(make_pulse, t)
 
     def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
-        moving = integrate_pulse(t, *self.clasp, _RAMP_S)
-        return moving + sum((integrate_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
+        return self._sum_pulses(integrate_pulse, t)
+
+    def _sum_pulses(self, pulse: Callable[[np.ndarray, float, float, float], np.ndarray], t: np.ndarray) -> np.ndarray:
+        protocol = sum((pulse(t, *each) for each in self.protocol_pulses()), np.zeros_like(t))
+        return protocol + sum((pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
 
     def _clasp_point(self, t: np.ndarray, moving: np.ndarray) -> np.ndarray:
         """Return the point where the palms meet (n, 3) [m] in T, from midway between the shoulders, in reach."""
@@ -295,7 +334,7 @@ class Motion(BodyMotion):
         return (lower + fraction * (upper - lower))[:, None] * ray
 
     def _motion_share(self, t: np.ndarray) -> np.ndarray:
-        return make_pulse(t, *self.clasp, _RAMP_S)  # 0 at both ends of the clasp
+        return make_pulse(t, *self.clasp, RAMP_S)  # 0 at both ends of the clasp
 
     def _torso(self, _t: np.ndarray, lean: np.ndarray) -> Rotation:
         """Return R_WT from `lean` (n, 3) [rad]: yaw, pitch, roll."""
@@ -309,9 +348,9 @@ class Motion(BodyMotion):
         """Return the share (n,) by which each palm leads its arm; 0: the arm hangs."""
         return {"left": led * (1.0 - table), "right": led}  # the left arm returns to hanging
 
-    def _free(self, _t: np.ndarray, _side: str) -> FreeArm | None:
-        """Return what an arm does while its palm is led nowhere; None: it hangs."""
-        return None
+    def _free(self, t: np.ndarray, _side: str) -> FreeArm:
+        """Return what an arm does while its palm is led nowhere: it hangs."""
+        return FreeArm(np.zeros((len(t), 3)), np.zeros((len(t), 2)), np.ones_like(t))
 
     def _arm(self, side: str, palm_T: np.ndarray, swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:
         """Upper arm in T and elbow flexion [rad] to bring the palm to `palm_T` (n, 3) [m], from the shoulder.
@@ -348,11 +387,8 @@ class Motion(BodyMotion):
         lean = np.column_stack([self.wander[name](t) for name in ("yaw", "pitch", "roll")])
         lean *= np.deg2rad(self.lean_deg * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
         flaws = self.flaws
-        sway = np.deg2rad(flaws.sizes.sway_deg_s)
-        if sway:
-            lean[:, 1:] += sway * flaws.sway["torso"](t)
-        if flaws.sizes.sway_tilt_deg:
-            lean[:, 1:] += np.deg2rad(flaws.sizes.sway_tilt_deg) / np.sqrt(2.0) * flaws.tilt(t)
+        lean[:, 1:] += np.deg2rad(flaws.sizes.sway_deg_s) * flaws.sway["torso"](t)
+        lean[:, 1:] += np.deg2rad(flaws.sizes.sway_tilt_deg) / np.sqrt(2.0) * flaws.tilt(t)
         R_WT = self._torso(t, lean)
         if flaws.start_pose.torso.any():
             R_WT = compose(R_WT, Rotation.from_rotvec((1.0 - led)[:, None] * flaws.start_pose.torso))
@@ -361,11 +397,9 @@ class Motion(BodyMotion):
         hand_W = self.table_W + sum((c.offset_W(t, self.table_W) for c in self.circles), np.zeros((len(t), 3)))
         palm_T = self._palms(t, moving, clasp_T)
         palm_T["right"] = palm_T["right"] + table[:, None] * (R_WT.inv().apply(hand_W) - palm_T["right"])
-        if self.slip_gain.any():
-            slip_T = moving[:, None] * np.column_stack(
-                [g * w(t) for g, w in zip(self.slip_gain, flaws.slip, strict=True)]
-            )
-            palm_T = {"left": palm_T["left"] + 0.5 * slip_T, "right": palm_T["right"] - 0.5 * slip_T}
+        slips = [gain * wander(t) for gain, wander in zip(self.slip_gain, flaws.slip, strict=True)]
+        slip_T = moving[:, None] * np.column_stack(slips)
+        palm_T = {"left": palm_T["left"] + 0.5 * slip_T, "right": palm_T["right"] - 0.5 * slip_T}
         swivel, pronation = {}, {}
         for side in SIDES:
             wander = self.wander[f"{side}_swivel"](t)
@@ -379,18 +413,14 @@ class Motion(BodyMotion):
             hand_F = {side: flaws.wrists.rotate(y, t, moving, circling, distance) for side, y in SIDES.items()}
         return _Aim(R_WT, palm_T, self._lead_share(t, led, table), swivel, pronation, hand_F)
 
-    def _shoulder(self, side: str) -> np.ndarray:
-        """Return the shoulder's place (3,) [m] in T, by the lengths."""
-        return np.array((0.0, SIDES[side] * self.half_width, self.lengths["trunk"]))
-
     def _raising(self, t: np.ndarray, side: str) -> np.ndarray:
         """Compute the rate (n,) [deg/s] at which the arm is raised, the shoulder at rest."""
         elevation = []
         for step in (-_RATE_STEP_S, _RATE_STEP_S):
             aim = self._aim(t + step, wrists=False)
-            R_TU, _ = self._arm(side, aim.palm_T[side] - self._shoulder(side), aim.swivel[side])
+            R_TU, _ = self._arm(side, aim.palm_T[side] - place_shoulder(side, self.lengths), aim.swivel[side])
             free, lead = self._free(t + step, side), aim.lead[side][:, None]
-            down = -E_Z if free is None else Rotation.from_rotvec((1.0 - lead) * free.turn).apply(-E_Z)
+            down = Rotation.from_rotvec((1.0 - lead) * free.turn).apply(-E_Z)
             along_T = Rotation.from_rotvec(lead * log(R_TU.as_quat())).apply(down)
             elevation.append(np.rad2deg(np.arctan2(np.hypot(along_T[:, 0], along_T[:, 1]), -along_T[:, 2])))
         return (elevation[1] - elevation[0]) / (2.0 * _RATE_STEP_S)
@@ -408,7 +438,7 @@ class Motion(BodyMotion):
         lower = np.linalg.norm(palm_F, axis=1)
         hysteresis = flaws.sizes.girdle and flaws.sizes.girdle_hysteresis
         raising = self._raising(t, side) if hysteresis else np.zeros_like(t)
-        centre_T = self._shoulder(side) + flaws.girdle.place(y, self.moving_time(t))
+        centre_T = place_shoulder(side, self.lengths) + flaws.girdle.place(y, self.moving_time(t))
         down_U = hang.apply(-E_Z)
 
         def bend(flexion: np.ndarray) -> np.ndarray:
@@ -448,24 +478,23 @@ class Motion(BodyMotion):
         aim, flaws = self._aim(t), self.flaws
         sway = np.deg2rad(flaws.sizes.sway_deg_s)
         R_WT = aim.R_WT
-        R_WL, origins = {"torso": R_WT}, {"torso": np.zeros(3)}
-        points: dict[str, np.ndarray] = {}
+        pose = BodyPose({"torso": R_WT}, {}, {"torso": np.zeros(3)})
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
             y, blend = SIDES[side], aim.lead[side]
+            y, blend = SIDES[side], aim.lead[side]
             hanging, free = (1.0 - blend)[:, None], self._free(t, side)
-            turns = [] if free is None else [hanging * free.turn]  # of a hanging arm
-            starting = hanging if free is None else hanging * free.start[:, None]
-            if sway:
-                turns.append(hanging * sway * np.pad(flaws.sway[side](t), ((0, 0), (0, 1))))
-            if flaws.sizes.start_segment_deg:
-                turns.append(hanging * flaws.start[f"{side}_upper_arm"])
-            if flaws.sizes.start_pose:
-                turns.append(starting * flaws.start_pose.upper_arm[side])
+            starting = hanging * free.start[:, None]
+            turns = (  # of a hanging arm
+                hanging * free.turn,
+                hanging * sway * np.pad(flaws.sway[side](t), ((0, 0), (0, 1))),
+                hanging * flaws.start[f"{side}_upper_arm"],
+                starting * flaws.start_pose.upper_arm[side],
+            )
             if flaws.iterates:
                 hang = compose(Rotation.identity(len(t)), *(Rotation.from_rotvec(turn) for turn in turns))
                 shoulder_T, R_TU, flexion = self._reach(t, side, aim, hang)
             else:
-                shoulder_T = self._shoulder(side)
+                shoulder_T = place_shoulder(side, self.lengths)
                 R_TU, flexion = self._arm(side, aim.palm_T[side] - shoulder_T, aim.swivel[side])
             if flaws.sizes.shoulder_wander:
                 # The elevation is that of the arm from the mean centre: the same to within a degree.
@@ -473,36 +502,38 @@ class Motion(BodyMotion):
                 shoulder_T = shoulder_T + (1.0 + along_T[:, 2:]) * flaws.shoulder[side]
                 R_TU, flexion = self._arm(side, aim.palm_T[side] - shoulder_T, aim.swivel[side])
             bend = np.column_stack((-blend * flexion, blend * aim.pronation[side]))
-            if flaws.sizes.start_elbow_deg:
-                bend[:, 0] -= (1.0 - blend) * flaws.elbow[side]
-            if flaws.sizes.start_pose:
-                bend -= starting * np.array((flaws.start_pose.flexion[side], -flaws.start_pose.pronation[side]))
-            if free is not None:
-                bend += hanging * free.bend
+            bend[:, 0] -= (1.0 - blend) * flaws.elbow[side]
+            bend -= starting * np.array((flaws.start_pose.flexion[side], -flaws.start_pose.pronation[side]))
+            bend += hanging * free.bend
             R_TU = Rotation.from_rotvec(blend[:, None] * log(R_TU.as_quat()))
             R_WU = compose(R_WT, R_TU, *(Rotation.from_rotvec(turn) for turn in turns))
-            R_WF = compose(
-                R_WU, flaws.elbow_joint.rotate(y, -bend[:, 0], bend[:, 1])
-            )  # a hinge about -y, then pronation
+            R_WF = compose(R_WU, flaws.elbow_joint.rotate(y, -bend[:, 0], bend[:, 1]))
             if flaws.sizes.start_segment_deg:
                 R_WF = compose(R_WF, Rotation.from_rotvec(hanging * flaws.start[f"{side}_forearm"]))
-            R_WL[f"{side}_upper_arm"], R_WL[f"{side}_forearm"] = R_WU, R_WF
             R_WH = compose(R_WF, aim.hand_F[side]) if aim.hand_F else R_WF
-            points |= place_arm(R_WT.apply(shoulder_T), side, (R_WU, R_WF, R_WH), self.lengths)
-            origins |= {f"{side}_upper_arm": points[f"{side}_shoulder"], f"{side}_forearm": points[f"{side}_elbow"]}
-        return BodyPose(R_WL, points, origins)
+            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, R_WH), self.lengths)
+        return pose
+
+
+def place_shoulder(side: str, lengths: Mapping[str, float]) -> np.ndarray:
+    """Place a shoulder's centre (3,) [m] in the torso, by the lengths."""
+    return np.array((0.0, 0.5 * SIDES[side] * lengths["shoulder_width"], lengths["trunk"]))
 
 
 def place_arm(
-    shoulder_W: np.ndarray, side: str, R_WL: tuple[Rotation, Rotation, Rotation], lengths: Mapping[str, float]
-) -> dict[str, np.ndarray]:
-    """Place the points (n, 3) [m] in W of an arm, from its shoulder (n, 3) and the rotations of its three segments."""
-    points = {f"{side}_shoulder": shoulder_W}
+    pose: BodyPose,
+    side: str,
+    shoulder_W: np.ndarray,
+    R_WL: tuple[Rotation, Rotation, Rotation],
+    lengths: Mapping[str, float],
+) -> None:
+    """Put an arm into a pose, by its shoulder (n, 3) [m] in W and the rotations of upper arm, forearm and hand."""
     p_W = shoulder_W
-    for part, end, R in zip(ARM, ("elbow", "wrist", "palm"), R_WL, strict=True):
+    for part, start, R in zip(ARM, ("shoulder", "elbow", "wrist"), R_WL, strict=True):
+        pose.R_WL[f"{side}_{part}"] = R
+        pose.origins[f"{side}_{part}"] = pose.points[f"{side}_{start}"] = p_W
         p_W = p_W + R.apply((0.0, 0.0, -lengths[f"{side}_{part}"]))
-        points[f"{side}_{end}"] = p_W
-    return points
+    pose.points[f"{side}_palm"] = p_W
 
 
 def place_sensors(lengths: Mapping[str, float], sizes: Imperfections = IDEAL_PRESET) -> dict[str, np.ndarray]:
@@ -513,8 +544,3 @@ def place_sensors(lengths: Mapping[str, float], sizes: Imperfections = IDEAL_PRE
         places[f"{side}_upper_arm"] = np.array((0.0, 0.045 * y, -upper_arm * lengths[f"{side}_upper_arm"]))
         places[f"{side}_forearm"] = np.array((0.01, 0.03 * y, -forearm * lengths[f"{side}_forearm"]))
     return places
-
-
-def locate_sensor(pose: BodyPose, segment: str, p_LS: np.ndarray) -> np.ndarray:
-    """Compute the sensor's position (n, 3) [m] in W."""
-    return pose.R_WL[segment].apply(p_LS) + pose.origins[segment]

@@ -14,7 +14,7 @@ from .signals import Process, rotate_about
 
 
 class Offset(NamedTuple):
-    """A person's offset from the ideal pose, in degrees."""
+    """What people do otherwise than the ideal, in degrees or degrees per degree."""
 
     mean: float
     std: float  # between people
@@ -22,12 +22,14 @@ class Offset(NamedTuple):
 
 # The N-pose on request, each person's own: assumptions, held to the drop from acromion to wrist of ANSUR II (Gordon
 # 2014; a straight arm would be tilted by 10 to 12 deg), to N-pose errors in Bouvier 2015 and Bonfiglio 2024a.
-START_POSE = {
+TRUNK_POSE = {
     "torso_pitch": Offset(0.0, 3.0),
     "torso_roll": Offset(0.0, 1.5),
     "head_pitch": Offset(0.0, 5.0),
     "head_roll": Offset(0.0, 2.0),
     "head_heading": Offset(0.0, 5.0),
+}
+ARM_POSE = {
     "upper_arm_outwards": Offset(8.0, 4.0),
     "upper_arm_forwards": Offset(0.0, 5.0),
     "upper_arm_inward_twist": Offset(5.0, 12.0),
@@ -36,7 +38,7 @@ START_POSE = {
 }
 _SIDES_CORRELATION = 0.5  # of the arms' offsets, assumption
 
-# Carrying angle, extended and supinated: Van Roy 2005, Ergonomics 48, 1645; in neutral pronation: as in START_POSE.
+# Carrying angle, extended and supinated: Van Roy 2005, Ergonomics 48, 1645; in neutral pronation: as in ARM_POSE.
 _CARRYING = {"m": Offset(11.6, 3.2), "f": Offset(16.7, 2.6)}
 _NEUTRAL_CARRYING = Offset(5.0, 3.0)
 _SUPINATION_DEG = 80.0  # full; Zwerus 2019, Shoulder Elbow 11, 215
@@ -50,25 +52,24 @@ class StartPoseOffsets:
     """One person's offsets from the start pose: rotation vectors [rad] of torso and upper arms, angles of elbows."""
 
     def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], sides: Mapping[str, float]):
-        trunk = [name for name in START_POSE if name.startswith(("torso", "head"))]
-        drawn = dict(zip(trunk, rngs["start_pose"].standard_normal(len(trunk)), strict=True))
-        turn = {name: sizes.start_pose * np.deg2rad(START_POSE[name].std) * z for name, z in drawn.items()}
+        z = rngs["start_pose"].standard_normal(len(TRUNK_POSE))
+        turn = {
+            name: sizes.start_pose * np.deg2rad(offset.std) * own
+            for (name, offset), own in zip(TRUNK_POSE.items(), z, strict=True)
+        }
         heading = np.deg2rad(sizes.start_heading_deg) * rngs["start_heading"].standard_normal()
         self.torso = np.array((turn["torso_roll"], turn["torso_pitch"], heading))
         self.head = np.array((turn["head_roll"], turn["head_pitch"], turn["head_heading"]))
         self.upper_arm: dict[str, np.ndarray] = {}
         self.flexion: dict[str, float] = {}
         self.pronation: dict[str, float] = {}  # about z of the forearm
-        names = [name for name in START_POSE if name not in trunk]
-        both = rngs["start_pose"].standard_normal((3, len(names)))
-        for side, own in zip(sides, both[1:], strict=True):
+        both = rngs["start_pose"].standard_normal((3, len(ARM_POSE)))
+        for (side, y), own in zip(sides.items(), both[1:], strict=True):
             z = np.sqrt(_SIDES_CORRELATION) * both[0] + np.sqrt(1.0 - _SIDES_CORRELATION) * own
             size = {
-                name: sizes.start_pose
-                * np.deg2rad(START_POSE[name].mean + START_POSE[name].std * np.clip(u, -2.3, 2.3))
-                for name, u in zip(names, z, strict=True)
+                name: sizes.start_pose * np.deg2rad(offset.mean + offset.std * np.clip(u, -2.3, 2.3))
+                for (name, offset), u in zip(ARM_POSE.items(), z, strict=True)
             }
-            y = sides[side]
             self.upper_arm[side] = np.array(
                 (y * size["upper_arm_outwards"], -size["upper_arm_forwards"], -y * size["upper_arm_inward_twist"])
             )
@@ -110,8 +111,6 @@ class Elbow:
 
     def rotate(self, y: float, flexion: np.ndarray, pronation: np.ndarray) -> Rotation:
         """R_UF from flexion (n,) and pronation about z (n,) [rad] of the side y."""
-        if self.is_ideal:
-            return turn_about("YZ", np.column_stack((-flexion, pronation)))
         return turn_about("XYXZ", self._angles(y, flexion, pronation))
 
     def rotate_vectors(self, y: float, flexion: np.ndarray, pronation: np.ndarray, vectors_F: np.ndarray) -> np.ndarray:

@@ -10,16 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import BadOption, one_of
 from ..rotations import compose
-from .motion import LIFT_S, MARGIN_S, SIDES, FreeArm, Motion
+from .motion import MARGIN_S, SIDES, FreeArm, Motion
 from .people import Offset
-from .signals import integrate_pulse, make_pulse, make_step
+from .signals import make_pulse, make_step
 
 _LONG_S = 45.0  # [s] of a session, from which on parts have their full length
 _PART_S = {"bow": (5.0, 6.0), "t_pose": (4.0, 5.0)}  # short, full
 _LEAST_CLASP_S = 5.0
 _BLEND_S = 1.5  # between hanging arms and hands that are led, or arms held sideways
-_RAMP_S = 1.0  # in which a part's motion grows and dies away
-_LONG_RAMPS_S = {"bow": 2.0, "clasp": 2.0}
+_RAMP_S = {"bow": 2.0, "clasp": 2.0, "t_pose": 1.0}  # in which a part's motion grows and dies away
 BOW = np.deg2rad(45.0)
 BOW_AXIS_STD = np.deg2rad(3.5)  # from the torso's y: such axes repeat within 2 to 5 deg (Luinge 2007, de Vries 2010)
 # How people hold the T-pose, each their own: assumptions, held to N- and T-poses in Robert-Lachaine 2017.
@@ -44,11 +43,9 @@ class _Part(NamedTuple):
         return self.kind == "clasp"
 
     @property
-    def ramp(self) -> float:
-        return _LONG_RAMPS_S.get(self.kind, _RAMP_S)
-
-    def gate(self, t: np.ndarray) -> np.ndarray:
-        return make_pulse(t, self.start, self.stop, self.ramp)
+    def pulse(self) -> tuple[float, float, float]:
+        """Begin, end and ramp [s] of its motion."""
+        return self.start, self.stop, _RAMP_S[self.kind]
 
 
 class Sequence(Motion):
@@ -60,7 +57,8 @@ class Sequence(Motion):
         begin, end = self.clasp
         full = end - begin >= _LONG_S
         seconds = [_PART_S[kind][full] if kind in _PART_S else 0.0 for kind in self.parts]
-        changes = [_BLEND_S * (self._changes(a) + self._changes(b)) for a, b in pairwise(self.parts)]
+        # Time passes before and after a part but a bow: hands are led there, or arms are raised.
+        changes = [_BLEND_S * ((a != "bow") + (b != "bow")) for a, b in pairwise(self.parts)]
         first, last = _BLEND_S * (self.parts[0] == "t_pose"), _BLEND_S * (self.parts[-1] == "t_pose")
         left = end - begin - sum(seconds) - sum(changes) - first - last
         least = _LEAST_CLASP_S if "clasp" in self.parts else 0.0
@@ -85,27 +83,14 @@ class Sequence(Motion):
             }
         self.bow_axis = self.flaws.sizes.start_pose * BOW_AXIS_STD * np.clip(rng.standard_normal(), -2.3, 2.3)
 
-    @staticmethod
-    def _changes(kind: str) -> bool:
-        """Return whether time passes before and after a part: hands are led there, or arms are raised."""
-        return kind in ("clasp", "t_pose")
-
     def protocol_phases(self) -> dict[str, list[tuple[float, float]]]:
         return {part.kind: [(part.start + MARGIN_S, part.stop - MARGIN_S)] for part in self.schedule}
 
-    def _sum_gates(self, t: np.ndarray, parts: list[_Part]) -> np.ndarray:
-        return sum((part.gate(t) for part in parts), np.zeros_like(t))
-
-    def activity(self, t: np.ndarray) -> np.ndarray:
-        moving = self._sum_gates(t, self.schedule)
-        return moving + sum((make_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
-
-    def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
-        moving = sum((integrate_pulse(t, p.start, p.stop, p.ramp) for p in self.schedule), np.zeros_like(t))
-        return moving + sum((integrate_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
+    def protocol_pulses(self) -> list[tuple[float, float, float]]:
+        return [part.pulse for part in self.schedule]
 
     def _motion_share(self, t: np.ndarray) -> np.ndarray:
-        return self._sum_gates(t, [part for part in self.schedule if part.led])
+        return sum((make_pulse(t, *part.pulse) for part in self.schedule if part.led), np.zeros_like(t))
 
     def _lead_share(self, t: np.ndarray, led: np.ndarray, table: np.ndarray) -> dict[str, np.ndarray]:
         share = np.zeros_like(t)
@@ -123,12 +108,12 @@ class Sequence(Motion):
         torso = super()._torso(t, lean)
         for part in self.schedule:
             if part.kind == "bow":
-                torso = compose(make_bow(part.gate(t), self.bow_axis), torso)
+                torso = compose(make_bow(make_pulse(t, *part.pulse), self.bow_axis), torso)
         return torso
 
     def _free(self, t: np.ndarray, side: str) -> FreeArm:
         y = SIDES[side]
-        turn, bend, start = np.zeros((len(t), 3)), np.zeros((len(t), 2)), np.ones_like(t)
+        turn, bend, start = super()._free(t, side)
         for part in self.schedule:
             if part.kind == "t_pose":
                 held, pose = make_pulse(t, part.start - _BLEND_S, part.stop + _BLEND_S, _BLEND_S), self.pose[side]
@@ -147,10 +132,7 @@ def make_bow(share: np.ndarray, axis_angle: float) -> Rotation:
 
 
 PARTS = ("bow", "clasp", "t_pose")
-TASKS: dict[str, type[Motion]] = {
-    "clasp": Motion,
-    **{part: type("Sequence", (Sequence,), {"parts": (part,)}) for part in PARTS if part != "clasp"},
-}
+TASKS: dict[str, type[Motion]] = {"clasp": Motion}  # that are no `Sequence`
 
 
 def find_task(protocol: str) -> type[Motion]:
@@ -161,9 +143,10 @@ def find_task(protocol: str) -> type[Motion]:
     BadOption
         There is none.
     """
+    if protocol in TASKS:
+        return TASKS[protocol]
     parts = tuple(protocol.split("+"))
-    if len(parts) > 1 and set(parts) <= set(PARTS) and len(set(parts)) == len(parts):
-        return type("Sequence", (Sequence,), {"parts": parts})
-    if protocol not in TASKS:
-        raise BadOption(f"protocol {protocol!r} is not simulated; {one_of(TASKS, protocol)}; or several joined by +")
-    return TASKS[protocol]
+    if not set(parts) <= set(PARTS) or len(set(parts)) < len(parts):
+        names = dict.fromkeys((*TASKS, *PARTS))
+        raise BadOption(f"protocol {protocol!r} is not simulated; {one_of(names, protocol)}; or several joined by +")
+    return type("Sequence", (Sequence,), {"parts": parts})

@@ -13,6 +13,7 @@ from .imu import GRAVITY, MTI_3, Device, ImuNoise, jitter_time
 from .motion import E_Z
 from .signals import make_pulse
 
+_DURATION_S = 60.0  # of a trial
 _STENCIL_S = 1e-3
 _GRID_HZ = 200.0  # sampling rate for the scaling of the motion to its peaks
 
@@ -31,8 +32,6 @@ class SingleSensor:
     p_WS: np.ndarray  # (n, 3) [m], exact
     gyro_S: np.ndarray  # (n, 3) [rad/s]
     accel_S: np.ndarray  # (n, 3) [m/s^2]
-    gyro_bias: np.ndarray  # (n, 3) [rad/s], exact
-    accel_bias: np.ndarray  # (n, 3) [m/s^2], exact
     static: list[tuple[float, float]]  # [s], before and after the motion
     moving: tuple[float, float]  # [s]
 
@@ -47,7 +46,7 @@ class _HandMotion:
         ramp: float,
         turn_hz: tuple[float, ...],
         shake_hz: tuple[float, ...],
-        peaks: tuple[float, float],
+        peaks: tuple[float, ...],
     ) -> None:
         self.span, self.ramp = span, ramp
         self.R_W0 = Rotation.random(random_state=rng)
@@ -90,33 +89,38 @@ class _HandMotion:
         return turn / (2.0 * h), self.acceleration(t)
 
 
-def _record(
-    rng: np.random.Generator,
-    motion: _HandMotion,
-    duration: float,
+def _simulate_trial(
+    experiment: int,
+    seed: int,
+    span: tuple[float, float],
+    ramp: float,
+    waves_hz: tuple[tuple[float, ...], tuple[float, ...]],
+    peaks: tuple[tuple[float, float], tuple[float, float]],
     rate_hz: float,
     noise: ImuNoise,
-    imperfections: Imperfections,
+    imperfections: Imperfections = IDEAL_PRESET,
 ) -> SingleSensor:
-    noise_rng, device_rng, jitter_rng, warm_up_rng = rng.spawn(4)
-    n = int(np.floor(duration * rate_hz)) + 1
-    time = np.arange(n) / rate_hz
+    """Simulate 60 s with motion in the `span`; turns and shakes have these waves, and peaks in these ranges."""
+    motion_rng, sensor_rng = np.random.default_rng([seed, experiment]).spawn(2)
+    motion = _HandMotion(motion_rng, span, ramp, *waves_hz, tuple(motion_rng.uniform(*peak) for peak in peaks))
+    noise_rng, device_rng, jitter_rng, warm_up_rng = sensor_rng.spawn(4)
+    time = np.arange(int(np.floor(_DURATION_S * rate_hz)) + 1) / rate_hz
     own_time = jitter_time(jitter_rng, time, rate_hz, imperfections.clock_jitter)
     R_WS = motion.orientation(own_time)
     turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(own_time)[:, None]
     rate_S = np.vstack((np.zeros(3), turned))
     force_S = R_WS.inv().apply(motion.acceleration(own_time) + GRAVITY * E_Z)
-    readings = Device.sample(device_rng, imperfections, warm_up_rng).measure(
-        rate_S, force_S, rate_hz, noise, imperfections, noise_rng
-    )
+    device = Device.sample(device_rng, imperfections, warm_up_rng)
+    readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, noise_rng)
     return SingleSensor(
         time=time,
         rate_hz=rate_hz,
         quat_WS=motion.orientation(time).as_quat(),
         p_WS=motion.position(time),
-        static=[(0.0, motion.span[0]), (motion.span[1], duration)],
-        moving=motion.span,
-        **readings._asdict(),
+        gyro_S=readings.gyro_S,
+        accel_S=readings.accel_S,
+        static=[(0.0, span[0]), (span[1], _DURATION_S)],
+        moving=span,
     )
 
 
@@ -132,25 +136,14 @@ def simulate_paper_dynamic(
     Turns of 0.15 to 1.5 Hz with a peak of 6 to 8 rad/s, translation with a peak of 15 to 20 m/s^2, without pauses. Of
     `imperfections` those of a single sensor count: scale, misalignment, g-sensitivity, range, bits and jitter.
     """
-    motion_rng, sensor_rng = np.random.default_rng([seed, 11]).spawn(2)
-    peaks = motion_rng.uniform(6.0, 8.0), motion_rng.uniform(15.0, 20.0)
-    motion = _HandMotion(motion_rng, (5.0, 55.0), 1.5, (0.15, 0.4, 0.8, 1.5), (0.6, 1.0, 1.5, 2.2), peaks)
-    return _record(sensor_rng, motion, 60.0, rate_hz, noise, imperfections)
+    waves_hz, peaks = ((0.15, 0.4, 0.8, 1.5), (0.6, 1.0, 1.5, 2.2)), ((6.0, 8.0), (15.0, 20.0))
+    return _simulate_trial(11, seed, (5.0, 55.0), 1.5, waves_hz, peaks, rate_hz, noise, imperfections)
 
 
-def simulate_paper_drift(
-    seed: int,
-    rate_hz: float = 1000.0,
-    *,
-    noise: ImuNoise = MTI_3,
-    imperfections: Imperfections = IDEAL_PRESET,
-) -> SingleSensor:
+def simulate_paper_drift(seed: int, rate_hz: float = 1000.0, *, noise: ImuNoise = MTI_3) -> SingleSensor:
     """Simulate a trial of the paper's drift experiment: 25 s static, 10 s of fast shaking and rotating, 25 s static.
 
-    Turns of 0.5 to 4 Hz with a peak of 13 to 15 rad/s, shaking of 2 to 5 Hz with a peak of 40 to 50 m/s^2;
-    `imperfections` as in `simulate_paper_dynamic`.
+    Turns of 0.5 to 4 Hz with a peak of 13 to 15 rad/s, shaking of 2 to 5 Hz with a peak of 40 to 50 m/s^2.
     """
-    motion_rng, sensor_rng = np.random.default_rng([seed, 12]).spawn(2)
-    peaks = motion_rng.uniform(13.0, 15.0), motion_rng.uniform(40.0, 50.0)
-    motion = _HandMotion(motion_rng, (25.0, 35.0), 1.0, (0.5, 1.2, 2.2, 3.5), (2.0, 3.2, 4.5), peaks)
-    return _record(sensor_rng, motion, 60.0, rate_hz, noise, imperfections)
+    waves_hz, peaks = ((0.5, 1.2, 2.2, 3.5), (2.0, 3.2, 4.5)), ((13.0, 15.0), (40.0, 50.0))
+    return _simulate_trial(12, seed, (25.0, 35.0), 1.0, waves_hz, peaks, rate_hz, noise)

@@ -12,27 +12,21 @@ from ..rotations import compose, log
 from .imperfections import Imperfections
 from .imu import GRAVITY
 from .motion import E_Z, SIDES, STAND_S, BodyPose
+from .people import Offset
 from .signals import Process, RandomWalk, integrate_step, make_step
 
-
-class Gain(NamedTuple):
-    """Rotation of a sensor on its segment, degree per degree of a joint's."""
-
-    mean: float
-    std: float  # between people and strappings
-
-
+# Rotation of a sensor on its segment, degree per degree of a joint's, and its spread between people and strappings.
 GAINS = {
     # A bow turns the sternum more than the trunk, assumption.
-    "torso_flexion": Gain(0.12, 0.05),
+    "torso_flexion": Offset(0.12, 0.05),
     # The chest extends by 12.8 (7.6) deg when both arms go up: Edmondston 2012, J Orthop Sports Phys Ther 42, 861.
-    "torso_elevation": Gain(-0.04, 0.025),
+    "torso_elevation": Offset(-0.04, 0.025),
     # One arm up bends and turns the chest to either side: Stewart 1995, J Man Manip Ther 3, 15.
-    "torso_sides": Gain(0.0, 0.02),
-    "upper_arm_elevation": Gain(-0.05, 0.04),  # Hamming 2012 J Biomech; Jackson 2015 Appl Ergon 47, 242
-    "upper_arm_flexion": Gain(0.02, 0.02),  # biceps and triceps bulge, either sign, assumption
-    "forearm_flexion": Gain(0.01, 0.01),  # assumption, either sign
-    "pelvis_flexion": Gain(-0.08, 0.04),  # assumption
+    "torso_sides": Offset(0.0, 0.02),
+    "upper_arm_elevation": Offset(-0.05, 0.04),  # Hamming 2012 J Biomech; Jackson 2015 Appl Ergon 47, 242
+    "upper_arm_flexion": Offset(0.02, 0.02),  # biceps and triceps bulge, either sign, assumption
+    "forearm_flexion": Offset(0.01, 0.01),  # assumption, either sign
+    "pelvis_flexion": Offset(-0.08, 0.04),  # assumption
 }
 _TWIST_STD = 0.08  # of the two gains of twist, between people
 # rms across and about the segment's long axis [deg], correlation time [s]; assumptions, held to Lebel 2017.
@@ -62,15 +56,21 @@ def lost_twist(part: str, place: float) -> float:
     return 0.55 - 0.40 * place if part == "upper_arm" else 0.95 - 0.90 * place
 
 
+class ArmRotations(NamedTuple):
+    """What the joints of an arm do at n times."""
+
+    elevation: np.ndarray  # (n,) [rad] of the upper arm in T
+    swing: np.ndarray  # (n, 3) [rad] rotation vector of the elevation, in the upper arm
+    twist: np.ndarray  # (n,) [rad] of the upper arm against the torso, about its long axis
+    flexion: np.ndarray  # (n,) [rad] of the elbow
+    pronation: np.ndarray  # (n,) [rad] of the forearm against the upper arm, about its long axis
+
+
 class JointRotations(NamedTuple):
-    """What the joints of trunk and arms do at n times; sides as keys."""
+    """What the joints of trunk and arms do at n times."""
 
     trunk_flexion: np.ndarray  # (n,) [rad] of the torso against W, forward
-    elevation: dict[str, np.ndarray]  # (n,) [rad] of the upper arm in T
-    swing: dict[str, np.ndarray]  # (n, 3) [rad] rotation vector of the elevation, in the upper arm
-    twist: dict[str, np.ndarray]  # (n,) [rad] of the upper arm against the torso, about its long axis
-    flexion: dict[str, np.ndarray]  # (n,) [rad] of the elbow
-    pronation: dict[str, np.ndarray]  # (n,) [rad] of the forearm against the upper arm, about its long axis
+    arms: dict[str, ArmRotations]  # by side
 
 
 def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
@@ -84,17 +84,15 @@ def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
 def read_joints(pose: BodyPose) -> JointRotations:
     """Read the rotations of the joints that soft tissue follows, from a pose of trunk and at least one arm."""
     tilt, _ = _split(pose.R_WL["torso"])
-    by_side: tuple[dict[str, np.ndarray], ...] = ({}, {}, {}, {}, {})
+    arms = {}
     for side in SIDES:
-        if f"{side}_upper_arm" not in pose.R_WL:
-            continue
-        R_WU = pose.R_WL[f"{side}_upper_arm"]
-        swing, twist = _split(compose(pose.R_WL["torso"].inv(), R_WU))
-        bend, pronation = _split(compose(R_WU.inv(), pose.R_WL[f"{side}_forearm"]))
-        angles = [np.hypot(np.linalg.norm(vector, axis=1), _ROUND) - _ROUND for vector in (swing, bend)]
-        for values, value in zip(by_side, (angles[0], swing, twist, angles[1], pronation), strict=True):
-            values[side] = value
-    return JointRotations(tilt[:, 1], *by_side)
+        if f"{side}_upper_arm" in pose.R_WL:
+            R_WU = pose.R_WL[f"{side}_upper_arm"]
+            swing, twist = _split(compose(pose.R_WL["torso"].inv(), R_WU))
+            bend, pronation = _split(compose(R_WU.inv(), pose.R_WL[f"{side}_forearm"]))
+            elevation, flexion = (np.hypot(np.linalg.norm(v, axis=1), _ROUND) - _ROUND for v in (swing, bend))
+            arms[side] = ArmRotations(elevation, swing, twist, flexion, pronation)
+    return JointRotations(tilt[:, 1], arms)
 
 
 class SoftTissue:
@@ -123,18 +121,11 @@ class SoftTissue:
         self.breath = 2.0 * np.pi * rngs["breath"].uniform(*_BREATH_HZ), rngs["breath"].uniform(0.0, 2.0 * np.pi)
         self.creep = RandomWalk(rngs["creep"], duration, 3)
         self.creep_rms = np.deg2rad(sizes.creep_deg) * np.sqrt(duration / _CREEP_S)
-        self.slips = self._draw_slips(rngs["strap_slip"], duration)
-
-    @staticmethod
-    def _draw_slips(rng: np.random.Generator, duration: float) -> list[tuple[float, float]]:
-        """Draw the slips of a strap: time [s] and direction."""
-        slips: list[tuple[float, float]] = []
-        at = STAND_S
-        while True:
-            at += rng.exponential(1.0 / _SLIPS_PER_S)
-            if at > duration:
-                return slips
-            slips.append((at, rng.choice((-1.0, 1.0))))
+        self.slips: list[tuple[float, float]] = []  # time [s] and direction
+        at = STAND_S + rngs["strap_slip"].exponential(1.0 / _SLIPS_PER_S)
+        while at <= duration:
+            self.slips.append((at, rngs["strap_slip"].choice((-1.0, 1.0))))
+            at += rngs["strap_slip"].exponential(1.0 / _SLIPS_PER_S)
 
     def _gain(self, name: str, k: int, sign: float = 1.0) -> float:
         """Return this person's gain, with the draw k."""
@@ -144,30 +135,28 @@ class SoftTissue:
         """Rotation vectors (n, 3) [rad] in L by the joints' rotation since the start pose."""
         turn = np.zeros((len(now.trunk_flexion), 3))
         flexion = now.trunk_flexion - start.trunk_flexion
-        side = self.side
         if self.part == "torso":
-            left, right = (now.elevation[side] - start.elevation[side] for side in ("left", "right"))
+            left, right = (now.arms[side].elevation - start.arms[side].elevation for side in SIDES)
             turn[:, 1] = self._gain("torso_flexion", 0) * flexion
             turn[:, 1] += self._gain("torso_elevation", 1) * 0.5 * (left + right)
             turn[:, 0] = self._gain("torso_sides", 2) * (right - left)
             turn[:, 2] = self._gain("torso_sides", 3) * (right - left)
         elif self.part == "pelvis":
             turn[:, 1] = self._gain("pelvis_flexion", 0) * flexion
-        elif self.part == "upper_arm":
-            twist = now.twist[side] - start.twist[side]
+        elif self.part in ("upper_arm", "forearm"):
+            arm, first = now.arms[self.side], start.arms[self.side]
+            bend = arm.flexion - first.flexion
+            twist = arm.twist - first.twist if self.part == "upper_arm" else arm.pronation - first.pronation
             turn[:, 2] = -(self.sizes.tissue_gain * self.lost + self.draw[0] * _TWIST_STD) * twist
-            # The angle above 30 deg, about the axis of elevation; none below 20 deg, where that axis has no meaning.
-            angle = np.linalg.norm(now.swing[side], axis=1)
-            above = integrate_step(angle, *_ONSET) / np.maximum(angle, _ONSET[0])
-            turn += self._gain("upper_arm_elevation", 1) * above[:, None] * now.swing[side]
-            bend = now.flexion[side] - start.flexion[side]
-            turn += self._gain("upper_arm_flexion", 2, self.sign[0]) * bend[:, None] * self.across
-            turn[:, 2] += self._gain("upper_arm_flexion", 3, self.sign[1]) * bend
-        elif self.part == "forearm":
-            pronation = now.pronation[side] - start.pronation[side]
-            turn[:, 2] = -(self.sizes.tissue_gain * self.lost + self.draw[0] * _TWIST_STD) * pronation
-            bend = now.flexion[side] - start.flexion[side]
-            turn += self._gain("forearm_flexion", 1, self.sign[0]) * bend[:, None] * self.across
+            if self.part == "upper_arm":
+                # The angle above 30 deg, about the axis of elevation; none below 20 deg, where it has no meaning.
+                angle = np.linalg.norm(arm.swing, axis=1)
+                above = integrate_step(angle, *_ONSET) / np.maximum(angle, _ONSET[0])
+                turn += self._gain("upper_arm_elevation", 1) * above[:, None] * arm.swing
+                turn += self._gain("upper_arm_flexion", 2, self.sign[0]) * bend[:, None] * self.across
+                turn[:, 2] += self._gain("upper_arm_flexion", 3, self.sign[1]) * bend
+            else:
+                turn += self._gain("forearm_flexion", 1, self.sign[0]) * bend[:, None] * self.across
         return turn
 
     def __call__(

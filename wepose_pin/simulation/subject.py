@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,12 +23,12 @@ from ..rotations import compose, heading, log
 from ..subject import Subject, check_lengths, population_subject
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
-from .motion import E_Z, SEGMENTS, STAND_S, BodyMotion, BodyPose, Flaws, locate_sensor
+from .motion import E_Z, SEGMENTS, STAND_S, BodyMotion, BodyPose, Flaws
 from .sequence import find_task
 from .signals import Wander
 from .soft_tissue import JointRotations, SoftTissue, is_on, read_joints
 
-MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
+_MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
 MEASURED_LENGTHS = ("shoulder_width", "trunk")  # of a simulated person
 MEASURED_STD = 0.003  # [m] of each
@@ -180,21 +181,22 @@ class _Sampled:
     def __init__(self, motion: BodyMotion, t: np.ndarray, segment: str = "", *, joints: bool = False) -> None:
         """Sample all segments, or one segment and those that carry it; `joints`: with the rotations of the joints."""
         segments = [segment] if segment else list(motion.p_LS)
-        self.time = t
         all_arms = joints and segment in ("", "torso")  # the sensor on the chest follows both
+        self.time, self._motion, self._segments = t, motion, segments
         self.pose: BodyPose = motion(t, [*segments, *SEGMENTS] if all_arms else segments)
         self.joints: JointRotations | None = read_joints(self.pose) if joints else None
-        self._motion, self._segments = motion, segments
 
     @cached_property
     def neighbours(self) -> list[BodyPose]:
         """The poses two steps and one step before, one and two after."""
         return [self._motion(self.time + step * _STENCIL_S, self._segments) for step in (-2, -1, 1, 2)]
 
-    def segment(self, segment: str, p_LS: np.ndarray) -> _Moved:
+    def segment(self, segment: str) -> _Moved:
+        p_LS = self._motion.p_LS[segment]
+        poses = [self.pose, *self.neighbours]
+        p_W, *others_W = (pose.R_WL[segment].apply(p_LS) + pose.origins[segment] for pose in poses)
         # Differences to the middle first: for a static segment they are exactly zero.
-        p_W = locate_sensor(self.pose, segment, p_LS)
-        far, near, near_after, far_after = (locate_sensor(b, segment, p_LS) - p_W for b in self.neighbours)
+        far, near, near_after, far_after = (other_W - p_W for other_W in others_W)
         p_ddot = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
         turn = compose(self.neighbours[1].R_WL[segment].inv(), self.neighbours[2].R_WL[segment])
         return _Moved(self.time, self.pose.R_WL[segment], p_ddot, log(turn.as_quat()) / (2.0 * _STENCIL_S))
@@ -203,18 +205,15 @@ class _Sampled:
 class _MildTissue:
     """Soft-tissue rotation of a sensor of the mild preset: a mixture of specific force and rate, a slow wandering."""
 
-    def __init__(self, rng: np.random.Generator, rms_deg: float) -> None:
+    def __init__(self, rng: np.random.Generator, rms_deg: float, moved: _Moved, activity: np.ndarray) -> None:
+        """The rotation has its rms over these samples."""
         self.mixture = rng.standard_normal((6, 3))
         self.wander = [Wander(rng) for _ in range(3)]
-        self.rms = np.deg2rad(rms_deg) / np.sqrt(3.0)  # [rad] of an axis
-        self.gains = np.zeros((2, 3))  # of the two parts, of each axis
-
-    def scale(self, moved: _Moved, activity: np.ndarray) -> None:
-        """Set the gains so that the rotation has its rms over these samples."""
         follows, wanders = self._parts(moved, activity)
         each = np.array([1.0 / np.sqrt(np.mean(part**2, axis=0)) for part in (follows, wanders)])
         total = each[0] * follows + each[1] * wanders
-        self.gains = each * self.rms / np.sqrt(np.mean(total**2, axis=0))
+        rms = np.deg2rad(rms_deg) / np.sqrt(3.0)  # [rad] of an axis
+        self.gains = each * rms / np.sqrt(np.mean(total**2, axis=0))  # (2, 3) of the two parts, of each axis
 
     def _parts(self, moved: _Moved, activity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # In units of g and of 3 rad/s, typical of free arm motion; zero in a static N-pose.
@@ -224,8 +223,6 @@ class _MildTissue:
 
     def __call__(self, moved: _Moved, activity: np.ndarray) -> np.ndarray:
         """Return rotation vectors (n, 3) [rad] in L."""
-        if not self.rms:
-            return np.zeros((len(activity), 3))
         follows, wanders = self._parts(moved, activity)
         return self.gains[0] * follows + self.gains[1] * wanders
 
@@ -237,22 +234,30 @@ class _Skin:
         self,
         motion: BodyMotion,
         segment: str,
-        imperfections: Imperfections,
+        sizes: Imperfections,
         rngs: Mapping[str, np.random.Generator],
         start: JointRotations | None,
+        coarse: _Sampled | None,
     ) -> None:
-        """`start`: the joints in the start pose; None where soft tissue does not follow them."""
+        """`start`: the joints in the start pose; `coarse`: the motion that the mild tissue is scaled by; None: off."""
         self.motion, self.segment, self.start = motion, segment, start
-        self.p_LS = motion.p_LS[segment]
-        self.mild = _MildTissue(rngs["soft_tissue"], imperfections.soft_tissue_deg)
-        place = -self.p_LS[2] / motion.lengths.get(segment, 1.0)
-        self.tissue = SoftTissue(segment, place, imperfections, rngs, motion.span[1])
-        self.moves = bool(self.mild.rms) or start is not None
+        self.mild: _MildTissue | None = None
+        if coarse is not None:
+            moved, activity = coarse.segment(segment), motion.activity(coarse.time)
+            self.mild = _MildTissue(rngs["soft_tissue"], sizes.soft_tissue_deg, moved, activity)
+        place = -motion.p_LS[segment][2] / motion.lengths.get(segment, 1.0)
+        self.tissue = SoftTissue(segment, place, sizes, rngs, motion.span[1])
+
+    def sample(self, t: np.ndarray) -> _Sampled:
+        """Sample the motion at the times `t` (n,) [s], for this sensor alone."""
+        return _Sampled(self.motion, t, self.segment, joints=self.start is not None)
 
     def turn(self, sampled: _Sampled) -> tuple[_Moved, np.ndarray]:
         """Return the segment's motion and the sensor's rotation vectors (n, 3) [rad] in L."""
-        moved = sampled.segment(self.segment, self.p_LS)
-        soft_L = self.mild(moved, self.motion.activity(sampled.time))
+        moved = sampled.segment(self.segment)
+        soft_L = np.zeros((len(sampled.time), 3))
+        if self.mild is not None:
+            soft_L = self.mild(moved, self.motion.activity(sampled.time))
         if self.start is not None and sampled.joints is not None:
             accel_L = moved.R_WL.inv().apply(moved.p_ddot)
             moving_time = self.motion.moving_time(sampled.time, self.segment)
@@ -367,63 +372,47 @@ def measure_motion(
     sizes = imperfections
     own_clocks = any((sizes.clock_jitter, sizes.clock_offset, sizes.clock_drift_ppm))
     never_still = own_clocks or any((sizes.sway_deg_s, sizes.sway_tilt_deg, sizes.breath_deg, sizes.creep_deg))
-    start = read_joints(motion(np.array([0.5 * STAND_S]), SEGMENTS)) if is_on(imperfections) else None
+    start = read_joints(motion(np.array([0.5 * STAND_S]), SEGMENTS)) if is_on(sizes) else None
     stated_time = _Sampled(motion, time, joints=start is not None)
-    coarse_t = np.arange(*motion.span, 1.0 / _GAIN_RATE_HZ)
-    coarse = _Sampled(motion, coarse_t) if imperfections.soft_tissue_deg else None
+    coarse = _Sampled(motion, np.arange(*motion.span, 1.0 / _GAIN_RATE_HZ)) if sizes.soft_tissue_deg else None
 
-    sensors: dict[str, dict] = {name: {} for name in ("quat_LS", "gyro_S", "accel_S", "gyro_bias", "accel_bias")}
-    sensors |= {name: {} for name in ("quat_WS", "soft_tissue", "device", "sample_time")}
-    for segment, p_LS in motion.p_LS.items():
+    sensors: defaultdict[str, dict] = defaultdict(dict)
+    for segment in motion.p_LS:
         heading, tilt = rngs["strap"].uniform(0.0, 2.0 * np.pi), np.deg2rad(rngs["strap"].uniform(2.0, 10.0))
         R_LS = Rotation.from_rotvec(tilt * np.array((np.cos(heading), np.sin(heading), 0.0))) * N
         any_quat = rngs["mount"].standard_normal(4)  # uniform on the sphere
-        if imperfections.mount == "any":
+        if sizes.mount == "any":
             R_LS = Rotation.from_quat(any_quat / np.linalg.norm(any_quat))
-        own_time = jitter_time(rngs["clock_jitter"], time, rate_hz, imperfections.clock_jitter)
-        own_time = own_time + imperfections.clock_offset * rngs["clock_offset"].standard_normal()
-        drift = 1e-6 * imperfections.clock_drift_ppm * rngs["clock_drift"].standard_normal()
-        if drift:
-            own_time = own_time + drift * time
+        own_time = jitter_time(rngs["clock_jitter"], time, rate_hz, sizes.clock_jitter)
+        own_time = own_time + sizes.clock_offset * rngs["clock_offset"].standard_normal()
+        own_time = own_time + 1e-6 * sizes.clock_drift_ppm * rngs["clock_drift"].standard_normal() * time
 
-        skin = _Skin(motion, segment, imperfections, rngs, start)
-        if coarse is not None:
-            skin.mild.scale(coarse.segment(segment, p_LS), motion.activity(coarse.time))
-
-        sampled = _Sampled(motion, own_time, segment, joints=start is not None) if own_clocks else stated_time
-        moved, soft_L = skin.turn(sampled)
-        # A product with the identity would not keep the last bit.
-        R_WS = compose(moved.R_WL, *([Rotation.from_rotvec(soft_L)] if skin.moves else []), R_LS)
+        skin = _Skin(motion, segment, sizes, rngs, start, coarse)
+        moved, soft_L = skin.turn(skin.sample(own_time) if own_clocks else stated_time)
+        R_WS = compose(moved.R_WL, Rotation.from_rotvec(soft_L), R_LS)
         rotvec = log(compose(R_WS[:-1].inv(), R_WS[1:]).as_quat())
         rate_S = np.vstack((np.zeros(3), rotvec * rate_hz))  # static before the first sample
         if own_clocks:
             rate_S[1:] = rotvec / np.diff(own_time)[:, None]
         if never_still:  # a sample before the first one, for the rate that ends there
-            before_first = _Sampled(motion, own_time[:1] - 1.0 / rate_hz, segment, joints=start is not None)
-            before, soft_before = skin.turn(before_first)
+            before, soft_before = skin.turn(skin.sample(own_time[:1] - 1.0 / rate_hz))
             R_before = before.R_WL * Rotation.from_rotvec(soft_before) * R_LS
             rate_S[0] = (R_before[0].inv() * R_WS[0]).as_rotvec() * rate_hz
         force_S = R_WS.inv().apply(moved.p_ddot + GRAVITY * E_Z)
         if sizes.accel_average:
             parts = []
             for age in sizes.accel_average / rate_hz * _MIDPOINTS:
-                then, soft_then = skin.turn(_Sampled(motion, own_time - age, segment, joints=start is not None))
+                then, soft_then = skin.turn(skin.sample(own_time - age))
                 R_then = then.R_WL * Rotation.from_rotvec(soft_then) * R_LS
                 parts.append(R_then.inv().apply(then.p_ddot + GRAVITY * E_Z))
             force_S = np.mean(parts, axis=0)
 
-        device = Device.sample(rngs["device"], imperfections, rngs["gyro_warm_up"])
-        readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, rngs["noise"])
-        dropped = draw_lost(rngs["dropped"], n, rate_hz, imperfections.dropped)
+        device = Device.sample(rngs["device"], sizes, rngs["gyro_warm_up"])
+        readings = device.measure(rate_S, force_S, rate_hz, noise, sizes, rngs["noise"])
+        dropped = draw_lost(rngs["dropped"], n, rate_hz, sizes.dropped)
         readings.gyro_S[dropped] = readings.accel_S[dropped] = np.nan
-        for name, value in (
-            ("quat_LS", R_LS.as_quat()),
-            *readings._asdict().items(),
-            ("quat_WS", R_WS.as_quat()),
-            ("soft_tissue", soft_L),
-            ("device", device),
-            ("sample_time", own_time),
-        ):
+        own = {"quat_LS": R_LS.as_quat(), "quat_WS": R_WS.as_quat(), "soft_tissue": soft_L, "sample_time": own_time}
+        for name, value in {**own, **readings._asdict(), "device": device}.items():
             sensors[name][segment] = value
 
     return Simulation(
@@ -432,7 +421,7 @@ def measure_motion(
         quat_WL={segment: stated_time.pose.R_WL[segment].as_quat() for segment in motion.p_LS},
         points=stated_time.pose.points,
         p_LS=dict(motion.p_LS),
-        stated_mount=dict.fromkeys(motion.p_LS, MOUNT if imperfections.mount == "stated" else None),
+        stated_mount=dict.fromkeys(motion.p_LS, _MOUNT if sizes.mount == "stated" else None),
         lengths=dict(motion.lengths),
         phases=motion.phases(),
         imperfections=imperfections,
