@@ -58,6 +58,15 @@ def test_a_mount_tilted_from_its_stated_axes_is_found_by_gravity(simulation: Sim
         assert np.degrees(error[early].magnitude()).max() < 1.5
 
 
+MOUNT = Rotation.from_quat(compute_mount("+x", "-z"))
+
+
+def mounted(segment: str, covariance: np.ndarray) -> Subject:
+    """A subject with one calibrated mount, and the covariance (3, 3) [rad²] of its error."""
+    own = {"mounts": {segment: MOUNT.as_quat()}, "order": tuple(mount_rows(segment)), "covariance": covariance}
+    return replace(population_subject(), **own)
+
+
 def ready_recording(headings: dict[str, float], mounts: dict[str, Rotation]) -> tuple[Recording, dict[str, Rotation]]:
     """Ready orientations in worlds that each have a heading of their own; the true segment orientations beside."""
     time = np.arange(500) / 100.0
@@ -84,20 +93,13 @@ def test_calibrated_mounts_give_headings_of_any_size() -> None:
 
 def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
     """A person stands with the arm 5 deg bent: a sure mount sees it, a vague one takes it for its own error."""
-    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     bent = Rotation.from_rotvec([0.0, -np.deg2rad(5.0), 0.0])
-    recording, true = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * mount})
+    recording, true = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * MOUNT})
     # Sensor orientation = bent pose times true mount: `true` of the helper is the segment, straight at the start.
     truth = true["left_forearm"] * bent.inv()
     as_sure_as_the_pose = np.degrees(N_POSE.std("left_forearm")[1])
     for std_deg, share in ((0.0, 0.0), (as_sure_as_the_pose, 0.5), (100.0 * as_sure_as_the_pose, 1.0)):
-        rows = mount_rows("left_forearm")
-        subject = replace(
-            population_subject(),
-            mounts={"left_forearm": mount.as_quat()},
-            order=tuple(rows),
-            covariance=np.deg2rad(std_deg) ** 2 * np.eye(3),
-        )
+        subject = mounted("left_forearm", np.deg2rad(std_deg) ** 2 * np.eye(3))
         segments = estimate_segments(recording, subject)
         off = (truth.inv() * Rotation.from_quat(segments.quat_WL["left_forearm"])).magnitude()
         assert np.degrees(off.max()) == pytest.approx(5.0 * share, abs=0.05)
@@ -106,18 +108,12 @@ def test_a_calibrated_mount_is_weighed_against_the_start_pose() -> None:
 
 def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
     """A mount whose tilt and heading err together is corrected in both, and the person still faces ahead."""
-    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     bent = Rotation.from_rotvec([0.0, -np.deg2rad(5.0), 0.0])
-    recording, _ = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * mount})
+    recording, _ = ready_recording({"left_forearm": 0.7}, {"left_forearm": bent.inv() * MOUNT})
     known = N_POSE.std("left_forearm")[1] ** 2 * np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.9], [0.0, 0.9, 1.0]])
-    subject = replace(
-        population_subject(),
-        mounts={"left_forearm": mount.as_quat()},
-        order=tuple(mount_rows("left_forearm")),
-        covariance=known,
-    )
+    subject = mounted("left_forearm", known)
     segments = estimate_segments(recording, subject)
-    moved = (Rotation.from_quat(segments.quat_LS["left_forearm"]) * mount.inv()).as_rotvec(degrees=True)
+    moved = (Rotation.from_quat(segments.quat_LS["left_forearm"]) * MOUNT.inv()).as_rotvec(degrees=True)
     # Half of the 5 deg is the mount's, and with it 0.9 as much of its heading.
     np.testing.assert_allclose(np.abs(moved), [0.0, 2.5, 2.25], atol=0.06)
     start = Rotation.from_quat(segments.quat_WL["left_forearm"][:100]).mean()
@@ -125,15 +121,9 @@ def test_the_heading_follows_the_mount_that_the_start_pose_corrected() -> None:
 
 
 def test_a_calibrated_mount_that_has_moved_is_said() -> None:
-    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     moved = Rotation.from_rotvec([0.0, np.deg2rad(20.0), 0.0])
-    recording, _ = ready_recording({"torso": 0.0}, {"torso": moved * mount})
-    subject = replace(
-        population_subject(),
-        mounts={"torso": mount.as_quat()},
-        order=tuple(mount_rows("torso")),
-        covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
-    )
+    recording, _ = ready_recording({"torso": 0.0}, {"torso": moved * MOUNT})
+    subject = mounted("torso", np.deg2rad(1.0) ** 2 * np.eye(3))
     (diagnostic,) = estimate_segments(recording, subject).diagnostics
     assert (diagnostic.code, diagnostic.place) == ("mount-moved", "torso")
     std = np.hypot(np.deg2rad(1.0), N_POSE.std("torso")[1])  # [rad] of the mount and of the pose, about y
@@ -149,37 +139,29 @@ def test_a_calibrated_mount_that_has_moved_is_said() -> None:
 
 def test_a_person_stands_as_in_the_calibration() -> None:
     """Leaning by 20 deg in both start poses is no mount that moved; by 20 deg in one of them is."""
-    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     lean = np.array([0.0, np.deg2rad(20.0)])
-    subject = replace(
-        population_subject(),
-        mounts={"torso": mount.as_quat()},
-        order=tuple(mount_rows("torso")),
-        covariance=np.deg2rad(1.0) ** 2 * np.eye(3),
-        start_pose_offset={"torso": StartPoseOffset(lean, np.deg2rad(1.0))},
-    )
+    start = StartPoseOffset(lean, np.deg2rad(1.0))
+    subject = replace(mounted("torso", np.deg2rad(1.0) ** 2 * np.eye(3)), start_pose_offset={"torso": start})
     for tilt, off in ((lean, []), (lean - [0.0, np.deg2rad(9.0)], [9.0]), (0.0 * lean, [20.0])):
-        recording, _ = ready_recording({"torso": 0.0}, {"torso": Rotation.from_rotvec([*tilt, 0.0]) * mount})
+        recording, _ = ready_recording({"torso": 0.0}, {"torso": Rotation.from_rotvec([*tilt, 0.0]) * MOUNT})
         diagnostics = estimate_segments(recording, subject).diagnostics
         assert [each.code for each in diagnostics] == ["mount-moved"] * len(off)
         assert [each.value for each in diagnostics] == pytest.approx(np.deg2rad(off), abs=0.01)
 
 
 def test_a_calibrated_mount_that_cannot_be_names_the_strapping() -> None:
-    mount = Rotation.from_quat(compute_mount("+x", "-z"))
     over = Rotation.from_rotvec([0.0, np.pi, 0.0])
-    recording, _ = ready_recording({"torso": 0.0}, {"torso": over * mount})
-    subject = replace(population_subject(), mounts={"torso": mount.as_quat()})
+    recording, _ = ready_recording({"torso": 0.0}, {"torso": over * MOUNT})
+    subject = replace(population_subject(), mounts={"torso": MOUNT.as_quat()})
     with pytest.raises(BadSession, match=r"sensors\.torso: its calibrated mount is 180 deg off .* remounted = true"):
         estimate_segments(recording, subject)
 
 
 def test_a_new_strapping_leaves_the_subjects_mounts_aside() -> None:
     headings = {"torso": 0.2, "left_upper_arm": -0.1}
-    stated = Rotation.from_quat(compute_mount("+x", "-z"))
-    recording, _ = ready_recording(headings, dict.fromkeys(headings, stated))
-    sensors = {name: replace(s, stated_quat_LS=stated.as_quat()) for name, s in recording.sensors.items()}
-    wrong = (Rotation.from_rotvec([0, 0, 1.0]) * stated).as_quat()
+    recording, _ = ready_recording(headings, dict.fromkeys(headings, MOUNT))
+    sensors = {name: replace(s, stated_quat_LS=MOUNT.as_quat()) for name, s in recording.sensors.items()}
+    wrong = (Rotation.from_rotvec([0, 0, 1.0]) * MOUNT).as_quat()
     subject: Subject = replace(population_subject(), mounts=dict.fromkeys(headings, wrong))
     kept = estimate_segments(replace(recording, sensors=sensors), subject)
     new = estimate_segments(replace(recording, sensors=sensors, remounted=True), subject)
@@ -233,7 +215,6 @@ def test_what_is_bridged_is_uncertain(method: str) -> None:
         true = Rotation.from_quat(sensor.quat_WS) * Rotation.from_quat(stated).inv()
         error = (true * Rotation.from_quat(segments.quat_WL["torso"]).inv()).as_rotvec()[2050:2600]
         nees.append(uncertainty(error, segments.covariance_W["torso"][2050:2600]).nees)
-    print(method, "NEES after the gap:", np.round(nees, 2))
     assert np.mean(nees) < 6.0
 
 

@@ -39,9 +39,6 @@ def parts(name: str) -> dict[tuple[str, str | None], ET.Element]:
     return {(element.tag, element.get("name")): element for element in root}
 
 
-RATE_HZ = {"run": 400.0, "throw": 400.0}  # for differences of what is fast
-
-
 @pytest.fixture(scope="module", params=[name for name in ACTIVITIES if name != "tasks"])
 def activity(request: pytest.FixtureRequest) -> str:
     return request.param
@@ -101,20 +98,6 @@ def test_a_leg_is_de_levas(
             assert at[0] - heel == pytest.approx(centre / 100.0 * length, abs=1e-3)
         else:
             assert at[2] == pytest.approx(-centre / 100.0 * length, abs=1e-3)
-
-
-def test_left_and_right_leg_mirror_each_other() -> None:
-    whole = parts("whole_body.urdf")
-    for (kind, name), left in whole.items():
-        if kind != "joint" or not name.startswith(("left_thigh", "left_shank", "left_foot", "left_heel", "left_toe")):
-            continue
-        right = whole["joint", name.replace("left", "right")]
-        here, there = (np.array(each.find("origin").get("xyz").split(), dtype=float) for each in (left, right))
-        np.testing.assert_array_equal(here * [1.0, -1.0, 1.0], there)
-        if left.get("type") == "fixed":
-            continue
-        limits = [tuple(float(each.find("limit").get(end)) for end in ("lower", "upper")) for each in (left, right)]
-        assert limits[1] == (limits[0] if name.endswith("_y") else (-limits[0][1], -limits[0][0]))
 
 
 # Activities -------------------------------------------------------------------------------------------------------

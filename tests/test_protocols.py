@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
@@ -26,7 +25,6 @@ from wepose_pin.calibration.protocols import Closure, Direction
 from wepose_pin.commands import main
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
 from wepose_pin.model import BodyModel, load_model
-from wepose_pin.model.start_pose import orient_links
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (
@@ -112,7 +110,7 @@ def test_jacobians_are_those_of_differences(name: str) -> None:
         protocol = replace(protocol, conditions=(OWN[name],), needs=needs)
     rng = np.random.default_rng(1)
     model, sensors, closures = load_model(), protocol.needs, protocol.closures
-    start = StartPose(orient_links(model, pin.neutral(model.pin)))
+    start = StartPose(model.neutral_rotations)
     conditions = resolve_conditions(protocol, model, start, sensors)
     layout = Layout(
         LENGTHS,

@@ -10,9 +10,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pinocchio as pin
 import pytest
-from bodies import LENGTHS
 from scipy.spatial.transform import Rotation
-from test_model import GAZEBO, example_robot_data_human
+from test_model import GAZEBO, cosmik, example_robot_data_human
 
 from benchmarks.ur5_arm import write_table, write_urdf
 from wepose_pin.errors import BadModel
@@ -22,16 +21,6 @@ from wepose_pin.model import BodyModel, LinkVector, load_model, measure_reaches
 def point_position(lengths: list[float], R_WK: Mapping[str, Rotation], way: Mapping[str, LinkVector]) -> np.ndarray:
     """The place (3,) [m] of a point in W from the orientations of the links on its way."""
     return np.sum([R_WK[link].apply(part.by_length @ lengths + part.constant) for link, part in way.items()], axis=0)
-
-
-def cosmik(data: Path) -> BodyModel:
-    """A body whose table gives wrists as places on the forearms; it has no hands."""
-    segments, points = {"torso": "torso", "pelvis": "pelvis"}, {}
-    for side, letter in (("left", "L"), ("right", "R")):
-        segments |= {f"{side}_upper_arm": f"upperarm{letter}", f"{side}_forearm": f"lowerarm{letter}"}
-        points[f"{side}_wrist"] = {"link": f"lowerarm{letter}", "at": [0.0, -0.26, 0.0]}
-    path = data / "human_urdf" / "cosmik_human.urdf"
-    return load_model(path, segments=segments, points=points, up="+y", root="pelvis")
 
 
 def arm() -> BodyModel:
@@ -81,24 +70,6 @@ def test_every_point_is_pinocchios_for_all_lengths_and_orientations(body: BodyMo
             place = point_position(values, R_WK, way)
             expected = kinematics.oMf[changed.pin.getFrameId(changed.point_frames[point])].translation
             np.testing.assert_allclose(place, expected, atol=1e-12)
-
-
-def test_the_default_model_is_its_lengths() -> None:
-    """Every number is a whole one or a half: no rounding remains of the measurement."""
-    reaches = load_model().reaches
-    assert list(reaches["right_palm"]) == ["torso", "right_upper_arm", "right_forearm", "right_hand"]
-    for way in reaches.values():
-        for segment, (by_length, constant) in way.items():
-            assert not constant.any()
-            ends = {"torso": {"trunk", "shoulder_width"}}.get(segment, {segment})
-            assert {LENGTHS[k] for k in np.flatnonzero(by_length.any(axis=0))} == ends
-            assert set(np.abs(by_length).ravel()) <= {0.0, 0.5, 1.0}
-
-
-def test_bodies_of_others_have_links_between_the_segments(data: Path) -> None:
-    way = measure_reaches(load_model(data / "human_urdf" / GAZEBO["48"]))["left_palm"]
-    assert {"pelvis", "torso", "jLeftC7Shoulder_rotx", "left_upper_arm", "left_hand"} <= set(way)
-    assert any(part.constant.any() for part in way.values())
 
 
 def test_a_chain_that_orientations_and_lengths_do_not_give() -> None:

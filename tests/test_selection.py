@@ -12,7 +12,7 @@ from test_export import a_pose, write_folder
 
 from wepose_pin.commands import main
 from wepose_pin.errors import BadData, WrongOption
-from wepose_pin.kinematics import cut_pose
+from wepose_pin.kinematics import find_samples
 from wepose_pin.recording import select_interval
 from wepose_pin.writers.result import read_phases
 
@@ -74,7 +74,7 @@ def test_a_recording_without_phases_has_none_to_choose() -> None:
 
 def test_all_of_a_pose_is_cut() -> None:
     pose = a_pose()
-    part = cut_pose(pose, (2.5, 3.0))
+    part = pose.cut(find_samples(pose.time, (2.5, 3.0)))
     assert part.time.tolist() == pose.time[50:101].tolist()
     for name in ("quat_WL", "points", "segment_cov", "point_cov"):
         whole = getattr(pose, name)
@@ -82,7 +82,7 @@ def test_all_of_a_pose_is_cut() -> None:
             key: values.tolist() for key, values in getattr(part, name).items()
         }
     with pytest.raises(BadData, match=r"the interval 2\.501 to 2\.504 s has no sample"):
-        cut_pose(pose, (2.501, 2.504))
+        find_samples(pose.time, (2.501, 2.504))
 
 
 def test_damaged_phases_of_a_summary_are_none() -> None:

@@ -177,7 +177,6 @@ EXTREME: dict[str, dict[str, Any]] = {
     "a start tilt beyond 90 deg": {
         "start_pose_offset": {"torso": StartPoseOffset(np.deg2rad([-118.0, 60.0]), np.deg2rad(170.0))}
     },
-    "a start tilt of half a turn": {"start_pose_offset": {"left_hand": StartPoseOffset(np.array([0.0, np.pi]), np.pi)}},
     "a drift of tens of degrees a second": {"heading_drift": {"head": HeadingDrift(-1.5, 1.5)}},
     "a hinge that is hardly one": {"hinges": {"left_elbow": Hinge(np.array([0.6, 0.0, -0.8]), 0.999)}},
     "a name that TOML wants escaped": {"name": 'a\x7f\x00\n"\\\u2028é\ud800', "note": "\x7f"},

@@ -22,7 +22,7 @@ from .filters import Orientation, join_orientations
 from .filters.smekf import HOLD_S, LOST_RATE_STD
 from .filters.start import ACCEL_BIAS_STD
 from .model import BodyModel, BodyTable, load_table
-from .model.start_pose import compute_start_configuration, orient_links
+from .model.start_pose import compute_start_configuration
 from .model.table import NEUTRAL_POSE
 from .recording import OrientationSensor, Recording, format_span
 from .subject import Subject
@@ -56,11 +56,6 @@ class StartFrames:
     table: BodyTable = field(default_factory=load_table)
     q: np.ndarray | None = None
 
-    @property
-    def sways(self) -> bool:
-        """True for a person, who sways while standing; False for a mechanism."""
-        return not self.table.is_mechanism
-
     def std(self, segment: str) -> np.ndarray:
         """Return (3,) [rad], one standard deviation about each axis of a segment's rotation off the start pose."""
         return np.array(self.table.segments[segment].start_std)
@@ -93,7 +88,7 @@ def find_start_frames(body: BodyModel, recording: Recording) -> StartFrames:
     q = compute_start_configuration(body, recording.start_pose, recording.joints, recording.where())
     R_WL: dict[str, Rotation] = {}
     if table.is_mechanism or recording.start_pose != NEUTRAL_POSE:
-        R_WK = orient_links(body, q)
+        R_WK = body.orient_links(q)
         R_WL = {segment: Rotation.from_matrix(R_WK[segment]) for segment in recording.sensors}
     return StartFrames(R_WL, table, q)
 
@@ -342,10 +337,8 @@ def compute_segment_covariance(
     # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes
     # off the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
     R_WL = R @ start_frames.to_world(segment, R_LS).inv().as_matrix()
-    mount_cov, start_var = (
-        _find_start_mount_covariance(recording, segment, subject, start_frames),
-        start_frames.std(segment) ** 2,
-    )
+    mount_cov = _find_start_mount_covariance(recording, segment, subject, start_frames)
+    start_var = start_frames.std(segment) ** 2
     vertical = np.array([0.0, 0.0, 1.0])
     if mount_cov is not None and subject is not None:  # whose mount it is
         error_jacobian = R_WL - np.outer(vertical, vertical)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -13,21 +13,13 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from . import rotations
-from .arguments import (
-    check_array,
-    check_covariance,
-    check_fields,
-    check_finite,
-    check_names,
-    check_unit,
-    format_object,
-)
+from .arguments import check_array, check_covariance, check_fields, check_finite, check_names, check_unit, format_object
 from .compilation import kernel
 from .errors import BadData, BadModel, Named, one_of
 from .model import BodyModel
 from .model.configurations import find_determined_frames, joint_values
 from .model.fit import Fit
-from .model.girdle import PARAMETERS, SCALARS, Girdle, displace, find_girdle_scale, move_girdles
+from .model.girdle import PARAMETERS, SCALARS, displace, find_girdle_scale, move_girdles
 from .model.orientation_ik import OrientationIk, find_groups
 from .model.reaches import UNIVERSE
 from .recording import EACH_TIME, check_time, format_span
@@ -101,6 +93,7 @@ class Pose:
             ("points", self.points, (n, 3)),
             ("segment_cov", self.quat_WL, (n, 3, 3)),
             ("point_cov", self.points, (n, 3, 3)),
+            ("joints", self.joints, (n,)),
         ):
             check_names(f"{where}{name}", getattr(self, name), tuple(known))
             for key, values in getattr(self, name).items():
@@ -114,9 +107,6 @@ class Pose:
         check_names(f"{where}gap", self.gap, tuple(self.quat_WL))
         for segment, gap in self.gap.items():
             check_array(f"{where}gap.{segment}", gap, (n,), "b", EACH_TIME)
-        for joint, values in self.joints.items():
-            check_array(f"{where}joints.{joint}", values, (n,), rows=EACH_TIME)
-            check_finite(f"{where}joints.{joint}", values, missing=True)
         return self
 
 
@@ -203,17 +193,6 @@ def find_samples(time: np.ndarray, interval: tuple[float, float]) -> slice:
     return slice(first, last)
 
 
-def cut_pose(pose: Pose, interval: tuple[float, float]) -> Pose:
-    """Return the samples of a pose within an interval [s], both ends included; times stay.
-
-    Raises
-    ------
-    BadData
-        There is none.
-    """
-    return pose.cut(find_samples(pose.time, interval))
-
-
 def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:
     """Compute the pose of `model` from segment orientations `quat_WL`, segment → (n, 4) xyzw: `solve_configuration`."""
     return KinematicsSolver(model, quat_WL, limits=limits).solve_chunk(time, quat_WL)
@@ -235,8 +214,6 @@ class KinematicsSolver:
     def __init__(
         self, model: BodyModel, segments: Collection[str], *, limits: bool = True, start: np.ndarray | None = None
     ) -> None:
-        if not segments:
-            raise BadData("no segment has an orientation: a pose needs one")
         self._model, self._ik = model, _make_ik(model, segments, limits, start=start)
         self._points = find_known_points(model, segments)
         self._last_quats: dict[str, np.ndarray] = {}
@@ -323,28 +300,24 @@ def solve_configuration(
     quat_WL: Mapping[str, np.ndarray],
     *,
     limits: bool = True,
-    weights: Mapping[str, float] | None = None,
 ) -> np.ndarray:
     """Solve for the configuration `q` (n, nq) with the measured orientations, or the nearest one.
 
     Of a mechanism all joints are fitted at once, each frame from the one before. Of a person: Segments on spherical
-    joints have their orientations exactly. For limbs with fewer axes the weighted sum of the
-    segments' squared angles to their measured orientations is minimised; `compute_orientation_residuals` returns these
-    angles. An unmeasured segment is rigid with its parent segment. `wepose_pin.model.chains` finds the moving joints.
+    joints have their orientations exactly. For limbs with fewer axes the sum of the segments' squared angles to their
+    measured orientations is minimised; `compute_orientation_residuals` returns these angles. An unmeasured segment is
+    rigid with its parent segment. `wepose_pin.model.chains` finds the moving joints.
 
     Parameters
     ----------
     limits : keep the limits of joints with one axis; those of spherical joints are not kept
-    weights : segment → weight of its squared angle within its limb; 1 where not named
 
     Raises
     ------
     BadModel
         The model has no link for a measured segment.
     """
-    if not quat_WL:
-        raise BadData("no segment has an orientation: a pose needs one")
-    q = _make_ik(model, quat_WL, limits, weights).run(quat_WL)
+    q = _make_ik(model, quat_WL, limits).run(quat_WL)
     _write_girdles(model, q, quat_WL)
     return q
 
@@ -369,24 +342,14 @@ class _MechanismIk:
     start : (nq,) the configuration before the first frame
     """
 
-    def __init__(
-        self,
-        model: BodyModel,
-        segments: Collection[str],
-        limits: bool,
-        weights: Mapping[str, float] | None,
-        start: np.ndarray,
-    ) -> None:
-        self._segments, self._start, self._last = list(segments), start, start
+    def __init__(self, model: BodyModel, segments: Collection[str], limits: bool, start: np.ndarray) -> None:
+        self._segments, self._last = list(segments), start
         joints = [joint for joint in range(1, model.pin.njoints) if model.pin.nvs[joint]]  # a mimic joint has none
-        self._fit = Fit(model.pin, self._segments, joints, weights or {}, limits)
+        self._fit = Fit(model.pin, self._segments, joints, limits)
 
-    def run(
-        self, quat_WL: Mapping[str, np.ndarray], before: np.ndarray | None = None, *, warm_start: bool = False
-    ) -> np.ndarray:
-        """`q` (n, nq); parameters as of `OrientationIk.run`."""
-        first = before if before is not None else self._last if warm_start else self._start
-        q = self._fit.run({segment: quat_WL[segment] for segment in self._segments}, first[None])
+    def run(self, quat_WL: Mapping[str, np.ndarray], *_: object, **__: object) -> np.ndarray:
+        """`q` (n, nq) by segment → (n, 4) xyzw; the frames always continue the motion of the last run."""
+        q = self._fit.run({segment: quat_WL[segment] for segment in self._segments}, self._last[None])
         self._last = q[-1].copy()
         return q
 
@@ -395,14 +358,15 @@ def _make_ik(
     model: BodyModel,
     segments: Collection[str],
     limits: bool = True,
-    weights: Mapping[str, float] | None = None,
     start: np.ndarray | None = None,
 ) -> OrientationIk | _MechanismIk:
-    """Return the inverse kinematics of these segments; raise `BadModel` where the model has no link for one."""
+    """Return the inverse kinematics of these segments; `BadData` without any, `BadModel` where one has no link."""
+    if not segments:
+        raise BadData("no segment has an orientation: a pose needs one")
     model.table.check_segments(segments, f"{model.pin.name}: ", BadModel)
     if model.table.is_mechanism:
-        return _MechanismIk(model, segments, limits, weights, pin.neutral(model.pin) if start is None else start)
-    return OrientationIk(model, segments, limits=limits, weights=weights)
+        return _MechanismIk(model, segments, limits, pin.neutral(model.pin) if start is None else start)
+    return OrientationIk(model, segments, limits=limits)
 
 
 def compute_orientation_residuals(
@@ -476,7 +440,7 @@ class LiveKinematics:
         self._ik = None if self._spherical_joints is not None else _make_ik(model, self.segments, start=start)
         self._previous_q: np.ndarray | None = None
         self._girdles = [
-            _LiveGirdle.of(model, name, self.segments)
+            _LiveGirdle(model, name, self.segments)
             for name, girdle in model.table.girdles.items()
             if girdle.on in self.segments
         ]
@@ -486,23 +450,20 @@ class LiveKinematics:
 
         None if a measured segment is not on a spherical joint of its own.
         """
-        links, joints = self._model.chains, []
-        rows: dict[int, int] = {}  # Pinocchio joint → row of the segment whose orientation its frame has
-        identity = np.array([0.0, 0.0, 0.0, 1.0])
-        for joint in range(1, self._model.pin.njoints):
-            parent_row = rows.get(self._model.pin.parents[joint], -1)
-            rows[joint] = parent_row
-            if not np.allclose(self._model.pin.jointPlacements[joint].rotation, np.eye(3), atol=1e-15):
+        m, identity, joints = self._model.pin, np.array([0.0, 0.0, 0.0, 1.0]), []
+        if not all(np.allclose(placement.rotation, np.eye(3), atol=1e-15) for placement in m.jointPlacements):
+            return None
+        rows = {segment: row for row, segment in enumerate(self.segments)}
+        for segment, chain in self._model.chains.items():
+            if segment not in rows:
+                continue
+            spherical = len(chain.axes) == 1 and chain.axes[0] is None
+            if not spherical or not all(np.allclose(q, identity) for q in (*chain.quat, chain.quat_AL)):
                 return None
-            for segment, chain in links.items():
-                if segment not in self.segments or joint not in chain.joints:
-                    continue
-                spherical = len(chain.axes) == 1 and chain.axes[0] is None
-                if not spherical or not all(np.allclose(q, identity) for q in (*chain.quat, chain.quat_AL)):
-                    return None
-                row = self.segments.index(segment)
-                joints.append((self._model.pin.idx_qs[joint], row, parent_row))
-                rows[joint] = row
+            above = self._model.parents[segment]
+            while above is not None and above not in rows:
+                above = self._model.parents[above]
+            joints.append((m.idx_qs[chain.joints[0]], rows[segment], -1 if above is None else rows[above]))
         return joints if len(joints) == len(self.segments) else None
 
     def compute_points(self, quat_WL: np.ndarray) -> np.ndarray:
@@ -526,39 +487,26 @@ class LiveKinematics:
         return np.where(np.einsum("ki,ki->k", fitted, quat_WL)[:, None] < 0.0, -fitted, fitted)
 
 
-class _LiveGirdle(NamedTuple):
+class _LiveGirdle:
     """A girdle whose joints are set for one pose after another."""
 
-    girdle: Girdle
-    on: int  # rows of its segments; of the limb −1: it has no sensor
-    moves: int
-    along: np.ndarray  # (3,) of the limb
-    scale: float
-    parameters: tuple[float, ...]  # (7,)
-    at: tuple[int, ...]  # of its joints in q
-
-    @classmethod
-    def of(cls, model: BodyModel, name: str, segments: Sequence[str]) -> _LiveGirdle:
-        girdle = model.table.girdles[name]
-        moves = segments.index(girdle.moves) if girdle.moves in segments else -1
-        return cls(
-            girdle,
-            segments.index(girdle.on),
-            moves,
-            np.array(model.table.segments[girdle.moves].along),
-            find_girdle_scale(girdle, model.lengths),
-            tuple(model.girdle_parameters(name).tolist()),
-            tuple(model.pin.idx_qs[model.pin.getJointId(joint)] for joint in girdle.joints),
-        )
+    def __init__(self, model: BodyModel, name: str, segments: Sequence[str]) -> None:
+        self._girdle = girdle = model.table.girdles[name]
+        self._on = segments.index(girdle.on)
+        self._moves = segments.index(girdle.moves) if girdle.moves in segments else None
+        self._along = np.array(model.table.segments[girdle.moves].along)
+        self._scale = find_girdle_scale(girdle, model.lengths)
+        self._parameters = tuple(model.girdle_parameters(name).tolist())
+        self._at = [model.pin.idx_qs[model.pin.getJointId(joint)] for joint in girdle.joints]
 
     def place(self, quat_WL: np.ndarray, q: np.ndarray) -> None:
         """Set the joints in `q` (nq,) as `_write_girdles`, from `quat_WL` (k, 4) xyzw."""
         law, s = (0.0, 0.0, 0.0), 0.0
-        if self.moves >= 0:
-            along = turn_relatively(quat_WL, self.moves, self.on, self.along)
-            law, s = displace(self.girdle, along, self.scale, SCALARS)
-        share, rest, raised = 1.0 + self.parameters[0], self.parameters[1:4], self.parameters[4:]
-        for i, by_law, at_rest, at_raised in zip(self.at, law, rest, raised, strict=True):
+        if self._moves is not None:
+            along = turn_relatively(quat_WL, self._moves, self._on, self._along)
+            law, s = displace(self._girdle, along, self._scale, SCALARS)
+        share, rest, raised = 1.0 + self._parameters[0], self._parameters[1:4], self._parameters[4:]
+        for i, by_law, at_rest, at_raised in zip(self._at, law, rest, raised, strict=True):
             q[i] = share * by_law + at_rest + s * at_raised
 
 
@@ -662,11 +610,8 @@ def compute_point_covariances(
             shape_jacobian[:, :, : len(lengths)] += R_WK[link] @ part.by_length
         residual = np.zeros((n, 3, 3))
         for name in model.point_girdles[point]:
-            girdle, motion, first = (
-                model.table.girdles[name],
-                motions[name],
-                len(lengths) + len(PARAMETERS) * girdles.index(name),
-            )
+            girdle, motion = model.table.girdles[name], motions[name]
+            first = len(lengths) + len(PARAMETERS) * girdles.index(name)
             R_on = known[girdle.on]
             vectors[girdle.on] = vectors.get(girdle.on, 0.0) + np.einsum("nij,nj->ni", R_on, motion.displacement)
             shape_jacobian[:, :, first : first + len(PARAMETERS)] += R_on @ motion.jacobian

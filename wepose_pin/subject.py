@@ -23,15 +23,7 @@ from .arguments import (
     format_object,
 )
 from .diagnostics import notebook_html
-from .documents import (
-    TomlTable,
-    is_number,
-    parse_toml,
-    read_toml,
-    toml_string,
-    toml_strings,
-    whole_file,
-)
+from .documents import TomlTable, is_number, parse_toml, read_toml, toml_string, toml_strings, whole_file
 from .errors import BadData, BadModel, BadOption, BadSubject, one_of
 from .model import BodyModel, BodyTable, compute_population_lengths, load_table
 from .model.girdle import PARAMETERS
@@ -210,8 +202,7 @@ class Subject:
             missing = [name for name in table.lengths if name not in self.lengths]
             if missing:
                 raise BadOption(f"{where}lengths: {', '.join(missing)} of the body {table.name} is missing")
-            check_names(f"{where}mounts", self.mounts, table.segments)
-            for name in ("start_pose_offset", "heading_drift"):
+            for name in ("mounts", "start_pose_offset", "heading_drift"):
                 check_names(f"{where}{name}", getattr(self, name), table.segments)
             check_names(f"{where}hinges", self.hinges, table.hinges)
             if table.girdles:  # a body without any, as those of others, has its own shoulders
@@ -238,7 +229,7 @@ class Subject:
         return float(np.sqrt(self.covariance[k, k]))
 
     def lengths_covariance(self, names: Iterable[str] | None = None) -> np.ndarray:
-        """Return the covariance (n, n) [m²] of the named lengths, or of all; zero for a length that has no row."""
+        """Return the covariance (n, n) of the named rows of `order`, or of all lengths [m²]; zero without a row."""
         names = list(self.lengths if names is None else names)
         known = [k for k, name in enumerate(names) if name in self.order]
         rows = [self.order.index(names[k]) for k in known]
@@ -252,18 +243,11 @@ class Subject:
         The parameters are in the order and units of `girdles`. Where this subject has no covariance of them, it is the
         spread of people that the table states.
         """
-        rows = girdle_rows(table)
-        k = len(table.lengths)
-        covariance = np.zeros((k + len(rows), k + len(rows)))
-        covariance[k:, k:] = compute_girdle_prior(table)
-        if set(rows) <= set(self.order):
-            at = [self.order.index(row) for row in rows]
-            covariance[k:, k:] = self.covariance[np.ix_(at, at)]
-            known = [i for i, name in enumerate(table.lengths) if name in self.order]
-            of_lengths = [self.order.index(name) for name in table.lengths if name in self.order]
-            covariance[np.ix_(known, range(k, k + len(rows)))] = self.covariance[np.ix_(of_lengths, at)]
-            covariance[k:, :k] = covariance[:k, k:].T
-        covariance[:k, :k] = self.lengths_covariance(table.lengths)
+        rows, k = girdle_rows(table), len(table.lengths)
+        covariance = self.lengths_covariance([*table.lengths, *rows])
+        if not set(rows) <= set(self.order):
+            covariance[k:] = covariance[:, k:] = 0.0
+            covariance[k:, k:] = compute_girdle_prior(table)
         return covariance
 
     def mount_covariance(self, segment: str) -> np.ndarray | None:
@@ -271,8 +255,7 @@ class Subject:
         rows = mount_rows(segment)
         if segment not in self.mounts or not set(rows) <= set(self.order):
             return None
-        at = [self.order.index(row) for row in rows]
-        return self.covariance[np.ix_(at, at)]
+        return self.lengths_covariance(rows)
 
     def sample(self, rng: np.random.Generator) -> Subject:
         """Return a random person from this one's distribution of lengths, for simulation."""
@@ -482,20 +465,15 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
     if quality not in ("", *get_args(Quality)):
         raise BadSubject(f"{path}: quality = {quality!r} is not known; {one_of(get_args(Quality), str(quality))}")
     tables = {name: top.table(name, {}) for name in _TABLES}
-    of_segments = {
-        name: {segment: tables[name].table(segment) for segment in tables[name].values}
-        for name in ("mounts", "start_pose_offset", "heading_drift")
-    }
+    learned = {name: {key: tables[name].table(key) for key in tables[name].values} for name in _LEARNED}
     offset = {
         segment: np.radians(entry.numbers("x_deg", "y_deg", "std_deg", most=MOST_OFFSET_DEG))
-        for segment, entry in of_segments["start_pose_offset"].items()
+        for segment, entry in learned["start_pose_offset"].items()
     }
     drift = {
         segment: np.radians(entry.numbers("rate_deg_min", "std_deg_min", most=MOST_DRIFT_DEG_MIN)) / 60.0
-        for segment, entry in of_segments["heading_drift"].items()
+        for segment, entry in learned["heading_drift"].items()
     }
-    hinges = {joint: tables["hinges"].table(joint) for joint in tables["hinges"].values}
-    girdles = {point: tables["girdles"].table(point) for point in tables["girdles"].values}
     if "lengths" not in top:
         raise BadSubject(f"{path}: lengths is missing; it needs the lengths of the body [m], none where it has none")
     lengths = _read_lengths(tables["lengths"])
@@ -505,14 +483,14 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         lengths=lengths,
         order=order,
         covariance=matrix,
-        mounts={
-            segment: _read_unit(entry, ("qx", "qy", "qz", "qw")) for segment, entry in of_segments["mounts"].items()
-        },
+        mounts={name: _read_unit(entry, ("qx", "qy", "qz", "qw")) for name, entry in learned["mounts"].items()},
         note=str(values.get("note", "")),
-        hinges={joint: _read_hinge(entry) for joint, entry in hinges.items()},
+        hinges={joint: _read_hinge(entry) for joint, entry in learned["hinges"].items()},
         start_pose_offset={segment: StartPoseOffset(v[:2], float(v[2])) for segment, v in offset.items()},
         heading_drift={segment: HeadingDrift(float(rate), float(std)) for segment, (rate, std) in drift.items()},
-        girdles={point: np.array(entry.numbers(*PARAMETERS, most=LONGEST)) for point, entry in girdles.items()},
+        girdles={
+            point: np.array(entry.numbers(*PARAMETERS, most=LONGEST)) for point, entry in learned["girdles"].items()
+        },
         quality=quality,
     )
 

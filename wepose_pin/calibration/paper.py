@@ -27,7 +27,6 @@ from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import Rotation
 
@@ -35,7 +34,6 @@ from ..alignment import PALM_SLIP_STD, align_sensors
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, NoSolution, one_of
 from ..model import BodyModel
-from ..model.start_pose import orient_links
 from ..model.table import NEUTRAL_POSE
 from ..subject import Subject
 from .anatomy import check_limbs, measure_limbs
@@ -74,7 +72,7 @@ def check_paper_formulation(
             f"formulation 'paper' needs a protocol in which points of the body coincide and nothing else is asked, "
             f"such as clasp; not '{protocol.name}'"
         )
-    neutral = StartPose(orient_links(model, pin.neutral(model.pin)))
+    neutral = StartPose(model.neutral_rotations)
     groups = _find_groups(resolve_conditions(protocol, model, neutral, sensors), tuple(model.lengths))
     if not any(set(group) <= set(measured) for group in groups):
         names = [group[0] for group in groups if len(group) == 1]

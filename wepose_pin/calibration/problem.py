@@ -15,7 +15,7 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
 from ..model import BodyModel, Segment, list_breadths
-from ..model.start_pose import compute_start_configuration, orient_links
+from ..model.start_pose import compute_start_configuration
 from ..recording import Intervals, Recording, format_span
 from ..subject import Subject
 from .conditions import (
@@ -80,7 +80,7 @@ class CalibrationProblem:
         """The orientation of the links in the start pose."""
         recording, model = self.recording, self.model
         q = compute_start_configuration(model, recording.start_pose, recording.joints, recording.where())
-        return StartPose(orient_links(model, q))
+        return StartPose(model.orient_links(q))
 
     @cached_property
     def conditions(self) -> tuple[Constraint, ...]:

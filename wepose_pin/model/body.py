@@ -11,6 +11,7 @@ from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
+from scipy.spatial.transform import Rotation
 
 from ..arguments import check_arguments
 from ..assets import asset
@@ -24,9 +25,9 @@ from .girdle import PARAMETERS
 from .meshes import find_mesh
 from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
-from .table import DEFAULT_BODY, BodyTable, HingeJoint, Segment
+from .table import DEFAULT_BODY, BodyTable, Segment
 from .table_file import find_table, load_table, parse_table, read_table
-from .tree import AxisLimits, build, find_bounds, find_impossible_inertia, parse_tree
+from .tree import AxisLimits, build, check_joint_values, find_impossible_inertia, parse_tree
 from .urdf_library import import_yourdfpy
 from .visuals import Visual
 
@@ -102,10 +103,18 @@ class BodyModel:
 
     @cached_property
     def neutral_rotations(self) -> dict[str, np.ndarray]:
-        """Link → its rotation (3, 3) in W, all joints at zero."""
-        data = self.pin.createData()
-        pin.framesForwardKinematics(self.pin, data, pin.neutral(self.pin))
-        return {frame.name: np.array(M_WK.rotation) for frame, M_WK in zip(self.pin.frames, data.oMf, strict=True)}
+        """`orient_links` with all joints at zero."""
+        return self.orient_links(pin.neutral(self.pin))
+
+    def orient_links(self, q: np.ndarray) -> dict[str, np.ndarray]:
+        """Link → R_WK (3, 3) in a configuration (nq,): segments and points by name, others by that of their joint."""
+        m, data = self.pin, self.pin.createData()
+        pin.framesForwardKinematics(m, data, q)
+        R_WK = {m.names[joint]: np.array(data.oMi[joint].rotation) for joint in range(m.njoints)}
+        for link in (*self.table.points, *self.table.segments):
+            if m.existFrame(link):
+                R_WK[link] = np.array(data.oMf[m.getFrameId(link)].rotation)
+        return R_WK
 
     @cached_property
     def point_frames(self) -> dict[str, str]:
@@ -278,7 +287,8 @@ def _load_body(path: Path, entries: Mapping[str, Any] | None = None) -> BodyMode
     joints = {joint.name for joint in robot.joints}
     girdles = {name: girdle for name, girdle in table.girdles.items() if joints.issuperset(girdle.joints)}
     if own:
-        _check_poses(robot, table)
+        for pose, values in table.poses.items():
+            check_joint_values(robot, values, f"{table.where}: poses.{pose}", BadModel)
         _check_girdles(robot, table)
     else:  # the names fit; joints may have others
         table = replace(table, poses={name: pose for name, pose in table.poses.items() if joints.issuperset(pose)})
@@ -329,19 +339,6 @@ def _find_body(path: str | Path | None) -> Path:
     if path.suffix or path.exists() or len(path.parts) > 1:
         return path
     return asset("urdf", f"{load_table(path.name).name}.toml")
-
-
-def _check_poses(robot: Any, table: BodyTable) -> None:
-    """Raise `BadModel` where a pose names a joint that is none, or has a value outside its limits."""
-    joints = {joint.name: joint for joint in robot.joints if joint.type != "fixed"}
-    for pose, values in table.poses.items():
-        for name, value in values.items():
-            place = f"{table.where}: poses.{pose}.{name}"
-            if name not in joints:
-                raise BadModel(f"{place} is no joint that moves; {one_of(joints, name)}")
-            low, high = find_bounds(joints[name], np.inf)
-            if not low - 1e-6 <= value <= high + 1e-6:
-                raise BadModel(f"{place} = {value:g} is outside its limits, {low:g} to {high:g}")
 
 
 def _check_girdles(robot: Any, table: BodyTable) -> None:
@@ -414,29 +411,17 @@ def _check_segments_move(body: BodyModel, where: str) -> None:
                 f"{table.where}: hinges.{name} is none: {hinge.moves} hangs on "
                 f"{body.parents[hinge.moves] or 'the root'}, not on {hinge.on}"
             )
-        own = _find_single_axis(body, hinge)
-        if own is not None and abs(own @ hinge.axis) < MIN_HINGE_COSINE:
-            axis = ", ".join(f"{v:.2g}" for v in own + 0.0)
+        chain = body.chains[hinge.moves]
+        if len(chain.axes) != 1 or chain.axes[0] is None:
+            continue
+        axis_L = Rotation.from_quat(chain.quat_AL).inv().apply(chain.axes[0])  # all joints at zero
+        own = body.neutral_rotations[hinge.on].T @ body.neutral_rotations[hinge.moves] @ axis_L
+        if abs(own @ hinge.axis) < MIN_HINGE_COSINE:
+            axis = ", ".join(f"{v:.2g}" for v in np.round(own, 9) + 0.0)
             raise BadModel(
                 f"{table.where}: hinges.{name}.axis = {[*hinge.axis]} is none: {hinge.moves} turns about [{axis}] of "
                 f"{hinge.on}"
             )
-
-
-def _find_single_axis(body: BodyModel, hinge: HingeJoint) -> np.ndarray | None:
-    """The axis (3,) of the one revolute joint that moves a hinge's segment, in the frame of the other; None: no one.
-
-    With all joints at zero.
-    """
-    joints = body.chains[hinge.moves].joints
-    if len(joints) != 1 or body.pin.nvs[joints[0]] != 1:
-        return None
-    data = body.pin.createData()
-    pin.computeJointJacobians(body.pin, data, pin.neutral(body.pin))
-    pin.updateFramePlacements(body.pin, data)
-    axis_W = pin.getJointJacobian(body.pin, data, joints[0], pin.WORLD)[3:, body.pin.idx_vs[joints[0]]]
-    R_WL = data.oMf[body.pin.getFrameId(hinge.on)].rotation
-    return np.asarray(R_WL.T @ axis_W) if np.linalg.norm(axis_W) > 0.5 else None  # a joint that slides has none
 
 
 def _check_xml(path: Path) -> None:
@@ -450,5 +435,5 @@ def _check_xml(path: Path) -> None:
 
 
 def _body(robot: Any, table: BodyTable, where: str) -> BodyModel:
-    built = build(robot, where, spherical=not table.is_mechanism)
-    return BodyModel(built.pin, robot, table, built.joints, built.limits)
+    model, joints, limits = build(robot, where, spherical=not table.is_mechanism)
+    return BodyModel(model, robot, table, joints, limits)

@@ -124,11 +124,9 @@ def solve(chain: Chain, quat: np.ndarray) -> list[np.ndarray]:
 
 def _joints_below(model: pin.Model, joint: int, stops: set[int]) -> list[int]:
     """Joints from below the next one that carries a segment, or from the root, down to `joint`."""
-    joints: list[int] = []
-    while joint != 0 and (not joints or joint not in stops):
-        joints.append(joint)
-        joint = model.parents[joint]
-    return joints[::-1]
+    path = model.supports[joint].tolist()[1:]
+    carrying = [k for k, above in enumerate(path[:-1]) if above in stops]
+    return path[carrying[-1] + 1 :] if carrying else path
 
 
 def _take_nearest_three(model: pin.Model, joints: list[int]) -> list[int]:
@@ -153,16 +151,12 @@ def axis_in_joint(model: pin.Model, joint: int) -> np.ndarray | None:
 
 def _chain(model: pin.Model, frame: pin.Frame, free: list[int]) -> Chain:
     above = model.parents[free[0]] if free else frame.parentJoint
-    path: list[int] = []
-    joint = frame.parentJoint
-    while joint != above:
-        path.append(joint)
-        joint = model.parents[joint]
+    supports = model.supports[frame.parentJoint].tolist()
     M, place = pin.SE3.Identity(), 0
     axes: list[np.ndarray | None] = []
     places, quats = [], []
     last = None
-    for joint in reversed(path):
+    for joint in supports[supports.index(above) + 1 :]:
         M = M * model.jointPlacements[joint]
         if joint not in free:
             continue

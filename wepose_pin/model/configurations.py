@@ -50,12 +50,12 @@ def find_null_space(model: pin.Model, links: Sequence[str], q: np.ndarray) -> np
     return Vt[np.count_nonzero(s > 1e-6) :].T
 
 
-def find_undetermined_joints(model: pin.Model, links: Sequence[str], q: np.ndarray | None = None) -> list[str]:
+def find_undetermined_joints(model: pin.Model, links: Sequence[str]) -> list[str]:
     """Names of joints whose value the orientations of `links` leave open, at least in part.
 
-    In the configuration `q` (nq,), or without it anywhere: joints that stand in line for a moment do not count then.
+    Joints that stand in line for a moment do not count.
     """
-    null = find_null_space(model, links, find_generic_configuration(model) if q is None else q)
+    null = find_null_space(model, links, find_generic_configuration(model))
     share = np.linalg.norm(null, axis=1)
     return [
         model.names[j]

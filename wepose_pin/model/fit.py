@@ -1,6 +1,6 @@
 """The configuration in which links come nearest to the orientations they should have, within the joints' limits.
 
-Frame by frame the sum over the links of weight × angle² is made smallest: Gauss-Newton with Levenberg's damping on
+Frame by frame the sum over the links of angle² is made smallest: Gauss-Newton with Levenberg's damping on
 Pinocchio's Jacobian, each frame from the solution of the one before. Limits are kept by projection: a joint at its
 limit that the gradient pushes outward takes no part in the step, and what a step carries over a limit ends on it
 (Bertsekas 1982, "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 20:221).
@@ -38,34 +38,16 @@ def joint_limits(model: pin.Model, joints: Sequence[int]) -> Limits:
     return Limits(at, model.lowerPositionLimit[at], model.upperPositionLimit[at])
 
 
-def fit(
-    model: pin.Model,
-    quat_WL: Mapping[str, np.ndarray],
-    joints: Sequence[int],
-    start: np.ndarray,
-    *,
-    weights: Mapping[str, float] | None = None,
-    limits: bool = True,
-) -> np.ndarray:
-    """Configurations (n, nq) in which the links come nearest to `quat_WL`.
+class Fit:
+    """Configurations in which links come nearest to orientations; what does not change from frame to frame.
 
     Parameters
     ----------
-    quat_WL : link → (n, 4) xyzw, in the model's universe
-    joints : those that may move; the others keep their values of `start`
-    start : (n, nq), where a frame may start in place of the one before; (1, nq): where the first starts
-    weights : of the links' squared angles; 1 where not named
+    joints : those that may move
     limits : keep the limits of joints with one axis
     """
-    return Fit(model, list(quat_WL), joints, weights or {}, limits).run(quat_WL, start)
 
-
-class Fit:
-    """One problem with what does not change from frame to frame; parameters as of `fit`."""
-
-    def __init__(
-        self, model: pin.Model, links: Sequence[str], joints: Sequence[int], weights: Mapping[str, float], limits: bool
-    ) -> None:
+    def __init__(self, model: pin.Model, links: Sequence[str], joints: Sequence[int], limits: bool) -> None:
         self.model, self.data = model, model.createData()
         frames = [model.frames[model.getFrameId(link)] for link in links]
         # The joint's frame is compared in place of the link's, which is fixed to it: its rotation comes for nothing.
@@ -76,10 +58,9 @@ class Fit:
         for k, frame in enumerate(frames):
             for j in model.supports[frame.parentJoint]:
                 moves[k, model.idx_vs[j] : model.idx_vs[j] + model.nvs[j]] = j > 0
-        weight = np.array([weights.get(link, 1.0) for link in links])
-        self._pull = (weight[:, None] * moves[:, self.columns]).T  # (f, m): which links a column turns, weighted
-        self._both = self._pull @ moves[:, self.columns]  # (f, f): the weight of the links that two columns both turn
-        self._weight = weight
+        self._pull = moves[:, self.columns].astype(float).T  # (f, m): which links a column turns
+        self._both = self._pull @ self._pull.T  # (f, f): how many links two columns both turn
+        self._ones = np.ones(len(links))
         self._free_q = np.concatenate([model.idx_qs[j] + np.arange(model.nqs[j]) for j in joints])
         bounded = [j for j in joints if model.nqs[j] == 1] if limits else []
         self.limits = joint_limits(model, bounded)
@@ -87,7 +68,14 @@ class Fit:
         self._bounded = np.array([column[model.idx_vs[j]] for j in bounded], dtype=int)
 
     def run(self, quat_WL: Mapping[str, np.ndarray], start: np.ndarray, before: np.ndarray | None = None) -> np.ndarray:
-        """As `fit`; the first frame begins at `before` (nq,) where that is given."""
+        """Configurations (n, nq) for `quat_WL`, link → (n, 4) xyzw in the model's universe.
+
+        Parameters
+        ----------
+        start : (n, nq), where a frame may start in place of the one before; (1, nq): where the first starts. Joints
+            that may not move keep their values of it
+        before : (nq,) where the first frame starts; None: at `start`
+        """
         targets = np.stack([Rotation.from_quat(quat).as_matrix() for quat in quat_WL.values()], axis=1) @ self._R_LJ
         n = len(targets)
         own = len(start) == n
@@ -112,10 +100,10 @@ class Fit:
         return q
 
     def _left(self, q: np.ndarray, R_target: np.ndarray) -> tuple[float, np.ndarray]:
-        """What is left: weighted sum of squared angles [rad²], and the rotation vectors (m, 3) in W."""
+        """What is left: the sum of squared angles [rad²], and the rotation vectors (m, 3) in W."""
         pin.computeJointJacobians(self.model, self.data, q)
         e = np.array([pin.log3(R @ view.T) for R, view in zip(R_target, self._views, strict=True)])
-        return float(self._weight @ np.einsum("mi,mi->m", e, e)), e
+        return float(self._ones @ np.einsum("mi,mi->m", e, e)), e
 
     def _solve(self, q: np.ndarray, R_target: np.ndarray) -> tuple[np.ndarray, float]:
         at, lower, upper = self.limits

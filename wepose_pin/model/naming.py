@@ -94,15 +94,11 @@ def _check_links(table: BodyTable, tree: Tree) -> None:
             f"{where}: segments: no link for {format_closest_links(lacking, tree.below, table)}; "
             f"{one_of(tree.below, most=MOST_LINKS)}"
         )
-    for key, entries in (("segments", table.segments), ("points", table.points)):
-        for name, entry in entries.items():
-            if entry.link not in tree.below:
-                raise BadModel(
-                    f"{where}: {key}.{name}: no link '{entry.link}'; {one_of(tree.below, entry.link, MOST_LINKS)}"
-                )
-    for link in table.root:
+    places = [(f"segments.{name}", segment.link) for name, segment in table.segments.items()]
+    places += [(f"points.{name}", point.link) for name, point in table.points.items()]
+    for place, link in [*places, *(("root", link) for link in table.root)]:
         if link not in tree.below:
-            raise BadModel(f"{where}: root: no link '{link}'; {one_of(tree.below, link, MOST_LINKS)}")
+            raise BadModel(f"{where}: {place}: no link '{link}'; {one_of(tree.below, link, MOST_LINKS)}")
 
 
 def format_closest_links(segments: Iterable[str], links: Iterable[str], table: BodyTable) -> str:

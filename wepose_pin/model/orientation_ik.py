@@ -16,8 +16,8 @@ import pinocchio as pin
 from .. import rotations
 from ..rotations import conjugate, multiply, rotation_about
 from .body import BodyModel
-from .chains import axis_in_joint, find_parents, solve
-from .fit import Fit, Limits, joint_limits
+from .chains import axis_in_joint, solve
+from .fit import Fit, Limits
 
 _MAX_RESIDUAL = 1e-9  # [rad] that is nothing
 
@@ -31,7 +31,7 @@ class Group(NamedTuple):
 
 def find_groups(model: BodyModel, measured: Collection[str]) -> list[Group]:
     """What has to be fitted, the spine first: a limb, or a segment of the spine, that cannot follow everything."""
-    parents, segments = find_parents(model.pin, model.table), model.table.segments
+    parents, segments = model.parents, model.table.segments
 
     def limb(segment: str) -> str:
         """The first segment of the limb."""
@@ -56,7 +56,7 @@ class OrientationIk:
     Parameters
     ----------
     segments : the measured ones
-    limits, weights : as in `kinematics.solve_configuration`
+    limits : as in `kinematics.solve_configuration`
     """
 
     def __init__(
@@ -65,19 +65,15 @@ class OrientationIk:
         segments: Collection[str],
         *,
         limits: bool = True,
-        weights: Mapping[str, float] | None = None,
     ) -> None:
         self.model, self.chains, self._table = model.pin, model.chains, model.table
-        self._limits, self._weights = limits, weights
         to_fit = find_groups(model, segments)
-        self._fits = [(group, Fit(self.model, group.segments, group.joints, weights or {}, limits)) for group in to_fit]
-        self._ends = [joint_limits(self.model, group.joints) for group in to_fit]
+        self._fits = [(group, Fit(self.model, group.segments, group.joints, limits)) for group in to_fit]
         self._begins = {
             chain.joints[0]: name for name, chain in self.chains.items() if chain.joints and name in segments
         }
         self._neutral = pin.neutral(self.model)
-        placed = [placement.rotation for placement in self.model.jointPlacements]
-        self._placements = [pin.Quaternion(R).coeffs() for R in placed]
+        self._placements = [pin.Quaternion(placement.rotation).coeffs() for placement in self.model.jointPlacements]
         frames = [self.model.frames[self.model.getFrameId(name)] for group in to_fit for name in group.segments]
         self._stands = {frame.name: (frame.parentJoint, pin.Quaternion(frame.placement.rotation)) for frame in frames}
         axes = {j: axis_in_joint(self.model, j) for j in range(1, self.model.njoints) if self.model.nvs[j] == 1}
@@ -93,8 +89,8 @@ class OrientationIk:
         """
         kept: dict[int, np.ndarray] = {}
         q, quat_WJ = self.stepwise(quat_WL, kept)
-        for nth, ((group, fit), ends) in enumerate(zip(self._fits, self._ends, strict=True)):
-            rows = np.flatnonzero(self._find_unreached(q, quat_WJ, quat_WL, group, ends))
+        for nth, (group, fit) in enumerate(self._fits):
+            rows = np.flatnonzero(self._find_unreached(q, quat_WJ, quat_WL, group, fit.limits))
             if not len(rows):
                 continue
             begin = self._solved.get(nth) if warm_start else before
@@ -145,9 +141,7 @@ class OrientationIk:
             stands = multiply(quat_WJ[joint], quat_JL.coeffs())
             residual = multiply(conjugate(stands), quat_WL[segment])
             astray |= np.linalg.norm(residual[..., :3], axis=-1) > 0.5 * _MAX_RESIDUAL
-        if self._limits:
-            astray |= ((q[:, ends.at] < ends.lower) | (q[:, ends.at] > ends.upper)).any(axis=1)
-        return astray
+        return astray | ((q[:, ends.at] < ends.lower) | (q[:, ends.at] > ends.upper)).any(axis=1)
 
     def _write_joint(self, q: np.ndarray, joint: int, value: np.ndarray) -> np.ndarray:
         """Write a joint's value into `q`: an angle (n,) [rad] or a rotation (n, 4); gives its rotation."""

@@ -44,15 +44,12 @@ def measure_reaches(model: BodyModel) -> dict[str, dict[str, LinkVector]]:
     own = model.lengths
     lengths = np.array(list(own.values()))
     offsets = _link_offsets(model)
-    slopes = {
-        name: _difference_quotient(offsets, _link_offsets(model.with_lengths({name: STRETCHED * own[name]})), own[name])
-        for name in own
-    }
+    stretched = {name: _link_offsets(model.with_lengths({name: STRETCHED * own[name]})) for name in own}
     reaches: dict[str, dict[str, LinkVector]] = {}
     for point, way in offsets.items():
         reaches[point] = {}
         for link, offset in way.items():
-            columns = [slopes[name][point][link] for name in own]
+            columns = [(stretched[k][point][link] - offset) / (STRETCHED * own[k] - own[k]) for k in own]
             by_length = np.round(np.reshape(columns, (len(own), 3)).T, DECIMALS) + 0.0  # no negative zeros
             constant = offset - by_length @ lengths
             constant[np.abs(constant) < AFFINE_TOLERANCE] = 0.0
@@ -72,14 +69,12 @@ def _link_offsets(model: BodyModel) -> _Offsets:
     offsets: _Offsets = {}
     for point, link in model.point_frames.items():
         frame = m.frames[m.getFrameId(link)]
-        offsets[point], joint, translation = {}, frame.parentJoint, frame.placement.translation
-        parts: list[tuple[int, np.ndarray]] = [(joint, translation)]
-        while joint:
+        offsets[point], path = {}, m.supports[frame.parentJoint].tolist()
+        for joint in path[1:]:
             if m.joints[joint].shortname().startswith("JointModelP") and m.names[joint] not in follow:
                 raise BadModel(f"{m.name}: joint '{m.names[joint]}' slides: orientations do not tell where {point} is")
-            translation, joint = m.jointPlacements[joint].translation, m.parents[joint]
-            parts.append((joint, translation))
-        for joint, translation in reversed(parts):
+        steps = [*(m.jointPlacements[joint].translation for joint in path[1:]), frame.placement.translation]
+        for joint, translation in zip(path, steps, strict=True):
             name, R_JK = name_of[joint]
             offsets[point][name] = offsets[point].get(name, 0.0) + R_JK.T @ translation
     return offsets
@@ -93,14 +88,6 @@ def _name_links(model: BodyModel) -> dict[int, tuple[str, np.ndarray]]:
         frame = m.frames[m.getFrameId(segment)]
         name_of[frame.parentJoint] = segment, frame.placement.rotation
     return name_of
-
-
-def _difference_quotient(offsets: _Offsets, stretched: _Offsets, length: float) -> _Offsets:
-    step = STRETCHED * length - length
-    return {
-        point: {link: (stretched[point][link] - offset) / step for link, offset in way.items()}
-        for point, way in offsets.items()
-    }
 
 
 def _check_affine(model: BodyModel, reaches: Mapping[str, Mapping[str, LinkVector]]) -> None:

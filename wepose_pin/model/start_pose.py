@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadSession, one_of
 from ..recording import CONFIGURATION
 from .body import BodyModel
-from .tree import find_bounds, joint_axis, joint_placement, parse_tree
+from .tree import check_joint_values, joint_axis, joint_placement, parse_tree
 
 
 def compute_start_configuration(
@@ -37,13 +37,7 @@ def compute_start_configuration(
             f"{where}: start_pose = '{start_pose}' is not known; {one_of((*poses, CONFIGURATION), start_pose)}"
         )
     values = joints if start_pose == CONFIGURATION else poses[start_pose]
-    by_name = {joint.name: joint for joint in model.robot.joints if joint.type not in ("fixed", "floating")}
-    for name, value in values.items():
-        if name not in by_name:
-            raise BadSession(f"{where}: joints.{name} is no joint that moves; {one_of(by_name, name)}")
-        low, high = find_bounds(by_name[name], np.inf)
-        if not low - 1e-6 <= value <= high + 1e-6:
-            raise BadSession(f"{where}: joints.{name} = {value:g} is outside its limits, {low:g} to {high:g}")
+    check_joint_values(model.robot, values, f"{where}: joints", BadSession)
     q, m = pin.neutral(model.pin), model.pin
     tree = parse_tree(model.robot, where)
     spherical = {joint: link for link, joint in model.joints.items()}
@@ -60,17 +54,6 @@ def compute_start_configuration(
         else:  # without limits: cosine and sine
             q[first], q[first + 1] = np.cos(value), np.sin(value)
     return q
-
-
-def orient_links(model: BodyModel, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Link → R_WK (3, 3) in the configuration `q` (nq,): segments and points by name, others by that of their joint."""
-    data = model.pin.createData()
-    pin.framesForwardKinematics(model.pin, data, q)
-    R_WK = {model.pin.names[joint]: np.array(data.oMi[joint].rotation) for joint in range(model.pin.njoints)}
-    for link in (*model.table.points, *model.table.segments):
-        if model.pin.existFrame(link):
-            R_WK[link] = np.array(data.oMf[model.pin.getFrameId(link)].rotation)
-    return R_WK
 
 
 def _rotate_triple(joints: list[Any], values: Mapping[str, float]) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from ..errors import BadModel
+from ..errors import BadModel, one_of
 
 _TURNS = ("revolute", "continuous")
 DEEPEST = 200  # joints in a row; a person has 20
@@ -57,14 +57,6 @@ class Tree(NamedTuple):
         for joint in self.path(link):
             M = M @ joint_placement(joint)
         return M
-
-
-class Built(NamedTuple):
-    """A `pin.Model` with the spherical joints of `BodyModel`."""
-
-    pin: pin.Model
-    joints: dict[str, int]
-    limits: dict[str, AxisLimits]
 
 
 def copy_robot(robot: Any) -> Any:
@@ -122,8 +114,10 @@ def parse_tree(robot: Any, where: str) -> Tree:
     return Tree(roots[0], above, below)
 
 
-def build(robot: Any, where: str, *, spherical: bool = True) -> Built:
+def build(robot: Any, where: str, *, spherical: bool = True) -> tuple[pin.Model, dict[str, int], dict[str, AxisLimits]]:
     """The Pinocchio model, depth first as Pinocchio's algorithms need it; one frame a link.
+
+    Second and third: its spherical joints and their limits, as `BodyModel` has them.
 
     A mimic joint follows the joint it mimics. The limits of joints that stay as they are are the URDF's. Without
     `spherical` triples of revolute joints stay as they are too.
@@ -179,7 +173,7 @@ def build(robot: Any, where: str, *, spherical: bool = True) -> Built:
     for joint in robot.joints:
         if joint.mimic is not None:
             model = _mimicking(model, joint, where)
-    return Built(model, joints, limits)
+    return model, joints, limits
 
 
 def joint_placement(joint: Any) -> np.ndarray:
@@ -235,6 +229,17 @@ def find_bounds(joint: Any, unbounded: float) -> tuple[float, float]:
         return -unbounded, unbounded
     low, high = joint.limit.lower, joint.limit.upper
     return (-unbounded if low is None else float(low)), (unbounded if high is None else float(high))
+
+
+def check_joint_values(robot: Any, values: Mapping[str, float], place: str, error: type[Exception]) -> None:
+    """Raise an `error` where `values` [rad or m] name a joint that does not move, or are outside its limits."""
+    joints = {joint.name: joint for joint in robot.joints if joint.type not in ("fixed", "floating")}
+    for name, value in values.items():
+        if name not in joints:
+            raise error(f"{place}.{name} is no joint that moves; {one_of(joints, name)}")
+        low, high = find_bounds(joints[name], np.inf)
+        if not low - 1e-6 <= value <= high + 1e-6:
+            raise error(f"{place}.{name} = {value:g} is outside its limits, {low:g} to {high:g}")
 
 
 def _add_single(

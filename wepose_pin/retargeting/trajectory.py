@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..arguments import check_arguments
 from ..errors import BadOption, NoSolution, WrongOption
-from ..kinematics import Pose, PosedBody, cut_pose
+from ..kinematics import Pose, PosedBody, find_samples
 from ..model import BodyTable
 from ..recording import Intervals, select_interval
 from ..writers.joint_motion import JointMotion
@@ -247,7 +247,7 @@ def _select_pose(
         phases = getattr(pose, "phases", {})
         table, pose = pose.model.table, pose.pose
     selected = select_interval(pose.time, phases, interval, phase)
-    return (pose if selected is None else cut_pose(pose, selected)), table
+    return pose if selected is None else pose.cut(find_samples(pose.time, selected)), table
 
 
 def _compute_trajectory(

@@ -13,7 +13,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
@@ -29,7 +28,6 @@ from ..calibration.conditions import StartPose, find_girdle_signs, find_parts
 from ..errors import BadSession
 from ..filters import AboutVertical, Orientation
 from ..model import BodyModel
-from ..model.start_pose import orient_links
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..subject import Subject
 from .heading_filter import HeadingFilter, StanceEstimator, smooth
@@ -284,7 +282,7 @@ def _find_closures(
 
     Each holds in the intervals of its phase, none where the recording lacks it. `recording` None: none are read.
     """
-    neutral = StartPose(orient_links(model, pin.neutral(model.pin)))
+    neutral = StartPose(model.neutral_rotations)
     closures, taken = [], set[tuple[str, tuple[str, ...]]]()
     for name in PROTOCOLS:
         for closure in load_protocol(name).closures:

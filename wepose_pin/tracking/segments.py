@@ -111,7 +111,7 @@ class SegmentEstimator:
         """Filter and align the first chunk."""
         collect_nominal_mounts(first, self._subject, self._start_frames)  # an error before anything is filtered
         self._filters = filters = SensorFilters(
-            first, method=self._method, static_test=self._static_test, sways=self._start_frames.sways
+            first, method=self._method, static_test=self._static_test, sways=not self._start_frames.table.is_mechanism
         )
         orientation = filters.push(first)
         R_VS_start = find_start_orientations(first, orientation, filters.start)

@@ -14,7 +14,7 @@ from ..assets import find_plugins, load_plugin
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, MissingFile, one_of
-from ..kinematics import PosedBody, cut_pose
+from ..kinematics import PosedBody, find_samples
 from ..recording import select_interval
 from .bvh import write_bvh
 from .c3d import write_c3d
@@ -303,7 +303,7 @@ def _read_motion(
         )
     if isinstance(result, PosedBody):
         selected = select_interval(result.time, getattr(result, "phases", {}), interval, phase)
-        pose = result.pose if selected is None else cut_pose(result.pose, selected)
+        pose = result.pose if selected is None else result.pose.cut(find_samples(result.time, selected))
         motion = Motion(pose, result.model, result.name, result.name)
     else:
         folder = Path(str(result))

@@ -22,7 +22,7 @@ import polars as pl
 from .. import __version__
 from ..angles.torques import Torques, torque_table
 from ..errors import BadData, ExistingOutput, MissingFile
-from ..kinematics import Pose, build_pose_table, cut_pose, parse_pose_table
+from ..kinematics import Pose, build_pose_table, find_samples, parse_pose_table
 from ..model import BodyModel, BodyTable, load_model, load_table
 from ..model.table_file import MODEL_TABLE, format_table
 from ..readers.tables import open_source, read_columns, read_table
@@ -194,7 +194,7 @@ def read_result(
     if model.table.girdles and subject_file.is_file():
         model = replace(model, girdles=load_subject(subject_file).girdles)
     selected = select_interval(pose.time, read_phases(summary), interval, phase)
-    return pose if selected is None else cut_pose(pose, selected), model, summary
+    return pose if selected is None else pose.cut(find_samples(pose.time, selected)), model, summary
 
 
 def read_phases(summary: Mapping[str, Any]) -> dict[str, Intervals]:
