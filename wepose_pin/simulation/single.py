@@ -32,6 +32,7 @@ class SingleSensor:
     p_WS: np.ndarray  # (n, 3) [m], exact
     gyro_S: np.ndarray  # (n, 3) [rad/s]
     accel_S: np.ndarray  # (n, 3) [m/s^2]
+    gyro_bias: np.ndarray  # (n, 3) [rad/s], exact
     static: list[tuple[float, float]]  # [s], before and after the motion
     moving: tuple[float, float]  # [s]
 
@@ -119,6 +120,7 @@ def _simulate_trial(
         p_WS=motion.position(time),
         gyro_S=readings.gyro_S,
         accel_S=readings.accel_S,
+        gyro_bias=readings.gyro_bias,
         static=[(0.0, span[0]), (span[1], _DURATION_S)],
         moving=span,
     )
