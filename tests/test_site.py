@@ -297,6 +297,7 @@ def test_oldest_versions_are_those_of_the_package() -> None:
     conda = {names.get(name, name): bound for name, bound in lower_bounds(run, ">=").items() if name != "python"}
     assert conda == bounds
     assert f'version: "{project["version"]}"' in recipe
+    assert f"- wepose = {project['scripts']['wepose']}\n" in recipe
 
 
 def test_one_function_says_how_to_install_and_knows_the_packages_of_the_extras() -> None:

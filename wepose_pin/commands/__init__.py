@@ -41,6 +41,8 @@ def main(argv: list[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 1
     except (KeyboardInterrupt, Exception) as error:
+        if is_process:
+            ignore_signals()  # a second one would end in a traceback
         # A library may turn the interrupt into an error of its own.
         if is_stopped() or isinstance(error, KeyboardInterrupt):
             code, line = 130, f"stopped; {whats_written()}"
