@@ -19,15 +19,15 @@ from benchmarks.trials import RING_SEGMENTS, find_ring
 from benchmarks.validation import real
 from benchmarks.validation.experiment import align_rotation
 from wepose_pin import rotations
+from wepose_pin.body import load_model
+from wepose_pin.body.subject import load_subject, population_subject, subject_toml
 from wepose_pin.commands import main
 from wepose_pin.commands.evaluate import evaluate
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.evaluation import attitude_error
-from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.mvnx import SEGMENT_OF, read_frames
 from wepose_pin.simulation import NOISE_FREE
-from wepose_pin.subject import load_subject, population_subject, subject_toml
 from wepose_pin.tracking import track
 from wepose_pin.writers import write_session
 

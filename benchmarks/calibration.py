@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from wepose_pin.body import load_model
 from wepose_pin.calibration import alternatives, weights
 from wepose_pin.calibration.contact import find_initial_guess
 from wepose_pin.calibration.least_squares import LOOSE_TOLERANCE, STEPS, Estimate, LeastSquares, solve
@@ -18,7 +19,6 @@ from wepose_pin.calibration.protocols import load_protocol
 from wepose_pin.calibration.weights import FINAL_STEPS, solve_reweighted
 from wepose_pin.errors import NoSolution
 from wepose_pin.filters.sensors import filter_recording
-from wepose_pin.model import load_model
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
 

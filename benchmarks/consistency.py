@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.contenders import list_contenders
 from benchmarks.validation.simulated import compute_mount_errors, orient_recording
+from wepose_pin.body.kinematics import compute_axis_std
+from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.calibration import assess, calibrate
 from wepose_pin.errors import WeposeError
-from wepose_pin.kinematics import compute_axis_std
 from wepose_pin.simulation import (
     MEASURED_STD,
     PEOPLE_MEASURED_STD,
@@ -27,7 +28,6 @@ from wepose_pin.simulation import (
     simulate,
     simulate_person,
 )
-from wepose_pin.subject import Subject, mount_rows
 from wepose_pin.tracking import TrackedRecording, track
 
 FIRST_SEED = 5000  # of persons that no other measurement or test draws

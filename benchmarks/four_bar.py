@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from wepose_pin.model import BodyModel
+from wepose_pin.body import BodyModel
 
 from .ur5_arm import Moved, move_arm
 

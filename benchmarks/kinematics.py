@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.kinematics import compute_link_poses, compute_pose, solve_configuration
-from wepose_pin.model import load_model
+from wepose_pin.body import load_model
+from wepose_pin.body.kinematics import compute_link_poses, compute_pose, solve_configuration
 
 from .tables import Column, Section, Table, time_in_turn
 

@@ -93,8 +93,8 @@ def live_session(seconds: float) -> Table:
     )
     with tempfile.TemporaryDirectory() as folder:
         table.rows["poses and file"] = _measure(recording, Path(folder) / "a.mcap", [])
+        from wepose_pin.body import load_model
         from wepose_pin.live.page import LivePage
-        from wepose_pin.model import load_model
 
         page = LivePage(load_model())
         page.open()

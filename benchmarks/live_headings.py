@@ -11,12 +11,12 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.recording import Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import PEOPLE_PRESET, Person, Simulation, simulate, simulate_person
 from wepose_pin.simulation.sequence import TASKS
 from wepose_pin.simulation.signals import make_pulse
-from wepose_pin.subject import Subject, mount_rows
 from wepose_pin.tracking import TrackOptions, track_chunks
 
 from .free_motion import FreeMotion

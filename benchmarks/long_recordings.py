@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from wepose_pin.body import load_model
 from wepose_pin.calibration import calibrate
 from wepose_pin.errors import NoSolution
-from wepose_pin.model import load_model
 from wepose_pin.recording import Recording, Sensor
 from wepose_pin.simulation import simulate, simulate_person
 from wepose_pin.writers import write_session

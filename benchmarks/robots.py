@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from wepose_pin.body.kinematics import Pose
 from wepose_pin.commands.retarget import retarget
 from wepose_pin.commands.track import track
 from wepose_pin.errors import BadOption
-from wepose_pin.kinematics import Pose
 from wepose_pin.retargeting import (
     ROBOTS,
     ArmObserver,

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.trials import find_ur5, read_ur5
 from benchmarks.validation.real import UR5_EXCLUDED
-from wepose_pin.model import BodyModel
+from wepose_pin.body import BodyModel
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording
 from wepose_pin.simulation import MTI_3, ImuNoise
 

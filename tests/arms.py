@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import retargeting
-from wepose_pin.kinematics import Pose
+from wepose_pin.body.kinematics import Pose
 
 UPPER, FORE, HAND = 0.30, 0.27, 0.08  # [m] of the person
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from wepose_pin.model import load_table
-from wepose_pin.model.girdle import PARAMETERS
+from wepose_pin.body import load_table
+from wepose_pin.body.girdle import PARAMETERS
 
 TABLE = load_table()
 SEGMENTS = tuple(TABLE.segments)

@@ -9,9 +9,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.alignment import SegmentOrientations
+from wepose_pin.body.subject import Subject
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import Subject
 from wepose_pin.tracking.segments import SegmentEstimator
 
 G = 9.81

@@ -18,12 +18,12 @@ from wepose_pin.alignment import (
     compute_heading_offset,
     compute_soft_tissue_covariances,
 )
+from wepose_pin.body.subject import StartPoseOffset, Subject, mount_rows, population_subject
 from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
 from wepose_pin.filters.phases import COMMON_RATE
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, compute_mount, find_mount_axes
 from wepose_pin.simulation import Person, Simulation, simulate_paper_dynamic
-from wepose_pin.subject import StartPoseOffset, Subject, mount_rows, population_subject
 
 
 @pytest.mark.parametrize(("up", "forward"), [("+x", "-z"), ("-y", "+x"), ("+z", "+x"), ("-z", "-y")])

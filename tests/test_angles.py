@@ -24,9 +24,9 @@ from wepose_pin.angles import (
 from wepose_pin.angles.euler import UNKNOWN, decompose, follow, wrap
 from wepose_pin.angles.joints import ISB_AXES
 from wepose_pin.angles.tables import RATE_WINDOW_S
+from wepose_pin.body.kinematics import Pose
 from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadData, BadOption
-from wepose_pin.kinematics import Pose
 
 ARM = ("upper_arm", "forearm", "hand")
 LEG = ("thigh", "shank", "foot")

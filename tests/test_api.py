@@ -22,14 +22,14 @@ import pytest
 from arms import write_arm
 
 import wepose_pin as wp
+from wepose_pin.body.kinematics import PosedBody
+from wepose_pin.body.subject import subject_toml
 from wepose_pin.commands import main
 from wepose_pin.commands.track import track as track_session
 from wepose_pin.diagnostics import example
 from wepose_pin.errors import how_to_install
-from wepose_pin.kinematics import PosedBody
 from wepose_pin.recording import find_mount_axes
 from wepose_pin.simulation import Imperfections, ImuNoise, Simulation
-from wepose_pin.subject import subject_toml
 from wepose_pin.writers import write_session
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -11,13 +11,13 @@ from bodies import LENGTHS, RIGID_SHOULDERS, TABLE
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body.subject import Subject, girdle_rows, mount_rows, population_subject
 from wepose_pin.calibration import Calibration, calibrate
 from wepose_pin.calibration.equations import rotate
 from wepose_pin.calibration.quality import assess
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
 from wepose_pin.simulation.motion import Motion, Wander
-from wepose_pin.subject import Subject, girdle_rows, mount_rows, population_subject
 
 
 def codes(calibration: Calibration) -> set[str]:

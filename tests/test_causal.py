@@ -11,11 +11,11 @@ from bodies import LENGTHS
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body.kinematics import build_pose_table
+from wepose_pin.body.subject import Subject, mount_rows, population_subject
 from wepose_pin.errors import BadOption, BadPhase
-from wepose_pin.kinematics import build_pose_table
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import Subject, mount_rows, population_subject
 from wepose_pin.tracking import TrackedRecording, Tracker, TrackOptions, track
 from wepose_pin.tracking.segments import SegmentEstimator
 from wepose_pin.tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, stack_ticks

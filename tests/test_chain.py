@@ -14,21 +14,21 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.ur5_arm import RUNS, UPRIGHT, UR5, write_ur5_session, write_urdf
 from benchmarks.validation.real import UNSCORED_S
+from wepose_pin.body import BodyModel, load_model
+from wepose_pin.body.body import load_sensed_model
+from wepose_pin.body.configurations import joint_values
+from wepose_pin.body.kinematics import KinematicsSolver, LiveKinematics, compute_link_poses, compute_point_covariances
+from wepose_pin.body.start_pose import compute_start_configuration
+from wepose_pin.body.subject import Subject, load_subject
 from wepose_pin.commands import main
 from wepose_pin.commands.track import track as track_session
 from wepose_pin.errors import BadModel, BadSession, BadSubject, WeposeError
-from wepose_pin.kinematics import KinematicsSolver, LiveKinematics, compute_link_poses, compute_point_covariances
 from wepose_pin.live import LivePose, Output, SensorSetup, run_session
 from wepose_pin.live.sources.replay import ReplaySource
-from wepose_pin.model import BodyModel, load_model
-from wepose_pin.model.body import load_sensed_model
-from wepose_pin.model.configurations import joint_values
-from wepose_pin.model.start_pose import compute_start_configuration
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
-from wepose_pin.subject import Subject, load_subject
 from wepose_pin.tracking import summarize, track, track_chunks
 from wepose_pin.writers import write_session
 from wepose_pin.writers.result import read_result, write_subject

@@ -13,12 +13,12 @@ from test_chain import urdf  # noqa: F401  the arm's URDF
 
 from benchmarks.four_bar import LENGTHS, PROTOCOL, move_four_bar, write_four_bar
 from benchmarks.ur5_arm import MOVE_S, TRUE, Moved, move_arm, write_table
+from wepose_pin.body import BodyModel, load_model
 from wepose_pin.calibration import Calibration, Protocol, assess, calibrate
 from wepose_pin.calibration.protocols import Closure
 from wepose_pin.commands import main
 from wepose_pin.diagnostics import render_all
 from wepose_pin.errors import WeposeError
-from wepose_pin.model import BodyModel, load_model
 from wepose_pin.writers import write_session
 
 

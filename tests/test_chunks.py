@@ -13,15 +13,15 @@ from commands import run
 from reading import text_of
 
 from benchmarks.long_recordings import there_and_back
+from wepose_pin.body import load_model
+from wepose_pin.body.kinematics import build_pose_table
+from wepose_pin.body.subject import Subject
 from wepose_pin.calibration import calibrate
 from wepose_pin.errors import BadOption
-from wepose_pin.kinematics import build_pose_table
-from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.report import render_track_report
 from wepose_pin.simulation import Person, Simulation, simulate
-from wepose_pin.subject import Subject
 from wepose_pin.tracking import (
     SummaryAccumulator,
     TrackedRecording,

@@ -14,12 +14,12 @@ from bodies import LENGTHS, TABLE
 from commands import run
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body import load_model
+from wepose_pin.body.girdle import PARAMETERS
+from wepose_pin.body.kinematics import compute_axis_std, compute_point_covariances, compute_pose
+from wepose_pin.body.subject import girdle_rows, population_subject
 from wepose_pin.calibration import calibrate
-from wepose_pin.kinematics import compute_axis_std, compute_point_covariances, compute_pose
-from wepose_pin.model import load_model
-from wepose_pin.model.girdle import PARAMETERS
 from wepose_pin.simulation import MTI_3, PEOPLE_MEASURED_STD, PEOPLE_PRESET, simulate, simulate_person
-from wepose_pin.subject import girdle_rows, population_subject
 from wepose_pin.tracking import track
 from wepose_pin.tracking.error_budget import PERIOD_S, ErrorBudget, group_by_source
 from wepose_pin.writers import write_session

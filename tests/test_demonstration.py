@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from wepose_pin.body import load_model
 from wepose_pin.calibration import load_protocol
 from wepose_pin.live.demonstration import Demonstration
 from wepose_pin.live.state import GuideView
-from wepose_pin.model import load_model
 
 
 def wrist_heights(protocol: str, phase: str) -> np.ndarray:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body.kinematics import Pose, build_pose_table, parse_pose_table
 from wepose_pin.errors import BadData
 from wepose_pin.evaluation import evaluate, uncertainty
-from wepose_pin.kinematics import Pose, build_pose_table, parse_pose_table
 
 TIME = np.arange(101) / 10.0
 

@@ -13,13 +13,13 @@ from bodies import RIGID_SHOULDERS, SEGMENTS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.angles import joint_angles
+from wepose_pin.body import load_model
+from wepose_pin.body.kinematics import Pose, build_pose_table, compute_pose, parse_pose_table
+from wepose_pin.body.subject import population_subject, subject_toml
 from wepose_pin.commands import main
 from wepose_pin.errors import BadData, BadOption, ExistingOutput, MissingFile
-from wepose_pin.kinematics import Pose, build_pose_table, compute_pose, parse_pose_table
-from wepose_pin.model import load_model
 from wepose_pin.readers.c3d import read_c3d
 from wepose_pin.readers.markers import read_marker_table
-from wepose_pin.subject import population_subject, subject_toml
 from wepose_pin.writers import export as writers
 from wepose_pin.writers.export import Exported, export
 from wepose_pin.writers.motion import Motion, resampled

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from test_export import LENGTHS, POINTS, a_pose, smooth, with_gap, write_folder
 
 from wepose_pin.angles import joint_angles
+from wepose_pin.body import load_model
+from wepose_pin.body.kinematics import Pose, compute_pose
 from wepose_pin.errors import BadOption
-from wepose_pin.kinematics import Pose, compute_pose
-from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.writers.export import export

@@ -18,10 +18,10 @@ from arms import JOINTS, write_arm
 from scipy.spatial.transform import Rotation
 from test_export import a_pose, write_folder
 
+from wepose_pin.body.kinematics import PosedBody
+from wepose_pin.body.subject import population_subject
 from wepose_pin.commands import main
 from wepose_pin.errors import WeposeError, WrongOption
-from wepose_pin.kinematics import PosedBody
-from wepose_pin.subject import population_subject
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import (
     JointMotion,

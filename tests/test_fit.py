@@ -13,14 +13,14 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.angles.torques import pose_torques
-from wepose_pin.kinematics import (
+from wepose_pin.body import BodyModel, load_model
+from wepose_pin.body.fit import joint_limits
+from wepose_pin.body.kinematics import (
     compute_link_placements,
     compute_link_poses,
     compute_orientation_residuals,
     solve_configuration,
 )
-from wepose_pin.model import BodyModel, load_model
-from wepose_pin.model.fit import joint_limits
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Person, simulate
 from wepose_pin.tracking import summarize, track

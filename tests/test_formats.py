@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from test_mvnx import mvnx, turning
 
 import wepose_pin as wp
+from wepose_pin.body import load_table
 from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadData, BadSession, MissingFile, UnknownColumn, WeposeError
-from wepose_pin.model import load_table
 from wepose_pin.readers.guess import guess_columns
 from wepose_pin.readers.registry import detect_format, read_device
 from wepose_pin.readers.table_format import unwrap_counter

@@ -17,6 +17,8 @@ from arms import write_arm
 from guided_person import TRACKERS, GuidedPerson, PersonSource, TrackerPerson, perform
 
 from wepose_pin.assets import asset
+from wepose_pin.body import load_model
+from wepose_pin.body.subject import load_subject
 from wepose_pin.calibration import Calibration, calibrate, load_protocol
 from wepose_pin.commands.guide import choose_parts, choose_protocol
 from wepose_pin.commands.live import live
@@ -27,13 +29,11 @@ from wepose_pin.live.guide import Calibrated, Guide, GuideOptions
 from wepose_pin.live.setup import SensorSetup
 from wepose_pin.live.state import GuideView, Output, Request, Status
 from wepose_pin.live.steps import make_steps
-from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.recording import Recording
 from wepose_pin.recording.limits import STANDARD_GRAVITY
 from wepose_pin.simulation import simulate_person
-from wepose_pin.subject import load_subject
 
 PERSON = 3, 45.0  # seed, and seconds that the clasp may last
 MEASURED = {"shoulder_width": simulate_person(PERSON[0]).lengths["shoulder_width"]}

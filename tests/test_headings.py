@@ -12,15 +12,15 @@ from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
+from wepose_pin.body import load_model
+from wepose_pin.body.kinematics import compute_axis_std, compute_point_covariances
+from wepose_pin.body.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate
 from wepose_pin.filters import AboutVertical
-from wepose_pin.kinematics import compute_axis_std, compute_point_covariances
-from wepose_pin.model import load_model
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
-from wepose_pin.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.tracking import Tracker, summarize, track
 from wepose_pin.tracking.heading_filter import HeadingFilter, StanceEstimator
 from wepose_pin.tracking.heading_observations import ClaspDetector

@@ -316,7 +316,7 @@ def test_a_table_that_holds_no_sensor(capsys: pytest.CaptureFixture[str], tmp_pa
 
 
 def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simulation, person, tmp_path: Path) -> None:
-    from wepose_pin.subject import subject_toml
+    from wepose_pin.body.subject import subject_toml
     from wepose_pin.writers import write_result, write_session
 
     recording = simulation.recording("made")

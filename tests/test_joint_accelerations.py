@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body import load_model
+from wepose_pin.body.subject import population_subject
 from wepose_pin.filters import AboutVertical
-from wepose_pin.model import load_model
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
-from wepose_pin.subject import population_subject
 from wepose_pin.tracking import TrackedRecording, summarize, track
 from wepose_pin.tracking.heading_filter import HeadingFilter
 from wepose_pin.tracking.heading_observations import linearize_hinge

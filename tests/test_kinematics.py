@@ -12,8 +12,9 @@ import pytest
 from bodies import POINTS, RIGID_SHOULDERS
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.errors import BadModel
-from wepose_pin.kinematics import (
+from wepose_pin.body import BodyModel, load_model
+from wepose_pin.body.girdle import displace
+from wepose_pin.body.kinematics import (
     KinematicsSolver,
     LiveKinematics,
     compute_link_placements,
@@ -22,8 +23,7 @@ from wepose_pin.kinematics import (
     compute_pose,
     solve_configuration,
 )
-from wepose_pin.model import BodyModel, load_model
-from wepose_pin.model.girdle import displace
+from wepose_pin.errors import BadModel
 from wepose_pin.recording import Recording
 from wepose_pin.tracking import track
 

@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin.angles import joint_angles
+from wepose_pin.body import load_model
+from wepose_pin.body.kinematics import Pose, parse_pose_table
 from wepose_pin.commands.evaluate import evaluate as evaluate_result
 from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import evaluate
-from wepose_pin.kinematics import Pose, parse_pose_table
-from wepose_pin.model import load_model
 from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Imperfections, Simulation, simulate_activity
 from wepose_pin.simulation.activities import ACTIVITIES
 from wepose_pin.simulation.motion import Flaws

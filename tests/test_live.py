@@ -16,6 +16,7 @@ from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 from test_causal import first
 
+from wepose_pin.body.subject import mount_rows, parse_subject, population_subject
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
 from wepose_pin.live.loop import LiveLoop, SessionSummary
 from wepose_pin.live.session import run_session
@@ -29,7 +30,6 @@ from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.recording.limits import STANDARD_GRAVITY
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import mount_rows, parse_subject, population_subject
 from wepose_pin.tracking import TrackedRecording, track
 from wepose_pin.writers.live_log import LiveLog
 

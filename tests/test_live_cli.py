@@ -17,11 +17,11 @@ import pytest
 from bodies import LENGTHS, SEGMENTS
 from test_causal import first
 
+from wepose_pin.body.subject import mount_rows, population_subject, subject_toml
 from wepose_pin.commands import main
 from wepose_pin.readers import load_session
 from wepose_pin.readers.live_log import read_live_log
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import mount_rows, population_subject, subject_toml
 from wepose_pin.writers import write_session
 
 SPEED = 4.0

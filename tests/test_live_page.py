@@ -27,8 +27,9 @@ from scipy.spatial.transform import Rotation
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
+from wepose_pin.body import BodyModel, load_model
+from wepose_pin.body.kinematics import LiveKinematics, compute_link_placements, solve_configuration
 from wepose_pin.errors import BadOption
-from wepose_pin.kinematics import LiveKinematics, compute_link_placements, solve_configuration
 from wepose_pin.live.encoder import AngleCurves, PoseEncoder, RobotFigure
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.state import (
@@ -38,7 +39,6 @@ from wepose_pin.live.state import (
     Status,
     StreamInfo,
 )
-from wepose_pin.model import BodyModel, load_model
 from wepose_pin.retargeting import find_map, load_robot
 
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
@@ -165,7 +165,7 @@ def test_nothing_listens_but_on_loopback() -> None:
     """In a process of its own: other tests' sockets are not this page's."""
     code = (
         "import sys\nfrom wepose_pin.live.page import LivePage\nfrom wepose_pin.live.outputs import UdpOutput\n"
-        "from wepose_pin.live.terminal import TerminalView\nfrom wepose_pin.model import load_model\n"
+        "from wepose_pin.live.terminal import TerminalView\nfrom wepose_pin.body import load_model\n"
         "page, out, view = LivePage(load_model()), UdpOutput('127.0.0.1:9'), TerminalView()\n"
         "page.open()\nprint(page.url, flush=True)\nsys.stdin.read()\npage.close()\nout.close()\n"
     )

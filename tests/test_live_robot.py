@@ -26,8 +26,8 @@ from test_causal import first
 
 import wepose_pin as wp
 from wepose_pin import retargeting
+from wepose_pin.body.kinematics import Pose
 from wepose_pin.commands import main
-from wepose_pin.kinematics import Pose
 from wepose_pin.live.robot import LAST_COMMANDS, RobotOutput, command_json
 from wepose_pin.live.session import run_session
 from wepose_pin.live.setup import SensorSetup

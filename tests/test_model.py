@@ -12,9 +12,9 @@ import pytest
 import yourdfpy
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body import BodyModel, convert_breadths, load_model, load_table
 from wepose_pin.diagnostics import from_json, render
 from wepose_pin.errors import BadModel, BadOption, MissingFile
-from wepose_pin.model import BodyModel, convert_breadths, load_model, load_table
 from wepose_pin.recording import Recording
 from wepose_pin.tracking import summarize, track
 

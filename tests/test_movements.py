@@ -31,8 +31,8 @@ from wepose_pin.angles.movement_tables import build_comparison_table
 from wepose_pin.angles.smoothing import smooth_pose
 from wepose_pin.angles.tables import summarize_joint
 from wepose_pin.angles.uncertainty import compute_summary_std
-from wepose_pin.kinematics import Pose, compute_pose
-from wepose_pin.model import load_model
+from wepose_pin.body import load_model
+from wepose_pin.body.kinematics import Pose, compute_pose
 from wepose_pin.report.angles import draw_figures
 
 RATE = 100.0

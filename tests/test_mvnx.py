@@ -13,11 +13,11 @@ from bodies import RIGID_SHOULDERS
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
+from wepose_pin.body.kinematics import compute_pose
+from wepose_pin.body.subject import Hinge
 from wepose_pin.errors import BadData, BadSession, MissingFile
-from wepose_pin.kinematics import compute_pose
 from wepose_pin.readers.mvnx import read_frames, read_mvnx
 from wepose_pin.readers.subject import read_subject
-from wepose_pin.subject import Hinge
 from wepose_pin.tracking import track
 
 SEGMENTS = ("Pelvis", "T8", "LeftUpperArm", "LeftForeArm", "LeftHand", "RightUpperArm")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import wepose_pin
-from wepose_pin.model import load_table
+from wepose_pin.body import load_table
 
 PACKAGE = Path(wepose_pin.__file__).parent
 TABLE = load_table("whole_body")  # the upper body's names and those of legs

@@ -12,11 +12,11 @@ import pytest
 from reading import headings, rows, text_of
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body import BodyModel, load_model
+from wepose_pin.body.kinematics import Pose, compute_pose
+from wepose_pin.body.table_file import format_table
 from wepose_pin.errors import BadData, BadOption
 from wepose_pin.evaluation import evaluate
-from wepose_pin.kinematics import Pose, compute_pose
-from wepose_pin.model import BodyModel, load_model
-from wepose_pin.model.table_file import format_table
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.readers.propose import Wearer
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording

@@ -16,12 +16,12 @@ from commands import run
 from scipy.spatial.transform import Rotation
 from test_calibration import with_rigid_shoulders
 
+from wepose_pin.body.subject import load_subject, population_subject
 from wepose_pin.calibration import Calibration, assess, calibrate
 from wepose_pin.diagnostics import render
 from wepose_pin.errors import BadOption, BadSession, NoSolution
 from wepose_pin.recording import CONFIGURATION, OrientationSensor, Recording
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
-from wepose_pin.subject import load_subject, population_subject
 from wepose_pin.tracking import TrackOptions, track, track_chunks
 from wepose_pin.tracking.pose_diagnostics import describe_heading_remedy
 from wepose_pin.writers import write_session

@@ -10,6 +10,7 @@ import pytest
 from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body import BodyModel, load_model
 from wepose_pin.calibration import PROTOCOLS, Calibration, calibrate, load_protocol
 from wepose_pin.calibration.conditions import (
     Loop,
@@ -24,7 +25,6 @@ from wepose_pin.calibration.least_squares import Observations
 from wepose_pin.calibration.protocols import Closure, Direction
 from wepose_pin.commands import main
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
-from wepose_pin.model import BodyModel, load_model
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from test_model import GAZEBO, cosmik, example_robot_data_human
 
 from benchmarks.ur5_arm import write_table, write_urdf
+from wepose_pin.body import BodyModel, LinkVector, load_model, measure_reaches
 from wepose_pin.errors import BadModel
-from wepose_pin.model import BodyModel, LinkVector, load_model, measure_reaches
 
 
 def point_position(lengths: list[float], R_WK: Mapping[str, Rotation], way: Mapping[str, LinkVector]) -> np.ndarray:

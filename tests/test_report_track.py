@@ -16,15 +16,15 @@ from PIL import Image
 from reading import BROWSER, browse, captions, headings, is_self_contained, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body.kinematics import Pose, compute_axis_std
+from wepose_pin.body.subject import Hinge, Subject, population_subject
 from wepose_pin.commands import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
-from wepose_pin.kinematics import Pose, compute_axis_std
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.plausibility import find_cut_off
 from wepose_pin.report import render_track_report
 from wepose_pin.report.figures import COLUMNS, envelope
 from wepose_pin.simulation import Simulation, simulate, simulate_person
-from wepose_pin.subject import Hinge, Subject, population_subject
 from wepose_pin.tracking import TrackedRecording, TrackOptions, summarize, track
 from wepose_pin.tracking.measures import (
     compute_heading_uncertainties,

@@ -10,13 +10,13 @@ import numpy as np
 import polars as pl
 import pytest
 
+from wepose_pin.body import load_model
+from wepose_pin.body.subject import population_subject
+from wepose_pin.body.table_file import format_table, load_table
 from wepose_pin.commands.calibrate import calibrate as calibrate_session
 from wepose_pin.commands.track import track as track_session
 from wepose_pin.errors import ExistingOutput
-from wepose_pin.model import load_model
-from wepose_pin.model.table_file import format_table, load_table
 from wepose_pin.simulation import simulate, simulate_person
-from wepose_pin.subject import population_subject
 from wepose_pin.writers import write_session
 from wepose_pin.writers.folder import result_folder
 from wepose_pin.writers.result import write_subject

@@ -13,7 +13,7 @@ from arms import HAND, JOINTS, UPPER, is_sound, person, write_arm
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import errors, retargeting
-from wepose_pin.kinematics import Pose
+from wepose_pin.body.kinematics import Pose
 from wepose_pin.retargeting import controller as control
 from wepose_pin.retargeting.collision import CollisionModel
 

@@ -12,7 +12,7 @@ from arms import person, write_arm
 from test_live_robot import Session, keeps_its_limits, live_poses
 
 from wepose_pin import errors, retargeting
-from wepose_pin.kinematics import Pose
+from wepose_pin.body.kinematics import Pose
 from wepose_pin.retargeting import limits
 from wepose_pin.retargeting.collision import NEAR, CollisionModel
 

@@ -12,7 +12,7 @@ import pytest
 from arms import JOINTS, person, write_arm
 
 from wepose_pin import errors, retargeting
-from wepose_pin.kinematics import Pose
+from wepose_pin.body.kinematics import Pose
 
 pytest.importorskip("daqp")
 

@@ -10,9 +10,9 @@ import polars as pl
 import pytest
 from test_export import a_pose, write_folder
 
+from wepose_pin.body.kinematics import find_samples
 from wepose_pin.commands import main
 from wepose_pin.errors import BadData, WrongOption
-from wepose_pin.kinematics import find_samples
 from wepose_pin.recording import select_interval
 from wepose_pin.writers.result import read_phases
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from bodies import LENGTHS, SEGMENTS, TABLE
 
-from wepose_pin.errors import BadSubject
-from wepose_pin.model import load_model
-from wepose_pin.model.girdle import PARAMETERS
-from wepose_pin.subject import (
+from wepose_pin.body import load_model
+from wepose_pin.body.girdle import PARAMETERS
+from wepose_pin.body.subject import (
     HeadingDrift,
     Hinge,
     StartPoseOffset,
@@ -24,6 +23,7 @@ from wepose_pin.subject import (
     population_subject,
     subject_toml,
 )
+from wepose_pin.errors import BadSubject
 
 
 def test_the_average_man_of_de_leva() -> None:

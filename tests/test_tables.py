@@ -12,9 +12,9 @@ from test_chain_calibration import arm  # noqa: F401
 from test_model import example_robot_data_human
 
 from benchmarks.ur5_arm import BENT, SENSED, TABLE
+from wepose_pin.body import BodyModel, load_model
 from wepose_pin.commands import main
 from wepose_pin.errors import BadModel
-from wepose_pin.model import BodyModel, load_model
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording, compute_mount
 from wepose_pin.writers import write_session
 

@@ -7,8 +7,8 @@ import pinocchio as pin
 import pytest
 
 from wepose_pin.angles.torques import joint_torques, torque_table
+from wepose_pin.body import load_model
 from wepose_pin.errors import BadData, BadModel, BadOption
-from wepose_pin.model import load_model
 from wepose_pin.simulation import Simulation
 from wepose_pin.tracking import track
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body.subject import population_subject
 from wepose_pin.diagnostics import INFO, Diagnostic, as_json
 from wepose_pin.evaluation import evaluate
 from wepose_pin.filters import METHODS
 from wepose_pin.readers import load_session
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import NOISE_FREE, Person, Simulation, simulate
-from wepose_pin.subject import population_subject
 from wepose_pin.tracking import summarize, track
 
 

@@ -14,13 +14,13 @@ _AFTER = "assert type(trimesh).__name__ == 'module' and trimesh.transformations.
     "code",
     [
         # A body is read, changed and written without it.
-        "from wepose_pin.model import load_model\n"
+        "from wepose_pin.body import load_model\n"
         "load_model('whole_body').with_lengths({'trunk': 0.5}).urdf()\n"
         "assert not [name for name in sys.modules if name.split('.')[0] in ('trimesh', 'networkx')]\n"
         "import trimesh\n" + _AFTER,
         # yourdfpy's scenes find it.
         "from wepose_pin.assets import asset\n"
-        "from wepose_pin.model import load_model\n"
+        "from wepose_pin.body import load_model\n"
         "load_model()\n"
         "import yourdfpy\n"
         "path = str(asset('urdf', 'upper_body.urdf'))\n"
@@ -29,7 +29,7 @@ _AFTER = "assert type(trimesh).__name__ == 'module' and trimesh.transformations.
         "assert isinstance(scene, trimesh.Scene)\n" + _AFTER,
         # Whoever has it keeps it.
         "import trimesh\nbefore = trimesh\n"
-        "from wepose_pin.model import load_model\n"
+        "from wepose_pin.body import load_model\n"
         "load_model()\n"
         "assert sys.modules['trimesh'] is before\n" + _AFTER,
     ],

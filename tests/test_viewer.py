@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.model import Visual, load_model
+from wepose_pin.body import Visual, load_model
 from wepose_pin.report.viewer import (
     LEFT_COLOUR,
     OTHER_COLOUR,

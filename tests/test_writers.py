@@ -10,13 +10,13 @@ import numpy as np
 import polars as pl
 import pytest
 
+from wepose_pin.body import load_model
+from wepose_pin.body.kinematics import build_pose_table, parse_pose_table
+from wepose_pin.body.subject import population_subject
 from wepose_pin.documents import whole_folder
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
-from wepose_pin.kinematics import build_pose_table, parse_pose_table
-from wepose_pin.model import load_model
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Simulation
-from wepose_pin.subject import population_subject
 from wepose_pin.tracking import summarize, track
 from wepose_pin.writers import read_result, write_result, write_session
 from wepose_pin.writers.result import write_subject

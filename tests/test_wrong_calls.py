@@ -16,13 +16,13 @@ from arms import person as moving_arm
 from arms import write_arm
 
 import wepose_pin as wp
+from wepose_pin.body.kinematics import PosedBody
+from wepose_pin.body.subject import HeadingDrift, Hinge, StartPoseOffset
 from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadData
 from wepose_pin.filters import AmekfParams
-from wepose_pin.kinematics import PosedBody
 from wepose_pin.retargeting import ControllerParams
 from wepose_pin.simulation import Imperfections, ImuNoise
-from wepose_pin.subject import HeadingDrift, Hinge, StartPoseOffset
 
 NAN, INF = float("nan"), float("inf")
 ANYTHING = object()

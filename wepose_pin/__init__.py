@@ -27,6 +27,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what editors and type checkers see
     from .angles import joint_angles as joint_angles
+    from .body import load_model as load_model
+    from .body.kinematics import Pose as Pose
+    from .body.subject import Subject as Subject
+    from .body.subject import load_subject as load_subject
+    from .body.subject import population_subject as population_subject
     from .calibration import Calibration as Calibration
     from .calibration import calibrate as calibrate
     from .commands.results import TrackResult as TrackResult
@@ -37,17 +42,12 @@ if TYPE_CHECKING:  # what editors and type checkers see
     from .evaluation import evaluate as evaluate
     from .filters import estimate_orientation as estimate_orientation
     from .filters.static import StaticTest as StaticTest
-    from .kinematics import Pose as Pose
-    from .model import load_model as load_model
     from .readers import load_session as load_session
     from .recording import ImuSensor as ImuSensor
     from .recording import OrientationSensor as OrientationSensor
     from .recording import Recording as Recording
     from .retargeting import retarget as retarget
     from .simulation import simulate as simulate
-    from .subject import Subject as Subject
-    from .subject import load_subject as load_subject
-    from .subject import population_subject as population_subject
     from .writers.export import export as export
 
 # Loaded on first use, so that the command line answers at once.
@@ -55,10 +55,10 @@ _WHERE = {
     "Calibration": "calibration",
     "ImuSensor": "recording",
     "OrientationSensor": "recording",
-    "Pose": "kinematics",
+    "Pose": "body.kinematics",
     "Recording": "recording",
     "StaticTest": "filters.static",
-    "Subject": "subject",
+    "Subject": "body.subject",
     "TrackResult": "commands.results",
     "WeposeError": "errors",
     "WeposeWarning": "errors",
@@ -67,11 +67,11 @@ _WHERE = {
     "evaluate": "evaluation",
     "export": "writers.export",
     "joint_angles": "angles",
-    "load_model": "model",
+    "load_model": "body",
     "load_result": "commands.results",
     "load_session": "readers",
-    "load_subject": "subject",
-    "population_subject": "subject",
+    "load_subject": "body.subject",
+    "population_subject": "body.subject",
     "retarget": "retargeting",
     "simulate": "simulation",
     "track": "commands.results",

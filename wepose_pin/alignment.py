@@ -16,16 +16,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from . import rotations
+from .body import BodyModel, BodyTable, load_table
+from .body.start_pose import compute_start_configuration
+from .body.subject import Subject
+from .body.table import NEUTRAL_POSE
 from .diagnostics import WARNING, Diagnostic
 from .errors import BadSession
 from .filters import Orientation, join_orientations
 from .filters.smekf import HOLD_S, LOST_RATE_STD
 from .filters.start import ACCEL_BIAS_STD
-from .model import BodyModel, BodyTable, load_table
-from .model.start_pose import compute_start_configuration
-from .model.table import NEUTRAL_POSE
 from .recording import OrientationSensor, Recording, format_span
-from .subject import Subject
 
 # Angles [deg] between a stated mount and gravity or motion. Above them the mount is an error or gets a warning.
 MAX_MOUNT_ERROR_DEG = 60.0

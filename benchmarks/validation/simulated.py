@@ -15,10 +15,11 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import rotations
+from wepose_pin.body import ROOT, BodyTable, load_table
+from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.calibration import Formulation, calibrate
 from wepose_pin.evaluation import AttitudeError, Evaluation, attitude_error, evaluate
 from wepose_pin.filters.noise import estimate_noise
-from wepose_pin.model import ROOT, BodyTable, load_table
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import (
     CIRCLING_POINT,
@@ -32,7 +33,6 @@ from wepose_pin.simulation import (
     simulate_paper_drift,
     simulate_paper_dynamic,
 )
-from wepose_pin.subject import Subject, mount_rows
 from wepose_pin.tracking import track
 
 from .contenders import DEFAULT, OURS, Contender, list_contenders

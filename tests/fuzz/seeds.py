@@ -15,9 +15,9 @@ from scipy.io import savemat
 
 import wepose_pin
 from wepose_pin.assets import asset
+from wepose_pin.body.subject import population_subject, subject_toml
 from wepose_pin.live.sources import xbus
 from wepose_pin.live.sources.packets import CRC, HEADER, MAGIC, SAMPLE
-from wepose_pin.subject import population_subject, subject_toml
 
 N = 12
 TIME = np.arange(N) / 100.0

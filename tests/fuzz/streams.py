@@ -175,8 +175,8 @@ class _Heard(logging.Handler):
 
 @functools.cache
 def _page() -> tuple[Any, _Heard]:
+    from wepose_pin.body import load_model
     from wepose_pin.live.page import LivePage
-    from wepose_pin.model import load_model
 
     heard = _Heard()
     for name in ("tornado", "asyncio"):

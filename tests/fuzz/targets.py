@@ -84,13 +84,13 @@ def _markers(path: Path) -> object:
 
 
 def _subject(path: Path) -> object:
-    from wepose_pin.subject import load_subject, subject_toml
+    from wepose_pin.body.subject import load_subject, subject_toml
 
     return subject_toml(load_subject(path))
 
 
 def _table(path: Path) -> object:
-    from wepose_pin.model import load_model
+    from wepose_pin.body import load_model
 
     if not (path.parent / "upper_body.urdf").is_file():
         (path.parent / "upper_body.urdf").write_bytes(seeds.shipped("urdf/upper_body.urdf")[0])
@@ -139,20 +139,20 @@ def _protocol(path: Path) -> object:
 
 
 def _body(path: Path) -> object:
-    from wepose_pin.model import load_model
+    from wepose_pin.body import load_model
 
     return load_model(path).visuals
 
 
 def _robot(path: Path) -> object:
-    from wepose_pin.model.body import load_sensed_model
+    from wepose_pin.body.body import load_sensed_model
 
     return load_sensed_model(path, ("upper", "tool"), "session.toml")
 
 
 def _live(path: Path) -> object:
+    from wepose_pin.body.subject import parse_subject
     from wepose_pin.readers import read_live_log
-    from wepose_pin.subject import parse_subject
 
     log = read_live_log(path)
     if log.header["subject"]:
@@ -161,7 +161,7 @@ def _live(path: Path) -> object:
 
 
 def _pose(path: Path) -> object:
-    from wepose_pin.kinematics import parse_pose_table
+    from wepose_pin.body.kinematics import parse_pose_table
     from wepose_pin.readers.tables import read_table
 
     return parse_pose_table(read_table(path), str(path))
@@ -250,13 +250,13 @@ TARGETS = (
     Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML, "readers.session"),
     Target("setup", lambda: [seeds.SESSION.encode()], file("session.toml", _setup), TOML, "live.setup"),
     Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML, "subject"),
-    Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML, "model.table_file"),
+    Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML, "body.table_file"),
     Target("robot_map", lambda: [seeds.ARM_MAP], file("map.toml", _robot_map), TOML, "retargeting.maps"),
     Target("protocol", lambda: seeds.shipped(*_PROTOCOLS), file("own.toml", _protocol), TOML, "calibration.protocols"),
     Target("plan", lambda: [seeds.PLAN], records.plan, TOML, "batch.plan"),
     Target("plan_table", lambda: [seeds.PLAN_TABLE], records.plan_table, LINES, "batch.plan"),
-    Target("body", lambda: seeds.shipped("urdf/upper_body.urdf"), file("body.urdf", _body), XML, "model.tree"),
-    Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML, "model.body"),
+    Target("body", lambda: seeds.shipped("urdf/upper_body.urdf"), file("body.urdf", _body), XML, "body.tree"),
+    Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML, "body.body"),
     Target("retarget", lambda: [seeds.ARM.encode()], file("arm.urdf", _retargeted), XML, "retargeting.robot"),
     Target("srdf", lambda: [seeds.SRDF], file("arm.srdf", _srdf), XML, "retargeting.collision"),
     Target("datagram", seeds.datagrams, streams.datagram, JSON, "live.sources.packets"),
@@ -266,7 +266,7 @@ TARGETS = (
     Target("live_loop", lambda: [seeds.wild()], streams.loop, (), "live.loop"),
     Target("live_page", seeds.requests, streams.page, HTTP, "live.server"),
     Target("live_log", lambda: [seeds.live_log()], file("a.mcap", _live), JSON, "readers.live_log"),
-    Target("pose", lambda: [seeds.pose_csv()], file("pose.csv", _pose), (), "kinematics"),
+    Target("pose", lambda: [seeds.pose_csv()], file("pose.csv", _pose), (), "body.kinematics"),
     Target("result", lambda: [seeds.pose_csv()], records.result, LINES, "writers.motion"),
     Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON, "writers.result"),
 )

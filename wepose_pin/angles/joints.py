@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..arguments import check_arguments
+from ..body.kinematics import Pose, PosedBody
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData, BadOption, UnknownKey, one_of
-from ..kinematics import Pose, PosedBody
 from ..recording import AXES
 from ..rotations import conjugate, multiply
 from . import euler

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
+from ..body.kinematics import Pose, find_samples
 from ..errors import WrongOption, one_of
-from ..kinematics import Pose, find_samples
 from ..recording import Intervals
 from .curves import MeanCurve, compute_mean_curves
 from .euler import round_to_turns, wrap

@@ -7,9 +7,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from ..body.kinematics import Pose
 from ..errors import WrongOption
 from ..filters.butterworth import low_pass
-from ..kinematics import Pose
 from ..recording.gaps import find_runs
 from ..rotations import unwrap_signs
 

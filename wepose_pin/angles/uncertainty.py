@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..kinematics import Pose
+from ..body.kinematics import Pose
 from .joints import JOINTS, JointAngles, compute_gradients
 
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..body import load_table
+from ..body.anthropometry import check_stature
 from ..commands.command_line import APP, parse
 from ..documents import TomlTable, read_toml
 from ..errors import BadData, BadPlan, BadSession, WeposeError, WrongOption, one_of
-from ..model import load_table
-from ..model.anthropometry import check_stature
 from ..readers.tables import read_table
 from .storage import find_urls, is_remote
 

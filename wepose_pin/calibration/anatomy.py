@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..body import BodyTable, HingeJoint
 from ..diagnostics import ERROR, Diagnostic
 from ..errors import BadSession
-from ..model import BodyTable, HingeJoint
 from .conditions import Loop, find_parts
 from .result import Calibration, LabelCheck
 

@@ -1,6 +1,6 @@
 """A protocol's conditions on a body: which vectors, fixed to segments with sensors, make up each closure.
 
-A point is the sum of the vectors of the links between it and the root (`wepose_pin.model.reaches`). Each link rotates
+A point is the sum of the vectors of the links between it and the root (`wepose_pin.body.reaches`). Each link rotates
 with a segment that has a sensor, its own or the one above it with which it is rigid. As in `wepose_pin.alignment`, L'
 is the frame of such a segment that equals W in the start pose: of a person in the N-pose the segment's own frame L.
 """
@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..body import BodyModel, BodyTable, Girdle
+from ..body.girdle import find_girdle_scale
+from ..body.kinematics import find_carrier
+from ..body.reaches import UNIVERSE
 from ..errors import BadOption, BadSession
-from ..kinematics import find_carrier
-from ..model import BodyModel, BodyTable, Girdle
-from ..model.girdle import find_girdle_scale
-from ..model.reaches import UNIVERSE
 from .protocols import Axis, Closure, Direction, Protocol
 
 Vector = tuple[float, float, float]

@@ -33,8 +33,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..model.girdle import PARAMETERS, displace
-from ..model.reaches import UNIVERSE
+from ..body.girdle import PARAMETERS, displace
+from ..body.reaches import UNIVERSE
 from ..rotations import product_terms
 from .conditions import Constraint, GirdleTerm, HingeUnknown, Level, Loop, Moving, Part, Pointing
 

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from ..model import BodyTable
-from ..model.girdle import PARAMETERS
-from ..subject import Subject, girdle_rows
+from ..body import BodyTable
+from ..body.girdle import PARAMETERS
+from ..body.subject import Subject, girdle_rows
 
 # Share of a calibration's variance that recurs: on simulated people nearly all of it does.
 RECURRING = 0.9

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..model.reaches import UNIVERSE
+from ..body.reaches import UNIVERSE
 from .conditions import Constraint, Level, Loop, Part, Pointing
 from .joints import Coupling
 from .least_squares import Observations

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..body import BodyModel
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..model import BodyModel
 from ..recording import format_span
 from .conditions import Loop, choose_variant, find_segments
 from .least_squares import Observations

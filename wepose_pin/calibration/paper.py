@@ -31,11 +31,11 @@ from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import Rotation
 
 from ..alignment import PALM_SLIP_STD, align_sensors
+from ..body import BodyModel
+from ..body.subject import Subject
+from ..body.table import NEUTRAL_POSE
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, NoSolution, one_of
-from ..model import BodyModel
-from ..model.table import NEUTRAL_POSE
-from ..subject import Subject
 from .anatomy import check_limbs, measure_limbs
 from .conditions import Constraint, Loop, StartPose, resolve_conditions
 from .least_squares import MIN_LENGTH, QUIET_QP, Observations

@@ -11,11 +11,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import MEASURED_ORIENTATION_STD, find_mount_covariance
+from ..body import BodyTable
+from ..body.girdle import PARAMETERS
+from ..body.subject import Subject
+from ..body.table import NEUTRAL_POSE
 from ..errors import BadSubject
-from ..model import BodyTable
-from ..model.girdle import PARAMETERS
-from ..model.table import NEUTRAL_POSE
-from ..subject import Subject
 from .conditions import Loop
 from .equations import Layout
 from .initial_headings import estimate_headings, estimate_joint_headings

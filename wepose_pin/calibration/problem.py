@@ -11,13 +11,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
+from ..body import BodyModel, Segment, list_breadths
+from ..body.start_pose import compute_start_configuration
+from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
-from ..model import BodyModel, Segment, list_breadths
-from ..model.start_pose import compute_start_configuration
 from ..recording import Intervals, Recording, format_span
-from ..subject import Subject
 from .conditions import (
     Constraint,
     Level,

@@ -32,14 +32,14 @@ import numpy as np
 
 from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG
 from ..arguments import Positive, check_arguments
+from ..body import BodyModel, convert_breadths, list_breadths
+from ..body.body import load_sensed_model
+from ..body.subject import Subject, population_subject
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
-from ..model import BodyModel, convert_breadths, list_breadths
-from ..model.body import load_sensed_model
 from ..recording import Recording
-from ..subject import Subject, population_subject
 from .anatomy import BETTER, LEAST_ROTATION, check_labels, check_limbs, measure_limbs, measure_rotation
 from .conditions import Level, Pointing
 from .fusion import fuse_calibrations, separate_mounts

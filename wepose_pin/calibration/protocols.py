@@ -1,7 +1,7 @@
 """Protocols as data: what a person does in which phase, and the conditions that hold for the body meanwhile.
 
 A ``calibration/<name>.toml`` lists steps for the person and conditions for the solver. Points, segments and lengths are
-those of the body's table (`wepose_pin.model.BodyTable`). There are four kinds of conditions:
+those of the body's table (`wepose_pin.body.BodyTable`). There are four kinds of conditions:
 
 - ``[[closure]]``: two points coincide (``kind = "coincide"``), one stays at a point of W (``"fixed_point"``), unknown
   or stated by ``at``, points move on a level plane of unknown height (``"plane"``), or a point is where the session's
@@ -28,9 +28,9 @@ import numpy as np
 
 from ..alignment import PALM_SLIP_STD
 from ..assets import asset
+from ..body import BodyTable, list_breadths
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, one_of
-from ..model import BodyTable, list_breadths
 
 PROTOCOLS = ("bow", "clasp", "free", "t_pose", "table", "tip")
 _OF_CLASP = "clasp with a measured length, as in --measured biacromial=0.41"

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
+from ..body.subject import Quality
+from ..body.table import MECHANISM, ROOT
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity
-from ..model.table import MECHANISM, ROOT
-from ..subject import Quality
 from .anatomy import LEAST_ROTATION, diagnose_labels, measure_limbs, measure_rotation, reach_limbs
 from .conditions import Loop, choose_variant, group_lengths, is_scale_observed
 from .observability import MOST_OPEN, find_intervals, format_longest

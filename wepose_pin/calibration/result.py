@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..body.subject import Quality, Subject
 from ..diagnostics import Diagnostic, notebook_html, render
-from ..subject import Quality, Subject
 from .problem import CalibrationProblem
 
 MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart

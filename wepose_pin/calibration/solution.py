@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject
 from ..errors import NoSolution
-from ..subject import HeadingDrift, Hinge, StartPoseOffset, Subject
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
 from .conditions import find_hinges, is_scale_observed
 from .contact import find_initial_guess

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..model.girdle import PARAMETERS
-from ..subject import mount_rows
+from ..body.girdle import PARAMETERS
+from ..body.subject import mount_rows
 from .conditions import Level, Loop, Moving, Pointing, StartPose
 from .equations import GAP_ROWS, HINGE_STD, Layout
 from .joints import LEAST_CORRELATION_S

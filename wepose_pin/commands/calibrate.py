@@ -23,9 +23,9 @@ from .options import (
 from .output import print_diagnostics, print_lengths, print_table, progress_bar, say, say_indented, say_pages
 
 if TYPE_CHECKING:
+    from ..body import BodyModel
+    from ..body.subject import Subject as Person
     from ..calibration import Calibration, CalibrationQuality, Protocol
-    from ..model import BodyModel
-    from ..subject import Subject as Person
 
 EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
 COLOURS = {"pass": "green", "poor": "yellow", "fail": "red"}
@@ -117,9 +117,9 @@ def calibrate(
     """
     options = dict(locals())
     from .. import calibration as room
+    from ..body import list_breadths, load_model
+    from ..body.body import load_sensed_model
     from ..calibration.protocols import choose_protocol
-    from ..model import list_breadths, load_model
-    from ..model.body import load_sensed_model
     from ..readers import load_session
     from ..readers.subject import read_subject
     from ..report import write_calibration_page
@@ -192,8 +192,8 @@ def _print_lengths_and_gap(calibration: Calibration, protocol: Protocol, prior: 
 def _print_mounts(calibration: Calibration) -> None:
     import numpy as np
 
+    from ..body.subject import mount_rows
     from ..recording import find_mount_axes
-    from ..subject import mount_rows
 
     rows: list[tuple[str, ...]] = []
     for segment, tilt in calibration.start_pose_offset.items():

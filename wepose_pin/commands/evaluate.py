@@ -80,8 +80,8 @@ def _compare(
     markers: Path | None,
 ) -> Evaluation:
     """The errors of a result; the reference is brought to its clock and world where that is needed."""
+    from ..body.kinematics import Pose, parse_pose_table
     from ..evaluation import evaluate, register
-    from ..kinematics import Pose, parse_pose_table
     from ..readers import load_session
     from ..readers.reference import is_reference, read_reference
     from ..readers.tables import read_table

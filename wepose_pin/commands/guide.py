@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from ..errors import ExistingOutput
 
 if TYPE_CHECKING:
+    from ..body import BodyModel
     from ..calibration import Calibration
     from ..live import Output, SensorSetup
     from ..live.assignment import AssignedSource
     from ..live.guide import Calibrated
     from ..live.sources.base import Source
-    from ..model import BodyModel
     from ..recording import Recording
 
 SUBJECT_FILES = ("subject.toml", "subject.urdf", "calibration.json", "report.html")
@@ -63,6 +63,7 @@ def run_guide(
     ExistingOutput
         The folder holds a subject and `force` is not given, or it cannot be made.
     """
+    from ..body.subject import load_subject, population_subject
     from ..calibration import calibrate, load_protocol
     from ..calibration.protocols import split_protocol
     from ..live.assignment import read_segments, write_segments
@@ -72,7 +73,6 @@ def run_guide(
     from ..readers import load_session
     from ..readers.subject import read_subject
     from ..report import write_calibration_page
-    from ..subject import load_subject, population_subject
     from ..writers.calibration import write_calibration
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance

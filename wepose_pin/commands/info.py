@@ -39,8 +39,8 @@ def info(
         Propose the segments of this body: a URDF, a TOML that names one, or the name of a body of the package, such as
         whole_body (docs/models.md). Without it those of the upper body.
     """
+    from ..body import load_model
     from ..documents import check_file, whole_file
-    from ..model import load_model
     from ..readers.describe import describe_file, find_file
     from ..readers.propose import Wearer
 

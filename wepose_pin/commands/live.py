@@ -38,11 +38,11 @@ from .output import print_diagnostics, print_table, say
 from .stopping import stop_requests
 
 if TYPE_CHECKING:
+    from ..body import BodyModel
     from ..live import Output, SensorSetup, SessionSummary
     from ..live.page import LivePage
     from ..live.robot import RobotOutput, RobotSummary
     from ..live.sources.base import Source
-    from ..model import BodyModel
 
 GUIDE = Parameter(group=Group("Options with --guide", sort_key=1))
 UNSEEN = Parameter(parse=False)
@@ -155,6 +155,7 @@ def live(
     until
         Returns True to end the session; None: Ctrl-C ends it.
     """
+    from ..body.subject import load_subject
     from ..calibration import load_protocol
     from ..calibration.protocols import GUIDED
     from ..compilation import announce_compilation
@@ -164,7 +165,6 @@ def live(
     from ..live.setup import build_subject_model, check_mounts
     from ..live.terminal import TerminalView
     from ..retargeting.targets import check_person_arms
-    from ..subject import load_subject
     from .guide import run_guide
 
     for option, given in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():

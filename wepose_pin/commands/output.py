@@ -14,8 +14,8 @@ from ..errors import printable
 from .stopping import check_stopped
 
 if TYPE_CHECKING:
+    from ..body.subject import Subject
     from ..evaluation import PositionError
-    from ..subject import Subject
 
 WIDTH = 98  # columns of running text
 TABLE_WIDTH = 160  # rich would cut numbers off to fit a narrow terminal, which wraps by itself

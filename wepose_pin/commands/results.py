@@ -12,14 +12,14 @@ import polars as pl
 
 from .. import tracking
 from ..arguments import check_arguments, check_value
+from ..body import BodyModel
+from ..body.kinematics import PosedBody, build_pose_table
+from ..body.subject import Subject, load_subject
 from ..diagnostics import WARNING, Diagnostic, from_json, notebook_html
 from ..errors import BadData, WeposeError, how_to_install
 from ..filters import BEST
 from ..filters.static import StaticTest
-from ..kinematics import PosedBody, build_pose_table
-from ..model import BodyModel
 from ..recording import Intervals, Mark, Recording
-from ..subject import Subject, load_subject
 from ..tracking import TrackedRecording
 from ..writers import read_result, write_result
 from ..writers.folder import result_folder

@@ -11,7 +11,7 @@ from .options import MORE, Arms, Factor, Force, Hz, Interval, Out, Phase, Radian
 from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 
 if TYPE_CHECKING:
-    from ..kinematics import Pose
+    from ..body.kinematics import Pose
     from ..retargeting import Trajectory
 
 

@@ -88,10 +88,10 @@ def simulate(
     import numpy as np
 
     from .. import simulation as room
+    from ..body import DEFAULT_BODY
+    from ..body.subject import mount_rows, subject_toml
     from ..documents import whole_folder
-    from ..model import DEFAULT_BODY
     from ..simulation.sequence import find_task
-    from ..subject import mount_rows, subject_toml
     from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
 
@@ -189,7 +189,7 @@ def choose_imperfections(preset: str, changes: Mapping[str, float | str]) -> Imp
 
 def _tape_breadths(measured: Mapping[str, float]) -> dict[str, float]:
     """The breadths [m] that a tape reaches on a person, of measured lengths that no tape does."""
-    from ..model import list_breadths, load_table
+    from ..body import list_breadths, load_table
 
     breadths = list_breadths(load_table())
     return {name: measured[breadth.length] / breadth.ratio for name, breadth in breadths.items()}

@@ -87,12 +87,12 @@ def track(
         Keep joints with one or two axes within the limits of the model.
     """
     options = dict(locals())
+    from ..body.subject import parse_subject
     from ..filters import BEST
     from ..readers import is_live_log, load_session, read_live_log
     from ..readers.subject import read_subject
     from ..report import write_track_pages
     from ..report.viewer import MOST_FRAMES
-    from ..subject import parse_subject
     from ..tracking import CHUNK_S, SummaryAccumulator, TrackedRecording, TrackOptions, track_chunks
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance

@@ -17,8 +17,8 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
 from scipy.spatial.transform import Rotation
 
+from ..body.kinematics import Pose
 from ..errors import BadData
-from ..kinematics import Pose
 from ..recording import AXES, format_span
 from ..rotations import multiply
 from .sampling import sample_orientations, sample_points

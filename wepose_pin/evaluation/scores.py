@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..angles import euler, joint_angles
 from ..arguments import check_arguments
+from ..body import BodyTable, load_table
+from ..body.kinematics import Pose, PosedBody
 from ..diagnostics import notebook_html
 from ..errors import BadData, BadOption
-from ..kinematics import Pose, PosedBody
-from ..model import BodyTable, load_table
 from ..recording import format_span
 from .agreement import Agreement, compute_agreement
 from .registration import Registration

@@ -8,10 +8,10 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..body import DEFAULT_BODY, BodyModel
+from ..body.kinematics import LiveKinematics
 from ..calibration import Protocol
 from ..errors import BadOption
-from ..kinematics import LiveKinematics
-from ..model import DEFAULT_BODY, BodyModel
 from ..simulation import simulate
 from .state import GuideView, LivePose
 

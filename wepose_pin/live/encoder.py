@@ -12,9 +12,9 @@ import numpy as np
 import pinocchio as pin
 
 from ..angles import joint_angles
+from ..body import BodyModel
+from ..body.kinematics import LiveKinematics, Pose, find_known_links
 from ..errors import WeposeError
-from ..kinematics import LiveKinematics, Pose, find_known_links
-from ..model import BodyModel
 from ..report.viewer import Mesh, find_floor, visible
 from ..retargeting.robot import Robot
 from ..retargeting.targets import find_person_arm

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..body import BodyModel
 from ..calibration import Calibration, Protocol
-from ..model import BodyModel
 from ..readers.live_log import Markers, build_recording
 from ..recording import Recording, check_recording
 from ..recording.arrivals import Samples, Ticks

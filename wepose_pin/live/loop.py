@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..body import BodyModel
+from ..body.kinematics import LiveKinematics, compute_axis_std
+from ..body.start_pose import compute_start_configuration
+from ..body.table import NEUTRAL_POSE
 from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession, WeposeError
 from ..filters import BEST
-from ..kinematics import LiveKinematics, compute_axis_std
-from ..model import BodyModel
-from ..model.start_pose import compute_start_configuration
-from ..model.table import NEUTRAL_POSE
 from ..readers.live_log import LONGEST_TEXT, build_recording
 from ..recording import Intervals
 from ..recording.arrivals import COUNTS, CUT_OFF, DUPLICATE, LATE, Samples, Ticks

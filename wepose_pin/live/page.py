@@ -25,8 +25,8 @@ from collections import deque
 import numpy as np
 import pinocchio as pin
 
-from ..kinematics import find_known_points
-from ..model import BodyModel
+from ..body import BodyModel
+from ..body.kinematics import find_known_points
 from ..report.viewer import DARK, LIGHT, backdrop, choose_trail_colour, filled, find_floor, scene, view
 from .addresses import LOOPBACK
 from .encoder import PoseEncoder, RobotFigure

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ..body import BodyModel, BodyTable, load_table
+from ..body.subject import population_subject
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import TomlTable, read_toml
 from ..errors import BadOption, WrongOption
-from ..model import BodyModel, BodyTable, load_table
 from ..retargeting import LimitMargins, Robot, find_map, load_robot
 from ..retargeting.maps import list_sides
 from ..retargeting.stream import STUCK_M, ArmObserver, Command, CommandStream, StreamOptions
 from ..retargeting.targets import check_person_arms
-from ..subject import population_subject
 from .loop import Latencies
 from .outputs import UdpSender
 from .setup import SensorSetup

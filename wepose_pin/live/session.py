@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..body import BodyModel, load_model, load_table
+from ..body.kinematics import LiveKinematics
 from ..errors import ExistingOutput
 from ..filters import BEST
-from ..kinematics import LiveKinematics
-from ..model import BodyModel, load_model, load_table
 from ..recording import ImuSensor, Recording
 from ..recording.arrivals import Samples, StreamSynchronizer, order_arrivals
 from ..recording.plausibility import check_signals, find_unseen_rate

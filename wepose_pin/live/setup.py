@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from ..body import BodyModel
+from ..body.body import load_sensed_model
+from ..body.subject import Subject, load_subject, parse_subject, population_subject, subject_toml
+from ..body.table import NEUTRAL_POSE
 from ..errors import BadSession
-from ..model import BodyModel
-from ..model.body import load_sensed_model
-from ..model.table import NEUTRAL_POSE
 from ..readers.session_file import find_model, read_joints, read_phases, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
-from ..subject import Subject, load_subject, parse_subject, population_subject, subject_toml
 from .sources.base import Source
 from .sources.replay import ReplaySource
 

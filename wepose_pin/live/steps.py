@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from ..body import BodyModel
 from ..calibration import Calibration, Protocol
 from ..calibration.observability import format_longest
 from ..calibration.protocols import Axis
@@ -18,7 +19,6 @@ from ..calibration.protocols import Step as ProtocolStep
 from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals
 from ..diagnostics import Diagnostic, render, render_all
 from ..errors import BadData, WeposeError
-from ..model import BodyModel
 from ..recording.arrivals import Ticks
 from ..tracking.start_pose import StartPoseDetector, TickRates
 from .assignment import ShakeDetector

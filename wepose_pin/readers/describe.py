@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..body import load_table
 from ..diagnostics import Diagnostic
 from ..documents import is_number, read_toml
 from ..errors import BadData, MissingFile
-from ..model import load_table
 from ..recording import ImuSensor, Recording, format_span, format_time
 from ..recording.gaps import find_runs
 from ..recording.sensors import compute_rate

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..body import load_table
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, MissingFile, one_of
-from ..model import load_table
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from .guess import guess_unit
 from .libraries import library_errors

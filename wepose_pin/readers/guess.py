@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from ..model import BodyTable, load_table
+from ..body import BodyTable, load_table
 
 # The place of the axis in a name without it.
 HOLE = "\0"

@@ -20,10 +20,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
+from ..body import load_table
+from ..body.table import ROOT
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
-from ..model import load_table
-from ..model.table import ROOT
 from .device import Device, DeviceSensor, check_measured
 from .libraries import library_errors
 from .markers import Reference

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import polars as pl
 
+from ..body import BodyTable
 from ..diagnostics import ERROR, WARNING, Diagnostic
 from ..documents import parse_toml, toml_key, toml_string, toml_strings
 from ..errors import BadData, MissingRate, WeposeError, WrongUnit, one_of
-from ..model import BodyTable
 from ..recording import AXES, CONFIGURATION, ImuSensor, Intervals, Recording
 from ..recording.clocks import TIME_UNITS, guess_time_unit
 from ..recording.gaps import find_runs

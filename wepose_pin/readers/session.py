@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import polars as pl
 
+from ..body.table import NEUTRAL_POSE
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable
 from ..errors import BadData, BadSession, MissingFile, printable
-from ..model.table import NEUTRAL_POSE
 from ..recording import (
     ImuSensor,
     OrientationSensor,

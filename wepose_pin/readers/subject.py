@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..subject import Subject, load_subject, population_subject
+from ..body.subject import Subject, load_subject, population_subject
 from .mvnx import LENGTH_STD, read_mvnx_lengths
 
 

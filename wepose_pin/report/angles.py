@@ -19,7 +19,7 @@ from ..angles.movement import (
     measure_spans,
 )
 from ..angles.repetitions import list_angles
-from ..kinematics import Pose
+from ..body.kinematics import Pose
 from .figures import BAND, SESSION_COLOURS, SHADE, SOFT, Figures, ReportFigure, envelope, shade, styled
 from .page import MOST_FIGURES, Item, Page, Table
 from .words import intervals, listed, plain, signed

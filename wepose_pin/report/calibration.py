@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..body.kinematics import Pose
+from ..body.subject import Subject, mount_rows
 from ..calibration import Calibration, CalibrationQuality
 from ..calibration.observability import find_intervals
 from ..calibration.result import MIN_CONTACT
 from ..diagnostics import WARNING, Diagnostic, lines
 from ..errors import WeposeError, reason
 from ..filters import BEST
-from ..kinematics import Pose
 from ..recording import Recording, compute_mount, find_mount_axes
-from ..subject import Subject, mount_rows
 from ..tracking import TrackedRecording, Tracker, TrackOptions
 from .figures import BAND, COLOURS, SOFT, ReportFigure, draw_over_time, styled
 from .page import Banner, Facts, Item, Page, PageWriter, Table

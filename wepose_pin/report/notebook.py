@@ -12,9 +12,9 @@ from pathlib import Path
 from markupsafe import escape
 
 from ..angles import joint_angles
+from ..body.kinematics import PosedBody
 from ..documents import whole_file
 from ..errors import BadData
-from ..kinematics import PosedBody
 from ..tracking.measures import measure_tips
 from .figures import Figures
 from .track import draw_joint_angles, draw_tips, group_tips

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..angles import Angles, JointAngles, group_sides, joint_angles, summary
+from ..body import ROOT, BodyTable
 from ..errors import BadData
-from ..model import ROOT, BodyTable
 from ..tracking import TrackedRecording, TrackSummary
 from ..tracking.error_budget import group_by_source
 from ..tracking.measures import (

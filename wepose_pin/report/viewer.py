@@ -19,8 +19,8 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from ..kinematics import Pose, compute_link_placements, find_known_links, solve_configuration
-from ..model import BodyModel, Visual
+from ..body import BodyModel, Visual
+from ..body.kinematics import Pose, compute_link_placements, find_known_links, solve_configuration
 from .page import Frame, load_template
 
 if TYPE_CHECKING:

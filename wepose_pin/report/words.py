@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ..model import BodyTable
+from ..body import BodyTable
 from ..recording import format_span
 from ..writers.result import versions as package_versions
 

@@ -10,9 +10,9 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
+from ..body import read_urdf
+from ..body.meshes import resolve_meshes
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
-from ..model import read_urdf
-from ..model.meshes import resolve_meshes
 from ..recording import format_span, format_time
 from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY, JointMotion
 from ..writers.result import write_table

@@ -10,10 +10,10 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ..assets import asset
+from ..body import read_urdf
+from ..body.meshes import find_example_data
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadModel, MissingFile, one_of
-from ..model import read_urdf
-from ..model.meshes import find_example_data
 
 ROBOTS = ("panda", "panda_table", "ur5", "ur5_table", "so101", "baxter", "tiago_dual", "talos", "g1", "alex")
 SIDES = ("left", "right")

@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
+from ..body.meshes import package_folders
 from ..errors import BadModel, WrongOption, native_stderr_muted, one_of
-from ..model.meshes import package_folders
 from .maps import AXES, ArmMap, JointLimit, LinkPoint, RobotMap
 
 MIN_LIMIT_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from ..body import BodyTable, load_table
 from ..errors import WrongOption
-from ..model import BodyTable, load_table
 from .approach import HandReference, compute_norm, start_references
 from .collision import CollisionModel
 from .controller import JointState, QpController

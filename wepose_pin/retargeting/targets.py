@@ -10,10 +10,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline, interp1d
 from scipy.spatial.transform import Rotation, Slerp
 
+from ..body import BodyTable, Limb, load_table
+from ..body.kinematics import Pose, compute_axis_std
 from ..errors import BadData, WrongOption
 from ..filters.butterworth import low_pass
-from ..kinematics import Pose, compute_axis_std
-from ..model import BodyTable, Limb, load_table
 from .robot import Arm, Robot
 
 REACH_SHARE = 0.95  # of the robot's reach for a straight arm: its elbow stays flexed, far from the singularity

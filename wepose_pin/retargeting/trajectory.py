@@ -19,9 +19,9 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..arguments import check_arguments
+from ..body import BodyTable
+from ..body.kinematics import Pose, PosedBody, find_samples
 from ..errors import BadOption, NoSolution, WrongOption
-from ..kinematics import Pose, PosedBody, find_samples
-from ..model import BodyTable
 from ..recording import Intervals, select_interval
 from ..writers.joint_motion import JointMotion
 from .collision import CollisionModel

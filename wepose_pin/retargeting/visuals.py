@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from ..model.meshes import find_mesh, package_folders, reduce_triangles, triangulate
+from ..body.meshes import find_mesh, package_folders, reduce_triangles, triangulate
 from .collision import list_corners
 from .robot import Robot
 from .trajectory import Trajectory

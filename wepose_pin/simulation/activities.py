@@ -19,10 +19,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from ..arguments import Count, Positive, check_arguments
+from ..body import BodyModel, load_model
+from ..body.girdle import PARAMETERS
+from ..body.kinematics import compute_link_poses, solve_configuration
 from ..errors import BadOption, one_of
-from ..kinematics import compute_link_poses, solve_configuration
-from ..model import BodyModel, load_model
-from ..model.girdle import PARAMETERS
 from ..rotations import compose, turn_about
 from .arm_tasks import ArmTasks
 from .imperfections import IDEAL_PRESET, Imperfections

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..model import DEFAULT_BODY
+from ..body import DEFAULT_BODY
 from ..rotations import compose, turn_about
 from .motion import E_Z, END_S, RAMP_S, SEGMENTS, SIDES, STAND_S, Activity, BodyPose, place_arm, place_shoulder
 from .signals import Process, make_pulse, make_step

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..body import BodyModel
 from ..errors import BadOption
-from ..model import BodyModel
 from ..rotations import compose, log, quat_from_matrix, turn_about
 from .girdle import Girdle
 from .imperfections import IDEAL_PRESET, Imperfections

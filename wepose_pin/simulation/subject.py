@@ -12,15 +12,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arguments import Count, Positive, check_arguments, check_names
+from ..body import DEFAULT_BODY, SEXES, load_table
+from ..body.girdle import PARAMETERS
+from ..body.kinematics import Pose
+from ..body.subject import Subject, check_lengths, population_subject
 from ..errors import BadOption
-from ..kinematics import Pose
-from ..model import DEFAULT_BODY, SEXES, load_table
-from ..model.girdle import PARAMETERS
 from ..recording import ImuSensor, Recording, check_recording, compute_mount
 from ..recording.clocks import Clock
 from ..recording.gaps import bridge, mark_lost_samples
 from ..rotations import compose, heading, log
-from ..subject import Subject, check_lengths, population_subject
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
 from .motion import E_Z, SEGMENTS, STAND_S, BodyMotion, BodyPose, Flaws

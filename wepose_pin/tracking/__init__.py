@@ -8,11 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..arguments import check_arguments
+from ..body import BodyModel
+from ..body.subject import Subject
 from ..filters import BEST
 from ..filters.static import StaticTest
-from ..model import BodyModel
 from ..recording import Recording
-from ..subject import Subject
 from .summary import SummaryAccumulator, TrackSummary, summarize
 from .tracked import TrackedRecording, TrackOptions
 from .tracker import CHUNK_S, Tracker, track_chunks

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..alignment import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
+from ..body import GirdleMotion, move_girdles
+from ..body.girdle import PARAMETERS
 from ..compilation import kernel
-from ..model import GirdleMotion, move_girdles
-from ..model.girdle import PARAMETERS
 from .heading_problem import CoincidentPoints, HeadingProblem, HingeAxis, Knot
 
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier

@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..body import BodyModel, GirdleMotion
+from ..body.subject import Subject
 from ..calibration.conditions import Part, StartPose
 from ..filters import AboutVertical
-from ..model import BodyModel, GirdleMotion
-from ..subject import Subject
 from .joint_accelerations import JointPair
 
 

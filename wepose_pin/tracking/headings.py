@@ -23,13 +23,13 @@ from ..alignment import (
     compute_start_heading_var,
     find_mount_covariance,
 )
+from ..body import BodyModel
+from ..body.subject import Subject
 from ..calibration import PROTOCOLS, load_protocol
 from ..calibration.conditions import StartPose, find_girdle_signs, find_parts
 from ..errors import BadSession
 from ..filters import AboutVertical, Orientation
-from ..model import BodyModel
 from ..recording import ImuSensor, OrientationSensor, Recording
-from ..subject import Subject
 from .heading_filter import HeadingFilter, StanceEstimator, smooth
 from .heading_observations import correct_headings, linearize_hinge, move_all_girdles
 from .heading_problem import (

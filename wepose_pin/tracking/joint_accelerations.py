@@ -21,9 +21,9 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
+from ..body import BodyModel
+from ..body.kinematics import find_carrier
 from ..filters.butterworth import BandPass
-from ..kinematics import find_carrier
-from ..model import BodyModel
 
 BAND_HZ = (0.1, 1.5)  # what people move in
 LEAST_RATE_HZ = 20.0  # of recordings that are used

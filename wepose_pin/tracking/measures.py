@@ -10,15 +10,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..alignment import compute_heading_variance
+from ..body import BodyModel, BodyTable, HingeJoint
+from ..body.kinematics import Pose, compute_axis_std
+from ..body.subject import Subject
 from ..filters import Orientation
-from ..kinematics import Pose, compute_axis_std
-from ..model import BodyModel, BodyTable, HingeJoint
 from ..recording import OrientationSensor, Recording
 from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
 from ..recording.plausibility import find_cut_off
 from ..recording.sensors import compute_rate
-from ..subject import Subject
 from .tracked import TrackedRecording
 
 BENT = np.deg2rad(20.0)  # above which a hinge shows the plane in which it bends

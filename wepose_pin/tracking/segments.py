@@ -28,6 +28,7 @@ from ..alignment import (
     count_lost_samples,
     join_segments,
 )
+from ..body.subject import Subject
 from ..compilation import kernel
 from ..filters import BEST, AboutVertical, Orientation
 from ..filters.sensors import SensorFilters, find_start_orientations
@@ -35,7 +36,6 @@ from ..filters.static import StaticTest
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
-from ..subject import Subject
 from .heading_problem import FilterHeadings, HeadingProblem
 from .headings import (
     CausalHeadings,

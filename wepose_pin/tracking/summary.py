@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from ..body.kinematics import Pose, join_poses
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json, gravest_first, merge
 from ..errors import BadData, reason
 from ..filters import Orientation, join_orientations
-from ..kinematics import Pose, join_poses
 from ..recording import Recording
 from ..recording.gaps import find_runs
 from .error_budget import ErrorBudget

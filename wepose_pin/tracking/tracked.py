@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..alignment import SegmentOrientations
+from ..body.configurations import find_undetermined_joints
+from ..body.kinematics import PosedBody, compute_orientation_residuals
 from ..errors import BadOption
 from ..filters import BEST, OFFLINE, check_method
 from ..filters.static import StaticTest
-from ..kinematics import PosedBody, compute_orientation_residuals
-from ..model.configurations import find_undetermined_joints
 from ..recording import Intervals, Recording
 from .headings import HeadingCorrection
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from ..alignment import SegmentOrientations, StartFrames, find_start_frames
+from ..body import BodyModel
+from ..body.body import load_sensed_model
+from ..body.kinematics import KinematicsSolver, compute_point_covariances
+from ..body.subject import Subject, population_subject
 from ..errors import BadOption, BadPhase, BadSession
 from ..filters import OFFLINE
 from ..filters.noise import BEGINNING_S
-from ..kinematics import KinematicsSolver, compute_point_covariances
-from ..model import BodyModel
-from ..model.body import load_sensed_model
 from ..recording import Recording
-from ..subject import Subject, population_subject
 from .heading_problem import HeadingProblem
 from .headings import HeadingCorrector, make_heading_problem
 from .segments import SegmentEstimator

@@ -20,10 +20,10 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
+from ..body import move_girdles
+from ..body.kinematics import compute_link_poses, find_known_points, solve_configuration
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..kinematics import compute_link_poses, find_known_points, solve_configuration
-from ..model import move_girdles
 from ..rotations import conjugate, multiply
 from .motion import Motion, check_complete, diagnose_gaps, resample_evenly
 

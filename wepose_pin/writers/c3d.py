@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..body.kinematics import compute_link_poses, find_known_links, solve_configuration
 from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, ExistingOutput, how_to_install
-from ..kinematics import compute_link_poses, find_known_links, solve_configuration
 from .motion import Motion, find_measured_points, resample_evenly
 
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence

@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 
 from ..arguments import check_arguments
 from ..assets import find_plugins, load_plugin
+from ..body.kinematics import PosedBody, find_samples
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, MissingFile, one_of
-from ..kinematics import PosedBody, find_samples
 from ..recording import select_interval
 from .bvh import write_bvh
 from .c3d import write_c3d

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ..body.table_file import MODEL_TABLE
 from ..documents import whole_folder
 from ..errors import ExistingOutput
-from ..model.table_file import MODEL_TABLE
 from .provenance import INSIDE, list_files
 from .result import JOINTS
 

@@ -15,11 +15,11 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
+from ..body import BodyModel, read_urdf
+from ..body.configurations import joint_values
+from ..body.kinematics import solve_configuration
+from ..body.tree import joint_axis, joint_placement, parse_tree
 from ..errors import BadData, MissingFile
-from ..kinematics import solve_configuration
-from ..model import BodyModel, read_urdf
-from ..model.configurations import joint_values
-from ..model.tree import joint_axis, joint_placement, parse_tree
 from ..readers.tables import read_columns, read_table
 from ..recording import Intervals, select_interval
 from ..rotations import multiply

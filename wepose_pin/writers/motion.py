@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from ..body import BodyModel
+from ..body.kinematics import Pose, compute_pose
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, WrongOption
-from ..kinematics import Pose, compute_pose
-from ..model import BodyModel
 from ..recording import format_span
 
 # Times count as even while none is off the even grid by more than this share of a step.

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
-from ..model.chains import Chain, solve
+from ..body.chains import Chain, solve
 from ..readers.opensim import PRONATION, R_GW, compute_n_pose
 from ..rotations import conjugate, multiply, rotation_about
 

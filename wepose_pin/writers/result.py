@@ -21,13 +21,13 @@ import polars as pl
 
 from .. import __version__
 from ..angles.torques import Torques, torque_table
+from ..body import BodyModel, BodyTable, load_model, load_table
+from ..body.kinematics import Pose, build_pose_table, find_samples, parse_pose_table
+from ..body.subject import Subject, load_subject, subject_toml
+from ..body.table_file import MODEL_TABLE, format_table
 from ..errors import BadData, ExistingOutput, MissingFile
-from ..kinematics import Pose, build_pose_table, find_samples, parse_pose_table
-from ..model import BodyModel, BodyTable, load_model, load_table
-from ..model.table_file import MODEL_TABLE, format_table
 from ..readers.tables import open_source, read_columns, read_table
 from ..recording import Intervals, Mark, select_interval
-from ..subject import Subject, load_subject, subject_toml
 from ..tracking import TrackedRecording, TrackSummary
 
 POSE = "pose.parquet"

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import polars as pl
 
+from ..body.kinematics import Pose, build_pose_table
 from ..documents import toml_key, toml_string, toml_strings
-from ..kinematics import Pose, build_pose_table
 from ..recording import ImuSensor, Recording, find_mount_axes
 from .result import write_table
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import polars as pl
 
 from ..angles import angle_table, diagnose_lock, joint_angles
+from ..body.kinematics import build_pose_table
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from ..kinematics import build_pose_table
 from .motion import Motion, check_joint_names
 from .result import write_table
 

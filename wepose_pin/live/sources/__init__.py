@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ...assets import find_plugins, load_plugin
+from ...body import load_table
 from ...errors import BadOption, one_of
-from ...model import load_table
 from .base import Source, SourceOptions
 
 REMOVED = {  # kind → what to do instead

@@ -12,18 +12,26 @@ import pinocchio as pin
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from . import rotations
-from .arguments import check_array, check_covariance, check_fields, check_finite, check_names, check_unit, format_object
-from .compilation import kernel
-from .errors import BadData, BadModel, Named, one_of
-from .model import BodyModel
-from .model.configurations import find_determined_frames, joint_values
-from .model.fit import Fit
-from .model.girdle import PARAMETERS, SCALARS, displace, find_girdle_scale, move_girdles
-from .model.orientation_ik import OrientationIk, find_groups
-from .model.reaches import UNIVERSE
-from .recording import EACH_TIME, check_time, format_span
-from .rotations import product
+from .. import rotations
+from ..arguments import (
+    check_array,
+    check_covariance,
+    check_fields,
+    check_finite,
+    check_names,
+    check_unit,
+    format_object,
+)
+from ..compilation import kernel
+from ..errors import BadData, BadModel, Named, one_of
+from ..recording import EACH_TIME, check_time, format_span
+from ..rotations import product
+from . import BodyModel
+from .configurations import find_determined_frames, joint_values
+from .fit import Fit
+from .girdle import PARAMETERS, SCALARS, displace, find_girdle_scale, move_girdles
+from .orientation_ik import OrientationIk, find_groups
+from .reaches import UNIVERSE
 from .subject import Subject
 
 _ON_JOINT = 1e-12  # [m] from a joint's origin, below which the joint does not move a point
@@ -306,7 +314,7 @@ def solve_configuration(
     Of a mechanism all joints are fitted at once, each frame from the one before. Of a person: Segments on spherical
     joints have their orientations exactly. For limbs with fewer axes the sum of the segments' squared angles to their
     measured orientations is minimised; `compute_orientation_residuals` returns these angles. An unmeasured segment is
-    rigid with its parent segment. `wepose_pin.model.chains` finds the moving joints.
+    rigid with its parent segment. `wepose_pin.body.chains` finds the moving joints.
 
     Parameters
     ----------

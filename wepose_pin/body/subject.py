@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from .arguments import (
+from ..arguments import (
     NonNegative,
     check_arguments,
     check_array,
@@ -22,11 +22,11 @@ from .arguments import (
     check_unit,
     format_object,
 )
-from .diagnostics import notebook_html
-from .documents import TomlTable, is_number, parse_toml, read_toml, toml_string, toml_strings, whole_file
-from .errors import BadData, BadModel, BadOption, BadSubject, one_of
-from .model import BodyModel, BodyTable, compute_population_lengths, load_table
-from .model.girdle import PARAMETERS
+from ..diagnostics import notebook_html
+from ..documents import TomlTable, is_number, parse_toml, read_toml, toml_string, toml_strings, whole_file
+from ..errors import BadData, BadModel, BadOption, BadSubject, one_of
+from . import BodyModel, BodyTable, compute_population_lengths, load_table
+from .girdle import PARAMETERS
 
 _ROW = re.compile(
     r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law"
