@@ -249,7 +249,7 @@ TARGETS = (
     Target("info", _described_seeds, _described, LINES, "readers.describe"),
     Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML, "readers.session"),
     Target("setup", lambda: [seeds.SESSION.encode()], file("session.toml", _setup), TOML, "live.setup"),
-    Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML, "subject"),
+    Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML, "body.subject"),
     Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML, "body.table_file"),
     Target("robot_map", lambda: [seeds.ARM_MAP], file("map.toml", _robot_map), TOML, "retargeting.maps"),
     Target("protocol", lambda: seeds.shipped(*_PROTOCOLS), file("own.toml", _protocol), TOML, "calibration.protocols"),
