@@ -96,7 +96,7 @@ def _orientations(data: Sample) -> dict[str, np.ndarray]:
     """Method or peer → its quaternions (n, 4) xyzw."""
     gyro, accel, rate_hz, noise = data
     found = {
-        name: run_filter(gyro, accel, rate_hz, noise, FilterSettings(name, measured_start=True)).quat_WS
+        name: run_filter(gyro, accel, rate_hz, noise, FilterSettings(name, measured_start=True)).quat_VS
         for name in METHODS
     }
     unbiased = np.ascontiguousarray(gyro - noise.gyro_bias)

@@ -21,5 +21,5 @@ accel_S = np.tile([0.0, 0.0, 9.81], (len(time), 1)) + rng.normal(scale=0.01, siz
 
 for method in METHODS:
     o = wp.estimate_orientation(gyro_S, accel_S, rate_hz, method=method, static=(0.0, 1.9))
-    error_deg = np.degrees((true_WS.inv() * Rotation.from_quat(o.quat_WS)).magnitude())
+    error_deg = np.degrees((true_WS.inv() * Rotation.from_quat(o.quat_VS)).magnitude())
     print(f"{method:6s} largest error {error_deg.max():.2f} deg, static {100 * o.static.mean():.0f} % of the time")

@@ -73,7 +73,7 @@ def ready_recording(headings: dict[str, float], mounts: dict[str, Rotation]) -> 
     moving = np.clip(time - 2.0, 0.0, None)[:, None]
     true = {name: Rotation.from_rotvec(moving * np.array([0.3, -0.8, 0.2 * k])) for k, name in enumerate(headings)}
     sensors = {
-        name: OrientationSensor(quat_WS=(Rotation.from_rotvec([0, 0, -psi]) * true[name] * mounts[name]).as_quat())
+        name: OrientationSensor(quat_VS=(Rotation.from_rotvec([0, 0, -psi]) * true[name] * mounts[name]).as_quat())
         for name, psi in headings.items()
     }
     return Recording("ready", time, 100.0, sensors, {"start": ((0.0, 1.9),)}), true

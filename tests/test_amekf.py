@@ -100,7 +100,7 @@ def tilt_deg(error: Rotation) -> np.ndarray:
 
 def nees(of: Case, result: FilterRun) -> float:
     """Mean normalised squared error of the attitude in the motion; the heading is exact at the first sample."""
-    true, R_VS = Rotation.from_quat(of.true), Rotation.from_quat(result.quat_WS)
+    true, R_VS = Rotation.from_quat(of.true), Rotation.from_quat(result.quat_VS)
     psi = rotations.heading((true[0] * R_VS[0].inv()).as_quat())
     k = np.flatnonzero(of.moving)[300::25]
     error = ((Rotation.from_rotvec([0, 0, float(psi)]) * R_VS[k]).inv() * true[k]).as_rotvec()
@@ -195,16 +195,16 @@ def test_a_block_is_the_textbook_filter(still: bool) -> None:
     # The correction, from the strapdown's own end: the filter on a copy of which a block is a sample longer has it.
     open_ = Amekf(of.noise, RATE, of.true[at.start - 1], replace(params, block_s=0.26))
     open_.state.x[:] = x_before
-    end = open_.run(of.gyro[at], of.accel[at], np.full(25, still)).quat_WS[-1]
+    end = open_.run(of.gyro[at], of.accel[at], np.full(25, still)).quat_VS[-1]
     expected = np.array([0.0, 0.0, 0.0, 0.0, 0.0]) if still else np.zeros(4)
     innovation = expected - H @ open_.state.x
     if still:
         innovation[2:] += of.gyro[at].mean(axis=0)
     d = gain @ innovation
     np.testing.assert_allclose(filter_.state.x[3:] - open_.state.x[3:], d[3:], atol=1e-12)
-    turned = (Rotation.from_quat(result.quat_WS[-1]) * Rotation.from_quat(end).inv()).as_rotvec()
+    turned = (Rotation.from_quat(result.quat_VS[-1]) * Rotation.from_quat(end).inv()).as_rotvec()
     np.testing.assert_allclose(turned, d[:3], atol=1e-12)
-    R = Rotation.from_quat(result.quat_WS[-1]).as_matrix()
+    R = Rotation.from_quat(result.quat_VS[-1]).as_matrix()
     np.testing.assert_allclose(cov(result)[-1], R.T @ filter_.state.P[:3, :3] @ R, atol=1e-15)
 
 
@@ -214,7 +214,7 @@ def test_the_heading_is_nobody_s_to_measure() -> None:
     turn = Rotation.from_rotvec([0.0, 0.0, 2.0])
     here = run(of)
     there = run(of._replace(start=(turn * Rotation.from_quat(of.start)).as_quat()))
-    apart = (turn * Rotation.from_quat(here.quat_WS)).inv() * Rotation.from_quat(there.quat_WS)
+    apart = (turn * Rotation.from_quat(here.quat_VS)).inv() * Rotation.from_quat(there.quat_VS)
     assert apart.magnitude().max() < 1e-8
     np.testing.assert_allclose(there.gyro_bias, here.gyro_bias, atol=1e-10)
 
@@ -227,8 +227,8 @@ def test_known_errors_of_the_sensor_are_taken_off() -> None:
     rate = of.gyro - of.noise.gyro_bias
     measured = of._replace(gyro=of.gyro + rate @ gyro_matrix.T, accel=of.accel @ (np.eye(3) + accel_matrix).T + bias)
     known = AmekfParams(gyro_matrix=gyro_matrix, accel_matrix=accel_matrix, accel_bias=bias)
-    ideal = Rotation.from_quat(run(of).quat_WS)
-    with_, without = (Rotation.from_quat(run(measured, p).quat_WS) for p in (known, AmekfParams()))
+    ideal = Rotation.from_quat(run(of).quat_VS)
+    with_, without = (Rotation.from_quat(run(measured, p).quat_VS) for p in (known, AmekfParams()))
     # (I − M)(I + M) is 1 to M², a part in 10⁴
     assert (
         np.degrees((ideal.inv() * with_).magnitude()).max()
@@ -263,8 +263,8 @@ def test_the_gyroscope_s_scale_is_learned_in_motion() -> None:
         of = case(seed)
         wrong = of._replace(gyro=of.gyro + (of.gyro - of.noise.gyro_bias) * scale)
         filter_ = Amekf(of.noise, RATE, of.start, AmekfParams(gyro_matrix_std=0.01))
-        learned = errors(of, filter_.run(wrong.gyro, wrong.accel, wrong.static).quat_WS)
-        fixed = errors(of, run(wrong, AmekfParams(gyro_matrix_std=0.0)).quat_WS)
+        learned = errors(of, filter_.run(wrong.gyro, wrong.accel, wrong.static).quat_VS)
+        fixed = errors(of, run(wrong, AmekfParams(gyro_matrix_std=0.0)).quat_VS)
         np.testing.assert_allclose(filter_.state.x[[M, M + 4, M + 8]], scale, atol=0.0035)
         end = of.moving.nonzero()[0][-1000:]
         headings.append(
@@ -280,9 +280,9 @@ def test_the_gyroscope_s_scale_is_learned_in_motion() -> None:
 
 def within(of: Case, result: FilterRun, after: int, sigmas: float = 3.0) -> bool:
     """Errors in W from a sample on are within so many of the stated standard deviations."""
-    R = Rotation.from_quat(result.quat_WS).as_matrix()
+    R = Rotation.from_quat(result.quat_VS).as_matrix()
     std = np.sqrt(np.diagonal(R @ cov(result) @ R.transpose(0, 2, 1), axis1=1, axis2=2))
-    return bool((np.abs(errors(of, result.quat_WS).as_rotvec()) <= sigmas * std)[after:].all())
+    return bool((np.abs(errors(of, result.quat_VS).as_rotvec()) <= sigmas * std)[after:].all())
 
 
 @pytest.mark.parametrize("length", [1, 5, 30])
@@ -295,7 +295,7 @@ def test_lost_gyro_samples_grow_the_covariance_and_are_got_over(length: int, kin
     assert all(part is not None and np.isfinite(part).all() for part in lossy)
     assert within(of, lossy, 2000)
     assert np.trace(cov(lossy)[2100]) > np.trace(cov(clean)[2100])
-    tilt = tilt_deg(errors(of, lossy.quat_WS))
+    tilt = tilt_deg(errors(of, lossy.quat_VS))
     assert tilt[-600:].max() < 1.0
     assert tilt[1500:1950].max() < 1.0
 
@@ -308,7 +308,7 @@ def test_lost_accel_samples_count_as_gravity_alone() -> None:
     result = run(of._replace(accel=accel))
     assert all(part is not None and np.isfinite(part).all() for part in result)
     assert within(of, result, 500)
-    assert tilt_deg(errors(of, result.quat_WS))[2000:].max() < 1.0
+    assert tilt_deg(errors(of, result.quat_VS))[2000:].max() < 1.0
 
 
 def test_a_clipped_gyroscope_is_known_to_be_wrong() -> None:
@@ -325,7 +325,7 @@ def test_an_impact_does_not_tip_the_attitude() -> None:
     of = case(7)
     accel = of.accel.copy()
     accel[2500:2502] += [150.0, -100.0, 50.0]
-    clean, struck = (tilt_deg(errors(of, run(c).quat_WS)) for c in (of, of._replace(accel=accel)))
+    clean, struck = (tilt_deg(errors(of, run(c).quat_VS)) for c in (of, of._replace(accel=accel)))
     print(f"tilt after the impact: {struck[2500:].max():.2f} deg, without {clean[2500:].max():.2f} deg")
     assert struck[2500:].max() < 1.0
 
@@ -338,7 +338,7 @@ def test_a_bias_that_jumps_is_taken_over_at_the_next_rest() -> None:
     result = run(of._replace(gyro=gyro))
     assert of.static[-100:].all()
     np.testing.assert_allclose(result.gyro_bias[-1] - of.noise.gyro_bias, jump, atol=2e-4)
-    assert tilt_deg(errors(of, result.quat_WS))[3000:].max() < 3.0
+    assert tilt_deg(errors(of, result.quat_VS))[3000:].max() < 3.0
 
 
 def test_a_person_who_sways_at_rest_does_not_pass_for_bias() -> None:
@@ -368,7 +368,7 @@ def test_a_sensor_that_never_rests_converges_and_says_so(method: str) -> None:
         with pytest.warns(WeposeWarning, match="There is no static phase"):
             orientation = estimate_orientation(gyro, accel, RATE, method=method, static=None)
         assert [each.code for each in orientation.diagnostics] == ["static-phase-missing"]
-        error = Rotation.from_quat(orientation.quat_WS) * Rotation.from_quat(of.true[1000:5400]).inv()
+        error = Rotation.from_quat(orientation.quat_VS) * Rotation.from_quat(of.true[1000:5400]).inv()
         tilts.append(tilt_deg(error))
         assert not orientation.static.any()
     by = np.mean(tilts, axis=0)
@@ -383,7 +383,7 @@ def test_a_start_on_its_head_comes_round() -> None:
     of = case(9)
     start = (Rotation.from_rotvec([2.1, 0.0, 0.0]) * Rotation.from_quat(of.start)).as_quat()
     result = run(of._replace(start=start, static=np.zeros_like(of.static)))
-    assert tilt_deg(errors(of, result.quat_WS))[-1500:].max() < 3.0
+    assert tilt_deg(errors(of, result.quat_VS))[-1500:].max() < 3.0
 
 
 def test_hours_leave_the_covariance_a_covariance() -> None:
@@ -397,7 +397,7 @@ def test_hours_leave_the_covariance_a_covariance() -> None:
     scale = np.sqrt(np.diag(P))
     assert np.linalg.eigvalsh(P / np.outer(scale, scale))[0] > -1e-9
     assert np.abs(filter_.state.x).max() < 10.0
-    assert abs(np.linalg.norm(filter_.state.quat_WS) - 1.0) < 1e-14
+    assert abs(np.linalg.norm(filter_.state.quat_VS) - 1.0) < 1e-14
 
 
 # Real recordings ---------------------------------------------------------------------------------------------------
@@ -421,7 +421,7 @@ def test_broad_against_vqf(data: Path) -> None:
         true = Rotation.from_quat(np.where(seen[:, None], trial.quat_true, [0, 0, 0, 1]))
         for method in table:
             out = run_filter(trial.gyro_S, trial.accel_S, trial.rate_hz, noise, FilterSettings(method))
-            R_VS = Rotation.from_quat(out.quat_WS)
+            R_VS = Rotation.from_quat(out.quat_VS)
             psi = float(rotations.heading((true[rest] * R_VS[rest].inv()).mean().as_quat()))
             error = (Rotation.from_rotvec([0, 0, psi]) * R_VS[scored]) * true[scored].inv()
             of = attitude_error(error * true[scored], true[scored], scored / trial.rate_hz)

@@ -26,7 +26,7 @@ def codes(calibration: Calibration) -> set[str]:
 
 def ready(simulation: Simulation) -> Recording:
     """The simulated person with exact orientations in place of sensors: what is left is the calibration alone."""
-    sensors = {segment: OrientationSensor(quat_WS=quat) for segment, quat in simulation.quat_WL.items()}
+    sensors = {segment: OrientationSensor(quat_VS=quat) for segment, quat in simulation.quat_WL.items()}
     return replace(simulation.recording("exact"), sensors=sensors)
 
 
@@ -134,7 +134,7 @@ def test_a_hand_with_a_sensor_is_seen_by_itself(exact: tuple[Person, Recording])
     sensors = dict(recording.sensors)
     for side, sign in (("left", 1.0), ("right", -1.0)):
         bend = Rotation.from_rotvec(np.outer(np.sin(2 * np.pi * 0.37 * sign * (time - 6.0).clip(0.0)), [0.0, 0.5, 0.0]))
-        quat = sensors[f"{side}_forearm"].quat_WS
+        quat = sensors[f"{side}_forearm"].quat_VS
         assert quat is not None
         # Turn the forearm such that wrist bend and all, the palm stays where it was: the chain stays closed.
         forearm = Rotation.from_quat(quat)
@@ -145,8 +145,8 @@ def test_a_hand_with_a_sensor_is_seen_by_itself(exact: tuple[Person, Recording])
             *(Rotation.align_vectors(t[None], b[None]) for t, b in zip(together, bent, strict=True)), strict=True
         )
         turned = Rotation.concatenate(list(turn))
-        sensors[f"{side}_forearm"] = OrientationSensor(quat_WS=turned.as_quat())
-        sensors[f"{side}_hand"] = OrientationSensor(quat_WS=(turned * bend).as_quat())
+        sensors[f"{side}_forearm"] = OrientationSensor(quat_VS=turned.as_quat())
+        sensors[f"{side}_hand"] = OrientationSensor(quat_VS=(turned * bend).as_quat())
     clasp = [recording.phases["clasp"][0]]
     bent_recording = replace(
         recording, sensors=sensors, phases={"start": recording.phases["start"], "clasp": tuple(clasp)}
@@ -184,9 +184,9 @@ def test_hands_that_do_not_move_say_so(exact: tuple[Person, Recording]) -> None:
     held = recording.span(recording.phases["clasp"][0]).start + 300
     frozen = {}
     for name, sensor in recording.sensors.items():
-        quat = sensor.quat_WS.copy()
+        quat = sensor.quat_VS.copy()
         quat[held:] = quat[held]
-        frozen[name] = OrientationSensor(quat_WS=quat)
+        frozen[name] = OrientationSensor(quat_VS=quat)
     clasp = ((float(recording.time[held]), recording.phases["clasp"][0][1]),)
     still = replace(recording, sensors=frozen, phases={**recording.phases, "clasp": clasp})
     measured = {"shoulder_width": 0.38}

@@ -89,8 +89,8 @@ def test_measured_orientations_beside_raw_data_step_and_run_alike(recording: Rec
     gap[1500:1600] = True
     sensors = dict(first(recording, n).sensors)
     for name, lost in (("torso", None), ("left_forearm", gap)):
-        quat_WS, stated = simulation.quat_WS[name][:n], sensors[name].stated_quat_LS
-        sensors[name] = OrientationSensor(quat_WS, stated, lost)
+        quat_VS, stated = simulation.quat_WS[name][:n], sensors[name].stated_quat_LS
+        sensors[name] = OrientationSensor(quat_VS, stated, lost)
     mixed = replace(first(recording, n), sensors=sensors, resets=(1550,))
     mixed = replace(mixed, phases={**mixed.phases, "clasp": ((12.0, 14.0),)})
     pose = track(mixed, causal=True)

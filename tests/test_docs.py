@@ -168,9 +168,9 @@ def test_the_filter_of_the_recipe_follows_a_tilt(tmp_path: Path) -> None:
     start = np.array([0.0, 0.0, 0.0, 1.0])
     run = module.Levelled(TYPICAL, 100.0, start).run(gyro, accel, static)
     filter_ = module.Levelled(TYPICAL, 100.0, start)
-    single = [filter_.run(g, a, False).quat_WS[0] for g, a in zip(gyro, accel, strict=True)]
-    np.testing.assert_array_equal(single, run.quat_WS)
-    np.testing.assert_allclose(Rotation.from_quat(run.quat_WS[-1]).as_rotvec(), [0.5, 0.0, 0.0], atol=2e-3)
+    single = [filter_.run(g, a, False).quat_VS[0] for g, a in zip(gyro, accel, strict=True)]
+    np.testing.assert_array_equal(single, run.quat_VS)
+    np.testing.assert_allclose(Rotation.from_quat(run.quat_VS[-1]).as_rotvec(), [0.5, 0.0, 0.0], atol=2e-3)
 
 
 def test_the_description_of_the_recipe_is_read(tmp_path: Path) -> None:

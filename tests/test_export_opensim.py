@@ -116,7 +116,7 @@ def test_sto_is_read_back_as_it_was(result: Path, tmp_path: Path) -> None:
     assert set(recording.sensors) == set(SEGMENT_OF.values())
     for segment, sensor in recording.sensors.items():
         assert sensor.aligned
-        same = np.einsum("nc,nc->n", sensor.quat_WS, pose.quat_WL[segment])
+        same = np.einsum("nc,nc->n", sensor.quat_VS, pose.quat_WL[segment])
         np.testing.assert_allclose(np.abs(same), 1.0, atol=1e-8)
 
 

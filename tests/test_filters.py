@@ -127,9 +127,9 @@ def test_smekf_published_is_algorithm_1_with_the_papers_static_test() -> None:
     assert out.static[1300:].all()
     assert not estimate_orientation(gyro, accel, RATE, method="smekf", static=(0.0, 1.79)).static[1300:].any()
     noise = estimate_noise(gyro[:180], accel[:180], RATE)
-    before = (Rotation.from_quat(out.quat_WS[0]) * Rotation.from_rotvec((gyro[0] - noise.gyro_bias) / -RATE)).as_quat()
+    before = (Rotation.from_quat(out.quat_VS[0]) * Rotation.from_rotvec((gyro[0] - noise.gyro_bias) / -RATE)).as_quat()
     quat, bias, cov = smekf_by_the_book(noise, before, gyro, accel, out.static, 1 / RATE)
-    assert (Rotation.from_quat(out.quat_WS).inv() * Rotation.from_quat(quat)).magnitude().max() < 1e-9
+    assert (Rotation.from_quat(out.quat_VS).inv() * Rotation.from_quat(quat)).magnitude().max() < 1e-9
     np.testing.assert_allclose(out.gyro_bias, bias, atol=1e-9)
     np.testing.assert_allclose(out.attitude_cov, cov, rtol=1e-6, atol=1e-12)
 
@@ -185,7 +185,7 @@ def test_the_exact_covariance_keeps_the_heading_through_wild_motion() -> None:
         noise = estimate_noise(gyro[:180], accel[:180], RATE)
         for method, errors in worst.items():
             out = run_filter(gyro, accel, RATE, noise, FilterSettings(method))
-            error = heading_error_deg(out.quat_WS, true)
+            error = heading_error_deg(out.quat_VS, true)
             errors.append(float(np.abs(error - error[100]).max()))
     mean = {method: float(np.mean(errors)) for method, errors in worst.items()}
     print(f"largest heading error [deg], mean of 8: {mean}")
@@ -205,7 +205,7 @@ def test_the_heading_of_a_sensor_that_turns_round_and_round_is_as_uncertain_as_i
         gyro, accel, RATE, estimate_noise(gyro[:500], accel[:500], RATE), FilterSettings("smekf", measured_start=True)
     )
     assert out.attitude_cov is not None
-    turned = Rotation.from_quat(out.quat_WS[-1]).as_rotvec()[2] - rate * n / RATE
+    turned = Rotation.from_quat(out.quat_VS[-1]).as_rotvec()[2] - rate * n / RATE
     off = float(np.angle(np.exp(1j * turned)))
     assert abs(np.degrees(off)) == pytest.approx(28.0, abs=1.5)
     assert abs(off) < 3.0 * np.sqrt(out.attitude_cov[-1, 2, 2])
@@ -225,7 +225,7 @@ def test_ncf_is_mahonys_equations() -> None:
         e = np.cross(accel[k] / np.linalg.norm(accel[k]), matrix(q).T @ [0, 0, 1])
         q = quat_product(q, quat_exp((gyro[k] - b + filter_.params.proportional * e) / RATE))
         b = b - filter_.params.integral * e / RATE
-    np.testing.assert_allclose(run.quat_WS[-1] * np.sign(run.quat_WS[-1] @ q), q, atol=1e-11)
+    np.testing.assert_allclose(run.quat_VS[-1] * np.sign(run.quat_VS[-1] @ q), q, atol=1e-11)
     np.testing.assert_allclose(run.gyro_bias[-1], b, atol=1e-13)
 
 
@@ -239,9 +239,9 @@ def test_how_the_sensors_axes_lie_changes_nothing(method: str) -> None:
         noise = estimate_noise(own_gyro[:180], own_accel[:180], RATE)
         quat = run_filter(
             own_gyro, own_accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 180))
-        ).quat_WS
-        R_WS = Rotation.from_quat(quat) * R
-        runs.append(R_WS[0].inv() * R_WS)  # each world has a heading of its own
+        ).quat_VS
+        R_VS = Rotation.from_quat(quat) * R
+        runs.append(R_VS[0].inv() * R_VS)  # each world has a heading of its own
     # amekf doubts each axis of a measurement by itself (three standard deviations), the others none
     bound = 0.5 if method in ("amekf", "smoother") else 1e-4
     assert np.degrees((runs[0].inv() * runs[1]).magnitude()).max() < bound
@@ -260,7 +260,7 @@ def test_a_recording_may_begin_in_motion(method: str) -> None:
         trial = simulate_paper_dynamic(seed)
         gyro, accel, true = trial.gyro_S[800:], trial.accel_S[800:], trial.quat_WS[800:]
         orientation = estimate_orientation(gyro, accel, RATE, method=method, static=(47.6, 51.6))
-        tilt_deg = tilt_error_deg(orientation.quat_WS, true)
+        tilt_deg = tilt_error_deg(orientation.quat_VS, true)
         assert tilt_deg[4760:].max() < 0.5
         assert len(orientation.static) == len(gyro)
         assert orientation.static[4900:].mean() > 0.8
@@ -277,12 +277,12 @@ def test_what_is_before_the_start_phase_comes_with_the_first_chunk(method: str) 
     run = SensorRun(RATE, noise, FilterSettings(method, measured_start=True, start=slice(1003, 1180)))
     chunks = [run.push(gyro[a:b], accel[a:b]) for a, b in ((0, 2000), (2000, 4000), (4000, 6000))]
     whole = run_filter(gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(1003, 1180)))
-    quat = np.concatenate([chunk.quat_WS for chunk in chunks])
-    assert quat.shape == whole.quat_WS.shape
-    turned = np.degrees((Rotation.from_quat(quat).inv() * Rotation.from_quat(whole.quat_WS)).magnitude())
+    quat = np.concatenate([chunk.quat_VS for chunk in chunks])
+    assert quat.shape == whole.quat_VS.shape
+    turned = np.degrees((Rotation.from_quat(quat).inv() * Rotation.from_quat(whole.quat_VS)).magnitude())
     assert turned.max() < 1e-12
     # There is no step where the two runs meet.
-    step = (Rotation.from_quat(whole.quat_WS[990:1010]).inv() * Rotation.from_quat(whole.quat_WS[991:1011])).magnitude()
+    step = (Rotation.from_quat(whole.quat_VS[990:1010]).inv() * Rotation.from_quat(whole.quat_VS[991:1011])).magnitude()
     assert np.degrees(step).max() < 0.3
 
 
@@ -307,7 +307,7 @@ def test_the_rate_changes_little(method: str) -> None:
         assert orientation.attitude_cov is not None
         std.append(np.sqrt(np.trace(orientation.attitude_cov[round(50.0 * rate)])))
         every = round(rate / 100.0)
-        quats.append(Rotation.from_quat(orientation.quat_WS[every - 1 :: every]))
+        quats.append(Rotation.from_quat(orientation.quat_VS[every - 1 :: every]))
     assert np.degrees((quats[0].inv() * quats[1]).magnitude()).max() < 2.0
     assert abs(std[1] / std[0] - 1.0) < 0.1
 
@@ -329,7 +329,7 @@ def test_gdc_is_madgwicks_equations() -> None:
         rate = np.roll(quat_product(np.roll(q, -1), np.append(gyro[k] - noise.gyro_bias, 0.0)), 1) / 2
         q = q + (rate - 0.1 * step / np.linalg.norm(step)) / RATE
         q /= np.linalg.norm(q)
-    estimate = np.roll(run.quat_WS[-1], 1)
+    estimate = np.roll(run.quat_VS[-1], 1)
     np.testing.assert_allclose(estimate * np.sign(estimate @ q), q, atol=1e-11)
 
 
@@ -360,7 +360,7 @@ def test_the_start_has_the_tilt_of_the_accelerometer_and_no_heading(method: str)
     rng = np.random.default_rng(5)
     accel = accel + rng.normal(scale=1e-3, size=accel.shape)
     out = estimate_orientation(rng.normal(scale=1e-4, size=(100, 3)), accel, RATE, method=method, static=(0.0, 0.9))
-    first = Rotation.from_quat(out.quat_WS[0])
+    first = Rotation.from_quat(out.quat_VS[0])
     assert np.degrees((first * Rotation.from_rotvec([0.7, -0.4, 0.0]).inv()).magnitude()) < 0.1
 
 
@@ -417,15 +417,15 @@ def test_steps_of_many_sensors_give_the_bits_of_chunks(method: str) -> None:
     filters.push(recording.cut(slice(0, 200)))
     for k in range(200, 1000):
         quat = filters.step(gyro[k], accel[k])
-        np.testing.assert_array_equal(quat, [orientation.quat_WS[k] for orientation in alone])
+        np.testing.assert_array_equal(quat, [orientation.quat_VS[k] for orientation in alone])
         np.testing.assert_array_equal(filters.static, [orientation.static[k] for orientation in alone])
     rest = filters.push(recording.cut(slice(1000, 1800)))  # chunks and samples in turn
     for name, orientation in whole.items():
-        np.testing.assert_array_equal(rest[name].quat_WS, orientation.quat_WS[1000:1800])
+        np.testing.assert_array_equal(rest[name].quat_VS, orientation.quat_VS[1000:1800])
     for k in range(1800, len(gyro)):
         quat = filters.step(gyro[k], accel[k])
-    assert quat is filters.quat_WS
-    np.testing.assert_array_equal(quat, [orientation.quat_WS[-1] for orientation in alone])
+    assert quat is filters.quat_VS
+    np.testing.assert_array_equal(quat, [orientation.quat_VS[-1] for orientation in alone])
     np.testing.assert_array_equal(filters.gyro_bias, [orientation.gyro_bias[-1] for orientation in alone])
     if filters.attitude_cov is not None:
         np.testing.assert_array_equal(filters.attitude_cov, [orientation.attitude_cov[-1] for orientation in alone])
@@ -443,7 +443,7 @@ def test_a_sample_that_is_no_number_does_not_stay(method: str, wrong: float) -> 
     accel[[0, 500, 1100, 1200, 1201], [0, 1, 2, 0, 1]] = wrong
     run = METHODS[method](noise, RATE, start).run(gyro, accel, rest & np.isfinite(accel).all(axis=1))
     assert all(np.isfinite(part).all() for part in run if part is not None)
-    turned = np.degrees((Rotation.from_quat(run.quat_WS).inv() * Rotation.from_quat(clean.quat_WS)).magnitude())
+    turned = np.degrees((Rotation.from_quat(run.quat_VS).inv() * Rotation.from_quat(clean.quat_VS)).magnitude())
     assert turned[:500].max() < 0.3
     assert turned.max() < 3.0
 
@@ -461,7 +461,7 @@ def test_what_is_unseen_is_in_the_covariance(gap: int) -> None:
         gyro[first : first + gap] = np.nan
         run = Smekf(noise, RATE, quat_from_gravity(accel[:50].mean(axis=0)), params).run(gyro, accel, rest)
         last = first + gap - 1
-        error = (Rotation.from_quat(run.quat_WS[last]).inv() * Rotation.from_quat(clean.quat_WS[last])).as_rotvec()
+        error = (Rotation.from_quat(run.quat_VS[last]).inv() * Rotation.from_quat(clean.quat_VS[last])).as_rotvec()
         assert run.attitude_cov is not None
         normalised.append(error @ np.linalg.solve(run.attitude_cov[last], error))
         growth.append(np.sqrt(run.attitude_cov[last, 0, 0]))
@@ -478,8 +478,8 @@ def test_the_authors_own_trial_against_vicon(data: Any) -> None:
     true = Rotation.from_quat(trial.quat_true[trial.scored])
     for method, limit in (("smekf", 2.2), ("ncf", 2.5), ("gdc", 2.5)):
         out = estimate_orientation(trial.gyro_S, trial.accel_S, trial.rate_hz, method=method, static=(0.05, 0.9))
-        R_WS = Rotation.from_quat(out.quat_WS[trial.scored])
-        aligned = (true[0] * R_WS[0].inv()) * R_WS
+        R_VS = Rotation.from_quat(out.quat_VS[trial.scored])
+        aligned = (true[0] * R_VS[0].inv()) * R_VS
         angle = np.degrees((true.inv() * aligned).magnitude())
         print(f"{method}: mean angle {angle.mean():.3f} deg, largest {angle.max():.2f} deg")
         assert angle.mean() < limit

@@ -56,7 +56,7 @@ def own(values: np.ndarray, path: Path) -> np.ndarray:
 def check_orientation(recording: Recording, segment: str = "torso") -> None:
     sensor = recording.sensors[segment]
     assert isinstance(sensor, OrientationSensor)
-    assert (Rotation.from_quat(sensor.quat_WS).inv() * R_WS).magnitude().max() < 1e-6
+    assert (Rotation.from_quat(sensor.quat_VS).inv() * R_WS).magnitude().max() < 1e-6
     assert not sensor.aligned
 
 
@@ -162,7 +162,7 @@ def test_real_exports_of_mt_manager_2022(data: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(sensor.accel_S[3], [0.045482, -0.00984, 9.967645])
         np.testing.assert_allclose(sensor.gyro_S[3], [0.002354, 0.003944, 0.001659])
         ready = load(tmp_path, f"[data]\nfile = '{file}'\nrate_hz = 100.0\nuse = 'orientation'\n[sensors.torso]")
-        values.append(Rotation.from_quat(ready.sensors["torso"].quat_WS))
+        values.append(Rotation.from_quat(ready.sensors["torso"].quat_VS))
     assert len(values) == 2
     assert (values[0].inv() * values[1]).magnitude().max() < 1e-5  # one as a quaternion, one as a matrix
 
@@ -302,7 +302,7 @@ def test_a_real_export_of_apdm(data: Path, tmp_path: Path) -> None:
     recording = load(tmp_path, f"[data]\nfile = '{file}'\n[sensors.torso]\nlabel = 'Right Foot'")
     assert recording.rate_hz == pytest.approx(128.0, rel=1e-3)
     ready = load(tmp_path, f"[data]\nfile = '{file}'\nuse = 'orientation'\n[sensors.torso]\nlabel = 'Right Foot'")
-    up = Rotation.from_quat(ready.sensors["torso"].quat_WS).apply(recording.sensors["torso"].accel_S)
+    up = Rotation.from_quat(ready.sensors["torso"].quat_VS).apply(recording.sensors["torso"].accel_S)
     np.testing.assert_allclose(up, np.tile([0.0, 0.0, 9.81], (3, 1)), atol=0.3)
 
 

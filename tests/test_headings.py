@@ -47,7 +47,7 @@ def drifting(simulation: Simulation, deg_min: dict[str, float]) -> Recording:
     for name, quat in simulation.quat_WL.items():
         turn = np.deg2rad(deg_min.get(name, 0.0)) / 60.0 * since[:, None] * [0.0, 0.0, 1.0]
         drifted = (Rotation.from_rotvec(turn) * Rotation.from_quat(quat)).as_quat()
-        sensors[name] = OrientationSensor(quat_WS=drifted, stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]))
+        sensors[name] = OrientationSensor(quat_VS=drifted, stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]))
     return replace(recording, sensors=sensors)
 
 
@@ -320,7 +320,7 @@ def test_hands_with_sensors_of_their_own_bend_at_the_wrist(made: tuple[Simulatio
     lengths, sensors, mounts = dict(subject.lengths), dict(recording.sensors), dict(subject.mounts)
     for side in ("left", "right"):
         lengths[f"{side}_forearm"] += lengths[f"{side}_hand"]
-        sensors[f"{side}_hand"] = OrientationSensor(quat_WS=Rotation.from_rotvec(bent).as_quat())
+        sensors[f"{side}_hand"] = OrientationSensor(quat_VS=Rotation.from_rotvec(bent).as_quat())
         mounts[f"{side}_hand"] = np.array([0.0, 0.0, 0.0, 1.0])
     pose = track(replace(recording, sensors=sensors), replace(subject, lengths=lengths, mounts=mounts, hinges={}))
     assert pose.correction is not None

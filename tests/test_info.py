@@ -375,7 +375,7 @@ def test_quaternions_of_a_table(capsys: pytest.CaptureFixture[str], tmp_path: Pa
     names = ["t", *(f"left_hand_q{c}" for c in "wxyz")]
     pl.DataFrame(np.column_stack([TIME, WXYZ]), schema=names).write_csv(tmp_path / "a.csv")
     recording = written(capsys, tmp_path / "a.csv")
-    np.testing.assert_allclose(recording.sensors["left_hand"].quat_WS[:, 3], WXYZ[:, 0], atol=1e-6)
+    np.testing.assert_allclose(recording.sensors["left_hand"].quat_VS[:, 3], WXYZ[:, 0], atol=1e-6)
 
 
 def test_sensors_without_a_segment_are_left_to_the_user(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

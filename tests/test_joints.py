@@ -127,7 +127,7 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
             sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
             noise = assume_noise(sensor.rate_hz, registration.gyro_bias)
             R_VS[segment] = Rotation.from_quat(
-                run_filter(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise, FilterSettings("amekf")).quat_WS
+                run_filter(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise, FilterSettings("amekf")).quat_VS
             )
             clock = np.arange(len(sensor.gyro_S)) / sensor.rate_hz
             time = sensor.time + registration.offset_s

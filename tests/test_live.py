@@ -245,8 +245,8 @@ def test_measured_orientations_and_a_marked_clasp_give_the_same_bits(
     gap[1500:1600] = True
     sensors = dict(recording.sensors)
     for name, lost in (("torso", None), ("left_forearm", gap)):
-        quat_WS, mount = simulation.quat_WS[name][: len(recording)], sensors[name].stated_quat_LS
-        sensors[name] = OrientationSensor(quat_WS, mount, lost)
+        quat_VS, mount = simulation.quat_WS[name][: len(recording)], sensors[name].stated_quat_LS
+        sensors[name] = OrientationSensor(quat_VS, mount, lost)
     phases = {**recording.phases, "clasp": ((12.0, 14.0), (20.5, 22.5))}
     mixed = replace(recording, sensors=sensors, phases=phases)
     live(mixed, tmp_path / "a.mcap")
@@ -266,7 +266,7 @@ def test_measured_orientations_and_a_marked_clasp_give_the_same_bits(
     assert isinstance(read, OrientationSensor)
     assert read.gap is not None
     assert np.array_equal(read.gap, gap)
-    assert np.array_equal(read.quat_WS[~gap], simulation.quat_WS["left_forearm"][: len(recording)][~gap])
+    assert np.array_equal(read.quat_VS[~gap], simulation.quat_WS["left_forearm"][: len(recording)][~gap])
 
 
 def test_a_calibrated_subject_is_in_the_file(recording: Recording, simulation: Simulation, tmp_path: Path) -> None:

@@ -210,7 +210,7 @@ def test_the_torso_faces_x_and_arms_keep_what_they_had_to_it(tracked) -> None:
     start = recording.span(pose.segments.start)
     forward = Rotation.from_quat(pose.quat_WL["torso"][start]).mean().apply([1.0, 0.0, 0.0])
     assert abs(np.arctan2(forward[1], forward[0])) < 0.01
-    torso, arm = (Rotation.from_quat(recording.sensors[name].quat_WS) for name in ("torso", "left_forearm"))
+    torso, arm = (Rotation.from_quat(recording.sensors[name].quat_VS) for name in ("torso", "left_forearm"))
     ours = Rotation.from_quat(pose.quat_WL["torso"]).inv() * Rotation.from_quat(pose.quat_WL["left_forearm"])
     assert (ours.inv() * torso.inv() * arm).magnitude().max() < 1e-9
 
@@ -306,7 +306,7 @@ def test_raw_data_come_first_and_orientations_when_asked_for(tmp_path: Path) -> 
     assert not raw.sensors["torso"].aligned
     ready = wp.load_session(session(tmp_path, path.name, ("torso", "left_forearm"), 'use = "orientation"'))
     assert ready.sensors["torso"].aligned
-    angle = Rotation.from_quat(ready.sensors["torso"].quat_WS[-1]).magnitude()
+    angle = Rotation.from_quat(ready.sensors["torso"].quat_VS[-1]).magnitude()
     assert angle == pytest.approx(2 * 0.5)
 
 

@@ -83,7 +83,7 @@ def test_the_quietest_window_is_found(ready: bool) -> None:
         rotation = [Rotation.identity()]
         for quat in turned:
             rotation.append(rotation[-1] * Rotation.from_quat(quat))
-        sensor = OrientationSensor(quat_WS=Rotation.concatenate(rotation[1:]).as_quat())
+        sensor = OrientationSensor(quat_VS=Rotation.concatenate(rotation[1:]).as_quat())
     else:
         sensor = ImuSensor(gyro_S=gyro, accel_S=np.tile([0, 0, 9.8], (3000, 1)))
     first, last = find_static_window(Recording("r", time, RATE, {"torso": sensor}))

@@ -135,7 +135,7 @@ def squats(time: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 def tracked(body: BodyModel) -> TrackedRecording:
     time = np.arange(0.0, 20.0, 0.02)
     sensors: Mapping[str, OrientationSensor] = {
-        name: OrientationSensor(quat_WS=quat, stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]))
+        name: OrientationSensor(quat_VS=quat, stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]))
         for name, quat in squats(time)[1].items()
     }
     return track(Recording("squats", time, 50.0, sensors, phases={"start": ((0.5, 3.5),)}), model=body)

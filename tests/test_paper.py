@@ -138,7 +138,7 @@ def test_a_t_pose_beside_the_clasp_is_left_out(
 def test_exact_orientations_give_the_lengths_back() -> None:
     person = simulate_person(11)
     simulation = simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=20.0, circles=0)
-    sensors = {name: OrientationSensor(quat_WS=quat) for name, quat in simulation.quat_WL.items()}
+    sensors = {name: OrientationSensor(quat_VS=quat) for name, quat in simulation.quat_WL.items()}
     recording = replace(simulation.recording("exact"), sensors=sensors)
     measured = {name: person.lengths[name] for name in ("left_upper_arm", "left_hand", "right_forearm")}
     calibration = calibrate(recording, measured=measured, formulation="paper")
@@ -172,7 +172,7 @@ def test_noise_in_the_orientations_makes_arms_short() -> None:
     sensors = {}
     for name, quat in simulation.quat_WL.items():
         turn = Rotation.from_rotvec(rng.normal(scale=0.06, size=(len(quat), 3)) * moving)
-        sensors[name] = OrientationSensor(quat_WS=(Rotation.from_quat(quat) * turn).as_quat())
+        sensors[name] = OrientationSensor(quat_VS=(Rotation.from_quat(quat) * turn).as_quat())
     recording = replace(simulation.recording("noisy"), sensors=sensors)
     measured = {"shoulder_width": person.lengths["shoulder_width"]}
     ratio = {}
@@ -247,7 +247,7 @@ def test_hands_that_are_not_joined_give_no_lengths(swing: float, said: str) -> N
     sensors = {}
     for k, name in enumerate(simulation.quat_WL):
         angles = k * swing * np.sin((1.0 + 0.3 * k) * since)[:, None] * [0.3, 1.0, 0.0]
-        sensors[name] = OrientationSensor(quat_WS=Rotation.from_rotvec(angles).as_quat())
+        sensors[name] = OrientationSensor(quat_VS=Rotation.from_rotvec(angles).as_quat())
     with pytest.raises(NoSolution, match=said):
         calibrate(
             replace(simulation.recording("apart"), sensors=sensors),

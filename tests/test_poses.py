@@ -61,8 +61,8 @@ def as_trackers(recording: Recording) -> Recording:
     for name, sensor in recording.imus.items():
         noise = estimate_noise(sensor.gyro_S[rest], sensor.accel_S[rest], recording.rate_hz)
         settings = FilterSettings("amekf", measured_start=True)
-        quat_WS = run_filter(sensor.gyro_S, sensor.accel_S, recording.rate_hz, noise, settings).quat_WS
-        sensors[name] = OrientationSensor(quat_WS)
+        quat_VS = run_filter(sensor.gyro_S, sensor.accel_S, recording.rate_hz, noise, settings).quat_VS
+        sensors[name] = OrientationSensor(quat_VS)
     return replace(recording, sensors=sensors, remounted=True)
 
 

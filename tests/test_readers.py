@@ -89,7 +89,7 @@ def same(a: Recording, b: Recording) -> bool:
         np.array_equal(values, getattr(b.sensors[s], name))
         for s in a.sensors
         for name, values in vars(a.sensors[s]).items()
-        if name in ("gyro_S", "accel_S", "quat_WS")
+        if name in ("gyro_S", "accel_S", "quat_VS")
     )
 
 
@@ -203,7 +203,7 @@ def test_ready_orientations_are_bridged_along_the_rotation(tmp_path: Path) -> No
     table = table_at(time)
     zeros = (pl.col("time") >= 5.0) & (pl.col("time") < 5.05)
     table = table.with_columns(pl.when(zeros).then(0.0).otherwise(pl.col(SIGNALS["orientation"])).name.keep())
-    quat = load_session(write(tmp_path, table, ready=True)).sensors["torso"].quat_WS
+    quat = load_session(write(tmp_path, table, ready=True)).sensors["torso"].quat_VS
     assert quat is not None
     np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-12)
     assert np.degrees((Rotation.from_quat(quat).inv() * true_orientation(time)).magnitude()).max() < 0.3

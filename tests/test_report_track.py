@@ -159,7 +159,7 @@ def test_without_a_covariance_it_says_so(simulation: Simulation) -> None:
 def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedRecording) -> None:
     recording = simulation.recording("ready")
     sensors = {
-        name: OrientationSensor(quat_WS=pose.quat_WL[name]) for name in ("torso", "right_upper_arm", "right_forearm")
+        name: OrientationSensor(quat_VS=pose.quat_WL[name]) for name in ("torso", "right_upper_arm", "right_forearm")
     }  # orientations of segments
     ready = track(replace(recording, sensors=sensors))
     page = render_track_report(summarize(ready))
@@ -365,7 +365,7 @@ def test_heading_budgets_are_those_of_the_covariance(pose: TrackedRecording) -> 
     for name, budget in compute_heading_uncertainties(replace(pose, correction=None)).items():
         of = pose.segments.orientation[name]
         assert of.attitude_cov is not None
-        R = Rotation.from_quat(of.quat_WS).as_matrix()
+        R = Rotation.from_quat(of.quat_VS).as_matrix()
         cov = R @ of.attitude_cov @ R.swapaxes(1, 2)
         std = np.sqrt(cov[:, 2, 2])
         np.testing.assert_allclose(budget.drift, std, rtol=1e-6)

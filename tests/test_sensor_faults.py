@@ -161,16 +161,16 @@ def test_what_a_gyroscope_turned_beyond_its_range_is_uncertain(
 
     def worst(recording: Recording) -> float:
         of = estimate_segments(recording, method=method).orientation[BROKEN]
-        R_VS = Rotation.from_quat(of.quat_WS)
+        R_VS = Rotation.from_quat(of.quat_VS)
         off = (turned[300].inv() * turned).inv() * (R_VS[300].inv() * R_VS)
         return float((off.magnitude() / np.sqrt(np.linalg.eigvalsh(of.attitude_cov)[:, -1]))[450:].max())
 
     assert worst(with_sensor(read, BROKEN, gyro_range=np.inf)) > 6.0
     assert worst(read) < 6.0
     chunks = track_chunks(read, options=TrackOptions(method), chunk_s=6.0)
-    pieces = [chunk.segments.orientation[BROKEN].quat_WS for chunk in chunks]
+    pieces = [chunk.segments.orientation[BROKEN].quat_VS for chunk in chunks]
     of = estimate_segments(read, method=method).orientation[BROKEN]
-    np.testing.assert_array_equal(np.concatenate(pieces), of.quat_WS)
+    np.testing.assert_array_equal(np.concatenate(pieces), of.quat_VS)
 
 
 # One axis alone ---------------------------------------------------------------------------------------------------
@@ -432,10 +432,10 @@ def test_a_start_pose_with_a_gap_in_it_is_that_of_what_was_measured(made: Simula
     whole, n = made.recording("gap"), len(made.recording("gap"))
     gap = (whole.time > 2.7) & (whole.time < 5.5)
     raised = np.clip((whole.time - 2.7) / 2.8, 0.0, 1.0)[:, None] * [0.0, -1.5, 0.0]
-    quat_WS = Rotation.from_rotvec(raised).as_quat()
+    quat_VS = Rotation.from_rotvec(raised).as_quat()
     ready = replace(
         whole,
-        sensors={"torso": OrientationSensor(quat_WS, gap=gap), "head": OrientationSensor(quat_WS[:n])},
+        sensors={"torso": OrientationSensor(quat_VS, gap=gap), "head": OrientationSensor(quat_VS[:n])},
     )
     both = estimate_segments(ready)
     assert [(d.code, d.place) for d in both.diagnostics] == [("static-phase-trimmed", "head")]

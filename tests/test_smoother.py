@@ -29,7 +29,7 @@ def test_the_backward_pass_is_the_textbook_s() -> None:
     for first in range(0, 600, 25):
         at = slice(first, first + 25)
         blocks = np.empty(1, BLOCK)
-        quats.append(forward.run(of.gyro[at], of.accel[at], of.static[at], blocks=blocks).quat_WS[-1])
+        quats.append(forward.run(of.gyro[at], of.accel[at], of.static[at], blocks=blocks).quat_VS[-1])
         P.append(forward.state.P.copy())
         rows, whole = np.empty((7, STATES)), np.eye(STATES)
         fill_transition_rows(blocks[0], of.noise.gravity, np.eye(STATES), rows)
@@ -47,13 +47,13 @@ def test_the_backward_pass_is_the_textbook_s() -> None:
     result = Smoother(of.noise, RATE, of.start, params).run(of.gyro, of.accel, of.static)
     deviation, P_s = np.zeros(STATES), P[-1]
     for k in range(len(F) - 1, -1, -1):
-        R = Rotation.from_quat(result.quat_WS[25 * k + 24])
+        R = Rotation.from_quat(result.quat_VS[25 * k + 24])
         turned = (R * Rotation.from_quat(quats[k]).inv()).as_rotvec()
         np.testing.assert_allclose(turned, deviation[:3], atol=1e-8)
         cov_W = R.as_matrix() @ cov(result)[25 * k + 24] @ R.as_matrix().T
         np.testing.assert_allclose(cov_W, P_s[:3, :3], atol=1e-9, rtol=1e-6)
         if k < len(F) - 1:  # the next sample's is that of the block before it
-            u = Rotation.from_quat(result.quat_WS[25 * k + 25]).as_matrix()[2]
+            u = Rotation.from_quat(result.quat_VS[25 * k + 25]).as_matrix()[2]
             of_bias = np.concatenate([u, u]) @ P_s[np.ix_(BIASES, BIASES)] @ np.concatenate([u, u])
             assert result.about_vertical is not None
             np.testing.assert_allclose(result.about_vertical[25 * k + 25], (0.0, 0.0, of_bias), rtol=1e-6)
@@ -78,7 +78,7 @@ def test_a_rest_at_the_end_tells_the_bias_of_the_beginning() -> None:
         assert wrong[1] < 0.2 * wrong[0]
         true = Rotation.from_quat(of.true)
         tilt = [
-            tilt_deg(Rotation.from_quat(result.quat_WS) * true.inv())[:500].mean() for result in (forward, smoothed)
+            tilt_deg(Rotation.from_quat(result.quat_VS) * true.inv())[:500].mean() for result in (forward, smoothed)
         ]
         assert tilt[1] < 0.5 < tilt[0]
 
@@ -87,7 +87,7 @@ def test_a_gap_is_bridged_from_both_sides() -> None:
     of = case(5)
     gyro = of.gyro.copy()
     gyro[2012:2040] = np.nan
-    forward, smoothed = (errors(of, run(of._replace(gyro=gyro), kind=kind).quat_WS) for kind in (Amekf, Smoother))
+    forward, smoothed = (errors(of, run(of._replace(gyro=gyro), kind=kind).quat_VS) for kind in (Amekf, Smoother))
     after = slice(2041, 2100)
     tilt = [tilt_deg(error)[after].mean() for error in (forward, smoothed)]
     print(f"tilt after 0.3 s lost: filter {tilt[0]:.2f}, smoother {tilt[1]:.2f} deg")
@@ -101,7 +101,7 @@ def test_short_recordings_and_open_blocks(length: int) -> None:
     forward, smoothed = run(of), run(of, kind=Smoother)
     assert all(array is not None and len(array) == length and np.isfinite(array).all() for array in smoothed)
     # After the last whole block there is nothing that the filter does not know.
-    np.testing.assert_allclose(smoothed.quat_WS[-1], forward.quat_WS[-1], atol=1e-12)
+    np.testing.assert_allclose(smoothed.quat_VS[-1], forward.quat_VS[-1], atol=1e-12)
     np.testing.assert_allclose(cov(smoothed)[-1], cov(forward)[-1], atol=1e-12)
 
 

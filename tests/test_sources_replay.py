@@ -77,12 +77,12 @@ def test_nothing_due_is_nothing() -> None:
 
 def test_measured_orientations_come_as_six_numbers() -> None:
     r = recording()
-    quat_WS = Rotation.random(len(r), rng=np.random.default_rng(0)).as_quat()
-    source = ReplaySource(replace(r, sensors={"torso": OrientationSensor(quat_WS, aligned=True)}), math.inf)
+    quat_VS = Rotation.random(len(r), rng=np.random.default_rng(0)).as_quat()
+    source = ReplaySource(replace(r, sensors={"torso": OrientationSensor(quat_VS, aligned=True)}), math.inf)
     source.open()
     [first] = source.read(0.0) or []
     assert source.orientations == {"torso": True}
-    np.testing.assert_array_equal(unpack_orientations(first.gyro_S, first.accel_S), quat_WS[: len(first.time)])
+    np.testing.assert_array_equal(unpack_orientations(first.gyro_S, first.accel_S), quat_VS[: len(first.time)])
 
 
 @pytest.mark.parametrize(

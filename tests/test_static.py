@@ -137,7 +137,7 @@ def test_an_office_chair_is_no_bias(method: str, rate: float) -> None:
     orientation = run_filter(gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 500)))
     assert not orientation.static[650:1690].any()
     assert orientation.static[1900:].mean() > 0.8
-    error = Rotation.from_quat(orientation.quat_WS) * R.inv()
+    error = Rotation.from_quat(orientation.quat_VS) * R.inv()
     heading = np.degrees((error[1699] * error[499].inv()).as_rotvec()[2])
     assert abs(heading) < 1.0
 
@@ -153,7 +153,7 @@ def test_a_rotation_too_slow_to_tell_from_the_bias_is_in_the_standard_deviation(
             gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 500))
         )
         assert orientation.attitude_cov is not None
-        error = Rotation.from_quat(orientation.quat_WS) * R.inv()
+        error = Rotation.from_quat(orientation.quat_VS) * R.inv()
         up = R[-1].inv().apply([0.0, 0.0, 1.0])
         std = np.sqrt(up @ orientation.attitude_cov[-1] @ up)
         worst = max(worst, abs((error[-1] * error[:500].mean().inv()).as_rotvec()[2]) / std)

@@ -55,8 +55,8 @@ def test_exact_measured_orientations_are_used_as_they_are(
         for name, sensor in half_minute.sensors.items()
     }
     drift = Rotation.from_euler("z", np.interp(half_minute.time, [5.0, 30.0], [0.0, 50.0])[:, None], degrees=True)
-    drifting = (drift * Rotation.from_quat(sensors[segment].quat_WS)).as_quat()
-    off = {**sensors, segment: replace(sensors[segment], quat_WS=drifting)}
+    drifting = (drift * Rotation.from_quat(sensors[segment].quat_VS)).as_quat()
+    off = {**sensors, segment: replace(sensors[segment], quat_VS=drifting)}
     subject, change = replace(population_subject(), lengths=person.lengths), {}
     for name, each in (("exact", sensors), ("drifting", off)):
         recording = replace(half_minute, sensors=each)
@@ -79,9 +79,9 @@ def test_the_uncertainty_of_measured_orientations_grows_in_gaps(
         name: OrientationSensor(simulation.quat_WS[name][:n], sensor.stated_quat_LS)
         for name, sensor in half_minute.sensors.items()
     }
-    held = sensors[segment].quat_WS.copy()
+    held = sensors[segment].quat_VS.copy()
     held[gap] = held[1499]
-    with_gap = {**sensors, segment: replace(sensors[segment], quat_WS=held, gap=gap)}
+    with_gap = {**sensors, segment: replace(sensors[segment], quat_VS=held, gap=gap)}
     without, tracked = (track(replace(half_minute, sensors=each), causal=causal) for each in (sensors, with_gap))
     lost = gap[n - len(tracked.time) :]
     true = Rotation.from_quat(simulation.quat_WL[segment][n - len(tracked.time) : n])

@@ -88,10 +88,10 @@ def test_ready_orientations_are_written_too(simulation: Simulation, tmp_path: Pa
 
     from wepose_pin.recording import OrientationSensor
 
-    ready = {name: OrientationSensor(quat_WS=quat) for name, quat in simulation.quat_WL.items()}
+    ready = {name: OrientationSensor(quat_VS=quat) for name, quat in simulation.quat_WL.items()}
     write_session(tmp_path, replace(simulation.recording(), sensors=ready))
     again = load_session(tmp_path)
-    np.testing.assert_allclose(again.sensors["torso"].quat_WS, simulation.quat_WL["torso"], atol=1e-15)
+    np.testing.assert_allclose(again.sensors["torso"].quat_VS, simulation.quat_WL["torso"], atol=1e-15)
     assert again.truth is None
 
 

@@ -8,8 +8,7 @@ Conventions, everywhere:
   named there: torso T, upper arm U, forearm F, elbow E, hand H, joint J.
 - `R_WS` maps coordinates in S to W, and inner letters cancel: `R_WS = R_WL @ R_LS`. The mount is R_LS.
 - World V of one sensor: z up, heading that of its filter's start, unknown in W: `R_WV = Rz(ψ)`, ψ the heading offset.
-  A filter, `estimate_orientation` and `OrientationSensor` know one sensor and no other world: the `quat_WS` that they
-  return or hold is `quat_VS` everywhere else.
+  Filters, `estimate_orientation` and `OrientationSensor` know one sensor and no other world: they give `quat_VS`.
 - `gyro_S` [rad/s] is the rate over the interval that ends at the sample; `accel_S` [m/s²] is specific force, +g up
   while static.
 - Every segment frame equals W in the N-pose (upright, arms hanging, palms to the thighs).

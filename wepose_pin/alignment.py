@@ -268,7 +268,7 @@ def _describe_mount_error(
 
 def count_lost_samples(sensor: OrientationSensor, before: int = 0) -> np.ndarray:
     """Count (n,) the samples since the last that was measured; `before`: those before the first."""
-    samples = np.arange(len(sensor.quat_WS))
+    samples = np.arange(len(sensor.quat_VS))
     if sensor.gap is None:
         return np.zeros_like(samples)
     return samples - np.maximum.accumulate(np.where(sensor.gap, -1 - before, samples))

@@ -107,7 +107,7 @@ def quat_from_matrix(R: np.ndarray) -> np.ndarray:
 
 
 def quat_from_gravity(accel_S: ArrayLike) -> np.ndarray:
-    """Orientation `quat_WS` (4,) of a static sensor with zero heading: the shortest rotation of accel onto +z of W.
+    """Orientation `quat_VS` (4,) of a static sensor with zero heading: the shortest rotation of accel onto +z of V.
 
     Zero heading means no twist about the vertical; that is defined for every mount but the one exactly upside down,
     where the half turn about x is taken.
@@ -249,7 +249,7 @@ def fill_matrix(quat, R):  # type: ignore[no-untyped-def]
 
 @kernel
 def up_in_sensor(quat):  # type: ignore[no-untyped-def]
-    """``R_WSᵀ e_z``: the vertical in sensor coordinates, as three floats. `quat` (4,) or more: its first four, xyzw."""
+    """``R_VSᵀ e_z``: the vertical in sensor coordinates, as three floats. `quat` (4,) or more: its first four, xyzw."""
     x, y, z, w = quat[0], quat[1], quat[2], quat[3]
     return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
 

@@ -325,7 +325,7 @@ def recording_values(session: Path) -> dict[str, Any]:
     recording = wp.load_session(session)
     values: dict[str, Any] = {"time": recording.time, "rate_hz": recording.rate_hz, "phases": recording.phases}
     for name, sensor in recording.sensors.items():
-        fields = {"gyro": "gyro_S", "accel": "accel_S", "quat_WS": "quat_WS", "stated_quat_LS": "stated_quat_LS"}
+        fields = {"gyro": "gyro_S", "accel": "accel_S", "quat_WS": "quat_VS", "stated_quat_LS": "stated_quat_LS"}
         values[name] = {key: getattr(sensor, field, None) for key, field in fields.items()}
     return values
 
@@ -369,7 +369,7 @@ def orientation_values(
 
     with warnings.catch_warnings(action="ignore"):
         found = wp.estimate_orientation(gyro, accel, rate_hz, method=method, static=static)
-    return {"quat_WS": found.quat_WS, "gyro_bias": found.gyro_bias, "static": found.static}
+    return {"quat_WS": found.quat_VS, "gyro_bias": found.gyro_bias, "static": found.static}
 
 
 def has_robot(name: str) -> bool:

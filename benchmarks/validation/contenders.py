@@ -37,7 +37,7 @@ DEFAULT_GAINS: dict[str, Any] = {"ncf": NcfParams(0.5, 0.0), "gdc": GdcParams(0.
 class Contender(NamedTuple):
     """A filter with its settings.
 
-    `orient` takes gyro_S (n, 3) [rad/s], accel_S (n, 3) [m/s²], rate_hz and the static phase's noise and gives quat_WS
+    `orient` takes gyro_S (n, 3) [rad/s], accel_S (n, 3) [m/s²], rate_hz and the static phase's noise and gives quat_VS
     (n, 4) xyzw, in a world of its own with z up. `method`: the key of `METHODS` where it is ours with its defaults.
     """
 
@@ -62,14 +62,14 @@ def list_contenders(setting: str, trial: str = "") -> list[Contender]:
 
 def _make_ours(method: str) -> Contender:
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-        return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(method, measured_start=True)).quat_WS
+        return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(method, measured_start=True)).quat_VS
 
     return Contender(method, orient, method)
 
 
 def _make_tuned(method: str, params: Any) -> Contender:
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-        return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(method, params)).quat_WS
+        return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(method, params)).quat_VS
 
     return Contender(method, orient)
 
@@ -79,7 +79,7 @@ def _make_default(method: str, params: Any) -> Contender:
 
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
         unknown = replace(noise, gyro_bias=np.zeros(3))
-        return run_filter(gyro_S, accel_S, rate_hz, unknown, FilterSettings(method, params)).quat_WS
+        return run_filter(gyro_S, accel_S, rate_hz, unknown, FilterSettings(method, params)).quat_VS
 
     return Contender(f"{method}, default gains", orient)
 

@@ -124,7 +124,7 @@ def compute_rmse(trial: TuningTrial, params: NcfParams | GdcParams) -> float:
     """Compute the total RMSE [deg] over the scored samples of a trial."""
     quat_start = rotations.quat_from_gravity(trial.accel_S[: StaticTest().samples(trial.rate_hz)].mean(axis=0))
     filter_ = (Ncf if isinstance(params, NcfParams) else Gdc)(trial.noise, trial.rate_hz, quat_start, params)  # type: ignore[arg-type]
-    quat = filter_.run(trial.gyro_S, trial.accel_S, np.zeros(len(trial.gyro_S), dtype=bool)).quat_WS
+    quat = filter_.run(trial.gyro_S, trial.accel_S, np.zeros(len(trial.gyro_S), dtype=bool)).quat_VS
     R_VS = align_rotation(Rotation.from_quat(quat[trial.samples]), trial.R_WS, trial.static)
     angle = (R_VS[trial.scored] * trial.R_WS[trial.scored].inv()).magnitude()
     return float(np.degrees(np.sqrt(np.mean(angle**2))))

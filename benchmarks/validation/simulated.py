@@ -337,6 +337,6 @@ def orient_recording(recording: Recording, contender: Contender) -> tuple[Record
     rest = recording.span(recording.phases["start"][0])
     for segment, sensor in recording.imus.items():
         noise = estimate_noise(sensor.gyro_S[rest], sensor.accel_S[rest], recording.rate_hz)
-        quat_WS = contender.orient(sensor.gyro_S, sensor.accel_S, recording.rate_hz, noise)
-        sensors[segment] = OrientationSensor(quat_WS, sensor.stated_quat_LS)
+        quat_VS = contender.orient(sensor.gyro_S, sensor.accel_S, recording.rate_hz, noise)
+        sensors[segment] = OrientationSensor(quat_VS, sensor.stated_quat_LS)
     return replace(recording, sensors=sensors), "smekf"

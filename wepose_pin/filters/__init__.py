@@ -83,22 +83,21 @@ TYPICAL = SensorNoise(
 class Orientation(NamedTuple):
     """Orientation of one sensor over time.
 
-    W is the sensor's own world, called V outside of the filters: z up, zero heading at the first sample of the phase
-    from which the filter starts.
+    V is the sensor's own world: z up, zero heading at the first sample of the phase from which the filter starts.
 
     Parameters
     ----------
-    quat_WS : (n, 4) xyzw
+    quat_VS : (n, 4) xyzw
     gyro_bias : (n, 3) [rad/s]
     static : (n,) bool, the sensor did not move
-    attitude_cov : (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_WS`; None where the filter
+    attitude_cov : (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_VS`; None where the filter
         has none
     noise : of gyroscope and accelerometer in the static phase
     diagnostics : what the user should know
     about_vertical : (n, 3), as `base.AboutVertical`; None where the filter has no covariance
     """
 
-    quat_WS: np.ndarray
+    quat_VS: np.ndarray
     gyro_bias: np.ndarray
     static: np.ndarray
     attitude_cov: np.ndarray | None
@@ -115,13 +114,13 @@ class Orientation(NamedTuple):
     def __repr__(self) -> str:
         bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
         share = 100.0 * float(np.mean(self.static)) if len(self.static) else float("nan")
-        return f"Orientation({len(self.quat_WS)} samples, {share:.0f} % static, gyro bias {bias:.2f} deg/s)"
+        return f"Orientation({len(self.quat_VS)} samples, {share:.0f} % static, gyro bias {bias:.2f} deg/s)"
 
     def _repr_html_(self) -> str:
         return notebook_html(self, self.diagnostics)
 
 
-_OF_EACH_SAMPLE = ("quat_WS", "gyro_bias", "static", "attitude_cov", "about_vertical")
+_OF_EACH_SAMPLE = ("quat_VS", "gyro_bias", "static", "attitude_cov", "about_vertical")
 
 
 def join_orientations(parts: Sequence[Orientation]) -> Orientation:
@@ -158,7 +157,7 @@ def estimate_orientation(
 ) -> Orientation:
     """Estimate the orientation of a sensor from its gyroscope and accelerometer.
 
-    W of the returned `quat_WS` is the sensor's own world: z up, and a heading that has no relation to the worlds
+    V of the returned `quat_VS` is the sensor's own world: z up, and a heading that has no relation to the worlds
     of other sensors (`track` aligns them by the start pose). At the first sample of the static phase the heading is
     zero and the tilt is that of the mean accelerometer over the phase (without a phase: over the first window of
     `static_test`); the filter goes forward and backward in time from there. Where `gyro_S` is at the limit of the
@@ -188,8 +187,8 @@ def estimate_orientation(
     Returns
     -------
     Orientation
-        `quat_WS` (n, 4) xyzw, `gyro_bias` (n, 3) [rad/s], `static` (n,) bool: the sensor did not move, `attitude_cov`
-        (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_WS`, or None, `noise` of the static
+        `quat_VS` (n, 4) xyzw, `gyro_bias` (n, 3) [rad/s], `static` (n,) bool: the sensor did not move, `attitude_cov`
+        (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_VS`, or None, `noise` of the static
         phase, `diagnostics`.
 
     Raises
@@ -209,7 +208,7 @@ def estimate_orientation(
     >>> o = wp.estimate_orientation(sensor.gyro_S, sensor.accel_S, recording.rate_hz, static=(0.5, 4.5))
     >>> o
     Orientation(2251 samples, 28 % static, gyro bias 0.42 deg/s)
-    >>> o.quat_WS.shape  # xyzw
+    >>> o.quat_VS.shape  # xyzw
     (2251, 4)
     """
     check_arguments(estimate_orientation, locals())
@@ -338,7 +337,7 @@ class SensorRun:
             if self._method in OFFLINE:  # forward over all samples, from the end of the backward run
                 turn = np.nan_to_num(gyro_S[0] - run.gyro_bias[0]) / self._rate_hz
                 # The forward run alone uses these samples.
-                start = StartTilt(rotations.turned(run.quat_WS[0], -turn), MOVING_TILT_STD)
+                start = StartTilt(rotations.turned(run.quat_VS[0], -turn), MOVING_TILT_STD)
                 self._before_cov = run.attitude_cov
         self.filter = self._create_filter(self._method, self._noise, start)
         return before
@@ -354,12 +353,12 @@ class SensorRun:
         gyro, accel = -gyro_S[:0:-1], accel_S[::-1]
         static = StaticDetector(noise, self._rate_hz, self._test).run(gyro, accel)
         method = BEST if self._method in OFFLINE else self._method
-        filter_ = self._create_filter(method, noise, start._replace(quat_WS=rotations.turned(start.quat_WS, turn)))
+        filter_ = self._create_filter(method, noise, start._replace(quat_VS=rotations.turned(start.quat_VS, turn)))
         run = filter_.run(gyro, accel, static)
         cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
         # What the backward run has corrected is no correction of the forward run.
         vertical = None if run.about_vertical is None else np.zeros_like(run.about_vertical)
-        return FilterRun(run.quat_WS[::-1], -run.gyro_bias[::-1], cov, vertical), static[::-1]
+        return FilterRun(run.quat_VS[::-1], -run.gyro_bias[::-1], cov, vertical), static[::-1]
 
     def _create_filter(self, method: str, noise: SensorNoise, start: StartTilt) -> Any:
         params, gyro_range = self._settings.params, self._settings.gyro_range
@@ -368,10 +367,10 @@ class SensorRun:
         if params is None and method == "smekf":
             params = SmekfParams()
             if self._settings.measured_start:
-                params = starting_params(noise, self._rate_hz, start.quat_WS, start.tilt_std)
+                params = starting_params(noise, self._rate_hz, start.quat_VS, start.tilt_std)
         if method in ("amekf", "smoother", "smekf") and gyro_range < params.gyro_range:
             params = replace(params, gyro_range=gyro_range)
-        return METHODS[method](noise, self._rate_hz, start.quat_WS, params)
+        return METHODS[method](noise, self._rate_hz, start.quat_VS, params)
 
     def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
         """Return a run as orientations."""
@@ -380,7 +379,7 @@ class SensorRun:
             run.attitude_cov[: len(self._before_cov)] = self._before_cov
             self._before_cov = None
         return Orientation(
-            run.quat_WS, run.gyro_bias, static, run.attitude_cov, self._noise, about_vertical=run.about_vertical
+            run.quat_VS, run.gyro_bias, static, run.attitude_cov, self._noise, about_vertical=run.about_vertical
         )
 
 

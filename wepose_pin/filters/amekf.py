@@ -7,14 +7,14 @@ estimate the gyroscope's bias, its scale and misalignment (3×3), and the differ
 static phases, which rotation about horizontal axes makes observable. The heading is not observed; it improves with
 these parameters.
 
-W is here the sensor's own world, V elsewhere: z up, heading that of the filter's start. The 25 errors (`ErrorStates`)
-are additive except the attitude error, a rotation on the left, in that world: R = exp(θ) R_estimated. It does not
-change when the sensor rotates. Measured rate = (I + M) true rate + bias. Errors of velocity and position are those of
+V is the sensor's own world: z up, heading that of the filter's start. The 25 errors (`ErrorStates`) are additive
+except the attitude error, a rotation on the left, in V: R = exp(θ) R_estimated. It does not change when the sensor
+rotates. Measured rate = (I + M) true rate + bias. Errors of velocity and position are those of
 the invariant filter (Barrau and Bonnabel 2017, IEEE TAC 62(4)): θ × g e_z alone drives them, so that their bound gives
 no information on the heading.
 
 The strapdown runs at each sample, the covariance once a block (`AmekfParams.block_s`): over a block the transition is
-exact in the sums of R_WS and R_WS ω. In a static block (static phase of Lisini Baldi 2019, IEEE Sensors Journal) the
+exact in the sums of R_VS and R_VS ω. In a static block (static phase of Lisini Baldi 2019, IEEE Sensors Journal) the
 velocity is zero and the gyroscope measures its bias.
 """
 
@@ -49,9 +49,9 @@ from .static import static_step
 class ErrorStates(NamedTuple):
     """Index range of each error among the 25."""
 
-    attitude: slice = slice(0, 3)  # θ [rad], on the left, in W
-    velocity: slice = slice(3, 5)  # [m/s], horizontal, in W
-    position: slice = slice(5, 7)  # [m], horizontal, in W
+    attitude: slice = slice(0, 3)  # θ [rad], on the left, in V
+    velocity: slice = slice(3, 5)  # [m/s], horizontal, in V
+    position: slice = slice(5, 7)  # [m], horizontal, in V
     gyro_bias: slice = slice(7, 10)  # [rad/s], in S, in a static phase
     gyro_matrix: slice = slice(10, 19)  # M, rows first
     accel_bias: slice = slice(19, 22)  # [m/s²], in S
@@ -75,9 +75,9 @@ OUTLIER_CHI2_2, OUTLIER_CHI2_3 = 11.83, 14.16
 
 # Records of the compiled steps.
 TRANSITION = [
-    ("R", float, (3, 3)),  # Σ R_WS dt [s]
-    ("R_rate", float, (3, 3, 3)),  # Σ R_WS ω_c dt [rad], for the axes c = x, y, z of S
-    ("R_moving", float, (3, 3)),  # Σ R_WS dt [s] over the samples that are not static
+    ("R", float, (3, 3)),  # Σ R_VS dt [s]
+    ("R_rate", float, (3, 3, 3)),  # Σ R_VS ω_c dt [rad], for the axes c = x, y, z of S
+    ("R_moving", float, (3, 3)),  # Σ R_VS dt [s] over the samples that are not static
 ]
 SUMS = np.dtype(
     [
@@ -111,7 +111,7 @@ BLOCK = np.dtype(
 # The state of a sensor is one record, so that a run may be cut anywhere and a bank of sensors stacks them.
 STATE = np.dtype(
     [
-        ("quat_WS", float, 4),  # xyzw
+        ("quat_VS", float, 4),  # xyzw
         ("gyro_bias", float, 3),  # [rad/s] as returned: with the motion bias where the sample is not static
         ("attitude_cov", float, 6),  # [rad²] upper triangle, error on the right, in S
         ("x", float, STATES),  # as `ErrorStates`; the attitude's error is always zero
@@ -122,7 +122,7 @@ STATE = np.dtype(
         ("samples", np.int64),  # in the open block
         ("about_vertical", float, VERTICAL_COLUMNS),  # as `base.AboutVertical`
         # work space
-        ("R_WS", float, (3, 3)),
+        ("R_VS", float, (3, 3)),
         ("FP_rows", float, (PROPAGATED_STATES, COLUMNS)),
         ("FP_columns", float, (STATES, 8)),  # the last column is zero
         ("FPF_corner", float, (PROPAGATED_STATES, 8)),
@@ -212,7 +212,7 @@ class AmekfState:
 
     def __init__(self, record: np.ndarray) -> None:
         self.record = record  # (1,) of `STATE`
-        self.quat_WS = record["quat_WS"][0]  # (4,) xyzw
+        self.quat_VS = record["quat_VS"][0]  # (4,) xyzw
         self.gyro_bias = record["gyro_bias"][0]  # (3,) [rad/s]
         self.x = record["x"][0]  # (25,) as `ErrorStates`
         self.P = record["P"][0, :, :STATES]  # (25, 25)
@@ -231,11 +231,11 @@ class Amekf:
     Parameters
     ----------
     noise : first bias, its covariance, noise and gravity
-    quat_WS : (4,) xyzw at the start; its heading defines the filter's world
+    quat_VS : (4,) xyzw at the start; its heading defines the filter's world
     """
 
     def __init__(
-        self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: AmekfParams | None = None
+        self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: AmekfParams | None = None
     ) -> None:
         self.params = params or AmekfParams()
         self.rate_hz = rate_hz
@@ -243,7 +243,7 @@ class Amekf:
         self.block_samples = max(1, round(self.params.block_s * rate_hz))
         self.model = _build_model(noise, rate_hz, self.block_samples, self.params)
         self.state = AmekfState(np.zeros(1, STATE))
-        self.state.quat_WS[:], self.state.gyro_bias[:] = quat_WS, noise.gyro_bias
+        self.state.quat_VS[:], self.state.gyro_bias[:] = quat_VS, noise.gyro_bias
         p, x, std = self.params, self.state.x, np.zeros(STATES)
         x[ERROR.gyro_bias], x[ERROR.gyro_matrix] = noise.gyro_bias, p.gyro_matrix.ravel()
         x[ERROR.accel_bias] = p.accel_bias
@@ -504,36 +504,36 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
         else:
             at, axes, variance = POSITION, 2, model.position_var
             variance += _compute_added_variance(state, at, variance)
-        heading, rate = block.correction[2], compute_vertical_bias(block.correction, state.R_WS)
+        heading, rate = block.correction[2], compute_vertical_bias(block.correction, state.R_VS)
         for i in range(axes):
             state.measured[i] = sums.gyro[i] / count if axes == 3 else 0.0
         _correct(state, at, axes, state.measured, variance)
-        heading, rate = block.correction[2] - heading, compute_vertical_bias(block.correction, state.R_WS) - rate
-        add_correction(state.about_vertical, heading, rate, compute_vertical_bias_var(P, state.R_WS))
+        heading, rate = block.correction[2] - heading, compute_vertical_bias(block.correction, state.R_VS) - rate
+        add_correction(state.about_vertical, heading, rate, compute_vertical_bias_var(P, state.R_VS))
     for i in range(VELOCITY, STATES):
         x[i] += block.correction[i]
-    rotate_by_world_vector(state.quat_WS, block.correction[0], block.correction[1], block.correction[2])
+    rotate_by_world_vector(state.quat_VS, block.correction[0], block.correction[1], block.correction[2])
     state.samples = 0
     _reset_sums(sums)
 
 
 @inlined
-def compute_vertical_bias_var(P, R_WS):  # type: ignore[no-untyped-def]
+def compute_vertical_bias_var(P, R_VS):  # type: ignore[no-untyped-def]
     """Compute the variance [rad²/s²] about the vertical of the gyroscope's bias in motion."""
     variance = 0.0
     for i in range(3):
         for j in range(3):
             b, d, e, m = GYRO_BIAS + i, MOTION_BIAS + i, GYRO_BIAS + j, MOTION_BIAS + j
-            variance += R_WS[2, i] * R_WS[2, j] * (P[b, e] + P[b, m] + P[d, e] + P[d, m])
+            variance += R_VS[2, i] * R_VS[2, j] * (P[b, e] + P[b, m] + P[d, e] + P[d, m])
     return variance
 
 
 @inlined
-def compute_vertical_bias(x, R_WS):  # type: ignore[no-untyped-def]
+def compute_vertical_bias(x, R_VS):  # type: ignore[no-untyped-def]
     """Compute the gyroscope's bias in motion about the vertical [rad/s], of states (25,) or their corrections."""
     bias = 0.0
     for c in range(3):
-        bias += R_WS[2, c] * (x[GYRO_BIAS + c] + x[MOTION_BIAS + c])
+        bias += R_VS[2, c] * (x[GYRO_BIAS + c] + x[MOTION_BIAS + c])
     return bias
 
 
@@ -588,8 +588,8 @@ def _correct_rate(state, model, gx, gy, gz, static):  # type: ignore[no-untyped-
 
 @inlined
 def _compute_horizontal_acceleration(state, model, ax, ay, az):  # type: ignore[no-untyped-def]
-    """Compute the sample's horizontal acceleration in W, two floats [m/s²]; zero for a lost sample."""
-    sums, bias, A, R = state.sums, state.x[ERROR.accel_bias], model.accel_correction, state.R_WS
+    """Compute the sample's horizontal acceleration in V, two floats [m/s²]; zero for a lost sample."""
+    sums, bias, A, R = state.sums, state.x[ERROR.accel_bias], model.accel_correction, state.R_VS
     if not ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
         sums.lost_accel_s += model.dt
         return 0.0, 0.0
@@ -611,11 +611,11 @@ def _compute_horizontal_acceleration(state, model, ax, ay, az):  # type: ignore[
 @inlined
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
     """Filter one sample, gyro [rad/s], accel [m/s²]; records of `STATE` and `MODEL`. Return whether a block ended."""
-    dt, x, sums, R = model.dt, state.x, state.sums, state.R_WS
+    dt, x, sums, R = model.dt, state.x, state.sums, state.R_VS
     wx, wy, wz, ux, uy, uz = _correct_rate(state, model, gx, gy, gz, static)
     sums.rate_squared += wx * wx + wy * wy + wz * wz
-    rotate_unit_by_rate(state.quat_WS, wx, wy, wz, dt)
-    fill_matrix(state.quat_WS, R)
+    rotate_unit_by_rate(state.quat_VS, wx, wy, wz, dt)
+    fill_matrix(state.quat_VS, R)
     moving = 0.0 if static else 1.0
     for i in range(3):
         for c in range(3):
@@ -635,7 +635,7 @@ def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyp
     ended = state.samples == model.block_samples
     if ended:
         _finish_block(state, model)
-        fill_matrix(state.quat_WS, R)
+        fill_matrix(state.quat_VS, R)
     into_sensor(R, state.P, sums.lost_rotation_var, state.attitude_cov)
     return ended
 

@@ -56,9 +56,9 @@ def add_correction(sums, heading, rate, rate_var):  # type: ignore[no-untyped-de
 
 
 class FilterRun(NamedTuple):
-    """Results of a run, one row a sample; W is the sensor's own world, as in `OrientationFilter`."""
+    """Results of a run, one row a sample; V is the sensor's own world, as in `OrientationFilter`."""
 
-    quat_WS: np.ndarray  # (n, 4) xyzw, orientation after the sample
+    quat_VS: np.ndarray  # (n, 4) xyzw, orientation after the sample
     gyro_bias: np.ndarray  # (n, 3) [rad/s]
     attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²] of the error on the right, in S; None: the filter has none
     about_vertical: np.ndarray | None = None  # (n, 3) as `AboutVertical`; None: the filter has no covariance
@@ -90,18 +90,18 @@ def make_run(n: int, *, covariance: bool = True) -> FilterRun:
 class FilterState:
     """State of a filter without covariance."""
 
-    quat_WS: np.ndarray  # (4,) xyzw
+    quat_VS: np.ndarray  # (4,) xyzw
     gyro_bias: np.ndarray  # (3,) [rad/s]
 
 
 class OrientationFilter(Protocol):
-    """A filter made for one sensor: ``Filter(noise, rate_hz, quat_WS, params)``.
+    """A filter made for one sensor: ``Filter(noise, rate_hz, quat_VS, params)``.
 
-    W is here the sensor's own world, called V outside of the filters: z up, heading of the `quat_WS` from which the
-    filter starts. A run, the same run cut in two, and a run sample by sample are bit-identical.
+    V is the sensor's own world: z up, heading of the `quat_VS` from which the filter starts. A run, the same run cut
+    in two, and a run sample by sample are bit-identical.
     """
 
-    def __init__(self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray) -> None: ...
+    def __init__(self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray) -> None: ...
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray, out: FilterRun | None = None
@@ -130,10 +130,10 @@ def prepare_samples(
 
 
 @inlined
-def store_sample(state, k, quat_WS, gyro_bias, attitude_cov, about_vertical):  # type: ignore[no-untyped-def]
+def store_sample(state, k, quat_VS, gyro_bias, attitude_cov, about_vertical):  # type: ignore[no-untyped-def]
     """Fill row `k` of the arrays of a `FilterRun` from the record of a filter with covariance."""
     for i in range(4):
-        quat_WS[k, i] = state.quat_WS[i]
+        quat_VS[k, i] = state.quat_VS[i]
     for i in range(3):
         gyro_bias[k, i] = state.gyro_bias[i]
     fill_symmetric(state.attitude_cov, attitude_cov[k])

@@ -1,6 +1,6 @@
 """GDC: gradient-descent filter without magnetometer (Madgwick, Harrison, Vaidyanathan 2011, ICORR).
 
-Their equations (25), (26), (32) to (34): q̇ = ½ q ⊗ (gyro − b) − β ∇f/‖∇f‖ with f = R_WSᵀ e_z − a. The bias is the
+Their equations (25), (26), (32) to (34): q̇ = ½ q ⊗ (gyro − b) − β ∇f/‖∇f‖ with f = R_VSᵀ e_z − a. The bias is the
 static phase's and stays; their bias step needs a magnetometer. Of ∇f only the part across q is taken: the part along q
 turns nothing, and in their f, which counts on ‖q‖ = 1, its size depends on how the sensor's axes lie.
 """
@@ -29,11 +29,11 @@ class Gdc:
     """GDC of one sensor; the bias is the static phase's mean. A sample that is no number is passed over."""
 
     def __init__(
-        self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: GdcParams | None = None
+        self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: GdcParams | None = None
     ) -> None:
         self.params = params or GdcParams()
         self.rate_hz = rate_hz
-        self.state = FilterState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
+        self.state = FilterState(np.array(quat_VS, dtype=float), noise.gyro_bias.copy())
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
@@ -41,7 +41,7 @@ class Gdc:
         gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
         out = out or make_run(len(gyro), covariance=False)
         out.gyro_bias[:] = self.state.gyro_bias
-        _run(self.state.quat_WS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, self.params.gain, out.quat_WS)
+        _run(self.state.quat_VS, self.state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, self.params.gain, out.quat_VS)
         return out
 
 

@@ -1,6 +1,6 @@
 """NCF: the nonlinear (explicit) complementary filter with integral term (Mahony, Hamel, Pflimlin 2008, IEEE TAC 53(5)).
 
-Their equation (32) with gravity as the only measured direction: e = a × R_WSᵀ e_z with a the unit accelerometer
+Their equation (32) with gravity as the only measured direction: e = a × R_VSᵀ e_z with a the unit accelerometer
 direction, ω = gyro − b + k_P e, ḃ = −k_I e.
 """
 
@@ -29,11 +29,11 @@ class Ncf:
     """NCF of one sensor; the bias starts at the static phase's mean. A sample that is no number is passed over."""
 
     def __init__(
-        self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: NcfParams | None = None
+        self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: NcfParams | None = None
     ) -> None:
         self.params = params or NcfParams()
         self.rate_hz = rate_hz
-        self.state = FilterState(np.array(quat_WS, dtype=float), noise.gyro_bias.copy())
+        self.state = FilterState(np.array(quat_VS, dtype=float), noise.gyro_bias.copy())
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
@@ -41,7 +41,7 @@ class Ncf:
         gyro, accel, _ = prepare_samples(gyro_S, accel_S, static)
         out = out or make_run(len(gyro), covariance=False)
         state, gains = self.state, (self.params.proportional, self.params.integral)
-        _run(state.quat_WS, state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, *gains, out.quat_WS, out.gyro_bias)
+        _run(state.quat_VS, state.gyro_bias, gyro, accel, 1.0 / self.rate_hz, *gains, out.quat_VS, out.gyro_bias)
         return out
 
 

@@ -179,7 +179,7 @@ def find_static_window(recording: Recording) -> tuple[float, float]:
             signal = sensor.gyro_S[:n]
         else:
             # 2 (q[k] − q[k−1]) is the rotation between samples, with the signs made to agree.
-            quat = sensor.quat_WS[:n]
+            quat = sensor.quat_VS[:n]
             flips = np.sign(np.einsum("ni,ni->n", quat[1:], quat[:-1]))[:, None]
             signal = 2.0 * rate_hz * np.concatenate([np.zeros((1, 4)), quat[1:] - flips * quat[:-1]])
         windows = np.lib.stride_tricks.sliding_window_view(signal, window, axis=0)[::stride]

@@ -48,7 +48,7 @@ class SensorFilters:
     ----------
     start, static_phase, diagnostics : as in `FilteredRecording`
     names : the k segments whose sensors have a filter
-    quat_WS, gyro_bias : (k, 4) xyzw, (k, 3) [rad/s] now
+    quat_VS, gyro_bias : (k, 4) xyzw, (k, 3) [rad/s] now
     static : (k,) bool, of the last step
 
     Raises
@@ -117,24 +117,24 @@ class SensorFilters:
         filters, detectors = [run.filter for run in self._runs], [run.detector for run in self._runs]
         k = len(filters)
         self.static = np.zeros(k, dtype=np.bool_)
-        self.quat_WS, self.gyro_bias = np.empty((k, 4)), np.empty((k, 3))
+        self.quat_VS, self.gyro_bias = np.empty((k, 4)), np.empty((k, 3))
         if self._step is not None:
             self._states = np.concatenate([filter_.state.record for filter_ in filters])
             self._models = np.concatenate([filter_.model for filter_ in filters])
             self._detector_states = StaticState(
                 *map(np.concatenate, zip(*(detector.state for detector in detectors), strict=True))
             )
-            self.quat_WS, self.gyro_bias = self._states["quat_WS"], self._states["gyro_bias"]
+            self.quat_VS, self.gyro_bias = self._states["quat_VS"], self._states["gyro_bias"]
         for i, (filter_, detector) in enumerate(zip(filters, detectors, strict=True)):
             if self._step is not None:
                 filter_.state = type(filter_.state)(self._states[i : i + 1])
                 detector.state = StaticState(*(values[i : i + 1] for values in self._detector_states))
             else:
-                self.quat_WS[i], self.gyro_bias[i] = filter_.state.quat_WS, filter_.state.gyro_bias
-                filter_.state = type(filter_.state)(self.quat_WS[i], self.gyro_bias[i])
+                self.quat_VS[i], self.gyro_bias[i] = filter_.state.quat_VS, filter_.state.gyro_bias
+                filter_.state = type(filter_.state)(self.quat_VS[i], self.gyro_bias[i])
 
     def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """Take a sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²]; return `quat_WS` (k, 4).
+        """Take a sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²]; return `quat_VS` (k, 4).
 
         A sensor whose sample did not come has NaN in its row: its rate is held and fades, its covariance grows.
         """
@@ -144,13 +144,13 @@ class SensorFilters:
             raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape}: a row for each of {shape[0]} sensors")
         if self._step is not None:
             self._step(self._states, self._models, *self._detector_states, gyro, accel, self.static)
-            return self.quat_WS
+            return self.quat_VS
         for i, run in enumerate(self._runs):
             one = slice(i, i + 1)
             self.static[one] = run.detector.run(gyro[one], accel[one])
-            out = FilterRun(self.quat_WS[one], self.gyro_bias[one], None)
+            out = FilterRun(self.quat_VS[one], self.gyro_bias[one], None)
             run.filter.run(gyro[one], accel[one], self.static[one], out)
-        return self.quat_WS
+        return self.quat_VS
 
     @property
     def attitude_cov(self) -> np.ndarray | None:
@@ -180,7 +180,7 @@ def filter_recording(
     filters = SensorFilters(recording, method=method, static_test=static_test, sways=sways)
     orientation = filters.push(recording)
     R_VS = {
-        segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_WS)
+        segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_VS)
         for segment, sensor in recording.sensors.items()
     }
     R_VS_start = find_start_orientations(recording, orientation, filters.start)
@@ -194,5 +194,5 @@ def find_start_orientations(
     R_VS_start = {}
     for segment, sensor in first.sensors.items():
         source = sensor if isinstance(sensor, OrientationSensor) else orientation[segment]
-        R_VS_start[segment] = Rotation.from_quat(source.quat_WS[first.find_measured(segment, start)]).mean()
+        R_VS_start[segment] = Rotation.from_quat(source.quat_VS[first.find_measured(segment, start)]).mean()
     return R_VS_start

@@ -6,10 +6,10 @@ the covariance, so that static phases seem to measure the heading. Here Φ = exp
 covariance too. `PublishedSmekf` is the paper's, to the first order.
 
 The state is x = [a; b]: the attitude error a [rad] and the gyroscope bias b [rad/s]. The paper's a is on the right of
-`quat_WS`, in S, as that of `attitude_cov`. Inside, a is on the left, in W, where it changes neither with the sensor's
+`quat_VS`, in S, as that of `attitude_cov`. Inside, a is on the left, in V, where it changes neither with the sensor's
 rotation nor with a correction of the attitude, so that Φ is the identity and P need not be rotated.
 
-Measurement model: gyro = ω + b + w_ω, accel/g = R_WSᵀ e_z + w_g. In a static phase ω = 0, so gyro measures b. Σ_ω and
+Measurement model: gyro = ω + b + w_ω, accel/g = R_VSᵀ e_z + w_g. In a static phase ω = 0, so gyro measures b. Σ_ω and
 Σ_g are the covariances of the white noises w_ω and w_g, Σ_b that of the bias's random walk, P₀ that of the state at the
 first sample.
 """
@@ -66,7 +66,7 @@ class SmekfParams:
     gyro_range: float = np.inf  # [rad/s]; a sample at it is used, and the covariance grows by what may be beyond
 
 
-def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, tilt_std: float) -> SmekfParams:
+def starting_params(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, tilt_std: float) -> SmekfParams:
     """Return the parameters with P₀ of the start phase: the tilt as it is known, the heading exact by definition.
 
     A person's sway and the accelerometer's bias are correlated from sample to sample, while Σ_ω and Σ_g stand for white
@@ -74,10 +74,10 @@ def starting_params(noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, til
 
     Parameters
     ----------
-    quat_WS : (4,) xyzw, the orientation from which the filter starts
+    quat_VS : (4,) xyzw, the orientation from which the filter starts
     tilt_std : [rad] one standard deviation of its roll and pitch
     """
-    up_S = np.array(up_in_sensor(quat_WS))
+    up_S = np.array(up_in_sensor(quat_VS))
     across = np.eye(3) - np.outer(up_S, up_S)
     return SmekfParams(
         attitude_cov0=tilt_std**2 * across + START_HEADING_STD**2 * np.eye(3),
@@ -98,12 +98,12 @@ LOST_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
 # The state of a sensor is one record, its constants (the model) are another. Upper triangles are xx xy xz yy yz zz.
 STATE = np.dtype(
     [
-        ("quat_WS", float, 4),  # xyzw
+        ("quat_VS", float, 4),  # xyzw
         ("gyro_bias", float, 3),  # [rad/s]
         ("attitude_cov", float, 6),  # [rad²] upper triangle: P_aa, and what the gyroscope's scale adds to the heading
         ("turned", float),  # [rad] net rotation about the vertical since the start
-        ("P_aa", float, 6),  # [rad²] upper triangle, of a in W
-        ("P_ab", float, (3, 3)),  # [rad²/s] of a in W and b in S
+        ("P_aa", float, 6),  # [rad²] upper triangle, of a in V
+        ("P_ab", float, (3, 3)),  # [rad²/s] of a in V and b in S
         ("P_bb", float, 6),  # [rad²/s²] upper triangle
         ("held_rate", float, 3),  # [rad/s] the last that was measured
         ("lost_s", float),  # [s] since then
@@ -135,15 +135,15 @@ class SmekfState:
 
     def __init__(self, record: np.ndarray) -> None:
         self.record = record  # (1,) of `STATE`
-        self.quat_WS = record["quat_WS"][0]  # (4,) xyzw
+        self.quat_VS = record["quat_VS"][0]  # (4,) xyzw
         self.gyro_bias = record["gyro_bias"][0]  # (3,) [rad/s]
 
     @property
     def P(self) -> np.ndarray:
         """Covariance (6, 6) of [a; b], both in S; a copy."""
-        record, R_WS = self.record[0], Rotation.from_quat(self.quat_WS).as_matrix()
-        ab = R_WS.T @ record["P_ab"]
-        return np.block([[R_WS.T @ symmetric(record["P_aa"]) @ R_WS, ab], [ab.T, symmetric(record["P_bb"])]])
+        record, R_VS = self.record[0], Rotation.from_quat(self.quat_VS).as_matrix()
+        ab = R_VS.T @ record["P_ab"]
+        return np.block([[R_VS.T @ symmetric(record["P_aa"]) @ R_VS, ab], [ab.T, symmetric(record["P_bb"])]])
 
 
 class Smekf:
@@ -156,17 +156,17 @@ class Smekf:
     first_order = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
 
     def __init__(
-        self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: SmekfParams | None = None
+        self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: SmekfParams | None = None
     ) -> None:
         self.params = params or SmekfParams()
         self.noise = noise
         self.rate_hz = rate_hz
         self.model = _model(noise, 1.0 / rate_hz, self.params, self.first_order)
         record = np.zeros(1, STATE)
-        record["quat_WS"], record["gyro_bias"] = quat_WS, noise.gyro_bias
-        R_WS, attitude_cov = Rotation.from_quat(quat_WS).as_matrix(), _matrix(self.params.attitude_cov0)
+        record["quat_VS"], record["gyro_bias"] = quat_VS, noise.gyro_bias
+        R_VS, attitude_cov = Rotation.from_quat(quat_VS).as_matrix(), _matrix(self.params.attitude_cov0)
         record["attitude_cov"] = attitude_cov[_UPPER]
-        record["P_aa"] = (R_WS @ attitude_cov @ R_WS.T)[_UPPER]
+        record["P_aa"] = (R_VS @ attitude_cov @ R_VS.T)[_UPPER]
         record["P_bb"] = _matrix(self.params.bias_cov0)[_UPPER]
         record["about_vertical"][0, RATE_VAR] = float(np.trace(_matrix(self.params.bias_cov0))) / 3.0
         self.state = SmekfState(record)
@@ -284,15 +284,15 @@ def store_covariance(state, P):  # type: ignore[no-untyped-def]
 
 @inlined
 def predict(state, model, wx, wy, wz, lost_var):  # type: ignore[no-untyped-def]
-    """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w); return F P Fᵀ + G Q Gᵀ and R_WS.
+    """Algorithm 1, prediction by the turn w = (gyro − b) δt: q ← q ⊗ exp(w); return F P Fᵀ + G Q Gᵀ and R_VS.
 
-    F = [[I, B], [0, I]] of errors in W, B = −δt R_WS ∫₀¹ exp(−[w]× u) du, R_WS after the turn. G Q Gᵀ is
-    δt² diag(R_WS Σ_ω R_WSᵀ, Σ_b). `lost_var` [rad²] is added on top.
+    F = [[I, B], [0, I]] of errors in V, B = −δt R_VS ∫₀¹ exp(−[w]× u) du, R_VS after the turn. G Q Gᵀ is
+    δt² diag(R_VS Σ_ω R_VSᵀ, Σ_b). `lost_var` [rad²] is added on top.
     """
     dt, P = model.dt, load_covariance(state)
-    before = rotation_matrix(state.quat_WS)
-    rotate_by_vector(state.quat_WS, wx, wy, wz)
-    R = rotation_matrix(state.quat_WS)
+    before = rotation_matrix(state.quat_VS)
+    rotate_by_vector(state.quat_VS, wx, wy, wz)
+    R = rotation_matrix(state.quat_VS)
     if model.first_order:  # of errors in S, where F = [[I − [w]×, −δt I], [0, I]]
         turn = multiply(multiply(R, sum_of_three(1.0, -1.0, 0.0, wx, wy, wz)), transpose(before))
         P = rotate_covariance(P, turn)
@@ -333,9 +333,9 @@ def predict(state, model, wx, wy, wz, lost_var):  # type: ignore[no-untyped-def]
 
 @inlined
 def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
-    """Algorithm 1, correction in a static phase; return P and R_WS after it.
+    """Algorithm 1, correction in a static phase; return P and R_VS after it.
 
-    y = [R_WS accel/g; gyro], h = [e_z; b̂], H = [[[e_z]×, 0], [0, I]] of errors in W. A correction of the attitude does
+    y = [R_VS accel/g; gyro], h = [e_z; b̂], H = [[[e_z]×, 0], [0, I]] of errors in V. A correction of the attitude does
     not change e_z, so that P, whose long axis is the heading, need not follow it.
 
     The noises of the two are independent, so gyro is taken first and accel after it, which is the same correction with
@@ -352,7 +352,7 @@ def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-unty
         (b[2], b[5], b[8], c[2], c[4], c[5]),
     )
     P, d = fuse(P, (x, y, z), S, (gx - bias[0], gy - bias[1], gz - bias[2]))
-    # accel: H P = [−y; x; 0] of the rows x, y of P, S = H P Hᵀ + R_WS Σ_g R_WSᵀ; what gyro said is off the innovation.
+    # accel: H P = [−y; x; 0] of the rows x, y of P, S = H P Hᵀ + R_VS Σ_g R_VSᵀ; what gyro said is off the innovation.
     # Its vertical part measures nothing of the state, only the noise that it shares with the others.
     Q, g = rotate_symmetric(R, model.static_accel_cov), model.inverse_gravity
     ax, ay, az = ax * g, ay * g, az * g
@@ -370,12 +370,12 @@ def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-unty
     )
     tx, ty, tz = d[0] + e[0], d[1] + e[1], d[2] + e[2]
     rotate_by_vector(
-        state.quat_WS,
+        state.quat_VS,
         dot(R[0], tx, R[3], ty, R[6], tz),
         dot(R[1], tx, R[4], ty, R[7], tz),
         dot(R[2], tx, R[5], ty, R[8], tz),
     )
-    after_R = rotation_matrix(state.quat_WS)
+    after_R = rotation_matrix(state.quat_VS)
     if model.first_order:  # the paper leaves the covariance in S as it is
         P = rotate_covariance(P, multiply(after_R, transpose(R)))
     bx, by, bz = d[3] + e[3], d[4] + e[4], d[5] + e[5]
@@ -457,7 +457,7 @@ def rotate_covariance(P, A):  # type: ignore[no-untyped-def]
 
 @inlined
 def rotation_matrix(quat):  # type: ignore[no-untyped-def]
-    """R_WS of `quat` (4,) xyzw."""
+    """R_VS of `quat` (4,) xyzw."""
     x, y, z, w = quat[0], quat[1], quat[2], quat[3]
     x2, y2, z2 = x + x, y + y, z + z
     xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2

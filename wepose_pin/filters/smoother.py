@@ -32,18 +32,18 @@ class Smoother:
     """
 
     def __init__(
-        self, noise: SensorNoise, rate_hz: float, quat_WS: np.ndarray, params: AmekfParams | None = None
+        self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: AmekfParams | None = None
     ) -> None:
         self.params = params or AmekfParams()
         self.noise = noise
         self.rate_hz = rate_hz
-        self.quat_WS = np.array(quat_WS, dtype=float)
+        self.quat_VS = np.array(quat_VS, dtype=float)
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
     ) -> FilterRun:
         """Smooth a whole recording; each call starts anew, so a recording cut in two is two recordings."""
-        amekf = Amekf(self.noise, self.rate_hz, self.quat_WS, self.params)
+        amekf = Amekf(self.noise, self.rate_hz, self.quat_VS, self.params)
         is_static = np.ascontiguousarray(np.reshape(static, -1), dtype=np.bool_)
         P_rows = np.ascontiguousarray(amekf.state.P[list(SMOOTHED_STATES)])
         blocks = np.empty(len(is_static) // amekf.block_samples, BLOCK)

@@ -18,7 +18,7 @@ MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
 class StartTilt(NamedTuple):
     """Orientation of a sensor before the first sample of its start phase."""
 
-    quat_WS: np.ndarray  # (4,) xyzw, zero heading
+    quat_VS: np.ndarray  # (4,) xyzw, zero heading
     tilt_std: float  # [rad] one standard deviation of roll and of pitch
 
 

@@ -195,7 +195,7 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     sensors = {}
     for name, sensor in recording.sensors.items():
         signals = (
-            {"orientation": sensor.quat_WS}
+            {"orientation": sensor.quat_VS}
             if isinstance(sensor, OrientationSensor)
             else {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
         )

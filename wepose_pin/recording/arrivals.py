@@ -74,11 +74,11 @@ class Arrivals(NamedTuple):
     accel_S: np.ndarray  # (m, 3) [m/s²]
 
 
-def pack_orientations(quat_WS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pack_orientations(quat_VS: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return orientations (…, 4) xyzw as the six numbers of a sample: (…, 3) qx, qy, qz, and (…, 3) qw, 0, 0."""
-    rest = np.zeros((*quat_WS.shape[:-1], 3))
-    rest[..., 0] = quat_WS[..., 3]
-    return quat_WS[..., :3].copy(), rest
+    rest = np.zeros((*quat_VS.shape[:-1], 3))
+    rest[..., 0] = quat_VS[..., 3]
+    return quat_VS[..., :3].copy(), rest
 
 
 def unpack_orientations(gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
@@ -88,7 +88,7 @@ def unpack_orientations(gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
 
 def list_numbers(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
     """Return the six numbers of each sample, (n, 3), (n, 3): rate and specific force, or packed orientations."""
-    return (sensor.gyro_S, sensor.accel_S) if isinstance(sensor, ImuSensor) else pack_orientations(sensor.quat_WS)
+    return (sensor.gyro_S, sensor.accel_S) if isinstance(sensor, ImuSensor) else pack_orientations(sensor.quat_VS)
 
 
 def order_arrivals(samples: Sequence[Samples], sensors: Sequence[str]) -> Arrivals:

@@ -118,7 +118,7 @@ class Recording:
             Segment → axes of its sensor that point up and forwards in the N-pose, such as ("+z", "+x"); not needed with
             the subject of a calibration.
         **sensors
-            Segment → (gyro_S, accel_S), (n, 3) [rad/s] and (n, 3) [m/s²], or quat_WS, (n, 4) xyzw.
+            Segment → (gyro_S, accel_S), (n, 3) [rad/s] and (n, 3) [m/s²], or quat_VS, (n, 4) xyzw.
 
         Raises
         ------
@@ -144,7 +144,7 @@ class Recording:
             elif isinstance(values, tuple) and len(values) == 2:
                 built[segment] = ImuSensor(*values, mount)
             else:
-                raise BadData(f"{segment}: gyro_S and accel_S, (n, 3) each, or quat_WS, (n, 4), are needed")
+                raise BadData(f"{segment}: gyro_S and accel_S, (n, 3) each, or quat_VS, (n, 4), are needed")
         first = next(iter(sensors.values()), ())
         count = len(first[0] if isinstance(first, tuple) and first else first)
         time = np.arange(count) / rate_hz
@@ -280,7 +280,7 @@ def _check_sensor(place: str, time: np.ndarray, sensor: Sensor) -> None:
     if isinstance(sensor, ImuSensor):
         arrays = {"gyro": (sensor.gyro_S, 3), "accel": (sensor.accel_S, 3)}
     else:
-        arrays = {"orientation": (sensor.quat_WS, 4)}
+        arrays = {"orientation": (sensor.quat_VS, 4)}
     for name, (values, width) in arrays.items():
         check_array(f"{place}.{name}", values, (len(time), width), rows=EACH_TIME)
         bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
@@ -290,7 +290,7 @@ def _check_sensor(place: str, time: np.ndarray, sensor: Sensor) -> None:
                 f"all); fill or cut the gap first"
             )
     if isinstance(sensor, OrientationSensor):
-        length = np.linalg.norm(sensor.quat_WS, axis=1)
+        length = np.linalg.norm(sensor.quat_VS, axis=1)
         k = int(np.argmax(np.abs(length - 1.0)))
         if abs(length[k] - 1.0) > 1e-6:
             raise BadData(f"{place}.orientation: no unit quaternion at {time[k]:.3f} s: length {length[k]:.6g}")

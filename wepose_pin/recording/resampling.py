@@ -25,7 +25,7 @@ def resample(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
         gap = sensor.gap[after] | (sensor.gap[np.maximum(after - 1, 0)] & (clock[after] > time + 1e-9))
     within = np.clip(time, clock[0], clock[-1])
     if isinstance(sensor, OrientationSensor):
-        return replace(sensor, quat_WS=Slerp(clock, Rotation.from_quat(sensor.quat_WS))(within).as_quat(), gap=gap)
+        return replace(sensor, quat_VS=Slerp(clock, Rotation.from_quat(sensor.quat_VS))(within).as_quat(), gap=gap)
     quat = rotations.integrate(sensor.gyro_S[1:] * np.diff(clock)[:, None])
     R = Slerp(clock, Rotation.from_quat(quat))(within)
     rate = rotations.log(rotations.compose(R[:-1].inv(), R[1:]).as_quat()) / np.diff(time)[:, None]

@@ -80,23 +80,23 @@ class OrientationSensor:
 
     Parameters
     ----------
-    quat_WS : (n, 4) xyzw, sensor frame S to a world of the device's own: its z points up, its heading is arbitrary
+    quat_VS : (n, 4) xyzw, sensor frame S to a world V of the device's own: its z points up, its heading is arbitrary
     stated_quat_LS, gap : as in `ImuSensor`
-    aligned : `quat_WS` is the orientation of the segment, not of the sensor, in a world that all aligned sensors
+    aligned : `quat_VS` is the orientation of the segment, not of the sensor, in a world that all aligned sensors
         share; the start pose gives the heading of that world
     """
 
-    quat_WS: np.ndarray
+    quat_VS: np.ndarray
     stated_quat_LS: np.ndarray | None = None
     gap: np.ndarray | None = None
     aligned: bool = False
 
     def __repr__(self) -> str:
-        return format_object(self, lambda: f"{len(self.quat_WS)} samples")
+        return format_object(self, lambda: f"{len(self.quat_VS)} samples")
 
     def part(self, samples: slice | np.ndarray) -> OrientationSensor:
         """Return the sensor at these samples."""
-        return replace(self, quat_WS=self.quat_WS[samples], gap=None if self.gap is None else self.gap[samples])
+        return replace(self, quat_VS=self.quat_VS[samples], gap=None if self.gap is None else self.gap[samples])
 
 
 Sensor = ImuSensor | OrientationSensor
@@ -111,7 +111,7 @@ def join_sensors(parts: Sequence[Sensor]) -> Sensor:
         gyro_S, accel_S = np.concatenate([s.gyro_S for s in imus]), np.concatenate([s.accel_S for s in imus])
         return replace(imus[-1], gyro_S=gyro_S, accel_S=accel_S, gap=gap)
     fused = [part for part in parts if isinstance(part, OrientationSensor)]
-    return replace(fused[-1], quat_WS=np.concatenate([s.quat_WS for s in fused]), gap=gap)
+    return replace(fused[-1], quat_VS=np.concatenate([s.quat_VS for s in fused]), gap=gap)
 
 
 def compute_rate(sensor: Sensor, rate_hz: float) -> np.ndarray:
@@ -121,6 +121,6 @@ def compute_rate(sensor: Sensor, rate_hz: float) -> np.ndarray:
     """
     if isinstance(sensor, ImuSensor):
         return sensor.gyro_S
-    R = Rotation.from_quat(sensor.quat_WS)
+    R = Rotation.from_quat(sensor.quat_VS)
     rate = rotations.log(rotations.compose(R[:-1].inv(), R[1:]).as_quat()) * rate_hz
     return np.concatenate([rate[:1], rate])

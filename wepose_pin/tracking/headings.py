@@ -626,7 +626,7 @@ def _stack_samples(
     for name in names:
         sensor = chunk.sensors[name]
         filtered = sensor if isinstance(sensor, OrientationSensor) else orientations.orientation[name]
-        quats.append(filtered.quat_WS)
+        quats.append(filtered.quat_VS)
         accels.append(find_specific_force(chunk, name))
     return np.stack(quats, axis=1), np.stack(accels, axis=1)
 
@@ -644,7 +644,7 @@ def read_filter_headings(orientation: Mapping[str, Orientation], names: Sequence
     filtered = {i: orientation[name] for i, name in enumerate(names) if name in orientation}
     covs = {i: each.attitude_cov[row] for i, each in filtered.items() if each.attitude_cov is not None}
     if covs:
-        quat_VS = np.stack([filtered[i].quat_WS[row] for i in covs])
+        quat_VS = np.stack([filtered[i].quat_VS[row] for i in covs])
         variance[list(covs)] = compute_heading_variance(quat_VS, np.stack(list(covs.values())))
     for i, each in filtered.items():
         if each.about_vertical is not None:
@@ -674,7 +674,7 @@ def _compute_filter_covariance(orientations: SegmentOrientations, name: str) -> 
     orientation = orientations.orientation.get(name)
     if orientation is None or orientation.attitude_cov is None:
         return None
-    with_heading_V = compute_heading_covariance(Rotation.from_quat(orientation.quat_WS), orientation.attitude_cov)
+    with_heading_V = compute_heading_covariance(Rotation.from_quat(orientation.quat_VS), orientation.attitude_cov)
     R_WV = Rotation.from_rotvec([0.0, 0.0, orientations.heading_offset[name]])
     return R_WV.apply(with_heading_V), with_heading_V[:, 2]
 

@@ -113,7 +113,7 @@ def compute_heading_uncertainties(tracked: TrackedRecording) -> dict[str, Budget
         orientation = tracked.segments.orientation.get(name)
         if orientation is None or orientation.attitude_cov is None:
             continue
-        drift = np.sqrt(np.maximum(compute_heading_variance(orientation.quat_WS, orientation.attitude_cov), 0.0))
+        drift = np.sqrt(np.maximum(compute_heading_variance(orientation.quat_VS, orientation.attitude_cov), 0.0))
         first, last = float(drift[0]), float(drift[-1])
         minutes = float(np.count_nonzero(~orientation.static)) / tracked.recording.rate_hz / 60.0
         growth = max(last - first, 0.0) / minutes if minutes > 0.0 else float("nan")

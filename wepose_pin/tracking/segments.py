@@ -240,9 +240,9 @@ class SegmentEstimator:
         columns = []
         for i, (name, sensor) in enumerate(chunk.sensors.items()):
             if isinstance(sensor, ImuSensor):
-                columns.append(orientation[name].quat_WS)
+                columns.append(orientation[name].quat_VS)
                 continue
-            quat_VS = sensor.quat_WS
+            quat_VS = sensor.quat_VS
             if self._causal and sensor.gap is not None and sensor.gap.any():
                 before = self._recent[self._oldest - 1, i] if len(self._recent) else quat_VS[0]
                 known = np.concatenate([[True], ~sensor.gap])
@@ -305,7 +305,7 @@ class SegmentEstimator:
         if cov is None:
             return None
         variance = np.full(len(self.names), np.nan)
-        variance[~self._measured] = compute_heading_variance(self._filters.quat_WS, cov)
+        variance[~self._measured] = compute_heading_variance(self._filters.quat_VS, cov)
         return variance
 
     def _read_filter_headings(self) -> FilterHeadings:

@@ -40,7 +40,7 @@ def write_session(folder: Path, recording: Recording, truth: Pose | None = None)
         if isinstance(sensor, ImuSensor):
             signals = {"gyro": ("gyr_", sensor.gyro_S), "accel": ("acc_", sensor.accel_S)}
         else:
-            signals = {"orientation": ("q", sensor.quat_WS)}
+            signals = {"orientation": ("q", sensor.quat_VS)}
         for key, (short, values) in signals.items():
             names = [f"{segment}_{short}{c}" for c in "xyzw"[: values.shape[1]]]
             table |= {column: values[:, k] for k, column in enumerate(names)}
