@@ -2,26 +2,27 @@
 
 One of the whole body is a set of joint angles as closed forms of time, of the hips and ankles after Wu et al. 2002, of
 the knees after Grood and Suntay 1983; segment orientations are put together from them here, without the code of the
-angles room. Where the segments and their sensors are follows from the model by Pinocchio. Points are relative to the
-root, midway between the hips, so a person who sits down raises the feet. A person who runs moves the root, which the
-accelerometers measure.
+angles room. Where the segments and their sensors are follows from the model's placements at rest. Points are relative
+to the root, midway between the hips, so a person who sits down raises the feet. A person who runs moves the root, which
+the accelerometers measure.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from ..arguments import Count, Positive, check_arguments
 from ..body import BodyModel, load_model
 from ..body.girdle import PARAMETERS
-from ..body.kinematics import compute_link_poses, solve_configuration
+from ..body.kinematics import compute_link_poses
 from ..errors import BadOption, one_of
 from ..rotations import compose, turn_about
 from .arm_tasks import ArmTasks
@@ -55,6 +56,7 @@ class WholeBodyActivity(Activity):
 
     def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws) -> None:
         super().__init__(model, rng, seconds, flaws)
+        self._carriers = find_carriers(model)
         lengths = self.lengths
         self.p_LS |= {"pelvis": np.array((-0.1, 0.0, 0.02)), "head": np.array((-0.1, 0.0, 0.15))}
         for side, y in SIDES.items():
@@ -86,39 +88,44 @@ class WholeBodyActivity(Activity):
     def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
         return integrate_pulse(t, STAND_S, self.stop, RAMP_S)
 
-    def __call__(self, t: np.ndarray, _segments: Collection[str] = ()) -> BodyPose:
-        """Return the exact pose of all segments at the times `t` (n,) [s]."""
-        R_WL = self._orientations(t)
-        q = solve_configuration(self.model, {segment: R.as_quat() for segment, R in R_WL.items()})
-        frames = self.model.point_frames
-        _, p_W = compute_link_poses(self.model, q, [*R_WL, *frames.values()], rotations=False)
-        origins = {segment: p_W[:, k] for k, segment in enumerate(R_WL)}
-        points = {point: p_W[:, len(R_WL) + k] for k, point in enumerate(frames)}
+    def __call__(self, t: np.ndarray, segments: Collection[str] = tuple(SIDES)) -> BodyPose:
+        """Return the exact pose of the trunk and of the segments' sides at the times `t` (n,) [s]."""
+        sides = [side for side in SIDES if any(segment.startswith(side) for segment in segments)]
+        R_WL = self._orientations(t, sides)
+        p_W: dict[str, np.ndarray] = {}
+        for link, (carrier, place) in self._carriers.items():
+            if link.startswith(tuple(SIDES)) and not link.startswith(tuple(sides)):
+                continue
+            p_W[link] = p_W[carrier] + R_WL[carrier].apply(place) if carrier else np.tile(place, (len(t), 1))
+        origins = {segment: p_W[segment] for segment in R_WL}
+        points = {point: p_W[link] for point, link in self.model.point_frames.items() if link in p_W}
         pose = BodyPose(R_WL, points, origins)
         if self.flaws.girdle.moves:
-            self._move_shoulders(pose, t)
+            self._move_shoulders(pose, t, sides)
         root = self.root(t)
         if root is not None:
             pose = pose._replace(origins={segment: origin + root for segment, origin in origins.items()})
         return pose
 
-    def _move_shoulders(self, pose: BodyPose, t: np.ndarray) -> None:
+    def _move_shoulders(self, pose: BodyPose, t: np.ndarray, sides: Sequence[str]) -> None:
         """Place the arms of a pose on shoulders that move."""
         girdle, R_WT = self.flaws.girdle, pose.R_WL["torso"]
-        for side, y in SIDES.items():
+        for side in sides:
+            y = SIDES[side]
             R_arm = tuple(pose.R_WL[f"{side}_{part}"] for part in ARM)
             along_T = compose(R_WT.inv(), R_arm[0]).apply(-E_Z)
             shoulder_T = place_shoulder(side, self.lengths) + girdle.place(y, self.moving_time(t))
             shoulder_T = shoulder_T + girdle.displace(along_T, y, np.zeros_like(t))
             place_arm(pose, side, pose.origins["torso"] + R_WT.apply(shoulder_T), R_arm, self.lengths)
 
-    def _orientations(self, t: np.ndarray) -> dict[str, Rotation]:
+    def _orientations(self, t: np.ndarray, sides: Sequence[str]) -> dict[str, Rotation]:
         R_WL = {name: Rotation.from_rotvec(turn) for name, turn in self.trunk(t)._asdict().items()}
         start = self.flaws.start_pose
         if start.torso.any() or start.head.any():
             R_WL["torso"] = R_WL["torso"] * Rotation.from_rotvec(start.torso)
             R_WL["head"] = R_WL["head"] * Rotation.from_rotvec(start.head)
-        for side, y in SIDES.items():
+        for side in sides:
+            y = SIDES[side]
             R_WU = compose(R_WL["torso"], self.shoulder(side, t))
             if start.upper_arm[side].any():
                 R_WU = R_WU * Rotation.from_rotvec(start.upper_arm[side])
@@ -132,6 +139,27 @@ class WholeBodyActivity(Activity):
             parts = {"upper_arm": R_WU, "forearm": R_WF, "hand": R_WF, "thigh": R_WT, "shank": R_WS, "foot": R_WA}
             R_WL |= {f"{side}_{part}": R for part, R in parts.items()}
         return R_WL
+
+
+def find_carriers(model: BodyModel) -> dict[str, tuple[str, np.ndarray]]:
+    """Find for the link of each segment and point the segment that carries it and its place (3,) [m] there.
+
+    Carriers come first; what the root carries has an empty carrier.
+    """
+    body, segments = model.pin, list(model.table.segments)
+    joint_of = {
+        link: body.frames[body.getFrameId(link)].parentJoint for link in (*segments, *model.point_frames.values())
+    }
+    segment_of = {joint_of[segment]: segment for segment in segments}
+    links = sorted(joint_of, key=lambda link: (len(body.supports[joint_of[link]]), link not in segments))
+    _, p_W = compute_link_poses(model, pin.neutral(body)[np.newaxis], links, rotations=False)
+    places = dict(zip(links, p_W[0], strict=True))
+    carriers: dict[str, tuple[str, np.ndarray]] = {}
+    for link in links:
+        way = [segment_of[joint] for joint in body.supports[joint_of[link]] if segment_of.get(joint, link) != link]
+        carrier = way[-1] if way else ""
+        carriers[link] = carrier, places[link] - places.get(carrier, 0.0)
+    return carriers
 
 
 class Walk(WholeBodyActivity):
