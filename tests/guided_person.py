@@ -130,7 +130,7 @@ class PersonSource(Source):
         aligned = self.person.orientations == "segment"
         return dict.fromkeys(self.person.worn, aligned) if self.person.orientations else {}
 
-    def open(self, waiting: object = None) -> None: ...
+    def open(self) -> None: ...
 
     def clock(self) -> float:
         return self._now

@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 import pytest
 from bodies import LENGTHS, SEGMENTS
+from sampling import find_free_port
 from test_causal import first
 
 from wepose_pin.body.subject import mount_rows, population_subject, subject_toml
@@ -162,9 +163,6 @@ def test_raw_sensors_without_any_mount_are_refused_before_they_are_waited_for(
 
 
 def test_ctrl_c_stops_the_wait_for_senders_at_once(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
     subject = replace(
         population_subject(),
         mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])},
@@ -172,29 +170,16 @@ def test_ctrl_c_stops_the_wait_for_senders_at_once(tmp_path: Path) -> None:
         covariance=1e-4 * np.eye(len(LENGTHS) + 3),
     )
     (tmp_path / "subject.toml").write_text(subject_toml(subject))
-    command = [sys.executable, "-c", _WAITING, f"udp:{port}"]
+    command = [sys.executable, "-um", "wepose_pin", "live", "--source", f"udp:{find_free_port()}"]
+    command += ["--subject", "subject.toml", "--no-page"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     assert process.stdout is not None
-    assert process.stdout.readline() == "open\n"
+    while "Waiting for samples at UDP" not in (line := process.stdout.readline()):
+        assert line
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert err.splitlines()[-1] == "wepose: stopped; nothing was written"  # in a new clone it compiles before
     assert process.returncode == 130
-
-
-# Says when it waits, so that the interrupt comes neither before nor after.
-_WAITING = """
-import sys
-from wepose_pin.commands import main
-from wepose_pin.live.sources.datagrams import DatagramSource
-find = DatagramSource._find_sensors
-def say(self, *arguments):
-    print("open", flush=True)
-    find(self, *arguments)
-DatagramSource._find_sensors = say
-sys.argv[1:] = ["live", "--source", sys.argv[1], "--subject", "subject.toml", "--no-page"]
-main()
-"""
 
 
 def test_a_session_without_a_start_pose_promises_no_poses(

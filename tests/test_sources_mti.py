@@ -10,16 +10,15 @@ import struct
 import threading
 import time
 import tty
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sampling import collect, connected
 from test_sources_xbus import ACCEL, GYRO, mtdata2, whole
 
 from wepose_pin.errors import BadSource
 from wepose_pin.live.sources import mti, open_source
-from wepose_pin.recording.arrivals import Samples
 
 serial = pytest.importorskip("serial")
 
@@ -126,28 +125,12 @@ def plugged(tmp_path: Path):
             device.pull()
 
 
-def collect(source: mti.MTiSource, enough: Callable[[dict[str, list[Samples]]], bool]) -> dict[str, Samples]:
-    """Samples by sensor until there are enough, or what came in five seconds."""
-    parts: dict[str, list[Samples]] = {}
-    deadline = time.monotonic() + 5.0
-    while not enough(parts) and time.monotonic() < deadline:
-        for samples in source.read(0.05):
-            parts.setdefault(samples.sensor, []).append(samples)
-    return {name: Samples(name, *(np.concatenate([s[k] for s in of]) for k in (1, 2, 3))) for name, of in parts.items()}
-
-
-def count(parts: dict[str, list[Samples]], sensor: str) -> int:
-    return sum(len(samples.time) for samples in parts.get(sensor, []))
-
-
 def test_two_sensors_configured_to_a_rate(plugged) -> None:
     one, two = plugged("one", streaming=True), plugged("two")
-    source = open_source(f"mti:{one.link}=torso,{two.link}=head@50")
-    assert source.sensors == ("torso", "head")
-    assert source.rate_hz == 50
-    source.open()
-    samples = collect(source, lambda p: min(count(p, "torso"), count(p, "head")) >= 40)
-    source.close()
+    with connected(f"mti:{one.link}=torso,{two.link}=head@50") as source:
+        assert source.sensors == ("torso", "head")
+        assert source.rate_hz == 50
+        samples = collect(source, 40, sensors=2)
     for device, name in ((one, "torso"), (two, "head")):
         assert [mid for mid, _ in device.asked] == [0x30, 0xC0, 0x10]
         assert device.asked[1][1] == bytes.fromhex("1020FFFF1060FFFF4020003280200032")
@@ -158,50 +141,38 @@ def test_two_sensors_configured_to_a_rate(plugged) -> None:
     assert source.problems == {}
 
 
-def test_high_rates_are_asked_of_the_hr_outputs(plugged) -> None:
-    device = plugged("one")
-    source = open_source(f"mti:{device.link}=torso@1000", baud=921600)
-    source.open()
-    samples = collect(source, lambda p: count(p, "torso") >= 500)["torso"]
-    source.close()
+def test_the_outputs_that_are_asked_for(plugged) -> None:
+    """High rates of the HR outputs; of a device without them the plain ones; without a rate it stays as it is."""
+    device, plain = plugged("one"), plugged("two", most={0x4020: 400, 0x8020: 400})
+    with connected(f"mti:{device.link}=torso@1000", baud=921600) as source:
+        samples = collect(source, 500)["torso"]
     assert {kind for kind, _ in device.items} == {0x4040, 0x8040}
     assert np.diff(samples.time).mean() == pytest.approx(0.001, rel=0.0101)
-
-
-def test_a_device_without_hr_is_asked_for_the_plain_outputs(plugged) -> None:
-    device = plugged("one", most={0x4020: 400, 0x8020: 400})
-    source = open_source(f"mti:{device.link}=torso@400")
-    source.open()
-    source.close()
-    assert device.items == [(0x4020, 400), (0x8020, 400)]
+    with connected(f"mti:{plain.link}=torso@400"):
+        assert plain.items == [(0x4020, 400), (0x8020, 400)]
+    measuring, waiting = plugged("three", streaming=True), plugged("four")
+    with connected(f"mti:{measuring.link}=torso,{waiting.link}=head") as source:
+        collect(source, 5, sensors=2)
+    assert measuring.asked == []
+    assert [mid for mid, _ in waiting.asked] == [0x10]
 
 
 def test_a_rate_that_the_device_has_not(plugged) -> None:
     device = plugged("one", most={0x4020: 100, 0x8020: 100, 0x4040: 1000, 0x8040: 800})
-    with pytest.raises(BadSource, match=r"at 1000 Hz; it offers RateOfTurnHR at 800 Hz, .*; choose a rate"):
-        open_source(f"mti:{device.link}=torso@1000").open()
-    device.error = 0x21
-    with pytest.raises(BadSource, match="RateOfTurn: a parameter is not one it knows"):
-        open_source(f"mti:{device.link}=torso@100").open()
-
-
-def test_a_device_is_left_as_it_is_set_up_without_a_rate(plugged) -> None:
-    measuring, waiting = plugged("one", streaming=True), plugged("two")
-    source = open_source(f"mti:{measuring.link}=torso,{waiting.link}=head")
-    source.open()
-    collect(source, lambda p: min(count(p, "torso"), count(p, "head")) >= 5)
-    source.close()
-    assert measuring.asked == []
-    assert [mid for mid, _ in waiting.asked] == [0x10]
+    for rate, error, said in (
+        (1000, None, r"at 1000 Hz; it offers RateOfTurnHR at 800 Hz, .*; choose a rate"),
+        (100, 0x21, "RateOfTurn: a parameter is not one it knows"),
+    ):
+        device.error = error
+        with pytest.raises(BadSource, match=said), connected(f"mti:{device.link}=torso@{rate}"):
+            pass
 
 
 def test_noise_is_counted_and_no_sample_lost(plugged) -> None:
     device = plugged("one")
     device.noise = b"\xfa\xff\x36\x05noise\x00"
-    source = open_source(f"mti:{device.link}=torso@100")
-    source.open()
-    samples = collect(source, lambda p: count(p, "torso") >= 60)["torso"]
-    source.close()
+    with connected(f"mti:{device.link}=torso@100") as source:
+        samples = collect(source, 60)["torso"]
     assert len(samples.time) >= 60
     np.testing.assert_allclose(np.diff(samples.time), 0.01, rtol=0.0101)
     assert source.problems["bytes skipped"] >= 59 * len(device.noise)
@@ -211,98 +182,52 @@ def test_noise_is_counted_and_no_sample_lost(plugged) -> None:
 def test_a_port_that_vanishes_is_taken_up_again(plugged) -> None:
     """The other sensor goes on; the one that comes back is configured anew, its clock begins anew."""
     gone, stays = plugged("one"), plugged("two")
-    source = open_source(f"mti:{gone.link}=torso,{stays.link}=head@100")
-    source.open()
-    collect(source, lambda p: count(p, "torso") >= 20)
-    gone.pull()
-    between = collect(source, lambda p: count(p, "head") >= 30)
-    assert len(between["head"].time) >= 30
-    assert source.problems["connections lost to torso"] == 1
-    gone.measuring, gone.ticks = False, 0
-    gone.plug()
-    samples = collect(source, lambda p: count(p, "torso") >= 20)["torso"]
-    assert len(samples.time) >= 20
-    assert abs(samples.time[-1] - source.clock()) < 0.5
-    assert source.problems["reconnections of torso"] == 1
-    assert [mid for mid, _ in gone.asked] == [0x30, 0xC0, 0x10] * 2
-    source.close()
+    with connected(f"mti:{gone.link}=torso,{stays.link}=head@100") as source:
+        collect(source, 20, sensors=2)
+        gone.pull()
+        between = collect(source, 30)
+        assert len(between["head"].time) >= 30
+        assert source.problems["connections lost to torso"] == 1
+        gone.measuring, gone.ticks = False, 0
+        gone.plug()
+        samples = collect(source, 20, sensors=2)["torso"]
+        assert len(samples.time) >= 20
+        assert abs(samples.time[-1] - source.clock()) < 0.5
+        assert source.problems["reconnections of torso"] == 1
+        assert [mid for mid, _ in gone.asked] == [0x30, 0xC0, 0x10] * 2
 
 
 def test_a_device_that_falls_silent_is_woken(plugged, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mti, "SILENT_S", 0.2)
     device = plugged("one")
-    source = open_source(f"mti:{device.link}=torso@100")
-    source.open()
-    collect(source, lambda p: count(p, "torso") >= 20)
-    device.measuring = False  # its supply failed, it starts in config state, the port stays
-    while source.read(0.1):
-        pass
-    samples = collect(source, lambda p: count(p, "torso") >= 20)
-    source.close()
-    assert len(samples["torso"].time) >= 20
+    with connected(f"mti:{device.link}=torso@100") as source:
+        collect(source, 20)
+        device.measuring = False  # its supply failed, it starts in config state, the port stays
+        while source.read(0.1):
+            pass
+        assert len(collect(source, 20)["torso"].time) >= 20
 
 
-def test_nothing_there(tmp_path: Path, plugged, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_port_is_waited_for_and_what_is_wrong_is_said(
+    tmp_path: Path, plugged, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(mti, "ANSWER_S", 0.05)
-    with pytest.raises(BadSource, match=r"cannot open the port \(.*No such file"):
-        open_source(f"mti:{tmp_path / 'none'}=torso@100").open()
+    path = tmp_path / "one"
+    unset, source = open_source(f"mti:{path}=torso"), open_source(f"mti:{path}=torso@100")
+    place = f"the MTi of torso at {path}: "
+    assert not source.connect(0.0)
+    assert source.describe_awaited() == f"{place}cannot open the port (No such file or directory)"
     device = plugged("one")
     device.deaf = True
-    with pytest.raises(BadSource, match="no MTi answers at 115200 baud"):
-        open_source(f"mti:{device.link}=torso@100").open()
-    with pytest.raises(BadSource, match="no MTData2 comes at 115200 baud"):
-        open_source(f"mti:{device.link}=torso").open()
-
-
-def test_a_port_is_waited_for(tmp_path: Path, plugged) -> None:
-    source, said = open_source(f"mti:{tmp_path / 'two'}=torso@100"), []
-
-    def wait(text: str) -> bool:
-        said.append(text)
-        if len(said) == 2:
-            plugged("two")
-        return len(said) < 20
-
-    source.open(wait)
-    try:
-        place = tmp_path / "two"
-        assert said[0] == f"Waiting for the MTi of torso at {place}: cannot open the port (No such file or directory)."
-        assert collect(source, lambda p: count(p, "torso") >= 5)
-    finally:
-        source.close()
-    gone = open_source(f"mti:{tmp_path / 'three'}=torso@100")
-    gone.open(lambda _text: False)  # the user has had enough
-    assert gone.sensors == ()
-
-
-def test_a_device_that_is_switched_off_is_waited_for(plugged, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mti, "ANSWER_S", 0.05)
-    device, said = plugged("one"), []
-    device.deaf = True
-
-    def wait(text: str) -> bool:
-        said.append(text)
-        device.deaf = False
-        return len(said) < 20
-
-    source = open_source(f"mti:{device.link}=torso@100")
-    source.open(wait)
-    try:
-        assert said == [f"Waiting for the MTi of torso at {device.link}: no MTi answers at 115200 baud."]
-        assert collect(source, lambda p: count(p, "torso") >= 5)
-        assert source.describe_awaited(["torso"]) == f"MTi sensors: torso at {device.link}"
-    finally:
-        source.close()
-
-
-def test_close_frees_the_ports_and_may_be_repeated(plugged) -> None:
-    device = plugged("one")
-    source = open_source(f"mti:{device.link}=torso@100")
-    for _ in range(2):
-        source.open()
-        with pytest.raises(BadSource, match="cannot open the port"):
-            open_source(f"mti:{device.link}=torso@100").open()
-        collect(source, lambda p: count(p, "torso") >= 5)
-        source.close()
-        source.close()
+    for waiting, said in ((unset, "no MTData2 comes at 115200 baud"), (source, "no MTi answers at 115200 baud")):
+        assert not waiting.connect(0.0)
+        assert waiting.describe_awaited().startswith(place + said)
+    device.deaf = False
+    with connected(source):
+        assert source.describe_awaited(["torso"]) == f"MTi sensors: torso at {path}"
+        assert collect(source, 5)
+        assert not unset.connect(0.0)
+        assert "cannot open the port" in unset.describe_awaited()
+    with connected(source):  # the port is free again
+        assert collect(source, 5)
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("mti ")]

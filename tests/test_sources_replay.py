@@ -104,6 +104,11 @@ def test_measured_orientations_come_as_six_numbers() -> None:
         ("mti:/dev/a=torso@fast", {}, "rate 'fast'"),
         ("mti:/dev/a=torso", {"sensors": ["head"]}, "no device for head"),
         ("udp:9000", {"sensors": ["trunk"]}, "'trunk' is not a segment"),
+        ("udp:9000,gyro_unit=rpm", {}, "gyro_unit 'rpm' is not known; there is: rad/s, deg/s"),
+        ("udp:9000,unit=g", {}, "'unit=g' is no unit"),
+        ("slimevr:0.0.0.0:70000", {}, "70000: a port or HOST:PORT"),
+        ("slimevr:,4c:11=torso,4c:12=torso", {}, "'4c:12=torso': each device and each segment is named once"),
+        ("slimevr:,torso", {}, "'torso' is no DEVICE=SEGMENT, as 4c:11:ae:00:00:01/0=torso"),
     ],
 )
 def test_a_wrong_spec_says_what_is_right(spec: str, options: dict, words: str) -> None:

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bodies import SEGMENTS
+from sampling import collect, connected, find_free_port
 
-from wepose_pin.errors import BadOption, BadSource
-from wepose_pin.live.sources import open_source, packets
+from wepose_pin.errors import BadSource
+from wepose_pin.live.sources import open_source
 from wepose_pin.live.sources.base import MAX_KINDS
-from wepose_pin.live.sources.udp import UdpSource
-from wepose_pin.recording.arrivals import Samples
+from wepose_pin.live.sources.udp import NUMBERS, UdpSource, decode
 from wepose_pin.recording.limits import STANDARD_GRAVITY
 
 GOOD = {"sensor": "torso", "t": 12.345, "gyro": [0.1, -0.2, 0.3], "accel": [0.0, 0.5, 9.81]}
@@ -35,10 +35,8 @@ def binary(number: int, times: list[float], values: list[list[float]], version: 
 
 @pytest.fixture
 def source() -> Iterator[UdpSource]:
-    source = UdpSource("127.0.0.1", 0, SEGMENTS)
-    source.open()
-    yield source
-    source.close()
+    with connected(UdpSource("127.0.0.1", 0, SEGMENTS)) as source:
+        yield source
 
 
 @pytest.fixture
@@ -47,20 +45,10 @@ def sender() -> Iterator[socket.socket]:
         yield sender
 
 
-def read_until(source: UdpSource, count: int) -> dict[str, Samples]:
-    """Samples by sensor, put together, as soon as there are `count` of them, or what came in two seconds."""
-    parts: dict[str, list[Samples]] = {}
-    deadline = time.monotonic() + 2.0
-    while sum(len(s.time) for of in parts.values() for s in of) < count and time.monotonic() < deadline:
-        for samples in source.read(0.05):
-            parts.setdefault(samples.sensor, []).append(samples)
-    return {name: Samples(name, *(np.concatenate([s[k] for s in of]) for k in (1, 2, 3))) for name, of in parts.items()}
-
-
 def test_a_json_line_may_say_the_charge_of_the_battery(source: UdpSource, sender: socket.socket) -> None:
     for line in (GOOD, GOOD | {"t": 12.355, "battery": 0.4}, GOOD | {"t": 12.365}, GOOD | {"t": 12.375, "battery": 40}):
         sender.sendto(json.dumps(line).encode(), source.address)
-    assert len(read_until(source, 3)["torso"].time) == 3
+    assert len(collect(source, 3)["torso"].time) == 3
     assert source.batteries == {"torso": 0.4}
     assert source.problems == {"JSON lines whose battery is not a share, 0 to 1": 1}
 
@@ -68,7 +56,7 @@ def test_a_json_line_may_say_the_charge_of_the_battery(source: UdpSource, sender
 def test_a_json_line_of_one_sample(source: UdpSource, sender: socket.socket) -> None:
     before = time.monotonic()
     sender.sendto(json.dumps(GOOD).encode(), source.address)
-    samples = read_until(source, 1)["torso"]
+    samples = collect(source, 1)["torso"]
     np.testing.assert_array_equal(samples.gyro_S, [GOOD["gyro"]])
     np.testing.assert_array_equal(samples.accel_S, [GOOD["accel"]])
     assert before <= samples.time[0] <= source.clock()
@@ -79,35 +67,23 @@ def test_a_json_line_of_one_sample(source: UdpSource, sender: socket.socket) -> 
 def test_a_sender_states_its_units(sender: socket.socket, stated: str) -> None:
     units = {"gyro_unit": "deg/s", "accel_unit": "g"}
     options = ",gyro_unit=deg/s,accel_unit=g" if stated == "source" else ""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        spec = f"udp:{free.getsockname()[1]}{options}"
-    source = open_source(spec, sensors=["torso", "head"])
+    source = open_source(f"udp:{find_free_port()}{options}", sensors=["torso", "head"])
     source.open()
     lines = [GOOD | units] if stated == "line" else [GOOD, GOOD | {"sensor": "head", "gyro_unit": "rad/s"}]
     for line in lines:
         sender.sendto(json.dumps(line).encode(), source.address)
-    samples = read_until(source, len(lines))
+    samples = collect(source, 1, sensors=len(lines))
     np.testing.assert_allclose(samples["torso"].gyro_S, [np.deg2rad(GOOD["gyro"])])
     np.testing.assert_allclose(samples["torso"].accel_S, [np.multiply(STANDARD_GRAVITY, GOOD["accel"])])
     if stated == "source":
         np.testing.assert_array_equal(samples["head"].gyro_S, [GOOD["gyro"]])
         sender.sendto(binary(0, [12.4], [[90.0, 0, 0, 0, 0, 1.0]]), source.address)
-        np.testing.assert_allclose(read_until(source, 1)["torso"].gyro_S, [[0.5 * np.pi, 0, 0]])
+        np.testing.assert_allclose(collect(source, 1)["torso"].gyro_S, [[0.5 * np.pi, 0, 0]])
     assert source.problems == {}
     sender.sendto(json.dumps(GOOD | {"gyro_unit": "rpm"}).encode(), source.address)
     assert source.read(0.2) == []
     assert list(source.problems) == ["JSON lines with gyro_unit 'rpm'; there is: rad/s, deg/s"]
     source.close()
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [("gyro_unit=rpm", "gyro_unit 'rpm' is not known; there is: rad/s, deg/s"), ("unit=g", "'unit=g' is no unit")],
-)
-def test_units_that_are_none_are_refused(options: str, said: str) -> None:
-    with pytest.raises(BadOption, match=said):
-        open_source(f"udp:9000,{options}")
 
 
 def test_many_lines_and_lists_of_samples(source: UdpSource, sender: socket.socket) -> None:
@@ -116,7 +92,7 @@ def test_many_lines_and_lists_of_samples(source: UdpSource, sender: socket.socke
     many = {"sensor": "head", "t": times, "gyro": rows[:, :3].tolist(), "accel": rows[:, 3:].tolist()}
     lines = "\r\n".join([json.dumps(many), "", json.dumps({**GOOD, "t": 100.04, "extra": "passed over"})]) + "\n"
     sender.sendto(lines.encode(), source.address)
-    samples = read_until(source, 6)
+    samples = collect(source, 1, sensors=2)
     np.testing.assert_array_equal(np.column_stack([samples["head"].gyro_S, samples["head"].accel_S]), rows)
     np.testing.assert_allclose(np.diff(samples["head"].time), 0.01, atol=1e-9)
     assert samples["torso"].time[0] == pytest.approx(samples["head"].time[4], abs=1e-9)
@@ -126,13 +102,13 @@ def test_a_binary_packet(source: UdpSource, sender: socket.socket) -> None:
     rows = np.random.default_rng(2).normal(size=(40, 6)).astype(np.float32)
     times = [1.7e9 + k / 1000.0 for k in range(40)]
     sender.sendto(binary(3, times, rows.tolist()), source.address)
-    samples = read_until(source, 40)["right_upper_arm"]
+    samples = collect(source, 40)["right_upper_arm"]
     np.testing.assert_array_equal(np.column_stack([samples.gyro_S, samples.accel_S]), rows)
     np.testing.assert_allclose(np.diff(samples.time), 0.001, atol=1e-6)
 
 
 def test_the_numbers_of_sensors_are_all_segments() -> None:
-    assert sorted(packets.NUMBERS) == sorted(SEGMENTS)
+    assert sorted(NUMBERS) == sorted(SEGMENTS)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +147,7 @@ def test_what_is_wrong_is_counted_and_the_next_is_read(
 ) -> None:
     sender.sendto(datagram, source.address)
     sender.sendto(json.dumps(GOOD).encode(), source.address)
-    received = read_until(source, 1)
+    received = collect(source, 1)
     assert [len(samples.time) for samples in received.values()] == [1]
     assert [kind.startswith(problem) for kind in source.problems] == [True]
     assert list(source.problems.values()) == [1]
@@ -182,52 +158,36 @@ def test_the_examples_of_the_page_are_read() -> None:
     lines = re.findall(r"```json\n(.*?)\n```", page, re.DOTALL)
     assert len(lines) == 2
     for line in lines:
-        batches, problems = packets.decode(line.encode())
+        batches, problems = decode(line.encode())
         assert problems == []
         assert len(batches) == 1
     [packet] = re.findall(r"```text\n(.*?)\n```", page, re.DOTALL)
-    [batch], problems = packets.decode(bytes.fromhex(packet))
+    [batch], problems = decode(bytes.fromhex(packet))
     assert (batch.sensor, problems) == ("torso", [])
     np.testing.assert_allclose(batch.time, [12.5, 12.51], atol=1e-9)
     np.testing.assert_allclose(
         batch.values, [[0.1, -0.2, 0.3, 0, 0.5, 9.81], [0.125, -0.25, 0.5, 0, 0.5, 9.75]], rtol=1e-7
     )
-    for number, name in enumerate(packets.NUMBERS):
+    for number, name in enumerate(NUMBERS):
         assert f"{number} {name}" in page
 
 
-def test_two_senders_with_clocks_of_their_own() -> None:
+def test_two_senders_with_clocks_of_their_own(source: UdpSource, sender: socket.socket) -> None:
     """Sent at the same moment, their samples have the same time."""
-    with UdpPair() as (source, first, second):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         for k in range(20):
-            first.sendto(json.dumps({**GOOD, "t": 5000.0 + k / 100}).encode(), source.address)
-            second.sendto(json.dumps({**GOOD, "t": k / 100, "sensor": "head"}).encode(), source.address)
+            sender.sendto(json.dumps({**GOOD, "t": 5000.0 + k / 100}).encode(), source.address)
+            other.sendto(json.dumps({**GOOD, "t": k / 100, "sensor": "head"}).encode(), source.address)
             time.sleep(0.01)
-        samples = read_until(source, 40)
-        assert np.abs(samples["torso"].time - samples["head"].time).max() < 0.02
-
-
-class UdpPair:
-    def __enter__(self) -> tuple[UdpSource, socket.socket, socket.socket]:
-        self.all = (
-            UdpSource("127.0.0.1", 0, ["torso", "head"]),
-            *(socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)),
-        )
-        self.all[0].open()
-        return self.all
-
-    def __exit__(self, *_: object) -> None:
-        for one in self.all:
-            one.close()
+        samples = collect(source, 20, sensors=2)
+    assert np.abs(samples["torso"].time - samples["head"].time).max() < 0.02
 
 
 def test_a_sensor_that_is_not_tracked_is_counted(sender: socket.socket) -> None:
-    source = UdpSource("127.0.0.1", 0, ["head"])
-    source.open()
-    sender.sendto(json.dumps(GOOD).encode(), source.address)
-    assert source.read(0.2) == []
+    with connected(UdpSource("127.0.0.1", 0, ["head"])) as source:
+        sender.sendto(json.dumps(GOOD).encode(), source.address)
+        assert source.read(0.2) == []
     assert source.problems == {"samples of torso, which is not tracked": 1}
-    source.close()
 
 
 def test_kinds_of_problems_are_bounded(source: UdpSource, sender: socket.socket) -> None:
@@ -239,24 +199,23 @@ def test_kinds_of_problems_are_bounded(source: UdpSource, sender: socket.socket)
 
 
 def test_sensors_are_found_where_they_are_not_given(sender: socket.socket) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    source = open_source(f"udp:{port}", wait_s=5.0)
-    assert isinstance(source, UdpSource)
-    assert source.address == ("127.0.0.1", port)
+    port = find_free_port()
+    source = open_source(f"udp:{port}")
+    source.open()
+    assert not source.connect(0.05)
+    assert f"samples at UDP 127.0.0.1:{port} (this machine only)" in source.describe_awaited()
 
     def send() -> None:
         for k in range(30):
             # The second sensor begins when the first has long been seen.
             for name in ("torso", "left_forearm") if k > 8 else ("torso",):
-                sender.sendto(json.dumps({**GOOD, "sensor": name, "t": k / 20}).encode(), source.address)
+                sender.sendto(json.dumps({**GOOD, "sensor": name, "t": k / 20}).encode(), ("127.0.0.1", port))
             time.sleep(0.05)
 
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        source.open()
+        assert source.connect(5.0)
         assert source.sensors == ("torso", "left_forearm")
         thread.join()
         waited = source.read(0.1)  # what came while it waited is not lost, and comes once
@@ -268,23 +227,10 @@ def test_sensors_are_found_where_they_are_not_given(sender: socket.socket) -> No
         source.close()
 
 
-def test_nobody_sends() -> None:
-    source = UdpSource("127.0.0.1", 0, wait_s=0.2)
-    with pytest.raises(BadSource, match=r"nothing came within 0\.2 s from samples at UDP"):
-        source.open()
-
-
-def test_a_port_in_use_is_told(source: UdpSource) -> None:
-    other = UdpSource(*source.address, ["torso"])
-    with pytest.raises(BadSource, match="cannot listen there"):
-        other.open()
-
-
-def test_close_frees_the_port_and_may_be_repeated() -> None:
-    source = UdpSource("127.0.0.1", 0, ["torso"])
-    source.open()
-    source.close()
-    source.close()
-    again = UdpSource(*source.address, ["torso"])
-    again.open()
-    again.close()
+def test_a_port_in_use_is_told_and_close_frees_it() -> None:
+    with connected(UdpSource("127.0.0.1", 0, ["torso"])) as source:
+        other = UdpSource(*source.address, ["torso"])
+        with pytest.raises(BadSource, match="cannot listen there"):
+            other.open()
+    with connected(other):
+        assert other.address == source.address

@@ -116,9 +116,9 @@ def test_a_wrong_checksum_and_a_cut_frame_cost_themselves_only() -> None:
 @pytest.mark.parametrize("axes", [0x0, 0x4, 0x8])  # ENU, NED, NWU: of the world, not of the sensor
 def test_every_way_to_write_numbers(form: str, axes: int) -> None:
     data = mtdata2(77, (0x8020 | axes, GYRO), (0x4020 | axes, ACCEL), form=form)
-    assert xbus.parse_packet(data) == (77, tuple(GYRO), tuple(ACCEL), None, None)
+    assert xbus.parse_packet(data) == {0x1060: (77,), 0x8020: tuple(GYRO), 0x4020: tuple(ACCEL)}
     data = mtdata2(77, (0x8040 | axes, GYRO), (0x4040 | axes, ACCEL), form=form)
-    assert xbus.parse_packet(data) == (77, None, None, tuple(GYRO), tuple(ACCEL))
+    assert xbus.parse_packet(data) == {0x1060: (77,), 0x8040: tuple(GYRO), 0x4040: tuple(ACCEL)}
 
 
 def test_a_packet_of_a_device() -> None:
@@ -130,9 +130,9 @@ def test_a_packet_of_a_device() -> None:
         "301004000186E1E0200400400003"
     )
     packet = xbus.parse_packet(data)
-    assert packet.ticks == 20332454
-    assert packet.accel == pytest.approx((-0.05550629, 9.81465530, 0.21842313), abs=1e-8)
-    assert packet.gyro == pytest.approx((0.02131760, -0.00327826, -0.00163019), abs=1e-8)
+    assert packet[xbus.SAMPLE_TIME_FINE] == (20332454,)
+    assert packet[xbus.ACCELERATION] == pytest.approx((-0.05550629, 9.81465530, 0.21842313), abs=1e-8)
+    assert packet[xbus.RATE_OF_TURN] == pytest.approx((0.02131760, -0.00327826, -0.00163019), abs=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -212,8 +212,8 @@ def test_packets_without_a_time_are_counted() -> None:
 
 
 def test_what_is_asked_of_a_device() -> None:
-    assert xbus.build_output_items(100, hr=False) == bytes.fromhex("1020FFFF 1060FFFF 40200064 80200064")
-    assert xbus.build_output_items(1000, hr=True) == bytes.fromhex("1020FFFF 1060FFFF 404003E8 804003E8")
+    assert xbus.build_output_items(100, 0x8020, 0x4020) == bytes.fromhex("1020FFFF 1060FFFF 40200064 80200064")
+    assert xbus.build_output_items(1000, 0x8040, 0x4040) == bytes.fromhex("1020FFFF 1060FFFF 404003E8 804003E8")
     assert xbus.read_rates(bytes.fromhex("1060FFFF 40230190 80")) == {0x1060: 0xFFFF, 0x4020: 400}
     assert xbus.describe_error(b"\x21") == "a parameter is not one it knows"
     assert xbus.describe_error(b"\x77") == "error 0x77"

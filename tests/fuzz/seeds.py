@@ -17,7 +17,7 @@ import wepose_pin
 from wepose_pin.assets import asset
 from wepose_pin.body.subject import population_subject, subject_toml
 from wepose_pin.live.sources import xbus
-from wepose_pin.live.sources.packets import CRC, HEADER, MAGIC, SAMPLE
+from wepose_pin.live.sources.udp import CRC, HEADER, MAGIC, SAMPLE
 
 N = 12
 TIME = np.arange(N) / 100.0

@@ -22,7 +22,7 @@ APART = b"\n\n"  # between datagrams
 def datagram(_folder: Path, data: bytes) -> object:
     """The input is one datagram, decoded."""
     from wepose_pin.live.sources.clocks import HostClock
-    from wepose_pin.live.sources.packets import decode
+    from wepose_pin.live.sources.udp import decode
 
     batches, problems = decode(data)
     if not all(problem.isprintable() for problem in problems):
@@ -90,7 +90,7 @@ def lsl(_folder: Path, data: bytes) -> object:
 
     stream, *rest = data.decode("utf-8", errors="replace").split("\n")
     labels, units = rest[::2], rest[1::2]
-    return find_channels(stream, "imu", labels, units, len(labels))
+    return find_channels(stream, "imu", labels, units, len(labels), TORSO_HEAD)
 
 
 SAMPLE = np.dtype([("which", "u1"), ("time", "<f8"), ("gyro", "<f4", 3), ("accel", "<f4", 3)])
@@ -113,7 +113,7 @@ class _Wild:
         self._rows = np.frombuffer(data[: len(data) // SAMPLE.itemsize * SAMPLE.itemsize], SAMPLE)
         self._at = 0
 
-    def open(self, waiting: object = None) -> None: ...
+    def open(self) -> None: ...
 
     def close(self) -> None: ...
 

@@ -259,7 +259,7 @@ TARGETS = (
     Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML, "body.body"),
     Target("retarget", lambda: [seeds.ARM.encode()], file("arm.urdf", _retargeted), XML, "retargeting.robot"),
     Target("srdf", lambda: [seeds.SRDF], file("arm.srdf", _srdf), XML, "retargeting.collision"),
-    Target("datagram", seeds.datagrams, streams.datagram, JSON, "live.sources.packets"),
+    Target("datagram", seeds.datagrams, streams.datagram, JSON, "live.sources.udp"),
     Target("udp", lambda: [streams.APART.join(seeds.datagrams())], streams.udp, JSON, "live.sources.udp"),
     Target("xbus", lambda: [seeds.serial()], streams.serial, (), "live.sources.xbus"),
     Target("lsl", lambda: [LSL], streams.lsl, (), "live.sources.lsl"),

@@ -11,7 +11,7 @@ import numpy as np
 from ..documents import read_toml, toml_key, toml_string, whole_file
 from ..errors import BadSession
 from ..recording.arrivals import Samples, unpack_orientations
-from .sources.base import Source, Waiting
+from .sources.base import Source
 
 SETUP_FILE = "setup.toml"
 SETUP_FORMAT = 1
@@ -110,14 +110,17 @@ class AssignedSource(Source):
         """As of the source, by segment."""
         return {self.segments[name]: own for name, own in self.source.orientations.items() if name in self.segments}
 
-    def open(self, waiting: Waiting | None = None) -> None:
+    def open(self) -> None:
         """Open the source; of one that is open already, leave out what has come so far."""
         if self._is_open:
             while self.source.read(0.0):
                 pass
         else:
-            self.source.open(waiting)
-            self._is_open = True
+            self.source.open()
+
+    def connect(self, timeout_s: float) -> bool:
+        """As of the source."""
+        return self._is_open or self.source.connect(timeout_s)
 
     def read(self, timeout_s: float) -> list[Samples] | None:
         """Samples of the assigned sensors since the last call; None at the end."""

@@ -25,6 +25,8 @@ from .sources.base import Source
 from .sources.replay import ReplaySource
 from .state import Output, Status
 
+CONNECT_S = 0.2  # [s] for which a source searches before the user is asked again
+
 
 def run_session(
     source: Source,
@@ -86,26 +88,24 @@ def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[],
     ------
     KeyboardInterrupt
         `until` returns True meanwhile.
+    WeposeError
+        There is no such source.
     """
-    stopped = False
-
-    def show(message: str) -> bool:
-        nonlocal stopped
-        for output in outputs:
-            output.status(Status("waiting", message, 0.0, 0.0, (), (0.0, 0.0), 0.0, dict(source.problems)))
-        if until():
-            raise KeyboardInterrupt
-        stopped = "quit" in [request.kind for output in outputs for request in output.take_requests()]
-        return not stopped
-
     try:
-        source.open(show)
-    except KeyboardInterrupt:
+        source.open()
+        while not source.connect(CONNECT_S):
+            message = f"Waiting for {source.describe_awaited()}."
+            for output in outputs:
+                output.status(Status("waiting", message, 0.0, 0.0, (), (0.0, 0.0), 0.0, dict(source.problems)))
+            if until():
+                raise KeyboardInterrupt
+            if "quit" in [request.kind for output in outputs for request in output.take_requests()]:
+                source.close()
+                return False
+    except BaseException:
         source.close()
         raise
-    if stopped:
-        source.close()
-    return not stopped
+    return True
 
 
 def warm_up(method: str) -> None:

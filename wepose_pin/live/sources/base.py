@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -12,14 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...errors import BadOption, BadSource, one_of
+from ...errors import BadOption, one_of
 from ...recording.arrivals import Samples
 from ...recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
 
-# Called a few times a second with what is awaited and where; False: no longer.
-Waiting = Callable[[str], bool]
-
-POLL_S = 0.2  # [s] between two such calls
 MAX_KINDS = 24  # of problems
 # Seconds since 1970 have ten digits; larger times are in another unit, or damaged.
 MAX_TIME = 1e10  # [s]
@@ -39,7 +34,6 @@ class SourceOptions:
     any_name : sensors may have any name, and begin to send at any time; they are assigned to segments later
     speed : of a replay: 1.0 its own, 4.0 four times that, "max" as fast as possible
     baud : of serial ports
-    wait_s : [s] for which `Source.open` waits for streams or senders
     """
 
     spec: str
@@ -48,7 +42,10 @@ class SourceOptions:
     any_name: bool = False
     speed: float | str = 1.0
     baud: int = 115200
-    wait_s: float = 10.0
+
+    def error(self, reason: str) -> BadOption:
+        """The error that refuses the spec."""
+        return BadOption(f"source '{self.spec}': {reason}")
 
     def read_pairs(self, text: str, example: str) -> dict[str, str]:
         """Segment → device of ``DEVICE=SEGMENT,…``; raises `BadOption`."""
@@ -56,24 +53,24 @@ class SourceOptions:
         for pair in text.split(","):
             device, equals, segment = pair.rpartition("=")
             if not equals or not device:
-                raise BadOption(f"source '{self.spec}': '{pair}' is no DEVICE=SEGMENT, as {example}={self.segments[0]}")
+                raise self.error(f"'{pair}' is no DEVICE=SEGMENT, as {example}={self.segments[0]}")
             self.check_segment(segment)
             if segment in devices or device in devices.values():
-                raise BadOption(f"source '{self.spec}': '{pair}': each device and each segment is named once")
+                raise self.error(f"'{pair}': each device and each segment is named once")
             devices[segment] = device
         return devices
 
     def check_segment(self, name: str) -> None:
         """Raise `BadOption` where this is not the name of a segment."""
         if name not in self.segments:
-            raise BadOption(f"source '{self.spec}': '{name}' is not a segment; {one_of(self.segments, name)}")
+            raise self.error(f"'{name}' is not a segment; {one_of(self.segments, name)}")
 
     def choose(self, present: Iterable[str], kind: str) -> tuple[str, ...]:
         """The sensors to take of those that are present; raises `BadOption` where one is not."""
         present = tuple(present)
         for name in self.sensors or ():
             if name not in present:
-                raise BadOption(f"source '{self.spec}': no {kind} {name}; {one_of(present, name)}")
+                raise self.error(f"no {kind} {name}; {one_of(present, name)}")
         return present if self.sensors is None else self.sensors
 
 
@@ -91,7 +88,7 @@ class SourceKind(NamedTuple):
 
 
 class Source(ABC):
-    """Samples of several sensors as they come.
+    """Samples of several sensors as they come: `open` it, `connect` until that returns True, `read`, `close`.
 
     Attributes
     ----------
@@ -128,12 +125,12 @@ class Source(ABC):
         """What to do where samples are in `unit`; `key` as in a session's [data], ``gyro_unit`` or ``accel_unit``."""
         return f"The source must give rad/s and m/s^2, not {unit} ({key})"
 
-    @abstractmethod
-    def open(self, waiting: Waiting | None = None) -> None:
-        """Connect, or bind, and wait for what is not there yet: with `waiting` until it returns False.
+    def open(self) -> None:  # noqa: B027
+        """Take what is needed, such as a port; raises `WeposeError` where that cannot be done."""
 
-        Raises `WeposeError` with one line on what is missing, without `waiting` after some seconds.
-        """
+    def connect(self, timeout_s: float) -> bool:  # noqa: ARG002
+        """Search what sends, for about so long; whether all of it is there. Raises `WeposeError` where it cannot be."""
+        return True
 
     @abstractmethod
     def read(self, timeout_s: float) -> list[Samples] | None:
@@ -143,8 +140,7 @@ class Source(ABC):
         """Now [s], on the clock of the samples' times."""
         return time.monotonic()
 
-    @abstractmethod
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027
         """Disconnect and free what `open` took. May be called twice."""
 
     # For sources -----------------------------------------------------------------------------------------------------
@@ -162,35 +158,6 @@ class Source(ABC):
             self.count(IMPLAUSIBLE, len(time) - int(plausible.sum()))
             time, values = time[plausible], values[plausible]
         return [Samples(sensor, time, values[:, :3], values[:, 3:])] if len(time) else []
-
-    def wait_for(
-        self,
-        is_found: Callable[[float], bool],
-        describe: Callable[[], str],
-        waiting: Waiting | None,
-        wait_s: float = math.inf,
-        refuse: Callable[[], str] | None = None,
-    ) -> bool:
-        """Wait until `is_found`, called with the seconds that it may take; False where `waiting` ends it.
-
-        Raises
-        ------
-        BadSource
-            Without `waiting` it is not found in `wait_s` [s]; `refuse` gives the text.
-        """
-        deadline = time.monotonic() + wait_s
-        try:
-            while not is_found(POLL_S):
-                if waiting is not None and not waiting(f"Waiting for {describe()}."):
-                    self.close()
-                    self.sensors = ()
-                    return False
-                if waiting is None and time.monotonic() >= deadline:
-                    raise BadSource(refuse() if refuse else f"nothing came within {wait_s:g} s from {describe()}")
-        except BadSource:
-            self.close()
-            raise
-        return True
 
 
 def find_plausible(time: np.ndarray, values: np.ndarray) -> np.ndarray:

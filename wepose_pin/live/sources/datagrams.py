@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 import socket
 import time
@@ -12,8 +13,7 @@ from typing import Any
 from ...errors import BadSource
 from ...recording.arrivals import Samples
 from ..addresses import name_host
-from .base import Source, Waiting
-from .packets import NUMBERS
+from .base import Source
 
 MAX_SIZE = 65536  # [bytes] of a datagram
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
@@ -28,9 +28,8 @@ class DatagramSource(Source):
     Parameters
     ----------
     port : 0 for any free one; then see `address`
-    sensors : to take; None: those that send while `open` waits
+    sensors : to take; None: those that send while it connects
     segments : names that sensors may have; None: any, and `sensors` grows as new ones send
-    wait_s : [s] for which `open` waits for the first sample where `sensors` are not given
 
     Attributes
     ----------
@@ -42,17 +41,13 @@ class DatagramSource(Source):
     hint = ""
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        sensors: Sequence[str] | None = None,
-        segments: Collection[str] | None = NUMBERS,
-        wait_s: float = 10.0,
+        self, host: str, port: int, sensors: Sequence[str] | None = None, segments: Collection[str] | None = None
     ) -> None:
         super().__init__(sensors or ())
-        self.address, self._segments, self._wait_s = (host, port), segments, wait_s
+        self.address, self._segments = (host, port), segments
         self._socket: socket.socket | None = None
-        self._waiting: list[Samples] = []
+        self._searching = not self.sensors and segments is not None
+        self._waiting: list[Samples] = []  # that came while it connected
 
     @abstractmethod
     def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
@@ -61,51 +56,40 @@ class DatagramSource(Source):
     def _serve(self, now: float) -> None:
         """Do what senders want to hear from time to time; `now` [s]."""
 
-    def open(self, waiting: Waiting | None = None) -> None:
-        """Bind; where the sensors are not given, wait for them, with `waiting` until it returns False.
+    def open(self) -> None:
+        """Bind; raises `BadSource` where the address cannot be bound."""
+        host, port = self.address
+        with contextlib.ExitStack() as bound:
+            try:
+                family, form, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+                udp = bound.enter_context(socket.socket(family, form, protocol))
+                udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+                udp.bind(address)
+            except (OSError, UnicodeError) as error:
+                raise BadSource(
+                    f"{self.kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); "
+                    f"an address of this machine and a port that nobody uses are needed"
+                ) from None
+            udp.setblocking(False)
+            bound.pop_all()
+        self._socket, self.address = udp, udp.getsockname()[:2]
+        if self._searching:
+            self.sensors = tuple(self._segments or ())
 
-        Raises
-        ------
-        BadSource
-            The address cannot be bound, or without `waiting` nothing comes.
-        """
-        self._socket = self._bind(*self.address)
-        self.address = self._socket.getsockname()[:2]
-        if not self.sensors and self._segments is not None:
-            self._find_sensors(self._segments, waiting)
-
-    def _bind(self, host: str, port: int) -> socket.socket:
-        """A socket at an address of this machine, which never blocks."""
-        bound = None
-        try:
-            family, form, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-            bound = socket.socket(family, form, protocol)
-            bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
-            bound.bind(address)
-        except (OSError, UnicodeError) as error:
-            if bound is not None:
-                bound.close()
-            raise BadSource(
-                f"{self.kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); "
-                f"an address of this machine and a port that nobody uses are needed"
-            ) from None
-        bound.setblocking(False)
-        return bound
-
-    def _find_sensors(self, segments: Collection[str], waiting: Waiting | None) -> None:
-        """Take the sensors that send."""
-
-        def collect(timeout_s: float) -> bool:
-            self._waiting += self._read_new(timeout_s)
-            return bool(self._waiting)
-
-        self.sensors = tuple(segments)
-        if self.wait_for(collect, self.describe_awaited, waiting, self._wait_s):
-            deadline = time.monotonic() + COLLECT_S
-            while time.monotonic() < deadline:
-                collect(0.1)
-            present = {samples.sensor for samples in self._waiting}
-            self.sensors = tuple(segment for segment in segments if segment in present)
+    def connect(self, timeout_s: float) -> bool:
+        """Wait for sensors where none are given: those that send within a second of the first sample are taken."""
+        if not self._searching:
+            return True
+        self._waiting += self._read_new(timeout_s)
+        if not self._waiting:
+            return False
+        deadline = time.monotonic() + COLLECT_S
+        while time.monotonic() < deadline:
+            self._waiting += self._read_new(0.1)
+        present = {samples.sensor for samples in self._waiting}
+        self.sensors = tuple(segment for segment in self.sensors if segment in present)
+        self._searching = False
+        return True
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:  # noqa: ARG002
         host, port = self.address
@@ -135,15 +119,14 @@ class DatagramSource(Source):
 
     def _receive(self, udp: socket.socket) -> list[tuple[bytes, Any]]:
         datagrams: list[tuple[bytes, Any]] = []
-        while len(datagrams) < MAX_DATAGRAMS:
-            try:
+        try:
+            while len(datagrams) < MAX_DATAGRAMS:
                 datagram, sender = udp.recvfrom(MAX_SIZE)
-            except BlockingIOError:
-                break
-            except OSError:  # an ICMP reply to another datagram
-                self.count("errors of the socket")
-                break
-            datagrams.append((datagram, sender[:2]))
+                datagrams.append((datagram, sender[:2]))
+        except BlockingIOError:
+            pass
+        except OSError:  # an ICMP reply to another datagram
+            self.count("errors of the socket")
         return datagrams
 
     def _tracks(self, sensor: str) -> bool:

@@ -21,8 +21,7 @@ from ...errors import BadOption, BadSource, how_to_install, one_of
 from ...recording.arrivals import Samples
 from ...recording.limits import STANDARD_GRAVITY
 from ..state import join_names
-from .base import Source, SourceKind, SourceOptions, Waiting
-from .packets import NUMBERS
+from .base import Source, SourceKind, SourceOptions
 
 # Scope of the search → configuration of liblsl. On one machine there is one clock and one loopback.
 _QUIET = "[log]\nlevel = -3\n"
@@ -54,13 +53,20 @@ class SensorChannels(NamedTuple):
     scale: np.ndarray  # (6,) to rad/s and m/s²
 
 
+@dataclass
+class Stream:
+    """An inlet and its sensors."""
+
+    name: str
+    inlet: Any
+    parts: Sequence[SensorChannels]
+    rate_hz: float
+    last_sample: float = field(default_factory=time.monotonic)
+    lost: bool = False
+
+
 def find_channels(
-    stream: str,
-    name: str,
-    labels: Sequence[str],
-    units: Sequence[str],
-    count: int,
-    segments: Sequence[str] = NUMBERS,
+    stream: str, name: str, labels: Sequence[str], units: Sequence[str], count: int, segments: Sequence[str]
 ) -> list[SensorChannels]:
     """The sensors of a stream and their channels.
 
@@ -75,11 +81,8 @@ def find_channels(
     """
     where, known_labels = f"lsl:{name}: stream '{stream}'", list(filter(None, labels))
     if stream == name:
-        wanted = {
-            segment: [f"{segment}_{signal}" for signal in SIGNALS]
-            for segment in segments
-            if any(label.startswith(f"{segment}_") for label in labels)
-        }
+        sensors = {segment: f"{segment}_" for segment in segments}
+        wanted = {s: prefix for s, prefix in sensors.items() if any(label.startswith(prefix) for label in labels)}
         if not wanted:
             raise BadSource(
                 f"{where}: no channel label names a segment, as {segments[0]}_gyr_x; {one_of(known_labels)} "
@@ -94,18 +97,17 @@ def find_channels(
                 f"{where}: {count} channels without labels; 6 are gyro xyz and accel xyz, more need labels "
                 f"{', '.join(SIGNALS)}"
             )
-        labels, wanted = labels if known_labels else SIGNALS, {segment: list(SIGNALS)}
+        labels, wanted = labels if known_labels else SIGNALS, {segment: ""}
     parts = []
-    for segment, names in wanted.items():
-        missing = [label for label in names if label not in labels]
-        if missing:
-            raise BadSource(f"{where}: no channel labelled '{missing[0]}'; {one_of(known_labels, missing[0])}")
-        channels = [list(labels).index(label) for label in names]
-        scale = []
-        for k, channel in enumerate(channels):
-            known, unit = (GYRO_UNITS if k < 3 else ACCEL_UNITS), units[channel] if channel < len(units) else ""
+    for segment, prefix in wanted.items():
+        channels, scale = [], []
+        for k, label in enumerate(prefix + signal for signal in SIGNALS):
+            if label not in labels:
+                raise BadSource(f"{where}: no channel labelled '{label}'; {one_of(known_labels, label)}")
+            channels.append(list(labels).index(label))
+            known, unit = GYRO_UNITS if k < 3 else ACCEL_UNITS, "".join(units[channels[-1] : channels[-1] + 1])
             if unit not in known:
-                raise BadSource(f"{where}: channel '{names[k]}': unit '{unit}'; {one_of(filter(None, known), unit)}")
+                raise BadSource(f"{where}: channel '{label}': unit '{unit}'; {one_of(filter(None, known), unit)}")
             scale.append(known[unit])
         parts.append(SensorChannels(segment, channels, np.array(scale)))
     return parts
@@ -115,9 +117,12 @@ def open_spec(rest: str, options: SourceOptions) -> LslSource:
     """The source of ``lsl:NAME[@SCOPE]``."""
     name, separator, scope = rest.rpartition("@")
     if separator and scope not in SCOPES:
-        raise BadOption(f"source '{options.spec}': '{scope}' is no reach of a search; {one_of(SCOPES, scope)}")
-    chosen = (name, scope) if separator else (rest, None)
-    return LslSource(chosen[0], options.sensors, chosen[1], options.wait_s, options.segments)
+        raise options.error(f"'{scope}' is no reach of a search; {one_of(SCOPES, scope)}")
+    if not separator:
+        name = rest
+    if not name or "'" in name:
+        raise BadOption(f"lsl:{name}: a stream's name has at least one letter and no quote, as lsl:wepose")
+    return LslSource(name, options.segments, options.sensors, scope if separator else None)
 
 
 class LslSource(Source):
@@ -125,10 +130,9 @@ class LslSource(Source):
 
     Parameters
     ----------
+    segments : names that sensors may have
     sensors : to wait for; None: all that are found
     scope : "machine", "link" or "site"; None: this machine, or as the user's own ``LSLAPICFG`` says where it is set
-    wait_s : [s] for which `open` searches the streams
-    segments : names that sensors may have
 
     Notes
     -----
@@ -137,51 +141,42 @@ class LslSource(Source):
     """
 
     def __init__(
-        self,
-        name: str,
-        sensors: Sequence[str] | None = None,
-        scope: str | None = None,
-        wait_s: float = 10.0,
-        segments: Sequence[str] = NUMBERS,
+        self, name: str, segments: Sequence[str], sensors: Sequence[str] | None = None, scope: str | None = None
     ) -> None:
-        if not name or "'" in name:
-            raise BadOption(f"lsl:{name}: a stream's name has at least one letter and no quote, as lsl:wepose")
         super().__init__(sensors or ())
-        self._segments, self._name, self._scope, self._wait_s = tuple(segments), name, scope, wait_s
-        self._streams: dict[str, _Stream] = {}
-        self._lock = threading.Lock()
+        self._name, self._segments, self._scope, self._reach = name, tuple(segments), scope, ""
+        self._streams: dict[str, Stream] = {}
         self._stop = threading.Event()
         self._reconnector: threading.Thread | None = None
-        self._reach = ""  # of the search, once it began
 
     def explain_unit(self, key: str, unit: str) -> str:
         channels = SIGNALS[:3] if key == "gyro_unit" else SIGNALS[3:]
         return f'State the unit "{unit}" of the channels {", ".join(channels)} in the stream\'s description'
 
-    def open(self, waiting: Waiting | None = None) -> None:
-        """Find the streams and subscribe, with `waiting` until it returns False.
-
-        Raises
-        ------
-        BadSource
-            liblsl is missing, no such stream is found, or one has other channels than it should.
-        """
+    def open(self) -> None:
+        """Configure liblsl; raises `BadSource` where it is missing, `BadOption` where it has another scope already."""
         self._lsl, scope = configure_pylsl(self._scope)
         self._reach = f"on this {scope}" if scope in SCOPES else "where LSLAPICFG looks"
         self._flags = 0 if scope == "machine" else int(self._lsl.proc_clocksync)
         self._stop.clear()
-        if not self.wait_for(self._search, self._describe_missing, waiting, self._wait_s, self._refuse):
-            return
+
+    def connect(self, timeout_s: float) -> bool:
+        """Search and subscribe; raises `BadSource` where a stream has other channels than it should."""
+        for name, info in self._resolve(max(COLLECT_S, timeout_s)).items():
+            if name not in self._streams:
+                self._streams[name] = self._subscribe(name, info)
         present = self._present
+        if not present or self._missing:
+            return False
         twice = {segment for segment in present if present.count(segment) > 1}
         if twice:
-            self.close()
             raise BadSource(f"lsl:{self._name}: {min(twice)} is in two streams; stop one of them")
         self.sensors = self.sensors or tuple(segment for segment in self._segments if segment in present)
         rates = {stream.rate_hz for stream in self._streams.values()}
         self.rate_hz = rates.pop() if len(rates) == 1 and min(rates) > 0.0 else None
         self._reconnector = threading.Thread(target=self._reconnect, name=f"lsl {self._name}", daemon=True)
         self._reconnector.start()
+        return True
 
     @property
     def _present(self) -> list[str]:
@@ -192,40 +187,21 @@ class LslSource(Source):
     def _missing(self) -> list[str]:
         return [segment for segment in self.sensors if segment not in self._present]
 
-    def _search(self, _timeout_s: float) -> bool:
-        """Search streams; return whether all are there."""
-        for stream, info in self._resolve(min(COLLECT_S, self._wait_s)).items():
-            if stream not in self._streams:
-                self._streams[stream] = self._subscribe(stream, info)
-        return bool(self._present) and not self._missing
-
-    def _describe_missing(self) -> str:
-        return self.describe_awaited(self._missing)
-
-    def _refuse(self) -> str:
-        problem = f"{', '.join(self._missing)} is in none of the streams" if self._present else "no such stream"
-        return (
-            f"lsl:{self._name}: {problem} {self._reach}, within {self._wait_s:g} s; name streams "
-            f"{self._name}-<segment>, or look further with lsl:{self._name}@site"
-        )
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
+        names = list(sensors) or (self._missing if self._present else [])
+        return f"the LSL stream {self._name} {self._reach}" + (f": {join_names(names)}" if names else "")
 
     def read(self, timeout_s: float) -> list[Samples]:
         """Samples since the last call, one `Samples` a sensor."""
         samples: list[Samples] = []
         deadline = time.monotonic() + timeout_s
         while True:
-            with self._lock:
-                streams = list(self._streams.values())
-            for stream in streams:
+            for stream in list(self._streams.values()):
                 samples += self._pull(stream)
             left = deadline - time.monotonic()
             if samples or left <= 0.0:
                 return samples
             time.sleep(min(POLL_S, left))
-
-    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        names = f": {join_names(list(sensors))}" if sensors else ""
-        return f"the LSL stream {self._name} {self._reach}{names}"
 
     def clock(self) -> float:
         """Now [s], liblsl's local clock."""
@@ -239,7 +215,7 @@ class LslSource(Source):
             self._reconnector = None
         self._streams.clear()
 
-    def _pull(self, stream: _Stream) -> list[Samples]:
+    def _pull(self, stream: Stream) -> list[Samples]:
         if stream.lost:
             return []
         try:
@@ -265,52 +241,33 @@ class LslSource(Source):
         streams = self._lsl.resolve_bypred(query, minimum=MAX_STREAMS, timeout=timeout_s)
         return {info.name(): info for info in sorted(streams, key=lambda info: info.created_at())}
 
-    def _subscribe(self, stream: str, info: Any) -> _Stream:
-        lsl = self._lsl
-        inlet = lsl.StreamInlet(info, max_buflen=BUFFER_S, recover=False, processing_flags=self._flags)
+    def _subscribe(self, stream: str, info: Any) -> Stream:
+        inlet = self._lsl.StreamInlet(info, max_buflen=BUFFER_S, recover=False, processing_flags=self._flags)
         try:
             full = inlet.info(timeout=ANSWER_S)
             inlet.open_stream(timeout=ANSWER_S)
         except RuntimeError as error:
             raise BadSource(f"lsl:{self._name}: stream '{stream}' does not answer: {error}") from None
-        if full.channel_format() == lsl.cf_string:
+        if full.channel_format() == self._lsl.cf_string:
             raise BadSource(f"lsl:{self._name}: stream '{stream}' holds text; six channels of numbers a sensor")
         labels, units = (
             [text or "" for text in texts or ()] for texts in (full.get_channel_labels(), full.get_channel_units())
         )
         parts = find_channels(stream, self._name, labels, units, full.channel_count(), self._segments)
-        return _Stream(stream, inlet, parts, float(full.nominal_srate()))
+        return Stream(stream, inlet, parts, float(full.nominal_srate()))
 
     def _reconnect(self) -> None:
         """Reconnect streams that are lost or silent."""
         while not self._stop.wait(RETRY_S):
-            now = time.monotonic()
-            gone = [
-                name for name, stream in self._streams.items() if stream.lost or now - stream.last_sample > SILENT_S
-            ]
-            if not gone:
-                continue
-            infos = self._resolve(0.5 * RETRY_S)
+            silent_since = time.monotonic() - SILENT_S
+            gone = [name for name, each in self._streams.items() if each.lost or each.last_sample < silent_since]
+            infos = self._resolve(0.5 * RETRY_S) if gone else {}
             for name in gone:
                 if name in infos and not self._stop.is_set():
                     try:
-                        fresh = self._subscribe(name, infos[name])
+                        self._streams[name] = self._subscribe(name, infos[name])
                     except BadSource:
                         continue
-                    with self._lock:
-                        self._streams[name] = fresh
-
-
-@dataclass
-class _Stream:
-    """An inlet and its sensors."""
-
-    name: str
-    inlet: Any
-    parts: Sequence[SensorChannels]
-    rate_hz: float
-    last_sample: float = field(default_factory=time.monotonic)
-    lost: bool = False
 
 
 def configure_pylsl(scope: str | None) -> tuple[Any, str]:

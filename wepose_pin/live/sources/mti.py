@@ -6,33 +6,45 @@ import os
 import select
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from types import ModuleType
-from typing import Any
+from queue import Empty, SimpleQueue
+from typing import Any, NamedTuple
 
-from ...errors import BadOption, BadSource, how_to_install
+import numpy as np
+
+from ...errors import BadSource, how_to_install
 from ...recording.arrivals import Samples
 from ..state import join_names
 from . import xbus
-from .base import Source, SourceKind, SourceOptions, Waiting
+from .base import Source, SourceKind, SourceOptions
 from .clocks import HostClock
 
-PLAIN_HZ = 100  # that the plain outputs of every MTi have; above, the HR outputs are tried first
+# Name, rate of turn, acceleration; every MTi has the plain outputs up to 100 Hz, above the HR outputs are tried first.
+PLAIN, HIGH_RATE = ("", xbus.RATE_OF_TURN, xbus.ACCELERATION), ("HR", xbus.RATE_OF_TURN_HR, xbus.ACCELERATION_HR)
+PLAIN_HZ = 100
 ANSWER_S = 0.5
 TRIES = 3
 SILENT_S = 3.0  # [s] without a byte, after which a port is reopened: not every adapter reports a pulled cable
 RETRY_S = 1.0
 WAIT_S = 0.05
 PAUSE_S = 0.002  # [s] between two reads: at 1 kHz two packets come at once, and cost half
-MAX_WAITING = 20_000  # blocks while nobody reads; then the oldest are dropped
+
+
+class Delivery(NamedTuple):
+    """What the thread of a port has read."""
+
+    segment: str
+    problems: Counter[str]
+    time: np.ndarray = np.empty(0)  # (m,) [s]
+    values: np.ndarray = np.empty((0, 6))
 
 
 def open_spec(rest: str, options: SourceOptions) -> MTiSource:
     """The source of ``mti:DEVICE=SEGMENT,…[@RATE]``."""
     pairs, separator, rate = rest.rpartition("@")
     if separator and not (rate.isascii() and rate.isdigit() and 0 < int(rate) <= 2000):
-        raise BadOption(f"source '{options.spec}': rate '{rate}'; whole samples a second from 1 to 2000, as @100")
+        raise options.error(f"rate '{rate}'; whole samples a second from 1 to 2000, as @100")
     devices = options.read_pairs(pairs if separator else rest, "/dev/ttyUSB0")
     chosen = {name: devices[name] for name in options.choose(devices, "device for")}
     return MTiSource(chosen, int(rate) if separator else None, options.baud)
@@ -53,30 +65,43 @@ class MTiSource(Source):
 
     def __init__(self, devices: Mapping[str, str], rate_hz: int | None = None, baud: int = 115200) -> None:
         super().__init__(devices, rate_hz)
-        self._inbox = Inbox()
+        self._inbox: SimpleQueue[Delivery] = SimpleQueue()
         self._devices = [Device(segment, port, rate_hz, baud, self._inbox) for segment, port in devices.items()]
+        self._problem = ""  # of the port that is awaited
 
-    def open(self, waiting: Waiting | None = None) -> None:
-        """Open and configure every port, then listen; wait for a port, with `waiting` until that returns False.
-
-        Raises
-        ------
-        BadSource
-            An MTi cannot send at the rate; without `waiting` also: a port cannot be opened, or no MTi answers there.
-        """
+    def open(self) -> None:
         for device in self._devices:
-            refuse = device.refuse
-            if not self.wait_for(device.try_to_connect, device.describe_wait, waiting, 0.0, refuse):
-                return
+            device.open()
+
+    def connect(self, timeout_s: float) -> bool:
+        """Open and configure the ports, and listen once all are there; raises `BadSource` where one lacks the rate."""
+        for device in self._devices:
+            if not device.is_open:
+                try:
+                    device.connect()
+                except NotReady as error:
+                    self._problem = f"the MTi of {device.place}: {error}"
+                    time.sleep(timeout_s)
+                    return False
         for device in self._devices:
             device.start()
+        self._problem = ""
+        return True
 
     def read(self, timeout_s: float) -> list[Samples]:
         """Samples since the last call, in the order of arrival."""
-        samples, problems = self._inbox.take(timeout_s)
-        for problem, number in problems.items():
-            self.count(problem, number)
-        return [kept for sensor, time_s, values in samples for kept in self.keep_plausible(sensor, time_s, values)]
+        samples: list[Samples] = []
+        deadline = time.monotonic() + timeout_s
+        try:
+            while True:
+                left = deadline - time.monotonic()
+                is_awaited = left > 0.0 and not samples
+                came = self._inbox.get(timeout=left) if is_awaited else self._inbox.get_nowait()
+                for problem, number in came.problems.items():
+                    self.count(problem, number)
+                samples += self.keep_plausible(came.segment, came.time, came.values)
+        except Empty:
+            return samples
 
     def close(self) -> None:
         """Stop listening and free the ports."""
@@ -85,78 +110,37 @@ class MTiSource(Source):
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
         places = [device.place for device in self._devices if device.segment in sensors or not sensors]
-        return f"MTi sensors: {', '.join(places)}"
+        return self._problem or f"MTi sensors: {', '.join(places)}"
 
 
-class Inbox:
-    """What the threads of all ports have read: samples, with sensor, times and values, and counts of problems."""
-
-    def __init__(self) -> None:
-        self._filled = threading.Condition()
-        self._samples: deque[tuple[str, Any, Any]] = deque(maxlen=MAX_WAITING)
-        self._problems: Counter[str] = Counter()
-
-    def put(self, sensor: str, time_s: Any, values: Any) -> None:
-        """Add samples of a sensor, perhaps none."""
-        if len(time_s):
-            with self._filled:
-                self._samples.append((sensor, time_s, values))
-                self._filled.notify()
-
-    def count(self, problems: Mapping[str, int]) -> None:
-        with self._filled:
-            self._problems.update(problems)
-
-    def take(self, timeout_s: float) -> tuple[list[tuple[str, Any, Any]], Counter[str]]:
-        """All samples and counts since the last call; wait `timeout_s` for a sample."""
-        with self._filled:
-            self._filled.wait_for(lambda: self._samples, timeout_s)
-            samples, problems = list(self._samples), self._problems
-            self._samples.clear()
-            self._problems = Counter()
-        return samples, problems
-
-
-class NotReady(BadSource):
+class NotReady(Exception):
     """A port cannot be opened, or no MTi answers there: it may come."""
-
-    def __init__(self, path: str, reason: str, remedy: str) -> None:
-        super().__init__(f"mti:{path}: {reason}; {remedy}")
-        self.reason = reason
 
 
 class Device:
     """One port, and the thread that listens to it."""
 
-    def __init__(self, segment: str, path: str, rate_hz: int | None, baud: int, inbox: Inbox) -> None:
+    def __init__(self, segment: str, path: str, rate_hz: int | None, baud: int, inbox: SimpleQueue[Delivery]) -> None:
+        try:
+            import serial
+        except ImportError:
+            raise BadSource(f"mti: needs pyserial: {how_to_install('pyserial')}") from None
         self.segment, self.place = segment, f"{join_names([segment])} at {path}"
-        self._path, self._rate_hz, self._baud, self._inbox = path, rate_hz, baud, inbox
-        self._serial = _import_pyserial()
+        self._path, self._rate_hz, self._baud, self._inbox, self._serial = path, rate_hz, baud, inbox, serial
         self._port: Any = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._error: NotReady | None = None  # for which it could not be connected
 
-    def try_to_connect(self, timeout_s: float) -> bool:
-        """Connect, or wait `timeout_s` and return False where that cannot be done now."""
+    @property
+    def is_open(self) -> bool:
+        return self._port is not None
+
+    def open(self) -> None:
+        """Begin anew after `close`."""
         self._stop.clear()
-        try:
-            self.connect()
-        except NotReady as error:
-            self._error = error
-            self._stop.wait(timeout_s)
-            return False
-        return True
-
-    def describe_wait(self) -> str:
-        return f"the MTi of {self.place}: {self._error.reason if self._error else ''}"
-
-    def refuse(self) -> str:
-        """Why it could not be connected."""
-        return str(self._error)
 
     def connect(self) -> None:
-        """Open the port and start measurement; raises `BadSource`."""
+        """Open the port and start measurement; raises `NotReady`, or `BadSource` where it lacks the rate."""
         try:
             self._port = self._serial.Serial(self._path, self._baud, timeout=WAIT_S, write_timeout=1.0, exclusive=True)
             self._frames, self._joiner, self._clock = xbus.Frames(), xbus.Joiner(), HostClock()
@@ -168,13 +152,13 @@ class Device:
         except (OSError, ValueError) as error:  # SerialException is an OSError
             self._disconnect()
             reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else str(error)
-            remedy = "a serial port that is there, may be read and is not in use, as /dev/ttyUSB0"
-            raise NotReady(self._path, f"cannot open the port ({reason})", remedy) from None
-        except BadSource:
+            raise NotReady(f"cannot open the port ({reason})") from None
+        except (NotReady, BadSource):
             self._disconnect()
             raise
 
     def start(self) -> None:
+        """Listen in a thread."""
         self._thread = threading.Thread(target=self._listen, name=f"mti {self._path}", daemon=True)
         self._thread.start()
 
@@ -195,18 +179,18 @@ class Device:
     def _configure(self, rate_hz: int) -> None:
         self._ask(xbus.GO_TO_CONFIG)
         offers = []
-        for hr in (False, True) if rate_hz <= PLAIN_HZ else (True, False):
-            items = xbus.RATE_OF_TURN_HR if hr else xbus.RATE_OF_TURN, xbus.ACCELERATION_HR if hr else xbus.ACCELERATION
-            names = ("RateOfTurnHR", "AccelerationHR") if hr else ("RateOfTurn", "Acceleration")
-            answer = self._ask(xbus.SET_OUTPUT, xbus.build_output_items(rate_hz, hr))
+        for kind, gyro, accel in (PLAIN, HIGH_RATE) if rate_hz <= PLAIN_HZ else (HIGH_RATE, PLAIN):
+            answer = self._ask(xbus.SET_OUTPUT, xbus.build_output_items(rate_hz, gyro, accel))
             if answer.mid == xbus.ERROR:
-                offers.append(f"{names[0]}: {xbus.describe_error(answer.data)}")
+                offers.append(f"RateOfTurn{kind}: {xbus.describe_error(answer.data)}")
                 continue
             rates = xbus.read_rates(answer.data)
-            if all(rates.get(item) == rate_hz for item in items):
+            if rates.get(gyro) == rates.get(accel) == rate_hz:
                 self._ask(xbus.GO_TO_MEASUREMENT)
                 return
-            offers += [f"{name} at {rates.get(item, 0)} Hz" for item, name in zip(items, names, strict=True)]
+            offers.append(
+                f"RateOfTurn{kind} at {rates.get(gyro, 0)} Hz, Acceleration{kind} at {rates.get(accel, 0)} Hz"
+            )
         raise BadSource(
             f"mti:{self._path}: does not send rate of turn and acceleration at {rate_hz} Hz; it offers "
             f"{', '.join(offers)}; choose a rate that it has"
@@ -223,8 +207,7 @@ class Device:
                         return frame
                     if frame.mid == xbus.ERROR and mid != xbus.GO_TO_CONFIG:  # then it may be an earlier one
                         raise BadSource(f"mti:{self._path}: the device says: {xbus.describe_error(frame.data)}")
-        remedy = "check the cable, the port and the baud rate"
-        raise NotReady(self._path, f"no MTi answers at {self._baud} baud", remedy)
+        raise NotReady(f"no MTi answers at {self._baud} baud; check the cable, the port and the baud rate")
 
     def _wait_for_data(self) -> None:
         """Wait for data of a device that is not configured; start its measurement where it waits for that."""
@@ -235,7 +218,7 @@ class Device:
                     return
             self._port.write(xbus.build_frame(xbus.GO_TO_MEASUREMENT))
         remedy = "check cable, port, baud rate and outputs, or name a rate, as @100, for the device to be configured"
-        raise NotReady(self._path, f"no MTData2 comes at {self._baud} baud", remedy)
+        raise NotReady(f"no MTData2 comes at {self._baud} baud; {remedy}")
 
     def _read_bytes(self) -> bytes:
         """Bytes that came, none after a while; past pyserial, whose `read` costs twice as much."""
@@ -255,23 +238,23 @@ class Device:
             try:
                 if self._port is None:
                     self.connect()
-                    self._inbox.count({f"reconnections of {self.segment}": 1})
+                    self._inbox.put(Delivery(self.segment, Counter({f"reconnections of {self.segment}": 1})))
                     last_byte = time.monotonic()
                 data = self._read_bytes()
                 now = time.monotonic()
                 if data:
                     last_byte = now
-                    self.decode(data, now)
+                    self._decode(data, now)
                     time.sleep(PAUSE_S)
                 elif now - last_byte > SILENT_S:
                     raise OSError("nothing comes")
-            except BadSource:
+            except (NotReady, BadSource):
                 self._stop.wait(RETRY_S)
             except OSError:  # SerialException is one
                 self._disconnect()
-                self._inbox.count({f"connections lost to {self.segment}": 1})
+                self._inbox.put(Delivery(self.segment, Counter({f"connections lost to {self.segment}": 1})))
 
-    def decode(self, data: bytes, arrival: float) -> None:
+    def _decode(self, data: bytes, arrival: float) -> None:
         """Put the samples in bytes that came at a time [s] into the inbox."""
         problems: Counter[str] = Counter()
         for frame in self._frames.feed(data):
@@ -285,20 +268,11 @@ class Device:
         for own in (self._frames.problems, self._joiner.problems):
             problems.update(own)
             own.clear()
-        if problems:
-            self._inbox.count(problems)
         time_s, values = self._joiner.take()
         if len(time_s):
-            self._inbox.put(self.segment, self._clock.to_host(time_s, arrival), values)
-
-
-def _import_pyserial() -> ModuleType:
-    try:
-        import serial
-    except ImportError:
-        raise BadSource(f"mti: needs pyserial: {how_to_install('pyserial')}") from None
-    module: ModuleType = serial
-    return module
+            self._inbox.put(Delivery(self.segment, problems, self._clock.to_host(time_s, arrival), values))
+        elif problems:
+            self._inbox.put(Delivery(self.segment, problems))
 
 
 KIND = SourceKind("mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]", open_spec)

@@ -13,7 +13,7 @@ from ...errors import BadOption
 from ...readers import load_session
 from ...recording import OrientationSensor, Recording
 from ...recording.arrivals import Samples, list_numbers
-from .base import Source, SourceKind, SourceOptions, Waiting
+from .base import Source, SourceKind, SourceOptions
 
 # Up to 1 kHz every sample comes when it is due, faster ones come together.
 MIN_SLEEP_S = 0.0005
@@ -61,7 +61,7 @@ class ReplaySource(Source):
     def orientations(self) -> dict[str, bool]:
         return self._orientations
 
-    def open(self, waiting: Waiting | None = None) -> None:  # noqa: ARG002
+    def open(self) -> None:
         """Start: the first sample is due now."""
         self._next, self._begin = 0, time.monotonic()
 
@@ -94,9 +94,6 @@ class ReplaySource(Source):
             gyro_S, accel_S = self._numbers[segment]
             samples.append(Samples(segment, self._time[rows], gyro_S[rows], accel_S[rows]))
         return samples
-
-    def close(self) -> None:
-        """Nothing to free."""
 
     def _count_due(self) -> int:
         """One past the last sample that is due."""

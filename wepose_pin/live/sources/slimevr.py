@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,21 +28,19 @@ MAX_TRACKERS = 64
 UNIT_ERROR = 0.05  # of a quaternion's length
 LONGEST_STEP_S = 0.02  # [s] between orientations that came together
 HEADER = struct.Struct(">IQ")
-QUAT = struct.Struct(">4f")
-BUNDLED_QUAT = struct.Struct(">4h")
 HANDSHAKE_ANSWER = (b"\x03Hey OVR =D 5").ljust(64, b"\0")
 HEARTBEAT = HEADER.pack(1, 0)
-ROTATION_1, HANDSHAKE, PING, SENSOR_INFO, ROTATION_2, ROTATION, ROTATION_ACCEL = 1, 3, 10, 15, 16, 17, 23
-BATTERY = 12
-ROTATIONS = {  # kind → places of the sensor's number, None: it is in the kind, and of the rotation; its layout
-    ROTATION_1: (None, 0, QUAT),
-    ROTATION_2: (None, 0, QUAT),
-    ROTATION: (0, 2, QUAT),
-    ROTATION_ACCEL: (0, 1, BUNDLED_QUAT),
+HANDSHAKE, PING, BATTERY, SENSOR_INFO, ROTATION = 3, 10, 12, 15, 17
+FLOATS, BUNDLED = struct.Struct(">4f"), struct.Struct(">4h")  # layouts of a rotation
+ROTATIONS = {  # kind → place of the sensor's number, of the rotation, and its layout; without a place the number
+    1: (None, 0, FLOATS, 0),
+    16: (None, 0, FLOATS, 1),
+    ROTATION: (0, 2, FLOATS, 0),
+    23: (0, 1, BUNDLED, 0),
 }
 NORMAL = 1  # kind of a rotation; 2 is a correction
 # Packets that hold nothing for us: heartbeat, acceleration, tap, error, signal and others.
-UNUSED = frozenset({0, 2, 4, 10, 11, 13, 14, 18, 19, 20, 21, 22, 26})
+UNUSED = frozenset({0, 2, 4, 11, 13, 14, 18, 19, 20, 21, 22, 26})
 # Place on the body → segment.
 SEGMENT_OF = {
     1: "head",
@@ -76,7 +74,7 @@ class Tracker:
     newest_time: float  # [s] at which it last sent
     number: int = 0
     places: dict[int, str] = field(default_factory=dict)
-    battery: float = float("nan")
+    battery: float = math.nan
 
 
 def open_spec(rest: str, options: SourceOptions) -> SlimeVrSource:
@@ -86,7 +84,7 @@ def open_spec(rest: str, options: SourceOptions) -> SlimeVrSource:
     devices = options.read_pairs(pairs, "4c:11:ae:00:00:01/0") if pairs else {}
     assigned = {tracker.lower(): segment for segment, tracker in devices.items()}
     segments = None if options.any_name else options.segments
-    return SlimeVrSource(host, port, options.sensors or list(devices), segments, options.wait_s, assigned=assigned)
+    return SlimeVrSource(host, port, options.sensors or list(devices), segments, assigned=assigned)
 
 
 class SlimeVrSource(DatagramSource):
@@ -106,11 +104,10 @@ class SlimeVrSource(DatagramSource):
     kind, sender = "slimevr", "SlimeVR trackers"
     measures_orientations = True
 
-    def __init__(self, *args: Any, assigned: Mapping[str, str] | None = None, **options: Any) -> None:
-        super().__init__(*args, **options)
+    def __init__(self, *options: Any, assigned: Mapping[str, str] | None = None) -> None:
+        super().__init__(*options)
         self.trackers: dict[Any, Tracker] = {}
-        self._assigned = dict(assigned or {})
-        self._heartbeat = -np.inf
+        self._assigned, self._heartbeat = dict(assigned or {}), -math.inf
         self._last_times: dict[str, float] = {}
 
     @property
@@ -124,9 +121,14 @@ class SlimeVrSource(DatagramSource):
         for tracker in self.trackers.values():
             for sensor in tracker.places or {0: ""}:
                 segment = self._find_segment(tracker, sensor)
-                if segment is not None and np.isfinite(tracker.battery):
+                if segment is not None and math.isfinite(tracker.battery):
                     batteries[segment] = tracker.battery
         return batteries
+
+    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
+        known = ", ".join(tracker.mac or address[0] for address, tracker in self.trackers.items())
+        text = super().describe_awaited(sensors)
+        return f"{text}; connected: {known}" if known else text
 
     def _serve(self, now: float) -> None:
         if now - self._heartbeat < HEARTBEAT_S:
@@ -139,14 +141,17 @@ class SlimeVrSource(DatagramSource):
     def _take(self, datagrams: Sequence[tuple[bytes, Any]], now: float, /) -> list[Samples]:
         by_segment: dict[str, list[np.ndarray]] = {}
         for datagram, sender in datagrams:
-            for segment, quat in self._decode(datagram, sender, now):
-                size = float(np.linalg.norm(quat))
-                if not self._tracks(segment):
-                    self.count(f"orientations of {segment}, which is not tracked")
-                elif not (math.isfinite(size) and abs(size - 1.0) < UNIT_ERROR):
-                    self.count("orientations that are none")
-                else:
-                    by_segment.setdefault(segment, []).append(quat / size)
+            decoded = self._decode(datagram, sender, now)
+            if decoded is None:
+                continue
+            segment, quat = decoded
+            size = float(np.linalg.norm(quat))
+            if not self._tracks(segment):
+                self.count(f"orientations of {segment}, which is not tracked")
+            elif not (math.isfinite(size) and abs(size - 1.0) < UNIT_ERROR):
+                self.count("orientations that are none")
+            else:
+                by_segment.setdefault(segment, []).append(quat / size)
         return [
             Samples(segment, self._find_times(segment, len(own), now), *pack_orientations(np.array(own)))
             for segment, own in by_segment.items()
@@ -166,25 +171,27 @@ class SlimeVrSource(DatagramSource):
             except OSError:
                 self.count("answers that could not be sent")
 
-    def _decode(self, datagram: bytes, sender: Any, now: float) -> Iterator[tuple[str, np.ndarray]]:
-        """Segment and orientation (4,) xyzw, not yet of unit length, of each sensor in a datagram."""
+    def _decode(self, datagram: bytes, sender: Any, now: float) -> tuple[str, np.ndarray] | None:
+        """Segment and orientation (4,) xyzw, not yet of unit length, in a datagram; None: it holds none."""
         if len(datagram) < HEADER.size or datagram[:3] != b"\0\0\0":
             self.count("datagrams that are none of SlimeVR")
-            return
+            return None
         kind, number = HEADER.unpack_from(datagram)
         data = datagram[HEADER.size :]
         if kind == HANDSHAKE:
             self._welcome(datagram, sender, now)
-            return
+            return None
         tracker = self.trackers.get(sender)
         if tracker is None:
             # It found a server before; without answer for three seconds it looks for one again.
             self.count("packets of trackers that have not introduced themselves")
-            return
+            return None
         if number and number <= tracker.number:
             self.count("SlimeVR packets that came twice or too late")
-            return
+            return None
         tracker.number, tracker.newest_time = max(number, tracker.number), now
+        if kind in ROTATIONS:
+            return self._read_rotation(kind, data, tracker)
         if kind == SENSOR_INFO and len(data) >= 2:
             self._send(struct.pack(">IBB", SENSOR_INFO, data[0], data[1]), sender)
             if len(data) >= 7 and data[6] in SEGMENT_OF:
@@ -193,10 +200,9 @@ class SlimeVrSource(DatagramSource):
             self._send(datagram, sender)
         elif kind == BATTERY and len(data) >= 8:
             tracker.battery = float(np.clip(struct.unpack_from(">2f", data)[1], 0.0, 1.0))
-        elif kind in ROTATIONS:
-            yield from self._read_rotation(kind, data, tracker)
         elif kind not in UNUSED:
             self.count(f"SlimeVR packets of type {kind}, which is not read")
+        return None
 
     def _welcome(self, datagram: bytes, sender: Any, now: float) -> None:
         """Answer a handshake."""
@@ -208,23 +214,22 @@ class SlimeVrSource(DatagramSource):
             at += 1 + datagram[at]  # the firmware's name
         mac = datagram[at : at + 6] if len(datagram) >= at + 6 else b""
         places = self.trackers[sender].places if sender in self.trackers else {}
-        self.trackers[sender] = Tracker(":".join(f"{byte:02x}" for byte in mac), now, places=places)
+        self.trackers[sender] = Tracker(mac.hex(":"), now, places=places)
         self._send(HANDSHAKE_ANSWER, sender)
 
-    def _read_rotation(self, kind: int, data: bytes, tracker: Tracker) -> Iterator[tuple[str, np.ndarray]]:
-        sensor_at, at, layout = ROTATIONS[kind]
+    def _read_rotation(self, kind: int, data: bytes, tracker: Tracker) -> tuple[str, np.ndarray] | None:
+        sensor_at, at, layout, sensor = ROTATIONS[kind]
         if len(data) < at + layout.size:
             self.count("SlimeVR packets of a wrong length")
-            return
+            return None
         if kind == ROTATION and data[1] != NORMAL:
-            return
-        sensor = int(kind == ROTATION_2) if sensor_at is None else data[sensor_at]
-        quat = np.array(layout.unpack_from(data, at), dtype=float)
+            return None
+        sensor = sensor if sensor_at is None else data[sensor_at]
         segment = self._find_segment(tracker, sensor)
         if segment is None:
             self.count(f"orientations of {tracker.mac or 'a tracker'}/{sensor}, whose place on the body is not known")
-        else:
-            yield segment, quat / (2.0**15 if layout is BUNDLED_QUAT else 1.0)
+            return None
+        return segment, np.array(layout.unpack_from(data, at), dtype=float) / (2.0**15 if layout is BUNDLED else 1.0)
 
     def _find_segment(self, tracker: Tracker, sensor: int) -> str | None:
         named = f"{tracker.mac}/{sensor}"
@@ -232,11 +237,6 @@ class SlimeVrSource(DatagramSource):
             return named
         stated = self._assigned.get(named) or (None if sensor else self._assigned.get(tracker.mac))
         return stated or tracker.places.get(sensor) or (named if self._segments is None and tracker.mac else None)
-
-    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        known = ", ".join(tracker.mac or address[0] for address, tracker in self.trackers.items())
-        text = super().describe_awaited(sensors)
-        return f"{text}; connected: {known}" if known else text
 
 
 KIND = SourceKind("slimevr:[HOST][:PORT][,TRACKER=SEGMENT...]", open_spec)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter, deque
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ GO_TO_MEASUREMENT, GO_TO_CONFIG, DATA, ERROR, SET_OUTPUT = 0x10, 0x30, 0x36, 0x4
 PACKET_COUNTER, SAMPLE_TIME_FINE = 0x1020, 0x1060
 ACCELERATION, ACCELERATION_HR = 0x4020, 0x4040
 RATE_OF_TURN, RATE_OF_TURN_HR = 0x8020, 0x8040
+VECTORS = {ACCELERATION, ACCELERATION_HR, RATE_OF_TURN, RATE_OF_TURN_HR}  # [m/s²] and [rad/s], in the sensor's axes
 TICKS_HZ = 10_000.0  # SampleTimeFine
 WITH_EVERY_PACKET = 0xFFFF  # the rate of items that come with every packet
 
@@ -39,7 +41,7 @@ ERRORS = {
 }
 SKIPPED, BAD_CHECKSUMS = "bytes skipped", "bad checksums"  # problems
 UNTIMED, UNPAIRED = "packets without SampleTimeFine", "rates without an acceleration"
-Vector = tuple[float, float, float]
+Vector = tuple[float, ...]  # three numbers
 
 
 class Frame(NamedTuple):
@@ -47,16 +49,6 @@ class Frame(NamedTuple):
 
     mid: int
     data: bytes
-
-
-class Packet(NamedTuple):
-    """Items of one MTData2 frame, in the sensor's axes; None where it lacks one."""
-
-    ticks: int | None  # SampleTimeFine
-    gyro: Vector | None  # [rad/s]
-    accel: Vector | None  # [m/s²]
-    gyro_hr: Vector | None
-    accel_hr: Vector | None
 
 
 class Malformed(ValueError):
@@ -114,49 +106,38 @@ class Frames:
         return frames
 
 
-def parse_packet(data: bytes) -> Packet:
-    """The items of an MTData2 frame that a sample needs; others are ignored.
+def parse_packet(data: bytes) -> dict[int, Vector]:
+    """The items of an MTData2 frame that a sample needs: `VECTORS`, and SampleTimeFine as one number.
 
     Raises
     ------
     Malformed
         An item is cut off, or of a length that its id does not have.
     """
-    ticks = None
-    vectors: dict[int, Vector] = {}
+    items: dict[int, Vector] = {}
     at = 0
     while at < len(data):
         if at + 3 > len(data) or at + 3 + data[at + 2] > len(data):
             raise Malformed("an item is cut off")
-        kind = data[at] << 8 | data[at + 1]
-        content = data[at + 3 : at + 3 + data[at + 2]]
+        kind, content = data[at] << 8 | data[at + 1], data[at + 3 : at + 3 + data[at + 2]]
         at += 3 + len(content)
-        item = kind & 0xFFF0
-        if item == SAMPLE_TIME_FINE:
-            if len(content) != 4:
-                raise Malformed("SampleTimeFine is not of four bytes")
-            ticks = int.from_bytes(content, "big")
-        elif item in (ACCELERATION, ACCELERATION_HR, RATE_OF_TURN, RATE_OF_TURN_HR):
-            vectors[item] = _parse_vector(kind & 0x3, content)
-    return Packet(
-        ticks,
-        vectors.get(RATE_OF_TURN),
-        vectors.get(ACCELERATION),
-        vectors.get(RATE_OF_TURN_HR),
-        vectors.get(ACCELERATION_HR),
-    )
+        try:
+            if kind & 0xFFF0 == SAMPLE_TIME_FINE:
+                items[SAMPLE_TIME_FINE] = struct.unpack(">I", content)
+            elif kind & 0xFFF0 in VECTORS:
+                items[kind & 0xFFF0] = _parse_vector(kind & 0x3, content)
+        except struct.error:
+            raise Malformed(f"item {kind:#06x} in {len(content)} bytes") from None
+    return items
 
 
 def _parse_vector(encoding: int, content: bytes) -> Vector:
     """Three numbers; `encoding` is 0 float32, 1 fixed 12.20, 2 fixed 16.32 (fraction first), 3 float64."""
-    try:
-        if encoding == 2:
-            x0, x1, y0, y1, z0, z1 = struct.unpack(">IhIhIh", content)
-            return x1 + x0 / 2**32, y1 + y0 / 2**32, z1 + z0 / 2**32
-        x, y, z = struct.unpack((">3f", ">3i", "", ">3d")[encoding], content)
-    except struct.error:
-        raise Malformed(f"three numbers in {len(content)} bytes") from None
-    return (x / 2**20, y / 2**20, z / 2**20) if encoding == 1 else (x, y, z)
+    if encoding == 2:
+        parts = struct.unpack(">IhIhIh", content)
+        return tuple(whole + fraction / 2**32 for fraction, whole in zip(parts[::2], parts[1::2], strict=True))
+    values = struct.unpack((">3f", ">3i", "", ">3d")[encoding], content)
+    return tuple(value / 2**20 for value in values) if encoding == 1 else values
 
 
 # Samples -------------------------------------------------------------------------------------------------------------
@@ -179,27 +160,26 @@ class Joiner:
     def __init__(self) -> None:
         self.problems: Counter[str] = Counter()
         self._ticks: int | None = None
-        self._gyro_hr = self._accel_hr = False
+        self._gyro, self._accel = RATE_OF_TURN, ACCELERATION  # the kind that is used
         self._rates: deque[tuple[float, Vector]] = deque()
         self._accels: deque[tuple[float, Vector]] = deque(maxlen=1024)
         self._time: list[float] = []
-        self._values: list[tuple[float, ...]] = []
+        self._values: list[Vector] = []
 
-    def add(self, packet: Packet) -> None:
+    def add(self, items: Mapping[int, Vector]) -> None:
         """Add a packet."""
-        self._gyro_hr, self._accel_hr = self._gyro_hr or bool(packet.gyro_hr), self._accel_hr or bool(packet.accel_hr)
-        gyro = packet.gyro_hr if self._gyro_hr else packet.gyro
-        accel = packet.accel_hr if self._accel_hr else packet.accel
-        if gyro is None and accel is None:
+        self._gyro = RATE_OF_TURN_HR if RATE_OF_TURN_HR in items else self._gyro
+        self._accel = ACCELERATION_HR if ACCELERATION_HR in items else self._accel
+        if self._gyro not in items and self._accel not in items:
             return
-        if packet.ticks is None:
+        if SAMPLE_TIME_FINE not in items:
             self.problems[UNTIMED] += 1
             return
-        time = self._seconds(packet.ticks)
-        if accel is not None:
-            self._accels.append((time, accel))
-        if gyro is not None:
-            self._rates.append((time, gyro))
+        time = self._seconds(int(items[SAMPLE_TIME_FINE][0]))
+        if self._accel in items:
+            self._accels.append((time, items[self._accel]))
+        if self._gyro in items:
+            self._rates.append((time, items[self._gyro]))
         self._join()
 
     def take(self) -> tuple[np.ndarray, np.ndarray]:
@@ -224,36 +204,26 @@ class Joiner:
             time, gyro = rates[0]
             while len(accels) > 1 and accels[1][0] <= time:
                 accels.popleft()
-            awaited = not accels or (len(accels) == 1 and accels[0][0] < time)
-            if awaited and rates[-1][0] - time <= MAX_STEP_S:
+            is_awaited = not accels or (len(accels) == 1 and accels[0][0] < time)
+            if is_awaited and rates[-1][0] - time <= MAX_STEP_S:
                 return  # its acceleration is still to come
             rates.popleft()
-            accel = None if awaited else self._interpolate(time)
-            if accel is None:
+            if is_awaited or accels[0][0] > time or (accels[0][0] < time and accels[1][0] - accels[0][0] > MAX_STEP_S):
                 self.problems[UNPAIRED] += 1
-            else:
-                self._time.append(time)
-                self._values.append((*gyro, *accel))
-
-    def _interpolate(self, time: float) -> Vector | None:
-        """The acceleration at a time [s] from the first two; None: they are after it, or too far apart."""
-        begin, before = self._accels[0]
-        if begin >= time:
-            return before if begin == time else None
-        end, after = self._accels[1]
-        if end - begin > MAX_STEP_S:
-            return None
-        part = (time - begin) / (end - begin)
-        x, y, z = (a + part * (b - a) for a, b in zip(before, after, strict=True))
-        return x, y, z
+                continue
+            (begin, accel), (end, after) = accels[0], accels[-1 if len(accels) == 1 else 1]
+            if begin < time:
+                share = (time - begin) / (end - begin)
+                accel = tuple(a + share * (b - a) for a, b in zip(accel, after, strict=True))
+            self._time.append(time)
+            self._values.append((*gyro, *accel))
 
 
 # Configuration -------------------------------------------------------------------------------------------------------
 
 
-def build_output_items(rate_hz: int, hr: bool) -> bytes:
-    """Data of SetOutputConfiguration: counter, time, rate of turn and acceleration in float32, at `rate_hz`."""
-    accel, gyro = (ACCELERATION_HR, RATE_OF_TURN_HR) if hr else (ACCELERATION, RATE_OF_TURN)
+def build_output_items(rate_hz: int, gyro: int, accel: int) -> bytes:
+    """Data of SetOutputConfiguration: counter, time, and these two items in float32, at `rate_hz`."""
     every = WITH_EVERY_PACKET
     return struct.pack(">8H", PACKET_COUNTER, every, SAMPLE_TIME_FINE, every, accel, rate_hz, gyro, rate_hz)
 
