@@ -267,7 +267,8 @@ def serial() -> bytes:
         data += struct.pack(">HB3f", xbus.RATE_OF_TURN, 12, 0.1, 0.2, 0.3)
         data += struct.pack(">HB3d", xbus.ACCELERATION | 3, 24, 0.0, 0.0, 9.8)
         stream += xbus.build_frame(xbus.DATA, data)
-    return stream + xbus.build_frame(xbus.SET_OUTPUT + 1, xbus.build_output_items(100, False))
+    outputs = xbus.build_output_items(100, xbus.RATE_OF_TURN, xbus.ACCELERATION)
+    return stream + xbus.build_frame(xbus.SET_OUTPUT + 1, outputs)
 
 
 def pose() -> bytes:
