@@ -106,7 +106,7 @@ def test_a_leg_is_de_levas(
 def test_the_true_pose_has_the_angles_of_the_activity(activity: str) -> None:
     motion = ACTIVITIES[activity](load_model("whole_body"), np.random.default_rng(1), 10.0, IDEAL_MOTION)
     t = np.arange(0.0, 17.0, 0.013)
-    R_WL = motion(t, ()).R_WL
+    R_WL = motion(t).R_WL
     angles = joint_angles(Pose(t, {segment: R.as_quat() for segment, R in R_WL.items()}, {}))
     for side in SIDES:
         for joint, values in motion.leg(side, t)._asdict().items():
