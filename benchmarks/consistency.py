@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.contenders import list_contenders
 from benchmarks.validation.simulated import compute_mount_errors, orient_recording
-from wepose_pin.body.kinematics import compute_axis_std
+from wepose_pin.body.covariance import compute_axis_std
 from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.calibration import assess, calibrate
 from wepose_pin.errors import WeposeError

@@ -7,7 +7,9 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.body import load_model
-from wepose_pin.body.kinematics import compute_link_poses, compute_pose, solve_configuration
+from wepose_pin.body.configuration import solve_configuration
+from wepose_pin.body.kinematics import compute_pose
+from wepose_pin.body.links import compute_link_poses
 
 from .tables import Column, Section, Table, time_in_turn
 

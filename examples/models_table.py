@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
-from wepose_pin.body.kinematics import compute_orientation_residuals, solve_configuration
+from wepose_pin.body.configuration import compute_orientation_residuals, solve_configuration
 
 N = 200  # random poses: every segment up to 60 deg from the one above
 for path in sys.argv[1:] or [None]:

@@ -16,8 +16,9 @@ from benchmarks.ur5_arm import RUNS, UPRIGHT, UR5, write_ur5_session, write_urdf
 from benchmarks.validation.real import UNSCORED_S
 from wepose_pin.body import BodyModel, load_model
 from wepose_pin.body.body import load_sensed_model
-from wepose_pin.body.configurations import joint_values
-from wepose_pin.body.kinematics import KinematicsSolver, LiveKinematics, compute_link_poses, compute_point_covariances
+from wepose_pin.body.covariance import compute_point_covariances
+from wepose_pin.body.kinematics import KinematicsSolver
+from wepose_pin.body.links import compute_joint_values, compute_link_poses
 from wepose_pin.body.start_pose import compute_start_configuration
 from wepose_pin.body.subject import Subject, load_subject
 from wepose_pin.commands import main
@@ -259,9 +260,9 @@ def test_values_of_a_joint_without_end_go_on(tmp_path: Path) -> None:
     body = load_sensed_model(file, ["rim"], "test")
     angle = np.linspace(0.0, 9.0, 200)
     q = np.column_stack([np.cos(angle), np.sin(angle)])
-    np.testing.assert_allclose(joint_values(body.pin, q)["axle"], angle)
-    first = joint_values(body.pin, q[:150])
-    again = joint_values(body.pin, q[150:], {"axle": float(first["axle"][-1])})
+    np.testing.assert_allclose(compute_joint_values(body.pin, q)["axle"], angle)
+    first = compute_joint_values(body.pin, q[:150])
+    again = compute_joint_values(body.pin, q[150:], {"axle": float(first["axle"][-1])})
     np.testing.assert_allclose(again["axle"], angle[150:])
     start = compute_start_configuration(body, CONFIGURATION, {"axle": 0.3}, "x")
     np.testing.assert_allclose(start, [np.cos(0.3), np.sin(0.3)])
@@ -412,7 +413,7 @@ def test_live_kinematics_follow_a_mechanism(urdf: Path) -> None:
     tracked = track(recording, model=urdf, causal=True)
     body = tracked.model
     start = compute_start_configuration(body, CONFIGURATION, UPRIGHT, "x")
-    live = LiveKinematics(body, list(recording.sensors), start)
+    live = KinematicsSolver(body, list(recording.sensors), start=start)
     for k in range(60):
         measured = np.array([tracked.segments.quat_WL[name][k] for name in recording.sensors])
         live.compute_points(measured)

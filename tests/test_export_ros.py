@@ -17,7 +17,9 @@ from test_export import LENGTHS, a_pose, write_folder
 from test_export_robot import write_trajectory_folder
 
 from wepose_pin.body import load_model
-from wepose_pin.body.kinematics import Pose, compute_link_poses, solve_configuration
+from wepose_pin.body.configuration import solve_configuration
+from wepose_pin.body.kinematics import Pose
+from wepose_pin.body.links import compute_link_poses
 from wepose_pin.errors import BadOption
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import JointMotion, compute_link_poses_W, read_joint_motion

@@ -14,13 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.angles.torques import pose_torques
 from wepose_pin.body import BodyModel, load_model
-from wepose_pin.body.fit import joint_limits
-from wepose_pin.body.kinematics import (
-    compute_link_placements,
-    compute_link_poses,
-    compute_orientation_residuals,
-    solve_configuration,
-)
+from wepose_pin.body.configuration import compute_orientation_residuals, solve_configuration
+from wepose_pin.body.links import compute_link_placements, compute_link_poses
 from wepose_pin.readers import load_session
 from wepose_pin.simulation import Person, simulate
 from wepose_pin.tracking import summarize, track
@@ -91,7 +86,8 @@ def test_nothing_is_nearer_by_another_minimiser(body: BodyModel, limits: bool) -
 def test_limits_are_kept_and_the_rest_of_the_arm_takes_its_share(body: BodyModel) -> None:
     quat_WL = motion(body, 200, 2, 5.0, reach=1.5)
     kept, passed = solve_configuration(body, quat_WL), solve_configuration(body, quat_WL, limits=False)
-    at, lower, upper = joint_limits(body.pin, [body.pin.getJointId(name) for name in HINGES])
+    at = places(body.pin)
+    lower, upper = body.pin.lowerPositionLimit[at], body.pin.upperPositionLimit[at]
     assert np.all((kept[:, at] >= lower) & (kept[:, at] <= upper))
     assert np.any((passed[:, at] < lower - 0.1) | (passed[:, at] > upper + 0.1))
     free, bound = (
@@ -125,7 +121,8 @@ def test_a_person_on_48_degrees_of_freedom(data: Path, body: BodyModel) -> None:
         R, _ = compute_link_poses(body, pose.q[span], arms)
         down = np.degrees(np.arccos(np.clip(R[:, :, 2, 2].mean(axis=0), -1.0, 1.0)))
         assert np.all(down < most)
-    at, lower, upper = joint_limits(body.pin, [body.pin.getJointId(name) for name in HINGES])
+    at = places(body.pin)
+    lower, upper = body.pin.lowerPositionLimit[at], body.pin.upperPositionLimit[at]
     assert np.all((pose.q[:, at] >= lower) & (pose.q[:, at] <= upper))
 
 
@@ -136,7 +133,8 @@ def test_limits_can_be_let_go_and_torques_are_written_as_estimates(
     simulation = simulate(person.lengths, seed=3, rate_hz=25.0)
     pose = track(simulation.recording(), model=body, limits=False)
     assert pose.q is not None
-    at, lower, upper = joint_limits(body.pin, [body.pin.getJointId(name) for name in HINGES])
+    at = places(body.pin)
+    lower, upper = body.pin.lowerPositionLimit[at], body.pin.upperPositionLimit[at]
     assert np.any((pose.q[:, at] < lower - 0.01) | (pose.q[:, at] > upper + 0.01))
     write_result(tmp_path, pose, summarize(pose), torques=pose_torques(pose))
     table = pl.read_parquet(tmp_path / "torques.parquet")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import wepose_pin as wp
 from wepose_pin.body import load_model
-from wepose_pin.body.kinematics import compute_axis_std, compute_point_covariances
+from wepose_pin.body.covariance import compute_axis_std, compute_point_covariances
 from wepose_pin.body.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate

@@ -13,16 +13,10 @@ from bodies import POINTS, RIGID_SHOULDERS
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.body import BodyModel, load_model
+from wepose_pin.body.configuration import compute_orientation_residuals, solve_configuration
 from wepose_pin.body.girdle import displace
-from wepose_pin.body.kinematics import (
-    KinematicsSolver,
-    LiveKinematics,
-    compute_link_placements,
-    compute_link_poses,
-    compute_orientation_residuals,
-    compute_pose,
-    solve_configuration,
-)
+from wepose_pin.body.kinematics import KinematicsSolver, compute_pose
+from wepose_pin.body.links import compute_link_placements, compute_link_poses
 from wepose_pin.errors import BadModel
 from wepose_pin.recording import Recording
 from wepose_pin.tracking import track
@@ -119,7 +113,7 @@ def test_shoulders_of_single_poses_are_those_of_the_recording_bit_for_bit() -> N
     quat_WL = orientations(SEGMENTS, 3)
     pose = compute_pose(body, np.arange(N) / 100.0, quat_WL)
     sliding = [body.pin.idx_qs[body.pin.getJointId(name)] for g in body.table.girdles.values() for name in g.joints]
-    live, chunks, views = LiveKinematics(body, SEGMENTS), KinematicsSolver(body, SEGMENTS), []
+    live, chunks, views = KinematicsSolver(body, SEGMENTS), KinematicsSolver(body, SEGMENTS), []
     assert set(live.points) == set(pose.points)
     for k in range(N):
         chunk = chunks.solve_chunk(np.array([k / 100.0]), {name: quat[k : k + 1] for name, quat in quat_WL.items()})
@@ -163,7 +157,7 @@ def test_the_unmeasured_is_rigid_with_what_is_above() -> None:
         assert at[segment][1].shape == (N, 3)
 
 
-@pytest.mark.parametrize("use", [solve_configuration, LiveKinematics])
+@pytest.mark.parametrize("use", [solve_configuration, KinematicsSolver])
 def test_a_segment_that_the_model_lacks(use: Callable[..., object]) -> None:
     with pytest.raises(BadModel, match="left_foot is no segment of upper_body"):
         use(load_model(), orientations(["torso", "left_foot"]))
@@ -292,7 +286,7 @@ def test_a_body_with_hinges_is_followed_live_as_in_a_recording(data: Path, half_
     body = gazebo(data, 48)
     recording = replace(half_minute, phases={"start": half_minute.phases["start"]}).cut(slice(0, 1200))
     pose = track(recording, model=body, causal=True)
-    live = LiveKinematics(body, list(pose.quat_WL))
+    live = KinematicsSolver(body, list(pose.quat_WL))
     rows = range(600, 650)
     points = np.stack([live.compute_points(np.array([quat[k] for quat in pose.quat_WL.values()])) for k in rows])
     assert live.points

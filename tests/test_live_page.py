@@ -28,7 +28,9 @@ from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from wepose_pin.body import BodyModel, load_model
-from wepose_pin.body.kinematics import LiveKinematics, compute_link_placements, solve_configuration
+from wepose_pin.body.configuration import solve_configuration
+from wepose_pin.body.kinematics import KinematicsSolver
+from wepose_pin.body.links import compute_link_placements
 from wepose_pin.errors import BadOption
 from wepose_pin.live.encoder import AngleCurves, PoseEncoder, RobotFigure
 from wepose_pin.live.page import LivePage
@@ -54,7 +56,7 @@ class Person:
     """A fake loop: arms that swing, and the status of their sensors."""
 
     def __init__(self, model: BodyModel, segments: tuple[str, ...] = SEGMENTS) -> None:
-        self._kinematics = LiveKinematics(model, segments)
+        self._kinematics = KinematicsSolver(model, segments)
         self.info = StreamInfo(segments, self._kinematics.points, 100.0)
 
     def pose(self, t: float, lost: tuple[str, ...] = ()) -> LivePose:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from test_model import GAZEBO, cosmik, example_robot_data_human
 
 from benchmarks.ur5_arm import write_table, write_urdf
-from wepose_pin.body import BodyModel, LinkVector, load_model, measure_reaches
+from wepose_pin.body import BodyModel, LinkVector, load_model
 from wepose_pin.errors import BadModel
 
 
@@ -60,7 +60,7 @@ def random_rotations(body: BodyModel, rng: np.random.Generator) -> tuple[pin.Dat
 def test_every_point_is_pinocchios_for_all_lengths_and_orientations(body: BodyModel) -> None:
     """All known bodies are affine in their lengths; those of others have constant parts and links between segments."""
     rng, own = np.random.default_rng(0), body.lengths
-    reaches = measure_reaches(body)
+    reaches = body.reaches
     assert set(reaches) == set(body.point_frames)
     for _ in range(5):
         changed = body.with_lengths({name: value * rng.uniform(0.7, 1.3) for name, value in own.items()})
@@ -79,4 +79,4 @@ def test_a_chain_that_orientations_and_lengths_do_not_give() -> None:
     joint = m.addJoint(m.getJointId("left_forearm"), pin.JointModelPZ(), pin.SE3.Identity(), "telescope")
     m.frames[m.getFrameId("left_palm")].parentJoint = joint
     with pytest.raises(BadModel, match=r"joint 'telescope' slides: orientations do not tell where left_palm is"):
-        measure_reaches(body)
+        _ = body.reaches

@@ -16,7 +16,8 @@ from PIL import Image
 from reading import BROWSER, browse, captions, headings, is_self_contained, rows, text_of, without_frame
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body.kinematics import Pose, compute_axis_std
+from wepose_pin.body.covariance import compute_axis_std
+from wepose_pin.body.kinematics import Pose
 from wepose_pin.body.subject import Hinge, Subject, population_subject
 from wepose_pin.commands import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from wepose_pin.body import load_model
-from wepose_pin.body.kinematics import build_pose_table, parse_pose_table
+from wepose_pin.body.pose_table import build_pose_table, parse_pose_table
 from wepose_pin.body.subject import population_subject
 from wepose_pin.documents import whole_folder
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile

@@ -52,7 +52,7 @@ def result(folder: Path, data: bytes) -> object:
     """The input is a pose as CSV, in a result that is well otherwise: exported to all formats, compared, shown."""
     import polars as pl
 
-    from wepose_pin.body.kinematics import parse_pose_table
+    from wepose_pin.body.pose_table import parse_pose_table
     from wepose_pin.errors import WeposeError
     from wepose_pin.evaluation import evaluate
     from wepose_pin.readers.tables import read_table

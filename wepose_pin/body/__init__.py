@@ -9,16 +9,19 @@ What there is on a body stands in a table beside its URDF (`BodyTable`): segment
 pairs. In a `BodyModel` links bear the names of segments and points, in our frames; a body of others gets massless links
 for them, fixed to its own.
 
-`tree` reads the joints, `table` the table, `naming` gives links its names, `lengths` measures and stretches,
-`anthropometry` has the lengths of people, `chains` turns a segment's orientation into joint values, `reaches` has the
-way from the root to each point, `girdle` moves shoulders on the trunk, `visuals` reads the shapes of the links.
+`tree` reads the joints, `table` and `table_file` the table, `naming` gives links its names, `lengths` measures and
+stretches, `chains` finds the joints that set a segment, `reaches` the way from the root to each point, and `body` is
+what they make. A person's numbers stand in `subject`, those of all people in `anthropometry`.
+
+`configuration` solves for the joints from orientations of segments, `links` places links and points, `kinematics` does
+both (`Pose`), `covariance` says how well points are known.
 """
 
 from .anthropometry import SEXES, LengthPrior, compute_population_lengths, convert_breadths, list_breadths
 from .body import BodyModel, load_model, read_urdf
 from .chains import Chain
-from .girdle import Girdle, GirdleMotion, move_girdles
-from .reaches import LinkVector, measure_reaches
+from .girdle import Girdle, GirdleMotion
+from .reaches import LinkVector
 from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, Segment
 from .table_file import find_table, load_table, read_table
 from .tree import AxisLimits
@@ -46,8 +49,6 @@ __all__ = [
     "list_breadths",
     "load_model",
     "load_table",
-    "measure_reaches",
-    "move_girdles",
     "read_table",
     "read_urdf",
 ]

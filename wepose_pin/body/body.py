@@ -11,7 +11,6 @@ from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
-from scipy.spatial.transform import Rotation
 
 from ..arguments import check_arguments
 from ..assets import asset
@@ -20,7 +19,7 @@ from ..errors import BadModel, BadSession, MissingFile, one_of
 from . import lengths as _lengths
 from . import visuals as _visuals
 from .anthropometry import compute_population_lengths
-from .chains import Chain, find_chains, find_parents
+from .chains import Chain, axis_in_joint, find_chains, find_parents
 from .girdle import PARAMETERS
 from .meshes import find_mesh
 from .naming import MOST_LINKS, format_closest_links, rename_links
@@ -99,7 +98,11 @@ class BodyModel:
     @cached_property
     def reaches(self) -> dict[str, dict[str, LinkVector]]:
         """Point → link → its part of the way from the root, the same for all lengths."""
-        return measure_reaches(self) if self.loaded is None else self.loaded.reaches
+        if self.loaded is not None:
+            return self.loaded.reaches
+        return measure_reaches(
+            self.table, self.lengths, lambda lengths: self.with_lengths(lengths).pin if lengths else self.pin
+        )
 
     @cached_property
     def neutral_rotations(self) -> dict[str, np.ndarray]:
@@ -412,10 +415,12 @@ def _check_segments_move(body: BodyModel, where: str) -> None:
                 f"{body.parents[hinge.moves] or 'the root'}, not on {hinge.on}"
             )
         chain = body.chains[hinge.moves]
-        if len(chain.axes) != 1 or chain.axes[0] is None:
+        if len(chain.joints) != 1 or chain.exact:
             continue
-        axis_L = Rotation.from_quat(chain.quat_AL).inv().apply(chain.axes[0])  # all joints at zero
-        own = body.neutral_rotations[hinge.on].T @ body.neutral_rotations[hinge.moves] @ axis_L
+        [joint], data = chain.joints, body.pin.createData()
+        pin.forwardKinematics(body.pin, data, pin.neutral(body.pin))
+        axis_W = data.oMi[joint].rotation @ axis_in_joint(body.pin, joint)
+        own = body.neutral_rotations[hinge.on].T @ axis_W
         if abs(own @ hinge.axis) < MIN_HINGE_COSINE:
             axis = ", ".join(f"{v:.2g}" for v in np.round(own, 9) + 0.0)
             raise BadModel(

@@ -12,18 +12,13 @@ that segment [m] a place at rest, and a displacement at 90° that grows with s.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
 from ..documents import Key
 from ..recording.sensors import AXES
-
-if TYPE_CHECKING:
-    from .body import BodyModel
 
 MAX_ELEVATION = np.deg2rad(130.0)  # [rad] up to which the law holds; it stays there beyond
 # Of a person: a share of the law, then [m].
@@ -31,8 +26,6 @@ PARAMETERS = ("law", "rest_x", "rest_y", "rest_z", "raised_x", "raised_y", "rais
 # s that stands for the limb's elevation where it has no sensor: arms at 50 ± 35° in mixed planes.
 MEAN_RAISED = 0.55
 _LEAST_SINE = 1e-9  # squared; keeps the slope finite at rest, where the law is below a micrometre
-# The functions of `displace` for numbers, some ten times as fast as NumPy's.
-SCALARS = SimpleNamespace(sqrt=math.sqrt, arctan2=math.atan2, fmin=min, exp=math.exp)
 
 Direction = Annotated[
     tuple[float, float, float], Key(words={name: tuple(map(float, axis)) for name, axis in AXES.items()})
@@ -89,7 +82,7 @@ def displace(girdle: Girdle, along: Any, scale: Any, math: Any) -> tuple[tuple[A
     Parameters
     ----------
     along : (x, y, z) of the limb's unit direction, from its first point on, in the frame of `on`
-    math : `numpy`, `casadi` for symbols, or `SCALARS`
+    math : `numpy`, or `casadi` for symbols
     """
     x, y, z = along
     outward = sum(part * axis for part, axis in zip(along, girdle.outward, strict=True) if axis)
@@ -134,36 +127,3 @@ class GirdleMotion(NamedTuple):
         if not self.is_known:  # what the law would have said is not known either
             var += self.raised[:, None] ** 2 * np.square((girdle.back[1], girdle.middle[0], girdle.up[0]))
         return var
-
-
-def move_girdles(
-    model: BodyModel, R_WL: Mapping[str, np.ndarray], names: Iterable[str] | None = None
-) -> dict[str, GirdleMotion]:
-    """Girdle → its motion, of those that hang on a measured segment.
-
-    Parameters
-    ----------
-    R_WL : segment → orientations (n, 3, 3)
-    names : of girdles; None: all of the body
-    """
-    motions = {}
-    for name in model.table.girdles if names is None else names:
-        girdle = model.table.girdles[name]
-        if girdle.on not in R_WL:
-            continue
-        parameters = model.girdle_parameters(name)
-        n = len(R_WL[girdle.on])
-        if girdle.moves not in R_WL:
-            raised = np.full(n, MEAN_RAISED)
-            motions[name] = GirdleMotion(np.tile(parameters[1:4], (n, 1)), np.zeros((n, 3)), raised, False)
-            continue
-        # Sums of columns: a product of matrices may have other last bits for one orientation than for many.
-        x, y, z = model.table.segments[girdle.moves].along
-        columns = R_WL[girdle.moves].transpose(2, 1, 0)
-        along_W = x * columns[0] + y * columns[1] + z * columns[2]
-        along = sum(rows * part for rows, part in zip(R_WL[girdle.on].transpose(1, 2, 0), along_W, strict=True))
-        law, s = displace(girdle, along, find_girdle_scale(girdle, model.lengths), np)
-        by_law = np.column_stack(law)
-        displacement = (1.0 + parameters[0]) * by_law + parameters[1:4] + s[:, None] * parameters[4:]
-        motions[name] = GirdleMotion(displacement, by_law, np.asarray(s), True)
-    return motions

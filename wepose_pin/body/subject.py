@@ -25,8 +25,11 @@ from ..arguments import (
 from ..diagnostics import notebook_html
 from ..documents import TomlTable, is_number, parse_toml, read_toml, toml_string, toml_strings, whole_file
 from ..errors import BadData, BadModel, BadOption, BadSubject, one_of
-from . import BodyModel, BodyTable, compute_population_lengths, load_table
+from .anthropometry import compute_population_lengths
+from .body import BodyModel
 from .girdle import PARAMETERS
+from .table import BodyTable
+from .table_file import load_table
 
 _ROW = re.compile(
     r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law"

@@ -7,7 +7,7 @@ module of the package names a segment, a point or a length. docs/models.md expla
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -16,7 +16,6 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from ..documents import Key
-from ..errors import one_of
 from .girdle import Direction, Girdle, SegmentName
 
 DEFAULT_BODY = "upper_body"
@@ -320,18 +319,6 @@ class BodyTable:
         """Return the points at which the length of a segment begins and ends; None where not just one length is its."""
         stretches = [part for length in self.lengths.values() for part in length.stretches if part.segment == segment]
         return (stretches[0].start, stretches[0].end) if len(stretches) == 1 else None
-
-    def check_segments(self, names: Iterable[str], where: str, error: type[Exception]) -> None:
-        """Raise an `error` whose text begins with `where` if a name is no segment."""
-        from .table_file import list_bodies_with  # which imports this module
-
-        for name in names:
-            if name not in self.segments:
-                others = list_bodies_with(name)
-                known = f"the body {others[0]} has it" if others else one_of(self.segments, name)
-                if others and where.endswith("sensors."):
-                    known += f"; to do without that sensor, write ignore = true in [sensors.{name}]"
-                raise error(f"{where}{name} is no segment of {self.name}; {known}")
 
     def guess_segment(self, label: str) -> str | None:
         """Guess the segment from a label or a file name, as ``humerus_r_imu`` or ``LeftForeArm``; None if unclear."""

@@ -66,9 +66,15 @@ def _list_bodies() -> list[str]:
     return sorted(path.stem for path in asset("urdf", f"{DEFAULT_BODY}.toml").parent.glob("*.toml"))
 
 
-def list_bodies_with(segment: str) -> list[str]:
-    """Return the names of the bodies of the package that have a segment of this name."""
-    return [body for body in _list_bodies() if segment in load_table(body).segments]
+def check_segments(table: BodyTable, names: Iterable[str], where: str, error: type[Exception]) -> None:
+    """Raise an `error` whose text begins with `where` if a name is no segment of a body."""
+    for name in names:
+        if name not in table.segments:
+            others = [body for body in _list_bodies() if name in load_table(body).segments]
+            known = f"the body {others[0]} has it" if others else one_of(table.segments, name)
+            if others and where.endswith("sensors."):
+                known += f"; to do without that sensor, write ignore = true in [sensors.{name}]"
+            raise error(f"{where}{name} is no segment of {table.name}; {known}")
 
 
 def read_table(path: Path, *, needs_urdf: bool = False) -> tuple[BodyTable, Path | None]:

@@ -15,8 +15,9 @@ import numpy as np
 
 from ..body import BodyModel, BodyTable, Girdle
 from ..body.girdle import find_girdle_scale
-from ..body.kinematics import find_carrier
+from ..body.links import find_carrier
 from ..body.reaches import UNIVERSE
+from ..body.table_file import check_segments
 from ..errors import BadOption, BadSession
 from .protocols import Axis, Closure, Direction, Protocol
 
@@ -196,7 +197,7 @@ def resolve_conditions(
 
 def _check_posed(segments: tuple[str, ...], protocol: Protocol, model: BodyModel, sensors: Collection[str]) -> None:
     """Raise `BadOption` where the body lacks a segment of a pose, `BadSession` where it has no sensor."""
-    model.table.check_segments(segments, f"protocol '{protocol.name}': ", BadOption)
+    check_segments(model.table, segments, f"protocol '{protocol.name}': ", BadOption)
     lacking = [segment for segment in segments if segment not in sensors]
     if lacking:
         raise BadSession(

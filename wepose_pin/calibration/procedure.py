@@ -35,6 +35,7 @@ from ..arguments import Positive, check_arguments
 from ..body import BodyModel, convert_breadths, list_breadths
 from ..body.body import load_sensed_model
 from ..body.subject import Subject, population_subject
+from ..body.table_file import check_segments
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
@@ -163,7 +164,7 @@ def calibrate(
 
 def _check_body(recording: Recording, protocol: Protocol, model: BodyModel) -> None:
     """Raises where the body lacks a segment of the recording, lengths, or what the protocol names."""
-    model.table.check_segments(recording.sensors, f"{recording.where()}: sensors.", BadSession)
+    check_segments(model.table, recording.sensors, f"{recording.where()}: sensors.", BadSession)
     if not model.table.lengths:
         raise BadModel(
             f"{model.table.where}: this body has no lengths; a table beside the URDF names its points and [lengths], "

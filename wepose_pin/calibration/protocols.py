@@ -29,6 +29,7 @@ import numpy as np
 from ..alignment import PALM_SLIP_STD
 from ..assets import asset
 from ..body import BodyTable, list_breadths
+from ..body.table_file import check_segments
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, one_of
 
@@ -183,7 +184,7 @@ class Protocol:
                     raise BadOption(f"{where}'{point}' is no point of {table.name}; {one_of(table.points, point)}")
         named = [c.segment for c in self.conditions if isinstance(c, Direction | Axis)]
         named += [closure.in_front_of for closure in self.closures if closure.in_front_of]
-        table.check_segments((*named, *self.needs), where, BadOption)
+        check_segments(table, (*named, *self.needs), where, BadOption)
         measured = self.measured_example.partition("=")[0]
         if measured and measured not in (*table.lengths, *list_breadths(table)):
             raise BadOption(f"{where}measured_example: '{measured}' is no length; {one_of(table.lengths, measured)}")

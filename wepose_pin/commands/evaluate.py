@@ -80,7 +80,8 @@ def _compare(
     markers: Path | None,
 ) -> Evaluation:
     """The errors of a result; the reference is brought to its clock and world where that is needed."""
-    from ..body.kinematics import Pose, parse_pose_table
+    from ..body.kinematics import Pose
+    from ..body.pose_table import parse_pose_table
     from ..evaluation import evaluate, register
     from ..readers import load_session
     from ..readers.reference import is_reference, read_reference

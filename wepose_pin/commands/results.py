@@ -13,7 +13,8 @@ import polars as pl
 from .. import tracking
 from ..arguments import check_arguments, check_value
 from ..body import BodyModel
-from ..body.kinematics import PosedBody, build_pose_table
+from ..body.kinematics import PosedBody
+from ..body.pose_table import build_pose_table
 from ..body.subject import Subject, load_subject
 from ..diagnostics import WARNING, Diagnostic, from_json, notebook_html
 from ..errors import BadData, WeposeError, how_to_install

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body import DEFAULT_BODY, BodyModel
-from ..body.kinematics import LiveKinematics
+from ..body.kinematics import KinematicsSolver
 from ..calibration import Protocol
 from ..errors import BadOption
 from ..simulation import simulate
@@ -35,7 +35,7 @@ class Demonstration:
         if lengths and not self._motion:  # a protocol of one's own
             self._motion, self._phases = _simulate(lengths, "clasp")
         self.segments = tuple(name for name in model.table.needed)
-        self._kinematics = LiveKinematics(model, self.segments)
+        self._kinematics = KinematicsSolver(model, self.segments)
 
     def pose(self, view: GuideView, time: float) -> LivePose:
         """The figure at a time [s]: the start pose, the motion of a phase, or one segment that is shaken."""

@@ -13,7 +13,8 @@ import pinocchio as pin
 
 from ..angles import joint_angles
 from ..body import BodyModel
-from ..body.kinematics import LiveKinematics, Pose, find_known_links
+from ..body.kinematics import KinematicsSolver, Pose
+from ..body.links import find_known_links
 from ..errors import WeposeError
 from ..report.viewer import Mesh, find_floor, visible
 from ..retargeting.robot import Robot
@@ -89,7 +90,7 @@ class PoseEncoder:
 
     def points(self, segments: tuple[str, ...]) -> tuple[str, ...]:
         """The points that sensors on these segments determine."""
-        return LiveKinematics(self._model, segments).points
+        return KinematicsSolver(self._model, segments).points
 
     def start(self, info: StreamInfo) -> None:
         self.newest = None  # it may be of another stream
@@ -169,7 +170,7 @@ class MeasuredLinks:
 
     def __init__(self, model: BodyModel, links: tuple[str, ...], info: StreamInfo) -> None:
         self.segments = info.segments
-        self._kinematics = LiveKinematics(model, info.segments)
+        self._kinematics = KinematicsSolver(model, info.segments)
         frames = [model.pin.getFrameId(link) for link in links]
         self._views = [self._kinematics.data.oMf[frame] for frame in frames]
         known = set(find_known_links(model, info.segments))

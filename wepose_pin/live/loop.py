@@ -15,9 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..body import BodyModel
-from ..body.kinematics import LiveKinematics, compute_axis_std
+from ..body.covariance import compute_axis_std
+from ..body.kinematics import KinematicsSolver
 from ..body.start_pose import compute_start_configuration
 from ..body.table import NEUTRAL_POSE
+from ..body.table_file import check_segments
 from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession, WeposeError
 from ..filters import BEST
@@ -167,11 +169,11 @@ class LiveLoop(Stage):
         super().__init__(source, outputs)
         self.method, self.log, self._open_log, self.setup = method, log, open_log, setup.as_recorded()
         self.model = build_subject_model(setup, model, source.sensors)
-        self.model.table.check_segments(source.sensors, f"{setup.name}: sensors.", BadSession)
+        check_segments(self.model.table, source.sensors, f"{setup.name}: sensors.", BadSession)
         with suppress(BadModel):  # measured before samples come; the parts of the way to a point
             _ = self.model.reaches
         start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
-        self.kinematics = LiveKinematics(self.model, source.sensors, start)
+        self.kinematics = KinematicsSolver(self.model, source.sensors, start=start)
         self._instruction = START_POSES.get(setup.start_pose, f"Hold still in the start pose, {setup.start_pose}")
         if self.model.table.is_mechanism:
             self._instruction = f"{self.model.table.name} must stand still in its start configuration"

@@ -26,7 +26,7 @@ import numpy as np
 import pinocchio as pin
 
 from ..body import BodyModel
-from ..body.kinematics import find_known_points
+from ..body.links import find_known_points
 from ..report.viewer import DARK, LIGHT, backdrop, choose_trail_colour, filled, find_floor, scene, view
 from .addresses import LOOPBACK
 from .encoder import PoseEncoder, RobotFigure

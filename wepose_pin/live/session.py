@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..body import BodyModel, load_model, load_table
-from ..body.kinematics import LiveKinematics
+from ..body.kinematics import KinematicsSolver
 from ..errors import ExistingOutput
 from ..filters import BEST
 from ..recording import ImuSensor, Recording
@@ -133,6 +133,6 @@ def warm_up(method: str) -> None:
     for _ in range(round(2.0 * CAUSAL_KNOT_S * recording.rate_hz)):
         estimator.step(np.zeros((len(sensors), 3)), np.tile([0.0, 0.0, 9.81], (len(sensors), 1)))
     estimator.covariance()
-    LiveKinematics(load_model(), sensors).compute_points(np.tile([0.0, 0.0, 0.0, 1.0], (len(sensors), 1)))
+    KinematicsSolver(load_model(), sensors).compute_points(np.tile([0.0, 0.0, 0.0, 1.0], (len(sensors), 1)))
     synchronizer = StreamSynchronizer(sensors, 100.0, 0.0)
     synchronizer.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))

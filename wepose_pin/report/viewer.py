@@ -20,7 +20,9 @@ from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel, Visual
-from ..body.kinematics import Pose, compute_link_placements, find_known_links, solve_configuration
+from ..body.configuration import solve_configuration
+from ..body.kinematics import Pose
+from ..body.links import compute_link_placements, find_known_links
 from .page import Frame, load_template
 
 if TYPE_CHECKING:

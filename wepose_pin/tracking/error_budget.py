@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..alignment import compute_soft_tissue_covariances
-from ..body.kinematics import compute_point_covariances
+from ..body.covariance import compute_point_covariances
 from .tracked import TrackedRecording
 
 PERIOD_S = 1.0  # [s] from one sample to the next

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..alignment import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
-from ..body import GirdleMotion, move_girdles
+from ..body import GirdleMotion
 from ..body.girdle import PARAMETERS
+from ..body.links import move_girdles
 from ..compilation import kernel
 from .heading_problem import CoincidentPoints, HeadingProblem, HingeAxis, Knot
 

@@ -22,7 +22,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel
-from ..body.kinematics import find_carrier
+from ..body.links import find_carrier
 from ..filters.butterworth import BandPass
 
 BAND_HZ = (0.1, 1.5)  # what people move in

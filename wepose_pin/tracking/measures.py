@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from ..alignment import compute_heading_variance
 from ..body import BodyModel, BodyTable, HingeJoint
-from ..body.kinematics import Pose, compute_axis_std
+from ..body.covariance import compute_axis_std
+from ..body.kinematics import Pose
 from ..body.subject import Subject
 from ..filters import Orientation
 from ..recording import OrientationSensor, Recording

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..alignment import SegmentOrientations
-from ..body.configurations import find_undetermined_joints
-from ..body.kinematics import PosedBody, compute_orientation_residuals
+from ..body.configuration import compute_orientation_residuals
+from ..body.kinematics import PosedBody
+from ..body.links import find_undetermined_joints
 from ..errors import BadOption
 from ..filters import BEST, OFFLINE, check_method
 from ..filters.static import StaticTest
@@ -76,4 +77,4 @@ class TrackedRecording(PosedBody):
         """The joints of a mechanism that the measured segments leave open, at least in part: they move little."""
         if not self.model.table.is_mechanism:
             return []
-        return find_undetermined_joints(self.model.pin, list(self.quat_WL))
+        return find_undetermined_joints(self.model, self.quat_WL)

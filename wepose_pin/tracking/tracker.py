@@ -11,8 +11,10 @@ import numpy as np
 from ..alignment import SegmentOrientations, StartFrames, find_start_frames
 from ..body import BodyModel
 from ..body.body import load_sensed_model
-from ..body.kinematics import KinematicsSolver, compute_point_covariances
+from ..body.covariance import compute_point_covariances
+from ..body.kinematics import KinematicsSolver
 from ..body.subject import Subject, population_subject
+from ..body.table_file import check_segments
 from ..errors import BadOption, BadPhase, BadSession
 from ..filters import OFFLINE
 from ..filters.noise import BEGINNING_S
@@ -255,7 +257,7 @@ def _fit_body(
     where = recording.where()
     chosen = model or recording.model or None
     body = chosen if isinstance(chosen, BodyModel) else load_sensed_model(chosen, recording.sensors, where)
-    body.table.check_segments(recording.sensors, f"{where}: sensors.", BadSession)
+    check_segments(body.table, recording.sensors, f"{where}: sensors.", BadSession)
     start_frames = find_start_frames(body, recording)
     person = subject or population_subject(body=body)
     person.check_body(body.table)

@@ -20,8 +20,8 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
-from ..body import move_girdles
-from ..body.kinematics import compute_link_poses, find_known_points, solve_configuration
+from ..body.configuration import solve_configuration
+from ..body.links import compute_link_poses, find_known_points, move_girdles
 from ..diagnostics import Diagnostic
 from ..errors import BadData
 from ..rotations import conjugate, multiply

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body.kinematics import compute_link_poses, find_known_links, solve_configuration
+from ..body.configuration import solve_configuration
+from ..body.links import compute_link_poses, find_known_links
 from ..diagnostics import Diagnostic
 from ..errors import BadData, BadOption, ExistingOutput, how_to_install
 from .motion import Motion, find_measured_points, resample_evenly

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
 from ..body import BodyModel, read_urdf
-from ..body.configurations import joint_values
-from ..body.kinematics import solve_configuration
+from ..body.configuration import solve_configuration
+from ..body.links import compute_joint_values
 from ..body.tree import joint_axis, joint_placement, parse_tree
 from ..errors import BadData, MissingFile
 from ..readers.tables import read_columns, read_table
@@ -335,7 +335,7 @@ def convert_person(motion: Motion) -> JointMotion:
     if free := [child for child in model.joints if child not in model.limits]:
         raise BadData(f"{motion.where}: link '{free[0]}' hangs on a joint of type floating, which has no axes to state")
     q = solve_configuration(model, pose.quat_WL) if pose.q is None else pose.q
-    values = joint_values(model.pin, q)
+    values = compute_joint_values(model.pin, q)
     for child in model.limits:
         values |= _split_triple(model, child, q)
     names = tuple(values)

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
-from ..body.chains import Chain, solve
 from ..readers.opensim import PRONATION, R_GW, compute_n_pose
 from ..rotations import conjugate, multiply, rotation_about
 
@@ -222,6 +221,13 @@ def _body_errors(
 
 
 def _solve_two_axes(axes: Sequence[np.ndarray], quat: np.ndarray) -> list[np.ndarray]:
-    """Angles (n,) [rad] about two axes that come nearest to rotations (n, 4)."""
-    chain = Chain(joints=(1, 2), above=0, axes=tuple(axes), place=(0, 0), quat=(_STILL, _STILL), quat_AL=_STILL)
-    return solve(chain, quat)
+    """Angles (n,) [rad] about two axes whose rotations come nearest to `quat` (n, 4).
+
+    With half angles α, β the scalar product of the two quaternions is (cos α, sin α) m (cos β, sin β)ᵀ, that is
+    ½ [(m00 + m11) cos(α−β) + (m10 − m01) sin(α−β)] + ½ [(m00 − m11) cos(α+β) + (m10 + m01) sin(α+β)]: each bracket has
+    its largest value alone.
+    """
+    (a, b), v, w = axes, quat[:, :3], quat[:, 3]
+    m00, m01, m10, m11 = w, v @ b, v @ a, v @ np.cross(a, b) - w * (a @ b)
+    difference, total = np.arctan2(m10 - m01, m00 + m11), np.arctan2(m10 + m01, m00 - m11)
+    return [total + difference, total - difference]

@@ -1,0 +1,467 @@
+"""Segment orientations → configuration of a body: exactly where its joints can, else as near as they come.
+
+A segment on a spherical joint has its orientation: the joint takes the rotation relative to the measured segment above.
+In a spine of several joints each place takes an equal share of the tilt, and the spherical joint nearest to the segment
+takes what they leave, with it the turn about the vertical: a whole turn of the person does not twist the spine.
+
+All else is one least-squares fit within the limits of the joints (`_Fit`): a limb that has fewer axes somewhere, with
+all its segments; a segment of the spine without a spherical joint; all joints of a mechanism. Girdles follow the limbs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from scipy.spatial.transform import Rotation
+
+from ..compilation import kernel
+from ..errors import BadData, BadModel
+from ..rotations import conjugate, exp, log, multiply, product, rotation_about
+from .body import BodyModel
+from .chains import axis_in_joint
+from .girdle import displace, find_girdle_scale
+from .links import compute_link_poses, find_columns
+from .table_file import check_segments
+
+_MEET_TOLERANCE = 1e-6  # [m] between joints of one place
+_ROUNDS = 100  # of a fit; two to four are the rule from the frame before
+_STEP = 1e-6  # [rad] at which a frame is fitted
+_DAMPING, _MOST_DAMPING = 1e-7, 1e6  # the least; the greatest ends a search that finds nothing better
+_WORTH_ANOTHER_START = np.deg2rad(1.0) ** 2  # [rad²] left, from which another start is tried
+_GROWTH = 1.5  # of what is left, from which it is tried again
+_IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def solve_configuration(model: BodyModel, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> np.ndarray:
+    """Solve for the configuration `q` (n, nq) with the measured orientations, or the nearest one.
+
+    Parameters
+    ----------
+    quat_WL : segment → (n, 4) xyzw; an unmeasured segment is rigid with the one above
+    limits : keep the limits of joints with one axis; those of spherical joints are not kept
+
+    Raises
+    ------
+    BadData, BadModel
+        No segment; the model has no link for one.
+    """
+    solver = ConfigurationSolver(model, quat_WL, limits=limits)
+    return solver.solve(np.stack(list(quat_WL.values()), axis=1))
+
+
+class ConfigurationSolver:
+    """Configurations that follow orientations: of a whole recording, or of one pose after another.
+
+    Parameters
+    ----------
+    segments : the measured ones, in the order in which `solve` takes them
+    limits : as of `solve_configuration`
+    start : (nq,) the configuration of a mechanism before the first frame; None: all joints at zero
+
+    Raises
+    ------
+    BadData, BadModel
+        As `solve_configuration`.
+    """
+
+    def __init__(
+        self, model: BodyModel, segments: Collection[str], *, limits: bool = True, start: np.ndarray | None = None
+    ) -> None:
+        if not segments:
+            raise BadData("no segment has an orientation: a pose needs one")
+        check_segments(model.table, segments, f"{model.pin.name}: ", BadModel)
+        m = model.pin
+        self._model, self._segments, self._neutral = model, tuple(segments), pin.neutral(m)
+        self._last: np.ndarray | None = None  # (nq,) of the frame before
+        self._spherical: list[_SphericalJoint] = []
+        self._bent: list[_BentSpine] = []
+        self._spine_fits: list[_Fit] = []
+        self._fits: list[_Fit] = []
+        if model.table.is_mechanism:
+            self._last = self._neutral if start is None else start
+            joints = [joint for joint in range(1, m.njoints) if m.nvs[joint]]  # a mimic joint has none
+            self._fits.append(_Fit(m, self._segments, self._segments, joints, limits, restarts=False))
+        else:
+            self._plan(limits)
+        self._joined = tuple(np.array(column) for column in zip(*self._spherical, strict=True))
+        self._quaternions = np.array([m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4], dtype=int)
+        self._girdles = [
+            _PlacedGirdle(model, name, self._segments)
+            for name, girdle in model.table.girdles.items()
+            if girdle.on in self._segments
+        ]
+
+    def _plan(self, limits: bool) -> None:
+        """Find how each measured segment of a person is followed."""
+        model, segments = self._model, self._model.table.segments
+        data = model.pin.createData()
+        pin.framesForwardKinematics(model.pin, data, self._neutral)
+        for names in _find_limbs(model, self._segments):
+            for name in names:
+                chain, above = model.chains[name], model.parents[name]
+                while above is not None and not (above in self._segments and model.chains[above].joints):
+                    above = model.parents[above]
+                if chain.exact and len(chain.joints) == 1:
+                    self._spherical.append(_join_spherical(model, data, name, above, self._segments))
+                elif chain.exact:
+                    self._bent.append(_BentSpine(model, data, name, above, self._segments, limits))
+            if _is_fitted(model, names):
+                joints = sorted({joint for name in names for joint in model.chains[name].joints})
+                fits = self._spine_fits if segments[names[0]].spine else self._fits
+                fits.append(_Fit(model.pin, names, self._segments, joints, limits, restarts=True))
+
+    def solve(self, quat_WL: np.ndarray) -> np.ndarray:
+        """Solve for `q` (n, nq) of orientations (n, k, 4) xyzw; they continue the motion of the last call."""
+        last = self._last
+        q = np.empty((len(quat_WL), len(self._neutral)))
+        q[:] = self._neutral
+        self._follow_exactly(q, quat_WL)
+        if self._spine_fits:  # what hangs on them stands elsewhere then
+            stands = quat_WL.copy()
+            for fit in self._spine_fits:
+                fit.run(q, quat_WL, last)
+                R_WL, _ = compute_link_poses(self._model, q, fit.links)
+                for k, row in enumerate(fit.rows):
+                    stands[:, row] = Rotation.from_matrix(R_WL[:, k]).as_quat()
+                self._follow_exactly(q, stands)
+        for fit in self._fits:
+            fit.run(q, quat_WL, last)
+        for girdle in self._girdles:
+            girdle.place(q, quat_WL)
+        _unwrap_signs(q, self._quaternions, q[0] if last is None else last)
+        self._last = q[-1].copy()
+        return q
+
+    def _follow_exactly(self, q: np.ndarray, stands: np.ndarray) -> None:
+        """Write the joints of segments that follow exactly; `stands` (n, k, 4): the orientations of the segments."""
+        if self._joined:
+            _set_relative_rotations(stands, *self._joined, q)
+        for spine in self._bent:
+            spine.bend(q, stands)
+
+
+def _find_limbs(model: BodyModel, measured: Collection[str]) -> list[list[str]]:
+    """Find the measured segments of each limb, and each segment of the spine by itself, the spine first."""
+    parents, segments = model.parents, model.table.segments
+
+    def first_of_limb(segment: str) -> str:
+        above = parents[segment]
+        return segment if above is None or segments[segment].spine or segments[above].spine else first_of_limb(above)
+
+    limbs: dict[str, list[str]] = {}
+    for segment in model.chains:
+        if segment in measured:
+            limbs.setdefault(first_of_limb(segment), []).append(segment)
+    return sorted(limbs.values(), key=lambda names: not segments[names[0]].spine)
+
+
+def _is_fitted(model: BodyModel, limb: Collection[str]) -> bool:
+    """Return whether a segment of a limb has joints that cannot follow every orientation."""
+    return any(model.chains[name].joints and not model.chains[name].exact for name in limb)
+
+
+# Exactly ----------------------------------------------------------------------------------------------------------
+
+
+class _SphericalJoint(NamedTuple):
+    """A spherical joint that takes the rotation of its segment L against the measured segment A above, or W."""
+
+    row: int  # of its segment
+    above: int  # row of the segment above; -1: W
+    left: np.ndarray  # (4,) R_JA, all joints at zero
+    right: np.ndarray  # (4,) R_LJ
+    at: int  # its place in q
+
+
+def _join_spherical(
+    model: BodyModel, data: pin.Data, segment: str, above: str | None, segments: Sequence[str]
+) -> _SphericalJoint:
+    joint = model.chains[segment].spherical
+    R_AJ, R_AL = _stand_at_zero(model, data, segment, above, [joint])
+    left, right = R_AJ[0].inv(), R_AL.inv() * R_AJ[0]
+    row = -1 if above is None else segments.index(above)
+    return _SphericalJoint(segments.index(segment), row, left.as_quat(), right.as_quat(), model.pin.idx_qs[joint])
+
+
+def _stand_at_zero(
+    model: BodyModel, data: pin.Data, segment: str, above: str | None, joints: Sequence[int | None]
+) -> tuple[Rotation, Rotation]:
+    """Find R_AJ of joints' moving frames and R_AL of a segment, A the segment above or W.
+
+    `data` is Pinocchio's with all joints at zero.
+    """
+    m = model.pin
+    R_WA = np.eye(3) if above is None else data.oMf[m.getFrameId(above)].rotation
+    R_AJ = [R_WA.T @ data.oMi[joint].rotation for joint in joints]
+    return Rotation.from_matrix(R_AJ), Rotation.from_matrix(R_WA.T @ data.oMf[m.getFrameId(segment)].rotation)
+
+
+@kernel
+def _set_relative_rotations(quat, rows, above, left, right, at, q):  # type: ignore[no-untyped-def]
+    """Write R_JA R_AW R_WL R_LJ of each `_SphericalJoint` into `q` (n, nq), from `quat` (n, k, 4) xyzw."""
+    for j in range(len(rows)):
+        for i in range(len(quat)):
+            x, y, z, w = left[j, 0], left[j, 1], left[j, 2], left[j, 3]
+            if above[j] >= 0:
+                a = quat[i, above[j]]
+                x, y, z, w = product(x, y, z, w, -a[0], -a[1], -a[2], a[3])
+            b = quat[i, rows[j]]
+            x, y, z, w = product(x, y, z, w, b[0], b[1], b[2], b[3])
+            x, y, z, w = product(x, y, z, w, right[j, 0], right[j, 1], right[j, 2], right[j, 3])
+            scale, k = 1.0 / np.sqrt(x * x + y * y + z * z + w * w), at[j]
+            q[i, k], q[i, k + 1], q[i, k + 2], q[i, k + 3] = x * scale, y * scale, z * scale, w * scale
+
+
+@kernel
+def _unwrap_signs(q, at, before):  # type: ignore[no-untyped-def]
+    """Choose the signs of quaternions at `at` in `q` (n, nq) that lie on one side with the row before."""
+    for k in at:
+        a, b, c, d = before[k], before[k + 1], before[k + 2], before[k + 3]
+        for i in range(len(q)):
+            if a * q[i, k] + b * q[i, k + 1] + c * q[i, k + 2] + d * q[i, k + 3] < 0.0:
+                for j in range(k, k + 4):
+                    q[i, j] = -q[i, j]
+            a, b, c, d = q[i, k], q[i, k + 1], q[i, k + 2], q[i, k + 3]
+
+
+class _BentSpine:
+    """Several joints between a segment L and the measured segment A above, or W, the last spherical one of them free.
+
+    Hinges in the place of a spherical joint rest. Joints with limits keep them.
+    """
+
+    def __init__(
+        self,
+        model: BodyModel,
+        data: pin.Data,
+        segment: str,
+        above: str | None,
+        segments: Sequence[str],
+        limits: bool,
+    ) -> None:
+        m, chain = model.pin, model.chains[segment]
+        self._row, self._above = segments.index(segment), -1 if above is None else segments.index(above)
+        R_AJ, R_AL = _stand_at_zero(model, data, segment, above, chain.joints)
+        self._quat_LA, self._up_A = R_AL.inv().as_quat(), R_AL.apply([0.0, 0.0, 1.0])
+        places: list[list[int]] = []  # joints that meet in one point
+        for joint in chain.joints:
+            p = data.oMi[joint].translation
+            if not places or np.linalg.norm(p - data.oMi[places[-1][-1]].translation) > _MEET_TOLERANCE:
+                places.append([])
+            places[-1].append(joint)
+        self._share = 1.0 / len(places)
+        self._joints = []  # place in q, R_AJ, axis in A and limits of each that moves, from the root outwards
+        for place in places:
+            spherical = [joint for joint in place if m.nvs[joint] == 3]
+            for joint in spherical[-1:] or place:
+                R, at = R_AJ[chain.joints.index(joint)], m.idx_qs[joint]
+                axis = None if spherical else R.apply(axis_in_joint(m, joint))
+                bounded = limits and m.nqs[joint] == 1
+                ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if bounded else (-np.inf, np.inf)
+                self._joints.append((joint == chain.spherical, at, m.nqs[joint], R.as_quat(), axis, ends))
+
+    def bend(self, q: np.ndarray, stands: np.ndarray) -> None:
+        """Write the joints' values into `q` (n, nq); `stands` (n, k, 4) xyzw."""
+        R_WA = stands[:, self._above] if self._above >= 0 else _IDENTITY
+        turned = multiply(multiply(conjugate(R_WA), stands[:, self._row]), self._quat_LA)
+        share = self._share * log(_remove_turn(turned, self._up_A))  # (n, 3)
+        before, after, free = _IDENTITY, _IDENTITY, (0, _IDENTITY)
+        for is_free, at, size, quat_AJ, axis, ends in self._joints:
+            if is_free:
+                free, before, after = (at, quat_AJ), after, _IDENTITY
+                continue
+            if axis is None:
+                rotation = exp(share)
+                q[:, at : at + 4] = multiply(multiply(conjugate(quat_AJ), rotation), quat_AJ)
+            else:
+                angle = np.clip(share @ axis, *ends)
+                q[:, at : at + size] = np.transpose([angle] if size == 1 else [np.cos(angle), np.sin(angle)])
+                rotation = rotation_about(axis, angle)
+            after = multiply(after, rotation)
+        rotation = multiply(multiply(conjugate(before), turned), conjugate(after))
+        at, quat_AJ = free
+        q[:, at : at + 4] = multiply(multiply(conjugate(quat_AJ), rotation), quat_AJ)
+
+
+def _remove_turn(quat: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return what is left of rotations (n, 4) when the turn about `up` (3,), that came before, is taken off."""
+    turn = np.column_stack([np.outer(quat[:, :3] @ up, up), quat[:, 3]])
+    norm = np.linalg.norm(turn, axis=1)
+    turn[norm < 1e-9] = _IDENTITY  # upside down: no turn is better than another
+    return multiply(quat, conjugate(turn / np.maximum(norm, 1e-9)[:, None]))
+
+
+# As near as they come ---------------------------------------------------------------------------------------------
+
+
+class _Fit:
+    """Configurations in which links come nearest to orientations: the sum over the links of angle² is least.
+
+    Gauss-Newton with Levenberg's damping on Pinocchio's Jacobian, each frame from the solution of the one before.
+    Limits are kept by projection: a joint at its limit that the gradient pushes outward takes no part in the step, and
+    what a step carries over a limit ends on it (Bertsekas 1982, "Projected Newton methods for optimization problems
+    with simple constraints", SIAM J. Control 20:221). Joints that the links do not determine move as little as possible
+    from frame to frame.
+
+    Parameters
+    ----------
+    segments : the measured ones, `links` are some of them
+    joints : those that may move
+    limits : keep the limits of joints with one axis
+    restarts : try a frame's own start too where the one from the frame before leaves much
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        links: Sequence[str],
+        segments: Sequence[str],
+        joints: Sequence[int],
+        limits: bool,
+        restarts: bool,
+    ) -> None:
+        self._restarts, self._least_left = restarts, np.inf  # [rad²] since another start was tried
+        self.links, self.rows = list(links), [segments.index(link) for link in links]
+        self._model, self._data = model, model.createData()
+        frames = [model.frames[model.getFrameId(link)] for link in links]
+        # The joint's frame is compared in place of the link's, which is fixed to it: its rotation comes for nothing.
+        self._R_LJ = np.array([frame.placement.rotation.T for frame in frames])
+        self._views = [self._data.oMi[frame.parentJoint].rotation for frame in frames]
+        self._columns = find_columns(model, joints)
+        moves = np.zeros((len(links), model.nv), dtype=bool)
+        for k, frame in enumerate(frames):
+            moves[k, find_columns(model, model.supports[frame.parentJoint].tolist()[1:])] = True
+        self._pull = moves[:, self._columns].astype(float).T  # (f, m): which links a column turns
+        self._both = self._pull @ self._pull.T  # (f, f): how many links two columns both turn
+        self._places = np.concatenate([model.idx_qs[j] + np.arange(model.nqs[j]) for j in joints])  # in q
+        bounded = [j for j in joints if model.nqs[j] == 1] if limits else []
+        self._at = np.array([model.idx_qs[joint] for joint in bounded], dtype=int)
+        self._lower, self._upper = model.lowerPositionLimit[self._at], model.upperPositionLimit[self._at]
+        self._bounded = np.searchsorted(self._columns, find_columns(model, bounded))
+
+    def run(self, q: np.ndarray, quat_WL: np.ndarray, last: np.ndarray | None) -> None:
+        """Write the joints that may move into `q` (n, nq), where the others have their values.
+
+        Parameters
+        ----------
+        q : with the joints that may move at each frame's own start
+        quat_WL : (n, k, 4) xyzw of the segments
+        last : (nq,) the frame before the first; None: the first begins at its own start
+        """
+        quat = quat_WL[:, self.rows].reshape(-1, 4)
+        targets = Rotation.from_quat(quat).as_matrix().reshape(len(q), -1, 3, 3) @ self._R_LJ
+        for k, R in enumerate(targets):
+            start = self._keep_limits(q[k].copy())
+            if last is not None:
+                q[k, self._places] = last[self._places]
+            last, left = self._solve(self._keep_limits(q[k].copy()), R)
+            if self._restarts and left > max(_WORTH_ANOTHER_START, _GROWTH * self._least_left):
+                # What was nearest before may have become the shallower of two valleys.
+                other, less = self._solve(start, R)
+                if less < left:
+                    last, left = other, less
+                self._least_left = left
+            self._least_left = min(self._least_left, left)
+            q[k] = last
+
+    def _keep_limits(self, q: np.ndarray) -> np.ndarray:
+        q[self._at] = np.clip(q[self._at], self._lower, self._upper)
+        return q
+
+    def _compare(self, q: np.ndarray, R_target: np.ndarray) -> tuple[float, np.ndarray]:
+        """Compute what is left: the sum of squared angles [rad²], and the rotation vectors (m, 3) in W."""
+        pin.computeJointJacobians(self._model, self._data, q)
+        e = np.array([pin.log3(R @ view.T) for R, view in zip(R_target, self._views, strict=True)])
+        return float(np.sum(e * e)), e
+
+    def _solve(self, q: np.ndarray, R_target: np.ndarray) -> tuple[np.ndarray, float]:
+        """Return the configuration (nq,) that is nearest from the start `q`, and what is left [rad²]."""
+        left, e = self._compare(q, R_target)
+        damping = _DAMPING
+        step = np.zeros(self._model.nv)
+        for _ in range(_ROUNDS):
+            J = self._data.J[3:, self._columns]
+            g = np.einsum("if,fi->f", J, self._pull @ e)  # downhill; exact, as log(R)ᵀ is its own under its Jacobian
+            free = np.ones(len(g), dtype=bool)
+            push, value = g[self._bounded], q[self._at]
+            free[self._bounded] = ~((value <= self._lower) & (push < 0.0) | (value >= self._upper) & (push > 0.0))
+            rows = np.flatnonzero(free)
+            H = ((J.T @ J) * self._both)[np.ix_(rows, rows)]
+            while True:
+                step[:] = 0.0
+                step[self._columns[rows]] = np.linalg.solve(H + damping * np.eye(len(rows)), g[rows])
+                tried = self._keep_limits(pin.integrate(self._model, q, step))
+                less, new = self._compare(tried, R_target)
+                if less <= left or damping >= _MOST_DAMPING:
+                    break
+                damping *= 10.0
+            if less > left:
+                break
+            q, left, e = tried, less, new
+            damping = max(_DAMPING, 0.1 * damping)
+            if np.abs(step).max() < _STEP:
+                break
+        return q, left
+
+
+def compute_orientation_residuals(
+    model: BodyModel, q: np.ndarray, quat_WL: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Compute segment → angle (n,) [rad] between its measured orientation and that of the model in `q`.
+
+    Only for segments whose orientation the joints cannot reproduce exactly; for all of a mechanism.
+    """
+    limited = list(quat_WL)
+    if not model.table.is_mechanism:
+        fitted = {name for names in _find_limbs(model, quat_WL) if _is_fitted(model, names) for name in names}
+        limited = [
+            name for name, chain in model.chains.items() if name in quat_WL and (name in fitted or not chain.exact)
+        ]
+    if not limited:
+        return {}
+    R_WL, _ = compute_link_poses(model, q, limited)
+    R_model = {segment: Rotation.from_matrix(R_WL[:, k]) for k, segment in enumerate(limited)}
+    return {segment: (R_model[segment].inv() * Rotation.from_quat(quat_WL[segment])).magnitude() for segment in limited}
+
+
+# Girdles ----------------------------------------------------------------------------------------------------------
+
+
+class _PlacedGirdle:
+    """A girdle whose joints follow its limb."""
+
+    def __init__(self, model: BodyModel, name: str, segments: Sequence[str]) -> None:
+        self._girdle = girdle = model.table.girdles[name]
+        self._on = segments.index(girdle.on)
+        self._moves = segments.index(girdle.moves) if girdle.moves in segments else None
+        self._along = np.array(model.table.segments[girdle.moves].along)
+        self._scale = find_girdle_scale(girdle, model.lengths)
+        self._parameters = model.girdle_parameters(name).tolist()
+        self._at = [model.pin.idx_qs[model.pin.getJointId(joint)] for joint in girdle.joints]
+
+    def place(self, q: np.ndarray, quat_WL: np.ndarray) -> None:
+        """Write its joints into `q` (n, nq), from `quat_WL` (n, k, 4) xyzw; where the limb is not known, at rest."""
+        law, s = (0.0, 0.0, 0.0), 0.0
+        if self._moves is not None:
+            along = np.empty((3, len(q)))
+            _turn_relatively(quat_WL, self._moves, self._on, self._along, along)
+            # The law of plain numbers is ten times as fast as that of arrays of one.
+            law, s = displace(self._girdle, along if len(q) > 1 else along[:, 0].tolist(), self._scale, np)
+        share, rest, raised = 1.0 + self._parameters[0], self._parameters[1:4], self._parameters[4:]
+        for at, by_law, at_rest, at_raised in zip(self._at, law, rest, raised, strict=True):
+            q[:, at] = share * by_law + at_rest + s * at_raised
+
+
+@kernel
+def _turn_relatively(quat, row, above, v, out):  # type: ignore[no-untyped-def]
+    """Write a vector `v` (3,) of row `row` of `quat` (n, k, 4) xyzw in the frame of row `above` into `out` (3, n)."""
+    for i in range(len(quat)):
+        a, b = quat[i, above], quat[i, row]
+        x, y, z, w = product(-a[0], -a[1], -a[2], a[3], b[0], b[1], b[2], b[3])
+        tx, ty, tz, tw = product(x, y, z, w, v[0], v[1], v[2], 0.0)
+        rx, ry, rz, _ = product(tx, ty, tz, tw, -x, -y, -z, w)
+        scale = 1.0 / (x * x + y * y + z * z + w * w)
+        out[0, i], out[1, i], out[2, i] = rx * scale, ry * scale, rz * scale

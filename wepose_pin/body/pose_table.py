@@ -1,0 +1,118 @@
+"""The table of a pose: `pose.parquet` and `truth.parquet`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import polars as pl
+
+from ..errors import BadData, one_of
+from .covariance import compute_axis_std
+from .kinematics import Pose
+
+_MAX_TABLE_VALUE = 1e12  # beyond this a number in a table is no time [s] and no position [m]
+MAX_TABLE_NORM_DEVIATION = 1e-2  # of a quaternion in a table from 1: a file may have few decimals
+
+
+def build_pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
+    """Build the table of ``pose.parquet``.
+
+    ``time``; ``<segment>_qx,_qy,_qz,_qw`` (`quat_WL`) and ``<segment>_std`` [rad]; ``<point>_x,_y,_z`` [m] in W and
+    ``<point>_std`` [m]; with `covariance` ``<name>_cov_xx,_xy,_xz,_yy,_yz,_zz`` of each as well; ``<segment>_gap``.
+    A standard deviation is that of one axis, the mean over the three (`compute_axis_std`).
+    """
+    table = {"time": pose.time}
+    for segment, quat in pose.quat_WL.items():
+        table |= {f"{segment}_{c}": quat[:, k] for k, c in enumerate(("qx", "qy", "qz", "qw"))}
+        if segment in pose.segment_cov:
+            table |= _build_uncertainty_columns(segment, pose.segment_cov[segment], covariance)
+    for point, p in pose.points.items():
+        table |= {f"{point}_{c}": p[:, k] for k, c in enumerate("xyz")}
+        if point in pose.point_cov:
+            table |= _build_uncertainty_columns(point, pose.point_cov[point], covariance)
+    table |= {f"{segment}_gap": gap for segment, gap in pose.gap.items()}
+    return pl.DataFrame(table)
+
+
+def _build_uncertainty_columns(name: str, cov: np.ndarray, entries: bool) -> dict[str, np.ndarray]:
+    columns = {f"{name}_std": compute_axis_std(cov)}
+    if entries:
+        columns |= {f"{name}_cov_{'xyz'[i]}{'xyz'[j]}": cov[:, i, j] for i in range(3) for j in range(i, 3)}
+    return columns
+
+
+def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
+    """Parse a `Pose` from a table as of `build_pose_table`; segments and points may be missing.
+
+    Raises
+    ------
+    BadData
+        No column of time; neither orientations nor points; a text; a quaternion that is not of unit norm; a number
+        beyond `_MAX_TABLE_VALUE`.
+    """
+    if "time" not in table.columns:
+        raise BadData(f"{file}: no column 'time'; a table as in pose.parquet is needed; {one_of(table.columns)}")
+    try:
+        numbers = {name: table[name].cast(pl.Float64).to_numpy() for name in table.columns}
+    except pl.exceptions.PolarsError as error:
+        raise BadData(f"{file}: a column holds text: {str(error).splitlines()[0]}") from error
+    segments = [name for name in _stems(numbers, "_qx") if {f"{name}_{c}" for c in ("qy", "qz", "qw")} <= set(numbers)]
+    places = [name for name in _stems(numbers, "_x") if {f"{name}_{c}" for c in "yz"} <= set(numbers)]
+    _check_numbers(numbers, file, (*segments, *places))
+    quat_WL, points = {}, {}
+    for segment in segments:
+        quat = np.column_stack([numbers[f"{segment}_{c}"] for c in ("qx", "qy", "qz", "qw")])
+        norm = np.linalg.norm(quat, axis=1)
+        if np.any(np.abs(norm - 1.0) > MAX_TABLE_NORM_DEVIATION):
+            raise BadData(f"{file}: {segment}_qx … _qw is no unit quaternion in row {np.argmax(abs(norm - 1)) + 1}")
+        quat_WL[segment] = quat / norm[:, None]
+    for point in places:
+        points[point] = np.column_stack([numbers[f"{point}_{c}"] for c in "xyz"])
+    if not quat_WL and not points:
+        raise BadData(f"{file}: neither orientations nor points; columns as <segment>_qx … or <point>_x … are needed")
+    segment_cov = {name: _parse_covariances(numbers, name) for name in quat_WL}
+    point_cov = {name: _parse_covariances(numbers, name) for name in points}
+    gap = {name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers}
+    return Pose(
+        numbers["time"],
+        quat_WL,
+        points,
+        segment_cov={name: cov for name, cov in segment_cov.items() if cov is not None},
+        point_cov={name: cov for name, cov in point_cov.items() if cov is not None},
+        gap=gap,
+    )
+
+
+def _stems(numbers: Mapping[str, np.ndarray], ending: str) -> list[str]:
+    """Return the beginnings of the columns that end so."""
+    return [name.removesuffix(ending) for name in numbers if name.endswith(ending)]
+
+
+def _check_numbers(numbers: Mapping[str, np.ndarray], file: str, names: tuple[str, ...]) -> None:
+    """Raise `BadData` where time does not increase or a number is beyond `_MAX_TABLE_VALUE`; NaN means not known."""
+    time = numbers["time"]
+    if not len(time):
+        raise BadData(f"{file}: no rows; a pose has at least one")
+    if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
+        raise BadData(f"{file}: time does not increase from row to row; seconds that do are needed")
+    for name, values in numbers.items():
+        if name != "time" and not name.startswith(names):
+            continue
+        too_large = np.abs(values) > _MAX_TABLE_VALUE
+        if too_large.any():
+            row = int(np.argmax(too_large))
+            raise BadData(f"{file}: {name} is {values[row]:g} in row {row + 1}; no pose has such a number")
+
+
+def _parse_covariances(numbers: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:
+    """Parse covariances (n, 3, 3) of a table: its entries, else the standard deviation on all axes; None: neither."""
+    entries = {(i, j): f"{name}_cov_{'xyz'[i]}{'xyz'[j]}" for i in range(3) for j in range(i, 3)}
+    if all(column in numbers for column in entries.values()):
+        cov = np.empty((len(numbers["time"]), 3, 3))
+        for (i, j), column in entries.items():
+            cov[:, i, j] = cov[:, j, i] = numbers[column]
+        return cov
+    if f"{name}_std" in numbers:
+        return numbers[f"{name}_std"][:, None, None] ** 2 * np.eye(3)
+    return None
