@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from bodies import LENGTHS, RIGID_SHOULDERS, TABLE
@@ -13,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.body.subject import Subject, girdle_rows, mount_rows, population_subject
 from wepose_pin.calibration import Calibration, calibrate
-from wepose_pin.calibration.equations import rotate
 from wepose_pin.calibration.quality import assess
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
@@ -45,14 +43,6 @@ def with_rigid_shoulders(subject: Subject) -> Subject:
 def exact() -> tuple[Person, Recording]:
     person = simulate_person(11)
     return person, ready(simulate(person.lengths, seed=11, noise=NOISE_FREE, clasp_s=30.0, circles=0))
-
-
-def test_rotate_in_casadi_is_scipys() -> None:
-    rotation = Rotation.random(random_state=1)
-    v = np.array([0.2, -1.0, 0.7])
-    np.testing.assert_allclose(
-        np.asarray(rotate(ca.DM(rotation.as_quat()), ca.DM(v))).ravel(), rotation.apply(v), atol=1e-15
-    )
 
 
 def test_a_known_mount_is_known_better_after_and_a_new_strapping_not(exact: tuple[Person, Recording]) -> None:

@@ -17,13 +17,12 @@ from wepose_pin.body.covariance import compute_axis_std, compute_point_covarianc
 from wepose_pin.body.subject import Hinge, Subject, load_subject, mount_rows, subject_toml
 from wepose_pin.errors import BadSubject
 from wepose_pin.evaluation import evaluate
-from wepose_pin.filters import AboutVertical
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.tracking import Tracker, summarize, track
+from wepose_pin.tracking.clasps import ClaspDetector
 from wepose_pin.tracking.heading_filter import HeadingFilter, StanceEstimator
-from wepose_pin.tracking.heading_observations import ClaspDetector
 from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, Knot
 
 # The simulated person's shoulders stay in place, against the law of the table.
@@ -146,7 +145,7 @@ def test_a_marked_clasp_of_two_seconds_brings_a_turned_arm_back_within_one(
 ) -> None:
     """Sensors without accelerations: nothing else tells that a whole arm has turned against the torso."""
     simulation, subject = made
-    monkeypatch.setattr(ClaspDetector, "find", lambda *_: [])
+    monkeypatch.setattr(ClaspDetector, "find", lambda *_: {})
     recording = drifting(simulation, dict.fromkeys(("right_upper_arm", "right_forearm"), 24.0)).cut(slice(0, 3000))
     subject = replace(subject, covariance=0.04 * subject.covariance)
     off = {}
@@ -220,15 +219,15 @@ KNOWN_STD = 0.02 * BIAS_STD
 def make_filter() -> HeadingFilter:
     """Of a segment whose heading nothing observes but its orientation filter."""
     problem = HeadingProblem(
-        ("torso",), load_model(), wp.population_subject(), (), (), (), PERSON_NOISE, KNOT_S, 16, np.zeros(1),
-        np.full(1, BIAS_STD), np.full(1, START_STD**2), np.full(1, np.deg2rad(6.0) ** 2), 0.0,
+        ("torso",), load_model(), wp.population_subject(), (), (), np.zeros((0, 3)), {}, PERSON_NOISE, KNOT_S, 16,
+        np.zeros(1), np.full(1, BIAS_STD), np.full(1, START_STD**2), np.full(1, np.deg2rad(6.0) ** 2), 0.0,
     )  # fmt: skip
     return HeadingFilter(problem)
 
 
 def say(about_vertical: tuple[float, ...]) -> FilterHeadings:
     """What a filter says: correction of the heading and of the rate, variance of the rate."""
-    return FilterHeadings(np.zeros(1), AboutVertical(*np.array(about_vertical)[:, None]))
+    return FilterHeadings(np.zeros(1), *np.array(about_vertical)[:, None])
 
 
 def go_on(state: HeadingFilter, knots: int, about_vertical: tuple[float, ...]) -> np.ndarray:

@@ -17,9 +17,9 @@ from wepose_pin.calibration import calibrate, problem
 from wepose_pin.calibration.joints import (
     MAX_STD,
     SYSTEMATIC_STD,
-    _estimate_heading,
-    _joint_forces,
+    compute_joint_sides,
     estimate_couplings,
+    estimate_heading,
 )
 from wepose_pin.filters import FilterSettings, run_filter
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
@@ -90,7 +90,7 @@ def test_a_heading_half_a_turn_away_that_explains_as_much_makes_it_uncertain(mov
         shaken = rng.normal(scale=0.05, size=(2, 600, 3))
         near = np.concatenate([(joint + shaken[0])[:, :, None], levers[0]], axis=2)
         far = np.concatenate([(turned + shaken[1])[:, :, None], levers[1]], axis=2)
-        heading, std = _estimate_heading(near, far)
+        heading, std = estimate_heading(near, far)
         off = abs(float(np.angle(np.exp(1j * (heading - 0.4)))))
         assert off < 3.0 * std
         assert (std < MAX_STD) == trusted
@@ -143,9 +143,9 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
         recording = Recording("ring", clock, sensor.rate_hz, sensors)
         filtered = FilteredRecording(R_VS, {}, {}, (0.0, 0.0), (0.0, 0.0), [])
         at = np.arange(0, round(60.0 * sensor.rate_hz), 4)
-        forces = {name: _joint_forces(recording, filtered, name, at) for name in RING_SEGMENTS}
+        forces = {name: compute_joint_sides(recording, filtered, name)[at] for name in RING_SEGMENTS}
         for near, far in pairwise(RING_SEGMENTS):
-            turn, std = _estimate_heading(forces[near], forces[far])
+            turn, std = estimate_heading(forces[near], forces[far])
             off = np.degrees(np.angle(np.exp(1j * (turn - psi[near] + psi[far]))))
             assert abs(off) < 2.5, (mount, near, far)
             assert abs(off) < 2.0 * np.degrees(np.hypot(std, SYSTEMATIC_STD))

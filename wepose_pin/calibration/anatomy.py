@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from ..body import BodyTable, HingeJoint
 from ..diagnostics import ERROR, Diagnostic
 from ..errors import BadSession
-from .conditions import Loop, find_parts
+from ..observations.paths import find_path
+from .conditions import Loop
 from .result import Calibration, LabelCheck
 
 # Limits of a person's limbs, with soft tissue and headings some degrees off.
@@ -114,10 +115,10 @@ def reach_limbs(calibration: Calibration, R: Mapping[str, Rotation]) -> dict[str
     lengths = np.array([calibration.subject.lengths[name] for name in problem.model.lengths])
     for first, *_, last in problem.model.table.limbs:
         try:
-            parts = find_parts(problem.model, problem.start_pose, R, [(last, 1.0), (first, -1.0)])
+            parts = find_path(problem.model, problem.start_pose, R, [(last, 1.0), (first, -1.0)]).vectors
         except BadSession:  # the limb's end is not known
             continue
-        turned = [R[part.sensor] * problem.start_rotation(part.sensor).inv() for part in parts]
+        turned = [R[part.segment] * problem.start_rotation(part.segment).inv() for part in parts]
         reaches[last] = np.sum([t.apply(part.vector(lengths)) for t, part in zip(turned, parts, strict=True)], axis=0)
     return reaches
 

@@ -20,7 +20,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.reaches import UNIVERSE
-from .conditions import Constraint, Level, Loop, Part, Pointing
+from ..observations.directions import Level, Pointing
+from ..observations.paths import SegmentVector
+from .conditions import Constraint, Loop
 from .joints import Coupling
 from .least_squares import Observations
 
@@ -60,15 +62,15 @@ def find_linear(conditions: Sequence[Constraint]) -> Loop | None:
     """The one closure of points that coincide, with all parts but the first vertical, that shows all headings."""
     loops = [c for c in conditions if isinstance(c, Loop)]
     joined = [loop for loop in loops if loop.kind == "coincide"]
-    if len(joined) != 1 or not {p.sensor for c in loops for p in c.parts} <= {p.sensor for p in joined[0].parts}:
+    if len(joined) != 1 or not {p.segment for c in loops for p in c.parts} <= {p.segment for p in joined[0].parts}:
         return None
     first, *others = joined[0].parts
-    linear = first.sensor != UNIVERSE and not _is_vertical(first) and all(map(_is_vertical, others))
+    linear = first.segment != UNIVERSE and not _is_vertical(first) and all(map(_is_vertical, others))
     return joined[0] if linear else None
 
 
-def _is_vertical(part: Part) -> bool:
-    return part.sensor != UNIVERSE and not np.any(np.array(part.by_length)[:2]) and not np.any(part.constant[:2])
+def _is_vertical(part: SegmentVector) -> bool:
+    return part.segment != UNIVERSE and not np.any(np.array(part.by_length)[:2]) and not np.any(part.constant[:2])
 
 
 def _rotations(observations: Observations) -> dict[str, Rotation]:
@@ -104,9 +106,9 @@ def _solve_linear(observations: Observations, loop: Loop, x: np.ndarray, stated:
     layout = observations.layout
     lengths, (first, *others) = x[layout.length], loop.parts
     rotations = _rotations(observations)
-    columns = [rotations[first.sensor].as_matrix()]
+    columns = [rotations[first.segment].as_matrix()]
     for other in others:
-        v = rotations[other.sensor].apply([0.0, 0.0, float(np.sign(other.vector(lengths)[2]))])
+        v = rotations[other.segment].apply([0.0, 0.0, float(np.sign(other.vector(lengths)[2]))])
         zero = np.zeros(len(v))
         columns.append(
             np.stack((np.column_stack((v[:, 0], v[:, 1], zero)), np.column_stack((-v[:, 1], v[:, 0], zero))), 2)
@@ -120,9 +122,9 @@ def _solve_linear(observations: Observations, loop: Loop, x: np.ndarray, stated:
     known = first.vector(lengths)
     reference = float(np.arctan2(known[1], known[0]) - np.arctan2(z[1], z[0]))  # turns s to its direction
     headings = {
-        other.sensor: float(np.arctan2(xy[1], xy[0]) + reference) for other, xy in zip(others, solved, strict=True)
+        other.segment: float(np.arctan2(xy[1], xy[0]) + reference) for other, xy in zip(others, solved, strict=True)
     }
-    headings = {**headings, **stated, first.sensor: reference}
+    headings = {**headings, **stated, first.segment: reference}
     return np.array([headings.get(name, 0.0) for name in layout.sensors])
 
 
@@ -163,13 +165,13 @@ def _find_minima(
         few = np.unique(np.linspace(span.start, span.stop - 1, count).astype(int))
         Q = np.stack([R.as_matrix() for R in _rotations(observations.take(few)).values()])
         places = observations.data[layout.place][:, few].T if loop.kind == "recorded" else np.zeros(3)
-        for way in loop.ways:
+        for path in loop.paths:
             u, still = np.zeros((m, 3)), -places
-            for part in way:
-                if part.sensor == UNIVERSE:
+            for part in path.vectors:
+                if part.segment == UNIVERSE:
                     still = still + part.vector(known_x[layout.length])
                 else:
-                    u[sensors.index(part.sensor)] += part.vector(known_x[layout.length])
+                    u[sensors.index(part.segment)] += part.vector(known_x[layout.length])
             parts.append((loop, Q, u, still))
 
     def closure_residuals(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

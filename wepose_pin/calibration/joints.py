@@ -1,13 +1,9 @@
 """Headings of two neighbours by the acceleration of the joint between them, which both sensors measure.
 
-A sensor at r from a joint measures the joint's acceleration and its own about it: in the sensor's world V,
-
-    a_joint = R_VS (f + K r),   K = −([ω̇]× + [ω]×²)
-
-and both give the same acceleration, rotated by the difference of the two worlds' headings. The lever r is constant and
-estimated with the heading. Weygers and Kok 2020 (IEEE Sensors Journal 20) track joints so. Here it separates what the
-closure confuses: soft tissue that rotates the torso's sensor sideways as the torso leans forwards has the same effect
-on the closure as a heading, but none on a joint's acceleration, since orientation and specific force are the sensor's.
+The levers of the two sensors are constant and estimated with the heading (`observations.joint_accelerations`). Here it
+separates what the closure confuses: soft tissue that rotates the torso's sensor sideways as the torso leans forwards
+has the same effect on the closure as a heading, but none on a joint's acceleration, since orientation and specific
+force are the sensor's.
 """
 
 from __future__ import annotations
@@ -17,20 +13,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..filters.butterworth import band_pass, low_pass
+from ..filters.butterworth import band_pass
 from ..filters.sensors import FilteredRecording
+from ..observations.joint_accelerations import BAND_HZ, LEAST_RATE_HZ, compute_sides, linearize_joint
 from ..recording import Recording
 from .equations import Layout
 from .least_squares import Gaussian
 from .sample_losses import find_sample_losses, mask_connected
 
-# What people move in, without gravity's constant and without what tissue shakes; of the rate, before it is derived.
-BAND_HZ, RATE_HZ = (0.1, 1.5), 8.0
 SAMPLES_HZ = 10.0
 # Errors of orientations are slow: two samples closer than this [s] are never independent, however white the residual
 # of one phase is. Chosen on simulated people, whose joint errors it brings within the covariance.
 LEAST_CORRELATION_S = 3.0
-LEAST_RATE_HZ, LEAST_S = 20.0, 20.0  # of recordings that are used
+LEAST_S = 20.0  # of motion that is used
 LEAST_LEVER = 1e-6  # [1/s⁴], keeps unobserved levers finite
 LEAST_MISMATCH = 0.005  # [m/s²] below which no two sensors agree
 STARTS, ROUNDS = 24, 20
@@ -64,28 +59,27 @@ def estimate_couplings(
     pairs : of neighbouring segments, the one nearer the root first
     """
     pairs = [pair for pair in pairs if set(pair) <= set(recording.imus)]
-    raw = list(dict.fromkeys(name for pair in pairs for name in pair))
+    names = list(dict.fromkeys(name for pair in pairs for name in pair))
     if recording.rate_hz < LEAST_RATE_HZ or not pairs:
         return []
     inside = np.zeros(len(recording), dtype=bool)
     for span in spans:
         inside[recording.span(span)] = True
-    for name in raw:
+    for name in names:
         gap = recording.sensors[name].gap
         if gap is not None:
             inside &= ~gap
     samples = np.flatnonzero(inside)
     # Beyond a loss the headings are others.
-    samples = samples[mask_connected(find_sample_losses(recording, filtered.start, raw), samples)]
+    samples = samples[mask_connected(find_sample_losses(recording, filtered.start, names), samples)]
     if len(samples) < LEAST_S * recording.rate_hz:
         return []
     samples = samples[:: max(1, round(recording.rate_hz / SAMPLES_HZ))]
-    names = sorted({name for pair in pairs for name in pair})
-    forces = {name: _joint_forces(recording, filtered, name, samples) for name in names}
+    sides = {name: compute_joint_sides(recording, filtered, name)[samples] for name in names}
     elapsed_s = float(np.mean(recording.time[samples]) - filtered.start[1])
     couplings = []
     for near, far in pairs:
-        heading, std = _estimate_heading(forces[near], forces[far])
+        heading, std = estimate_heading(sides[near], sides[far])
         if std < MAX_STD:
             couplings.append(Coupling(near, far, heading, float(np.hypot(std, SYSTEMATIC_STD)), elapsed_s))
     return couplings
@@ -106,15 +100,12 @@ def add_couplings(prior: Gaussian, layout: Layout, couplings: Sequence[Coupling]
     return Gaussian(prior.mean + np.linalg.solve(information, H.T @ (weight * off)), information)
 
 
-def _joint_forces(recording: Recording, filtered: FilteredRecording, name: str, samples: np.ndarray) -> np.ndarray:
-    """(n, 3, 4) in V: specific force, and what a lever of 1 m along each axis of the sensor adds to the joint's."""
-    sensor, rate_hz = recording.imus[name], recording.rate_hz
-    gyro_S = low_pass(_interpolate_missing(sensor.gyro_S), min(RATE_HZ, 0.4 * rate_hz), rate_hz)
-    turning_S = np.gradient(gyro_S, 1.0 / rate_hz, axis=0)
-    columns = [_interpolate_missing(sensor.accel_S)]
-    columns += [-(np.cross(turning_S, axis) + np.cross(gyro_S, np.cross(gyro_S, axis))) for axis in np.eye(3)]
-    forces_V = [band_pass(filtered.R_VS[name].apply(column), BAND_HZ, rate_hz) for column in columns]
-    return np.stack([force_V[samples] for force_V in forces_V], axis=2)
+def compute_joint_sides(recording: Recording, filtered: FilteredRecording, name: str) -> np.ndarray:
+    """(n, 3, 4) in V, band-passed: specific force, and what a lever of 1 m along each axis adds to the joint's."""
+    accel_S = _interpolate_missing(recording.imus[name].accel_S)
+    R_VS = filtered.R_VS[name].as_matrix()
+    sides = compute_sides(R_VS[:, None], accel_S[:, None], recording.rate_hz)[:, 0, :, :4]
+    return band_pass(np.concatenate([sides[:1], sides, sides[-1:]]), BAND_HZ, recording.rate_hz)
 
 
 def _interpolate_missing(values: np.ndarray) -> np.ndarray:
@@ -126,18 +117,21 @@ def _interpolate_missing(values: np.ndarray) -> np.ndarray:
     return np.column_stack([np.interp(at, at[finite], column[finite]) for column in values.T])
 
 
-def _estimate_heading(near: np.ndarray, far: np.ndarray) -> tuple[float, float]:
-    """The rotation [rad] about z from the near sensor's world to the far one's, and its standard deviation."""
+def estimate_heading(near: np.ndarray, far: np.ndarray) -> tuple[float, float]:
+    """The rotation [rad] about z from the near sensor's world to the far one's, and its standard deviation.
+
+    `near`, `far` : (n, 3, 4) of `compute_joint_sides`
+    """
     starts = np.linspace(0.0, 2.0 * np.pi, STARTS, endpoint=False)
-    costs = np.array([np.sum(_mismatch(near, far, angle)[0] ** 2) for angle in starts])
+    costs = np.array([np.sum(_fit_levers(near, far, angle)[0] ** 2) for angle in starts])
     heading = float(starts[int(np.argmin(costs))])
     for _ in range(ROUNDS):
-        r, J = _mismatch(near, far, heading)
+        r, J = _fit_levers(near, far, heading)
         step = -float(J @ r) / max(float(J @ J), 1e-12)
         heading += step
         if abs(step) < 1e-6:
             break
-    r, J = _mismatch(near, far, heading)
+    r, J = _fit_levers(near, far, heading)
     variance = max(float(np.mean(r**2)), LEAST_MISMATCH**2) * LEAST_CORRELATION_S * SAMPLES_HZ
     std = float(np.sqrt(variance / max(float(J @ J), 1e-12)))
     # Where little moves, a heading half a turn away explains it nearly as well: the whole circle's variance counts.
@@ -148,14 +142,12 @@ def _estimate_heading(near: np.ndarray, far: np.ndarray) -> tuple[float, float]:
     return heading, float(np.sqrt(((total - mass.sum()) * std**2 + mass @ off[distant] ** 2) / total))
 
 
-def _mismatch(near: np.ndarray, far: np.ndarray, heading: float) -> tuple[np.ndarray, np.ndarray]:
-    """Far less near acceleration of the joint (3 n,) with the best levers, and its derivative by the heading."""
-    c, s = np.cos(heading), np.sin(heading)
-    near = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ near
-    H = np.concatenate([far[:, :, 1:], -near[:, :, 1:]], axis=2).reshape(-1, 6)
-    known = (far[:, :, 0] - near[:, :, 0]).ravel()
+def _fit_levers(near: np.ndarray, far: np.ndarray, heading: float) -> tuple[np.ndarray, np.ndarray]:
+    """Misfit (3 n,) of the joint with the best levers, and its derivative by the heading."""
+    without = linearize_joint(near, far, heading, np.zeros(3), np.zeros(3))
+    H = without.jacobian[:, :, 1:].reshape(-1, 6)
     normal = H.T @ H + LEAST_LEVER * len(H) * np.eye(6)
-    levers = -np.linalg.solve(normal, H.T @ known)
-    joint = near[:, :, 0] + near[:, :, 1:] @ levers[3:]
-    slope = np.stack([joint[:, 1], -joint[:, 0], np.zeros(len(joint))], axis=1).ravel()
-    return known + H @ levers, slope - H @ np.linalg.solve(normal, H.T @ slope)
+    levers = -np.linalg.solve(normal, H.T @ without.e.ravel())
+    fitted = linearize_joint(near, far, heading, levers[:3], levers[3:])
+    slope = fitted.jacobian[:, :, 0].ravel()
+    return fitted.e.ravel(), slope - H @ np.linalg.solve(normal, H.T @ slope)

@@ -36,8 +36,9 @@ from ..body.subject import Subject
 from ..body.table import NEUTRAL_POSE
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, NoSolution, one_of
+from ..observations.paths import StartPose
 from .anatomy import check_limbs, measure_limbs
-from .conditions import Constraint, Loop, StartPose, resolve_conditions
+from .conditions import Constraint, Loop, resolve_conditions
 from .least_squares import MIN_LENGTH, QUIET_QP, Observations
 from .observability import diagnose_lengths
 from .priors import combine_lengths
@@ -147,7 +148,7 @@ def compute_gap_matrices(observations: Observations, quat_WL: Mapping[str, np.nd
     for loop, span in observations.spans():
         assert isinstance(loop, Loop)
         for part in loop.parts:
-            A[span] += Rotation.from_quat(quat_WL[part.sensor][span]).as_matrix() @ np.array(part.by_length)
+            A[span] += Rotation.from_quat(quat_WL[part.segment][span]).as_matrix() @ np.array(part.by_length)
     return A
 
 

@@ -17,19 +17,12 @@ from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
+from ..observations.directions import Level, Pointing
+from ..observations.hinges import find_hinges
+from ..observations.joint_accelerations import find_neighbours
+from ..observations.paths import StartPose, find_girdles
 from ..recording import Intervals, Recording, format_span
-from .conditions import (
-    Constraint,
-    Level,
-    Loop,
-    Moving,
-    Pointing,
-    StartPose,
-    find_girdles,
-    find_hinges,
-    group_lengths,
-    resolve_conditions,
-)
+from .conditions import Constraint, Loop, Moving, group_lengths, resolve_conditions
 from .equations import Layout
 from .joints import Coupling, estimate_couplings
 from .least_squares import Observations
@@ -121,8 +114,7 @@ class CalibrationProblem:
     @cached_property
     def couplings(self) -> list[Coupling]:
         """The relative headings of neighbours by the acceleration of the joint between them."""
-        neighbours = [(self.model.parents[name], name) for name in self.sensors]
-        pairs = [(above, name) for above, name in neighbours if above is not None and above in self.sensors]
+        pairs = find_neighbours(self.model, self.sensors)
         return estimate_couplings(self.recording, self.filtered, pairs, self.moving_intervals)
 
     def intervals(self, condition: Condition) -> Intervals:
@@ -163,7 +155,7 @@ class CalibrationProblem:
         used = set[str]()
         for condition in self.conditions:
             if isinstance(condition, Loop):
-                used |= {part.sensor for part in condition.parts}
+                used |= {part.segment for part in condition.parts}
             elif isinstance(condition, Moving):
                 used |= set(condition.segments)
             else:

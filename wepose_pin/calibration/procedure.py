@@ -40,9 +40,9 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
+from ..observations.directions import Level, Pointing
 from ..recording import Recording
 from .anatomy import BETTER, LEAST_ROTATION, check_labels, check_limbs, measure_limbs, measure_rotation
-from .conditions import Level, Pointing
 from .fusion import fuse_calibrations, separate_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .priors import combine_lengths

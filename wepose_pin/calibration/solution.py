@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject
 from ..errors import NoSolution
+from ..observations.hinges import find_hinges
 from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
-from .conditions import find_hinges, is_scale_observed
+from .conditions import is_scale_observed
 from .contact import find_initial_guess
 from .equations import HINGE_STD
 from .joints import add_couplings

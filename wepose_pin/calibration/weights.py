@@ -14,7 +14,9 @@ import numpy as np
 
 from ..body.girdle import PARAMETERS
 from ..body.subject import mount_rows
-from .conditions import Level, Loop, Moving, Pointing, StartPose
+from ..observations.directions import Level, Pointing
+from ..observations.paths import StartPose
+from .conditions import Loop, Moving
 from .equations import GAP_ROWS, HINGE_STD, Layout
 from .joints import LEAST_CORRELATION_S
 from .least_squares import STEPS, Estimate, Gaussian, LeastSquares, Observations, solve

@@ -16,7 +16,7 @@ from ..recording import ImuSensor, Recording
 from ..recording.arrivals import Samples, StreamSynchronizer, order_arrivals
 from ..recording.plausibility import check_signals, find_unseen_rate
 from ..tracking import Tracker, TrackOptions
-from ..tracking.headings import CAUSAL_KNOT_S
+from ..tracking.heading_problem import CAUSAL_KNOT_S
 from ..writers.live_log import LiveLog
 from ..writers.result import versions
 from .loop import EMPTY_SESSION, LiveLoop, SessionSummary

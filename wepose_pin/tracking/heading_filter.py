@@ -4,11 +4,10 @@
 step variance is the growth of the orientation filter's heading variance, and by a rate that changes slowly: the bias
 that the orientation filter has not found. Differences of two or more δ are observed by:
 
-- the acceleration of a joint, which two sensors measure (`joint_accelerations`), with their levers as unknowns;
-- a hinge with the axis n on the segment O: the long axis e of the segment M below stays in the plane across n, so that
-  n · R_WOᵀ R_WM e = 0;
-- ranges of motion: the hinge bends within its range;
-- two points that coincide (`CoincidentPoints`): palms in a phase `clasp`, or in a clasp that was found.
+- the acceleration of a joint, which two sensors measure (`observations.joint_accelerations`), with their levers as
+  unknowns;
+- a hinge: the long axis of the segment below stays in the plane across the hinge's axis, within its range;
+- two points that coincide: palms in a phase `clasp`, or in a clasp that was found.
 
 Errors by soft tissue, tilted hinge axes and travelling joints are correlated over seconds or over the whole recording.
 They are states, so that a long recording does not average them away.
@@ -22,9 +21,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit, logit
 
-from .heading_observations import OUTLIER_STDS, ClaspDetector, build_gap_rows, correct_headings, linearize_hinge
+from ..observations.hinges import linearize_hinge
+from ..observations.joint_accelerations import JointResidual, linearize_joint
+from ..recording import Intervals
+from .clasps import OUTLIER_STDS, ClaspDetector, Rows, whiten_gap
 from .heading_problem import HeadingProblem, Knot
-from .joint_accelerations import JointMisfit, linearize_joint
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
@@ -37,7 +38,11 @@ MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accele
 CAREFUL_SHARE, CAREFUL_PROBABILITY = 0.1, 0.2
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
+# A heading may be feigned by this many times the rms of the coherent misfits that no heading explains, and by no more
+# than a share of the rms misfit; found by simulated people who walk, run, throw and reach.
+COHERENT_MARGIN, LARGEST_COHERENT_SHARE = 2.0, 0.5
 _DIFFERENCE = np.array([[1.0, -1.0], [-1.0, 1.0]])
+_HINGE_COLUMNS = [0, 1, 2, 2, 3]  # of `HingeRows.H`: soft tissue twists a sensor about the same axis as the hinge's
 # Jacobian of the angle and of the two sides of a joint by its columns (`HeadingProblem.pair_columns`).
 _JOINT_JACOBIAN = np.zeros((15, 17))
 _JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
@@ -61,6 +66,56 @@ class KnotChange(NamedTuple):
     rate_share: np.ndarray
 
 
+class JointMisfit(NamedTuple):
+    """The recent misfit of a joint: sums over samples, in which older ones count less.
+
+    Some of a misfit repeats with the motion, as that of soft tissue with the gait: it is coherent with the joint's
+    force and does not average out. A heading explains one coherent misfit, which turns the force about the vertical.
+    The other ones, which stretch it or mix it with the vertical, show how large coherent misfits are in this motion.
+
+    Parameters
+    ----------
+    products : (3, 3) [m²/s⁴] Σ e fᵀ of the misfit e and the force f
+    misfit, force : (3,) [m²/s⁴] Σ e², Σ f²
+    samples : that count
+    """
+
+    products: np.ndarray = np.zeros((3, 3))
+    misfit: np.ndarray = np.zeros(3)
+    force: np.ndarray = np.zeros(3)
+    samples: float = 0.0
+
+    def add(self, residual: JointResidual, decay: float) -> JointMisfit:
+        """Return the sums with the samples of a residual, the former ones times `decay`."""
+        e, f = residual.e, residual.force
+        return JointMisfit(
+            decay * self.products + e.T @ f,
+            decay * self.misfit + np.sum(e**2, axis=0),
+            decay * self.force + np.sum(f**2, axis=0),
+            decay * self.samples + len(e),
+        )
+
+    @property
+    def variance(self) -> float:
+        """[m²/s⁴] of the misfit, mean of the axes."""
+        return float(self.misfit.sum() / (3.0 * self.samples)) if self.samples else 0.0
+
+    def find_coherent_variance(self, correlated_samples: float) -> float:
+        """Return the variance [rad²] of the heading that a coherent misfit can feign.
+
+        `correlated_samples` are one observation; so many of them have coherent parts by chance.
+        """
+        horizontal = self.force[0] + self.force[1]
+        if not horizontal:
+            return 0.0
+        E = self.products / horizontal
+        mixed = E[:2, 2] * np.sqrt(horizontal / max(self.force[2], 1e-9 * horizontal))
+        parts = np.array([E[0, 0] + E[1, 1], E[0, 0] - E[1, 1], E[0, 1] + E[1, 0], *mixed, *E[2, :2]])
+        by_chance = self.variance / horizontal * correlated_samples / self.samples
+        coherent = COHERENT_MARGIN**2 * max(float(np.mean(parts**2)) - by_chance, 0.0)
+        return min(coherent, LARGEST_COHERENT_SHARE**2 * self.variance * 2.0 * self.samples / horizontal)
+
+
 class HeadingFilter:
     """The state and its covariance, knot by knot.
 
@@ -71,26 +126,22 @@ class HeadingFilter:
 
     def __init__(self, problem: HeadingProblem) -> None:
         self.problem = problem
-        noise, k = problem.noise, len(problem.names)
-        self.x, std = np.zeros(problem.size), np.zeros(problem.size)
+        self.phases: dict[str, Intervals] = dict(problem.phases)  # of closures, as far as they are known
+        noise, knot_s, c, k = problem.noise, problem.knot_s, problem.columns, len(problem.names)
+        self.x, std, decay = np.zeros(c.size), np.zeros(c.size), np.ones(c.size)
         bias_std = problem.rate_std
         if problem.start is not None:
-            known = np.sqrt(problem.start.about_vertical.rate_var)
+            known = np.sqrt(problem.start.rate_var)
             bias_std = np.where(np.isfinite(known), known, bias_std)
-        std[k : 2 * k] = np.hypot(noise.rate_std, bias_std)
-        decay = np.ones(problem.size)
+        std[c.rate] = np.hypot(noise.rate_std, bias_std)
         for i, pair in enumerate(problem.pairs):
-            column = problem.find_column("joint", i)
-            std[column] = noise.girdle_std if pair.travels else noise.joint_std
-            decay[column] = np.exp(-problem.knot_s / noise.joint_correlation_s)
-            self.x[problem.find_lever_columns(i)], std[problem.find_lever_columns(i)] = pair.levers, pair.lever_std
-        std[problem.find_column("delay", 0) : problem.find_column("delay", k)] = problem.delay_std
-        forces = slice(problem.find_column("force", 0), problem.find_column("force", 3 * k))
-        std[forces], decay[forces] = noise.force_std, np.exp(-problem.knot_s / noise.force_correlation_s)
-        for i, hinge in enumerate(problem.hinges):
-            std[problem.find_column("axis", i)], std[problem.find_column("tilt", i)] = hinge.axis_std, hinge.tilt_std
-            std[problem.find_column("twist", i)] = noise.twist_std
-            decay[problem.find_column("twist", i)] = np.exp(-problem.knot_s / noise.twist_correlation_s)
+            std[c.joint[i]] = noise.girdle_std if pair.travels else noise.joint_std
+            self.x[c.lever[i]], std[c.lever[i]] = pair.levers, pair.lever_std
+        decay[c.joint] = np.exp(-knot_s / noise.joint_correlation_s)
+        std[c.delay] = problem.delay_std
+        std[c.force], decay[c.force] = noise.force_std, np.exp(-knot_s / noise.force_correlation_s)
+        std[c.axis], std[c.tilt] = problem.hinge_std[:, 0], problem.hinge_std[:, 1]
+        std[c.twist], decay[c.twist] = noise.twist_std, np.exp(-knot_s / noise.twist_correlation_s)
         self.P = np.diag(std**2)
         self._set_start_covariance()
         self._decay, self._process_var = decay, (1.0 - decay**2) * std**2
@@ -99,27 +150,26 @@ class HeadingFilter:
         self._last_up: np.ndarray | None = None  # (k, 3) the axis of each segment that was turned to the vertical
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
         self._recent_growth = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, the largest
-        self._clasps = ClaspDetector(problem)
-        self._closed_before = set[tuple[str, ...]]()  # points that coincided in the last knot
+        self._detector = ClaspDetector(problem)
+        self._closed_before = set[str]()  # phases whose points coincided in the last knot
         self.clasps: list[tuple[float, float]] = []  # [s] when points were found to coincide
 
     def reset(self, headings: np.ndarray) -> None:
         """Set δ (k,) [rad] as known to within the start pose."""
-        columns, _, starts = self.problem.start_columns
-        self.x[columns], self.x[starts] = headings, 0.0
+        columns = self.problem.columns
+        self.x[columns.heading], self.x[columns.start] = headings, 0.0
         self._set_start_covariance()
 
     def _set_start_covariance(self) -> None:
         """Set the covariance of δ = s − ε_z, of the mounts' ε_z and of the segments' s after a start pose."""
-        problem = self.problem
-        headings, mounts, starts = problem.start_columns
-        at = np.concatenate([headings, mounts, starts])
-        self.P[at, :], self.P[:, at] = 0.0, 0.0
-        self.P[headings, headings] = problem.start_var + problem.mount_var
-        self.P[mounts, mounts] = problem.mount_var
-        self.P[headings, mounts] = self.P[mounts, headings] = -problem.mount_var
-        self.P[starts, starts] = problem.start_var
-        self.P[headings, starts] = self.P[starts, headings] = problem.start_var
+        problem, c = self.problem, self.problem.columns
+        for columns in (c.heading, c.mount, c.start):
+            self.P[columns, :], self.P[:, columns] = 0.0, 0.0
+        self.P[c.heading, c.heading] = problem.start_var + problem.mount_var
+        self.P[c.mount, c.mount] = problem.mount_var
+        self.P[c.heading, c.mount] = self.P[c.mount, c.heading] = -problem.mount_var
+        self.P[c.start, c.start] = problem.start_var
+        self.P[c.heading, c.start] = self.P[c.start, c.heading] = problem.start_var
 
     def step(self, knot: Knot) -> KnotChange:
         """Predict to the end of a knot and update by its observations; return the change of the prediction."""
@@ -128,13 +178,6 @@ class HeadingFilter:
         for _ in self.update(knot):
             pass
         return change
-
-    def step_gradually(self, knot: Knot) -> Iterator[None]:
-        """Do as `step`, in parts of a millisecond or two; the state is valid after the last one."""
-        change = self.find_change(knot)
-        self.predict(change)
-        yield
-        yield from self.update(knot)
 
     def find_change(self, knot: Knot) -> KnotChange:
         """Find how headings and their rates change within a knot.
@@ -157,13 +200,13 @@ class HeadingFilter:
         self._recent_growth = np.maximum(remembered, np.where(known, gained, 0.0))
         limited = np.where(leaps, gained, np.minimum(gained, self.problem.drift_psd * knot_s))
         drift_var = np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k))
-        heading = np.nan_to_num(now.about_vertical.heading - last.about_vertical.heading)
-        rate = np.nan_to_num(now.about_vertical.rate - last.about_vertical.rate)
+        heading = np.nan_to_num(now.heading - last.heading)
+        rate = np.nan_to_num(now.rate - last.rate)
         headings, rates = np.diag(self.P)[:k], np.diag(self.P)[k : 2 * k]
         alone = np.nan_to_num(last.var) + self.problem.start_var + self.problem.mount_var
         believed = np.minimum(1.0, headings / alone)
-        rate_alone = np.nan_to_num(now.about_vertical.rate_var, nan=np.inf) + noise.rate_std**2
-        rate_before = np.nan_to_num(last.about_vertical.rate_var, nan=np.inf) + noise.rate_std**2
+        rate_alone = np.nan_to_num(now.rate_var, nan=np.inf) + noise.rate_std**2
+        rate_before = np.nan_to_num(last.rate_var, nan=np.inf) + noise.rate_std**2
         rate_believed = np.minimum(1.0, rates / rate_before)
         unknown_again = self._find_new_axis_share(knot) * np.nan_to_num(np.maximum(rate_alone - rates, 0.0), posinf=0.0)
         grown = noise.rate_change_psd * knot_s + (rate_believed * rate) ** 2 + unknown_again
@@ -213,51 +256,58 @@ class HeadingFilter:
         self.P = self.advance(self.advance(self.P, change).T, change).T + np.diag(grown)
 
     def update(self, knot: Knot) -> Iterator[None]:
-        """Update by a knot's observations, then by the points that are found to coincide in it; yield between parts."""
+        """Update by a knot's observations, then by points that are found to coincide in it.
+
+        It yields between parts of a millisecond or two; the state is valid after the last one.
+        """
+        problem, k = self.problem, len(self.problem.names)
         before, P = self.x, self.P
         x, information = before, np.zeros_like(P)
         for iteration in range(ITERATIONS):
             information, vector = np.zeros_like(P), np.zeros(len(x))
             self._add_joints(knot, x, information, vector, last=iteration == ITERATIONS - 1)
             yield
-            yield from self._add_rows(knot, x, information, vector)
+            yield from self._add_hinges(knot, x, information, vector)
+            yield from self._add_closures(knot, x, information, vector)
             x = self._fuse(x, information, vector)
             yield
         self.x = x
         self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + P @ information, P))
         yield
-        k = len(self.problem.names)
-        found = self._clasps.find(knot, self.x[:k], self.P[:k, :k])
+        closed = set(self._find_closed(knot))
+        found = self._detector.find(knot, self.x[:k], self.P[:k, :k], closed)
         yield
-        unreliable = self._find_unreliable(knot)
+        if self._find_unreliable(knot).any():
+            found = {}
         self._lost_before = knot.lost
-        if unreliable.any():
-            found = []
-        closed = {closure.points for closure in self.problem.closures if closure.holds(knot.time).any()}
-        for points, rows in found:
-            closed.add(points)
+        for phase, rows in found.items():
             information, vector = np.zeros_like(P), np.zeros(len(x))
-            weight = rows.weight / self._count_correlated(points, knot)
-            information[:k, :k] = rows.H.T @ (weight[:, None] * rows.H)
-            vector[:k] = rows.H.T @ (weight * rows.r)
+            self._add_gap(phase, rows, knot, information, vector)
             self.x = self._fuse(self.x, information, vector)
             self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + self.P @ information, self.P))
             begin = float(knot.time[0])
-            if self.clasps and begin - self.clasps[-1][1] < 1.5 * self.problem.knot_s:
+            if self.clasps and begin - self.clasps[-1][1] < 1.5 * problem.knot_s:
                 begin = self.clasps.pop()[0]
             self.clasps.append((begin, knot.end))
             yield
-        self._closed_before = closed
+        self._closed_before = closed | set(found)
 
-    def _count_correlated(self, points: tuple[str, ...], knot: Knot) -> float:
-        """Count the samples of a closure that are one observation, as their residuals are correlated.
+    def _find_closed(self, knot: Knot) -> dict[str, np.ndarray]:
+        """Find the phases of closures in a knot, and the samples (m,) bool in them."""
+        inside = {phase: mask_intervals(knot.time, self.phases.get(phase, ())) for phase in self.problem.closures}
+        return {phase: rows for phase, rows in inside.items() if rows.any()}
 
-        Causally all of a clasp's first knot: a clasp may be shorter than its residuals are correlated.
+    def _add_gap(self, phase: str, rows: Rows, knot: Knot, information: np.ndarray, vector: np.ndarray) -> None:
+        """Add the rows of a closure; as many samples as its residuals are correlated over are one observation.
+
+        Causally all of a clasp's first knot is one: a clasp may be shorter than its residuals are correlated.
         """
-        rate = self.problem.samples_per_knot / self.problem.knot_s
-        if self.problem.causal and points not in self._closed_before:
-            return float(len(knot.time))
-        return max(1.0, self.problem.noise.closure_correlation_s * rate)
+        problem, k = self.problem, len(self.problem.names)
+        correlated = max(1.0, problem.noise.closure_correlation_s * problem.rate_hz)
+        if problem.causal and phase not in self._closed_before:
+            correlated = float(len(knot.time))
+        information[:k, :k] += rows.H.T @ rows.H / correlated
+        vector[:k] += rows.H.T @ rows.r / correlated
 
     def _find_unreliable(self, knot: Knot) -> np.ndarray:
         """Find the sensors (k,) bool that lost samples in this knot or in the last one: their tilt may be wrong."""
@@ -272,8 +322,7 @@ class HeadingFilter:
         self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray, *, last: bool
     ) -> None:
         problem, noise = self.problem, self.problem.noise
-        rate = problem.samples_per_knot / problem.knot_s
-        correlated = max(1.0, noise.acceleration_correlation_s * rate)
+        correlated = max(1.0, noise.acceleration_correlation_s * problem.rate_hz)
         decay = np.exp(-problem.knot_s / MISFIT_MEMORY_S)
         for i, columns in enumerate(problem.pair_columns):
             near, far, joint = columns[:3]
@@ -294,34 +343,43 @@ class HeadingFilter:
             if last:
                 self._misfits[i] = misfit
 
-    def _add_rows(self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Iterator[None]:
-        """Add the hinges and the closures that hold; yield between them."""
-        problem = self.problem
-        k, noise = len(problem.names), problem.noise
-        rate = problem.samples_per_knot / problem.knot_s
-        R = correct_headings(knot.quat_WL, x)
+    def _add_hinges(self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Iterator[None]:
+        """Add the hinges; yield between them."""
+        problem, noise = self.problem, self.problem.noise
+        samples = max(1.0, noise.hinge_correlation_s * problem.rate_hz)
         unreliable = self._find_unreliable(knot)
-        for i, hinge in enumerate(problem.hinges):
-            if unreliable[hinge.on] or unreliable[hinge.moves]:
+        for hinge, columns, (_, _, std) in zip(problem.hinges, problem.hinge_columns, problem.hinge_std, strict=True):
+            moves, on = columns[:2]
+            if unreliable[on] or unreliable[moves]:
                 continue
             yield
-            columns, samples = problem.hinge_columns[i], max(1.0, noise.hinge_correlation_s * rate)
-            r, H, excess, slope = linearize_hinge(R[hinge.on], R[hinge.moves], hinge)
-            r = r + H[:, 2:] @ x[columns[2:]]
-            weight = (np.abs(r) < OUTLIER_STDS * hinge.std + HINGE_HEADING_MARGIN) / (hinge.std**2 * samples)
+            rows = linearize_hinge(hinge, knot.quat_WL[:, on], knot.quat_WL[:, moves], x[columns[:2]])
+            H = rows.H[:, _HINGE_COLUMNS]
+            r = rows.r + H[:, 2:] @ x[columns[2:]]
+            weight = (np.abs(r) < OUTLIER_STDS * std + HINGE_HEADING_MARGIN) / (std**2 * samples)
             information[columns[:, None], columns] += H.T @ (weight[:, None] * H)
             vector[columns] += H.T @ (weight * r)
-            beyond = slope / (noise.range_std**2 * samples) * (excess != 0.0)
-            information[columns[:2, None], columns[:2]] += beyond @ slope * _DIFFERENCE
-            vector[columns[:2]] += beyond @ excess * _DIFFERENCE[0]
-        for closure in problem.closures:
-            closed = closure.holds(knot.time)
-            if closed.any() and not unreliable[closure.gap.segments].any():
+            beyond = rows.slope / (noise.range_std**2 * samples) * (rows.excess != 0.0)
+            information[columns[:2, None], columns[:2]] += beyond @ rows.slope * _DIFFERENCE
+            vector[columns[:2]] += beyond @ rows.excess * _DIFFERENCE[0]
+
+    def _add_closures(self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Iterator[None]:
+        """Add the closures whose phase holds; yield between them."""
+        names, unreliable = self.problem.names, self._find_unreliable(knot)
+        for phase, inside in self._find_closed(knot).items():
+            points = self.problem.closures[phase]
+            if not unreliable[[names.index(name) for name in points.segments]].any():
                 yield
-                rows = build_gap_rows(R, problem, closure, closed)
-                weight = rows.weight / self._count_correlated(closure.points, knot)
-                information[:k, :k] += rows.H.T @ (weight[:, None] * rows.H)
-                vector[:k] += rows.H.T @ (weight * rows.r)
+                rows = whiten_gap(self.problem, points.linearize(knot.quat_WL[inside], x[: len(names)]))
+                self._add_gap(phase, rows, knot, information, vector)
+
+
+def mask_intervals(time: np.ndarray, intervals: Intervals) -> np.ndarray:
+    """Return (n,) bool: which times [s] lie in one of the intervals [s]."""
+    inside = np.zeros(len(time), dtype=bool)
+    for begin, end in intervals:
+        inside |= (time >= begin) & (time <= end)
+    return inside
 
 
 def _symmetric(P: np.ndarray) -> np.ndarray:
@@ -356,7 +414,8 @@ class StanceEstimator:
     """
 
     def __init__(self, problem: HeadingProblem) -> None:
-        self._columns = np.concatenate(problem.start_columns)
+        c = problem.columns
+        self._columns = np.concatenate([c.heading, c.mount, c.start])
         self._information = (CAREFUL_SHARE**-2 - 1.0) / problem.start_var  # that care adds, of s
         self.careful = self._before = CAREFUL_PROBABILITY if problem.pairs else 0.0
 

@@ -1,23 +1,39 @@
 """The problem of the heading filter: what observes the headings, the noise of that, and the states.
 
 δ (k,) [rad] are the heading errors of the k segments with sensors, on the left in W. Time is cut into intervals of
-equal length, the knots. Headings are observed by joints between two sensors, by hinges and by closures.
+equal length, the knots. Headings are observed by joints between two sensors, by hinges and by points that coincide
+(`wepose_pin.observations`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from ..body import BodyModel, GirdleMotion
+from ..alignment import SegmentOrientations, StartFrames, compute_start_heading_var, find_mount_covariance
+from ..body import BodyModel
 from ..body.subject import Subject
-from ..calibration.conditions import Part, StartPose
-from ..filters import AboutVertical
-from .joint_accelerations import JointPair
+from ..calibration import PROTOCOLS, load_protocol
+from ..errors import BadSession
+from ..observations.closures import PointPair
+from ..observations.hinges import HingePlane, find_hinges
+from ..observations.joint_accelerations import LEAST_RATE_HZ, JointPair, find_joint_pairs
+from ..observations.paths import StartPose
+from ..recording import Intervals, Recording
+
+REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
+MEASURED_RATE_STD = np.deg2rad(0.1)  # [rad/s] at which a measured orientation drifts about the vertical; assumption
+LEAST_MOUNT_VAR = np.deg2rad(0.01) ** 2  # [rad²] of a mount's heading, so that covariances can be inverted
+# [s] between knots: causally what a knot observes is corrected by the end of the next one, offline each costs memory.
+CAUSAL_KNOT_S, OFFLINE_KNOT_S = 0.5, 2.0
+SAMPLE_RATE_HZ = 8.0
+# Standard deviation of the delay of an accelerometer against its gyroscope: half a sample, over which it averages, and
+# what filters inside the chips differ by [s]; assumption.
+AVERAGED_SAMPLES, CHIP_DELAY_STD = 0.5, 0.002
 
 
 @dataclass(frozen=True)
@@ -80,115 +96,58 @@ MECHANISM_NOISE = HeadingNoise(
 )
 
 
-class HingeAxis(NamedTuple):
-    """A hinge between two segments with sensors.
-
-    Parameters
-    ----------
-    on, moves : indices of the segment above and of the one below
-    axis, on_along : (3,) unit, the axis and the long axis of `on`, in the frame of `on`
-    along : (3,) unit, the long axis of `moves`, in the frame of `moves`
-    range : [rad] of the angle about the axis from the long axis of `on` to that of `moves`
-    axis_std, tilt_std : [rad] as in `HeadingNoise`
-    std : [rad] of the angle between the hinge's plane and the long axis of `moves`
-    """
-
-    joint: str
-    on: int
-    moves: int
-    axis: np.ndarray
-    on_along: np.ndarray
-    along: np.ndarray
-    range: tuple[float, float]
-    axis_std: float
-    tilt_std: float
-    std: float
-
-
-class Way(NamedTuple):
-    """Vectors that turn with segments; their sum is the way from the root to a point, or from one point to another.
-
-    Parameters
-    ----------
-    segments : (p,) index of each vector's segment
-    vectors : (p, 3) [m] in the frames L of their segments
-    by_length : (p, 3, lengths) their derivatives by the lengths of the model
-    girdles : those that move the ends; of each the name, the sign, and the index of the vector on whose segment it is
-    """
-
-    segments: np.ndarray
-    vectors: np.ndarray
-    by_length: np.ndarray
-    girdles: tuple[tuple[str, float, int], ...]
-
-    @classmethod
-    def from_parts(
-        cls,
-        model: BodyModel,
-        names: Sequence[str],
-        parts: Sequence[Part],
-        neutral: StartPose,
-        girdles: Sequence[tuple[str, float]],
-    ) -> Way:
-        """Return the way of `parts`, whose frames equal W in the pose `neutral`; `names` are the segments."""
-        parts = [part for part in parts if part.sensor in names]  # the others do not rotate
-        lengths = np.array(list(model.lengths.values()))
-        R_LW = [neutral.R_WK[part.sensor].T for part in parts]
-        carriers = [part.sensor for part in parts]
-        return cls(
-            np.array([names.index(carrier) for carrier in carriers], dtype=int),
-            np.array([R @ part.vector(lengths) for R, part in zip(R_LW, parts, strict=True)]).reshape(-1, 3),
-            np.array([R @ np.array(part.by_length) for R, part in zip(R_LW, parts, strict=True)]),
-            tuple((name, sign, carriers.index(model.table.girdles[name].on)) for name, sign in girdles),
-        )
-
-    def turn(self, R_WL: np.ndarray, motions: Mapping[str, GirdleMotion]) -> np.ndarray:
-        """Return the vectors (p, n, 3) [m] in W, for orientations (k, n, 3, 3) and the motions of the girdles."""
-        turned = np.asarray((R_WL[self.segments] @ self.vectors[:, None, :, None])[..., 0])
-        for name, sign, i in self.girdles:
-            turned[i] += sign * (R_WL[self.segments[i]] @ motions[name].displacement[:, :, None])[..., 0]
-        return turned
-
-
-class CoincidentPoints(NamedTuple):
-    """Two points that coincide in some intervals [s], those of a phase."""
-
-    phase: str
-    points: tuple[str, ...]
-    intervals: tuple[tuple[float, float], ...]
-    gap: Way  # from the second point to the first one
-    ways: tuple[Way, ...]  # from the root to each of the points
-
-    def holds(self, time: np.ndarray) -> np.ndarray:
-        """(n,) bool: which times [s] lie in an interval."""
-        closed = np.zeros(len(time), dtype=bool)
-        for begin, end in self.intervals:
-            closed |= (time >= begin) & (time <= end)
-        return closed
-
-
 class FilterHeadings(NamedTuple):
-    """What the orientation filters of k sensors know of their headings after a sample.
+    """What the orientation filters of k sensors know of their headings after a sample; NaN without a covariance.
 
     Parameters
     ----------
-    var : (k,) [rad²] of the heading; NaN: the filter has no covariance
-    about_vertical : (k,) each
+    var : (k,) [rad²] of the heading
+    heading, rate, rate_var : (k,) as `wepose_pin.filters.AboutVertical`
     """
 
     var: np.ndarray
-    about_vertical: AboutVertical
+    heading: np.ndarray
+    rate: np.ndarray
+    rate_var: np.ndarray
 
 
 class Knot(NamedTuple):
-    """The observations of a knot, with uncorrected headings."""
+    """The samples of a knot, with uncorrected headings."""
 
     end: float  # [s]
     time: np.ndarray  # (m,) [s] of the samples
-    quat_WL: np.ndarray  # (m, k, 4) xyzw
-    sides: np.ndarray  # (m, k, 3, 8) of each sensor at its joints, as `JointAccelerationFilter.push`
+    quat_WL: np.ndarray  # (m, k, 4) xyzw of L'
+    sides: np.ndarray  # (m, k, 3, 8) of each sensor at its joints, as `compute_sides`, band-passed
     filters: FilterHeadings  # at the end
     lost: np.ndarray  # (k,) bool: the sensor has lost a sample
+
+
+class StateColumns(NamedTuple):
+    """The columns of the states of a heading filter, of k segments, j joints and h hinges."""
+
+    heading: np.ndarray  # (k,) δ [rad]
+    rate: np.ndarray  # (k,) [rad/s] at which δ drifts
+    joint: np.ndarray  # (j,) [rad] of the heading by a joint's acceleration
+    axis: np.ndarray  # (h,) [rad] of a hinge's axis about the long axis of the segment above
+    twist: np.ndarray  # (h,) [rad] of the sensor on that segment about its long axis
+    tilt: np.ndarray  # (h,) [rad] of a hinge's axis about the direction across
+    mount: np.ndarray  # (k,) [rad] of a mount's heading
+    force: np.ndarray  # (k, 3) [m/s²] fixed in the sensor's frame
+    delay: np.ndarray  # (k,) [s] of the accelerometer
+    start: np.ndarray  # (k,) [rad] of the segment's heading in the start pose
+    lever: np.ndarray  # (j, 6) [m] of the near and the far sensor from the joint
+
+    @classmethod
+    def lay_out(cls, k: int, j: int, h: int) -> StateColumns:
+        shapes = [(k,), (k,), (j,), (h,), (h,), (h,), (k,), (k, 3), (k,), (k,), (j, 6)]
+        sizes = [int(np.prod(shape)) for shape in shapes]
+        parts = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        return cls(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
+
+    @property
+    def size(self) -> int:
+        """Number of states."""
+        return sum(columns.size for columns in self)
 
 
 @dataclass(frozen=True)
@@ -197,7 +156,12 @@ class HeadingProblem:
 
     Parameters
     ----------
-    names : segments, in the order of δ
+    names : k segments, in the order of δ
+    pairs, hinges : joints between two sensors
+    hinge_std : (h, 3) [rad] of each hinge's axis about the long axis of the segment above and across, as in
+        `HeadingNoise`, and of the angle between its plane and the segment below
+    closures : phase → points that coincide in it
+    phases : phase → its intervals [s]; causally they are marked as they begin and end
     knot_s : [s] length of a knot
     drift_psd : (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate
     rate_std : (k,) [rad/s] of the drift rates at the start: of the gyroscopes' biases, or of measured orientations
@@ -211,8 +175,9 @@ class HeadingProblem:
     model: BodyModel
     subject: Subject
     pairs: tuple[JointPair, ...]
-    hinges: tuple[HingeAxis, ...]
-    closures: tuple[CoincidentPoints, ...]
+    hinges: tuple[HingePlane, ...]
+    hinge_std: np.ndarray
+    closures: Mapping[str, PointPair]
     noise: HeadingNoise
     knot_s: float
     samples_per_knot: int
@@ -221,71 +186,143 @@ class HeadingProblem:
     start_var: np.ndarray
     mount_var: np.ndarray
     delay_std: float
+    phases: Mapping[str, Intervals] = field(default_factory=dict)
     start: FilterHeadings | None = None
     causal: bool = False
+
+    @property
+    def rate_hz(self) -> float:
+        """Of a knot's samples."""
+        return self.samples_per_knot / self.knot_s
+
+    @cached_property
+    def columns(self) -> StateColumns:
+        return StateColumns.lay_out(len(self.names), len(self.pairs), len(self.hinges))
 
     @cached_property
     def shape_cov(self) -> np.ndarray:
         """The covariance of the lengths and of the girdles' parameters, as `Subject.shape_covariance`."""
         return self.subject.shape_covariance(self.model.table)
 
-    @property
-    def size(self) -> int:
-        """Number of states."""
-        return self.find_column("lever", 6 * len(self.pairs))
-
-    @cached_property
-    def start_columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The columns (k,) of the headings, of the mounts' errors and of those of the segments in the start pose."""
-        segments = np.arange(len(self.names))
-        return segments, self.find_column("mount", 0) + segments, self.find_column("start", 0) + segments
-
-    def find_column(self, state: str, index: int) -> int:
-        """Find the column of a state; `index` is that of its segment, joint or hinge.
-
-        A force has 3 columns for each, so that `index` is 3 times that; the levers of a joint have 6.
-        """
-        k, j, h = len(self.names), len(self.pairs), len(self.hinges)
-        first = {
-            "heading": 0,
-            "rate": k,
-            "joint": 2 * k,
-            "axis": 2 * k + j,
-            "twist": 2 * k + j + h,
-            "tilt": 2 * k + j + 2 * h,
-            "mount": 2 * k + j + 3 * h,
-            "force": 3 * k + j + 3 * h,
-            "delay": 6 * k + j + 3 * h,
-            "start": 7 * k + j + 3 * h,
-            "lever": 8 * k + j + 3 * h,
-        }
-        return first[state] + index
-
-    @cached_property
-    def hinge_columns(self) -> list[np.ndarray]:
-        """The columns of each hinge, in the order of `heading_observations.HingeRows.H`."""
-        return [
-            np.array([hinge.moves, hinge.on, *(self.find_column(state, i) for state in ("axis", "twist", "tilt"))])
-            for i, hinge in enumerate(self.hinges)
-        ]
-
     @cached_property
     def pair_columns(self) -> list[np.ndarray]:
         """The columns (17,) of each joint: headings of its segments, joint; lever, force and delay near and far."""
-        columns = []
+        c, pair_columns = self.columns, []
         for i, pair in enumerate(self.pairs):
             near, far = self.names.index(pair.near), self.names.index(pair.far)
-            first = self.find_column("lever", 6 * i)
-            sides = [
-                np.concatenate((lever + np.arange(3), self.find_force_columns(at), [self.find_column("delay", at)]))
-                for at, lever in ((near, first), (far, first + 3))
-            ]
-            columns.append(np.concatenate(([near, far, self.find_column("joint", i)], *sides)))
-        return columns
+            sides = [(*c.lever[i, :3], *c.force[near], c.delay[near]), (*c.lever[i, 3:], *c.force[far], c.delay[far])]
+            pair_columns.append(np.array([near, far, c.joint[i], *sides[0], *sides[1]]))
+        return pair_columns
 
-    def find_lever_columns(self, pair: int) -> slice:
-        first = self.find_column("lever", 6 * pair)
-        return slice(first, first + 6)
+    @cached_property
+    def hinge_columns(self) -> list[np.ndarray]:
+        """The columns (5,) of each hinge: headings of the segments below and above, axis, twist, tilt."""
+        c, index = self.columns, self.names.index
+        return [
+            np.array([index(hinge.moves), index(hinge.on), c.axis[i], c.twist[i], c.tilt[i]])
+            for i, hinge in enumerate(self.hinges)
+        ]
 
-    def find_force_columns(self, segment: int) -> np.ndarray:
-        return self.find_column("force", 3 * segment) + np.arange(3)
+
+def find_stride(rate_hz: float) -> int:
+    """Return the number of samples from one that the heading filter takes to the next, at `SAMPLE_RATE_HZ`."""
+    return max(1, round(rate_hz / SAMPLE_RATE_HZ))
+
+
+def make_heading_problem(
+    recording: Recording, orientations: SegmentOrientations, subject: Subject, model: BodyModel, *, causal: bool
+) -> HeadingProblem | None:
+    """Return what observes the headings of these segments, and how well they are known at the start; None: nothing.
+
+    Parameters
+    ----------
+    recording, orientations : the first chunk, or the one that ends with the start pose
+    causal : headings are corrected as samples come; the phases of closures are not read but marked as they begin and
+        end (`CausalHeadings.mark`)
+    """
+    names = tuple(orientations.quat_WL)
+    noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE
+    raw = {name: orientations.quat_LS[name] for name in names if name in recording.imus}
+    pairs = find_joint_pairs(model, raw) if recording.rate_hz >= LEAST_RATE_HZ else ()
+    hinges, hinge_std = _find_hinges(recording, names, subject, model, noise)
+    closures = _find_closures(names, model)
+    phases = {} if causal else {phase: recording.phases.get(phase, ()) for phase in closures}
+    closed = any(end >= orientations.start[1] for intervals in phases.values() for _, end in intervals)
+    if not (pairs or hinges or closed):
+        return None
+    stride = find_stride(recording.rate_hz)
+    samples = max(1, round((CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S) * recording.rate_hz / stride))
+    drift_psd, rate_std = np.full(len(names), noise.drift_psd), np.full(len(names), MEASURED_RATE_STD)
+    for i, name in enumerate(names):
+        if name in orientations.orientation:  # a gyroscope's white noise may be more
+            of_sensor = orientations.orientation[name].noise
+            drift_psd[i] = max(noise.drift_psd, float(np.trace(of_sensor.gyro_cov)) / (3.0 * recording.rate_hz))
+            rate_std[i] = np.sqrt(float(np.trace(of_sensor.gyro_bias_cov)) / 3.0)
+    start_var, mount_var = np.array([find_start_variances(recording, name, subject, model) for name in names]).T
+    return HeadingProblem(
+        names,
+        model,
+        subject,
+        pairs,
+        hinges,
+        hinge_std,
+        closures,
+        noise,
+        samples * stride / recording.rate_hz,
+        samples,
+        drift_psd,
+        rate_std,
+        start_var,
+        mount_var,
+        AVERAGED_SAMPLES / recording.rate_hz + CHIP_DELAY_STD,
+        phases,
+        causal=causal,
+    )
+
+
+def find_start_variances(recording: Recording, segment: str, subject: Subject, model: BodyModel) -> tuple[float, float]:
+    """Find the variances [rad²] of a sensor's heading after the start pose: by the pose, and by the mount's heading."""
+    table = model.table
+    mount_cov = find_mount_covariance(recording, segment, subject)
+    mount_var = LEAST_MOUNT_VAR if mount_cov is None else max(float(mount_cov[2, 2]), LEAST_MOUNT_VAR)
+    if segment == table.reference:
+        return float(REFERENCE_START_STD**2), mount_var
+    return compute_start_heading_var(recording, segment, subject, StartFrames(table=table)), mount_var
+
+
+def _find_hinges(
+    recording: Recording, names: Sequence[str], subject: Subject, model: BodyModel, noise: HeadingNoise
+) -> tuple[tuple[HingePlane, ...], np.ndarray]:
+    """Return the hinges between two segments with sensors, and the standard deviations (h, 3) [rad] of `hinge_std`.
+
+    Their axes are calibrated, or of a person as the body's table has them.
+    """
+    table, start = model.table, StartPose(model.neutral_rotations)
+    # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
+    calibrated = {} if recording.remounted else subject.hinges
+    hinges, stds = [], []
+    for plane in find_hinges(model, start, names):
+        hinge = table.hinges[plane.name]
+        if plane.name in calibrated:
+            found = calibrated[plane.name]
+            hinges.append(plane._replace(axis=start.turn(plane.on, found.axis)))
+            stds.append((noise.axis_std, noise.tilt_std, max(found.std, noise.hinge_std)))
+        elif not table.is_mechanism:
+            hinges.append(plane)
+            axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
+            stds.append((axis_std, hinge.tilt_std, max(hinge.softness, noise.hinge_std)))
+    return tuple(hinges), np.array(stds).reshape(-1, 3)
+
+
+def _find_closures(names: Sequence[str], model: BodyModel) -> dict[str, PointPair]:
+    """Return the points that coincide in a phase of some protocol, where the sensors tell where they are."""
+    start, closures = StartPose(model.neutral_rotations), {}
+    for name in PROTOCOLS:
+        for closure in load_protocol(name).closures:
+            if closure.kind == "coincide" and set(closure.points) <= set(model.table.points):
+                first, second = closure.points
+                try:
+                    closures[closure.phase] = PointPair(model, start, names, (first, second))
+                except BadSession:
+                    continue
+    return closures

@@ -16,47 +16,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..alignment import (
-    SegmentOrientations,
-    StartFrames,
-    compute_heading_variance,
-    compute_start_heading_var,
-    find_mount_covariance,
-)
-from ..body import BodyModel
-from ..body.subject import Subject
-from ..calibration import PROTOCOLS, load_protocol
-from ..calibration.conditions import StartPose, find_girdle_signs, find_parts
-from ..errors import BadSession
-from ..filters import AboutVertical, Orientation
-from ..recording import ImuSensor, OrientationSensor, Recording
-from .heading_filter import HeadingFilter, StanceEstimator, smooth
-from .heading_observations import correct_headings, linearize_hinge, move_all_girdles
-from .heading_problem import (
-    MECHANISM_NOISE,
-    PERSON_NOISE,
-    CoincidentPoints,
-    FilterHeadings,
-    HeadingProblem,
-    HingeAxis,
-    Knot,
-    Way,
-)
-from .joint_accelerations import LEAST_RATE_HZ, JointAccelerationFilter, find_pairs
+from ..alignment import SegmentOrientations, StartFrames, compute_start_heading_var
+from ..observations.hinges import linearize_hinge
+from ..recording import OrientationSensor, Recording
+from .heading_filter import HeadingFilter, StanceEstimator, mask_intervals, smooth
+from .heading_problem import FilterHeadings, HeadingProblem, Knot
+from .knots import E_Z, KnotReader, Samples, read_filter_headings, stack_samples
 
-REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
-MEASURED_RATE_STD = np.deg2rad(0.1)  # [rad/s] at which a measured orientation drifts about the vertical; assumption
-LEAST_MOUNT_VAR = np.deg2rad(0.01) ** 2  # [rad²] of a mount's heading, so that covariances can be inverted
-# [s] between knots: causally what a knot observes is corrected by the end of the next one, offline each costs memory.
-CAUSAL_KNOT_S, OFFLINE_KNOT_S = 0.5, 2.0
 # Share of the next knot in which a knot is solved, in so many parts at even distances (a few more where it closes
 # several gaps); over the rest its correction fades in.
 SOLVE_SHARE, SOLVE_PARTS = 0.4, 20
-SAMPLE_RATE_HZ = 8.0
-# Standard deviation of the delay of an accelerometer against its gyroscope: half a sample, over which it averages, and
-# what filters inside the chips differ by [s]; assumption.
-AVERAGED_SAMPLES, CHIP_DELAY_STD = 0.5, 0.002
-E_Z = np.array([0.0, 0.0, 1.0])
 
 
 class HeadingCorrection(NamedTuple):
@@ -109,207 +78,6 @@ class HeadingCorrection(NamedTuple):
         return np.concatenate(([0.0], values))[np.searchsorted(self.time, time - self.delay_s, side="right")]
 
 
-def find_stride(rate_hz: float) -> int:
-    """Return the number of samples from one that the heading filter takes to the next, at `SAMPLE_RATE_HZ`."""
-    return max(1, round(rate_hz / SAMPLE_RATE_HZ))
-
-
-class KnotReader:
-    """Cuts samples into knots of `size` samples and forms the observations of each.
-
-    Parameters
-    ----------
-    quat_LS, heading_offset : mounts (k, 4) xyzw and ψ (k,) [rad] of the problem's segments
-    rate_hz : of the samples
-    """
-
-    def __init__(
-        self,
-        quat_LS: np.ndarray,
-        heading_offset: np.ndarray,
-        rate_hz: float,
-        problem: HeadingProblem,
-    ) -> None:
-        names = problem.names
-        self._stride = find_stride(rate_hz)
-        self.size = self._stride * problem.samples_per_knot
-        k = len(names)
-        self._quat_SL = rotations.conjugate(quat_LS)
-        self._heading_offset = heading_offset
-        self._time, self._quat_VS, self._accel_S = (
-            np.zeros(self.size),
-            np.zeros((self.size, k, 4)),
-            np.zeros((self.size, k, 3)),
-        )
-        self.count = 0  # samples in the open knot
-        self._accelerations = JointAccelerationFilter(k, rate_hz) if problem.pairs else None
-
-    @property
-    def remaining(self) -> int:
-        """Number of samples that the open knot lacks."""
-        return self.size - self.count
-
-    def push(self, time: np.ndarray, quat_VS: np.ndarray, accel_S: np.ndarray) -> None:
-        """Add at most `remaining` samples: (n,) [s], (n, k, 4) xyzw, (n, k, 3) [m/s²]."""
-        rows = slice(self.count, self.count + len(time))
-        self._time[rows], self._quat_VS[rows], self._accel_S[rows] = time, quat_VS, accel_S
-        self.count += len(time)
-
-    def close(self, filters: FilterHeadings) -> Knot:
-        """Return the open knot and open the next one; `filters` is at its last sample."""
-        return self.form(self.take(), filters)
-
-    def take(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the samples of the open knot, time, `quat_VS` and `accel_S`, and open the next one."""
-        n, self.count = self.count, 0
-        return self._time[:n].copy(), self._quat_VS[:n].copy(), self._accel_S[:n].copy()
-
-    def form(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], filters: FilterHeadings) -> Knot:
-        """Return the knot of samples from `take`; knots must be formed in the order of time."""
-        time, quat_VS, accel_S = samples
-        n = len(time)
-        rows = np.arange(0, n, self._stride)
-        R_WS = correct_headings(quat_VS, self._heading_offset).swapaxes(0, 1)
-        no_sides = np.zeros((0, accel_S.shape[1], 3, 8))
-        sides = no_sides if self._accelerations is None else self._accelerations.push(R_WS, accel_S, rows)
-        quat_WS = rotations.multiply(rotations.rotation_about(E_Z, self._heading_offset), quat_VS[rows])
-        quat_WL = rotations.multiply(quat_WS, self._quat_SL)
-        lost = np.asarray(~np.isfinite(accel_S).all(axis=(0, 2)))
-        return Knot(float(time[n - 1]), time[rows].copy(), quat_WL, sides, filters, lost)
-
-
-def make_heading_problem(
-    recording: Recording, orientations: SegmentOrientations, subject: Subject, model: BodyModel, *, causal: bool
-) -> HeadingProblem | None:
-    """Return what observes the headings of these segments, and how well they are known at the start; None: nothing.
-
-    Parameters
-    ----------
-    recording, orientations : the first chunk, or the one that ends with the start pose
-    causal : headings are corrected as samples come; the phases of closures are not read but marked as they begin and
-        end (`CausalHeadings.mark`)
-    """
-    names = tuple(orientations.quat_WL)
-    raw = {name: orientations.quat_LS[name] for name in names if name in recording.imus}
-    pairs = find_pairs(model, raw) if recording.rate_hz >= LEAST_RATE_HZ else ()
-    hinges = _find_hinges(recording, names, subject, model)
-    closures = _find_closures(None if causal else recording, names, model)
-    closed = any(end >= orientations.start[1] for closure in closures for _, end in closure.intervals)
-    if not (pairs or hinges or closed):
-        return None
-    noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE
-    stride = find_stride(recording.rate_hz)
-    samples = max(1, round((CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S) * recording.rate_hz / stride))
-    knot_s = samples * stride / recording.rate_hz
-    drift_psd, rate_std = np.full(len(names), noise.drift_psd), np.full(len(names), MEASURED_RATE_STD)
-    for i, name in enumerate(names):
-        if name in orientations.orientation:  # a gyroscope's white noise may be more
-            of_sensor = orientations.orientation[name].noise
-            drift_psd[i] = max(noise.drift_psd, float(np.trace(of_sensor.gyro_cov)) / (3.0 * recording.rate_hz))
-            rate_std[i] = np.sqrt(float(np.trace(of_sensor.gyro_bias_cov)) / 3.0)
-    start_var, mount_var = np.array([find_start_variances(recording, name, subject, model) for name in names]).T
-    return HeadingProblem(
-        names,
-        model,
-        subject,
-        pairs,
-        hinges,
-        closures,
-        noise,
-        knot_s,
-        samples,
-        drift_psd,
-        rate_std,
-        start_var,
-        mount_var,
-        AVERAGED_SAMPLES / recording.rate_hz + CHIP_DELAY_STD,
-        causal=causal,
-    )
-
-
-def find_start_variances(recording: Recording, segment: str, subject: Subject, model: BodyModel) -> tuple[float, float]:
-    """Find the variances [rad²] of a sensor's heading after the start pose: by the pose, and by the mount's heading."""
-    table = model.table
-    mount_cov = find_mount_covariance(recording, segment, subject)
-    mount_var = LEAST_MOUNT_VAR if mount_cov is None else max(float(mount_cov[2, 2]), LEAST_MOUNT_VAR)
-    if segment == table.reference:
-        return float(REFERENCE_START_STD**2), mount_var
-    return compute_start_heading_var(recording, segment, subject, StartFrames(table=table)), mount_var
-
-
-def _find_hinges(
-    recording: Recording, names: Sequence[str], subject: Subject, model: BodyModel
-) -> tuple[HingeAxis, ...]:
-    """Return the hinges between two segments with sensors, their axes calibrated or as the body's table has them."""
-    table = model.table
-    noise = MECHANISM_NOISE if table.is_mechanism else PERSON_NOISE
-    # A calibrated axis is relative to the calibrated mounts and holds as long as they do.
-    calibrated = {} if recording.remounted else subject.hinges
-    hinges = []
-    for joint, hinge in table.hinges.items():
-        if not {hinge.on, hinge.moves} <= set(names):
-            continue
-        axis, std, axis_std, tilt_std = np.array(hinge.axis), hinge.softness, 0.0, hinge.tilt_std
-        if joint in calibrated:
-            axis, std = calibrated[joint].axis, calibrated[joint].std
-            axis_std, tilt_std = noise.axis_std, noise.tilt_std
-        elif table.is_mechanism:
-            continue
-        else:
-            axis_std = float(np.hypot(hinge.common_std, hinge.mirror_std))
-        along = np.array(table.segments[hinge.on].along)
-        hinges.append(
-            HingeAxis(
-                joint,
-                names.index(hinge.on),
-                names.index(hinge.moves),
-                axis,
-                along,
-                np.array(table.segments[hinge.moves].along),
-                hinge.range,
-                axis_std,
-                tilt_std,
-                max(std, noise.hinge_std),
-            )
-        )
-    return tuple(hinges)
-
-
-def _find_closures(
-    recording: Recording | None, segments: Sequence[str], model: BodyModel
-) -> tuple[CoincidentPoints, ...]:
-    """Return the closures of the protocols in which points coincide and all segments between them have sensors.
-
-    Each holds in the intervals of its phase, none where the recording lacks it. `recording` None: none are read.
-    """
-    neutral = StartPose(model.neutral_rotations)
-    closures, taken = [], set[tuple[str, tuple[str, ...]]]()
-    for name in PROTOCOLS:
-        for closure in load_protocol(name).closures:
-            if closure.kind != "coincide" or not set(closure.points) <= set(model.table.points):
-                continue
-            if (closure.phase, closure.points) in taken:
-                continue
-            taken.add((closure.phase, closure.points))
-            first, last = closure.points
-            try:
-                gap, *ways = (
-                    Way.from_parts(
-                        model,
-                        segments,
-                        find_parts(model, neutral, segments, ends),
-                        neutral,
-                        find_girdle_signs(model, ends),
-                    )
-                    for ends in ([(first, 1.0), (last, -1.0)], [(first, 1.0)], [(last, 1.0)])
-                )
-            except BadSession:
-                continue
-            intervals = () if recording is None else tuple(recording.phases.get(closure.phase, ()))
-            closures.append(CoincidentPoints(closure.phase, closure.points, intervals, gap, tuple(ways)))
-    return tuple(closures)
-
-
 class HeadingCorrector:
     """Corrects the headings of a recording in two passes over its chunks.
 
@@ -325,115 +93,122 @@ class HeadingCorrector:
     def __init__(self, chunk: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
         self._problem, self._start_end = problem, orientations.start[1]
         self._start_frames = StartFrames(table=problem.model.table)
-        self._names, self._measured = problem.names, find_measured_headings(chunk, problem.names)
-        mounts = np.array([orientations.quat_LS[name] for name in self._names])
-        offsets = np.array([orientations.heading_offset[name] for name in self._names])
-        self._reader = KnotReader(mounts, offsets, chunk.rate_hz, problem)
+        self._measured = find_measured_headings(chunk, problem.names)
+        self._reader = KnotReader(chunk.rate_hz, orientations, problem)
         self._knots: list[Knot] = []
-        self._corrected_samples = 0  # of the second pass so far
-        self._gaps = {stage: _RmsAccumulator() for stage in ("before", "after")}
-        self._hinge_rms = {
-            stage: {hinge.joint: _RmsAccumulator() for hinge in problem.hinges} for stage in ("before", "after")
-        }
-        self._max_correction_deg = dict.fromkeys(self._names, 0.0)
+        self._errors = np.zeros((0, len(problem.names)))  # of each knot, from `solve` on; as the correction
+        self._correction: HeadingCorrection
 
     def add_observations(self, chunk: Recording, orientations: SegmentOrientations) -> None:
         """Add the observations of a chunk, in the first pass."""
-        first = int(np.searchsorted(chunk.time, self._start_end))
-        if first == len(chunk):
+        begin, names = int(np.searchsorted(chunk.time, self._start_end)), self._problem.names
+        if begin == len(chunk):
             return
-        quat_VS, accel_S = _stack_samples(chunk, orientations, self._names)
+        samples = stack_samples(chunk, orientations, names)
         if not (self._knots or self._reader.count):
-            start = read_filter_headings(orientations.orientation, self._names, first)
+            start = read_filter_headings(orientations.orientation, names, begin)
             self._problem = replace(self._problem, start=start)
-        begin = first
         while begin < len(chunk):
             end = min(len(chunk), begin + self._reader.remaining)
-            self._reader.push(chunk.time[begin:end], quat_VS[begin:end], accel_S[begin:end])
-            self._last_filters = read_filter_headings(orientations.orientation, self._names, end - 1)
+            self._reader.push(*(values[begin:end] for values in samples))
+            self._last_filters = read_filter_headings(orientations.orientation, names, end - 1)
             if not self._reader.remaining:
-                self._knots.append(self._reader.close(self._last_filters))
+                self._knots.append(self._reader.form(self._reader.take(), self._last_filters))
             begin = end
 
     def solve(self) -> bool:
         """Estimate the heading errors; return False where nothing observes them."""
+        problem = self._problem
         if self._reader.count:
-            self._knots.append(self._reader.close(self._last_filters))
+            self._knots.append(self._reader.form(self._reader.take(), self._last_filters))
         if not self._knots:
             return False
-        self._smoothed, self._clasps = smooth(self._problem, self._knots)
-        if self._measured.any() and not exceed_uncertainty(self._smoothed.errors, self._smoothed.covariance):
-            self._smoothed.errors[:, self._measured] = 0.0
-        ends = np.array([knot.end for knot in self._knots])
-        begins = np.array([knot.time[0] for knot in self._knots])
-        self._knot_times = 0.5 * (begins + ends)  # the errors are constant before the first and after the last
+        smoothed, clasps = smooth(problem, self._knots)
+        if self._measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
+            smoothed.errors[:, self._measured] = 0.0
+        # The errors are constant before the first and after the last.
+        knot_times = np.array([0.5 * (knot.time[0] + knot.end) for knot in self._knots])
+        time = np.concatenate([knot.time for knot in self._knots])
+        quat_WL = np.concatenate([knot.quat_WL for knot in self._knots])
         self._knots = []
+        residuals = [
+            measure_residuals(problem, time, quat_WL, headings)
+            for headings in (np.zeros(quat_WL.shape[:2]), interpolate(time, knot_times, smoothed.errors))
+        ]
+        gaps, hinges = zip(*residuals, strict=True)
+        self._errors = smoothed.errors
+        self._correction = HeadingCorrection(
+            gap_rms_mm=None if gaps[0] is None else gaps,
+            hinge_residual_rms_deg={joint: tuple(rms[joint] for rms in hinges) for joint in hinges[0]},
+            max_correction_deg=dict(
+                zip(problem.names, np.degrees(np.abs(smoothed.errors).max(axis=0)).tolist(), strict=True)
+            ),
+            joint_accelerations=tuple(pair.far for pair in problem.pairs),
+            hinges=tuple(hinge.name for hinge in problem.hinges),
+            found_clasps=tuple(clasps),
+            segments=problem.names,
+            time=knot_times,
+            covariance=smoothed.covariance,
+            segment_covariance=smoothed.segment_covariance,
+        )
         return True
 
     def correct(self, chunk: Recording, orientations: SegmentOrientations) -> SegmentOrientations:
-        """Return the chunk's orientations with corrected headings, in the second pass, and add up its residuals."""
+        """Return the chunk's orientations with corrected headings, in the second pass."""
         corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
-        for i, name in enumerate(self._names):
-            delta = np.interp(chunk.time, self._knot_times, self._smoothed.errors[:, i])
+        knot_times, segment_cov = self._correction.time, self._correction.segment_covariance
+        errors = interpolate(chunk.time, knot_times, self._errors)
+        for i, name in enumerate(self._problem.names):
+            delta = errors[:, i]
             corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
-            self._max_correction_deg[name] = max(self._max_correction_deg[name], float(np.degrees(np.abs(delta).max())))
-            filter_cov = _compute_filter_covariance(orientations, name)
-            if filter_cov is not None:
-                with_heading, filter_var = filter_cov
+            orientation = orientations.orientation.get(name)
+            if orientation is not None and orientation.attitude_cov is not None:
+                R_VS = Rotation.from_quat(orientation.quat_VS)
+                with_heading = compute_heading_covariance(R_VS, orientation.attitude_cov)
                 start_var = compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
-                before = filter_var + start_var
-                variance = np.interp(chunk.time, self._knot_times, self._smoothed.segment_covariance[:, i, i])
+                before = with_heading[:, 2] + start_var
+                variance = np.interp(chunk.time, knot_times, segment_cov[:, i, i])
                 # The filter alone may know the heading better; to it a correction is an error of that size.
                 variance = np.minimum(variance, before + delta**2)
                 gap = chunk.sensors[name].gap
                 if gap is not None:  # where the sensor is lost, neighbours do not tell where its segment is
                     variance = np.where(gap, np.maximum(variance, before), variance)
+                R_WV = Rotation.from_rotvec([0.0, 0.0, orientations.heading_offset[name]])
+                with_heading = R_WV.apply(with_heading)
                 covariance[name] = replace_heading_variance(covariance[name], with_heading, before, variance)
-        result = replace(orientations, quat_WL=corrected, covariance_W=covariance)
-        stride = find_stride(chunk.rate_hz)
-        rows = np.arange(-self._corrected_samples % stride, len(chunk), stride)
-        rows = rows[chunk.time[rows] >= self._start_end]
-        self._corrected_samples += len(chunk)
-        for stage, quats in (("before", orientations.quat_WL), ("after", corrected)):
-            quat_WL = np.stack([quats[name][rows] for name in self._names], axis=1)
-            self._add_residuals(stage, chunk.time[rows], correct_headings(quat_WL, np.zeros(len(self._names))))
-        return result
+        return replace(orientations, quat_WL=corrected, covariance_W=covariance)
 
     def summarize(self) -> HeadingCorrection:
-        """Return what was observed, and residuals and the largest correction of the chunks corrected so far."""
-        gaps, hinge_rms = self._gaps, self._hinge_rms
-        return HeadingCorrection(
-            gap_rms_mm=(1e3 * gaps["before"].value, 1e3 * gaps["after"].value) if gaps["before"].count else None,
-            hinge_residual_rms_deg={
-                hinge.joint: (
-                    float(np.degrees(hinge_rms["before"][hinge.joint].value)),
-                    float(np.degrees(hinge_rms["after"][hinge.joint].value)),
-                )
-                for hinge in self._problem.hinges
-            },
-            max_correction_deg=dict(self._max_correction_deg),
-            joint_accelerations=tuple(pair.far for pair in self._problem.pairs),
-            hinges=tuple(hinge.joint for hinge in self._problem.hinges),
-            found_clasps=tuple(self._clasps),
-            segments=self._names,
-            time=self._knot_times,
-            covariance=self._smoothed.covariance,
-            segment_covariance=self._smoothed.segment_covariance,
-        )
+        """Return what was observed and corrected, and the residuals."""
+        return self._correction
 
-    def _add_residuals(self, stage: str, time: np.ndarray, R_WL: np.ndarray) -> None:
-        """Add the residuals of closures and hinges, "before" or "after" the correction, of R_WL (k, n, 3, 3)."""
-        problem = self._problem
-        motions = move_all_girdles(problem, R_WL) if problem.closures else {}
-        for closure in problem.closures:
-            closed = closure.holds(time)
-            if closed.any():
-                gap = closure.gap.turn(R_WL, motions).sum(axis=0)
-                self._gaps[stage].add(np.sum(gap[closed] ** 2, axis=1))
-        if len(time):
-            for hinge in problem.hinges:
-                r = linearize_hinge(R_WL[hinge.on], R_WL[hinge.moves], hinge).r
-                self._hinge_rms[stage][hinge.joint].add(r**2)
+
+def interpolate(time: np.ndarray, knot_times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return what is between the knots (n, k) of `values` (m, k) at them."""
+    return np.stack([np.interp(time, knot_times, column) for column in values.T], axis=1)
+
+
+def measure_residuals(
+    problem: HeadingProblem, time: np.ndarray, quat_WL: np.ndarray, headings: np.ndarray
+) -> tuple[float | None, dict[str, float]]:
+    """Return the rms gap [mm] between points that coincide, None in no phase, and hinge → rms deviation [deg].
+
+    Parameters
+    ----------
+    time, quat_WL, headings : (n,) [s], (n, k, 4) xyzw of L', (n, k) [rad] by which they are corrected
+    """
+    squares = []
+    for phase, points in problem.closures.items():
+        inside = mask_intervals(time, problem.phases[phase])
+        if inside.any():
+            squares.append(np.sum(points.linearize(quat_WL[inside], headings[inside]).gap ** 2, axis=1))
+    gap = 1e3 * float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else None
+    rms = {}
+    for hinge in problem.hinges:
+        moves, on = (problem.names.index(name) for name in (hinge.moves, hinge.on))
+        r = linearize_hinge(hinge, quat_WL[:, on], quat_WL[:, moves], headings[:, [moves, on]]).r
+        rms[hinge.name] = float(np.degrees(np.sqrt(np.mean(r**2))))
+    return gap, rms
 
 
 class CausalHeadings:
@@ -456,9 +231,8 @@ class CausalHeadings:
     def __init__(self, recording: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
         start = read_filter_headings(orientations.orientation, problem.names, len(recording) - 1)
         self._problem = problem = replace(problem, start=start)
-        mounts = np.array([orientations.quat_LS[name] for name in problem.names])
         self.offset = np.array([orientations.heading_offset[name] for name in problem.names])
-        self._reader = KnotReader(mounts, self.offset, recording.rate_hz, problem)
+        self._reader = KnotReader(recording.rate_hz, orientations, problem)
         self._filter, self._stance = HeadingFilter(problem), StanceEstimator(problem)
         self._rate_hz, self._samples = recording.rate_hz, 0
         self._start_end = float(recording.time[-1])
@@ -479,7 +253,7 @@ class CausalHeadings:
     @property
     def phases(self) -> set[str]:
         """The names of the phases in which points coincide."""
-        return {closure.phase for closure in self._problem.closures}
+        return set(self._problem.closures)
 
     @property
     def fade(self) -> tuple[np.ndarray, np.ndarray, int, int]:
@@ -527,21 +301,18 @@ class CausalHeadings:
         else:
             return
         # Half a sample around the first and the last one.
-        intervals = tuple(
+        self._filter.phases[phase] = tuple(
             ((first - 0.5) / self._rate_hz, np.inf if last is None else (last - 0.5) / self._rate_hz)
             for first, last in marked
         )
-        closures = tuple(
-            closure._replace(intervals=intervals) if closure.phase == phase else closure
-            for closure in self._problem.closures
-        )
-        self._problem = self._filter.problem = replace(self._problem, closures=closures)
 
-    def _solve(self, samples: tuple[np.ndarray, np.ndarray, np.ndarray], filters: FilterHeadings) -> Iterator[None]:
+    def _solve(self, samples: Samples, filters: FilterHeadings) -> Iterator[None]:
         """Estimate the heading errors of a knot, a part at each step of the iterator."""
         knot = self._reader.form(samples, filters)
         yield
-        yield from self._filter.step_gradually(knot)
+        self._filter.predict(self._filter.find_change(knot))
+        yield
+        yield from self._filter.update(knot)
         self._stance.assess(self._filter.x, self._filter.P)
         self._estimate = self._stance.estimate(self._filter.x, self._filter.P)
         if self._record:
@@ -590,7 +361,7 @@ class CausalHeadings:
             hinge_residual_rms_deg={},
             max_correction_deg=dict(zip(names, np.degrees(self._max_correction).tolist(), strict=True)),
             joint_accelerations=tuple(pair.far for pair in self._problem.pairs),
-            hinges=tuple(hinge.joint for hinge in self._problem.hinges),
+            hinges=tuple(hinge.name for hinge in self._problem.hinges),
             found_clasps=tuple((self._start_end + a, self._start_end + b) for a, b in self._filter.clasps),
             segments=names,
             time=np.array([time for time, _, _ in self._history]),
@@ -616,67 +387,6 @@ def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:
     """
     weighted = np.linalg.solve(covariance, errors[:, :, None])[:, :, 0]
     return bool((np.sum(errors * weighted, axis=1) > 1.0).any())
-
-
-def _stack_samples(
-    chunk: Recording, orientations: SegmentOrientations, names: Sequence[str]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Stack `quat_VS` (n, k, 4) and `accel_S` (n, k, 3) [m/s²], NaN where a sensor is lost."""
-    quats, accels = [], []
-    for name in names:
-        sensor = chunk.sensors[name]
-        filtered = sensor if isinstance(sensor, OrientationSensor) else orientations.orientation[name]
-        quats.append(filtered.quat_VS)
-        accels.append(find_specific_force(chunk, name))
-    return np.stack(quats, axis=1), np.stack(accels, axis=1)
-
-
-def find_specific_force(chunk: Recording, name: str) -> np.ndarray:
-    """Return `accel_S` (n, 3) [m/s²] of a sensor, NaN where samples are lost; zeros of an `OrientationSensor`."""
-    sensor = chunk.sensors[name]
-    accel_S = sensor.accel_S if isinstance(sensor, ImuSensor) else np.zeros((len(chunk), 3))
-    return accel_S if sensor.gap is None else np.where(sensor.gap[:, None], np.nan, accel_S)
-
-
-def read_filter_headings(orientation: Mapping[str, Orientation], names: Sequence[str], row: int) -> FilterHeadings:
-    """Read what the filters say of their headings at sample `row`."""
-    variance, about_vertical = np.full(len(names), np.nan), np.full((len(names), len(AboutVertical._fields)), np.nan)
-    filtered = {i: orientation[name] for i, name in enumerate(names) if name in orientation}
-    covs = {i: each.attitude_cov[row] for i, each in filtered.items() if each.attitude_cov is not None}
-    if covs:
-        quat_VS = np.stack([filtered[i].quat_VS[row] for i in covs])
-        variance[list(covs)] = compute_heading_variance(quat_VS, np.stack(list(covs.values())))
-    for i, each in filtered.items():
-        if each.about_vertical is not None:
-            about_vertical[i] = each.about_vertical[row]
-    return FilterHeadings(variance, AboutVertical(*about_vertical.T))
-
-
-class _RmsAccumulator:
-    """The root mean square of residuals whose squares are added chunk by chunk."""
-
-    def __init__(self) -> None:
-        self.count, self._sum = 0, 0.0
-
-    def add(self, squares: np.ndarray) -> None:
-        self.count, self._sum = self.count + len(squares), self._sum + float(squares.sum())
-
-    @property
-    def value(self) -> float:
-        return float(np.sqrt(self._sum / self.count)) if self.count else float("nan")
-
-
-def _compute_filter_covariance(orientations: SegmentOrientations, name: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Compute the filter's covariance of the heading with each axis of W (n, 3), and its variance (n,), both [rad²].
-
-    None: the filter has no covariance.
-    """
-    orientation = orientations.orientation.get(name)
-    if orientation is None or orientation.attitude_cov is None:
-        return None
-    with_heading_V = compute_heading_covariance(Rotation.from_quat(orientation.quat_VS), orientation.attitude_cov)
-    R_WV = Rotation.from_rotvec([0.0, 0.0, orientations.heading_offset[name]])
-    return R_WV.apply(with_heading_V), with_heading_V[:, 2]
 
 
 def compute_heading_covariance(R_VS: Rotation, attitude_cov: np.ndarray) -> np.ndarray:

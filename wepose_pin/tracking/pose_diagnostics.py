@@ -10,7 +10,7 @@ from ..diagnostics import INFO, WARNING, Diagnostic, render
 from ..filters import STATIC_ONLY
 from ..recording import OrientationSensor
 from ..recording.limits import STANDARD_GRAVITY
-from .headings import find_start_variances
+from .heading_problem import find_start_variances
 from .measures import (
     BENT,
     Budget,

@@ -37,13 +37,8 @@ from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
 from .heading_problem import FilterHeadings, HeadingProblem
-from .headings import (
-    CausalHeadings,
-    compute_heading_covariance,
-    find_specific_force,
-    read_filter_headings,
-    replace_heading_variance,
-)
+from .headings import CausalHeadings, compute_heading_covariance, replace_heading_variance
+from .knots import find_specific_force, read_filter_headings
 
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
 
@@ -313,9 +308,7 @@ class SegmentEstimator:
         var, about_vertical = self.heading_var(), np.full((len(self.names), len(AboutVertical._fields)), np.nan)
         if self._filters.about_vertical is not None:
             about_vertical[~self._measured] = self._filters.about_vertical
-        return FilterHeadings(
-            np.full(len(self.names), np.nan) if var is None else var, AboutVertical(*about_vertical.T)
-        )
+        return FilterHeadings(np.full(len(self.names), np.nan) if var is None else var, *about_vertical.T)
 
     def covariance(self) -> np.ndarray:
         """Return the covariances (k, 3, 3) [rad²] of the segments in W after the last step, mounts included.

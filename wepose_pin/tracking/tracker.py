@@ -19,8 +19,8 @@ from ..errors import BadOption, BadPhase, BadSession
 from ..filters import OFFLINE
 from ..filters.noise import BEGINNING_S
 from ..recording import Recording
-from .heading_problem import HeadingProblem
-from .headings import HeadingCorrector, make_heading_problem
+from .heading_problem import HeadingProblem, make_heading_problem
+from .headings import HeadingCorrector
 from .segments import SegmentEstimator
 from .start_pose import StartPoseCutter
 from .tracked import TrackedRecording, TrackOptions

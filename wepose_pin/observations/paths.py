@@ -1,0 +1,194 @@
+"""Paths between points of a body: vectors that rotate with segments, and girdles that move the points.
+
+A point is the sum of the vectors of the links between it and the root (`wepose_pin.body.reaches`). Each link rotates
+with a segment that has a sensor, its own or the one above it with which it is rigid. Where points coincide, the path
+from one to the other is zero; its covariance weighs what is left of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from ..body import BodyModel, Girdle
+from ..body.girdle import displace, find_girdle_scale
+from ..body.links import find_carrier
+from ..body.reaches import UNIVERSE
+from ..body.table import Vector
+from ..errors import BadSession
+from .symbols import rotate, rotate_back
+
+ZERO_LENGTH = 1e-12  # [m] below which a vector is zero; its derivatives by the lengths alike
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """The orientation of the links of a body in the start pose, link → R_WK (3, 3)."""
+
+    R_WK: Mapping[str, np.ndarray]
+
+    def turn(self, link: str, vector: Collection[float]) -> Vector:
+        """Return a vector (3,) of a link's frame, in L'."""
+        R = self.R_WK.get(link)
+        x, y, z = vector if R is None else R @ np.array(vector)
+        return float(x), float(y), float(z)
+
+
+class SegmentVector(NamedTuple):
+    """What rotates with one segment of a path: the vector ``by_length @ lengths + constant`` [m] in L'."""
+
+    segment: str  # with a sensor; `UNIVERSE`: the vector does not rotate
+    by_length: tuple[tuple[float, ...], ...]  # (3, k), lengths in the order of the table
+    constant: Vector
+
+    def vector(self, lengths: np.ndarray) -> np.ndarray:
+        """Return (3,) [m] for lengths (k,) [m]."""
+        return np.array(self.by_length) @ lengths + np.array(self.constant)
+
+
+class PointPath(NamedTuple):
+    """The path from the root to a point, or from one point to another.
+
+    Parameters
+    ----------
+    vectors : their sum is the path, but for girdles
+    girdles : those that move the ends, each with the sign of its displacement
+    """
+
+    vectors: tuple[SegmentVector, ...]
+    girdles: tuple[tuple[str, float], ...]
+
+
+class GirdleTerm(NamedTuple):
+    """A girdle with sensors on both its segments.
+
+    Parameters
+    ----------
+    along : (3,) of the limb, in L' of `law.moves`
+    R_on : (3, 3), row by row: maps the frame L of `law.on` to its L'
+    scale : of the law
+    """
+
+    name: str
+    law: Girdle
+    along: Vector
+    R_on: tuple[float, ...]
+    scale: float
+
+    def displacement(self, quat_WL: Mapping[str, ca.SX], parameters: ca.SX) -> ca.SX:
+        """Return the displacement (3,) [m] in W of the point that the girdle moves, by a person's parameters (7,)."""
+        R_on, law = ca.DM(np.reshape(self.R_on, (3, 3))), self.law
+        along = R_on.T @ rotate_back(quat_WL[law.on], rotate(quat_WL[law.moves], self.along))
+        by_law, raised = displace(law, ca.vertsplit(along), self.scale, ca)
+        own = (1.0 + parameters[0]) * ca.vertcat(*by_law) + parameters[1:4] + raised * parameters[4:]
+        return rotate(quat_WL[law.on], R_on @ own)
+
+
+class BodySymbols(NamedTuple):
+    """A body in CasADi.
+
+    Parameters
+    ----------
+    quat_WL : segment → (4,) xyzw of L'
+    lengths : (k,) [m], in the order of the table
+    girdles : name → the girdle and a person's parameters (7,)
+    """
+
+    quat_WL: Mapping[str, ca.SX]
+    lengths: ca.SX
+    girdles: Mapping[str, tuple[GirdleTerm, ca.SX]]
+
+
+def express_path(path: PointPath, body: BodySymbols) -> tuple[ca.SX, dict[str, ca.SX]]:
+    """Return a path (3,) [m] in W, and its vectors, segment → (3,) [m], without the girdles."""
+    whole, vectors = ca.SX.zeros(3), {}
+    for name, sign in path.girdles:
+        if name in body.girdles:
+            term, parameters = body.girdles[name]
+            whole += sign * term.displacement(body.quat_WL, parameters)
+    for part in path.vectors:
+        vector = ca.sparsify(ca.DM(np.array(part.by_length))) @ body.lengths + ca.DM(part.constant)
+        if part.segment != UNIVERSE:
+            vectors[part.segment] = vector = rotate(body.quat_WL[part.segment], vector)
+        whole += vector
+    return whole, vectors
+
+
+def express_covariance(vectors: Mapping[str, ca.SX], slip: float, attitude_std: Mapping[str, float]) -> ca.SX:
+    """Return the covariance (3, 3) [m²] of a path by errors of its orientations, and by points that slip.
+
+    Parameters
+    ----------
+    vectors : as of `express_path`
+    slip : [m] one standard deviation, each axis, by which the points do not coincide
+    attitude_std : segment → [rad] of its orientation about each axis
+    """
+    covariance = slip**2 * ca.SX.eye(3)
+    for segment, v in vectors.items():
+        # An error of variance σ² about each axis moves the end by a vector of this covariance.
+        covariance += attitude_std[segment] ** 2 * (ca.sumsqr(v) * ca.SX.eye(3) - v @ v.T)
+    return covariance
+
+
+def find_path(
+    model: BodyModel, start: StartPose, sensors: Collection[str], points: Collection[tuple[str, float]]
+) -> PointPath:
+    """Find the path of a signed sum of points, its vectors by segments in the order of the table.
+
+    Raises
+    ------
+    BadSession
+        A link on the path has no sensor, and is not rigid with one that has.
+    """
+    lengths = len(model.lengths)
+    sums: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    links: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for point, sign in points:
+        for link, (by_length, constant) in model.reaches[point].items():
+            B, c = links.get(link, (np.zeros((3, lengths)), np.zeros(3)))
+            links[link] = B + sign * by_length, c + sign * constant
+    for link, (by_length, constant) in links.items():
+        if not (np.any(np.abs(by_length) > ZERO_LENGTH) or np.any(np.abs(constant) > ZERO_LENGTH)):
+            continue
+        carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
+        if carrier is None:
+            raise BadSession(_describe_missing_sensor(model, link, [point for point, _ in points]))
+        R = start.R_WK.get(link, np.eye(3))
+        B, c = sums.get(carrier, (np.zeros((3, lengths)), np.zeros(3)))
+        sums[carrier] = B + R @ by_length, c + R @ constant
+    vectors = []
+    for carrier in sorted(sums, key=[UNIVERSE, *model.table.segments].index):
+        B, c = sums[carrier]
+        if np.any(np.abs(B) > ZERO_LENGTH) or np.any(np.abs(c) > ZERO_LENGTH):
+            x, y, z = (float(v) for v in c)
+            vectors.append(SegmentVector(carrier, tuple(tuple(row) for row in B.tolist()), (x, y, z)))
+    signs: dict[str, float] = {}
+    for point, sign in points:
+        for name in model.point_girdles[point]:
+            signs[name] = signs.get(name, 0.0) + sign
+    return PointPath(tuple(vectors), tuple((name, sign) for name, sign in signs.items() if sign))
+
+
+def _describe_missing_sensor(model: BodyModel, link: str, points: Collection[str]) -> str:
+    place = f"the place of {' and '.join(points)} is not known"
+    if link not in model.table.segments:
+        return (
+            f"no segment of {model.table.name} moves with '{link}', so that {place}; add its link to [segments], with "
+            f"a sensor, or use a protocol without that point"
+        )
+    return f"sensors.{link} is missing: without it {place}; add it, or use a protocol without that point"
+
+
+def find_girdles(model: BodyModel, start: StartPose, sensors: Collection[str]) -> tuple[GirdleTerm, ...]:
+    """Find the girdles of the body whose two segments both have sensors."""
+    terms = []
+    for name, girdle in model.table.girdles.items():
+        if {girdle.on, girdle.moves} <= set(sensors):
+            along = start.turn(girdle.moves, model.table.segments[girdle.moves].along)
+            R_on = tuple(float(v) for v in start.R_WK[girdle.on].ravel())
+            terms.append(GirdleTerm(name, girdle, along, R_on, find_girdle_scale(girdle, model.lengths)))
+    return tuple(terms)
