@@ -9,16 +9,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from wepose_pin.body import load_model
-from wepose_pin.calibration import alternatives, weights
-from wepose_pin.calibration.contact import find_initial_guess
+from wepose_pin.calibration import alternatives, calibrate, weights
 from wepose_pin.calibration.least_squares import LOOSE_TOLERANCE, STEPS, Estimate, LeastSquares, solve
-from wepose_pin.calibration.priors import build_prior
-from wepose_pin.calibration.problem import CalibrationProblem
-from wepose_pin.calibration.protocols import load_protocol
-from wepose_pin.calibration.weights import FINAL_STEPS, solve_reweighted
+from wepose_pin.calibration.weights import FINAL_STEPS
 from wepose_pin.errors import NoSolution
-from wepose_pin.filters.sensors import filter_recording
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
 
@@ -132,17 +126,27 @@ def pose_cases(seconds: float) -> dict[str, Posed]:
         "clasp, 5 s": ("clasp", still),
         "t_pose+bow": ("t_pose+bow", recorded("t_pose+bow")),
     }
-    posed = {}
-    for name, (protocol, recording) in recordings.items():
-        filtered = filter_recording(recording)
-        problem = CalibrationProblem(recording, filtered, load_protocol(protocol), person.prior, {}, load_model())
-        posed[name] = pose(problem)
-    return posed
+    return {
+        name: record_last(recording, protocol=protocol, prior=person.prior)
+        for name, (protocol, recording) in recordings.items()
+    }
 
 
-def pose(problem: CalibrationProblem) -> Posed:
-    """The last least squares of a calibration."""
-    observations, _ = problem.observe()
-    prior = build_prior(problem, observations)
-    guess, contact = find_initial_guess(observations, prior.mean, lambda some: build_prior(problem, some).mean)
-    return Posed(solve_reweighted(observations, prior, guess, contact).fit.problem, guess)
+def record_last(recording: Recording, **options: Any) -> Posed:
+    """The last least squares of a calibration that must converge, from where the first one starts."""
+    posed: list[Posed] = []
+
+    def solve_and_record(
+        problem: LeastSquares, start: np.ndarray, steps: int = STEPS, *, strict: bool = True
+    ) -> Estimate:
+        posed.append(Posed(problem, start))
+        return solve(problem, start, steps, strict=strict)
+
+    exchange_solver(solve_and_record)
+    try:
+        calibrate(recording, **options)
+    finally:
+        exchange_solver(solve)
+    size = max(len(each.problem.observations) for each in posed)
+    full = [each for each in posed if len(each.problem.observations) == size]
+    return Posed(full[-1].problem, full[0].start)

@@ -61,7 +61,7 @@ def made(protocol: str, seed: int, real: bool, seconds: float = 60.0) -> tuple[P
 def mount_errors(calibration: Calibration, simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the mounts (sensors, 3) [deg] in L, the last of them the heading's, and their standard deviations."""
     error, std = [], []
-    for name in calibration.heading_drift:
+    for name in calibration.subject.heading_drift:
         off = Rotation.from_quat(calibration.subject.mounts[name]) * Rotation.from_quat(simulation.quat_LS[name]).inv()
         error.append(off.as_rotvec(degrees=True))
         std.append([np.degrees(calibration.subject.std(f"mounts.{name}.{axis}")) for axis in "xyz"])
@@ -184,7 +184,7 @@ def test_poses_tell_headings_and_no_length() -> None:
         assert calibration.subject.std(name) == pytest.approx(person.prior.std(name))
     assert "lengths-not-observed" in codes(calibration)
     # As well as the poses are held, the T-pose and the N-pose of bent elbows, against a torso that bowed.
-    heading = dict(zip(calibration.heading_drift, mount_errors(calibration, simulation)[1][:, 2], strict=True))
+    heading = dict(zip(calibration.subject.heading_drift, mount_errors(calibration, simulation)[1][:, 2], strict=True))
     torso = heading.pop("torso")
     assert 5.0 < torso < 10.0
     (t_pose,) = {np.degrees(c.std) for c in load_protocol("t_pose+bow").conditions if isinstance(c, Direction)}

@@ -241,7 +241,7 @@ def test_too_little_motion_is_named(share: dict[str, float], wanted: str, causes
     calibration = solved(moved_otherwise(person, share).recording(), person)
     quality = assess(calibration)
     print(codes(quality))
-    assert calibration.labels.doubt < 1.0  # uncertain headings are no exchange
+    assert quality.doubt < 1.0  # uncertain headings are no exchange
     assert quality.quality == wanted
     assert causes & set(codes(quality))
     assert quality.determined < quality.unknowns

@@ -84,12 +84,12 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
     calibration = made[0]
     bare = replace(
         calibration,
-        subject=replace(calibration.subject, order=(), covariance=np.zeros((0, 0))),
+        subject=replace(
+            calibration.subject, order=(), covariance=np.zeros((0, 0)), start_pose_offset={}, heading_drift={}
+        ),
         gap=np.full_like(calibration.gap, np.nan),
         prior_gap=np.full_like(calibration.gap, np.nan),
         problem=replace(calibration.problem, measured={}),
-        start_pose_offset={"torso": np.array([np.nan, 0.0])},
-        heading_drift={},
         hinge_rms={},
     )
     page = render_calibration_report(bare, made[1], tracked=made[2])
@@ -102,7 +102,6 @@ def test_what_is_missing_is_left_out_or_called_so(made: Made) -> None:
         gap=calibration.gap[:1],
         prior_gap=calibration.prior_gap[:1],
         contact=calibration.contact[:1],
-        start_pose_offset={},
     )
     assert "Palm to palm over time" not in headings(render_calibration_report(few, made[1], tracked=made[2]))
 

@@ -1,101 +1,92 @@
-"""Other solutions that explain the motion nearly as well.
+"""Problems that explain a recording better than the stated one: without some mounts, with other labels, without a pose.
 
-A covariance describes one minimum. Where the hands hardly move, the closure has several: one arm's headings turned by
-118 deg close the chain as well. So the closure is searched for all its minima. Each is solved in full and weighted by
-how much worse it explains all that is known.
+Each function takes the solution of a problem. It returns that of a better problem where there is one, else the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 
+from ..alignment import MOUNT_WARNING_DEG
 from ..diagnostics import WARNING, Diagnostic
-from .equations import Layout
-from .initial_headings import find_distinct_headings
-from .least_squares import Estimate, Gaussian, LeastSquares, solve
-from .priors import place_points
-from .weights import WeightedFit
+from .anatomy import LEAST_ROTATION, OPEN, LimbMotion, measure_limbs, measure_rotation
+from .priors import combine_lengths
+from .result import Calibration
+from .solution import solve_problem
+from .weights import CONTRADICTED, SUSPECT
 
-COMPARED_SAMPLES = 120  # on which solutions are compared
-STEPS = 25
-LEAST_WEIGHT = 1e-4  # of a solution that counts
-NEAR = 3.0  # standard deviations within which two solutions are the same
-CIRCLE_STD = np.pi / np.sqrt(3.0)  # [rad] of a heading that may be anywhere
+BETTER = 0.6  # times the doubt of the stated labels, below which another labelling is the true one
 
 
-class Alternative(NamedTuple):
-    """Another solution."""
+def leave_out_mounts(stated: Calibration) -> Calibration:
+    """Return the quick solution without the mounts that the motion contradicts."""
+    problem = stated.problem
+    if measure_limbs(stated).doubt <= 1.0 and not problem.mounts_against_motion(stated.subject.mounts):
+        return stated
+    free = solve_problem(problem.remove_mounts(problem.filtered.R_VS), quick=True)
+    wrong = problem.mounts_against_motion(free.subject.mounts)
+    if not wrong or measure_limbs(free).doubt >= 1.0:
+        return stated
+    return solve_problem(problem.leave_out_mounts(wrong, MOUNT_WARNING_DEG, "motion"), quick=True)
 
-    offset: np.ndarray  # (m,) from the best solution, headings within half a turn
-    weight: float  # its probability over that of the best solution, at most 1
 
+def exchange_labels(stated: Calibration) -> Calibration:
+    """Return the quick solution with the labels by which the limbs move as a person's; its lengths are the prior's.
 
-def find_alternatives(
-    result: WeightedFit, prior_at: Callable[[np.ndarray], Gaussian], stated: Mapping[str, float]
-) -> list[Alternative]:
-    """Solutions with other headings, the likeliest first, down to `LEAST_WEIGHT`.
-
-    Parameters
-    ----------
-    result : the best solution
-    prior_at : x (m,) → what is known without the closure, where headings without a stated mount are those of x
-    stated : sensor → ψ [rad] of its stated mount; where all sensors have one there is nothing to search
+    First one labelling of those that close the same chain shows whether it closes, then those that do are compared.
     """
-    fit, (observations, _, weights) = result.fit, result.fit.problem
-    layout = observations.layout
-    unknown = np.array([name not in stated for name in layout.sensors])
-    if not observations.closed.any() or not unknown.any():
-        return []
-    stride = max(1, len(observations) // COMPARED_SAMPLES)
-    few = np.concatenate([np.arange(len(observations))[span][::stride] for _, span in observations.spans()])
-    some, weights = observations.take(few), stride * weights[few]
-    rows = layout.heading
+    problem, doubt, table = stated.problem, measure_limbs(stated).doubt, stated.problem.model.table
+    if doubt <= 1.0 or table.is_mechanism or not measure_rotation(stated) >= LEAST_ROTATION:
+        return stated
 
-    def solve_from(psi: np.ndarray) -> Estimate:
-        start = fit.x.copy()
-        start[rows] += np.where(unknown, (psi - start[rows] + np.pi) % (2.0 * np.pi) - np.pi, 0.0)
-        start = place_points(start, some)
-        return solve(LeastSquares(some, prior_at(start), weights), start, STEPS, strict=False)
+    def measure(labels: Mapping[str, str]) -> LimbMotion:
+        return measure_limbs(solve_problem(problem.relabel(labels), quick=True))
 
-    best = solve_from(fit.x[rows])
-    std = np.sqrt(np.diag(fit.covariance)[rows])
-    alternatives: list[Alternative] = []
-    closed = observations.take(observations.closed)
-    for psi in find_distinct_headings(closed, fit.x, stated):
-        other = solve_from(psi)
-        offset = other.x - best.x
-        offset[rows] = (offset[rows] + np.pi) % (2.0 * np.pi) - np.pi
-        # The residuals' variance is estimated from the effective samples: Student's t, not a Gaussian.
-        degrees = max(3.0 * result.effective_sample_size, 1.0)
-        new = Alternative(offset, float((1.0 + max(other.cost - best.cost, 0.0) / degrees) ** (-0.5 * degrees)))
-        if np.abs(offset[rows] / std).max() < NEAR or new.weight < LEAST_WEIGHT:
-            continue
-        if all(np.abs((offset - each.offset)[rows] / std).max() > NEAR for each in alternatives):
-            alternatives.append(new)
-    return sorted(alternatives, key=lambda each: -each.weight)
+    places = [name for name in problem.sensors if name in table.needed]
+    alike: dict[frozenset, list[dict[str, str]]] = {}
+    for order in permutations(places):
+        labels = dict(zip(places, order, strict=True))
+        sides = frozenset(frozenset(labels[p] for p in places if table.side(p) == side) for side in ("left", "right"))
+        alike.setdefault(sides, []).append({place: label for place, label in labels.items() if place != label})
+    gaps = {sides: measure(min(labellings, key=len)).gap for sides, labellings in alike.items()}
+    closing = [sides for sides, gap in gaps.items() if gap < OPEN and gap < 2.0 * min(gaps.values())]
+    doubts = [(measure(labels).doubt, labels) for sides in closing for labels in sorted(alike[sides], key=len)]
+    least, exchanged = min(doubts, key=lambda pair: pair[0], default=(np.inf, {}))
+    return _keep_prior(replace(stated, exchanged=exchanged)) if least < min(1.0, BETTER * doubt) else stated
 
 
-def widen_covariance(covariance: np.ndarray, others: list[Alternative], layout: Layout) -> np.ndarray:
-    """The covariance (m, m) about the solution with the alternatives included; no heading beyond the circle's."""
-    if not others:
-        return covariance
-    total = 1.0 + sum(each.weight for each in others)
-    outer = sum((each.weight / total * np.outer(each.offset, each.offset) for each in others), 0.0 * covariance)
-    widened = covariance + outer
-    rows = layout.heading
-    std = np.sqrt(np.diag(widened))
-    shrink = np.ones(layout.size)
-    shrink[rows] = np.minimum(1.0, CIRCLE_STD / std[rows])
-    return widened * np.outer(shrink, shrink)
+def leave_out_poses(best: Calibration) -> Calibration:
+    """Return the full solution without the phases of poses that contradict all else, the worst first."""
+    problem = best.problem
+    posed = {phase: deviation for phase, deviation in best.posed.items() if phase not in problem.loose}
+    phase = max(posed, key=lambda name: posed[name], default="")
+    if not phase or posed[phase] <= SUSPECT or not problem.protocol.closures:
+        return best
+    # Where a pose is wrong all else fits worse: what it is compared with must be found without it.
+    loose = solve_problem(problem.loosen_phase(phase))
+    deviation = loose.posed[phase]
+    if deviation <= CONTRADICTED:
+        return best
+    unused = Diagnostic("phase-not-used", WARNING, phase, deviation, CONTRADICTED)
+    return leave_out_poses(replace(loose, remarks=(unused, *loose.remarks)))
 
 
-def diagnose_ambiguity(others: list[Alternative], layout: Layout) -> list[Diagnostic]:
-    """The sensor whose heading differs most in the likeliest alternative, where there is one."""
-    if not others:
-        return []
-    turned = np.abs(others[0].offset[layout.heading])
-    worst = int(np.argmax(turned))
-    return [Diagnostic("headings-ambiguous", WARNING, layout.sensors[worst], float(turned[worst]))]
+def _keep_prior(calibration: Calibration) -> Calibration:
+    """Return the calibration with the lengths and covariance from before the motion."""
+    problem, names = calibration.problem, tuple(calibration.subject.lengths)
+    lengths, information = combine_lengths(problem.prior, problem.measured, names)
+    subject = replace(
+        calibration.subject,
+        lengths=dict(zip(names, lengths.tolist(), strict=True)),
+        covariance=calibration.prior_covariance,
+        hinges={},
+        start_pose_offset={},
+        heading_drift={},
+        note="sensors sit elsewhere than labelled: nothing of the motion is used",
+    )
+    scale_std = float(np.sqrt(lengths @ information @ lengths) ** -1)
+    return replace(calibration, subject=subject, scale_std=scale_std, hinge_rms={})

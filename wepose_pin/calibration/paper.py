@@ -37,7 +37,6 @@ from ..body.table import NEUTRAL_POSE
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, NoSolution, one_of
 from ..observations.paths import StartPose
-from .anatomy import check_limbs, measure_limbs
 from .conditions import Constraint, Loop, resolve_conditions
 from .least_squares import MIN_LENGTH, QUIET_QP, Observations
 from .observability import diagnose_lengths
@@ -116,7 +115,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     measured_covariance = np.linalg.inv(combine_lengths(prior, problem.measured, tuple(problem.model.lengths))[1])
     note = f"{protocol.title}, lengths alone as in the paper; scale measured: {', '.join(problem.scale_lengths)}"
     subject = _replace_lengths(prior, lengths, covariance, name=recording.name, note=note)
-    calibration = Calibration(
+    return Calibration(
         problem=problem,
         subject=subject.fix_girdles(problem.model.table),
         effective_sample_size=len(gap) / correlated,
@@ -139,7 +138,6 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         },
         formulation="paper",
     )
-    return replace(calibration, labels=check_limbs(measure_limbs(calibration), problem.model.table))
 
 
 def compute_gap_matrices(observations: Observations, quat_WL: Mapping[str, np.ndarray]) -> np.ndarray:

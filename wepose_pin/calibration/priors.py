@@ -18,7 +18,6 @@ from ..body.table import NEUTRAL_POSE
 from ..errors import BadSubject
 from .conditions import Loop
 from .equations import Layout
-from .initial_headings import estimate_headings, estimate_joint_headings
 from .least_squares import Gaussian, Observations
 from .problem import CalibrationProblem
 
@@ -32,8 +31,7 @@ POINT_STD = 3.0  # [m] of an unknown point of W
 
 
 def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaussian:
-    """All that is known before the closure, as one Gaussian over x; unknown headings start at those that
-    the closure shows, or joints and hinges where no closure holds.
+    """Return all that is known before the motion, as one Gaussian over x; unknown headings are 0.
 
     Raises
     ------
@@ -44,15 +42,10 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
     _add_shape(mean, information, problem, layout)
     _add_places(mean, information, observations)
-
     stated_headings = problem.stated_headings(layout.sensors)
-    if problem.is_free_motion:
-        headings = estimate_joint_headings(observations, problem.couplings, stated_headings)
-    else:
-        headings = estimate_headings(observations, mean, stated_headings)
     for i, name in enumerate(layout.sensors):
         rows = [*layout.tilt[i], layout.heading[i]]
-        mean[rows[2]] = stated_headings.get(name, headings[i])
+        mean[rows[2]] = stated_headings.get(name, 0.0)
         offset, information[np.ix_(rows, rows)] = _mount_prior(problem, name, stated_headings.get(name))
         mean[rows] += offset
     information[layout.drift, layout.drift] = DRIFT_STD**-2
@@ -61,7 +54,7 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
         std = np.maximum(3 * segments[name].soft_tissue_std, LEAST_SOFT_TISSUE)
         information[rows, rows] = std**-2.0
     _add_hinges(information, layout, problem.model.table)
-    return Gaussian(place_points(mean, observations), information)
+    return Gaussian(mean, information)
 
 
 def _add_shape(mean: np.ndarray, information: np.ndarray, problem: CalibrationProblem, layout: Layout) -> None:

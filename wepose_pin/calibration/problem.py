@@ -55,7 +55,7 @@ class CalibrationProblem:
     measured : name of a length → value and standard deviation [m]
     model : the body
     loose : phases whose poses are not used, as they contradict all else
-    unused_mounts, unused_phases : diagnostics of mounts and poses that are not used, as all else contradicts them
+    unused_mounts : diagnostics of mounts that are not used, as gravity or the motion contradicts them
     """
 
     recording: Recording
@@ -66,7 +66,6 @@ class CalibrationProblem:
     model: BodyModel
     loose: tuple[str, ...] = ()
     unused_mounts: tuple[Diagnostic, ...] = ()
-    unused_phases: tuple[Diagnostic, ...] = ()
 
     @cached_property
     def start_pose(self) -> StartPose:

@@ -30,28 +30,26 @@ from typing import Literal
 
 import numpy as np
 
-from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG
+from ..alignment import MAX_MOUNT_ERROR_DEG
 from ..arguments import Positive, check_arguments
 from ..body import BodyModel, convert_breadths, list_breadths
 from ..body.body import load_sensed_model
 from ..body.subject import Subject, population_subject
 from ..body.table_file import check_segments
-from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadModel, BadOption, BadPhase, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
 from ..observations.directions import Level, Pointing
 from ..recording import Recording
-from .anatomy import BETTER, LEAST_ROTATION, check_labels, check_limbs, measure_limbs, measure_rotation
+from .alternatives import exchange_labels, leave_out_mounts, leave_out_poses
+from .anatomy import LEAST_ROTATION, measure_limbs, measure_rotation
 from .fusion import fuse_calibrations, separate_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
-from .priors import combine_lengths
 from .problem import CalibrationProblem
 from .protocols import Protocol, choose_protocol, load_protocol
 from .quality import assess
-from .result import Calibration, LabelCheck
-from .solution import solve_fully, solve_quickly
-from .weights import CONTRADICTED, SUSPECT
+from .result import Calibration
+from .solution import solve_problem
 
 # One standard deviation [m] of a length measured over the skin, where the user gives none.
 MEASURED_STD = 0.003
@@ -155,7 +153,7 @@ def calibrate(
         prior = separate_mounts(earlier, population_subject(body=model))
     problem = CalibrationProblem(recording, filtered, protocol, prior, lengths, model)
     calibration = solve_paper_calibration(problem) if formulation == "paper" else solve_plausible(problem)
-    if earlier is not None and not calibration.labels.moved:
+    if earlier is not None and not calibration.exchanged:
         fused = fuse_calibrations(earlier, calibration.subject, prior, lengths, model.table)
         calibration = replace(calibration, subject=fused, problem=replace(calibration.problem, prior=earlier))
     quality = assess(calibration)
@@ -194,88 +192,24 @@ def _check_sensors(recording: Recording, protocol: Protocol) -> None:
 
 
 def solve_plausible(problem: CalibrationProblem) -> Calibration:
-    """The calibration without the mounts and poses that gravity or the motion contradicts, its labels checked.
-
-    Mounts, labels and poses are revised one after the other, each on a quick or a full solution of the problem before.
-    """
+    """Return the solution without the mounts and poses that gravity or the motion contradicts, its labels checked."""
     problem = problem.leave_out_mounts(problem.mounts_against_gravity(), MAX_MOUNT_ERROR_DEG)
     problem.observe()  # raises where a phase is too short, before anything is estimated
     _check_free_motion(problem)
-    problem, stated = _revise_mounts(problem)
-    labels = _revise_labels(stated)
-    if labels.moved:
-        return _keep_prior(replace(stated, labels=labels))
-    rotation = measure_rotation(stated)
-    if labels.doubt > 1.0 and rotation < LEAST_ROTATION:  # hands that hardly move show nothing
-        return replace(stated, labels=labels, posed={})
+    quick = solve_problem(problem, quick=True)
+    for revise in (leave_out_mounts, exchange_labels):
+        quick = revise(quick)
+    rotation = measure_rotation(quick)
+    if quick.exchanged or (rotation < LEAST_ROTATION and measure_limbs(quick).doubt > 1.0):
+        return quick  # hands that hardly move show nothing
     try:
-        best = solve_fully(problem)
+        return leave_out_poses(solve_problem(quick.problem))
     except NoSolution as error:
         hint = ""
         if rotation < LEAST_ROTATION:
             turned_deg = np.degrees(rotation)
             hint = f"; the segments turned by {turned_deg:.1f} deg only: move for a minute through the whole reach"
         raise NoSolution(f"{problem.recording.where()}: {error}{hint}") from error
-    revised = _revise_poses(best)
-    if revised is not problem:
-        return solve_plausible(revised)
-    posed = {} if problem.protocol.closures else best.posed
-    return replace(best, posed=posed, labels=check_limbs(measure_limbs(best), problem.model.table))
-
-
-def _revise_mounts(problem: CalibrationProblem) -> tuple[CalibrationProblem, Calibration]:
-    """The problem without the mounts that the motion contradicts, and its quick solution."""
-    stated = solve_quickly(problem)
-    doubt = measure_limbs(stated).doubt()
-    if doubt > 1.0 or problem.mounts_against_motion(stated.subject.mounts):
-        free = solve_quickly(problem.remove_mounts(problem.filtered.R_VS))
-        wrong = problem.mounts_against_motion(free.subject.mounts)
-        if wrong and measure_limbs(free).doubt() < min(1.0, BETTER * max(doubt, 1.0 / BETTER)):
-            problem = problem.leave_out_mounts(wrong, MOUNT_WARNING_DEG, "motion")
-            return problem, solve_quickly(problem)
-    return problem, stated
-
-
-def _revise_labels(stated: Calibration) -> LabelCheck:
-    """The check of the labels: other labels close other chains; hands that hardly move do not show which."""
-    problem, limbs = stated.problem, measure_limbs(stated)
-    table = problem.model.table
-    if not measure_rotation(stated) >= LEAST_ROTATION:
-        return check_limbs(limbs, table)
-    places = [name for name in problem.sensors if name in table.needed]
-    return check_labels(limbs, lambda moved: measure_limbs(solve_quickly(problem.relabel(moved))), places, table)
-
-
-def _revise_poses(calibration: Calibration) -> CalibrationProblem:
-    """The problem without the phase of poses that contradicts all else, if there is one."""
-    problem = calibration.problem
-    posed = {phase: deviation for phase, deviation in calibration.posed.items() if phase not in problem.loose}
-    phase = max(posed, key=lambda name: posed[name], default="")
-    if phase and posed[phase] > SUSPECT and problem.protocol.closures:
-        # Where a pose is wrong all else fits worse: what it is compared with must be found without it.
-        loose = problem.loosen_phase(phase)
-        deviation = solve_fully(loose).posed[phase]
-        if deviation > CONTRADICTED:
-            unused = Diagnostic("phase-not-used", WARNING, phase, deviation, CONTRADICTED)
-            return replace(loose, unused_phases=(unused, *loose.unused_phases))
-    return problem
-
-
-def _keep_prior(calibration: Calibration) -> Calibration:
-    """The calibration with the lengths and covariance from before the motion, where sensors sit on other segments."""
-    problem, names = calibration.problem, tuple(calibration.subject.lengths)
-    lengths, information = combine_lengths(problem.prior, problem.measured, names)
-    subject = replace(
-        calibration.subject,
-        lengths=dict(zip(names, lengths.tolist(), strict=True)),
-        covariance=calibration.prior_covariance,
-        hinges={},
-        start_pose_offset={},
-        heading_drift={},
-        note="sensors sit elsewhere than labelled: nothing of the motion is used",
-    )
-    scale_std = float(np.sqrt(lengths @ information @ lengths) ** -1)
-    return replace(calibration, subject=subject, scale_std=scale_std, hinge_rms={})
 
 
 def _check_free_motion(problem: CalibrationProblem) -> None:

@@ -77,14 +77,25 @@ ENOUGH_SAMPLES = 12.0  # effective sample size that a minute of motion reaches
 
 
 def assess(calibration: Calibration) -> CalibrationQuality:
-    """The quality of a calibration."""
-    motion = _measure_motion(calibration)
-    checks = _check_sensors(calibration)
-    hardly_moved = _check_rotation(calibration)
-    if hardly_moved is not None:  # all else follows from it
-        checks = [hardly_moved]
-    elif not calibration.labels.moved:  # with exchanged sensors all other checks are meaningless
-        checks += [*_check_deviations(calibration, motion), *_check_residuals(calibration)]
+    """Return the quality of a calibration."""
+    problem, limbs, rotation = calibration.problem, measure_limbs(calibration), measure_rotation(calibration)
+    is_mechanism = problem.model.table.is_mechanism
+    doubt = 0.0 if is_mechanism else limbs.doubt
+    motion, checks = _measure_motion(calibration, limbs.flexion), list[Check]()
+    if doubt > 1.0 and rotation < LEAST_ROTATION:  # all else follows from it: anatomy tells nothing
+        checks.append(_check(Diagnostic("motion-too-small", INFO, value=rotation), ROTATION, quality="fail"))
+    else:
+        if not is_mechanism:
+            cause = limbs.contradiction if doubt > 1.0 else None
+            checks.append(_check(diagnose_labels(calibration, doubt), DOUBT, cause))
+        for mount in problem.unused_mounts:
+            checks.append(_check(mount, QualityLimits(float(mount.limit or 0.0), np.pi), quality="poor"))
+        if not problem.protocol.closures:  # nothing tells which of them is wrong
+            for phase, deviation in calibration.posed.items():
+                checks.append(_check(Diagnostic("pose-contradicted", INFO, phase, deviation), POSED))
+        if not calibration.exchanged:  # with exchanged sensors all other checks are meaningless
+            checks += _check_lengths(calibration, motion) + _check_headings(calibration, motion)
+            checks += _check_scale(calibration) + _check_residuals(calibration)
     reasons = _reasons(checks)
     return CalibrationQuality(
         quality=max((check.quality for check in checks), key=QUALITIES.index),
@@ -93,6 +104,7 @@ def assess(calibration: Calibration) -> CalibrationQuality:
         further=tuple(each for each in calibration.remarks if each.code not in {reason.code for reason in reasons}),
         motion=motion,
         directions=_find_directions(calibration),
+        doubt=doubt,
     )
 
 
@@ -120,26 +132,6 @@ def _check(
     return Check(diagnostic, quality, limits, None if cause is None else replace(cause, severity=severity))
 
 
-def _check_sensors(calibration: Calibration) -> list[Check]:
-    """Checks of labels and mounts."""
-    labels, checks = calibration.labels, []
-    if not calibration.problem.model.table.is_mechanism:
-        checks.append(_check(diagnose_labels(calibration), DOUBT, labels.contradiction))
-    for mount in calibration.problem.unused_mounts:
-        checks.append(_check(mount, QualityLimits(float(mount.limit or 0.0), np.pi), quality="poor"))
-    for phase, deviation in calibration.posed.items():
-        checks.append(_check(Diagnostic("pose-contradicted", INFO, phase, deviation), POSED))
-    return checks
-
-
-def _check_rotation(calibration: Calibration) -> Check | None:
-    """The check of a motion that is too small for anatomy to tell anything of it; None where there is no doubt."""
-    rotation = measure_rotation(calibration)
-    if calibration.labels.doubt <= 1.0 or not rotation < LEAST_ROTATION:
-        return None
-    return _check(Diagnostic("motion-too-small", INFO, value=rotation), ROTATION, quality="fail")
-
-
 def _find_variant(calibration: Calibration) -> str:
     """The variant of texts: the kind of the closure, or "general"; empty without a closure."""
     problem = calibration.problem
@@ -148,19 +140,16 @@ def _find_variant(calibration: Calibration) -> str:
     return "general" if problem.model.table.is_mechanism or "general" in variants else problem.closure_kind
 
 
-def _check_deviations(calibration: Calibration, motion: MotionRange) -> list[Check]:
-    """Checks of the standard deviations."""
-    checks = [*_check_lengths(calibration, motion), *_check_headings(calibration, motion)]
+def _check_scale(calibration: Calibration) -> list[Check]:
+    """The check of the scale, where no closure shows it."""
     problem = calibration.problem
-    if not is_scale_observed(problem.conditions):
-        facts = {"measured": problem.measured_example}
-        if problem.scale_lengths:
-            code = "scale-uncertain"
-        else:
-            code = "scale-from-prior"
-            facts |= {"prior": problem.prior.note or problem.prior.name, "protocol": problem.protocol.name}
-        checks.append(_check(Diagnostic(code, INFO, value=calibration.scale_std, facts=facts), SCALE))
-    return checks
+    if is_scale_observed(problem.conditions):
+        return []
+    code, facts = "scale-uncertain", {"measured": problem.measured_example}
+    if not problem.scale_lengths:
+        code = "scale-from-prior"
+        facts |= {"prior": problem.prior.note or problem.prior.name, "protocol": problem.protocol.name}
+    return [_check(Diagnostic(code, INFO, value=calibration.scale_std, facts=facts), SCALE)]
 
 
 def _check_lengths(calibration: Calibration, motion: MotionRange) -> list[Check]:
@@ -273,7 +262,7 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
             _check(Diagnostic("motion-too-short", INFO, value=calibration.effective_sample_size, facts=facts), SAMPLES),
             _check(Diagnostic("closure-open", INFO, value=share, facts=facts | intervals), OPEN_SHARE),
         ]
-    tilts = {name: float(np.linalg.norm(tilt)) for name, tilt in calibration.start_pose_offset.items()}
+    tilts = {name: float(np.linalg.norm(offset.tilt)) for name, offset in calibration.subject.start_pose_offset.items()}
     if tilts:
         name = max(tilts, key=lambda n: tilts[n])
         checks.append(_check(Diagnostic("start-pose-off", INFO, name, tilts[name]), TILT))
@@ -298,14 +287,14 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
     return [*checks, _check(Diagnostic("length-unusual", INFO, name, z[name], facts=unusual), UNUSUAL)]
 
 
-def _measure_motion(calibration: Calibration) -> MotionRange:
+def _measure_motion(calibration: Calibration, flexion: Mapping[str, np.ndarray]) -> MotionRange:
     model = calibration.problem.model
     table = model.table
     rows = calibration.touching if calibration.touching.any() else np.ones(len(calibration.time), dtype=bool)
     R = {name: Rotation.from_quat(quat[rows]) for name, quat in calibration.quat_WL.items()}
     hinges = {hinge.on: joint for joint, hinge in table.hinges.items()}
     elevation, sideways, bend = {}, {}, {}
-    flexion, reaches = measure_limbs(calibration).flexion, reach_limbs(calibration, R)
+    reaches = reach_limbs(calibration, R)
     for limb in () if table.is_mechanism else table.limbs:  # its links hang in no common pose
         key, first = table.side(limb[0]) or limb[-1], table.points[limb[0]].link
         above, joint = model.parents.get(first), hinges.get(first, "")

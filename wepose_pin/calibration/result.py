@@ -30,22 +30,6 @@ class MeasuredLength(NamedTuple):
         return abs(self.metres - self.expected) / float(np.hypot(self.std, self.measured_std))
 
 
-class LabelCheck(NamedTuple):
-    """Whether the sensors sit where the session says.
-
-    Parameters
-    ----------
-    doubt : of the stated labels, above 1 where a person cannot move so
-    contradiction : the movement that a person cannot make; None where all is well
-    moved : segment → label of the sensor on it, of the labelling with a person's limbs; empty where that is the stated
-        one, or none is
-    """
-
-    doubt: float = 0.0
-    contradiction: Diagnostic | None = None
-    moved: Mapping[str, str] = {}
-
-
 class QualityLimits(NamedTuple):
     """Up to `passes` a value passes, up to `poor` it is poor; from them on where `passes` is the larger one."""
 
@@ -120,6 +104,7 @@ class CalibrationQuality:
     further : what else the user should know
     motion : how far the body moved
     directions : of lengths and mounts jointly, best determined first
+    doubt : of the labels, above 1 where a person cannot move so
     """
 
     quality: Quality = "fail"
@@ -128,6 +113,7 @@ class CalibrationQuality:
     further: tuple[Diagnostic, ...] = ()
     motion: MotionRange = field(default_factory=lambda: MotionRange({}, {}, {}, np.nan, None))
     directions: tuple[InformationDirection, ...] = ()
+    doubt: float = 0.0
 
     def __repr__(self) -> str:
         failing = sum(check.quality != "pass" for check in self.checks)
@@ -181,12 +167,9 @@ class Calibration:
     prior_covariance : (k, k) before the motion, rows as `subject.order`
     quat_WL : segment → (n, 4) xyzw at each sample, as tracking gives it
     measured_lengths : name → measured length beside the estimate without it
-    start_pose_offset : segment → (2,) [rad] about x and y of W, by which it was off the start pose
-    heading_drift : segment → [rad/s] drift of its sensor's heading
     hinge_rms : joint → [rad] rms angle of the segment below to the plane across its axis
-    labels : the check that each sensor is on the segment that the session states
-    posed : phase of poses → by how many standard deviations it deviates from what is known without it; where no
-        closure tells which of them is wrong
+    exchanged : segment → label of the sensor on it, where the sensors sit on other segments than the session states
+    posed : phase of poses → by how many standard deviations it deviates from what is known without it
     formulation : "full" or "paper"
     quality : of `quality.assess`
     """
@@ -203,10 +186,8 @@ class Calibration:
     prior_covariance: np.ndarray
     quat_WL: Mapping[str, np.ndarray]
     measured_lengths: Mapping[str, MeasuredLength]
-    start_pose_offset: Mapping[str, np.ndarray] = field(default_factory=dict)
-    heading_drift: Mapping[str, float] = field(default_factory=dict)
     hinge_rms: Mapping[str, float] = field(default_factory=dict)
-    labels: LabelCheck = field(default_factory=LabelCheck)
+    exchanged: Mapping[str, str] = field(default_factory=dict)
     posed: Mapping[str, float] = field(default_factory=dict)
     formulation: str = "full"
     quality: CalibrationQuality = field(default_factory=CalibrationQuality)

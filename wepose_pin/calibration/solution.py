@@ -12,15 +12,15 @@ from scipy.spatial.transform import Rotation
 from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject
 from ..errors import NoSolution
 from ..observations.hinges import find_hinges
-from .alternatives import Alternative, diagnose_ambiguity, find_alternatives, widen_covariance
+from .ambiguity import OtherMinimum, diagnose_ambiguity, find_other_minima, widen_covariance
 from .conditions import is_scale_observed
-from .contact import find_initial_guess
 from .equations import HINGE_STD
+from .initial_headings import search_headings
 from .joints import add_couplings
 from .least_squares import MIN_LENGTH, Gaussian
 from .observability import diagnose_closures, diagnose_lengths, diagnose_mounts
 from .priors import build_prior, place_points
-from .problem import LOOSE, CalibrationProblem
+from .problem import LOOSE, SAMPLE_RATE_HZ, CalibrationProblem
 from .result import Calibration
 from .weights import (
     LEAST_LENGTH_STD,
@@ -32,6 +32,7 @@ from .weights import (
     solve_reweighted,
 )
 
+WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
 
 
@@ -42,42 +43,40 @@ class _Solution(NamedTuple):
     prior: Gaussian  # without what accelerations show
     result: WeightedFit
     covariance: np.ndarray  # (m, m) of x
-    alternatives: list[Alternative]
+    minima: list[OtherMinimum]
 
 
-def solve_quickly(problem: CalibrationProblem) -> Calibration:
-    """The calibration at fewer samples, by the closure alone: whether mounts and labels can be as stated."""
-    observations, samples = problem.observe(QUICK_RATE_HZ)
-    prior = build_prior(problem, observations)
-    if problem.is_free_motion:
-        prior = add_couplings(prior, observations.layout, problem.couplings, prior.mean)
-    result = solve_reweighted(observations, prior, prior.mean, np.ones(len(samples)), quick=True)
-    return _describe(problem, _Solution(samples, prior, result, result.fit.covariance, []))
+def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibration:
+    """Return the calibration, with other minima that explain the motion nearly as well.
 
-
-def solve_fully(problem: CalibrationProblem) -> Calibration:
-    """The calibration with all that is known, and with other solutions that explain the motion nearly as well.
+    Parameters
+    ----------
+    quick : at fewer samples and by the closure alone, which shows whether mounts and labels can be as stated
 
     Raises
     ------
     NoSolution
-        It did not converge, or a length is at its bound.
+        It did not converge, or a length is at its bound; not where it is quick.
     """
-    observations, samples = problem.observe()
+    observations, samples = problem.observe(QUICK_RATE_HZ if quick else SAMPLE_RATE_HZ)
     layout, prior = observations.layout, build_prior(problem, observations)
-    guess, contact = find_initial_guess(observations, prior.mean, lambda some: build_prior(problem, some).mean)
-    coupled = add_couplings(prior, layout, problem.couplings, guess)
-    result = solve_reweighted(observations, coupled, guess, contact)
+    couplings = [] if quick and not problem.is_free_motion else problem.couplings
+    stated = problem.stated_headings(layout.sensors)
+    is_free = np.array([name not in stated for name in layout.sensors])
 
-    headings = problem.stated_headings(layout.sensors)
-    free = layout.heading[[name not in headings for name in layout.sensors]]
-
-    def prior_at(x: np.ndarray) -> Gaussian:
+    def prior_at(psi: np.ndarray) -> Gaussian:
+        """Return the prior with couplings, and with unknown headings at ψ (sensors,) [rad]."""
         mean = prior.mean.copy()
-        mean[free] = x[free]
-        return add_couplings(Gaussian(mean, prior.information), layout, problem.couplings, x)
+        mean[layout.heading] = np.where(is_free, psi, mean[layout.heading])
+        return add_couplings(Gaussian(mean, prior.information), layout, couplings, mean)
 
-    alternatives = find_alternatives(result, prior_at, headings)
+    headings = search_headings(observations, prior.mean, stated, couplings)
+    start = place_points(prior_at(headings[0]).mean, observations)
+    # The weight of a gap in the initial guess: near 0 where the palms are apart.
+    contact = (1.0 + np.sum(observations.gaps(start) ** 2, axis=1) / WIDE**2) ** -2
+    result = solve_reweighted(observations, prior_at(headings[0]), start, contact, quick)
+    if quick:
+        return _describe(problem, _Solution(samples, prior, result, result.fit.covariance, []))
     lengths = result.fit.x[layout.length]
     if np.min(lengths, initial=np.inf) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
         raise NoSolution(
@@ -85,13 +84,14 @@ def solve_fully(problem: CalibrationProblem) -> Calibration:
             f"mm); check that the points do in the phase what the protocol says, and that every sensor sits where the "
             f"session says"
         )
-    covariance = widen_covariance(estimate_covariance(result), alternatives, layout)
-    return _describe(problem, _Solution(samples, prior, result, covariance, alternatives))
+    minima = find_other_minima(result, headings[1:], prior_at)
+    covariance = widen_covariance(estimate_covariance(result), minima, layout)
+    return _describe(problem, _Solution(samples, prior, result, covariance, minima))
 
 
 def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
     """The calibration that a solution makes."""
-    samples, prior, result, x_cov, alternatives = solution
+    samples, prior, result, x_cov, minima = solution
     fit, observations = result.fit, result.fit.problem.observations
     layout = observations.layout
     lengths, covariance = fit.x[layout.length], x_cov[np.ix_(layout.length, layout.length)]
@@ -109,12 +109,12 @@ def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
         for gaps in (fit.gaps, observations.gaps(place_points(prior_x, observations)))
     )
     prior_cov = np.linalg.inv(prior.information)
-    diagnostics = [*problem.unused_phases, *problem.filtered.diagnostics, *problem.diagnose_losses()]
+    diagnostics = [*problem.filtered.diagnostics, *problem.diagnose_losses()]
     if not scale_observed:
         length_cov = np.linalg.inv(prior.information[np.ix_(layout.length, layout.length)])
         free_scale_std = None if problem.scale_lengths else scale_std
         diagnostics += diagnose_lengths(problem, lengths, covariance, length_cov, free_scale_std)
-    diagnostics += diagnose_ambiguity(alternatives, layout)
+    diagnostics += diagnose_ambiguity(minima, layout)
     diagnostics += diagnose_mounts([name for name in problem.filtered.R_VS if name not in subject.mounts], problem)
     time = problem.recording.time[samples]
     diagnostics += diagnose_closures(time, result.contact, observations, problem.model)
@@ -133,8 +133,6 @@ def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
         prior_covariance=project_to_subject(layout, prior_cov, problem.start_pose)[1],
         quat_WL=problem.orient_segments(subject.mounts, samples),
         measured_lengths=compare_measured(fit, layout, problem.measured, least_std),
-        start_pose_offset={name: offset.tilt for name, offset in subject.start_pose_offset.items()},
-        heading_drift={name: drift.rate for name, drift in subject.heading_drift.items()},
         hinge_rms=hinge_rms,
         posed=compare_posed(fit, phases, loose),
     )

@@ -195,11 +195,14 @@ def _print_mounts(calibration: Calibration) -> None:
     from ..body.subject import mount_rows
     from ..recording import find_mount_axes
 
-    rows: list[tuple[str, ...]] = []
-    for segment, tilt in calibration.start_pose_offset.items():
-        x, y, z = (np.degrees(calibration.subject.std(row)) for row in mount_rows(segment))
-        up, forward = find_mount_axes(calibration.subject.mounts[segment])
-        off_start, drift = np.degrees(np.linalg.norm(tilt)), 60.0 * np.degrees(calibration.heading_drift[segment])
+    subject, rows = calibration.subject, list[tuple[str, ...]]()
+    for segment, offset in subject.start_pose_offset.items():
+        x, y, z = (np.degrees(subject.std(row)) for row in mount_rows(segment))
+        up, forward = find_mount_axes(subject.mounts[segment])
+        off_start, drift = (
+            np.degrees(np.linalg.norm(offset.tilt)),
+            60.0 * np.degrees(subject.heading_drift[segment].rate),
+        )
         cells = f"± {z:.1f}", f"± {np.hypot(x, y) / 2**0.5:.1f}", f"{off_start:.1f}", f"{drift:+.1f}"
         rows.append((segment, f"{up} up, {forward} ahead", *cells))
     if not rows:

@@ -399,7 +399,7 @@ def _add_estimate(
     if calibration is None:
         return view
     newest = calibration.gap[calibration.time > calibration.time[-1] - APART_S]
-    if calibration.labels.moved and not marker.interruption:
+    if calibration.exchanged and not marker.interruption:
         view = view._replace(note="Some sensors seem to sit on other segments than assigned: finish, and see.")
     elif marker.running and np.isfinite(newest).any() and np.nanmedian(newest) > APART:
         view = view._replace(note=f"{_choose_sentence(motion, 0.0)} They seem to be apart.")
@@ -408,7 +408,7 @@ def _add_estimate(
     return view._replace(
         lengths=_list_lengths(calibration),
         sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES),
-        reasons=() if calibration.labels.moved else _advise(calibration),
+        reasons=() if calibration.exchanged else _advise(calibration),
     )
 
 
@@ -484,7 +484,7 @@ def show_result(guide: Guide, _: Turn) -> StepRun:
 
 def _exchange(guide: Guide, attempt: Attempt, calibration: Calibration) -> None:
     """Assign the sensors as the calibration found them."""
-    segments = {label: segment for segment, label in (calibration.labels.moved or {}).items()}
+    segments = {label: segment for segment, label in calibration.exchanged.items()}
     attempt.exchange(segments)
     guide.segments = {sensor: segments.get(segment, segment) for sensor, segment in guide.segments.items()}
 
@@ -514,7 +514,7 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None, refused:
     diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "phase-not-used")]
     counted = [count_from_begin(each, calibration) for each in diagnostics]
     reasons = [text.line() for _, text in render_all(counted, REMEDIES)]
-    if calibration.labels.moved:  # all other reasons follow from this one
+    if calibration.exchanged:  # all other reasons follow from this one
         sentence = "Some sensors sit on other segments than assigned. The same motion will do."
         reasons, actions = reasons[:1], (EXCHANGE, RESTART)
     return GuideView(

@@ -162,7 +162,7 @@ def _list_lengths(calibration: Calibration) -> list[Item]:
 def _list_sensors(calibration: Calibration, recording: Recording) -> list[Item]:
     rows = []
     for name, quat_LS in calibration.subject.mounts.items():
-        drift = np.degrees(calibration.heading_drift.get(name, np.nan)) * 60.0
+        offset, drift = calibration.subject.start_pose_offset.get(name), calibration.subject.heading_drift.get(name)
         up, forward = find_mount_axes(quat_LS)
         nearest = Rotation.from_quat(compute_mount(up, forward))
         off = np.degrees((nearest.inv() * Rotation.from_quat(quat_LS)).magnitude())
@@ -173,8 +173,8 @@ def _list_sensors(calibration: Calibration, recording: Recording) -> list[Item]:
                 f"{up} up, {forward} forward, turned {off:.0f}°".replace("-", "−"),
                 "yes" if sensor is not None and sensor.stated_quat_LS is not None else "no",
                 *map(degrees, _mount_stds(calibration.subject, name)),
-                degrees(float(np.degrees(np.linalg.norm(calibration.start_pose_offset.get(name, np.nan))))),
-                f"{signed(drift)} °/min" if np.isfinite(drift) else "",
+                degrees(float(np.degrees(np.linalg.norm(offset.tilt))) if offset else np.nan),
+                f"{signed(float(np.degrees(drift.rate)) * 60.0)} °/min" if drift else "",
             ]
         )
     if not rows:

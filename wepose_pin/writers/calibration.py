@@ -56,8 +56,8 @@ def _document(calibration: Calibration, quality: CalibrationQuality) -> dict[str
             }
             for segment, quat in subject.mounts.items()
         },
-        "start_pose_offset_deg": {name: np.degrees(tilt) for name, tilt in calibration.start_pose_offset.items()},
-        "heading_drift_deg_min": {name: 60.0 * np.degrees(rate) for name, rate in calibration.heading_drift.items()},
+        "start_pose_offset_deg": {name: np.degrees(offset.tilt) for name, offset in subject.start_pose_offset.items()},
+        "heading_drift_deg_min": {name: 60.0 * np.degrees(drift.rate) for name, drift in subject.heading_drift.items()},
         "hinges": {
             joint: {"axis": subject.hinges[joint].axis, "rms_deg": _number(np.degrees(rms))}
             for joint, rms in calibration.hinge_rms.items()
@@ -79,7 +79,7 @@ def _document(calibration: Calibration, quality: CalibrationQuality) -> dict[str
             "directions": quality.directions,
         },
         "motion_deg": {**quality.motion._asdict(), "lean": _number(quality.motion.lean)},
-        "labels": {"doubt": _number(calibration.labels.doubt), "moved": dict(calibration.labels.moved)},
+        "labels": {"doubt": _number(quality.doubt), "moved": dict(calibration.exchanged)},
     }
 
 
