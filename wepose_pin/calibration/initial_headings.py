@@ -67,7 +67,7 @@ def search_headings(
     for each in _descend(psi, terms, center, information, MORE_ROUNDS):
         if all(np.abs(wrap_angle(each - other)).max() > DISTINCT for other in distinct):
             distinct.append(each)
-    headings = np.array(distinct[:MOST_DISTINCT])
+    headings = wrap_angle(np.array(distinct[:MOST_DISTINCT]))
     if not stated and not any(isinstance(c, Loop | Pointing | Level) for c in observations.conditions):
         headings = headings[:1] + _turn_by_hinges(observations, headings[0])
     return headings

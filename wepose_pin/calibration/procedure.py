@@ -42,7 +42,7 @@ from ..filters.sensors import filter_recording
 from ..observations.directions import Level, Pointing
 from ..recording import Recording
 from .alternatives import exchange_labels, leave_out_mounts, leave_out_poses
-from .anatomy import LEAST_ROTATION, measure_limbs, measure_rotation
+from .anatomy import LEAST_ROTATION, measure_rotation
 from .fusion import fuse_calibrations, separate_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .problem import CalibrationProblem
@@ -199,13 +199,12 @@ def solve_plausible(problem: CalibrationProblem) -> Calibration:
     quick = solve_problem(problem, quick=True)
     for revise in (leave_out_mounts, exchange_labels):
         quick = revise(quick)
-    rotation = measure_rotation(quick)
-    if quick.exchanged or (rotation < LEAST_ROTATION and measure_limbs(quick).doubt > 1.0):
-        return quick  # hands that hardly move show nothing
+    if quick.exchanged:
+        return quick
     try:
         return leave_out_poses(solve_problem(quick.problem))
     except NoSolution as error:
-        hint = ""
+        hint, rotation = "", measure_rotation(quick)
         if rotation < LEAST_ROTATION:
             turned_deg = np.degrees(rotation)
             hint = f"; the segments turned by {turned_deg:.1f} deg only: move for a minute through the whole reach"

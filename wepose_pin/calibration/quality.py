@@ -82,20 +82,20 @@ def assess(calibration: Calibration) -> CalibrationQuality:
     is_mechanism = problem.model.table.is_mechanism
     doubt = 0.0 if is_mechanism else limbs.doubt
     motion, checks = _measure_motion(calibration, limbs.flexion), list[Check]()
-    if doubt > 1.0 and rotation < LEAST_ROTATION:  # all else follows from it: anatomy tells nothing
-        checks.append(_check(Diagnostic("motion-too-small", INFO, value=rotation), ROTATION, quality="fail"))
-    else:
-        if not is_mechanism:
-            cause = limbs.contradiction if doubt > 1.0 else None
-            checks.append(_check(diagnose_labels(calibration, doubt), DOUBT, cause))
-        for mount in problem.unused_mounts:
-            checks.append(_check(mount, QualityLimits(float(mount.limit or 0.0), np.pi), quality="poor"))
-        if not problem.protocol.closures:  # nothing tells which of them is wrong
-            for phase, deviation in calibration.posed.items():
-                checks.append(_check(Diagnostic("pose-contradicted", INFO, phase, deviation), POSED))
-        if not calibration.exchanged:  # with exchanged sensors all other checks are meaningless
-            checks += _check_lengths(calibration, motion) + _check_headings(calibration, motion)
-            checks += _check_scale(calibration) + _check_residuals(calibration)
+    if not is_mechanism:
+        cause = limbs.contradiction if doubt > 1.0 else None
+        checks.append(_check(diagnose_labels(calibration, doubt), DOUBT, cause))
+    for mount in problem.unused_mounts:
+        checks.append(_check(mount, QualityLimits(float(mount.limit or 0.0), np.pi), quality="poor"))
+    if not problem.protocol.closures:  # nothing tells which of them is wrong
+        for phase, deviation in calibration.posed.items():
+            checks.append(_check(Diagnostic("pose-contradicted", INFO, phase, deviation), POSED))
+    if not calibration.exchanged:  # with exchanged sensors all other checks are meaningless
+        checks += _check_lengths(calibration, motion) + _check_headings(calibration, motion)
+        checks += _check_scale(calibration) + _check_residuals(calibration)
+    if rotation < LEAST_ROTATION and not is_mechanism and any(check.quality == "fail" for check in checks):
+        # All that fails follows from it.
+        checks = [_check(Diagnostic("motion-too-small", INFO, value=rotation), ROTATION, quality="fail")]
     reasons = _reasons(checks)
     return CalibrationQuality(
         quality=max((check.quality for check in checks), key=QUALITIES.index),
