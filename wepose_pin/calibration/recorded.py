@@ -13,7 +13,7 @@ LONGEST_STEP = 2.5  # between two rows, in usual steps, over which places are in
 
 
 def read_recorded_places(recording: Recording, closure: Closure, time: np.ndarray) -> np.ndarray:
-    """The place of the closure's point from its origin, (n, 3) [m] in W at `time` (n,) [s]; NaN where it was lost.
+    """Return places (n, 3) [m] in W of the closure's point from its origin at `time` (n,) [s]; NaN where it was lost.
 
     Places are interpolated linearly between two rows of the truth that both have them.
 
@@ -36,22 +36,13 @@ def read_recorded_places(recording: Recording, closure: Closure, time: np.ndarra
     places = read_columns(table, columns, file, place)
     if closure.origin:
         places = places - read_columns(table, [f"{closure.origin}_{axis}" for axis in "xyz"], file, place)
-    if len(known_time) < 2 or not (np.diff(known_time) > 0.0).all():
+    steps = np.diff(known_time)
+    if not len(steps) or not (steps > 0.0).all():
         raise BadSession(
             f"{place}: time of {recording.truth.name} does not increase from row to row; seconds that do "
             f"are needed, two at least"
         )
-    return interpolate_places(time, known_time, places)
-
-
-def interpolate_places(time: np.ndarray, known_time: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Places (n, 3) at `time` (n,) from those at `known_time` (m,); NaN outside, and where a neighbour is NaN."""
-    last = len(known_time) - 1
-    after = np.clip(np.searchsorted(known_time, time - 1e-9), 0, last)
-    before = np.clip(np.searchsorted(known_time, time + 1e-9, side="right") - 1, 0, last)
-    step = known_time[after] - known_time[before]
-    share = np.divide(time - known_time[before], step, out=np.zeros(len(time)), where=step > 0.0)[:, None]
-    between = places[before] + share * (places[after] - places[before])
-    inside = (time >= known_time[0] - 1e-9) & (time <= known_time[-1] + 1e-9)
-    inside &= step <= LONGEST_STEP * np.median(np.diff(known_time))
-    return np.where(inside[:, None], between, np.nan)
+    row = np.clip(np.searchsorted(known_time, time) - 1, 0, len(steps) - 1)
+    lost = steps[row] > LONGEST_STEP * np.median(steps)
+    at = [np.interp(time, known_time, column, left=np.nan, right=np.nan) for column in places.T]
+    return np.where(lost[:, None], np.nan, np.column_stack(at))

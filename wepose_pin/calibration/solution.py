@@ -9,12 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject
+from ..body.girdle import PARAMETERS
+from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject, mount_rows
 from ..errors import NoSolution
 from ..observations.hinges import find_hinges
+from ..observations.paths import StartPose
 from .ambiguity import OtherMinimum, diagnose_ambiguity, find_other_minima, widen_covariance
 from .conditions import is_scale_observed
-from .equations import HINGE_STD
+from .equations import HINGE_STD, Layout
 from .initial_headings import search_headings
 from .joints import add_couplings
 from .least_squares import MIN_LENGTH, Gaussian
@@ -28,7 +30,6 @@ from .weights import (
     compare_measured,
     compare_posed,
     estimate_covariance,
-    project_to_subject,
     solve_reweighted,
 )
 
@@ -130,7 +131,7 @@ def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
         gap=gap,
         prior_gap=prior_gap,
         contact=result.contact,
-        prior_covariance=project_to_subject(layout, prior_cov, problem.start_pose)[1],
+        prior_covariance=_project_to_subject(layout, prior_cov, problem.start_pose)[1],
         quat_WL=problem.orient_segments(subject.mounts, samples),
         measured_lengths=compare_measured(fit, layout, problem.measured, least_std),
         hinge_rms=hinge_rms,
@@ -156,7 +157,7 @@ def _make_subject(problem: CalibrationProblem, solution: _Solution) -> tuple[Sub
         start_W = Rotation.from_rotvec([0.0, 0.0, psi]) * filtered.R_VS_start[name]
         mounts[name] = (problem.start_rotation(name).inv() * start_W).as_quat()
     hinges = _estimate_hinges(problem, solution)
-    order, covariance = project_to_subject(layout, solution.covariance, problem.start_pose)
+    order, covariance = _project_to_subject(layout, solution.covariance, problem.start_pose)
     subject = replace(
         problem.prior,
         name=problem.recording.name,
@@ -187,3 +188,23 @@ def _estimate_hinges(problem: CalibrationProblem, solution: _Solution) -> Mappin
         rms = float(HINGE_STD * np.sqrt(np.mean(residuals**2)))
         hinges[term.name] = Hinge(axis_L, max(rms, problem.model.table.hinges[term.name].softness)), rms
     return hinges
+
+
+def _project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return names and covariance of the lengths, mount errors and girdles, from that of x.
+
+    Mounts are R_LS = exp(−ε) Rz(ψ) R_VS(start). Their errors are turned from the frames that equal W in the start pose
+    to those of the segments. By how much a person turns a segment about the vertical in the start pose is not in them:
+    no closure shows it.
+    """
+    K, rows = len(layout.lengths), [row for name in layout.sensors for row in mount_rows(name)]
+    of_girdles = [f"girdles.{term.name}.{parameter}" for term in layout.girdles for parameter in PARAMETERS]
+    T = np.zeros((K + len(rows) + len(of_girdles), layout.size))
+    T[:K, :K] = np.eye(K)
+    T[K + len(rows) :, layout.girdle.ravel()] = np.eye(len(of_girdles))
+    for i, name in enumerate(layout.sensors):
+        own = np.zeros((3, layout.size))
+        own[[0, 1], layout.tilt[i]] = -1.0
+        own[2, layout.heading[i]] = 1.0
+        T[K + 3 * i : K + 3 * i + 3] = start.R_WK[name].T @ own
+    return (*layout.lengths, *rows, *of_girdles), T @ covariance @ T.T

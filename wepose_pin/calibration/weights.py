@@ -12,10 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..body.girdle import PARAMETERS
-from ..body.subject import mount_rows
 from ..observations.directions import Level, Pointing
-from ..observations.paths import StartPose
 from .conditions import Loop, Moving
 from .equations import GAP_ROWS, HINGE_STD, Layout
 from .joints import LEAST_CORRELATION_S
@@ -46,26 +43,70 @@ class WeightedFit(NamedTuple):
 
     fit: Estimate
     contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
-    effective_sample_size: float  # effective sample size of the gap
+    effective_sample_size: float  # of the gap
+
+
+class _Block(NamedTuple):
+    """Residuals of a closure whose weight is measured: those of the gap, or those of the hinges."""
+
+    span: slice  # of samples
+    columns: slice  # of residuals
+    contact: np.ndarray  # (n,) of these samples; 1 for hinges
+
+    def measure(self, residuals: np.ndarray, least: float) -> tuple[float, float]:
+        """Return the variance of residuals (n, k), and of how many samples one is independent, at least `least`."""
+        r = residuals[self.span, self.columns]
+        variance = float(self.contact @ np.sum(r**2, axis=1)) / (r.shape[1] * float(self.contact.sum()))
+        return max(variance, LEAST_VARIANCE), count_correlated_samples(r * self.contact[:, None], least)
+
+
+def _list_blocks(observations: Observations, contact: np.ndarray) -> list[_Block]:
+    blocks = []
+    for condition, span in observations.spans():
+        if isinstance(condition, Loop):
+            blocks.append(_Block(span, slice(condition.rows), contact[span]))
+            if observations.layout.hinges:
+                blocks.append(_Block(span, slice(GAP_ROWS, None), np.ones(span.stop - span.start)))
+    return [block for block in blocks if block.contact.sum() > 0.0]
 
 
 def solve_reweighted(
     observations: Observations, prior: Gaussian, start: np.ndarray, contact: np.ndarray, quick: bool = False
 ) -> WeightedFit:
-    """The fit with gap and hinges weighted by their own residuals: variance, and how long it stays correlated.
+    """Return the fit with gap and hinges weighted by their own residuals: variance, and how long it stays correlated.
 
     Parameters
     ----------
     start, contact : x (m,) to begin with, and the weight (n,) of each sample's gap in it
     quick : one round with few steps and without hinges
     """
-    n, closed = len(observations), observations.closed
-    rounds, steps = (range(QUICK_ROUNDS), QUICK_STEPS) if quick else (range(ROUNDS), STEPS)
+    closures = [(condition, span) for condition, span in observations.spans() if isinstance(condition, Loop)]
+    rounds, steps = (QUICK_ROUNDS, QUICK_STEPS) if quick else (ROUNDS, STEPS)
     x, contact, correlation = start, contact.copy(), min_correlation(observations)
-    weights = np.full((n, observations.layout.residuals), 1.0 / correlation)
-    weights[:, :3] *= contact[:, None]
+    weights = _state_weights(observations, contact, correlation)
     if quick:
         weights[:, GAP_ROWS:] = 0.0
+    for k in range(rounds if closures else 0):
+        fit = solve(LeastSquares(observations, prior, weights), x, steps if k == 0 else ROUND_STEPS, strict=False)
+        x = fit.x
+        for closure, span in closures:
+            r = fit.closure[span, : closure.rows]
+            contact[span] = _estimate_contact(r, MIN_LATE_CONTACT if k > 1 else MIN_CONTACT)
+        weights = weights.copy()
+        for block in _list_blocks(observations, contact):
+            if block.columns.start is None or not quick:
+                variance, correlated = block.measure(fit.residuals, correlation)
+                weights[block.span, block.columns] = block.contact[:, None] / (correlated * variance)
+    fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, strict=not quick)
+    gaps = [block for block in _list_blocks(observations, contact) if block.columns.start is None]
+    sizes = [float(block.contact.sum()) / block.measure(fit.residuals, correlation)[1] for block in gaps]
+    return WeightedFit(fit, contact, sum(sizes))
+
+
+def _state_weights(observations: Observations, contact: np.ndarray, correlation: float) -> np.ndarray:
+    """Return the weights (n, k) of poses, which are stated, and those of closures to begin with."""
+    weights = np.full((len(observations), observations.layout.residuals), 1.0 / correlation)
+    weights[:, :GAP_ROWS] *= contact[:, None]
     for condition, span in observations.spans():
         # The error of a pose is constant, and how an elbow leaves its hinge follows its angles: one effective sample.
         if not isinstance(condition, Loop):
@@ -73,25 +114,7 @@ def solve_reweighted(
             if isinstance(condition, Level):
                 size = _measure_bend(observations, span, condition)
             weights[span] = size**-2 / (span.stop - span.start)
-    effective = float(closed.sum())
-    if not closed.any():
-        fit = solve(LeastSquares(observations, prior, weights), x, steps, strict=not quick)
-        return WeightedFit(fit, contact, effective)
-    for k in rounds:
-        # The last solve is the strict one.
-        fit = solve(LeastSquares(observations, prior, weights), x, steps if k == 0 else ROUND_STEPS, strict=False)
-        x = fit.x
-        effective = 0.0
-        for closure, span in observations.spans():
-            if isinstance(closure, Loop):
-                r = fit.closure[span, : closure.rows]
-                contact[span] = _estimate_contact(r, MIN_LATE_CONTACT if k > 1 else MIN_CONTACT)
-                weights[span, :3] = _weigh(r, contact[span], correlation)
-                effective += float(contact[span].sum()) / count_correlated_samples(r * contact[span, None], correlation)
-        if observations.layout.hinges and not quick:
-            weights[closed, GAP_ROWS:] = _weigh(fit.hinge[closed], np.ones(int(closed.sum())), correlation)
-    fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, strict=not quick)
-    return WeightedFit(fit, contact, effective)
+    return weights
 
 
 def _measure_bend(observations: Observations, span: slice, level: Level) -> float:
@@ -109,12 +132,6 @@ def _estimate_contact(r: np.ndarray, least: float) -> np.ndarray:
     usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[k], LEAST_VARIANCE)
     weight = (1.0 + size / (usual * OUTLIER**2 * k)) ** -2
     return np.where(weight > least, weight, 0.0)
-
-
-def _weigh(r: np.ndarray, contact: np.ndarray, least: float) -> np.ndarray:
-    """Weights (n, 1) of residuals (n, k): one over their variance and the number of correlated samples."""
-    variance = max(float(np.sum(contact * np.sum(r**2, axis=1))) / (r.shape[1] * float(contact.sum())), LEAST_VARIANCE)
-    return contact[:, None] / (count_correlated_samples(r * contact[:, None], least) * variance)
 
 
 def min_correlation(observations: Observations) -> float:
@@ -137,38 +154,31 @@ def count_correlated_samples(r: np.ndarray, least: float) -> float:
 
 
 def estimate_covariance(result: WeightedFit) -> np.ndarray:
-    """Covariance (m, m) of x under errors that are correlated over time.
+    """Return the covariance (m, m) of x under errors that are correlated over time.
 
     The weights count as many samples as one as the errors last. That is right where the motion is as slow as the
     errors. Where the motion covers a good part of its range meanwhile, an error acts on other unknowns from sample to
     sample and cancels. So the gradient's covariance is that of sums over windows of the errors' duration,
     C (Λ + Σ (Σ w J)ᵀ σ² (Σ w J) / duration) C, as of Newey and West 1987 with their triangle of weights.
     """
-    fit, contact, (observations, prior, weights) = result.fit, result.contact, result.fit.problem
-    J, r, C, least = fit.jacobian, fit.residuals, fit.covariance, min_correlation(observations)
-    hinges = list(range(GAP_ROWS, observations.layout.residuals))
+    fit, (observations, prior, weights) = result.fit, result.fit.problem
+    J, C, least = fit.jacobian, fit.covariance, min_correlation(observations)
     gradient = prior.information.copy()
     for condition, span in observations.spans():
-        parts = [(list(range(condition.rows)), contact[span])] if condition.rows else []
-        if isinstance(condition, Loop | Moving) and hinges:
-            parts.append((hinges, np.ones(span.stop - span.start)))
-        for rows, share in parts:
-            slope, w = J[span][:, rows], weights[span][:, rows]
-            pull = w[:, :, None] * slope
-            if not isinstance(condition, Loop):
-                gradient += np.einsum("nki,nkj->ij", pull, slope)
-                continue
-            if not share.sum() > 0.0:
-                continue
-            # The fit has reduced the residuals: their variance gets back what it took.
-            size = np.sum(r[span][:, rows] ** 2, axis=1) + np.einsum("nki,ij,nkj->n", slope, C, slope, optimize=True)
-            variance = max(float(share @ size) / (len(rows) * float(share.sum())), LEAST_VARIANCE)
-            duration = round(count_correlated_samples(r[span][:, rows] * share[:, None], least))
-            summed = np.concatenate((np.zeros((1, *pull.shape[1:])), np.cumsum(pull, axis=0)))
-            ends = np.arange(1, len(pull) + duration)
-            windows = summed[np.minimum(ends, len(pull))] - summed[np.maximum(ends - duration, 0)]
-            windows = windows.reshape(-1, C.shape[0])
-            gradient += variance / duration * windows.T @ windows
+        if not isinstance(condition, Loop):
+            gradient += np.einsum("nk,nki,nkj->ij", weights[span], J[span], J[span], optimize=True)
+    for block in _list_blocks(observations, result.contact):
+        slope = J[block.span, block.columns]
+        variance, duration = block.measure(fit.residuals, least)
+        # The fit has reduced the residuals: their variance gets back what it took.
+        taken = np.einsum("nki,ij,nkj->n", slope, C, slope, optimize=True)
+        variance += float(block.contact @ taken) / (slope.shape[1] * float(block.contact.sum()))
+        pull, length = weights[block.span, block.columns, None] * slope, round(duration)
+        summed = np.concatenate((np.zeros((1, *pull.shape[1:])), np.cumsum(pull, axis=0)))
+        ends = np.arange(1, len(pull) + length)
+        windows = summed[np.minimum(ends, len(pull))] - summed[np.maximum(ends - length, 0)]
+        windows = windows.reshape(-1, C.shape[0])
+        gradient += variance / length * windows.T @ windows
     return C @ gradient @ C
 
 
@@ -227,23 +237,3 @@ def _find_normal_deviate(chi2: float, degrees: int) -> float:
     """The standard deviations of a normal variable that are as rare as chi², by Wilson and Hilferty 1931."""
     spread = 2.0 / (9.0 * degrees)
     return float((np.cbrt(chi2 / degrees) - (1.0 - spread)) / np.sqrt(spread))
-
-
-def project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names and covariance of the lengths, mount errors and girdles, from x's covariance: R_LS = exp(−ε) Rz(ψ)
-    R_VS(start).
-
-    Errors of mounts are turned from the frames that equal W in the start pose to those of the segments. By how much a
-    person turns a segment about the vertical in the start pose is not in them: no closure shows it.
-    """
-    K, rows = len(layout.lengths), [row for name in layout.sensors for row in mount_rows(name)]
-    of_girdles = [f"girdles.{term.name}.{parameter}" for term in layout.girdles for parameter in PARAMETERS]
-    T = np.zeros((K + len(rows) + len(of_girdles), layout.size))
-    T[:K, :K] = np.eye(K)
-    T[K + len(rows) :, layout.girdle.ravel()] = np.eye(len(of_girdles))
-    for i, name in enumerate(layout.sensors):
-        own = np.zeros((3, layout.size))
-        own[[0, 1], layout.tilt[i]] = -1.0
-        own[2, layout.heading[i]] = 1.0
-        T[K + 3 * i : K + 3 * i + 3] = start.R_WK[name].T @ own
-    return (*layout.lengths, *rows, *of_girdles), T @ covariance @ T.T
