@@ -204,28 +204,6 @@ def rotate_by_world_vector(quat, x, y, z):  # type: ignore[no-untyped-def]
     quat[0], quat[1], quat[2], quat[3] = rx * norm, ry * norm, rz * norm, rw * norm
 
 
-# Power series in θ² of the terms below; the first terms left out are under 1e-17 of them for θ² < 0.02.
-T0, T1, T2, T3, T4, T5 = ((-1) ** k / factorial(2 * k + 1) for k in range(6))  # sin θ/θ
-U0, U1, U2, U3, U4 = ((-1) ** k / factorial(2 * k + 2) for k in range(5))  # (1 − cos θ)/θ²
-
-
-@inlined
-def rotation_terms(t):  # type: ignore[no-untyped-def]
-    """cos θ, sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ of θ² = `t`; below 0.02 by series, to the last bit or two.
-
-    With θ = ‖w‖, exp([w]×) = cos θ I + sin θ/θ [w]× + (1 − cos θ)/θ² w wᵀ. The integral of exp([w]× u) over u from 0 to
-    1 has the second to fourth term in their place.
-    """
-    if t < 0.02:
-        t2 = t * t
-        d = -(T1 + T2 * t + t2 * (T3 + T4 * t + t2 * T5))
-        c = U0 + U1 * t + t2 * (U2 + U3 * t + t2 * U4)
-        return 1.0 - t * c, T0 - t * d, c, d
-    angle = np.sqrt(t)
-    cosine, s = np.cos(angle), np.sin(angle) / angle
-    return cosine, s, (1.0 - cosine) / t, (1.0 - s) / t
-
-
 @inlined
 def derivative(x, y, z, w, wx, wy, wz):  # type: ignore[no-untyped-def]
     """``½ quat ⊗ [wx, wy, wz, 0]``: by how much a quaternion changes in a second at a rate [rad/s], as four floats."""
@@ -237,7 +215,7 @@ def derivative(x, y, z, w, wx, wy, wz):  # type: ignore[no-untyped-def]
     )
 
 
-@inlined
+@kernel
 def fill_matrix(quat, R):  # type: ignore[no-untyped-def]
     """`R` (3, 3) of `quat` (4,) xyzw."""
     x, y, z, w = quat[0], quat[1], quat[2], quat[3]

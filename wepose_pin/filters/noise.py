@@ -99,7 +99,7 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     else:  # the means of blocks average white noise out and keep sway
         bias_cov = _apply_floor(half_second_cov / (len(gyro_S) // max(1, round(BLOCK_S * rate_hz))), BIAS_FLOOR)
     return SensorNoise(
-        gyro_bias=gyro_S.mean(axis=0),
+        gyro_bias=average_blocks(gyro_S, len(gyro_S))[0],
         gyro_bias_cov=bias_cov,
         gyro_cov=_apply_floor(gyro_cov, GYRO_FLOOR),
         accel_cov=_apply_floor(_compute_cov(accel_S / gravity), ACCEL_FLOOR),
@@ -128,30 +128,30 @@ def _estimate_sway_cov(gyro_S: np.ndarray, rate_hz: float, measured: np.ndarray 
 
 def _compute_cov(values: np.ndarray) -> np.ndarray:
     """Compute the covariance (3, 3) of samples (n, 3), bit by bit that of `np.cov` in a quarter of its time."""
-    off = _subtract_mean(np.ascontiguousarray(values))
+    off = values - average_blocks(values, len(values))
     return np.asarray(off.T @ off * (1.0 / (len(values) - 1)))
 
 
+def average_blocks(values: np.ndarray, size: int) -> np.ndarray:
+    """Means (n // size, 3) of the complete blocks of `size` samples (n, 3), in a tenth of NumPy's time."""
+    return np.asarray(_average_blocks(np.ascontiguousarray(values, dtype=float), size))
+
+
 @compiled
-def _subtract_mean(values):  # type: ignore[no-untyped-def]
-    """``values - values.mean(axis=0)`` of samples (n, 3); of three columns NumPy takes ten times as long."""
-    x = y = z = 0.0
-    for k in range(len(values)):
-        x, y, z = x + values[k, 0], y + values[k, 1], z + values[k, 2]
-    x, y, z = x / len(values), y / len(values), z / len(values)
-    out = np.empty_like(values)
-    for k in range(len(values)):
-        out[k, 0], out[k, 1], out[k, 2] = values[k, 0] - x, values[k, 1] - y, values[k, 2] - z
-    return out
+def _average_blocks(values, size):  # type: ignore[no-untyped-def]
+    means = np.empty((len(values) // size, 3))
+    for block in range(len(means)):
+        x = y = z = 0.0
+        for k in range(block * size, (block + 1) * size):
+            x, y, z = x + values[k, 0], y + values[k, 1], z + values[k, 2]
+        means[block, 0], means[block, 1], means[block, 2] = x / size, y / size, z / size
+    return means
 
 
 def _compute_half_second_cov(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray | None:
     """Compute the covariance of the means of blocks; None with fewer than four blocks."""
     size = max(1, round(BLOCK_S * rate_hz))
-    blocks = len(gyro_S) // size
-    if blocks < 4:
-        return None
-    return _compute_cov(gyro_S[: blocks * size].reshape(blocks, size, 3).mean(axis=1))
+    return _compute_cov(average_blocks(gyro_S, size)) if len(gyro_S) // size >= 4 else None
 
 
 def _apply_floor(cov: np.ndarray, std: float) -> np.ndarray:

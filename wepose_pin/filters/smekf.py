@@ -17,6 +17,7 @@ first sample.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -24,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from ..compilation import fma, inlined, kernel
 from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
-from ..rotations import rotate_by_vector, rotation_terms, up_in_sensor
+from ..rotations import C0, C1, C2, C3, S0, S1, S2, S3, fill_matrix, half_angle_terms, up_in_sensor
 from .base import (
     RATE_VAR,
     START_HEADING_STD,
@@ -128,6 +129,9 @@ MODEL = np.dtype(
     align=True,
 )
 _UPPER = np.triu_indices(3)
+# Below this (θ/2)² four terms of a power series are enough; the first terms left out are under 3e-17.
+SHORT_SERIES = 1e-3
+D0, D1, D2, D3 = ((-1) ** k / factorial(2 * k + 3) for k in range(4))  # (θ − sin θ)/θ³ in θ²
 
 
 class SmekfState:
@@ -164,11 +168,13 @@ class Smekf:
         self.model = _model(noise, 1.0 / rate_hz, self.params, self.first_order)
         record = np.zeros(1, STATE)
         record["quat_VS"], record["gyro_bias"] = quat_VS, noise.gyro_bias
-        R_VS, attitude_cov = Rotation.from_quat(quat_VS).as_matrix(), _matrix(self.params.attitude_cov0)
+        R_VS, attitude_cov = np.empty((3, 3)), _matrix(self.params.attitude_cov0)
+        fill_matrix(record["quat_VS"][0], R_VS)
         record["attitude_cov"] = attitude_cov[_UPPER]
         record["P_aa"] = (R_VS @ attitude_cov @ R_VS.T)[_UPPER]
-        record["P_bb"] = _matrix(self.params.bias_cov0)[_UPPER]
-        record["about_vertical"][0, RATE_VAR] = float(np.trace(_matrix(self.params.bias_cov0))) / 3.0
+        bias_cov = _matrix(self.params.bias_cov0)
+        record["P_bb"] = bias_cov[_UPPER]
+        record["about_vertical"][0, RATE_VAR] = float(np.trace(bias_cov)) / 3.0
         self.state = SmekfState(record)
 
     def run(
@@ -191,6 +197,8 @@ class PublishedSmekf(Smekf):
 
 def _matrix(cov: float | np.ndarray) -> np.ndarray:
     """A covariance (3, 3) that may be given as one variance."""
+    if isinstance(cov, float) and 0.0 <= cov < np.inf:
+        return cov * np.eye(3)
     array = np.asarray(cov, dtype=float)
     matrix = array if array.ndim == 2 else array * np.eye(3)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] < -1e-15:
@@ -290,15 +298,16 @@ def predict(state, model, wx, wy, wz, lost_var):  # type: ignore[no-untyped-def]
     δt² diag(R_VS Σ_ω R_VSᵀ, Σ_b). `lost_var` [rad²] is added on top.
     """
     dt, P = model.dt, load_covariance(state)
-    before = rotation_matrix(state.quat_VS)
-    rotate_by_vector(state.quat_VS, wx, wy, wz)
-    R = rotation_matrix(state.quat_VS)
-    if model.first_order:  # of errors in S, where F = [[I − [w]×, −δt I], [0, I]]
-        turn = multiply(multiply(R, sum_of_three(1.0, -1.0, 0.0, wx, wy, wz)), transpose(before))
-        P = rotate_covariance(P, turn)
+    square = dot(wx, wx, wy, wy, wz, wz)
+    half, cosine, d = rotation_terms(square)
+    R = turn(state.quat_VS, load_quat(state.quat_VS), (half * wx, half * wy, half * wz, cosine))
+    s, c = 2.0 * half * cosine, 2.0 * half * half  # sin θ/θ, (1 − cos θ)/θ²
+    if model.first_order:  # of errors in S, where F = [[I − [w]×, −δt I], [0, I]]: R (I − [w]×) exp([w]×) Rᵀ
+        whole = fma(-square, c, 1.0)  # cos θ
+        off = sum_of_three(fma(square, s, whole), s - whole, c - s, wx, wy, wz)
+        P = rotate_covariance(P, multiply(multiply(R, off), transpose(R)))
         B = multiply(R, sum_of_three(-dt, 0.0, 0.0, wx, wy, wz))
     else:
-        _, s, c, d = rotation_terms(wx * wx + wy * wy + wz * wz)
         B = multiply(R, sum_of_three(-dt * s, dt * c, -dt * d, wx, wy, wz))
     aa, ab, bb = P
     b = (
@@ -369,13 +378,8 @@ def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-unty
         add_dot(fma(-ly, off, -d[0]), R[3], ax, R[4], ay, R[5], az),
     )
     tx, ty, tz = d[0] + e[0], d[1] + e[1], d[2] + e[2]
-    rotate_by_vector(
-        state.quat_VS,
-        dot(R[0], tx, R[3], ty, R[6], tz),
-        dot(R[1], tx, R[4], ty, R[7], tz),
-        dot(R[2], tx, R[5], ty, R[8], tz),
-    )
-    after_R = rotation_matrix(state.quat_VS)
+    half, cosine, _ = rotation_terms(dot(tx, tx, ty, ty, tz, tz))
+    after_R = turn(state.quat_VS, (half * tx, half * ty, half * tz, cosine), load_quat(state.quat_VS))
     if model.first_order:  # the paper leaves the covariance in S as it is
         P = rotate_covariance(P, multiply(after_R, transpose(R)))
     bx, by, bz = d[3] + e[3], d[4] + e[4], d[5] + e[5]
@@ -456,13 +460,44 @@ def rotate_covariance(P, A):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def rotation_matrix(quat):  # type: ignore[no-untyped-def]
-    """R_VS of `quat` (4,) xyzw."""
-    x, y, z, w = quat[0], quat[1], quat[2], quat[3]
+def rotation_terms(square):  # type: ignore[no-untyped-def]
+    """sin(θ/2)/θ, cos(θ/2), (θ − sin θ)/θ³ of θ² = `square`; a sample's are power series, to the last bit or two.
+
+    With θ = ‖w‖, exp([w]×) = cos θ I + sin θ/θ [w]× + (1 − cos θ)/θ² w wᵀ. The integral of exp([w]× u) over u from 0 to
+    1 has sin θ/θ, (1 − cos θ)/θ², (θ − sin θ)/θ³ in their place.
+    """
+    h = 0.25 * square
+    if h < SHORT_SERIES:
+        half, cosine = fma(fma(fma(S3, h, S2), h, S1), h, S0), fma(fma(fma(C3, h, C2), h, C1), h, C0)
+        return half, cosine, fma(fma(fma(D3, square, D2), square, D1), square, D0)
+    half, cosine = half_angle_terms(h)
+    return half, cosine, (1.0 - 2.0 * half * cosine) / square
+
+
+@inlined
+def load_quat(quat):  # type: ignore[no-untyped-def]
+    return quat[0], quat[1], quat[2], quat[3]
+
+
+@inlined
+def turn(out, a, b):  # type: ignore[no-untyped-def]
+    """Fill `out` (4,) with a ⊗ b of two quaternions xyzw, normalised; return its matrix R_VS."""
+    x = fma(a[3], b[0], fma(a[0], b[3], fma(a[1], b[2], -a[2] * b[1])))
+    y = fma(a[3], b[1], fma(-a[0], b[2], fma(a[1], b[3], a[2] * b[0])))
+    z = fma(a[3], b[2], fma(a[0], b[1], fma(-a[1], b[0], a[2] * b[3])))
+    w = fma(a[3], b[3], fma(-a[0], b[0], fma(-a[1], b[1], -a[2] * b[2])))
+    square = fma(w, w, dot(x, x, y, y, z, z))
+    # Of an almost unit quaternion 1/norm is 1 − (square − 1)/2, to 3/8 (square − 1)².
+    scale = fma(-0.5, square, 1.5) if abs(square - 1.0) < 1e-8 else 1.0 / np.sqrt(square)
+    x, y, z, w = x * scale, y * scale, z * scale, w * scale
+    out[0], out[1], out[2], out[3] = x, y, z, w
     x2, y2, z2 = x + x, y + y, z + z
-    xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
-    wx, wy, wz = w * x2, w * y2, w * z2
-    return 1.0 - (yy + zz), xy - wz, xz + wy, xy + wz, 1.0 - (xx + zz), yz - wx, xz - wy, yz + wx, 1.0 - (xx + yy)
+    xy, xz, yz = x * y2, x * z2, y * z2
+    return (
+        fma(-z, z2, fma(-y, y2, 1.0)), fma(-w, z2, xy), fma(w, y2, xz),
+        fma(w, z2, xy), fma(-z, z2, fma(-x, x2, 1.0)), fma(-w, x2, yz),
+        fma(-w, y2, xz), fma(w, x2, yz), fma(-y, y2, fma(-x, x2, 1.0)),
+    )  # fmt: skip
 
 
 @inlined

@@ -9,7 +9,7 @@ import numpy as np
 from .. import rotations
 from ..compilation import compiled
 from ..errors import BadData
-from .noise import BLOCK_S, SensorNoise
+from .noise import BLOCK_S, SensorNoise, average_blocks
 
 ACCEL_BIAS_STD = 0.003  # [rad] tilt error from the bias of a calibrated MEMS accelerometer (3 mg: our assumption)
 MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
@@ -39,7 +39,7 @@ def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNo
     """
     gyro, accel = np.ascontiguousarray(gyro_S), np.ascontiguousarray(accel_S)
     force = _turn_to_first(gyro, accel, noise.gyro_bias, 1.0 / rate_hz)
-    mean = force.mean(axis=0) if len(force) else np.zeros(3)
+    mean = average_blocks(force, len(force))[0] if len(force) else np.zeros(3)
     norm = float(np.linalg.norm(mean))
     if not norm > 0.0:
         raise BadData("accel is zero in the start phase; the filter starts from the direction of gravity")
@@ -47,8 +47,7 @@ def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNo
     size = max(1, round(BLOCK_S * rate_hz))
     blocks = len(across) // size
     if blocks >= 4:
-        means = across[: blocks * size].reshape(blocks, size, 3).mean(axis=1)
-        variance = float(means.var(axis=0, ddof=1).sum()) / 2.0 / blocks
+        variance = float(average_blocks(across, size).var(axis=0, ddof=1).sum()) / 2.0 / blocks
     else:  # too short for sway to average out
         variance = float(across.var(axis=0).sum()) / 2.0
     return StartTilt(rotations.quat_from_gravity(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm)))

@@ -134,7 +134,9 @@ class StaticState(NamedTuple):
 
     detector: np.ndarray  # (k,) of `DETECTOR`
     block: np.ndarray  # (k, N, 7) samples of the current block, then of the one before
-    tail: np.ndarray  # (k, N) of `SUMS`: of the block before, from each of its samples on which it does not move
+    # (k, N) of `SUMS`: of the block before, from each of its samples on which it does not move; where no window begins
+    # any more, `gyro` is that of the current block up to the sample
+    tail: np.ndarray
 
 
 class StaticDetector:
@@ -302,15 +304,17 @@ def _is_within(limit, sums, tail_sums, products, tail_products, share):  # type:
 
 
 @inlined
-def _rate_is_steady(detector, block, at, gx, gy, gz):  # type: ignore[no-untyped-def]
-    """Condition (6) for a window of mean rate g that ends with sample `at` of the block."""
-    newest = detector.newest
-    begin = at + 1 - newest
-    x, y, z = -newest * gx, -newest * gy, -newest * gz
-    for k in range(max(begin, 0), at + 1):
-        x, y, z = x + block[k, 0], y + block[k, 1], z + block[k, 2]
-    for k in range(len(block) + min(begin, 0), len(block)):  # of the block before
-        x, y, z = x + block[k, 0], y + block[k, 1], z + block[k, 2]
+def _rate_is_steady(detector, tail, n, gx, gy, gz):  # type: ignore[no-untyped-def]
+    """Condition (6) for a window of n samples whose mean rate is g; the rates are differences from the anchor."""
+    newest, head = detector.newest, detector.sums.gyro
+    begin = detector.samples - newest  # first sample of the newest part in the current block
+    x, y, z = head[0] - newest * gx, head[1] - newest * gy, head[2] - newest * gz
+    if begin < 0:
+        part = tail[n + begin].gyro
+        x, y, z = x + part[0], y + part[1], z + part[2]
+    elif begin > 0:
+        part = tail[begin - 1].gyro
+        x, y, z = x - part[0], y - part[1], z - part[2]
     M = detector.rate_change
     across = M[1] * x * y + M[2] * x * z + M[4] * y * z
     return M[0] * x * x + M[3] * y * y + M[5] * z * z + 2.0 * across <= newest * newest
@@ -331,11 +335,13 @@ def _bias_agrees(detector, window, gx, gy, gz, ax, ay, az):  # type: ignore[no-u
     gx, gy, gz = gx - bias[0], gy - bias[1], gz - bias[2]
     off = (gx * ax + gy * ay + gz * az) / np.sqrt(ax * ax + ay * ay + az * az)
     known = detector.bias_var + detector.spread_var
-    bound = np.sqrt(detector.squared_stds * (known + detector.window_var))
+    squared_bound = detector.squared_stds * (known + detector.window_var)
+    agrees = off * off <= squared_bound
     # What enters the average is bounded, so that it is soon forgotten when a fast rotation ends.
-    detector.average_rate += detector.fade * (min(max(off, -bound), bound) - detector.average_rate)
+    bounded = off if agrees else np.copysign(np.sqrt(squared_bound), off)
+    detector.average_rate += detector.fade * (bounded - detector.average_rate)
     average = detector.average_rate
-    if abs(off) > bound or average * average > detector.squared_stds * (known + detector.average_var):
+    if not agrees or average * average > detector.squared_stds * (known + detector.average_var):
         return False
     # A window's mean measures the bias; its samples share that, since windows overlap.
     variance = detector.bias_var
@@ -362,6 +368,9 @@ def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[
         if not detector.moves:
             detector.moves = _widen(detector, gx, gy, gz)
             _add(head, head, block, at, anchor)
+            # No window needs the sums of the block before from here; those up to here serve condition (6).
+            gyro = tail[at].gyro
+            gyro[0], gyro[1], gyro[2] = head.gyro[0], head.gyro[1], head.gyro[2]
         if not detector.has_block:
             detector.bias_var += detector.walk_var
             return False
@@ -386,16 +395,16 @@ def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[
             detector.accel_limit, head.accel, rest.accel, head.accel_products, rest.accel_products, share
         )  # (2)
     )
-    gx = anchor[0] + (head.gyro[0] + rest.gyro[0]) * share
-    gy = anchor[1] + (head.gyro[1] + rest.gyro[1]) * share
-    gz = anchor[2] + (head.gyro[2] + rest.gyro[2]) * share
-    static = static and _rate_is_steady(detector, block, at, gx, gy, gz)  # (6)
+    gx = (head.gyro[0] + rest.gyro[0]) * share
+    gy = (head.gyro[1] + rest.gyro[1]) * share
+    gz = (head.gyro[2] + rest.gyro[2]) * share
+    static = static and _rate_is_steady(detector, tail, n, gx, gy, gz)  # (6)
     return _bias_agrees(
         detector,
         n if static else 0,
-        gx,
-        gy,
-        gz,
+        anchor[0] + gx,
+        anchor[1] + gy,
+        anchor[2] + gz,
         anchor[3] + (head.accel[0] + rest.accel[0]) * share,
         anchor[4] + (head.accel[1] + rest.accel[1]) * share,
         anchor[5] + (head.accel[2] + rest.accel[2]) * share,

@@ -291,15 +291,21 @@ def find_cut_off(values: np.ndarray, least: float) -> np.ndarray:
     return cut
 
 
-def has_plateaus(values: np.ndarray, least: float) -> bool:
+@compiled
+def has_plateaus(values, least):  # type: ignore[no-untyped-def]
     """Return whether an axis of `values` (n, 3) is at an extreme, `least` or more, so often that it may be cut off."""
-    if max(values.max(initial=0.0), -values.min(initial=0.0)) < least:
-        return False
-    for x in np.ascontiguousarray(values.T):
-        for extreme, reached in ((x.max(), np.greater_equal), (x.min(), np.less_equal)):
-            if abs(extreme) >= least and np.count_nonzero(reached(x, (1.0 - 2.0 * ROUNDING) * extreme)) >= PLATEAU:
-                return True
-    return False
+    share = 1.0 - 2.0 * ROUNDING
+    high, low, at_high, at_low = np.full(3, least), np.full(3, -least), np.zeros(3), np.zeros(3)
+    for k in range(len(values)):
+        for axis in range(3):
+            x = values[k, axis]
+            if x >= share * high[axis]:
+                at_high[axis] = at_high[axis] + 1.0 if high[axis] >= share * x else 1.0
+                high[axis] = max(high[axis], x)
+            elif x <= share * low[axis]:
+                at_low[axis] = at_low[axis] + 1.0 if low[axis] <= share * x else 1.0
+                low[axis] = min(low[axis], x)
+    return max(at_high.max(), at_low.max()) >= PLATEAU
 
 
 def _leads_beyond(x: np.ndarray, first: int, last: int, digit: float) -> bool:
