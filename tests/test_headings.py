@@ -22,7 +22,7 @@ from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
 from wepose_pin.tracking import Tracker, summarize, track
 from wepose_pin.tracking.clasps import ClaspDetector
-from wepose_pin.tracking.heading_filter import HeadingFilter, StanceEstimator
+from wepose_pin.tracking.heading_filter import HeadingFilter, estimate_headings
 from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, Knot
 
 # The simulated person's shoulders stay in place, against the law of the table.
@@ -236,7 +236,7 @@ def go_on(state: HeadingFilter, knots: int, about_vertical: tuple[float, ...]) -
     variance = []
     for _ in range(knots):
         state.step(Knot(0.0, *nothing, say(about_vertical), np.zeros(1, dtype=bool)))
-        variance.append(StanceEstimator(state.problem).estimate(state.x, state.P).segment_covariance[0, 0])
+        variance.append(estimate_headings(state.problem, state.x, state.P, 0.0).segment_covariance[0, 0])
     return np.sqrt(variance)
 
 
@@ -244,7 +244,7 @@ def test_a_headings_variance_is_start_pose_and_drift_until_the_filter_has_found_
     """Nothing is observed: the mount cancels, the rate adds up, and less is left once the filter knows its bias."""
     state = make_filter()
     np.testing.assert_allclose(
-        np.diag(StanceEstimator(state.problem).estimate(state.x, state.P).segment_covariance), START_STD**2
+        np.diag(estimate_headings(state.problem, state.x, state.P, 0.0).segment_covariance), START_STD**2
     )
     growing = go_on(state, 10, (0.0, 0.0, BIAS_STD**2))
     assert growing[-1] == pytest.approx(np.hypot(START_STD, 20.0 * np.hypot(BIAS_STD, PERSON_NOISE.rate_std)), rel=0.05)

@@ -16,22 +16,13 @@ from .symbols import about_z, evaluate, product, rotate, rotate_back
 
 
 class GapRows(NamedTuple):
-    """What n samples of orientations show of the gap between two points.
+    """What n samples of orientations show of the gap between two points."""
 
-    Parameters
-    ----------
-    gap : (n, 3) [m] in W, from the second point to the first one
-    H : (n, 3, k) [m/rad] its slope by the headings
-    by_shape : (n, 3, m) its slope by the lengths and the girdles' parameters, as in `Subject.shape_covariance`
-    by_attitude : (n, 3, 3) [m²] its covariance by errors of 1 rad of each orientation about each axis
-    off_law : (n, 3, 3) [m²] its covariance by shoulders that leave the law of their girdles
-    """
-
-    gap: np.ndarray
-    H: np.ndarray
-    by_shape: np.ndarray
-    by_attitude: np.ndarray
-    off_law: np.ndarray
+    gap: np.ndarray  # (n, 3) [m] in W, from the second point to the first one
+    H: np.ndarray  # (n, 3, k) [m/rad] its slope by the headings
+    by_shape: np.ndarray  # (n, 3, m) by the lengths and the girdles' parameters, as in `Subject.shape_covariance`
+    by_attitude: np.ndarray  # (n, 3, 3) [m²] its covariance by errors of 1 rad of each orientation about each axis
+    off_law: np.ndarray  # (n, 3, 3) [m²] its covariance by shoulders that leave the law of their girdles
 
 
 class PointPair:

@@ -21,24 +21,15 @@ LEAST_SQUARED_BEND_PART = 0.1  # of e in the plane across the axis, below which 
 
 
 class HingePlane(NamedTuple):
-    """A hinge between two segments with sensors; vectors (3,) in L'.
+    """A hinge between two segments with sensors, the segments `on` above and `moves` below; unit vectors (3,) in L'."""
 
-    Parameters
-    ----------
-    name : of the joint
-    on, moves : the segments above and below
-    axis, along_on : unit, the axis and the long axis of `on`, in the frame of `on`
-    along : unit, the long axis of `moves`, in its own frame
-    range : [rad] of the angle about the axis from the long axis of `on` to that of `moves`
-    """
-
-    name: str
+    name: str  # of the joint
     on: str
     moves: str
-    axis: Vector
-    along_on: Vector
-    along: Vector
-    range: tuple[float, float]
+    axis: Vector  # in the frame of `on`
+    along_on: Vector  # the long axis of `on`
+    along: Vector  # the long axis of `moves`, in its own frame
+    range: tuple[float, float]  # [rad] of the angle about the axis from the long axis of `on` to that of `moves`
 
     @property
     def across(self) -> np.ndarray:
@@ -66,20 +57,12 @@ class HingePlane(NamedTuple):
 
 
 class HingeRows(NamedTuple):
-    """What n samples of two orientations show of a hinge.
+    """What n samples of two orientations show of a hinge."""
 
-    Parameters
-    ----------
-    r : (n,) [rad] out of the hinge's plane
-    H : (n, 4) its slope by the headings of `moves` and `on`, and by the axis along `across` and `tilted`
-    excess : (n,) [rad] beyond the hinge's range, signed
-    slope : (n,) of that by the heading of `moves`; by the heading of `on` it is the negative
-    """
-
-    r: np.ndarray
-    H: np.ndarray
-    excess: np.ndarray
-    slope: np.ndarray
+    r: np.ndarray  # (n,) [rad] out of the hinge's plane
+    H: np.ndarray  # (n, 4) its slope by the headings of `moves` and `on`, and by the axis along `across` and `tilted`
+    excess: np.ndarray  # (n,) [rad] beyond the hinge's range, signed
+    slope: np.ndarray  # (n,) of that by the heading of `moves`; by the heading of `on` it is the negative
 
 
 def linearize_hinge(hinge: HingePlane, quat_on: np.ndarray, quat_moves: np.ndarray, headings: np.ndarray) -> HingeRows:

@@ -32,36 +32,21 @@ LEVER_STD_OF_LENGTH = 0.3  # of the distance to the joint, on large bodies
 
 
 class JointPair(NamedTuple):
-    """Two sensors at one joint.
-
-    Parameters
-    ----------
-    near, far : segments, the one nearer the root first
-    levers : (6,) [m] from the joint to the near sensor and to the far one, each in its own frame S; usual values
-    lever_std : [m] of each
-    travels : whether the joint travels on the near segment, as a shoulder does
-    """
+    """Two sensors at one joint, on the segment nearer the root and on the far one."""
 
     near: str
     far: str
-    levers: np.ndarray
-    lever_std: float
-    travels: bool
+    levers: np.ndarray  # (6,) [m] usual ones from the joint to the near sensor and to the far one, each in its own S
+    lever_std: float  # [m] of each
+    travels: bool  # whether the joint travels on the near segment, as a shoulder does
 
 
 class JointResidual(NamedTuple):
-    """The misfit of m samples of a joint's specific force between its two sensors.
+    """The misfit of m samples of a joint's specific force between its two sensors."""
 
-    Parameters
-    ----------
-    e : (m, 3) [m/s²] the far side less the near one, in the far one's W
-    jacobian : (m, 3, 1 + 2 p) by the angle and by the p parts of a of the near and of the far sensor
-    force : (m, 3) [m/s²] of the joint by the near sensor, in the far one's W
-    """
-
-    e: np.ndarray
-    jacobian: np.ndarray
-    force: np.ndarray
+    e: np.ndarray  # (m, 3) [m/s²] the far side less the near one, in the far one's W
+    jacobian: np.ndarray  # (m, 3, 1 + 2 p) by the angle and by the p parts of a of the near and of the far sensor
+    force: np.ndarray  # (m, 3) [m/s²] of the joint by the near sensor, in the far one's W
 
 
 def linearize_joint(

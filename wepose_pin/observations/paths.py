@@ -51,33 +51,20 @@ class SegmentVector(NamedTuple):
 
 
 class PointPath(NamedTuple):
-    """The path from the root to a point, or from one point to another.
+    """The path from the root to a point, or from one point to another."""
 
-    Parameters
-    ----------
-    vectors : their sum is the path, but for girdles
-    girdles : those that move the ends, each with the sign of its displacement
-    """
-
-    vectors: tuple[SegmentVector, ...]
-    girdles: tuple[tuple[str, float], ...]
+    vectors: tuple[SegmentVector, ...]  # whose sum is the path, but for girdles
+    girdles: tuple[tuple[str, float], ...]  # those that move the ends, each with the sign of its displacement
 
 
 class GirdleTerm(NamedTuple):
-    """A girdle with sensors on both its segments.
-
-    Parameters
-    ----------
-    along : (3,) of the limb, in L' of `law.moves`
-    R_on : (3, 3), row by row: maps the frame L of `law.on` to its L'
-    scale : of the law
-    """
+    """A girdle with sensors on both its segments."""
 
     name: str
     law: Girdle
-    along: Vector
-    R_on: tuple[float, ...]
-    scale: float
+    along: Vector  # of the limb, in L' of `law.moves`
+    R_on: tuple[float, ...]  # (9,) row by row: maps the frame L of `law.on` to its L'
+    scale: float  # of the law
 
     def displacement(self, quat_WL: Mapping[str, ca.SX], parameters: ca.SX) -> ca.SX:
         """Return the displacement (3,) [m] in W of the point that the girdle moves, by a person's parameters (7,)."""
@@ -89,18 +76,11 @@ class GirdleTerm(NamedTuple):
 
 
 class BodySymbols(NamedTuple):
-    """A body in CasADi.
+    """A body in CasADi."""
 
-    Parameters
-    ----------
-    quat_WL : segment → (4,) xyzw of L'
-    lengths : (k,) [m], in the order of the table
-    girdles : name → the girdle and a person's parameters (7,)
-    """
-
-    quat_WL: Mapping[str, ca.SX]
-    lengths: ca.SX
-    girdles: Mapping[str, tuple[GirdleTerm, ca.SX]]
+    quat_WL: Mapping[str, ca.SX]  # segment → (4,) xyzw of L'
+    lengths: ca.SX  # (k,) [m], in the order of the table
+    girdles: Mapping[str, tuple[GirdleTerm, ca.SX]]  # name → the girdle and a person's parameters (7,)
 
 
 def express_path(path: PointPath, body: BodySymbols) -> tuple[ca.SX, dict[str, ca.SX]]:

@@ -49,21 +49,13 @@ _JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
 
 
 class KnotChange(NamedTuple):
-    """How headings and their rates change within a knot, beside what the rates themselves add; (k,) each.
+    """How headings and their rates change within a knot, beside what the rates themselves add; (k,) each."""
 
-    Parameters
-    ----------
-    heading, rate : [rad], [rad/s] by what the orientation filters have corrected
-    heading_var : [rad²] growth of a heading's variance
-    rate_var : [rad²/s²] growth of a rate's variance
-    rate_share : of a rate's error that is left, as its sensor's filter knows the bias better than that
-    """
-
-    heading: np.ndarray
-    rate: np.ndarray
-    heading_var: np.ndarray
-    rate_var: np.ndarray
-    rate_share: np.ndarray
+    heading: np.ndarray  # [rad] by what the orientation filters have corrected
+    rate: np.ndarray  # [rad/s] the same
+    heading_var: np.ndarray  # [rad²] growth of a heading's variance
+    rate_var: np.ndarray  # [rad²/s²] growth of a rate's variance
+    rate_share: np.ndarray  # of a rate's error that is left, as its sensor's filter knows the bias better than that
 
 
 class JointMisfit(NamedTuple):
@@ -72,18 +64,12 @@ class JointMisfit(NamedTuple):
     Some of a misfit repeats with the motion, as that of soft tissue with the gait: it is coherent with the joint's
     force and does not average out. A heading explains one coherent misfit, which turns the force about the vertical.
     The other ones, which stretch it or mix it with the vertical, show how large coherent misfits are in this motion.
-
-    Parameters
-    ----------
-    products : (3, 3) [m²/s⁴] Σ e fᵀ of the misfit e and the force f
-    misfit, force : (3,) [m²/s⁴] Σ e², Σ f²
-    samples : that count
     """
 
-    products: np.ndarray = np.zeros((3, 3))
-    misfit: np.ndarray = np.zeros(3)
-    force: np.ndarray = np.zeros(3)
-    samples: float = 0.0
+    products: np.ndarray = np.zeros((3, 3))  # [m²/s⁴] Σ e fᵀ of the misfit e and the force f
+    misfit: np.ndarray = np.zeros(3)  # [m²/s⁴] Σ e²
+    force: np.ndarray = np.zeros(3)  # [m²/s⁴] Σ f²
+    samples: float = 0.0  # that count
 
     def add(self, residual: JointResidual, decay: float) -> JointMisfit:
         """Return the sums with the samples of a residual, the former ones times `decay`."""
@@ -389,58 +375,49 @@ def _symmetric(P: np.ndarray) -> np.ndarray:
 class HeadingEstimate(NamedTuple):
     """The headings of k segments, at a knot or at m of them (m, …).
 
-    Parameters
-    ----------
-    errors, covariance : (k,) [rad] and (k, k) [rad²] of δ
-    segment_covariance : (k, k) [rad²] of the segments' headings near the start pose. δ begins at s − ε_z, by errors s
-        of the start pose and ε_z of the mount, and grows by the drift; a segment that hangs is off by δ + ε_z.
+    δ begins at s − ε_z, by errors s of the start pose and ε_z of the mount, and grows by the drift; a segment that
+    hangs is off by δ + ε_z.
     """
 
-    errors: np.ndarray
-    covariance: np.ndarray
-    segment_covariance: np.ndarray
+    errors: np.ndarray  # (k,) [rad] δ
+    covariance: np.ndarray  # (k, k) [rad²] of δ
+    segment_covariance: np.ndarray  # (k, k) [rad²] of the segments' headings near the start pose
 
 
-class StanceEstimator:
-    """Finds how well the person stood in the start pose, and the headings by that.
+def find_care(problem: HeadingProblem, x: np.ndarray, P: np.ndarray) -> float:
+    """Return the probability that the person took care in the start pose, by the state and its covariance.
 
-    The filter's start pose is that of the population. That the person took care is a second hypothesis: the headings of
-    the start pose have `CAREFUL_SHARE` of the standard deviation. Its likelihood follows in closed form from what the
-    filter knows of the errors s of the start pose, which are states. Only accelerations of joints tell that much.
-
-    Attributes
-    ----------
-    careful : probability of the second hypothesis
+    The filter's start pose is that of the population. With care, its headings have `CAREFUL_SHARE` of the standard
+    deviation. The likelihood of that follows in closed form from what the filter knows of the errors s of the start
+    pose, which are states. Only accelerations of joints tell that much.
     """
+    if not problem.pairs:
+        return 0.0
+    columns = problem.columns.start
+    s, information = x[columns], _information_by_care(problem)
+    spread = np.eye(len(s)) + information[:, None] * P[np.ix_(columns, columns)]
+    misfit = s @ np.linalg.solve(spread, information * s)
+    log_ratio = -len(s) * np.log(CAREFUL_SHARE) - 0.5 * (np.linalg.slogdet(spread)[1] + misfit)
+    return float(expit(logit(CAREFUL_PROBABILITY) + log_ratio))
 
-    def __init__(self, problem: HeadingProblem) -> None:
-        c = problem.columns
-        self._columns = np.concatenate([c.heading, c.mount, c.start])
-        self._information = (CAREFUL_SHARE**-2 - 1.0) / problem.start_var  # that care adds, of s
-        self.careful = self._before = CAREFUL_PROBABILITY if problem.pairs else 0.0
 
-    def assess(self, x: np.ndarray, P: np.ndarray) -> None:
-        """Find the probability of care by the state and its covariance."""
-        k = len(self._information)
-        s, P_ss = x[self._columns[2 * k :]], P[np.ix_(self._columns[2 * k :], self._columns[2 * k :])]
-        spread = np.eye(k) + self._information[:, None] * P_ss
-        misfit = s @ np.linalg.solve(spread, self._information * s)
-        log_ratio = -k * np.log(CAREFUL_SHARE) - 0.5 * (np.linalg.slogdet(spread)[1] + misfit)
-        self.careful = float(expit(logit(self._before) + log_ratio))
+def estimate_headings(problem: HeadingProblem, x: np.ndarray, P: np.ndarray, care: float) -> HeadingEstimate:
+    """Return the mean over both start poses, with care of this probability and without, and its covariance."""
+    columns, information, k = problem.columns, _information_by_care(problem), len(problem.names)
+    rows = np.concatenate([columns.heading, columns.mount])
+    by_start = P[:, columns.start]
+    spread = np.eye(k) + information[:, None] * by_start[columns.start]
+    gain = by_start[rows] @ np.linalg.solve(spread, np.diag(information))
+    change = -gain @ x[columns.start]
+    cov = _symmetric(P[np.ix_(rows, rows)] - care * gain @ by_start[rows].T)
+    cov += care * (1.0 - care) * np.outer(change, change)
+    of_headings, both = cov[:k, :k], cov[:k, k:]
+    return HeadingEstimate((x[rows] + care * change)[:k], of_headings, of_headings + cov[k:, k:] + both + both.T)
 
-    def estimate(self, x: np.ndarray, P: np.ndarray) -> HeadingEstimate:
-        """Return the mean over both hypotheses, and its covariance."""
-        k = len(self._information)
-        x, P = x[self._columns], P[np.ix_(self._columns, self._columns)]
-        by_start = P[:, 2 * k :]
-        spread = np.eye(k) + self._information[:, None] * by_start[2 * k :]
-        gain = by_start @ np.linalg.solve(spread, np.diag(self._information))
-        change, p = -gain @ x[2 * k :], self.careful
-        mean = x + p * change
-        cov = _symmetric(P - p * gain @ by_start.T) + p * (1.0 - p) * np.outer(change, change)
-        headings, mounts = slice(0, k), slice(k, 2 * k)
-        both = cov[headings, mounts]
-        return HeadingEstimate(mean[:k], cov[:k, :k], cov[:k, :k] + cov[mounts, mounts] + both + both.T)
+
+def _information_by_care(problem: HeadingProblem) -> np.ndarray:
+    """Return what care adds to the information (k,) [1/rad²] of the start pose."""
+    return np.asarray((CAREFUL_SHARE**-2 - 1.0) / problem.start_var)
 
 
 def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> tuple[HeadingEstimate, list[tuple[float, float]]]:
@@ -448,19 +425,19 @@ def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> tuple[HeadingEstim
 
     Return the headings at the knots, and the intervals [s] in which points were found to coincide.
     """
-    forward, stance = HeadingFilter(problem), StanceEstimator(problem)
+    forward = HeadingFilter(problem)
     filtered, changes = [], []
     for knot in knots:
         changes.append(forward.step(knot))
         filtered.append((forward.x, forward.P))
     x, P = filtered[-1]
-    stance.assess(x, P)
-    estimates = [stance.estimate(x, P)]
+    care = find_care(problem, x, P)
+    estimates = [estimate_headings(problem, x, P, care)]
     for i in range(len(knots) - 2, -1, -1):
         forward.x, forward.P = filtered[i]
         forward.predict(changes[i + 1])
         gain = np.linalg.solve(forward.P, forward.advance(filtered[i][1], changes[i + 1])).T
         x = filtered[i][0] + gain @ (x - forward.x)
         P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)
-        estimates.append(stance.estimate(x, P))
+        estimates.append(estimate_headings(problem, x, P, care))
     return HeadingEstimate(*(np.array(each[::-1]) for each in zip(*estimates, strict=True))), forward.clasps

@@ -38,51 +38,29 @@ AVERAGED_SAMPLES, CHIP_DELAY_STD = 0.5, 0.002
 
 @dataclass(frozen=True)
 class HeadingNoise:
-    """Standard deviations, power spectral densities and correlation times of the heading filter.
+    """Standard deviations, power spectral densities and correlation times of the heading filter: those of a person."""
 
-    The defaults are those of a person.
-
-    Parameters
-    ----------
-    drift_psd : [rad²/s] of the random walk of a heading in motion, in addition to its rate: scale errors, soft tissue
-    rate_std : [rad/s] of the rate at which a heading drifts, by other causes than its gyroscope's bias
-    rate_change_psd : [rad²/s³] of the random walk of that rate: a sensor warms up under its strap
-    joint_std, girdle_std : [rad] of the heading error of a joint's acceleration, and of that of a joint on a girdle:
-        soft tissue and a travelling shoulder follow the motion
-    joint_correlation_s : [s] of these two
-    acceleration_std : [m/s²] least misfit between the accelerations of a joint by its two sensors; the recent misfit
-        where that is larger
-    acceleration_correlation_s : [s] of the misfit
-    force_std, force_correlation_s : [m/s²], [s] of an error of specific force that is fixed in the sensor's frame: the
-        tilt error of an orientation filter in motion, a degree, times gravity
-    twist_std, twist_correlation_s : [rad], [s] of the rotation of a sensor about its segment's long axis by soft tissue
-    hinge_std, hinge_correlation_s : [rad], [s] of the other errors of the angle between a hinge's plane and the segment
-        below
-    axis_std, tilt_std : [rad] of a calibrated hinge's axis: its rotation about the long axis of the segment above, and
-        about the direction across both
-    range_std : [rad] of the limits of a hinge's range
-    slip_std : [m] of the gap between palms in a clasp that was found: a cup may be between them
-    closure_correlation_s : [s] of the residuals of a closure
-    """
-
-    drift_psd: float = float(np.deg2rad(0.12) ** 2)
-    rate_std: float = float(np.deg2rad(0.05))
-    rate_change_psd: float = float(np.deg2rad(0.1) ** 2 / 900.0)
+    drift_psd: float = float(np.deg2rad(0.12) ** 2)  # [rad²/s] of a heading in motion: scale errors, soft tissue
+    rate_std: float = float(np.deg2rad(0.05))  # [rad/s] at which a heading drifts, apart from its gyroscope's bias
+    rate_change_psd: float = float(np.deg2rad(0.1) ** 2 / 900.0)  # [rad²/s³] a sensor warms up under its strap
+    # [rad] of the heading by a joint's acceleration: soft tissue and a travelling shoulder follow the motion.
     joint_std: float = float(np.deg2rad(0.5))
     girdle_std: float = float(np.deg2rad(0.9))
     joint_correlation_s: float = 60.0
-    acceleration_std: float = 0.07
+    acceleration_std: float = 0.07  # [m/s²] least misfit of a joint's accelerations; the recent one where it is larger
     acceleration_correlation_s: float = 0.4
+    # [m/s²] fixed in the sensor's frame: the tilt error of an orientation filter in motion, a degree, times gravity.
     force_std: float = float(np.deg2rad(1.0) * 9.81)
     force_correlation_s: float = 20.0
-    twist_std: float = float(np.deg2rad(7.0))
+    twist_std: float = float(np.deg2rad(7.0))  # [rad] of a sensor about its segment's long axis by soft tissue
     twist_correlation_s: float = 4.0
-    hinge_std: float = float(np.deg2rad(4.0))
+    hinge_std: float = float(np.deg2rad(4.0))  # [rad] other errors between a hinge's plane and the segment below
     hinge_correlation_s: float = 5.0
+    # [rad] of a calibrated hinge's axis about the long axis of the segment above, and about the direction across both.
     axis_std: float = float(np.deg2rad(5.0))
     tilt_std: float = float(np.deg2rad(2.0))
-    range_std: float = float(np.deg2rad(10.0))
-    slip_std: float = 0.03
+    range_std: float = float(np.deg2rad(10.0))  # [rad] of the limits of a hinge's range
+    slip_std: float = 0.03  # [m] of the gap between palms in a clasp that was found: a cup may be between them
     closure_correlation_s: float = 20.0
 
 
@@ -152,43 +130,28 @@ class StateColumns(NamedTuple):
 
 @dataclass(frozen=True)
 class HeadingProblem:
-    """What observes the headings of a recording, and how well they are known at the start.
+    """What observes the headings of a recording, and how well they are known at the start."""
 
-    Parameters
-    ----------
-    names : k segments, in the order of δ
-    pairs, hinges : joints between two sensors
-    hinge_std : (h, 3) [rad] of each hinge's axis about the long axis of the segment above and across, as in
-        `HeadingNoise`, and of the angle between its plane and the segment below
-    closures : phase → points that coincide in it
-    phases : phase → its intervals [s]; causally they are marked as they begin and end
-    knot_s : [s] length of a knot
-    drift_psd : (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate
-    rate_std : (k,) [rad/s] of the drift rates at the start: of the gyroscopes' biases, or of measured orientations
-    start_var, mount_var : (k,) [rad²] of the headings at the end of the start pose, by the pose and by the mounts
-    start : what the filters know at the end of the start pose; None: as at the end of the first knot
-    delay_std : [s] by which an accelerometer is late against its gyroscope
-    causal : headings are corrected as samples come; a short clasp then counts as one observation
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # k segments, in the order of δ
     model: BodyModel
     subject: Subject
-    pairs: tuple[JointPair, ...]
+    pairs: tuple[JointPair, ...]  # joints between two sensors
     hinges: tuple[HingePlane, ...]
+    # (h, 3) [rad] of each hinge's axis about the long axis of the segment above and across, as in `HeadingNoise`, and
+    # of the angle between its plane and the segment below.
     hinge_std: np.ndarray
-    closures: Mapping[str, PointPair]
+    closures: Mapping[str, PointPair]  # phase → points that coincide in it
     noise: HeadingNoise
-    knot_s: float
+    knot_s: float  # [s] length of a knot
     samples_per_knot: int
-    drift_psd: np.ndarray
-    rate_std: np.ndarray
-    start_var: np.ndarray
-    mount_var: np.ndarray
-    delay_std: float
-    phases: Mapping[str, Intervals] = field(default_factory=dict)
-    start: FilterHeadings | None = None
-    causal: bool = False
+    drift_psd: np.ndarray  # (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate
+    rate_std: np.ndarray  # (k,) [rad/s] at the start: gyroscopes' biases, or drift of measured orientations
+    start_var: np.ndarray  # (k,) [rad²] of the headings at the end of the start pose, by the pose
+    mount_var: np.ndarray  # (k,) [rad²] the same by the mounts
+    delay_std: float  # [s] by which an accelerometer is late against its gyroscope
+    phases: Mapping[str, Intervals] = field(default_factory=dict)  # phase → its intervals [s]; causally none yet
+    start: FilterHeadings | None = None  # at the end of the start pose; None: as at the end of the first knot
+    causal: bool = False  # headings are corrected as samples come; a short clasp then counts as one observation
 
     @property
     def rate_hz(self) -> float:

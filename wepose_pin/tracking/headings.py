@@ -19,7 +19,7 @@ from .. import rotations
 from ..alignment import SegmentOrientations, StartFrames, compute_start_heading_var
 from ..observations.hinges import linearize_hinge
 from ..recording import OrientationSensor, Recording
-from .heading_filter import HeadingFilter, StanceEstimator, mask_intervals, smooth
+from .heading_filter import HeadingFilter, estimate_headings, find_care, mask_intervals, smooth
 from .heading_problem import FilterHeadings, HeadingProblem, Knot
 from .knots import E_Z, KnotReader, Samples, read_filter_headings, stack_samples
 
@@ -64,8 +64,10 @@ class HeadingCorrection(NamedTuple):
         scale = []
         for name, i in zip(names, rows, strict=True):
             variance = self._read(self.segment_covariance[:, i, i], time)
+            # As much as the heading is uncertain where the tilt is known may be shared with other segments.
+            own = np.linalg.det(segment_cov[name]) / np.linalg.det(segment_cov[name][:, :2, :2])
             with np.errstate(divide="ignore"):
-                scale.append(np.sqrt(np.minimum(1.0, find_conditional_heading_variance(segment_cov[name]) / variance)))
+                scale.append(np.sqrt(np.clip(own / variance, 0.0, 1.0)))
         return {
             (names[a], names[b]): scale[a] * scale[b] * self._read(self.segment_covariance[:, rows[a], rows[b]], time)
             for a, b in combinations(range(len(names)), 2)
@@ -161,21 +163,17 @@ class HeadingCorrector:
         for i, name in enumerate(self._problem.names):
             delta = errors[:, i]
             corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
-            orientation = orientations.orientation.get(name)
-            if orientation is not None and orientation.attitude_cov is not None:
-                R_VS = Rotation.from_quat(orientation.quat_VS)
-                with_heading = compute_heading_covariance(R_VS, orientation.attitude_cov)
-                start_var = compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames)
-                before = with_heading[:, 2] + start_var
-                variance = np.interp(chunk.time, knot_times, segment_cov[:, i, i])
-                # The filter alone may know the heading better; to it a correction is an error of that size.
-                variance = np.minimum(variance, before + delta**2)
-                gap = chunk.sensors[name].gap
-                if gap is not None:  # where the sensor is lost, neighbours do not tell where its segment is
-                    variance = np.where(gap, np.maximum(variance, before), variance)
-                R_WV = Rotation.from_rotvec([0.0, 0.0, orientations.heading_offset[name]])
-                with_heading = R_WV.apply(with_heading)
-                covariance[name] = replace_heading_variance(covariance[name], with_heading, before, variance)
+            filtered = orientations.orientation.get(name)
+            if filtered is not None and filtered.attitude_cov is not None:
+                known = np.interp(chunk.time, knot_times, segment_cov[:, i, i])
+                covariance[name] = correct_covariance(
+                    covariance[name],
+                    (filtered.quat_VS, filtered.attitude_cov),
+                    orientations.heading_offset[name],
+                    compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames),
+                    np.stack([known, np.full(len(delta), np.inf), delta**2], axis=1),
+                    chunk.sensors[name].gap,
+                )
         return replace(orientations, quat_WL=corrected, covariance_W=covariance)
 
     def summarize(self) -> HeadingCorrection:
@@ -233,7 +231,8 @@ class CausalHeadings:
         self._problem = problem = replace(problem, start=start)
         self.offset = np.array([orientations.heading_offset[name] for name in problem.names])
         self._reader = KnotReader(recording.rate_hz, orientations, problem)
-        self._filter, self._stance = HeadingFilter(problem), StanceEstimator(problem)
+        self._filter = HeadingFilter(problem)
+        self._care = find_care(problem, self._filter.x, self._filter.P)
         self._rate_hz, self._samples = recording.rate_hz, 0
         self._start_end = float(recording.time[-1])
         self._lead = min(round(SOLVE_SHARE * self._reader.size), self._reader.size - 1)
@@ -242,9 +241,8 @@ class CausalHeadings:
         self._begin, self._end, self._at_reset = np.zeros((3, len(problem.names)))
         self._measured = find_measured_headings(recording, problem.names)
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
-        self._knot_filters: FilterHeadings | None = None  # of the last complete knot
-        self._var_at_knot = np.zeros(len(problem.names))  # [rad²] of the filters, at the last knot that is applied
-        self._estimate = self._stance.estimate(self._filter.x, self._filter.P)
+        self._var_at_knot = np.zeros(len(problem.names))  # [rad²] of the filters, at the last knot that is solved
+        self._update_estimate()
         self.variance = self._find_variances()
         self._max_correction = np.zeros(len(problem.names))
         self._marked: dict[str, list[tuple[int, int | None]]] = {}  # phase → first sample, and the one after the last
@@ -285,7 +283,7 @@ class CausalHeadings:
 
     def close(self, filters: FilterHeadings, *, record: bool = False) -> None:
         """Close a complete knot; `filters` is after its last sample; `record`: keep the covariance for `summarize`."""
-        self._record, self._knot_filters = record, filters
+        self._record = record
         self._solving = self._solve(self._reader.take(), filters)
         if not self._lead:
             self._apply()
@@ -313,19 +311,22 @@ class CausalHeadings:
         self._filter.predict(self._filter.find_change(knot))
         yield
         yield from self._filter.update(knot)
-        self._stance.assess(self._filter.x, self._filter.P)
-        self._estimate = self._stance.estimate(self._filter.x, self._filter.P)
+        self._care = find_care(self._problem, self._filter.x, self._filter.P)
+        self._update_estimate()
+        self._var_at_knot = np.nan_to_num(filters.var)
         if self._record:
             self._history.append((self._start_end + knot.end, *self._estimate[1:]))
 
+    def _update_estimate(self) -> None:
+        self._estimate = estimate_headings(self._problem, self._filter.x, self._filter.P, self._care)
+
     def _apply(self) -> None:
         """Finish the last knot; its correction fades in from the next sample on."""
-        if self._solving is None or self._knot_filters is None:
+        if self._solving is None:
             return
         for _ in self._solving:
             pass
         self._solving = None
-        self._var_at_knot = np.nan_to_num(self._knot_filters.var)
         self._begin, self._end = self._end, self._estimate.errors.copy()
         if self._measured.any() and not self._corrects_measured:
             self._corrects_measured = exceed_uncertainty(self._end[None], self._estimate.covariance[None])
@@ -339,7 +340,7 @@ class CausalHeadings:
         error = heading_offset - self.offset
         error = error + 2.0 * np.pi * np.round((self._end - error) / (2.0 * np.pi))
         self._filter.reset(error)
-        self._estimate = self._stance.estimate(self._filter.x, self._filter.P)
+        self._update_estimate()
         self._corrects_measured = True
         self._begin = self._end = error
         self._at_reset = error
@@ -347,11 +348,7 @@ class CausalHeadings:
 
     def _find_variances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what `variance` is now."""
-        return (
-            np.diag(self._estimate.segment_covariance),
-            self._var_at_knot,
-            (self._end - self._at_reset) ** 2,
-        )
+        return np.diag(self._estimate.segment_covariance), self._var_at_knot, (self._end - self._at_reset) ** 2
 
     def summarize(self) -> HeadingCorrection:
         """Return what was observed and corrected so far, without residuals: they are not computed causally."""
@@ -389,39 +386,37 @@ def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:
     return bool((np.sum(errors * weighted, axis=1) > 1.0).any())
 
 
-def compute_heading_covariance(R_VS: Rotation, attitude_cov: np.ndarray) -> np.ndarray:
-    """Compute the covariance (n, 3) [rad²] of the heading with each axis of V, from that in S (n, 3, 3)."""
-    return np.asarray(R_VS.apply(np.einsum("nab,nb->na", attitude_cov, R_VS.inv().apply([0.0, 0.0, 1.0]))))
-
-
-def find_conditional_heading_variance(cov_W: np.ndarray) -> np.ndarray:
-    """Find the variance (n,) [rad²] of the heading where the tilt is known, of covariances (n, 3, 3) [rad²] in W.
-
-    As much of `cov_W` may be shared with other segments.
-    """
-    xx, xy, yy = cov_W[:, 0, 0], cov_W[:, 0, 1], cov_W[:, 1, 1]
-    xz, yz, zz = cov_W[:, 0, 2], cov_W[:, 1, 2], cov_W[:, 2, 2]
-    explained = (yy * xz**2 - 2.0 * xy * xz * yz + xx * yz**2) / (xx * yy - xy**2)
-    return np.asarray(np.maximum(zz - explained, 0.0))
-
-
-def replace_heading_variance(
-    cov_W: np.ndarray, filter_W: np.ndarray, filter_var: np.ndarray, heading_var: np.ndarray
+def correct_covariance(
+    cov_W: np.ndarray,
+    filtered: tuple[np.ndarray, np.ndarray],
+    heading_offset: float,
+    start_var: float,
+    variance: np.ndarray,
+    lost: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the covariances (n, 3, 3) [rad²] with another variance of the heading from filter and start pose.
+    """Return the covariances (n, 3, 3) [rad²] of a segment in W, `cov_W`, with the variance of its corrected heading.
 
     Variance from other sources, such as a mount's heading, is not observed by what neighbours share: it stays.
 
     Parameters
     ----------
-    cov_W : (n, 3, 3) of a segment in W
-    filter_W : (n, 3) the filter's covariance of the heading with each axis of W
-    filter_var, heading_var : (n,) the variance of the heading in `cov_W`, and the one that replaces it
+    filtered : of the sensor's filter, `quat_VS` (n, 4) xyzw and the covariance (n, 3, 3) [rad²] of its error, in S
+    heading_offset, start_var : ψ [rad], and its variance [rad²] by the start pose
+    variance : (n, 3) [rad²] as `CausalHeadings.variance`
+    lost : (n,) bool: the sensor is lost, and neighbours do not tell where its segment is
     """
-    std_ratio = np.sqrt(heading_var / filter_var)
-    removed = (1.0 - std_ratio)[:, None] * filter_W
+    R_VS, attitude_cov = Rotation.from_quat(filtered[0]), filtered[1]
+    with_heading_V = R_VS.apply(np.einsum("nab,nb->na", attitude_cov, R_VS.inv().apply(E_Z)))  # with each axis
+    alone = with_heading_V[:, 2] + start_var
+    known, at_knot, correction = variance.T
+    # The filter alone may know the heading better; to it a correction is an error of that size.
+    corrected = np.minimum(known + np.maximum(with_heading_V[:, 2] - at_knot, 0.0), alone + correction)
+    if lost is not None:
+        corrected = np.where(lost, np.maximum(corrected, alone), corrected)
+    with_heading_W = Rotation.from_rotvec([0.0, 0.0, heading_offset]).apply(with_heading_V)
+    removed = (1.0 - np.sqrt(corrected / alone))[:, None] * with_heading_W
     replaced = cov_W.copy()
     replaced[:, 2, :2] -= removed[:, :2]
     replaced[:, :2, 2] -= removed[:, :2]
-    replaced[:, 2, 2] += heading_var - filter_var
+    replaced[:, 2, 2] += corrected - alone
     return replaced

@@ -37,7 +37,7 @@ from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
 from .heading_problem import FilterHeadings, HeadingProblem
-from .headings import CausalHeadings, compute_heading_covariance, replace_heading_variance
+from .headings import CausalHeadings, correct_covariance
 from .knots import find_specific_force, read_filter_headings
 
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
@@ -355,15 +355,8 @@ class SegmentEstimator:
             self._first, self.names[i], self._subject, quat_WS, R_LS, attitude_cov, self._start_frames
         )
         if self.headings is not None:
-            R_VS = Rotation.from_quat(quat_VS)
-            R_WV = Rotation.from_rotvec([0.0, 0.0, self.heading_offset[i]])
-            with_heading = compute_heading_covariance(R_VS, attitude_cov)
-            start = compute_start_heading_var(self._first, self.names[i], self._subject, self._start_frames)
-            var = with_heading[:, 2]
-            grown = np.maximum(var - variance[:, 1], 0.0)
-            # The filter alone may know the heading better; to it a correction is an error of that size.
-            corrected = np.minimum(variance[:, 0] + grown, var + start + variance[:, 2])
-            cov = replace_heading_variance(cov, R_WV.apply(with_heading), var + start, corrected)
+            start_var = compute_start_heading_var(self._first, self.names[i], self._subject, self._start_frames)
+            cov = correct_covariance(cov, (quat_VS, attitude_cov), self.heading_offset[i], start_var, variance)
         if self._var_at_reset is not None and np.isfinite(self._var_at_reset[i]):
             var = compute_heading_variance(quat_VS, attitude_cov)
             grown = np.maximum(0.0, var - self._var_at_reset[i])
