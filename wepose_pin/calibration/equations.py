@@ -35,7 +35,7 @@ from ..body.girdle import PARAMETERS
 from ..observations.directions import Level, Pointing
 from ..observations.hinges import HingePlane
 from ..observations.paths import BodySymbols, GirdleTerm, express_covariance, express_path
-from ..observations.symbols import about_z, inverse, product, rotate, small_rotation
+from ..observations.symbols import about_z, product, rotate_back, small_rotation
 from .conditions import Constraint, Loop, Moving
 
 HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
@@ -154,7 +154,7 @@ def _orient_segments(layout: Layout, x: ca.SX, data: ca.SX) -> dict[str, ca.SX]:
         quat = product(product(quat, about_z(-heading)), _start_rotation(layout, x, name))
         if name in layout.soft:
             A = ca.reshape(x[layout.soft_tissue[layout.soft.index(name)]], 3, 3)
-            quat = product(quat, small_rotation(A @ (rotate(inverse(quat), up) - up)))
+            quat = product(quat, small_rotation(A @ (rotate_back(quat, up) - up)))
         quat_WL[name] = quat
     return quat_WL
 

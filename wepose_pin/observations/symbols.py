@@ -15,11 +15,6 @@ def product(a: Any, b: Any) -> Any:
     return ca.vertcat(*product_terms(*ca.vertsplit(a), *ca.vertsplit(b)))  # type: ignore[no-untyped-call]
 
 
-def inverse(quat: Any) -> Any:
-    """Return the unit quaternion (4,) of the inverse rotation."""
-    return ca.vertcat(-quat[:3], quat[3])
-
-
 def rotate(quat: Any, v: Any) -> Any:
     """Return ``R v`` (3,) of a unit quaternion (4,) and a vector (3,)."""
     u, v = quat[:3], ca.vertcat(*v) if isinstance(v, tuple) else v
@@ -29,7 +24,7 @@ def rotate(quat: Any, v: Any) -> Any:
 
 def rotate_back(quat: Any, v: Any) -> Any:
     """Return ``Rᵀ v`` (3,) of a unit quaternion (4,) and a vector (3,)."""
-    return rotate(inverse(quat), v)
+    return rotate(ca.vertcat(-quat[:3], quat[3]), v)
 
 
 def about_z(angle: Any) -> Any:

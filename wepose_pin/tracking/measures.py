@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -44,8 +44,7 @@ def measure_signal(
 
     Parameters
     ----------
-    recording : with all samples
-    static : (n,) bool of them
+    recording, static : with all samples, static (n,) bool
     every : samples that are shown as one: as their fastest, and as what any of them is, or all are static
     """
     sensor = recording.sensors[name]
@@ -134,21 +133,15 @@ def compute_joint_heading_stds(
     From the body outwards: all of a limb before the next. `part` "drift": without start pose and soft tissue.
     """
     stds = {}
-    for segment in _list_outwards(model.parents, None):
+    segments = [segment for segment, above in model.parents.items() if above is None]
+    while segments:
+        segment = segments.pop(0)
+        segments = [*(each for each, above in model.parents.items() if above == segment), *segments]
         above = model.parents[segment]
         if above is not None and {above, segment} <= set(budgets):
-            stds[model.table.joint_name(segment)] = np.hypot(
-                getattr(budgets[above], part), getattr(budgets[segment], part)
-            )
+            both = (getattr(budgets[name], part) for name in (above, segment))
+            stds[model.table.joint_name(segment)] = np.hypot(*both)
     return stds
-
-
-def _list_outwards(parents: Mapping[str, str | None], above: str | None) -> Iterator[str]:
-    """The segments that hang on `above`, each followed by those that hang on it."""
-    for segment, parent in parents.items():
-        if parent == above:
-            yield segment
-            yield from _list_outwards(parents, segment)
 
 
 # Hinges ---------------------------------------------------------------------------------------------------------------
@@ -239,28 +232,16 @@ def measure_tips(pose: Pose, rate_hz: float, table: BodyTable) -> dict[str, TipM
 
 @dataclass(frozen=True)
 class Measures:
-    """All measures of a tracked recording.
+    """All measures of a tracked recording."""
 
-    Parameters
-    ----------
-    samples : of the recording
-    rate_hz : of its samples
-    steps_ms : shortest and longest step between samples
-    signals : sensor → its signal
-    budgets : segment → the uncertainty of its heading
-    hinges : name → its motion
-    tips : point whose path is drawn → its motion
-    error_budget : as `ErrorBudget.summarize`
-    """
-
-    samples: int
-    rate_hz: float
-    steps_ms: tuple[float, float]
-    signals: Mapping[str, Signal]
-    budgets: Mapping[str, Budget]
+    samples: int  # of the recording
+    rate_hz: float  # of its samples
+    steps_ms: tuple[float, float]  # shortest and longest step between samples
+    signals: Mapping[str, Signal]  # of each sensor
+    budgets: Mapping[str, Budget]  # of each segment's heading
     hinges: Mapping[str, HingeMotion]
-    tips: Mapping[str, TipMotion]
-    error_budget: Mapping[str, Mapping[str, float]]
+    tips: Mapping[str, TipMotion]  # of each point whose path is drawn
+    error_budget: Mapping[str, Mapping[str, float]]  # as `ErrorBudget.summarize`
 
 
 def measure(
