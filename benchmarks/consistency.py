@@ -28,7 +28,7 @@ from wepose_pin.simulation import (
     simulate,
     simulate_person,
 )
-from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.tracking import TrackResult, track
 
 FIRST_SEED = 5000  # of persons that no other measurement or test draws
 CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand")
@@ -107,7 +107,7 @@ def compare_lengths(subject: Subject, person: Person) -> dict[str, Any]:
     return {"lengths": lengths, "whole arms": arms}
 
 
-def _compare_pose(tracked: TrackedRecording, simulation: Simulation) -> dict[str, Any]:
+def _compare_pose(tracked: TrackResult, simulation: Simulation) -> dict[str, Any]:
     truth = simulation.truth_facing_torso()
     quat_WL, true_points = truth.quat_WL, truth.points
     begin, end = simulation.phases["tasks" if "tasks" in simulation.phases else "circles"][0]

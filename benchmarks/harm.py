@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, PRESETS, ImuNoise, Simulation, simulate, simulate_activity, simulate_person
 from wepose_pin.simulation.activities import ACTIVITIES
-from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.tracking import TrackResult, track
 
 from .tables import Column, Section, Table
 
@@ -119,7 +119,7 @@ def simulate_case(case: Case, seed: int) -> Simulation:
     )
 
 
-def find_heading_errors(simulation: Simulation, tracked: TrackedRecording) -> tuple[np.ndarray, np.ndarray]:
+def find_heading_errors(simulation: Simulation, tracked: TrackResult) -> tuple[np.ndarray, np.ndarray]:
     """Find the errors of all segments' headings over time and their stated standard deviations, both (m,) [rad]."""
     time = tracked.time
     step = max(1, round(EVERY_S * tracked.recording.rate_hz))

@@ -13,7 +13,7 @@ from wepose_pin.recording import Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, PEOPLE_PRESET, Imperfections, Simulation, simulate, simulate_person
 from wepose_pin.simulation.sequence import TASKS
-from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.tracking import TrackResult, track
 
 from .free_motion import FreeMotion
 from .tables import Column, Section, Table
@@ -85,7 +85,7 @@ def simulate_free_motion(seed: int, preset: Imperfections, seconds: float) -> Si
     )
 
 
-def track_in_all_ways(recording: Recording) -> dict[str, TrackedRecording]:
+def track_in_all_ways(recording: Recording) -> dict[str, TrackResult]:
     """Track a recording with its start phase alone: in open loop, and with headings corrected offline and causally."""
     recording = replace(recording, phases={"start": recording.phases["start"]})
     return {
@@ -95,7 +95,7 @@ def track_in_all_ways(recording: Recording) -> dict[str, TrackedRecording]:
     }
 
 
-def compare_headings(simulation: Simulation, tracked: TrackedRecording) -> dict[str, dict[str, float]]:
+def compare_headings(simulation: Simulation, tracked: TrackResult) -> dict[str, dict[str, float]]:
     """Each segment against its neighbour: rms of the heading [deg] of sensor and segment, and of error over std."""
     time = tracked.time
     rows = np.flatnonzero(time > UNSCORED_S)[::EVERY]

@@ -8,10 +8,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.alignment import SegmentOrientations
 from wepose_pin.body.subject import Subject
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import Simulation
+from wepose_pin.tracking.segment_orientations import SegmentOrientations, TrackOptions
 from wepose_pin.tracking.segments import SegmentEstimator
 
 G = 9.81
@@ -30,8 +30,8 @@ SUBJECT = {
 
 
 def estimate_segments(recording: Recording, subject: Subject | None = None, **options: Any) -> SegmentOrientations:
-    """Segment orientations of a whole recording from the N-pose; options and errors as of `SegmentEstimator`."""
-    return SegmentEstimator(subject, **options).push(recording)
+    """Segment orientations of a whole recording from the N-pose, by options of `TrackOptions`."""
+    return SegmentEstimator(subject, TrackOptions(**options)).push(recording)
 
 
 def within(sim: Simulation, *phases: str) -> np.ndarray:

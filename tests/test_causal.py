@@ -16,7 +16,7 @@ from wepose_pin.body.subject import Subject, mount_rows, population_subject
 from wepose_pin.errors import BadOption, BadPhase
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import Simulation
-from wepose_pin.tracking import TrackedRecording, Tracker, TrackOptions, track
+from wepose_pin.tracking import Tracker, TrackOptions, TrackResult, track
 from wepose_pin.tracking.segments import SegmentEstimator
 from wepose_pin.tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, stack_ticks
 
@@ -33,7 +33,7 @@ def first(recording: Recording, n: int, begin: int = 0) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def whole(recording: Recording) -> TrackedRecording:
+def whole(recording: Recording) -> TrackResult:
     return track(recording, causal=True)
 
 
@@ -161,7 +161,7 @@ def test_causal_chunks_put_together_are_the_whole(recording: Recording) -> None:
         assert table.equals(build_pose_table(whole.pose, covariance=True))
 
 
-def test_chunks_and_samples_in_turn_give_the_bits_of_the_whole(recording: Recording, whole: TrackedRecording) -> None:
+def test_chunks_and_samples_in_turn_give_the_bits_of_the_whole(recording: Recording, whole: TrackResult) -> None:
     estimator, begin = started(recording)
     gyro, accel = columns(recording)
     stepped = np.array([estimator.step(gyro[k], accel[k]).copy() for k in range(begin, begin + 777)])
@@ -172,14 +172,14 @@ def test_chunks_and_samples_in_turn_give_the_bits_of_the_whole(recording: Record
         assert np.array_equal(np.concatenate(parts), whole.quat_WL[name]), name
 
 
-def test_what_comes_later_changes_nothing(recording: Recording, whole: TrackedRecording) -> None:
+def test_what_comes_later_changes_nothing(recording: Recording, whole: TrackResult) -> None:
     part = track(first(recording, 2500), causal=True)
     for name, quat in part.quat_WL.items():
         assert np.array_equal(quat, whole.quat_WL[name][: len(quat)])
         assert np.array_equal(part.pose.segment_cov[name], whole.pose.segment_cov[name][: len(quat)])
 
 
-def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording, whole: TrackedRecording) -> None:
+def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording, whole: TrackResult) -> None:
     begin = recording.span(recording.phases["start"][0]).start
     assert begin > 0
     part = track(first(recording, len(recording), begin), causal=True)
@@ -237,8 +237,8 @@ def test_the_detector_finds_the_first_stillness_and_says_who_moves() -> None:
     gyro = 0.002 * rng.standard_normal((n, 3, 3))
     gyro[:400, 1] += 2.0 * np.sin(np.arange(400) / 10.0)[:, None]
     gyro[600, 2] = np.nan
-    detector = StartPoseDetector(rate, 3)
-    states = [detector.push(tick) for tick in gyro]
+    detector = StartPoseDetector(rate, np.zeros(3, dtype=bool))
+    states = [detector.push(tick, np.zeros((3, 3))) for tick in gyro]
     assert states[50] == "moved"
     assert detector.moving == (1,)
     assert "start_pose" in states[520:600]
@@ -250,11 +250,11 @@ def test_the_detector_finds_the_first_stillness_and_says_who_moves() -> None:
 
 def test_a_slow_steady_turn_is_no_stillness() -> None:
     gyro = np.full((1000, 1, 3), np.deg2rad(6.0))
-    detector = StartPoseDetector(100.0, 1)
-    assert all(detector.push(tick) != "ready" for tick in gyro)
+    detector = StartPoseDetector(100.0, np.zeros(1, dtype=bool))
+    assert all(detector.push(tick, np.zeros((1, 3))) != "ready" for tick in gyro)
 
 
-def test_without_a_named_start_pose_it_is_found(recording: Recording, whole: TrackedRecording) -> None:
+def test_without_a_named_start_pose_it_is_found(recording: Recording, whole: TrackResult) -> None:
     tracked = track(replace(recording, phases={}), causal=True)
     named = whole
     assert tracked.time[0] == pytest.approx(recording.time[0] + START_POSE_HOLD_S, abs=0.5)

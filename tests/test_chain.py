@@ -92,7 +92,7 @@ def test_sensors_on_all_links_give_all_joints(urdf: Path) -> None:
     assert list(tracked.joints) == list(UR5)
     for k, value in enumerate(tracked.joints.values()):
         assert np.abs(value - q[:, k]).max() < np.deg2rad(1.0)
-    residual = tracked.orientation_residual()
+    residual = tracked.compute_orientation_residuals()
     assert set(residual) == set(recording.sensors)
     assert max(rms_deg(angle) for angle in residual.values()) < 0.5
 
@@ -103,7 +103,7 @@ def test_a_link_may_have_the_name_of_its_fixed_joint(urdf: Path, tmp_path: Path)
     (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
     recording, _ = made(tmp_path / "arm.urdf", ["forearm_link", "tool"], 8.0)
     tracked = track(recording, model=tmp_path / "arm.urdf")
-    assert max(rms_deg(angle) for angle in tracked.orientation_residual().values()) < 0.5
+    assert max(rms_deg(angle) for angle in tracked.compute_orientation_residuals().values()) < 0.5
     assert set(tracked.quat_WL) == {"forearm_link", "tool"}
 
 

@@ -24,9 +24,9 @@ from wepose_pin.report import render_track_report
 from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.tracking import (
     SummaryAccumulator,
-    TrackedRecording,
     Tracker,
     TrackOptions,
+    TrackResult,
     TrackSummary,
     summarize,
     track,
@@ -63,11 +63,11 @@ def written(folder: Path, recording: Recording) -> Path:
     return folder
 
 
-def joined(chunks: list[TrackedRecording]) -> pl.DataFrame:
+def joined(chunks: list[TrackResult]) -> pl.DataFrame:
     return pl.concat([build_pose_table(chunk.pose, covariance=True) for chunk in chunks])
 
 
-def summarize_chunks(recording: Recording, chunks: list[TrackedRecording]) -> TrackSummary:
+def summarize_chunks(recording: Recording, chunks: list[TrackResult]) -> TrackSummary:
     accumulator = SummaryAccumulator(recording)
     for chunk in chunks:
         accumulator.add(chunk)

@@ -18,10 +18,10 @@ from arms import JOINTS, write_arm
 from scipy.spatial.transform import Rotation
 from test_export import a_pose, write_folder
 
-from wepose_pin.body.kinematics import PosedBody
 from wepose_pin.body.subject import population_subject
 from wepose_pin.commands import main
 from wepose_pin.errors import WeposeError, WrongOption
+from wepose_pin.tracking import TrackResult
 from wepose_pin.writers.export import export
 from wepose_pin.writers.joint_motion import (
     JointMotion,
@@ -336,6 +336,6 @@ def test_a_person_is_no_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert [path.name for path in tmp_path.iterdir()] == ["r"]
 
 
-def load_result_of(folder: Path) -> PosedBody:
+def load_result_of(folder: Path) -> TrackResult:
     pose, model, _ = read_result(folder)
-    return PosedBody("made", pose, model, population_subject())
+    return TrackResult("made", pose, model, population_subject())

@@ -331,7 +331,7 @@ def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simul
     assert "left_upper_arm" in text
     (tmp_path / "result").mkdir()
     tracked = track(recording, person.prior)
-    write_result(tmp_path / "result", tracked, summarize(tracked), phases=recording.phases)
+    write_result(tmp_path / "result", tracked, summarize(tracked))
     text = info(capsys, tmp_path / "result")
     assert "a result of `wepose track`" in text
     assert json.loads((tmp_path / "result" / "summary.json").read_text())["recording"] in text

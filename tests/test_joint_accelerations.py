@@ -15,7 +15,7 @@ from wepose_pin.observations.joint_accelerations import JointPair, linearize_joi
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
-from wepose_pin.tracking import TrackedRecording, summarize, track
+from wepose_pin.tracking import TrackResult, summarize, track
 from wepose_pin.tracking.heading_filter import HeadingFilter
 from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, Knot
 from wepose_pin.tracking.knots import JointAccelerationFilter
@@ -42,9 +42,7 @@ def biased(simulation: Simulation, deg_s: float) -> Recording:
     return replace(recording, sensors={**recording.sensors, "right_forearm": replace(sensor, gyro_S=gyro_S)})
 
 
-def heading_errors(
-    simulation: Simulation, tracked: TrackedRecording, from_s: float
-) -> dict[tuple[str, str], np.ndarray]:
+def heading_errors(simulation: Simulation, tracked: TrackResult, from_s: float) -> dict[tuple[str, str], np.ndarray]:
     """Heading [deg] of each sensor's world of the right arm against its neighbour's."""
     rows = np.flatnonzero(tracked.time > from_s)[::20]
     at = np.searchsorted(simulation.time, tracked.time[rows] - 1e-9)

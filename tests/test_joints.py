@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.validation.real import RING_SEGMENTS, assume_noise, register_ring
 from wepose_pin import rotations
-from wepose_pin.alignment import compute_heading_offset
+from wepose_pin.body.mounts import compute_heading_offset
 from wepose_pin.calibration import calibrate, problem
 from wepose_pin.calibration.joints import (
     MAX_STD,

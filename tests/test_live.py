@@ -30,7 +30,7 @@ from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.arrivals import Samples
 from wepose_pin.recording.limits import STANDARD_GRAVITY
 from wepose_pin.simulation import Simulation
-from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.tracking import TrackResult, track
 from wepose_pin.writers.live_log import LiveLog
 
 
@@ -334,7 +334,7 @@ def test_outputs_get_the_newest_pose_with_its_points(recording: Recording, tmp_p
             np.testing.assert_allclose(pose.points[i], causal.points[name][k], atol=1e-12)
 
 
-def is_told_by_a_neighbour(quat_WL: np.ndarray, clean: TrackedRecording, name: str) -> bool:
+def is_told_by_a_neighbour(quat_WL: np.ndarray, clean: TrackResult, name: str) -> bool:
     """Whether orientations (n, 4) have the tilt of the clean ones, and a heading within three of its deviations.
 
     Neighbours tell each other their headings, so a hurt one tells the others less.

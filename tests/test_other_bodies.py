@@ -22,7 +22,7 @@ from wepose_pin.readers.propose import Wearer
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording
 from wepose_pin.report import render_track_report
 from wepose_pin.report.viewer import FLOOR_Z, find_floor, pose_html
-from wepose_pin.tracking import TrackedRecording, summarize, track
+from wepose_pin.tracking import TrackResult, summarize, track
 from wepose_pin.tracking.measures import measure_hinge, measure_tips
 from wepose_pin.writers.bvh import write_bvh
 from wepose_pin.writers.export import export
@@ -132,7 +132,7 @@ def squats(time: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 @pytest.fixture(scope="module")
-def tracked(body: BodyModel) -> TrackedRecording:
+def tracked(body: BodyModel) -> TrackResult:
     time = np.arange(0.0, 20.0, 0.02)
     sensors: Mapping[str, OrientationSensor] = {
         name: OrientationSensor(quat_VS=quat, stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]))
@@ -141,7 +141,7 @@ def tracked(body: BodyModel) -> TrackedRecording:
     return track(Recording("squats", time, 50.0, sensors, phases={"start": ((0.5, 3.5),)}), model=body)
 
 
-def test_knees_bend_forwards_and_toes_are_seen_from_the_hips(tracked: TrackedRecording) -> None:
+def test_knees_bend_forwards_and_toes_are_seen_from_the_hips(tracked: TrackResult) -> None:
     flexion, _ = squats(tracked.time)
     assert find_floor(tracked.model) == pytest.approx(-THIGH - SHANK)
     table = tracked.model.table
@@ -158,7 +158,7 @@ def test_knees_bend_forwards_and_toes_are_seen_from_the_hips(tracked: TrackedRec
     np.testing.assert_allclose(tips["right_toe"].reach[deep], expected, atol=1e-6)
 
 
-def test_its_report_has_its_words(tracked: TrackedRecording) -> None:
+def test_its_report_has_its_words(tracked: TrackResult) -> None:
     """From gyroscopes and accelerometers, so that the page has all its sections."""
     rng = np.random.default_rng(4)
     sensors = {}
@@ -187,7 +187,7 @@ def test_its_report_has_its_words(tracked: TrackedRecording) -> None:
     )
 
 
-def test_its_result_is_read_exported_and_evaluated(tracked: TrackedRecording, tmp_path: Path) -> None:
+def test_its_result_is_read_exported_and_evaluated(tracked: TrackResult, tmp_path: Path) -> None:
     folder = tmp_path / "result"
     folder.mkdir()
     write_result(folder, tracked, summarize(tracked))
@@ -206,7 +206,7 @@ def test_its_result_is_read_exported_and_evaluated(tracked: TrackedRecording, tm
     assert max(error.worst for error in errors.position_on_limb.values()) < 0.01
 
 
-def test_a_point_is_lost_where_a_segment_on_its_way_is(tracked: TrackedRecording) -> None:
+def test_a_point_is_lost_where_a_segment_on_its_way_is(tracked: TrackResult) -> None:
     lost = np.zeros(len(tracked.time), dtype=bool)
     lost[100:200] = True
     gaps = Pose(tracked.time, tracked.quat_WL, tracked.points, gap={"left_shank": lost})

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.commands import main
 from wepose_pin.recording import ImuSensor, Recording, check_recording, compute_mount
 from wepose_pin.report import render_track_report
-from wepose_pin.tracking import TrackedRecording, summarize, track
+from wepose_pin.tracking import TrackResult, summarize, track
 from wepose_pin.writers import write_session
 
 RESULT = {"pose.parquet", "subject.toml", "subject.urdf", "summary.json"}
@@ -55,7 +55,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def pose() -> TrackedRecording:
+def pose() -> TrackResult:
     return track(recorded(ARM))
 
 
@@ -107,7 +107,7 @@ def nowhere(values: np.ndarray, rows: slice) -> np.ndarray:
 
 @pytest.mark.parametrize("rows", [slice(None), slice(0, 300), slice(300, None), slice(1, None), slice(None, None, 2)])
 @pytest.mark.parametrize("segments", ["arm", "all"])
-def test_a_report_where_segments_are_not_known(pose: TrackedRecording, rows: slice, segments: str) -> None:
+def test_a_report_where_segments_are_not_known(pose: TrackResult, rows: slice, segments: str) -> None:
     """No filter should give NaN undeclared; where one does, the report still stands."""
     lost = [name for name in pose.quat_WL if segments == "all" or name.startswith("left")]
     changed = replace(

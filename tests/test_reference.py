@@ -300,7 +300,7 @@ def result(person: Person, simulation: Simulation, tmp_path_factory: pytest.Temp
     recording = simulation.recording("made").cut(slice(0, 4500))
     recording = replace(recording, phases={"start": recording.phases["start"]})
     tracked = track(recording, person.prior)
-    write_result(folder, tracked, summarize(tracked), phases=recording.phases)
+    write_result(folder, tracked, summarize(tracked))
     return folder
 
 

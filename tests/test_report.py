@@ -17,9 +17,9 @@ from wepose_pin.recording import Recording
 from wepose_pin.report import render_calibration_report
 from wepose_pin.report.words import plus_minus
 from wepose_pin.simulation import MILD_PRESET, simulate, simulate_person
-from wepose_pin.tracking import TrackedRecording, track
+from wepose_pin.tracking import TrackResult, track
 
-Made = tuple[Calibration, Recording, TrackedRecording]
+Made = tuple[Calibration, Recording, TrackResult]
 UNCERTAIN = Diagnostic("length-uncertain", WARNING, "left_upper_arm", 0.013, 0.010)
 
 

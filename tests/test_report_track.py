@@ -26,7 +26,7 @@ from wepose_pin.recording.plausibility import find_cut_off
 from wepose_pin.report import render_track_report
 from wepose_pin.report.figures import COLUMNS, envelope
 from wepose_pin.simulation import Simulation, simulate, simulate_person
-from wepose_pin.tracking import TrackedRecording, TrackOptions, summarize, track
+from wepose_pin.tracking import TrackOptions, TrackResult, summarize, track
 from wepose_pin.tracking.measures import (
     compute_heading_uncertainties,
     compute_joint_heading_stds,
@@ -47,12 +47,12 @@ SECTIONS = [
 
 
 @pytest.fixture(scope="module")
-def pose(simulation: Simulation) -> TrackedRecording:
+def pose(simulation: Simulation) -> TrackResult:
     return track(simulation.recording("anna <3"))
 
 
 @pytest.fixture(scope="module")
-def page(pose: TrackedRecording) -> str:
+def page(pose: TrackResult) -> str:
     return render_track_report(summarize(pose))
 
 
@@ -60,12 +60,12 @@ def changed(recording: Recording, name: str, **signals: np.ndarray) -> Recording
     return replace(recording, sensors={**recording.sensors, name: replace(recording.sensors[name], **signals)})
 
 
-def with_pose(tracked: TrackedRecording, **changes: Any) -> TrackedRecording:
+def with_pose(tracked: TrackResult, **changes: Any) -> TrackResult:
     """The same with another pose."""
     return replace(tracked, pose=replace(tracked.pose, **changes))
 
 
-def the(code: str, pose: TrackedRecording, place: str | None = None) -> Diagnostic:
+def the(code: str, pose: TrackResult, place: str | None = None) -> Diagnostic:
     """The one diagnostic of that code, at that place."""
     diagnostics = summarize(pose).diagnostics
     matching = [each for each in diagnostics if each.code == code and place in (None, each.place)]
@@ -85,7 +85,7 @@ def test_it_has_its_sections_and_at_most_five_figures_each_with_a_caption(page: 
     assert "anna &lt;3" in page
 
 
-def test_it_begins_with_what_can_be_relied_on(page: str, pose: TrackedRecording) -> None:
+def test_it_begins_with_what_can_be_relied_on(page: str, pose: TrackResult) -> None:
     """The usual ± of elbows and hands, and of what is least certain; the worst instant stands in the tables."""
     since = pose.time >= pose.segments.start[1]
     hands = max(float(np.median(compute_axis_std(pose.pose.point_cov[name])[since])) for name in POINTS)
@@ -99,7 +99,7 @@ def test_it_begins_with_what_can_be_relied_on(page: str, pose: TrackedRecording)
     assert found.end() < least.start() < text.index("What to know")
 
 
-def test_it_gives_the_sensors_and_joints_in_numbers(page: str, pose: TrackedRecording) -> None:
+def test_it_gives_the_sensors_and_joints_in_numbers(page: str, pose: TrackResult) -> None:
     table = rows(page)
     for name, sensor in pose.recording.sensors.items():
         cells = [cell for row in table if row[0] == name.replace("_", " ") for cell in row]
@@ -112,9 +112,9 @@ def test_it_gives_the_sensors_and_joints_in_numbers(page: str, pose: TrackedReco
     assert ["right elbow", f"{np.median(elbow):.1f}°", f"{elbow.max():.1f}°"] in [row[:3] for row in table]
 
 
-def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedRecording, page: str) -> None:
+def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackResult, page: str) -> None:
     guessed = Diagnostic("start-pose-guessed", WARNING, facts={"start": 0.5, "end": 2.5})
-    warned = replace(pose, segments=replace(pose.segments, diagnostics=(guessed,)))
+    warned = replace(pose, source=replace(pose.segments, diagnostics=(guessed,)))
     text = without_frame(render_track_report(summarize(warned)))
     assert '<section class="banner poor">' in text
     first = text.index(render(guessed).what)
@@ -123,7 +123,7 @@ def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackedReco
     assert "of the population prior" in text_of(page)
 
 
-def test_a_known_person_and_nothing_to_say(pose: TrackedRecording) -> None:
+def test_a_known_person_and_nothing_to_say(pose: TrackResult) -> None:
     quiet = replace(pose, subject=replace(pose.subject, name="anna", note=""))
     assert summarize(quiet).diagnostics == ()
     assert "No warnings." in text_of(render_track_report(summarize(quiet)))
@@ -134,7 +134,7 @@ def test_it_opens_offline_and_has_a_dark_side(page: str) -> None:
     assert "@media screen and (prefers-color-scheme: dark)" in page
 
 
-def test_equal_arguments_give_equal_text_and_a_ready_view_is_taken(pose: TrackedRecording, page: str) -> None:
+def test_equal_arguments_give_equal_text_and_a_ready_view_is_taken(pose: TrackResult, page: str) -> None:
     assert render_track_report(summarize(pose)) == page
     assert 'srcdoc="&lt;p&gt;mine&lt;/p&gt;"' in render_track_report(summarize(pose), view="<p>mine</p>")
 
@@ -157,7 +157,7 @@ def test_without_a_covariance_it_says_so(simulation: Simulation) -> None:
     assert "± nan" not in page
 
 
-def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackedRecording) -> None:
+def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackResult) -> None:
     recording = simulation.recording("ready")
     sensors = {
         name: OrientationSensor(quat_VS=pose.quat_WL[name]) for name in ("torso", "right_upper_arm", "right_forearm")
@@ -202,7 +202,7 @@ def test_motion_beyond_the_range(simulation: Simulation) -> None:
     known = Diagnostic("signal-saturated", WARNING, "right_forearm", 0.4, facts={"variant": "gyro", "range": 2.1})
     assert [
         each
-        for each in summarize(replace(pose, segments=replace(pose.segments, diagnostics=(known,)))).diagnostics
+        for each in summarize(replace(pose, source=replace(pose.segments, diagnostics=(known,)))).diagnostics
         if each.code == known.code
     ] == [known]  # the reader has said it
 
@@ -239,38 +239,41 @@ def test_gravity_bias_and_stamps(simulation: Simulation) -> None:
     drifted = ours._replace(
         gyro_bias=ours.gyro_bias + np.linspace(0.0, np.deg2rad(0.5), len(time))[:, None] * [1, 0, 0]
     )
-    warm = replace(pose, segments=replace(pose.segments, orientation={**pose.segments.orientation, "torso": drifted}))
+    warm = replace(pose, source=replace(pose.segments, orientation={**pose.segments.orientation, "torso": drifted}))
     assert the("gyro-bias-changed", warm).value == pytest.approx(np.deg2rad(0.5), abs=np.deg2rad(0.1))
 
 
-def test_a_person_who_never_rests(pose: TrackedRecording) -> None:
+def test_a_person_who_never_rests(pose: TrackResult) -> None:
     restless = {name: of._replace(static=np.zeros_like(of.static)) for name, of in pose.segments.orientation.items()}
-    never = replace(pose, segments=replace(pose.segments, orientation=restless))
+    never = replace(pose, source=replace(pose.segments, orientation=restless))
     for method, severity in (("amekf", INFO), ("smekf", WARNING)):
         rare = [
             d
-            for d in summarize(replace(never, options=TrackOptions(method))).diagnostics
+            for d in summarize(replace(never, source=replace(never.segments, options=TrackOptions(method)))).diagnostics
             if d.code == "static-phases-rare"
         ]
         assert [d.place for d in rare] == list(restless)
         assert {d.severity for d in rare} == {severity}
 
 
-def test_headings_that_may_be_far_off(pose: TrackedRecording) -> None:
+def test_headings_that_may_be_far_off(pose: TrackResult) -> None:
     drifting = {
         name: of._replace(attitude_cov=100.0 * of.attitude_cov) for name, of in pose.segments.orientation.items()
     }
-    wide = replace(pose, correction=None, segments=replace(pose.segments, orientation=drifting))
+    wide = replace(pose, correction=None, source=replace(pose.segments, orientation=drifting))
     uncertain = [d for d in summarize(wide).diagnostics if d.code == "heading-uncertain"]
     assert {d.place for d in uncertain} == {"left_shoulder", "left_elbow", "right_shoulder", "right_elbow"}
     assert {d.severity for d in uncertain} == {WARNING}
     assert "which correct the headings as the joints move" in render(uncertain[0]).do
     assert [d.value for d in uncertain] == sorted((d.value for d in uncertain), reverse=True)  # type: ignore[type-var]
     assert len(compute_joint_heading_stds(compute_heading_uncertainties(wide), wide.model)) == 4
-    assert the("method-needs-static", replace(wide, options=TrackOptions("smekf"))).severity == WARNING
+    assert (
+        the("method-needs-static", replace(wide, source=replace(wide.segments, options=TrackOptions("smekf")))).severity
+        == WARNING
+    )
 
 
-def test_headings_that_were_turned_far(pose: TrackedRecording) -> None:
+def test_headings_that_were_turned_far(pose: TrackResult) -> None:
     from wepose_pin.tracking.headings import HeadingCorrection
 
     turned = replace(pose, correction=HeadingCorrection(None, {}, {"right_forearm": 23.0, "torso": 12.0}))
@@ -287,14 +290,12 @@ def bent(forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0) -> dict[s
     return {"torso": still, "left_upper_arm": still, "left_forearm": fore.as_quat(canonical=True)}
 
 
-def with_elbow(
-    pose: TrackedRecording, forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0
-) -> TrackedRecording:
+def with_elbow(pose: TrackResult, forward_deg: np.ndarray, aside_deg: np.ndarray | float = 0.0) -> TrackResult:
     quat_WL = {**pose.quat_WL, **bent(forward_deg, aside_deg)}
     return with_pose(pose, quat_WL=quat_WL)
 
 
-def test_elbows_that_cannot_be(pose: TrackedRecording) -> None:
+def test_elbows_that_cannot_be(pose: TrackResult) -> None:
     n = len(pose.time)
     usual = {each.code for each in summarize(with_elbow(pose, np.linspace(-10.0, 140.0, n))).diagnostics}
     assert not any(code.startswith("hinge-") for code in usual)
@@ -308,11 +309,11 @@ def test_elbows_that_cannot_be(pose: TrackedRecording) -> None:
     assert "by 15° in the first half of the recording and by 45° in the second" in render(drifting).what
 
 
-def test_new_strapping_and_a_late_start_pose(simulation: Simulation, pose: TrackedRecording) -> None:
+def test_new_strapping_and_a_late_start_pose(simulation: Simulation, pose: TrackResult) -> None:
     known: Subject = replace(pose.subject, mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])})
     anew = track(replace(simulation.recording("new"), remounted=True), known)
     assert the("sensors-remounted", anew).severity == INFO
-    late = replace(pose, segments=replace(pose.segments, start=(40.0, 44.0)))
+    late = replace(pose, source=replace(pose.segments, start=(40.0, 44.0)))
     assert the("start-pose-late", late).value == pytest.approx(40.0)
 
 
@@ -362,7 +363,7 @@ def test_the_elbows_uncertainty_against_draws() -> None:
     assert elbow.std[0] == pytest.approx(draws.bend.std(), rel=0.03)
 
 
-def test_heading_budgets_are_those_of_the_covariance(pose: TrackedRecording) -> None:
+def test_heading_budgets_are_those_of_the_covariance(pose: TrackResult) -> None:
     for name, budget in compute_heading_uncertainties(replace(pose, correction=None)).items():
         of = pose.segments.orientation[name]
         assert of.attitude_cov is not None
@@ -377,7 +378,7 @@ def test_heading_budgets_are_those_of_the_covariance(pose: TrackedRecording) -> 
         assert budget.growth * minutes == pytest.approx(std[-1] - std[0], rel=1e-6)
 
 
-def test_hands_are_seen_from_the_torso(pose: TrackedRecording) -> None:
+def test_hands_are_seen_from_the_torso(pose: TrackResult) -> None:
     turn = Rotation.from_euler("zyx", [70.0, 10.0, -20.0], degrees=True)
     turned = Pose(
         pose.time,
@@ -444,7 +445,7 @@ def test_in_a_browser_it_has_its_sections_light_and_dark(page: str, tmp_path: Pa
     assert corner["light"] > 250
 
 
-def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: TrackedRecording) -> None:
+def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: TrackResult) -> None:
     """A peak before the start pose: it was the largest ± of the page, beside "No warnings"."""
     begin = float(pose.time[0]) + 5.0
     before = pose.time < begin
@@ -452,7 +453,7 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
     def wider(cov: np.ndarray, factor: float) -> np.ndarray:
         return np.where(before[:, None, None], factor**2 * cov, cov)
 
-    late = replace(pose, segments=replace(pose.segments, start=(begin, begin + 2.0)))
+    late = replace(pose, source=replace(pose.segments, start=(begin, begin + 2.0)))
     peak = with_pose(late, point_cov={name: wider(cov, 60.0) for name, cov in late.pose.point_cov.items()})
     assert rows_of_hands(render_track_report(summarize(peak), view="<p>")) == rows_of_hands(
         render_track_report(summarize(late), view="<p>")
@@ -465,7 +466,7 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
     assert "the 7 s before its end are left out" in text
 
 
-def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackedRecording) -> None:
+def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackResult) -> None:
     cov = {name: np.broadcast_to(0.12**2 * np.eye(3), cov.shape) for name, cov in pose.pose.point_cov.items()}
     uncertain = the("position-uncertain", with_pose(pose, point_cov=cov), "right_palm")
     assert uncertain.severity == WARNING

@@ -16,13 +16,13 @@ from arms import person as moving_arm
 from arms import write_arm
 
 import wepose_pin as wp
-from wepose_pin.body.kinematics import PosedBody
 from wepose_pin.body.subject import HeadingDrift, Hinge, StartPoseOffset
 from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadData
 from wepose_pin.filters import AmekfParams
 from wepose_pin.retargeting import ControllerParams
 from wepose_pin.simulation import Imperfections, ImuNoise
+from wepose_pin.tracking import TrackResult
 
 NAN, INF = float("nan"), float("inf")
 ANYTHING = object()
@@ -497,7 +497,7 @@ def test_numbers_beyond_any_sensor_are_refused_with_their_unit() -> None:
 
 def test_an_unknown_point_lists_the_known_ones() -> None:
     pose = right()["evaluate"]["pose"]
-    motion = PosedBody("x", pose, wp.load_model(), wp.population_subject())
+    motion = TrackResult("x", pose, wp.load_model(), wp.population_subject())
     with pytest.raises(KeyError, match=r"no point 'hand'; .*right_palm") as raised:
         motion.points["hand"]
     assert isinstance(raised.value, wp.WeposeError)

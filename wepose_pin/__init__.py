@@ -33,9 +33,6 @@ if TYPE_CHECKING:  # what editors and type checkers see
     from .body.subject import population_subject as population_subject
     from .calibration import Calibration as Calibration
     from .calibration import calibrate as calibrate
-    from .commands.results import TrackResult as TrackResult
-    from .commands.results import load_result as load_result
-    from .commands.results import track as track
     from .errors import WeposeError as WeposeError
     from .errors import WeposeWarning as WeposeWarning
     from .evaluation import evaluate as evaluate
@@ -47,7 +44,10 @@ if TYPE_CHECKING:  # what editors and type checkers see
     from .recording import Recording as Recording
     from .retargeting import retarget as retarget
     from .simulation import simulate as simulate
+    from .tracking import TrackResult as TrackResult
+    from .tracking import track as track
     from .writers.export import export as export
+    from .writers.result import load_result as load_result
 
 # Loaded on first use, so that the command line answers at once.
 _WHERE = {
@@ -58,7 +58,7 @@ _WHERE = {
     "Recording": "recording",
     "StaticTest": "filters.static",
     "Subject": "body.subject",
-    "TrackResult": "commands.results",
+    "TrackResult": "tracking",
     "WeposeError": "errors",
     "WeposeWarning": "errors",
     "calibrate": "calibration",
@@ -67,22 +67,25 @@ _WHERE = {
     "export": "writers.export",
     "joint_angles": "angles",
     "load_model": "body",
-    "load_result": "commands.results",
+    "load_result": "writers.result",
     "load_session": "readers",
     "load_subject": "body.subject",
     "population_subject": "body.subject",
     "retarget": "retargeting",
     "simulate": "simulation",
-    "track": "commands.results",
+    "track": "tracking",
 }
+# What the methods of `TrackResult` call in rooms above its own.
+_OF_RESULTS = {"draw_figures": "report.notebook", "show_result": "report.notebook", "save_result": "report.pages"}
 __all__ = ["__version__", *sorted(_WHERE)]
 __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _WHERE:
+    room = _WHERE.get(name) or _OF_RESULTS.get(name)
+    if room is None:
         raise AttributeError(f"module 'wepose_pin' has no attribute '{name}'")
-    return getattr(import_module(f".{_WHERE[name]}", __name__), name)
+    return getattr(import_module(f".{room}", __name__), name)
 
 
 def __dir__() -> list[str]:

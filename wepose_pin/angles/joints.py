@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..arguments import check_arguments
-from ..body.kinematics import Pose, PosedBody
+from ..body.kinematics import Pose
 from ..diagnostics import INFO, Diagnostic
 from ..errors import BadData, BadOption, UnknownKey, one_of
 from ..recording import AXES
 from ..rotations import conjugate, multiply
+from ..tracking import TrackResult
 from . import euler
 
 # Where the ISB's axes X, Y, Z of a segment point in our frame of it. X is forward (of a forearm and a hand: to the side
@@ -200,7 +201,7 @@ def group_sides(joints: Iterable[str]) -> dict[str, dict[str, str]]:
     return groups
 
 
-def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float = NEAR_LOCK) -> Angles:
+def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY", near_lock: float = NEAR_LOCK) -> Angles:
     """Joint angles after the ISB: thorax and pelvis in W, shoulders, elbows, wrists, hips, knees, ankles, as measured.
 
     Left joints are mirrored on the sagittal plane first, so that an angle has the same sign and meaning on both sides.
@@ -209,7 +210,7 @@ def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float
 
     Parameters
     ----------
-    pose : Pose or PosedBody
+    pose : Pose or TrackResult
         What `track` or `load_result` gives, or its `pose`; n samples.
     sequence : str
         Intrinsic axes of the shoulder's angles: "YXY", "XZY" or "ZXY"; all other joints have ZXY.
@@ -240,7 +241,7 @@ def joint_angles(pose: Pose | PosedBody, sequence: str = "YXY", near_lock: float
     True
     """
     check_arguments(joint_angles, locals())
-    if isinstance(pose, PosedBody):
+    if isinstance(pose, TrackResult):
         pose = pose.pose
     if sequence not in SHOULDER_SEQUENCES:
         raise BadOption(f"shoulder sequence '{sequence}' is not known; {one_of(SHOULDER_SEQUENCES, sequence)}")

@@ -19,7 +19,7 @@ import polars as pl
 from ..errors import BadData, BadModel, BadOption
 from ..filters.butterworth import low_pass
 from ..rotations import unwrap_signs
-from ..tracking import TrackedRecording
+from ..tracking import TrackResult
 
 CUTOFF_HZ = 6.0  # usual for the motion of limbs
 _LEAST_MASS = 1e-6  # [kg]
@@ -110,7 +110,7 @@ def joint_torques(
     return Torques(time, torque, q, v, a, cutoff_hz, mass)
 
 
-def pose_torques(tracked: TrackedRecording, cutoff_hz: float = CUTOFF_HZ) -> Torques:
+def pose_torques(tracked: TrackResult, cutoff_hz: float = CUTOFF_HZ) -> Torques:
     """`joint_torques` of a person, of the joints that follow measured segments; of a mechanism, of all.
 
     Masses are the model's, stretched with the subject's lengths (`BodyModel.with_lengths`), not the person's.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,13 +19,12 @@ from ..arguments import (
     check_unit,
     format_object,
 )
-from ..errors import BadData, Named
+from ..errors import BadData
 from ..recording import EACH_TIME, check_time, format_span
 from ..rotations import unwrap_signs
 from .body import BodyModel
-from .configuration import ConfigurationSolver, solve_configuration
+from .configuration import ConfigurationSolver
 from .links import compute_joint_values, compute_link_poses, find_known_points
-from .subject import Subject
 
 MAX_POSE_NORM_DEVIATION = 1e-3  # of a quaternion in a `Pose` from 1
 
@@ -120,62 +118,6 @@ def join_poses(parts: Sequence[Pose]) -> Pose:
         return None if values[0] is None else np.concatenate(values)
 
     return Pose(*(join([getattr(part, entry.name) for part in parts]) for entry in fields(Pose)))
-
-
-@dataclass(frozen=True, repr=False)
-class PosedBody:
-    """A body and its pose over time.
-
-    Parameters
-    ----------
-    name : of the recording, as titles and files state it
-    model : the body with the subject's lengths
-    subject : lengths and mounts as used
-    """
-
-    name: str
-    pose: Pose
-    model: BodyModel
-    subject: Subject
-
-    def __repr__(self) -> str:
-        parts = f"{len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points"
-        return f"{type(self).__name__}({self.name!r}: {parts})"
-
-    @property
-    def time(self) -> np.ndarray:
-        """(n,) [s]."""
-        return self.pose.time
-
-    @property
-    def rate_hz(self) -> float:
-        """One over the usual time step, to six digits; NaN of one sample."""
-        return float(f"{1.0 / np.median(np.diff(self.time)):.6g}") if len(self.time) > 1 else float("nan")
-
-    @property
-    def quat_WL(self) -> Mapping[str, np.ndarray]:
-        """Segment → (n, 4) xyzw."""
-        return Named("segment", self.pose.quat_WL)
-
-    @property
-    def points(self) -> Mapping[str, np.ndarray]:
-        """Point → (n, 3) [m] in W."""
-        return Named("point", self.pose.points)
-
-    @property
-    def joints(self) -> Mapping[str, np.ndarray]:
-        """Joint of one axis → its values (n,) [rad or m]; of a mechanism."""
-        return Named("joint", self.pose.joints)
-
-    @cached_property
-    def q(self) -> np.ndarray:
-        """(n, nq) configuration of `model`."""
-        return solve_configuration(self.model, self.quat_WL) if self.pose.q is None else self.pose.q
-
-    def check(self) -> PosedBody:
-        """Check the pose (`Pose.check`) and return the posed body."""
-        self.pose.check()
-        return self
 
 
 def find_samples(time: np.ndarray, interval: tuple[float, float]) -> slice:

@@ -1,8 +1,9 @@
-"""The configuration of a body in its start pose."""
+"""The configuration of a body in its start pose, and its segment frames there."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,10 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadSession, one_of
-from ..recording import CONFIGURATION
+from ..recording import CONFIGURATION, Recording
 from .body import BodyModel
+from .table import NEUTRAL_POSE, BodyTable
+from .table_file import load_table
 from .tree import check_joint_values, joint_axis, joint_placement, parse_tree
 
 
@@ -64,3 +67,55 @@ def _rotate_triple(joints: list[Any], values: Mapping[str, float]) -> np.ndarray
         axis = joint_axis(joint) * values.get(joint.name, 0.0)
         zero, turned = zero @ placement, turned @ placement @ Rotation.from_rotvec(axis).as_matrix()
     return zero.T @ turned
+
+
+@dataclass(frozen=True)
+class StartFrames:
+    """The segment frames in the start pose.
+
+    Parameters
+    ----------
+    R_WL : segment → its orientation; a segment that is not named has the frame of W
+    table : of the body
+    q : (nq,) its configuration; None: not known
+    """
+
+    R_WL: Mapping[str, Rotation] = field(default_factory=dict)
+    table: BodyTable = field(default_factory=load_table)
+    q: np.ndarray | None = None
+
+    def std(self, segment: str) -> np.ndarray:
+        """Return (3,) [rad], one standard deviation about each axis of a segment's rotation off the start pose."""
+        return np.array(self.table.segments[segment].start_std)
+
+    def repeat_std(self, segment: str) -> np.ndarray:
+        """Return (3,) [rad], one standard deviation about each axis between two start poses of one person."""
+        return np.array(self.table.segments[segment].repeat_std)
+
+    def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
+        """Return R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
+        return self.R_WL[segment] * R_LS if segment in self.R_WL else R_LS
+
+    def to_segment(self, segment: str, R_WS: Rotation) -> Rotation:
+        """Return the mount R_LS of a sensor whose orientation in the start pose is R_WS."""
+        return self.R_WL[segment].inv() * R_WS if segment in self.R_WL else R_WS
+
+
+N_POSE = StartFrames()
+
+
+def find_start_frames(body: BodyModel, recording: Recording) -> StartFrames:
+    """Find the segment frames of a body in the start pose of its recording.
+
+    Raises
+    ------
+    BadSession
+        A start pose or a joint that the body does not have.
+    """
+    table = body.table
+    q = compute_start_configuration(body, recording.start_pose, recording.joints, recording.where())
+    R_WL: dict[str, Rotation] = {}
+    if table.is_mechanism or recording.start_pose != NEUTRAL_POSE:
+        R_WK = body.orient_links(q)
+        R_WL = {segment: Rotation.from_matrix(R_WK[segment]) for segment in recording.sensors}
+    return StartFrames(R_WL, table, q)

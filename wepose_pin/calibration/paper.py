@@ -30,8 +30,8 @@ import numpy as np
 from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import Rotation
 
-from ..alignment import PALM_SLIP_STD, align_sensors
 from ..body import BodyModel
+from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.subject import Subject
 from ..body.table import NEUTRAL_POSE
 from ..diagnostics import WARNING, Diagnostic

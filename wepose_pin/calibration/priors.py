@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import MEASURED_ORIENTATION_STD, find_mount_covariance
 from ..body import BodyTable
 from ..body.girdle import PARAMETERS
+from ..body.mounts import MEASURED_ORIENTATION_STD, find_mount_covariance
 from ..body.subject import Subject
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadSubject

@@ -10,8 +10,8 @@ from typing import TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
 from ..body import BodyModel, Segment, list_breadths
+from ..body.mounts import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
 from ..body.start_pose import compute_start_configuration
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic

@@ -30,10 +30,10 @@ from typing import Literal
 
 import numpy as np
 
-from ..alignment import MAX_MOUNT_ERROR_DEG
 from ..arguments import Positive, check_arguments
 from ..body import BodyModel, convert_breadths, list_breadths
 from ..body.body import load_sensed_model
+from ..body.mounts import MAX_MOUNT_ERROR_DEG
 from ..body.subject import Subject, population_subject
 from ..body.table_file import check_segments
 from ..errors import BadModel, BadOption, BadPhase, BadSession, NoSolution, one_of

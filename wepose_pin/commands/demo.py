@@ -71,7 +71,7 @@ def demo(
         best = calibrations[BEST]
         write_subject(folder / "subject", best.subject, playback.model)
         summary = tracking.summarize(playback)
-        write_result(folder / "result", playback, summary, phases=recording.phases)
+        write_result(folder / "result", playback, summary)
         progress("making the page", (steps - 1) / steps)
         failures = write_track_pages(folder / "result", summary, report=False)
         lengths = {

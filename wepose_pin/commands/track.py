@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -93,7 +93,7 @@ def track(
     from ..readers.subject import read_subject
     from ..report import write_track_pages
     from ..report.viewer import MOST_FRAMES
-    from ..tracking import CHUNK_S, SummaryAccumulator, TrackedRecording, TrackOptions, track_chunks
+    from ..tracking import CHUNK_S, SummaryAccumulator, TrackOptions, track_chunks
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance
     from ..writers.result import write_about, write_poses
@@ -113,21 +113,16 @@ def track(
                     person = parse_subject(log.header["subject"], session)
             else:
                 recording = load_session(session, gaps=gaps)
+            chunks = track_chunks(
+                recording,
+                person,
+                model=model,
+                options=TrackOptions(chosen, causal=causal, open_loop=open_loop, limits=limits),
+                chunk_s=float("inf") if torques else CHUNK_S,
+                progress=lambda share: progress(f"tracking by {chosen}", (1.0 + share) / 3.0),
+            )
             accumulator = SummaryAccumulator(recording)
-
-            def track_chunk_by_chunk() -> Iterator[TrackedRecording]:
-                for tracked in track_chunks(
-                    recording,
-                    person,
-                    model=model,
-                    options=TrackOptions(chosen, causal=causal, open_loop=open_loop, limits=limits),
-                    chunk_s=float("inf") if torques else CHUNK_S,
-                    progress=lambda share: progress(f"tracking by {chosen}", (1.0 + share) / 3.0),
-                ):
-                    accumulator.add(tracked)
-                    yield tracked
-
-            write_poses(folder, track_chunk_by_chunk(), covariance)
+            write_poses(folder, accumulator.accumulate(chunks), covariance)
             summary, joint_torques = accumulator.finish(), None
             if torques:
                 from ..angles.torques import pose_torques
@@ -135,7 +130,7 @@ def track(
                 joint_torques = pose_torques(accumulator.last)
             # Collected last, so that an input that is wrong is reported by its reader.
             provenance = collect_provenance("track", options)
-            write_about(folder, accumulator.last, summary, recording.phases, joint_torques, provenance)
+            write_about(folder, accumulator.last, summary, joint_torques, provenance)
         is_decimated = len(summary.tracked.time) < summary.content["samples"]
         view_rate_hz = min(30.0, MOST_FRAMES / summary.content["duration_s"]) if is_decimated else None
         failures: list[Diagnostic] = []

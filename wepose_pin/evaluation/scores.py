@@ -13,10 +13,11 @@ from .. import rotations
 from ..angles import euler, joint_angles
 from ..arguments import check_arguments
 from ..body import BodyTable, load_table
-from ..body.kinematics import Pose, PosedBody
+from ..body.kinematics import Pose
 from ..diagnostics import notebook_html
 from ..errors import BadData, BadOption
 from ..recording import format_span
+from ..tracking import TrackResult
 from .agreement import Agreement, compute_agreement
 from .registration import Registration
 from .sampling import sample_orientations, sample_points
@@ -114,8 +115,8 @@ class Evaluation:
 
 
 def evaluate(
-    pose: Pose | PosedBody,
-    truth: Pose | PosedBody,
+    pose: Pose | TrackResult,
+    truth: Pose | TrackResult,
     interval: tuple[float, float] | None = None,
     table: BodyTable | None = None,
 ) -> Evaluation:
@@ -123,9 +124,9 @@ def evaluate(
 
     Parameters
     ----------
-    pose : Pose or PosedBody
+    pose : Pose or TrackResult
         What `track` or `load_result` gives, or its `pose`.
-    truth : Pose or PosedBody
+    truth : Pose or TrackResult
         The reference. Where it is NaN, or has no sample near a time of the pose, that time is left out.
     interval : (float, float), optional
         From, to [s]; None: all of the time that both have.
@@ -155,9 +156,9 @@ def evaluate(
     True
     """
     check_arguments(evaluate, locals())
-    if isinstance(pose, PosedBody):
+    if isinstance(pose, TrackResult):
         table, pose = table or pose.model.table, pose.pose
-    if isinstance(truth, PosedBody):
+    if isinstance(truth, TrackResult):
         truth = truth.pose
     if interval is not None and not interval[0] < interval[1]:
         raise BadOption(f"interval = {interval}: from and to in seconds are needed, the earlier one first")

@@ -28,7 +28,7 @@ from ..recording import Intervals
 from ..recording.arrivals import COUNTS, CUT_OFF, DUPLICATE, LATE, Samples, Ticks
 from ..tracking import Tracker, TrackOptions
 from ..tracking.segments import SegmentEstimator
-from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector, TickRates
+from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
 from .monitor import SensorMonitor, check_units
 from .setup import SensorSetup, build_subject_model
@@ -94,8 +94,7 @@ class StartPoseSearch:
 
     def __init__(self, stream: TickStream, stated: tuple[float, float] | None = None) -> None:
         self._stream, self.stated = stream, stated
-        self.detector = StartPoseDetector(stream.clock.rate_hz, len(stream.sensors))
-        self._rates = TickRates(stream.measured, stream.clock.rate_hz)
+        self.detector = StartPoseDetector(stream.clock.rate_hz, stream.measured)
         self.ticks: list[Ticks] = []
 
     def push(self, ticks: Ticks) -> tuple[int, int, int] | None:
@@ -107,7 +106,7 @@ class StartPoseSearch:
                 if ticks.time[n] >= self.stated[1] - 0.5 / clock.rate_hz:
                     begin = max(0, round((self.stated[0] - clock.begin) * clock.rate_hz))
                     return begin, ticks.first + n, n + 1
-            elif detector.push(self._rates.push(ticks.gyro_S[n], ticks.accel_S[n])) == "ready":
+            elif detector.push(ticks.gyro_S[n], ticks.accel_S[n]) == "ready":
                 return detector.begin, detector.end, n + 1
         if self.stated is None and len(self.ticks) > MAX_TICK_BLOCKS:
             self.ticks = [t for t in self.ticks if t.first + len(t.time) > detector.begin]

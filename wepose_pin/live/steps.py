@@ -20,7 +20,7 @@ from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals
 from ..diagnostics import Diagnostic, render, render_all
 from ..errors import BadData, WeposeError
 from ..recording.arrivals import Ticks
-from ..tracking.start_pose import StartPoseDetector, TickRates
+from ..tracking.start_pose import StartPoseDetector
 from .assignment import ShakeDetector
 from .guide import Attempt, Calibrated, Guide, Step, StepRun, Turn
 from .monitor import check_units
@@ -192,10 +192,9 @@ class Stillness:
         for ticks in block:
             if self._detector is None:
                 stream = self._attempt.stream
-                self._detector = StartPoseDetector(stream.clock.rate_hz, len(stream.sensors), self.seconds)
-                self._rates = TickRates(stream.measured, stream.clock.rate_hz)
+                self._detector = StartPoseDetector(stream.clock.rate_hz, stream.measured, self.seconds)
             for n, (gyro_S, accel_S) in enumerate(zip(ticks.gyro_S, ticks.accel_S, strict=True)):
-                if self._detector.push(self._rates.push(gyro_S, accel_S)) == "ready":
+                if self._detector.push(gyro_S, accel_S) == "ready":
                     end = float(ticks.time[n])
                     return end - (self._detector.held_s - 1.0 / self._attempt.stream.clock.rate_hz), end
         return None

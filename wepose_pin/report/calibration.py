@@ -17,7 +17,7 @@ from ..diagnostics import WARNING, Diagnostic, lines
 from ..errors import WeposeError, reason
 from ..filters import BEST
 from ..recording import Recording, compute_mount, find_mount_axes
-from ..tracking import TrackedRecording, Tracker, TrackOptions
+from ..tracking import Tracker, TrackOptions, TrackResult
 from .figures import BAND, COLOURS, SOFT, ReportFigure, draw_over_time, styled
 from .page import Banner, Facts, Item, Page, PageWriter, Table
 from .viewer import show_motion
@@ -51,7 +51,7 @@ def render_calibration_report(
     calibration: Calibration,
     recording: Recording,
     *,
-    tracked: TrackedRecording | None = None,
+    tracked: TrackResult | None = None,
     method: str = BEST,
     failures: list[str] | None = None,
 ) -> str:
@@ -206,7 +206,7 @@ def _list_gap(calibration: Calibration, gap: str) -> list[Item]:
     return [draw_gap(calibration, gap), text]
 
 
-def _list_view(calibration: Calibration, recording: Recording, tracked: TrackedRecording | None) -> list[Item]:
+def _list_view(calibration: Calibration, recording: Recording, tracked: TrackResult | None) -> list[Item]:
     if tracked is None or not len(calibration.time):
         return []
     begin, end = float(calibration.time.min()), float(calibration.time.max())

@@ -12,24 +12,25 @@ from pathlib import Path
 from markupsafe import escape
 
 from ..angles import joint_angles
-from ..body.kinematics import PosedBody
 from ..documents import whole_file
 from ..errors import BadData
+from ..tracking import TrackResult
 from ..tracking.measures import measure_tips
 from .figures import Figures
 from .track import draw_joint_angles, draw_tips, group_tips
+from .viewer import pose_html
 
 FRAME_HEIGHT = 560  # [px] of the view page in a notebook
 
 
-def draw_figures(body: PosedBody) -> Figures:
+def draw_figures(result: TrackResult) -> Figures:
     """Draw the paths of the hands and their reach, and the joint angles, of what is known."""
-    figures, table = Figures(), body.model.table
-    tips = measure_tips(body.pose, body.rate_hz, table) if len(body.time) > 1 else {}
+    figures, table = Figures(), result.model.table
+    tips = measure_tips(result.pose, result.rate_hz, table) if len(result.time) > 1 else {}
     if tips:
-        figures |= draw_tips(body.time, group_tips(tips, table, body.subject.lengths), table)
+        figures |= draw_tips(result.time, group_tips(tips, table, result.subject.lengths), table)
     with contextlib.suppress(BadData):  # no joint has both of its segments
-        figures["angles"] = draw_joint_angles(joint_angles(body.pose))
+        figures["angles"] = draw_joint_angles(joint_angles(result.pose))
     return figures
 
 
@@ -72,6 +73,14 @@ class ViewPage:
         """Open the page in the browser, from a temporary file; returns whether there is one."""
         file = Path(tempfile.mkdtemp(prefix="wepose-")) / "view.html"
         return webbrowser.open(self.save(file).as_uri())
+
+
+def show_result(result: TrackResult, open: bool = True) -> ViewPage:
+    """Return the page that plays the motion, and open it in the browser where `open` and this is no notebook."""
+    page = ViewPage(result.name, pose_html(result.model, result.pose, phases=result.phases, title=result.name))
+    if open and not runs_in_notebook():
+        page.open()
+    return page
 
 
 def runs_in_notebook() -> bool:

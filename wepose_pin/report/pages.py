@@ -1,11 +1,16 @@
-"""The pages beside the result of a tracked recording that is written already."""
+"""The pages of a tracked recording beside its result, and both written to a folder."""
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import fields
 from pathlib import Path
 
 from ..diagnostics import Diagnostic
-from ..tracking import TrackSummary
+from ..tracking import TrackResult, TrackSummary, summarize
+from ..writers import write_result
+from ..writers.folder import result_folder
+from ..writers.provenance import CALL, collect_provenance
 from .page import PageWriter
 from .viewer import pose_html
 
@@ -40,3 +45,21 @@ def write_track_pages(
         writer.write("report.html", lambda failures: render_track_report(summary, view=page, failures=failures))
     writer.save_diagnostics("summary.json")
     return writer.diagnostics
+
+
+def save_result(result: TrackResult, folder: str | Path, force: bool = False) -> Path:
+    """Write what `wepose track -o` writes, whole or not at all, and return the folder; as `TrackResult.save`."""
+    out, source = Path(folder), result.source
+    with result_folder(out, force) as partial:
+        if isinstance(source, Path):
+            for file in source.iterdir():
+                if file.is_file():
+                    shutil.copyfile(file, partial / file.name)
+            return out
+        summary, options = summarize(result), result.options
+        # Inputs and options of `track`, under the names that they have in `wepose track`.
+        inputs = {"session": result.recording.source, "subject": result.subject.name, "model": result.model.table.name}
+        inputs |= {field.name: getattr(options, field.name) for field in fields(options)}
+        write_result(partial, result, summary, provenance=collect_provenance(CALL, inputs))
+    write_track_pages(out, summary)
+    return out

@@ -11,7 +11,7 @@ import numpy as np
 from ..angles import Angles, JointAngles, group_sides, joint_angles, summary
 from ..body import ROOT, BodyTable
 from ..errors import BadData
-from ..tracking import TrackedRecording, TrackSummary
+from ..tracking import TrackResult, TrackSummary
 from ..tracking.error_budget import group_by_source
 from ..tracking.measures import (
     Budget,
@@ -88,7 +88,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
 # Sections -------------------------------------------------------------------------------------------------------------
 
 
-def _list_reliance(tracked: TrackedRecording, measures: Measures, angles: Angles | None) -> list[Item]:
+def _list_reliance(tracked: TrackResult, measures: Measures, angles: Angles | None) -> list[Item]:
     """Return what the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
     after_start, table = find_samples_after_start(tracked), tracked.model.table
     stds = _find_angle_stds(angles, after_start) if angles is not None else {}
@@ -122,7 +122,7 @@ def _find_angle_stds(angles: Angles, samples: np.ndarray) -> dict[str, float]:
     return stds
 
 
-def _explain_no_covariance(tracked: TrackedRecording) -> str:
+def _explain_no_covariance(tracked: TrackResult) -> str:
     source = f"The filter {tracked.options.method}" if tracked.recording.imus else "The device"
     return (
         f"{source} states no uncertainty, so that this page cannot say how far angles and positions may be off. "
@@ -130,7 +130,7 @@ def _explain_no_covariance(tracked: TrackedRecording) -> str:
     )
 
 
-def _list_facts(tracked: TrackedRecording, measures: Measures) -> list[Item]:
+def _list_facts(tracked: TrackResult, measures: Measures) -> list[Item]:
     recording = tracked.recording
     text = (
         f"{_format_duration(float(recording.time[-1] - recording.time[0]))} at {measures.rate_hz:g} Hz from "
@@ -150,7 +150,7 @@ def _list_facts(tracked: TrackedRecording, measures: Measures) -> list[Item]:
     return [text]
 
 
-def _list_recorded(tracked: TrackedRecording, measures: Measures) -> list[Item]:
+def _list_recorded(tracked: TrackResult, measures: Measures) -> list[Item]:
     recording, rate_hz = tracked.recording, tracked.recording.rate_hz
     low, high = (f"{step:.2f}" for step in measures.steps_ms)
     phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())
@@ -181,7 +181,7 @@ def _list_recorded(tracked: TrackedRecording, measures: Measures) -> list[Item]:
     ]
 
 
-def _list_drift(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> list[Item]:
+def _list_drift(tracked: TrackResult, budgets: Mapping[str, Budget]) -> list[Item]:
     if not budgets:
         return [_explain_no_covariance(tracked)]
     recording, correction = tracked.recording, tracked.correction
@@ -232,7 +232,7 @@ def _list_drift(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> lis
     return [text, figure, Table(header, rows)]
 
 
-def _list_tips(tracked: TrackedRecording, measures: Measures) -> list[Item]:
+def _list_tips(tracked: TrackResult, measures: Measures) -> list[Item]:
     table, after_start = tracked.model.table, find_samples_after_start(tracked)
     groups = group_tips(measures.tips, table, tracked.subject.lengths)
     if not groups:
@@ -268,7 +268,7 @@ def _list_tips(tracked: TrackedRecording, measures: Measures) -> list[Item]:
     return items
 
 
-def _list_angles(tracked: TrackedRecording, angles: Angles | None) -> list[Item]:
+def _list_angles(tracked: TrackResult, angles: Angles | None) -> list[Item]:
     if angles is None:
         return []
     rows = []
@@ -305,13 +305,13 @@ def _list_angles(tracked: TrackedRecording, angles: Angles | None) -> list[Item]
     ]
 
 
-def _list_view(tracked: TrackedRecording, view: str | None) -> list[Item]:
+def _list_view(tracked: TrackResult, view: str | None) -> list[Item]:
     if view is not None and len(view) <= LARGEST_VIEW:
         return [Frame(view)]
     return [show_motion(tracked.model, tracked.pose, tracked.recording.phases, tracked.recording.name)]
 
 
-def _list_run(tracked: TrackedRecording) -> list[Item]:
+def _list_run(tracked: TrackResult) -> list[Item]:
     recording, subject = tracked.recording, tracked.subject
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
@@ -330,7 +330,7 @@ def _list_run(tracked: TrackedRecording) -> list[Item]:
 
 
 @styled
-def draw_timeline(tracked: TrackedRecording, signals: Mapping[str, Signal]) -> ReportFigure:
+def draw_timeline(tracked: TrackResult, signals: Mapping[str, Signal]) -> ReportFigure:
     """Each sensor over time: how fast it rotated, where it was static, lost, or cut off by its range."""
     time, table = tracked.time, tracked.model.table
     most = max(1.0, max(float(np.degrees(signal.rate.max())) for signal in signals.values()))
@@ -467,7 +467,7 @@ def _style_segments(names: Iterable[str], table: BodyTable) -> dict[str, dict[st
     return {name: line_style(name, table.side(name), rank) for name, rank in ranks.items()}
 
 
-def _find_joint_angles(tracked: TrackedRecording) -> Angles | None:
+def _find_joint_angles(tracked: TrackResult) -> Angles | None:
     """The joint angles; None where no joint has both of its segments."""
     try:
         return joint_angles(tracked.pose)

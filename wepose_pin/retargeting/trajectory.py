@@ -20,9 +20,10 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..arguments import check_arguments
 from ..body import BodyTable
-from ..body.kinematics import Pose, PosedBody, find_samples
+from ..body.kinematics import Pose, find_samples
 from ..errors import BadOption, NoSolution, WrongOption
 from ..recording import Intervals, select_interval
+from ..tracking import TrackResult
 from ..writers.joint_motion import JointMotion
 from .collision import CollisionModel
 from .controller import ControllerParams, JointState, PostureReference, QpController, StepReport
@@ -144,7 +145,7 @@ class Trajectory:
 
 
 def retarget(
-    pose: Pose | PosedBody | str | Path,
+    pose: Pose | TrackResult | str | Path,
     robot: Robot | str | Path,
     *,
     arm: Literal["left", "right", "both"] | None = None,
@@ -165,7 +166,7 @@ def retarget(
 
     Parameters
     ----------
-    pose : Pose, PosedBody, str or Path
+    pose : Pose, TrackResult, str or Path
         What `track` or `load_result` gives, or its `pose`; or a result folder.
     robot : Robot, str or Path
         A name such as "panda", a URDF with a map beside it, or the map; or what `wepose_pin.retargeting.load_robot`
@@ -233,7 +234,7 @@ def retarget(
 
 
 def _select_pose(
-    pose: Pose | PosedBody | str | Path, interval: tuple[float, float] | None, phase: str | None
+    pose: Pose | TrackResult | str | Path, interval: tuple[float, float] | None, phase: str | None
 ) -> tuple[Pose, BodyTable | None]:
     """Return an interval or a phase of a motion, and the table of its body where it has one."""
     if isinstance(pose, str | Path):
@@ -243,9 +244,8 @@ def _select_pose(
         return selected_pose, body.table
     phases: Mapping[str, Intervals] = {}
     table = None
-    if isinstance(pose, PosedBody):
-        phases = getattr(pose, "phases", {})
-        table, pose = pose.model.table, pose.pose
+    if isinstance(pose, TrackResult):
+        phases, table, pose = pose.phases, pose.model.table, pose.pose
     selected = select_interval(pose.time, phases, interval, phase)
     return pose if selected is None else pose.cut(find_samples(pose.time, selected)), table
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..alignment import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
+from ..body.mounts import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
 from ..observations.closures import GapRows
 from .heading_problem import HeadingProblem, Knot
 

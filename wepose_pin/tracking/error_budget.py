@@ -11,9 +11,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..alignment import compute_soft_tissue_covariances
 from ..body.covariance import compute_point_covariances
-from .tracked import TrackedRecording
+from .result import TrackResult
+from .segment_orientations import compute_soft_tissue_covariances
 
 PERIOD_S = 1.0  # [s] from one sample to the next
 SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES = "soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle"
@@ -27,7 +27,7 @@ class ErrorBudget:
         self._correlated: dict[str, float] = {}  # point → what correlated headings add, summed likewise
         self._samples = self._received = 0
 
-    def add(self, tracked: TrackedRecording) -> None:
+    def add(self, tracked: TrackResult) -> None:
         """Add a chunk; whatever the chunks, the samples are the same."""
         stride = max(1, round(PERIOD_S * tracked.recording.rate_hz))
         rows = np.arange(-self._received % stride, len(tracked.time), stride)

@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..alignment import SegmentOrientations, StartFrames, compute_start_heading_var, find_mount_covariance
 from ..body import BodyModel
+from ..body.mounts import compute_start_heading_var, find_mount_covariance
+from ..body.start_pose import StartFrames
 from ..body.subject import Subject
 from ..calibration import PROTOCOLS, load_protocol
 from ..errors import BadSession
@@ -24,6 +25,7 @@ from ..observations.hinges import HingePlane, find_hinges
 from ..observations.joint_accelerations import LEAST_RATE_HZ, JointPair, find_joint_pairs
 from ..observations.paths import StartPose
 from ..recording import Intervals, Recording
+from .segment_orientations import SegmentOrientations
 
 REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
 MEASURED_RATE_STD = np.deg2rad(0.1)  # [rad/s] at which a measured orientation drifts about the vertical; assumption

@@ -16,12 +16,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..alignment import SegmentOrientations, StartFrames, compute_start_heading_var
+from ..body.mounts import compute_start_heading_var
+from ..body.start_pose import StartFrames
 from ..observations.hinges import linearize_hinge
 from ..recording import OrientationSensor, Recording
 from .heading_filter import HeadingFilter, estimate_headings, find_care, mask_intervals, smooth
 from .heading_problem import FilterHeadings, HeadingProblem, Knot
 from .knots import E_Z, KnotReader, Samples, read_filter_headings, stack_samples
+from .segment_orientations import SegmentOrientations
 
 # Share of the next knot in which a knot is solved, in so many parts at even distances (a few more where it closes
 # several gaps); over the rest its correction fades in.

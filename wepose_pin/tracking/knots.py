@@ -8,12 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..alignment import SegmentOrientations, compute_heading_variance
 from ..filters import Orientation
 from ..filters.butterworth import BandPass
 from ..observations.joint_accelerations import BAND_HZ, compute_sides
 from ..recording import ImuSensor, OrientationSensor, Recording
 from .heading_problem import FilterHeadings, HeadingProblem, Knot, find_stride
+from .segment_orientations import SegmentOrientations, compute_heading_variance
 
 E_Z = np.array([0.0, 0.0, 1.0])
 Samples = tuple[np.ndarray, np.ndarray, np.ndarray]  # time (n,) [s], `quat_VS` (n, k, 4), `accel_S` (n, k, 3) [m/s²]

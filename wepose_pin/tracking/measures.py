@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..alignment import compute_heading_variance
 from ..body import BodyModel, BodyTable, HingeJoint
 from ..body.covariance import compute_axis_std
 from ..body.kinematics import Pose
@@ -20,7 +19,8 @@ from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
 from ..recording.plausibility import find_cut_off
 from ..recording.sensors import compute_rate
-from .tracked import TrackedRecording
+from .result import TrackResult
+from .segment_orientations import compute_heading_variance
 
 BENT = np.deg2rad(20.0)  # above which a hinge shows the plane in which it bends
 PEAK_OVER_S = 0.1  # a tip's speed is that of its mean over so long
@@ -76,7 +76,7 @@ def finite_median(values: np.ndarray) -> float:
     return float(np.median(known)) if len(known) else float("nan")
 
 
-def find_samples_after_start(tracked: TrackedRecording) -> np.ndarray:
+def find_samples_after_start(tracked: TrackResult) -> np.ndarray:
     """(n,) bool, the samples after the start pose, which the summaries of uncertainty are of.
 
     Before it the filters have not converged, and headings are extrapolated backwards.
@@ -90,7 +90,7 @@ def longest_run_s(mask: np.ndarray, rate_hz: float) -> float:
     return max((b - a for a, b in find_runs(mask)), default=0) / rate_hz
 
 
-def has_stated_mounts(tracked: TrackedRecording) -> bool:
+def has_stated_mounts(tracked: TrackResult) -> bool:
     """Whether the mounts are the session's and not calibrated ones."""
     return not tracked.subject.mounts or tracked.recording.remounted
 
@@ -106,7 +106,7 @@ class Budget(NamedTuple):
     growth: float  # of the filter's, a minute of motion; NaN where it was never in motion
 
 
-def compute_heading_uncertainties(tracked: TrackedRecording) -> dict[str, Budget]:
+def compute_heading_uncertainties(tracked: TrackResult) -> dict[str, Budget]:
     """Segment → its budget, from the covariances; none where there is no filter, or it has none."""
     budgets = {}
     for name, cov_W in tracked.pose.segment_cov.items():
@@ -245,7 +245,7 @@ class Measures:
 
 
 def measure(
-    tracked: TrackedRecording,
+    tracked: TrackResult,
     recording: Recording,
     static: Mapping[str, np.ndarray],
     error_budget: Mapping[str, Mapping[str, float]],

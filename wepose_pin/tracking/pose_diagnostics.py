@@ -25,7 +25,7 @@ from .measures import (
     has_stated_mounts,
     longest_run_s,
 )
-from .tracked import TrackedRecording
+from .result import TrackResult
 
 GRAVITY_OFF = 0.02
 BIAS_LARGE = np.deg2rad(1.5)  # [rad/s], three times what is usual from the factory
@@ -47,7 +47,7 @@ APART = np.deg2rad(15.0)  # between the halves of a recording
 LASTING_S = 1.0
 
 
-def diagnose_pose(tracked: TrackedRecording, measures: Measures) -> list[Diagnostic]:
+def diagnose_pose(tracked: TrackResult, measures: Measures) -> list[Diagnostic]:
     """The diagnostics of the motion; `measures` are the recording's."""
     budgets, tips = measures.budgets, measures.tips
     return [
@@ -61,7 +61,7 @@ def diagnose_pose(tracked: TrackedRecording, measures: Measures) -> list[Diagnos
     ]
 
 
-def _diagnose_signals(tracked: TrackedRecording, signals: Mapping[str, Signal]) -> Iterator[Diagnostic]:
+def _diagnose_signals(tracked: TrackResult, signals: Mapping[str, Signal]) -> Iterator[Diagnostic]:
     recording = tracked.recording
     for name, signal in signals.items():
         if signal.cut.any():
@@ -99,7 +99,7 @@ def _diagnose_signals(tracked: TrackedRecording, signals: Mapping[str, Signal]) 
         yield Diagnostic("start-pose-late", INFO, "", late, LATE_START_S)
 
 
-def _diagnose_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> Iterator[Diagnostic]:
+def _diagnose_headings(tracked: TrackResult, budgets: Mapping[str, Budget]) -> Iterator[Diagnostic]:
     wide = _find_uncertain_headings(tracked, budgets)
     for joint in sorted(wide, key=wide.__getitem__, reverse=True):
         yield Diagnostic("heading-uncertain", WARNING, joint, wide[joint], HEADING, _remedy_variant(tracked))
@@ -112,13 +112,13 @@ def _diagnose_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget])
                 yield Diagnostic("heading-corrected-far", WARNING, name, turned, float(limit), variant)
 
 
-def _diagnose_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> Iterator[Diagnostic]:
+def _diagnose_tips(tracked: TrackResult, tips: Mapping[str, TipMotion]) -> Iterator[Diagnostic]:
     for name, std in _find_uncertain_tips(tracked, tips).items():
         yield Diagnostic("position-uncertain", WARNING, name, std, PLACE, _remedy_variant(tracked))
 
 
 def _diagnose_method(
-    tracked: TrackedRecording, budgets: Mapping[str, Budget], tips: Mapping[str, TipMotion]
+    tracked: TrackResult, budgets: Mapping[str, Budget], tips: Mapping[str, TipMotion]
 ) -> Iterator[Diagnostic]:
     if tracked.options.method in STATIC_ONLY and (
         _find_uncertain_headings(tracked, budgets) or _find_uncertain_tips(tracked, tips)
@@ -126,7 +126,7 @@ def _diagnose_method(
         yield Diagnostic("method-needs-static", WARNING, facts={"method": tracked.options.method})
 
 
-def _find_uncertain_headings(tracked: TrackedRecording, budgets: Mapping[str, Budget]) -> dict[str, float]:
+def _find_uncertain_headings(tracked: TrackResult, budgets: Mapping[str, Budget]) -> dict[str, float]:
     """Joint → uncertainty [rad] of the heading between its segments by drift, of those beyond the limit."""
     since = find_samples_after_start(tracked)
     return {
@@ -136,7 +136,7 @@ def _find_uncertain_headings(tracked: TrackedRecording, budgets: Mapping[str, Bu
     }
 
 
-def _find_uncertain_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion]) -> dict[str, float]:
+def _find_uncertain_tips(tracked: TrackResult, tips: Mapping[str, TipMotion]) -> dict[str, float]:
     """Point → uncertainty [m], of those beyond the limit."""
     since = find_samples_after_start(tracked)
     stds = {name: finite_max(tip.std[since]) for name, tip in tips.items() if tip.std is not None}
@@ -144,7 +144,7 @@ def _find_uncertain_tips(tracked: TrackedRecording, tips: Mapping[str, TipMotion
 
 
 def _diagnose_time_before_start(
-    tracked: TrackedRecording, budgets: Mapping[str, Budget], tips: Mapping[str, TipMotion]
+    tracked: TrackResult, budgets: Mapping[str, Budget], tips: Mapping[str, TipMotion]
 ) -> Iterator[Diagnostic]:
     """Headings and tips that are less certain before the start pose than after it, longer than filters converge."""
     since, before = find_samples_after_start(tracked), tracked.time < tracked.segments.start[0]
@@ -163,7 +163,7 @@ def _diagnose_time_before_start(
         yield Diagnostic("position-uncertain-before-start", INFO, "", position, PLACE, facts)
 
 
-def _remedy_variant(tracked: TrackedRecording) -> dict[str, str]:
+def _remedy_variant(tracked: TrackResult) -> dict[str, str]:
     """The variant of the texts on drifting headings."""
     if tracked.options.open_loop:
         return {"variant": "open-loop"}
@@ -172,12 +172,12 @@ def _remedy_variant(tracked: TrackedRecording) -> dict[str, str]:
     return {} if tracked.recording and tracked.recording.phases.get("clasp") else {"variant": "no-clasp"}
 
 
-def describe_heading_remedy(tracked: TrackedRecording) -> str:
+def describe_heading_remedy(tracked: TrackResult) -> str:
     """The advice on drifting headings."""
     return render(Diagnostic("heading-uncertain", INFO, facts=_remedy_variant(tracked))).do
 
 
-def _diagnose_hinges(tracked: TrackedRecording, hinges: Mapping[str, HingeMotion]) -> Iterator[Diagnostic]:
+def _diagnose_hinges(tracked: TrackResult, hinges: Mapping[str, HingeMotion]) -> Iterator[Diagnostic]:
     rate_hz, table = tracked.recording.rate_hz, tracked.model.table
     for name, motion in hinges.items():
         hinge = table.hinges[name]
@@ -217,7 +217,7 @@ def _median_of_halves(motion: HingeMotion) -> tuple[float, float]:
     return float(np.median(parts[0])), float(np.median(parts[1]))
 
 
-def _diagnose_subject(tracked: TrackedRecording) -> Iterator[Diagnostic]:
+def _diagnose_subject(tracked: TrackResult) -> Iterator[Diagnostic]:
     if tracked.subject.name == "population":
         yield Diagnostic("population-lengths", INFO)
     measured = [name for name, sensor in tracked.recording.sensors.items() if isinstance(sensor, OrientationSensor)]

@@ -13,32 +13,28 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..alignment import (
-    N_POSE,
-    SegmentOrientations,
-    StartFrames,
-    align_sensors,
-    collect_nominal_mounts,
-    compute_heading_offset,
-    compute_heading_variance,
-    compute_measured_covariance,
-    compute_segment_covariance,
-    compute_soft_tissue_covariances,
-    compute_start_heading_var,
-    count_lost_samples,
-    join_segments,
-)
+from ..body.mounts import align_sensors, collect_nominal_mounts, compute_heading_offset, compute_start_heading_var
+from ..body.start_pose import N_POSE, StartFrames
 from ..body.subject import Subject
 from ..compilation import kernel
-from ..filters import BEST, AboutVertical, Orientation
+from ..filters import AboutVertical, Orientation
 from ..filters.sensors import SensorFilters, find_start_orientations
-from ..filters.static import StaticTest
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
 from .heading_problem import FilterHeadings, HeadingProblem
 from .headings import CausalHeadings, correct_covariance
 from .knots import find_specific_force, read_filter_headings
+from .segment_orientations import (
+    SegmentOrientations,
+    TrackOptions,
+    compute_heading_variance,
+    compute_measured_covariance,
+    compute_segment_covariance,
+    compute_soft_tissue_covariances,
+    count_lost_samples,
+    join_segments,
+)
 
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
 
@@ -53,8 +49,9 @@ class SegmentEstimator:
     Parameters
     ----------
     subject : its calibrated mounts are used in place of those that the session states; None: the stated ones
+    options : None: the default ones. While measured orientations are lost, the last one stands where `causal`; else
+        they are interpolated, as the reader does
     start_frames : of the body; left out: the N-pose
-    causal : while measured orientations are lost, the last one stands; else they are interpolated, as the reader does
 
     Attributes
     ----------
@@ -68,14 +65,10 @@ class SegmentEstimator:
     def __init__(
         self,
         subject: Subject | None = None,
-        *,
+        options: TrackOptions | None = None,
         start_frames: StartFrames = N_POSE,
-        method: str = BEST,
-        static_test: StaticTest | None = None,
-        causal: bool = False,
     ) -> None:
-        self._subject, self._start_frames, self._method, self._static_test = subject, start_frames, method, static_test
-        self._causal = causal
+        self._subject, self._options, self._start_frames = subject, options or TrackOptions(), start_frames
         self.names: tuple[str, ...] = ()
         self.headings: CausalHeadings | None = None
 
@@ -100,13 +93,16 @@ class SegmentEstimator:
                 self.mark_phase(phase, begins=begins)
             part = chunk.cut(slice(begin, end))
             parts.append(self._place_chunk(part, self._filters.push(part)))
-        return parts[0] if len(parts) == 1 else join_segments(parts)
+        return parts[0] if len(parts) == 1 else join_segments(chunk, parts)
 
     def _begin(self, first: Recording) -> SegmentOrientations:
         """Filter and align the first chunk."""
         collect_nominal_mounts(first, self._subject, self._start_frames)  # an error before anything is filtered
         self._filters = filters = SensorFilters(
-            first, method=self._method, static_test=self._static_test, sways=not self._start_frames.table.is_mechanism
+            first,
+            method=self._options.method,
+            static_test=self._options.static_test,
+            sways=not self._start_frames.table.is_mechanism,
         )
         orientation = filters.push(first)
         R_VS_start = find_start_orientations(first, orientation, filters.start)
@@ -215,7 +211,8 @@ class SegmentEstimator:
         by_name = {name: quat_WL[:, i] for i, name in enumerate(self.names)}
         soft = compute_soft_tissue_covariances(self._start_frames.table, by_name) if covs else {}
         return SegmentOrientations(
-            time=chunk.time,
+            recording=chunk,
+            options=self._options,
             quat_WL=by_name,
             quat_LS=dict(zip(self.names, self._quat_LS, strict=True)),
             heading_offset=dict(zip(self.names, self.heading_offset.tolist(), strict=True)),
@@ -238,7 +235,7 @@ class SegmentEstimator:
                 columns.append(orientation[name].quat_VS)
                 continue
             quat_VS = sensor.quat_VS
-            if self._causal and sensor.gap is not None and sensor.gap.any():
+            if self._options.causal and sensor.gap is not None and sensor.gap.any():
                 before = self._recent[self._oldest - 1, i] if len(self._recent) else quat_VS[0]
                 known = np.concatenate([[True], ~sensor.gap])
                 last = np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))

@@ -22,6 +22,10 @@ CHECK_WINDOW_S = 0.5  # [s] newest samples that a check uses
 class StartPoseDetector:
     """Detects a start pose that is not stated: `START_POSE_HOLD_S` in which no sensor moves or is lost.
 
+    Parameters
+    ----------
+    measured : (k,) bool: the sensors with measured orientations, whose rates are those from one tick to the next
+
     Attributes
     ----------
     state : "waiting" for sensors, "start_pose", "moved" (in the last second), "ready"
@@ -29,11 +33,12 @@ class StartPoseDetector:
     missing, moving : columns of the sensors that are lost, and of those that moved last
     """
 
-    def __init__(self, rate_hz: float, sensors: int, hold_s: float = START_POSE_HOLD_S) -> None:
-        self.state, self.missing, self.moving = "waiting", tuple(range(sensors)), tuple[int, ...]()
-        self._rate, self._hold = rate_hz, round(hold_s * rate_hz)
+    def __init__(self, rate_hz: float, measured: np.ndarray, hold_s: float = START_POSE_HOLD_S) -> None:
+        self.state, self.missing, self.moving = "waiting", tuple(range(len(measured))), tuple[int, ...]()
+        self._measured, self._rate, self._hold = measured, rate_hz, round(hold_s * rate_hz)
         self._every, self._window = max(1, round(CHECK_PERIOD_S * rate_hz)), max(4, round(CHECK_WINDOW_S * rate_hz))
-        self._gyro = np.zeros((self._hold, sensors, 3))
+        self._gyro = np.zeros((self._hold, len(measured), 3))
+        self._last_quat: np.ndarray | None = None  # of the measured ones
         self._held = 0
         self._tick = 0
         self._moved_at = -np.inf
@@ -52,11 +57,13 @@ class StartPoseDetector:
         """The last tick so far."""
         return self._tick - 1
 
-    def push(self, gyro_S: np.ndarray) -> str:
-        """Add one tick, (k, 3) [rad/s], NaN where a sensor is lost; return the state."""
+    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> str:
+        """Add one tick, (k, 3) [rad/s] and [m/s²] or a packed orientation, NaN where lost; return the state."""
         if self.state == "ready":
             return self.state
         self._tick += 1
+        if self._measured.any():
+            gyro_S = self._find_measured_rates(gyro_S, accel_S)
         self.missing = tuple(np.flatnonzero(~np.isfinite(gyro_S).all(axis=1)).tolist())
         if self.missing:
             self.state, self._held = "waiting", 0
@@ -81,31 +88,15 @@ class StartPoseDetector:
             self.state = "moved" if self._tick - self._moved_at < self._rate else "start_pose"
         return self.state
 
-
-class TickRates:
-    """Rates of all sensors, tick by tick; of measured orientations that from one tick to the next, zero at the first.
-
-    Parameters
-    ----------
-    measured : (k,) bool: the sensors with measured orientations
-    """
-
-    def __init__(self, measured: np.ndarray, rate_hz: float) -> None:
-        self._measured, self._rate_hz = measured, rate_hz
-        self._last: np.ndarray | None = None
-
-    def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """Return the rates (k, 3) [rad/s] in S at the next tick, NaN where a sensor is lost."""
-        if not self._measured.any():
-            return gyro_S
+    def _find_measured_rates(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+        """Return `gyro_S` with the rates of measured orientations since the last tick; zero at the first."""
         quat = unpack_orientations(gyro_S[self._measured], accel_S[self._measured])
-        last = quat if self._last is None else self._last
+        last = quat if self._last_quat is None else self._last_quat
         known = np.isfinite(quat).all(axis=1) & np.isfinite(last).all(axis=1)
-        rates = gyro_S.copy()
         turns = np.full((len(quat), 3), np.nan)
         turns[known] = (Rotation.from_quat(last[known]).inv() * Rotation.from_quat(quat[known])).as_rotvec()
-        rates[self._measured] = turns * self._rate_hz
-        self._last = quat
+        rates, self._last_quat = gyro_S.copy(), quat
+        rates[self._measured] = turns * self._rate
         return rates
 
 
@@ -115,7 +106,6 @@ class StartPoseCutter:
     def __init__(self) -> None:
         self._received: Recording | None = None
         self._detector: StartPoseDetector | None = None
-        self._rates: TickRates | None = None
 
     def push(self, chunk: Recording) -> tuple[Recording, Recording] | None:
         """Add a chunk; return the recording up to the end of the start pose, as `cut_start_pose`, and what follows.
@@ -130,12 +120,11 @@ class StartPoseCutter:
                 return None
             last = received.span(interval).stop
         else:
-            if self._detector is None or self._rates is None:
+            if self._detector is None:
                 measured = [isinstance(sensor, OrientationSensor) for sensor in received.sensors.values()]
-                self._detector = StartPoseDetector(received.rate_hz, len(measured))
-                self._rates = TickRates(np.array(measured), received.rate_hz)
+                self._detector = StartPoseDetector(received.rate_hz, np.array(measured))
             for gyro_S, accel_S in zip(*stack_ticks(chunk), strict=True):
-                if self._detector.push(self._rates.push(gyro_S, accel_S)) == "ready":
+                if self._detector.push(gyro_S, accel_S) == "ready":
                     break
             else:
                 return None

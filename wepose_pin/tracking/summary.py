@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from .error_budget import ErrorBudget
 from .headings import HeadingCorrection
 from .measures import PEAK_OVER_S, Measures, measure, measure_tips
 from .pose_diagnostics import diagnose_pose
-from .tracked import TrackedRecording
+from .result import TrackResult
 
 MOST_RESIDUAL = float(np.deg2rad(1.0))  # [rad] rms by which the model may miss a segment
 MOST_SAMPLES = 50_000  # that pages show; a longer recording is decimated to fewer than twice as many
@@ -38,11 +38,11 @@ class TrackSummary:
 
     content: dict[str, Any]
     diagnostics: tuple[Diagnostic, ...]
-    tracked: TrackedRecording
+    tracked: TrackResult
     measures: Measures | None
 
 
-def summarize(tracked: TrackedRecording) -> TrackSummary:
+def summarize(tracked: TrackResult) -> TrackSummary:
     """The summary of a recording that was tracked as a whole."""
     accumulator = SummaryAccumulator(tracked.recording)
     accumulator.add(tracked)
@@ -59,7 +59,7 @@ class SummaryAccumulator:
 
     def __init__(self, recording: Recording) -> None:
         self._recording, self._every = recording, max(1, len(recording) // MOST_SAMPLES)
-        self._last: TrackedRecording | None = None
+        self._last: TrackResult | None = None
         self._samples = 0
         self._poses: list[Pose] = []  # decimated, as the orientations
         self._orientations: dict[str, list[Orientation]] = {}
@@ -70,7 +70,7 @@ class SummaryAccumulator:
         self._error_budget = ErrorBudget()
 
     @property
-    def last(self) -> TrackedRecording:
+    def last(self) -> TrackResult:
         """The last chunk.
 
         Raises
@@ -82,7 +82,13 @@ class SummaryAccumulator:
             raise BadData("no chunk was tracked: there is nothing to summarise")
         return self._last
 
-    def add(self, tracked: TrackedRecording) -> None:
+    def accumulate(self, chunks: Iterable[TrackResult]) -> Iterator[TrackResult]:
+        """Iterate over chunks, and add each."""
+        for chunk in chunks:
+            self.add(chunk)
+            yield chunk
+
+    def add(self, tracked: TrackResult) -> None:
         """Add the next chunk."""
         rows = (
             np.arange(-self._samples % self._every, len(tracked.time), self._every) if self._every > 1 else slice(None)
@@ -93,7 +99,7 @@ class SummaryAccumulator:
             self._orientations.setdefault(segment, []).append(orientation.take(rows))
         if self._every > 1:
             self._add_peak_speeds(tracked)
-        for segment, angle in tracked.orientation_residual().items():
+        for segment, angle in tracked.compute_orientation_residuals().items():
             self._residual[segment] = self._residual.get(segment, 0.0) + float(np.sum(angle**2))
         for joint, values in tracked.joints.items():
             low, high = self._ranges.get(joint, (np.inf, -np.inf))
@@ -102,7 +108,7 @@ class SummaryAccumulator:
         self._samples += len(tracked.time)
         self._last = tracked
 
-    def _add_peak_speeds(self, tracked: TrackedRecording) -> None:
+    def _add_peak_speeds(self, tracked: TrackResult) -> None:
         """Take the highest speeds within a chunk, and from the one before into it."""
         poses, size = [tracked.pose], max(1, round(PEAK_OVER_S * tracked.recording.rate_hz))
         if self._last is not None:
@@ -131,7 +137,7 @@ class SummaryAccumulator:
         diagnostics = tuple(gravest_first(merge(self._diagnose(), of_motion)))
         return TrackSummary(self._compose(recording, diagnostics), diagnostics, tracked, measures)
 
-    def _decimate(self) -> tuple[TrackedRecording, Recording]:
+    def _decimate(self) -> tuple[TrackResult, Recording]:
         """Return what pages show, and the tracked part of the recording with all samples."""
         last, n = self.last, len(self._recording)
         recording = self._recording.cut(slice(n - self._samples, n))
@@ -145,8 +151,7 @@ class SummaryAccumulator:
         tracked = replace(
             last,
             pose=join_poses(self._poses),
-            recording=shown,
-            segments=replace(last.segments, time=shown.time, orientation=orientation),
+            source=replace(last.segments, recording=shown, orientation=orientation),
         )
         return tracked, recording
 
@@ -242,7 +247,7 @@ def _correction_json(correction: HeadingCorrection | None) -> dict[str, Any] | N
     return about
 
 
-def _diagnose_unknown_points(tracked: TrackedRecording) -> list[Diagnostic]:
+def _diagnose_unknown_points(tracked: TrackResult) -> list[Diagnostic]:
     """The points that are unknown for lack of a sensor."""
     missing = [point for point in tracked.model.table.points if point not in tracked.points]
     lacking = [name for name in tracked.model.table.needed if name not in tracked.quat_WL]
@@ -252,7 +257,7 @@ def _diagnose_unknown_points(tracked: TrackedRecording) -> list[Diagnostic]:
     return [Diagnostic("points-unknown", INFO, facts=facts)]
 
 
-def _diagnose_undetermined_joints(tracked: TrackedRecording) -> list[Diagnostic]:
+def _diagnose_undetermined_joints(tracked: TrackResult) -> list[Diagnostic]:
     """The joints that sensors are too few to tell apart."""
     joints = tracked.find_undetermined_joints()
     return [Diagnostic("joints-undetermined", WARNING, facts={"joints": ", ".join(joints)})] if joints else []

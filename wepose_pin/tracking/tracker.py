@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..alignment import SegmentOrientations, StartFrames, find_start_frames
 from ..body import BodyModel
 from ..body.body import load_sensed_model
 from ..body.covariance import compute_point_covariances
 from ..body.kinematics import KinematicsSolver
+from ..body.start_pose import StartFrames, find_start_frames
 from ..body.subject import Subject, population_subject
 from ..body.table_file import check_segments
 from ..errors import BadOption, BadPhase, BadSession
@@ -21,9 +21,10 @@ from ..filters.noise import BEGINNING_S
 from ..recording import Recording
 from .heading_problem import HeadingProblem, make_heading_problem
 from .headings import HeadingCorrector
+from .result import TrackResult
+from .segment_orientations import SegmentOrientations, TrackOptions
 from .segments import SegmentEstimator
 from .start_pose import StartPoseCutter
-from .tracked import TrackedRecording, TrackOptions
 
 CHUNK_S = 600.0  # of `track_chunks`
 SHORTEST_S = 2.0  # of a chunk: a filter's first window has to fit
@@ -87,7 +88,7 @@ class Tracker:
             raise BadPhase("the start pose has not ended: push a recording that includes it")
         return self._estimator
 
-    def push(self, chunk: Recording) -> TrackedRecording | None:
+    def push(self, chunk: Recording) -> TrackResult | None:
         """Add the next chunk; return it with its pose; None: `smooth` returns it, or the start pose has not ended.
 
         Raises
@@ -102,7 +103,7 @@ class Tracker:
             chunk = replace(chunk, resets=())
         return self._push_causal(chunk) if self.options.causal else self._push_offline(chunk)
 
-    def _push_causal(self, chunk: Recording) -> TrackedRecording | None:
+    def _push_causal(self, chunk: Recording) -> TrackResult | None:
         if self._estimator is None:
             found = self._start.push(chunk)
             if found is None:
@@ -118,7 +119,7 @@ class Tracker:
         self._has_tracked = True
         return self._solve_pose(chunk, self._estimator.push(chunk))
 
-    def _push_offline(self, chunk: Recording) -> TrackedRecording | None:
+    def _push_offline(self, chunk: Recording) -> TrackResult | None:
         is_first = self._estimator is None
         if self._estimator is None:
             self._estimator = self._make_estimator()
@@ -135,7 +136,7 @@ class Tracker:
         self._only = segments if is_first else None
         return None
 
-    def smooth(self) -> Iterator[TrackedRecording]:
+    def smooth(self) -> Iterator[TrackResult]:
         """Iterate over the chunks that `push` did not return, after the last one has been pushed.
 
         Raises
@@ -157,13 +158,7 @@ class Tracker:
             yield self._solve_pose(chunk, estimator.push(chunk))
 
     def _make_estimator(self) -> SegmentEstimator:
-        return SegmentEstimator(
-            self._subject,
-            start_frames=self._start_frames,
-            method=self.options.method,
-            static_test=self.options.static_test,
-            causal=self.options.causal,
-        )
+        return SegmentEstimator(self._subject, self.options, self._start_frames)
 
     def _make_problem(self, first: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
         """Return what observes the headings of a recording whose first chunk this is; None: nothing."""
@@ -171,7 +166,7 @@ class Tracker:
             return None
         return make_heading_problem(first, segments, self._person, self._body, causal=self.options.causal)
 
-    def _solve_pose(self, recording: Recording, segments: SegmentOrientations) -> TrackedRecording:
+    def _solve_pose(self, recording: Recording, segments: SegmentOrientations) -> TrackResult:
         """Return a chunk with its pose, after its headings have been corrected."""
         person, body = self._person, self._body
         if self._headings is not None:
@@ -194,7 +189,7 @@ class Tracker:
             point_cov=point_cov,
             gap={name: sensor.gap for name, sensor in recording.sensors.items() if sensor.gap is not None},
         )
-        return TrackedRecording(recording.name, pose, body, person, recording, segments, self.options, correction)
+        return TrackResult(recording.name, pose, body, person, recording.phases, recording.marks, segments, correction)
 
 
 def track_chunks(
@@ -205,7 +200,7 @@ def track_chunks(
     options: TrackOptions | None = None,
     chunk_s: float = CHUNK_S,
     progress: Callable[[float], None] | None = None,
-) -> Iterator[TrackedRecording]:
+) -> Iterator[TrackResult]:
     """Iterate over a recording's chunks with their poses: results of a day that are too long for memory.
 
     The smoother's is one chunk. Parameters as of `Tracker`.
@@ -227,7 +222,7 @@ def track_chunks(
     first_s = max(last for _, last in spans) - begin + SHORTEST_S if spans else BEGINNING_S
     chunk_s = min(end - begin + 1.0, np.inf if options.method in OFFLINE else max(chunk_s, SHORTEST_S))
 
-    def report(chunk: TrackedRecording | Recording, pass_number: int) -> None:
+    def report(chunk: TrackResult | Recording, pass_number: int) -> None:
         if progress is not None:
             progress((pass_number + (float(chunk.time[-1]) - begin) / (end - begin)) / 2.0)
 

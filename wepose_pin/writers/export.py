@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 
 from ..arguments import check_arguments
 from ..assets import find_plugins, load_plugin
-from ..body.kinematics import PosedBody, find_samples
+from ..body.kinematics import find_samples
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import whole_file, whole_folder
 from ..errors import BadData, BadOption, MissingFile, one_of
 from ..recording import select_interval
+from ..tracking import TrackResult
 from .bvh import write_bvh
 from .c3d import write_c3d
 from .joint_motion import (
@@ -37,7 +38,7 @@ from .ros import write_mcap, write_rosbag
 from .rrd import write_rrd
 from .tables import write_csv, write_parquet
 
-Result = PosedBody | HasJointMotion | str | Path
+Result = TrackResult | HasJointMotion | str | Path
 PERSON, JOINTS, BODY = "a person's motion", "joints", "a body"  # what a format is of
 MOTION = ("rate_hz", "interval", "phase")  # options of a format with a motion
 NAMES = ("isb", "opensim")
@@ -64,7 +65,7 @@ class Format(NamedTuple):
 
 def write_urdf(file: Path, result: Result) -> list[Diagnostic]:
     """Write the body of a person or a robot."""
-    if isinstance(result, PosedBody):
+    if isinstance(result, TrackResult):
         file.write_text(format_urdf(result.subject, result.model), encoding="utf-8")
     elif isinstance(result, HasJointMotion):
         file.write_text(result.joint_motion().urdf, encoding="utf-8")
@@ -81,7 +82,7 @@ def _is_of_robot(result: Result) -> bool:
     """Whether a result is a robot's trajectory, and not a person's motion."""
     if isinstance(result, str | Path):
         return (Path(result) / TRAJECTORY).is_file()
-    return not isinstance(result, PosedBody)
+    return not isinstance(result, TrackResult)
 
 
 # pyproject.toml registers them as those of other distributions.
@@ -154,7 +155,7 @@ def export(
 
     Parameters
     ----------
-    result : PosedBody, Trajectory, str or Path, or several
+    result : TrackResult, Trajectory, str or Path, or several
         A person's motion: what `track` or `load_result` gives, or a result folder. A robot's: what `retarget` gives, or
         a folder that `wepose retarget` wrote. Several only for "lerobot", which makes episodes of them.
     file : str or Path
@@ -301,8 +302,8 @@ def _read_motion(
             f"--format {format}: is of a person's motion, and this is a robot's trajectory; "
             f"of that there is: {', '.join(each for each, format in list_formats().items() if format.of != PERSON)}"
         )
-    if isinstance(result, PosedBody):
-        selected = select_interval(result.time, getattr(result, "phases", {}), interval, phase)
+    if isinstance(result, TrackResult):
+        selected = select_interval(result.time, result.phases, interval, phase)
         pose = result.pose if selected is None else result.pose.cut(find_samples(result.time, selected))
         motion = Motion(pose, result.model, result.name, result.name)
     else:

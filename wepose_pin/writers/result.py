@@ -9,7 +9,7 @@ import contextlib
 import json
 import platform
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
@@ -21,15 +21,17 @@ import polars as pl
 
 from .. import __version__
 from ..angles.torques import Torques, torque_table
+from ..arguments import check_arguments
 from ..body import BodyModel, BodyTable, load_model, load_table
 from ..body.kinematics import Pose, find_samples
 from ..body.pose_table import build_pose_table, parse_pose_table
 from ..body.subject import Subject, load_subject, subject_toml
 from ..body.table_file import MODEL_TABLE, format_table
+from ..diagnostics import from_json
 from ..errors import BadData, ExistingOutput, MissingFile
 from ..readers.tables import open_source, read_columns, read_table
 from ..recording import Intervals, Mark, select_interval
-from ..tracking import TrackedRecording, TrackSummary
+from ..tracking import TrackResult, TrackSummary
 
 POSE = "pose.parquet"
 JOINTS = "joints.parquet"
@@ -39,19 +41,17 @@ ROW_GROUP = 50_000  # rows of a table in chunks that are written at a time
 
 def write_result(
     folder: Path,
-    tracked: TrackedRecording,
+    tracked: TrackResult,
     summary: TrackSummary,
-    covariance: bool = False,
-    phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     torques: Torques | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
     """Write a recording that was tracked as a whole into an existing folder: `write_poses` and `write_about`."""
-    write_poses(folder, [tracked], covariance)
-    write_about(folder, tracked, summary, phases, torques, provenance)
+    write_poses(folder, [tracked])
+    write_about(folder, tracked, summary, torques, provenance)
 
 
-def write_poses(folder: Path, chunks: Iterable[TrackedRecording], covariance: bool = False) -> None:
+def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = False) -> None:
     """Write ``pose.parquet``, and of a mechanism ``joints.parquet``, of consecutive chunks, one in memory at a time.
 
     With `covariance` they have its entries besides standard deviations.
@@ -83,9 +83,8 @@ def write_poses(folder: Path, chunks: Iterable[TrackedRecording], covariance: bo
 
 def write_about(
     folder: Path,
-    tracked: TrackedRecording,
+    tracked: TrackResult,
     summary: TrackSummary,
-    phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     torques: Torques | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> None:
@@ -93,8 +92,7 @@ def write_about(
 
     Parameters
     ----------
-    tracked : the last chunk
-    phases : of the recording; they go to the summary, so that a page made from the folder shows them too
+    tracked : the last chunk; the phases of its recording go to the summary, and pages made from the folder show them
     torques : become ``torques.parquet``
     provenance : becomes part of the summary
     """
@@ -103,10 +101,10 @@ def write_about(
         write_table(folder / "torques.parquet", torque_table(torques))
         content = {**content, "torques": torques.summary()}
     write_subject(folder, tracked.subject, tracked.model)
-    spans = {name: [[float(a), float(b)] for a, b in intervals] for name, intervals in (phases or {}).items()}
+    spans = {name: [[float(a), float(b)] for a, b in intervals] for name, intervals in tracked.phases.items()}
     about = {**content, "recorded_phases": spans, "versions": versions()}
-    if tracked.recording.marks:
-        about["recorded_marks"] = [[mark.time, mark.text] for mark in tracked.recording.marks]
+    if tracked.marks:
+        about["recorded_marks"] = [[mark.time, mark.text] for mark in tracked.marks]
     if provenance is not None:
         about["provenance"] = dict(provenance)
     (folder / "summary.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
@@ -196,6 +194,52 @@ def read_result(
         model = replace(model, girdles=load_subject(subject_file).girdles)
     selected = select_interval(pose.time, read_phases(summary), interval, phase)
     return pose if selected is None else pose.cut(find_samples(pose.time, selected)), model, summary
+
+
+def load_result(folder: str | Path) -> TrackResult:
+    """Read a result folder, as `wepose track` and `TrackResult.save` write it.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Holds ``pose.parquet``, ``subject.toml``, ``subject.urdf`` and ``summary.json``.
+
+    Returns
+    -------
+    TrackResult
+        The content of its files. These have no covariances but standard deviations, the same for all axes, unless
+        `wepose track --covariance` wrote them.
+
+    Raises
+    ------
+    MissingFile, BadData, BadSubject, BadModel
+        The folder is not there or lacks a file, or a file is damaged.
+
+    Examples
+    --------
+    >>> wp.load_result("result")
+    TrackResult('simulated': 22.5 s at 100 Hz, 5 segments, 8 points, amekf, 0 warnings)
+    """
+    check_arguments(load_result, locals())
+    folder = Path(folder)
+    pose, model, summary = read_result(folder)
+    try:
+        diagnostics = tuple(from_json(each) for each in summary.get("diagnostics", ()))
+        recorded = summary.get("recorded_phases", {}).items()
+        phases = {phase: tuple((float(begin), float(end)) for begin, end in spans) for phase, spans in recorded}
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise BadData(f"{folder / 'summary.json'}: is damaged: {error}") from error
+    return TrackResult(
+        str(summary.get("recording") or folder.name),
+        pose,
+        model,
+        load_subject(folder),
+        phases,
+        read_marks(summary),
+        source=folder,
+        summary=summary,
+        diagnostics=diagnostics,
+    )
 
 
 def read_phases(summary: Mapping[str, Any]) -> dict[str, Intervals]:

@@ -1,4 +1,4 @@
-"""Sensor-to-segment alignment: mounts R_LS and heading offsets ψ from the start pose, then segment orientations.
+"""Sensor-to-segment alignment: mounts R_LS and heading offsets ψ from the start pose.
 
 A filter observes the vertical and not the heading: its world V differs from W by a rotation about the vertical,
 R_WV = Rz(ψ). Alignment works with the frame L' of each segment that equals W in the start pose: the mount in it is
@@ -10,26 +10,23 @@ person's segment frames L equal W in the N-pose; in another start pose R_LS = R_
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from . import rotations
-from .body import BodyModel, BodyTable, load_table
-from .body.start_pose import compute_start_configuration
-from .body.subject import Subject
-from .body.table import NEUTRAL_POSE
-from .diagnostics import WARNING, Diagnostic
-from .errors import BadSession
-from .filters import Orientation, join_orientations
-from .filters.smekf import HOLD_S, LOST_RATE_STD
-from .filters.start import ACCEL_BIAS_STD
-from .recording import OrientationSensor, Recording, format_span
+from .. import rotations
+from ..diagnostics import WARNING, Diagnostic
+from ..errors import BadSession
+from ..recording import OrientationSensor, Recording, format_span
+from .start_pose import N_POSE, StartFrames
+from .subject import Subject
+from .table import BodyTable
 
 # Angles [deg] between a stated mount and gravity or motion. Above them the mount is an error or gets a warning.
 MAX_MOUNT_ERROR_DEG = 60.0
 MOUNT_WARNING_DEG = 35.0
+# A calibrated mount has moved where gravity contradicts it by more standard deviations than this.
+MOUNT_MOVED_STDS = 3.5
 
 # Standard deviations per axis; assumptions. Those of start poses and soft tissue stand in the table of the body.
 # [rad] of a device's own orientation about each axis: segments differ from optical motion capture, in walking and
@@ -37,101 +34,6 @@ MOUNT_WARNING_DEG = 35.0
 MEASURED_ORIENTATION_STD = np.deg2rad(2.0)
 SEGMENT_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a segment's orientation in motion, mostly by soft tissue
 PALM_SLIP_STD = 0.005  # [m] by which joined palms slip
-# A calibrated mount has moved where gravity contradicts it by more standard deviations than this.
-MOUNT_MOVED_STDS = 3.5
-
-
-@dataclass(frozen=True)
-class StartFrames:
-    """The segment frames in the start pose.
-
-    Parameters
-    ----------
-    R_WL : segment → its orientation; a segment that is not named has the frame of W
-    table : of the body
-    q : (nq,) its configuration; None: not known
-    """
-
-    R_WL: Mapping[str, Rotation] = field(default_factory=dict)
-    table: BodyTable = field(default_factory=load_table)
-    q: np.ndarray | None = None
-
-    def std(self, segment: str) -> np.ndarray:
-        """Return (3,) [rad], one standard deviation about each axis of a segment's rotation off the start pose."""
-        return np.array(self.table.segments[segment].start_std)
-
-    def repeat_std(self, segment: str) -> np.ndarray:
-        """Return (3,) [rad], one standard deviation about each axis between two start poses of one person."""
-        return np.array(self.table.segments[segment].repeat_std)
-
-    def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
-        """Return R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
-        return self.R_WL[segment] * R_LS if segment in self.R_WL else R_LS
-
-    def to_segment(self, segment: str, R_WS: Rotation) -> Rotation:
-        """Return the mount R_LS of a sensor whose orientation in the start pose is R_WS."""
-        return self.R_WL[segment].inv() * R_WS if segment in self.R_WL else R_WS
-
-
-N_POSE = StartFrames()
-
-
-def find_start_frames(body: BodyModel, recording: Recording) -> StartFrames:
-    """Find the segment frames of a body in the start pose of its recording.
-
-    Raises
-    ------
-    BadSession
-        A start pose or a joint that the body does not have.
-    """
-    table = body.table
-    q = compute_start_configuration(body, recording.start_pose, recording.joints, recording.where())
-    R_WL: dict[str, Rotation] = {}
-    if table.is_mechanism or recording.start_pose != NEUTRAL_POSE:
-        R_WK = body.orient_links(q)
-        R_WL = {segment: Rotation.from_matrix(R_WK[segment]) for segment in recording.sensors}
-    return StartFrames(R_WL, table, q)
-
-
-@dataclass(frozen=True)
-class SegmentOrientations:
-    """Orientation of each measured segment.
-
-    Parameters
-    ----------
-    time : (n,) [s]
-    quat_WL : segment → (n, 4) xyzw
-    quat_LS : segment → (4,) xyzw, the mount used
-    heading_offset : segment → ψ [rad], heading of its sensor's world V in W
-    orientation : segment → result of its sensor's filter, in V; no entry for measured orientations
-    covariance_W : segment → (n, 3, 3) [rad²] of the error on the left of `quat_WL`, in W: the sum of the filter's
-        covariance, the tilt by the accelerometer's bias, the uncertainty of mount and start pose, and soft tissue. No
-        entry for filters without a covariance (ncf, gdc)
-    start, static_phase : intervals [s]; headings and mounts are from the first, noise and bias from the second
-    diagnostics : of the recording, its start pose and its mounts
-    """
-
-    time: np.ndarray
-    quat_WL: Mapping[str, np.ndarray]
-    quat_LS: Mapping[str, np.ndarray]
-    heading_offset: Mapping[str, float]
-    orientation: Mapping[str, Orientation]
-    covariance_W: Mapping[str, np.ndarray]
-    start: tuple[float, float]
-    static_phase: tuple[float, float]
-    diagnostics: tuple[Diagnostic, ...]
-
-
-def join_segments(parts: Sequence[SegmentOrientations]) -> SegmentOrientations:
-    """Join the samples of chunks; fields that are not a value a sample are those of the last chunk."""
-    last = parts[-1]
-    return replace(
-        last,
-        time=np.concatenate([part.time for part in parts]),
-        quat_WL={name: np.concatenate([part.quat_WL[name] for part in parts]) for name in last.quat_WL},
-        orientation={name: join_orientations([part.orientation[name] for part in parts]) for name in last.orientation},
-        covariance_W={name: np.concatenate([part.covariance_W[name] for part in parts]) for name in last.covariance_W},
-    )
 
 
 def collect_nominal_mounts(
@@ -220,7 +122,7 @@ def align_sensors(
         if tilt_error_deg > MOUNT_WARNING_DEG:
             value, limit = float(np.deg2rad(tilt_error_deg)), float(np.deg2rad(MOUNT_WARNING_DEG))
             diagnostics.append(Diagnostic("mount-contradicts-gravity", WARNING, segment, value, limit, facts))
-        mount_cov = _find_start_mount_covariance(recording, segment, subject, start_frames)
+        mount_cov = find_start_mount_covariance(recording, segment, subject, start_frames)
         if mount_cov is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
@@ -266,23 +168,6 @@ def _describe_mount_error(
     )
 
 
-def count_lost_samples(sensor: OrientationSensor, before: int = 0) -> np.ndarray:
-    """Count (n,) the samples since the last that was measured; `before`: those before the first."""
-    samples = np.arange(len(sensor.quat_VS))
-    if sensor.gap is None:
-        return np.zeros_like(samples)
-    return samples - np.maximum.accumulate(np.where(sensor.gap, -1 - before, samples))
-
-
-def compute_measured_covariance(lost_s: np.ndarray) -> np.ndarray:
-    """Compute the covariance (n, 3, 3) [rad²] of measured orientations that have been lost for `lost_s` (n,) [s].
-
-    It grows by the motion that may have been missed, as that of the filters.
-    """
-    missed_std = np.minimum(np.pi, LOST_RATE_STD * lost_s**2 / (lost_s + HOLD_S))
-    return (MEASURED_ORIENTATION_STD**2 + missed_std**2)[:, None, None] * np.eye(3)
-
-
 def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:
     """Return ψ [rad] such that Rz(ψ) R_VS is nearest to R_WS: the twist about the vertical of R_WS R_VSᵀ."""
     return float(rotations.heading((R_WS * R_VS.inv()).as_quat()))
@@ -307,83 +192,6 @@ def find_nominal_mount(
     return start_frames.to_segment(segment, Rotation.from_quat(stated)).as_quat()
 
 
-def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
-    """Compute the variance (n,) [rad²] of the heading from the covariance (n, 3, 3) [rad²] of the attitude error.
-
-    `quat_VS` is (n, 4) xyzw; the attitude error is in S, on the right.
-    """
-    up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
-    return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
-
-
-def compute_segment_covariance(
-    recording: Recording,
-    segment: str,
-    subject: Subject | None,
-    quat_WS: np.ndarray,
-    R_LS: Rotation,
-    attitude_cov: np.ndarray,
-    start_frames: StartFrames,
-) -> np.ndarray:
-    """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
-
-    `quat_WS` (n, 4) xyzw is the sensor's orientation, `attitude_cov` (n, 3, 3) [rad²] the filter's, in S, error on the
-    right.
-    """
-    R = Rotation.from_quat(quat_WS).as_matrix()
-    cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
-    # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
-    cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
-    # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes
-    # off the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
-    R_WL = R @ start_frames.to_world(segment, R_LS).inv().as_matrix()
-    mount_cov = _find_start_mount_covariance(recording, segment, subject, start_frames)
-    start_var = start_frames.std(segment) ** 2
-    vertical = np.array([0.0, 0.0, 1.0])
-    if mount_cov is not None and subject is not None:  # whose mount it is
-        error_jacobian = R_WL - np.outer(vertical, vertical)
-        if segment not in subject.start_pose_offset:
-            # What is left after the start pose has corrected the tilt, as in `align_sensors`. A person repeats the
-            # offset of the calibration's own start pose: then the start pose tells nothing new.
-            tilt = mount_cov[:2]
-            mount_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + np.diag(start_var[:2]), tilt)
-        if segment != start_frames.table.reference:
-            # By how much the person turned the segment about the vertical in the calibration's start pose is not known.
-            cov_W += start_var[2] * np.einsum("na,nb->nab", R_WL[:, :, 2], R_WL[:, :, 2])
-    else:
-        # The tilt of a stated mount is gravity's in the start pose, so that it has the error of the start pose.
-        error_jacobian, mount_cov = R_WL, np.diag([start_var[0], start_var[1], 0.0])
-    cov_W += error_jacobian @ mount_cov @ error_jacobian.swapaxes(1, 2)
-    cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_frames)
-    return cov_W
-
-
-def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Compute segment → covariance (n, 3, 3) [rad²] in W by which soft tissue turns its sensor in motion."""
-    covariances, elevation, relative = {}, {}, {}
-    for segment, quat in quat_WL.items():
-        tissue = table.segments[segment].soft_tissue
-        along = np.array(table.segments[segment].along)
-        below = quat_WL.get(tissue.relative_to)
-        relative[segment] = quat if below is None else rotations.multiply(rotations.conjugate(below), quat)
-        turned = Rotation.from_quat(relative[segment]).as_matrix() @ along
-        elevation[segment] = np.arccos(np.clip(turned @ along, -1.0, 1.0))
-    for segment, quat in quat_WL.items():
-        tissue = table.segments[segment].soft_tissue
-        along = np.array(table.segments[segment].along)
-        var = np.square(tissue.std) + np.square(np.outer(elevation[segment], tissue.per_tilt))
-        raised = [elevation[other] for other in tissue.raised if other in elevation]
-        if raised:
-            var = var + np.square(np.outer(np.mean(raised, axis=0), tissue.per_raised))
-        if tissue.per_twist and tissue.relative_to in quat_WL:
-            x_y_z, w = relative[segment][:, :3], relative[segment][:, 3]
-            twist = 2.0 * np.arctan2(np.abs(x_y_z @ along), np.abs(w))
-            var = var + np.square(np.outer(tissue.per_twist * twist, along))
-        matrix = Rotation.from_quat(quat).as_matrix()
-        covariances[segment] = (matrix * var[:, None, :]) @ matrix.swapaxes(1, 2)
-    return covariances
-
-
 def compute_start_heading_var(
     recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames
 ) -> float:
@@ -405,7 +213,7 @@ def find_mount_covariance(recording: Recording, segment: str, subject: Subject |
     return None if subject is None or recording.remounted else subject.mount_covariance(segment)
 
 
-def _find_start_mount_covariance(
+def find_start_mount_covariance(
     recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames
 ) -> np.ndarray | None:
     """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L'; None: as `find_mount_covariance`."""

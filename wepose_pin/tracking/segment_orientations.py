@@ -1,0 +1,184 @@
+"""`SegmentOrientations`: what is estimated of a recording's segments, and how; the covariances of segments in W."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .. import rotations
+from ..body import BodyTable
+from ..body.mounts import MEASURED_ORIENTATION_STD, compute_start_heading_var, find_start_mount_covariance
+from ..body.start_pose import StartFrames
+from ..body.subject import Subject
+from ..diagnostics import Diagnostic
+from ..errors import BadOption
+from ..filters import BEST, OFFLINE, Orientation, check_method, join_orientations
+from ..filters.smekf import HOLD_S, LOST_RATE_STD
+from ..filters.start import ACCEL_BIAS_STD
+from ..filters.static import StaticTest
+from ..recording import OrientationSensor, Recording
+
+
+@dataclass(frozen=True)
+class TrackOptions:
+    """What is chosen for a `Tracker`, beside the person and the body model; each as in `track`.
+
+    Raises
+    ------
+    BadOption
+        A method that is not known, or that needs the whole recording where `causal` is chosen.
+    """
+
+    method: str = BEST
+    static_test: StaticTest | None = None
+    open_loop: bool = False
+    causal: bool = False
+    limits: bool = True
+
+    def __post_init__(self) -> None:
+        check_method(self.method)
+        if self.causal and self.method in OFFLINE:
+            raise BadOption(f"method '{self.method}' needs the whole recording; 'amekf' looks at nothing ahead")
+
+
+@dataclass(frozen=True, repr=False)
+class SegmentOrientations:
+    """Orientation of each measured segment of a recording, or of a chunk of one.
+
+    Parameters
+    ----------
+    recording : the input, n samples; of a causal tracker the part after the start pose
+    options : how it was tracked
+    quat_WL : segment → (n, 4) xyzw
+    quat_LS : segment → (4,) xyzw, the mount used
+    heading_offset : segment → ψ [rad], heading of its sensor's world V in W
+    orientation : segment → result of its sensor's filter, in V; no entry for measured orientations
+    covariance_W : segment → (n, 3, 3) [rad²] of the error on the left of `quat_WL`, in W: the sum of the filter's
+        covariance, the tilt by the accelerometer's bias, the uncertainty of mount and start pose, and soft tissue. No
+        entry for filters without a covariance (ncf, gdc)
+    start, static_phase : intervals [s]; headings and mounts are from the first, noise and bias from the second
+    diagnostics : of the recording, its start pose and its mounts
+    """
+
+    recording: Recording
+    options: TrackOptions
+    quat_WL: Mapping[str, np.ndarray]
+    quat_LS: Mapping[str, np.ndarray]
+    heading_offset: Mapping[str, float]
+    orientation: Mapping[str, Orientation]
+    covariance_W: Mapping[str, np.ndarray]
+    start: tuple[float, float]
+    static_phase: tuple[float, float]
+    diagnostics: tuple[Diagnostic, ...]
+
+    def __repr__(self) -> str:
+        return f"SegmentOrientations({self.recording!r}, {self.options.method})"
+
+
+def join_segments(recording: Recording, parts: Sequence[SegmentOrientations]) -> SegmentOrientations:
+    """Join the parts of a recording; fields that are not a value a sample are those of the last part."""
+    last = parts[-1]
+    return replace(
+        last,
+        recording=recording,
+        quat_WL={name: np.concatenate([part.quat_WL[name] for part in parts]) for name in last.quat_WL},
+        orientation={name: join_orientations([part.orientation[name] for part in parts]) for name in last.orientation},
+        covariance_W={name: np.concatenate([part.covariance_W[name] for part in parts]) for name in last.covariance_W},
+    )
+
+
+def count_lost_samples(sensor: OrientationSensor, before: int = 0) -> np.ndarray:
+    """Count (n,) the samples since the last that was measured; `before`: those before the first."""
+    samples = np.arange(len(sensor.quat_VS))
+    if sensor.gap is None:
+        return np.zeros_like(samples)
+    return samples - np.maximum.accumulate(np.where(sensor.gap, -1 - before, samples))
+
+
+def compute_measured_covariance(lost_s: np.ndarray) -> np.ndarray:
+    """Compute the covariance (n, 3, 3) [rad²] of measured orientations that have been lost for `lost_s` (n,) [s].
+
+    It grows by the motion that may have been missed, as that of the filters.
+    """
+    missed_std = np.minimum(np.pi, LOST_RATE_STD * lost_s**2 / (lost_s + HOLD_S))
+    return (MEASURED_ORIENTATION_STD**2 + missed_std**2)[:, None, None] * np.eye(3)
+
+
+def compute_heading_variance(quat_VS: np.ndarray, attitude_cov: np.ndarray) -> np.ndarray:
+    """Compute the variance (n,) [rad²] of the heading from the covariance (n, 3, 3) [rad²] of the attitude error.
+
+    `quat_VS` is (n, 4) xyzw; the attitude error is in S, on the right.
+    """
+    up_S = Rotation.from_quat(quat_VS).inv().apply([0.0, 0.0, 1.0])
+    return np.einsum("na,nab,nb->n", up_S, attitude_cov, up_S)
+
+
+def compute_segment_covariance(
+    recording: Recording,
+    segment: str,
+    subject: Subject | None,
+    quat_WS: np.ndarray,
+    R_LS: Rotation,
+    attitude_cov: np.ndarray,
+    start_frames: StartFrames,
+) -> np.ndarray:
+    """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
+
+    `quat_WS` (n, 4) xyzw is the sensor's orientation, `attitude_cov` (n, 3, 3) [rad²] the filter's, in S, error on the
+    right.
+    """
+    R = Rotation.from_quat(quat_WS).as_matrix()
+    cov_W = R @ attitude_cov @ R.swapaxes(1, 2)
+    # The accelerometer's bias tilts each static phase in the same way, so that averaging does not remove it.
+    cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
+    # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes
+    # off the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
+    R_WL = R @ start_frames.to_world(segment, R_LS).inv().as_matrix()
+    mount_cov = find_start_mount_covariance(recording, segment, subject, start_frames)
+    start_var = start_frames.std(segment) ** 2
+    vertical = np.array([0.0, 0.0, 1.0])
+    if mount_cov is not None and subject is not None:  # whose mount it is
+        error_jacobian = R_WL - np.outer(vertical, vertical)
+        if segment not in subject.start_pose_offset:
+            # What is left after the start pose has corrected the tilt, as in `align_sensors`. A person repeats the
+            # offset of the calibration's own start pose: then the start pose tells nothing new.
+            tilt = mount_cov[:2]
+            mount_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + np.diag(start_var[:2]), tilt)
+        if segment != start_frames.table.reference:
+            # By how much the person turned the segment about the vertical in the calibration's start pose is not known.
+            cov_W += start_var[2] * np.einsum("na,nb->nab", R_WL[:, :, 2], R_WL[:, :, 2])
+    else:
+        # The tilt of a stated mount is gravity's in the start pose, so that it has the error of the start pose.
+        error_jacobian, mount_cov = R_WL, np.diag([start_var[0], start_var[1], 0.0])
+    cov_W += error_jacobian @ mount_cov @ error_jacobian.swapaxes(1, 2)
+    cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_frames)
+    return cov_W
+
+
+def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Compute segment → covariance (n, 3, 3) [rad²] in W by which soft tissue turns its sensor in motion."""
+    covariances, elevation, relative = {}, {}, {}
+    for segment, quat in quat_WL.items():
+        tissue = table.segments[segment].soft_tissue
+        along = np.array(table.segments[segment].along)
+        below = quat_WL.get(tissue.relative_to)
+        relative[segment] = quat if below is None else rotations.multiply(rotations.conjugate(below), quat)
+        turned = Rotation.from_quat(relative[segment]).as_matrix() @ along
+        elevation[segment] = np.arccos(np.clip(turned @ along, -1.0, 1.0))
+    for segment, quat in quat_WL.items():
+        tissue = table.segments[segment].soft_tissue
+        along = np.array(table.segments[segment].along)
+        var = np.square(tissue.std) + np.square(np.outer(elevation[segment], tissue.per_tilt))
+        raised = [elevation[other] for other in tissue.raised if other in elevation]
+        if raised:
+            var = var + np.square(np.outer(np.mean(raised, axis=0), tissue.per_raised))
+        if tissue.per_twist and tissue.relative_to in quat_WL:
+            x_y_z, w = relative[segment][:, :3], relative[segment][:, 3]
+            twist = 2.0 * np.arctan2(np.abs(x_y_z @ along), np.abs(w))
+            var = var + np.square(np.outer(tissue.per_twist * twist, along))
+        matrix = Rotation.from_quat(quat).as_matrix()
+        covariances[segment] = (matrix * var[:, None, :]) @ matrix.swapaxes(1, 2)
+    return covariances
