@@ -54,8 +54,8 @@ def compute_point_covariances(
             continue
         columns = [column for part in parts.values() for column in part.columns]
         J = np.concatenate([part.jacobian for part in parts.values()], axis=2)
-        by_shape = J.reshape(-1, len(columns)) @ shape_cov[np.ix_(columns, columns)]
-        cov = by_shape.reshape(J.shape) @ J.swapaxes(1, 2)
+        # Sample by sample: the bits of one large product would depend on the number of samples.
+        cov = J @ shape_cov[np.ix_(columns, columns)] @ J.swapaxes(1, 2)
         vectors: dict[str, np.ndarray] = {}
         for segment in {part.segment: None for part in parts.values() if part.segment is not None}:
             own = [key for key, part in parts.items() if part.segment == segment]
