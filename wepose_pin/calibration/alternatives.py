@@ -11,7 +11,7 @@ from itertools import permutations
 
 import numpy as np
 
-from ..alignment import MOUNT_WARNING_DEG
+from ..body.mounts import MOUNT_WARNING_DEG
 from ..diagnostics import WARNING, Diagnostic
 from .anatomy import LEAST_ROTATION, OPEN, LimbMotion, measure_limbs, measure_rotation
 from .priors import combine_lengths
