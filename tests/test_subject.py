@@ -130,7 +130,7 @@ GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 
     [
         ("format = 1", "this version reads format = 2"),
         ("format = 2\n[lengths]\nleft_uper_arm = 0.3", "did you mean 'left_upper_arm'"),
-        ("format = 2\n[lengths]\ntrunk = 'long'", "lengths.trunk = 'long'; a number in metres"),
+        ("format = 2\n[lengths]\ntrunk = 'long'", "lengths.trunk = 'long'; a number [m] from"),
         ("format = 2\n[lengths]\ntrunk = -0.5", "lengths.trunk = -0.5"),
         ("format = 2\n[lengths]\ntrunk = 0.5", "lengths: shoulder_width, left_upper_arm"),
         ("format 1", "not valid TOML"),
@@ -145,9 +145,18 @@ GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 
             "ALL\n[start_pose_offset.tors]\nx_deg = 1\ny_deg = 1\nstd_deg = 1",
             "start_pose_offset: 'tors' is not known; did you mean 'torso'",
         ),
-        ("ALL\n[start_pose_offset.torso]\nx_deg = 1", "it needs x_deg, y_deg, std_deg"),
-        ("ALL\n[heading_drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1", "it needs rate_deg_min, std_deg_min"),
-        (f"ALL\n[girdles.left_shoulder]\n{GIRDLE}", "girdles.left_shoulder has no raised_z; it needs law, rest_x"),
+        (
+            "ALL\n[start_pose_offset.torso]\nx_deg = 1",
+            "torso.y_deg is missing; a number [deg] from -180 to 180 is needed for each of x_deg, y_deg",
+        ),
+        (
+            "ALL\n[heading_drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1",
+            "std_deg_min = -1; a number [deg/min] from 0 to 6000 is",
+        ),
+        (
+            f"ALL\n[girdles.left_shoulder]\n{GIRDLE}",
+            "left_shoulder.raised_z is missing; a number from -3 to 3 is needed",
+        ),
         (f"ALL\n[girdles.left_shoulder]\n{GIRDLE}\nraised_z = 5.0", "girdles.left_shoulder"),
         (
             f"ALL\n[girdles.left_sholder]\n{GIRDLE}\nraised_z = 0",

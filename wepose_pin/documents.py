@@ -16,13 +16,13 @@ import signal
 import tempfile
 import threading
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from types import FrameType, UnionType
-from typing import Annotated, Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
 from .errors import BadSession, ExistingOutput, MissingFile, WeposeError, one_of
 
@@ -166,19 +166,6 @@ class TomlTable:
             raise self.error(f"{self.at(key)} = {value!r} must be greater than 0")
         return float(value)
 
-    def numbers(self, *names: str, most: float = 1e6) -> list[float]:
-        """Return the finite numbers of these keys, which are all required; a standard deviation is not negative."""
-        values: list[float] = []
-        for name in names:
-            value = self.values.get(name)
-            if not is_number(value) or abs(value) > most or (name.startswith("std") and value < 0.0):
-                entry = f"{name} = {_format_value(value)}" if name in self else f"no {name}"
-                raise self.error(
-                    f"{self.where} has {entry}; it needs {', '.join(names)}: numbers up to {most:g}, std from 0 on"
-                )
-            values.append(float(value))
-        return values
-
     def names(self, key: str, count: int) -> list[str]:
         """Return a list of `count` different names of columns."""
         value = self.values.get(key)
@@ -232,25 +219,31 @@ _COUNTS = ("", "a number", "two numbers", "three numbers")
 # Unit in a file → to SI, and back.
 _UNITS: dict[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
     "deg": (math.radians, math.degrees),
+    "deg_min": (lambda value: math.radians(value) / 60.0, lambda value: 60.0 * math.degrees(value)),
     "mm": (lambda value: 1e-3 * value, lambda value: 1e3 * value),
 }
 
 
 @dataclass(frozen=True)
 class Key:
-    """How a field of a NamedTuple is written in a TOML table, as in ``softness: Annotated[float, Key(unit="deg")]``.
+    """How a field of a record is written in a TOML table, as in ``softness: Annotated[float, Key(unit="deg")]``.
 
-    A field without it has a key of its own name. Fields are texts, numbers, flags, tuples of texts or of up to three
-    numbers, and other such NamedTuples.
+    A field without it has a key of its own name; with None in its place the table has no such field. Fields are texts,
+    numbers, flags, tuples of texts or of up to three numbers, arrays (k,) with `each`, NamedTuples, and mappings of
+    names to numbers, arrays or NamedTuples, each a table.
 
     Parameters
     ----------
     name : of the key; empty: that of the field and the unit, ``softness_deg``
-    unit : of the file's numbers; of deg and mm, the field is in rad and m
+    unit : of the file's numbers; of deg, deg_min and mm the field is in rad, rad/s and m
     least, most : limits of each number, in the file's unit
     of : what texts name; `read_record` is given the names that there are
     words : text in the file → value of the field
     omit_zero : zeros are not written
+    each : the keys of an array's numbers
+    unread : keys beside those, in tables of arrays, that are written for whoever looks at the file
+    digits : decimals that are written; None: all that count
+    comment : is written behind the heading of a table
     """
 
     name: str = ""
@@ -260,6 +253,10 @@ class Key:
     of: str = ""
     words: Mapping[str, Any] = field(default_factory=dict, hash=False)
     omit_zero: bool = False
+    each: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+    digits: int | None = None
+    comment: str = ""
 
 
 @cache
@@ -267,7 +264,10 @@ def _find_keys(kind: Callable[..., Any]) -> dict[str, tuple[Any, Key]]:
     """Return field → its type, without None, and its key."""
     keys = {}
     for name, hint in get_type_hints(kind, include_extras=True).items():
-        value_type, key = get_args(hint) if get_origin(hint) is Annotated else (hint, Key())
+        value_type, *notes = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+        if None in notes:
+            continue
+        key = next((note for note in notes if isinstance(note, Key)), Key())
         value_type = get_args(value_type)[0] if isinstance(value_type, UnionType) else value_type
         keys[name] = value_type, replace(key, name=key.name or "_".join(filter(None, (name, key.unit))))
     return keys
@@ -280,7 +280,7 @@ def read_record(
     base: Any = None,
     others: Collection[str] = (),
 ) -> R:
-    """Read a NamedTuple from a table; its errors are those of the table.
+    """Read a NamedTuple, or a dataclass with a base, from a table; its errors are those of the table.
 
     Parameters
     ----------
@@ -289,11 +289,12 @@ def read_record(
     others : further keys that the table may have
     """
     record: Any = kind if base is None else base
-    values = dict(record._field_defaults if base is None else record._asdict())
+    values = dict(record._field_defaults if base is None else getattr(record, "_asdict", lambda: vars(base))())
     keys = _find_keys(kind)
-    table.allow(*(key.name for _, key in keys.values()), *others)
+    arrays = {name: key.each for name, (value_type, key) in keys.items() if get_origin(value_type) is not Mapping}
+    table.allow(*(part for name, (_, key) in keys.items() for part in arrays.get(name) or (key.name,)), *others)
     for name, (value_type, key) in keys.items():
-        if table.values.get(key.name) is not None:
+        if arrays.get(name) or table.values.get(key.name) is not None:
             values[name] = _read_value(value_type, table, key, known or {}, values.get(name))
         elif name not in values:
             raise table.error(f"{table.at(key.name)} is missing; {_describe(value_type, key, known or {})} needed")
@@ -307,7 +308,7 @@ def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]]) -
         choices = f" ({one_of(known.get(key.of, key.words))})" if key.of or key.words else ""
         one = "a table" if hasattr(value_type, "_fields") else "a list of names" if ... in parts else "a text"
         return "three names are" if len(parts) == 3 else f"{one}{choices} is"
-    unit = f" [{key.unit}]" if key.unit else ""
+    unit = f" [{key.unit.replace('_', '/')}]" if key.unit else ""
     limits = f" from {key.least:g}{f' to {key.most:g}' if key.most < 1e6 else ' on'}" if key.least > -1e6 else ""
     return f"{_COUNTS[len(parts)]}{unit}{limits} {'are' if len(parts) > 1 else 'is'}"
 
@@ -315,12 +316,30 @@ def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]]) -
 def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str, Collection[str]], base: Any) -> Any:
     if hasattr(value_type, "_fields"):
         return read_record(value_type, table.table(key.name), known, base)
+    if get_origin(value_type) is Mapping:
+        kind, entries = get_args(value_type)[1], table.table(key.name)
+        if kind is float:
+            return {name: _read_number(entries, replace(key, name=name)) for name in entries.values}
+        tables = {name: entries.table(name) for name in entries.values}
+        if hasattr(kind, "_fields"):
+            return {name: read_record(kind, entry, known) for name, entry in tables.items()}
+        for entry in tables.values():
+            entry.allow(*key.each, *key.unread)
+        return {name: _read_value(kind, entry, key, known, None) for name, entry in tables.items()}
+    if key.each:
+        import numpy as np  # not for whoever reads none
+
+        return np.array([_read_number(table, replace(key, name=part)) for part in key.each])
     if key.words:
         return key.words[table.choice(key.name, key.words)]
+    if get_origin(value_type) is Literal:
+        return table.choice(key.name, filter(None, get_args(value_type)))
     if value_type is bool:
         return table.flag(key.name)
     if value_type is str:
         return table.choice(key.name, known[key.of]) if key.of else table.text(key.name, None)
+    if value_type is float:
+        return _read_number(table, key)
     value, parts = table.values[key.name], get_args(value_type)
     if str in parts:
         texts = table.texts(key.name)
@@ -330,22 +349,53 @@ def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str,
         if ... in parts or len(texts) == len(parts):
             return texts
     else:
-        numbers = value if parts else [value]
-        is_right = isinstance(numbers, list | tuple) and len(numbers) == max(len(parts), 1)
-        if is_right and all(is_number(number) and key.least <= number <= key.most for number in numbers):
-            to_si = _UNITS[key.unit][0] if key.unit in _UNITS else float
-            return tuple(map(to_si, numbers)) if parts else to_si(value)
+        is_right = isinstance(value, list | tuple) and len(value) == len(parts)
+        if is_right and all(is_number(number) and key.least <= number <= key.most for number in value):
+            return tuple(_to_si(key, number) for number in value)
     raise table.error(f"{table.at(key.name)} = {_format_value(value)}; {_describe(value_type, key, known)} needed")
 
 
-def format_record(record: Any) -> list[str]:
-    """Return the lines of a NamedTuple in a TOML file; None, false and what is empty are left out."""
-    lines = []
-    for name, (_, key) in _find_keys(record.__class__).items():
+def _read_number(table: TomlTable, key: Key) -> float:
+    value = table.values.get(key.name)
+    if is_number(value) and key.least <= value <= key.most:
+        return _to_si(key, value)
+    entry = f"= {_format_value(value)}" if key.name in table else "is missing"
+    others = f" for each of {', '.join(key.each)}" if key.each else ""
+    raise table.error(f"{table.at(key.name)} {entry}; {_describe(float, key, {})} needed{others}")
+
+
+def _to_si(key: Key, value: float) -> float:
+    return _UNITS[key.unit][0](value) if key.unit in _UNITS else float(value)
+
+
+def format_record(record: Any, unread: Mapping[str, Sequence[str]] | None = None) -> list[str]:
+    """Return the lines of a record in a TOML file, tables last; None, false and what is empty are left out.
+
+    `unread` : heading of a table → lines beside those of its fields.
+    """
+    lines, tables = [], []
+    for name, (value_type, key) in _find_keys(record.__class__).items():
         value = getattr(record, name)
-        if not (value is None or value is False or value in ("", ()) or (key.omit_zero and not any(value))):
-            lines.append(f"{key.name} = {_format_field(key, value)}")
-    return lines
+        comment = f"   # {key.comment}" if key.comment else ""
+        if get_args(value_type)[1:] == (float,) and isinstance(value, Mapping):
+            tables += ["", f"[{key.name}]{comment}"]
+            tables += [f"{toml_key(entry)} = {_format_field(key, number)}" for entry, number in value.items()]
+        elif isinstance(value, Mapping):
+            for entry, part in value.items():
+                heading = f"{key.name}.{toml_key(entry)}"
+                tables += ["", f"[{heading}]{comment}", *(_format_each(key, part) if key.each else format_record(part))]
+                tables += (unread or {}).get(heading, ())
+        elif key.each:
+            lines += _format_each(key, value)
+        elif not (value is None or value is False or (isinstance(value, str | tuple) and not value)) and (
+            not key.omit_zero or any(value)
+        ):
+            lines.append(f"{key.name} = {_format_field(key, value)}{comment}")
+    return lines + tables
+
+
+def _format_each(key: Key, values: Iterable[float]) -> list[str]:
+    return [f"{part} = {_format_field(key, float(value))}" for part, value in zip(key.each, values, strict=True)]
 
 
 def _format_field(key: Key, value: Any) -> str:
@@ -356,7 +406,9 @@ def _format_field(key: Key, value: Any) -> str:
     if isinstance(value, tuple):
         return f"[{', '.join(_format_field(key, each) for each in value)}]"
     if isinstance(value, float) and key.unit in _UNITS:
-        value = round(_UNITS[key.unit][1](value), 6)
+        value = round(_UNITS[key.unit][1](value), 6 if key.digits is None else key.digits)
+    if isinstance(value, float) and key.digits is not None:
+        return f"{value:.{key.digits}f}"
     return toml_string(value) if isinstance(value, str) else _format_value(value)
 
 

@@ -45,7 +45,7 @@ class MovementOptions:
     cycles: bool = False
 
 
-class Measures(NamedTuple):
+class JointMeasures(NamedTuple):
     """`MEASURES` of one joint in several spans; [rad], of `peak_rate` [rad/s]; NaN where not determined."""
 
     values: np.ndarray  # (s, 3 angles, 4)
@@ -79,7 +79,7 @@ class Movement:
     angles: Angles
     phases: Mapping[str, Intervals]
     repetitions: Repetitions
-    measures: Mapping[str, Measures]
+    measures: Mapping[str, JointMeasures]
     curves: Mapping[str, tuple[MeanCurve, MeanCurve, MeanCurve]]
     cutoff_hz: float | None
 
@@ -143,7 +143,9 @@ def _take_marked(phase: str, phases: Mapping[str, Intervals], inside: Mapping[st
     return Repetitions(np.array(inside[phase], dtype=float), phase)
 
 
-def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float]] | np.ndarray) -> dict[str, Measures]:
+def measure_spans(
+    pose: Pose, angles: Angles, spans: Sequence[tuple[float, float]] | np.ndarray
+) -> dict[str, JointMeasures]:
     """Joint → its measures in each span [s], both ends included.
 
     Raises
@@ -160,7 +162,7 @@ def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float
             values[row] = np.column_stack([each.lowest, each.highest, each.range, each.peak_rate])
             samples[row] = np.where(each.samples < 0, -1, each.samples + part.start)
         values[:, :, :2] -= _count_turns(values)[:, :, None]
-        measures[name] = Measures(
+        measures[name] = JointMeasures(
             values,
             compute_summary_std(pose, name, joint, samples),
             np.array([each.near_lock for each in summaries]),
@@ -240,7 +242,9 @@ def compare_statistics(first: Statistics, second: Statistics) -> Difference:
     return Difference(value, low, high, float(np.hypot(first.std, second.std)))
 
 
-def compare_measures(first: Measures, second: Measures, k: int) -> list[tuple[Statistics, Statistics, Difference]]:
+def compare_measures(
+    first: JointMeasures, second: JointMeasures, k: int
+) -> list[tuple[Statistics, Statistics, Difference]]:
     """Of each of `MEASURES` of the k-th angle both sessions' statistics, after the full turns between these."""
     one, two = first.statistics(k), second.statistics(k)
     turns = np.nan_to_num(round_to_turns(0.5 * (two[0].mean + two[1].mean - one[0].mean - one[1].mean)))

@@ -10,7 +10,7 @@ import polars as pl
 
 from .curves import PERCENT
 from .definitions import SOURCE, define_angles
-from .movement import MEASURES, Measures, Movement, compare_curves, compare_measures, measure_spans
+from .movement import MEASURES, JointMeasures, Movement, compare_curves, compare_measures, measure_spans
 
 
 def build_definition_table(movements: Sequence[Movement]) -> pl.DataFrame:
@@ -68,7 +68,7 @@ def build_repetition_table(movements: Sequence[Movement]) -> pl.DataFrame:
     return pl.DataFrame(rows)
 
 
-def _list_measures(movement: Movement, measures: Mapping[str, Measures], row: int) -> Iterator[dict[str, Any]]:
+def _list_measures(movement: Movement, measures: Mapping[str, JointMeasures], row: int) -> Iterator[dict[str, Any]]:
     for name, joint in movement.angles.joints.items():
         joint_measures = measures[name]
         for k, angle in enumerate(joint.names):

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,18 @@ from ..arguments import (
     format_object,
 )
 from ..diagnostics import notebook_html
-from ..documents import TomlTable, is_number, parse_toml, read_toml, toml_string, toml_strings, whole_file
+from ..documents import (
+    Key,
+    TomlTable,
+    format_record,
+    is_number,
+    parse_toml,
+    read_record,
+    read_toml,
+    toml_key,
+    toml_strings,
+    whole_file,
+)
 from ..errors import BadData, BadModel, BadOption, BadSubject, one_of
 from .anthropometry import compute_population_lengths
 from .body import BodyModel
@@ -35,34 +46,45 @@ _ROW = re.compile(
     r"(mounts\..+\.|girdles\..+\.(rest|raised)_)[xyz]|girdles\..+\.law"
 )  # of a covariance, other than lengths
 LONGEST = 3.0  # [m] of a plausible length
-_LEARNED = ("mounts", "hinges", "girdles", "start_pose_offset", "heading_drift")
-_TABLES = ("lengths", "lengths_std", *_LEARNED, "covariance")
 FORMAT = 2
 Quality = Literal["pass", "poor", "fail"]  # of a calibration
 POPULATION = "population"  # name of the prior of a body's lengths
-MOST_OFFSET_DEG = 180.0  # of a file; the calibration checks whether it is plausible
-MOST_DRIFT_DEG_MIN = 6000.0  # of a heading: 100 deg/s, beyond any gyroscope's bias
+
+# Limits of a file; whether numbers are plausible says the quality of the calibration.
+_OFFSET = Key(unit="deg", least=-180.0, most=180.0, digits=4)
+_DRIFT = Key(unit="deg_min", least=-6000.0, most=6000.0, digits=4)  # of a heading: up to 100 deg/s
+_UNIT = Key(least=-1.001, most=1.001, digits=9)  # of a component of a unit vector
+_MOUNT = replace(_UNIT, each=("qx", "qy", "qz", "qw"), unread=("std_deg",), comment="R_LS, sensor to segment")
+_GIRDLE = Key(
+    least=-LONGEST,
+    most=LONGEST,
+    each=PARAMETERS,
+    digits=6,
+    comment="m, off the law of the body's table: its place at rest, and what is added at 90 deg",
+)
 
 
 class Hinge(NamedTuple):
     """The axis of a joint of nearly one axis, such as an elbow."""
 
-    axis: np.ndarray  # (3,) unit, in the frame of the segment above
-    std: NonNegative  # [rad] by which the segment below leaves the plane across it, with soft tissue
+    # (3,) unit, in the frame of the segment above
+    axis: Annotated[np.ndarray, replace(_UNIT, each=("x", "y", "z"))]
+    # [rad] by which the segment below leaves the plane across it, with soft tissue
+    std: Annotated[NonNegative, Key(unit="deg", least=1e-3, most=57.3, digits=3)]
 
 
 class StartPoseOffset(NamedTuple):
     """The offset of a segment from the start pose in the calibration."""
 
-    tilt: np.ndarray  # (2,) [rad] about x and y of W
-    std: NonNegative  # [rad] of each
+    tilt: Annotated[np.ndarray, replace(_OFFSET, each=("x_deg", "y_deg"))]  # (2,) [rad] about x and y of W
+    std: Annotated[NonNegative, replace(_OFFSET, least=0.0)]  # [rad] of each
 
 
 class HeadingDrift(NamedTuple):
     """The drift of a sensor's heading in the calibration, from the remaining bias of its gyroscope."""
 
-    rate: float  # [rad/s]
-    std: NonNegative  # [rad/s]
+    rate: Annotated[float, _DRIFT]  # [rad/s]
+    std: Annotated[NonNegative, replace(_DRIFT, least=0.0)]  # [rad/s]
 
 
 @dataclass(frozen=True)
@@ -88,16 +110,22 @@ class Subject:
     """
 
     name: str
-    lengths: Mapping[str, float]
-    order: tuple[str, ...]
-    covariance: np.ndarray
-    mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
+    lengths: Annotated[Mapping[str, float], Key("lengths", "m", 1e-4, LONGEST, digits=6, comment="m")]
+    order: Annotated[tuple[str, ...], None]
+    covariance: Annotated[np.ndarray, None]
+    mounts: Annotated[Mapping[str, np.ndarray], _MOUNT] = field(default_factory=dict)
     note: str = ""
-    hinges: Mapping[str, Hinge] = field(default_factory=dict)
-    start_pose_offset: Mapping[str, StartPoseOffset] = field(default_factory=dict)
-    heading_drift: Mapping[str, HeadingDrift] = field(default_factory=dict)
-    girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
-    quality: Literal["", "pass", "poor", "fail"] = ""
+    hinges: Annotated[Mapping[str, Hinge], Key(comment="its axis in the frame of the segment above")] = field(
+        default_factory=dict
+    )
+    start_pose_offset: Annotated[
+        Mapping[str, StartPoseOffset], Key(comment="off the start pose in the calibration, about x and y of W")
+    ] = field(default_factory=dict)
+    heading_drift: Annotated[Mapping[str, HeadingDrift], Key(comment="of its sensor's heading in the calibration")] = (
+        field(default_factory=dict)
+    )
+    girdles: Annotated[Mapping[str, np.ndarray], _GIRDLE] = field(default_factory=dict)
+    quality: Annotated[Literal["", "pass", "poor", "fail"], Key(comment="of the calibration: pass, poor or fail")] = ""
 
     def __repr__(self) -> str:
         def describe() -> str:
@@ -369,42 +397,18 @@ def population_subject(
 
 def subject_toml(subject: Subject) -> str:
     """Return the text of ``subject.toml``."""
-    lines = [f"format = {FORMAT}", f"name = {toml_string(subject.name)}"]
-    if subject.note:
-        lines.append(f"note = {toml_string(subject.note)}")
-    if subject.quality:
-        lines.append(f"quality = {toml_string(subject.quality)}   # of the calibration: pass, poor or fail")
-    lines += ["", "[lengths]       # m", *(f"{k} = {v:.6f}" for k, v in subject.lengths.items())]
-    lines += ["", "[lengths_std]   # m, one standard deviation"]
-    lines += [f"{k} = {subject.std(k):.6f}" for k in subject.lengths if k in subject.order]
-    for segment, quat in subject.mounts.items():
-        lines += ["", f"[mounts.{segment}]   # R_LS, sensor to segment"]
-        lines += [f"{key} = {value:.9f}" for key, value in zip(("qx", "qy", "qz", "qw"), quat, strict=True)]
-        std = [subject.std(row) for row in mount_rows(segment)]
-        if np.isfinite(std).all():
-            lines.append(f"std_deg = {np.degrees(np.sqrt(np.mean(np.square(std)))):.3f}")
-    for joint, hinge in subject.hinges.items():
-        lines += ["", f"[hinges.{joint}]   # the axis in the upper arm's frame"]
-        lines += [f"{key} = {value:.9f}" for key, value in zip("xyz", hinge.axis, strict=True)]
-        lines.append(f"std_deg = {np.degrees(hinge.std):.3f}")
-    for point, values in subject.girdles.items():
-        lines += [
-            "",
-            f"[girdles.{point}]   # m, off the law of the body's table: its place at rest, and what is added at 90 deg",
-        ]
-        lines += [f"{key} = {value:.6f}" for key, value in zip(PARAMETERS, values, strict=True)]
-    for segment, start in subject.start_pose_offset.items():
-        lines += ["", f"[start_pose_offset.{segment}]   # off the start pose in the calibration, about x and y of W"]
-        lines += [f"{key} = {np.degrees(value):.4f}" for key, value in zip(("x_deg", "y_deg"), start.tilt, strict=True)]
-        lines.append(f"std_deg = {np.degrees(start.std):.4f}")
-    for segment, drift in subject.heading_drift.items():
-        lines += ["", f"[heading_drift.{segment}]   # of its sensor's heading in the calibration"]
-        rates = {"rate_deg_min": drift.rate, "std_deg_min": drift.std}
-        lines += [f"{key} = {60.0 * np.degrees(value):.4f}" for key, value in rates.items()]
+    stds = {}
+    for segment in subject.mounts:
+        covariance = subject.mount_covariance(segment)
+        if covariance is not None:
+            std = np.degrees(np.sqrt(np.trace(covariance) / 3.0))
+            stds[f"mounts.{toml_key(segment)}"] = [f"std_deg = {std:.3f}"]
+    lines = [f"format = {FORMAT}", *format_record(subject, stds)]
     if subject.order:
+        lines += ["", "[lengths_std]   # m, one standard deviation"]
+        lines += [f"{toml_key(k)} = {subject.std(k):.6f}" for k in subject.lengths if k in subject.order]
         lines += ["", "[covariance]    # of lengths [m], mount errors [rad] and girdles [m], jointly"]
-        lines.append(f"order = {toml_strings(subject.order)}")
-        lines.append("matrix = [")
+        lines += [f"order = {toml_strings(subject.order)}", "matrix = ["]
         lines += ["    [" + ", ".join(f"{v:.9e}" for v in row) + "]," for row in subject.covariance]
         lines.append("]")
     return "\n".join(lines) + "\n"
@@ -462,48 +466,33 @@ def _subject(values: Mapping[str, Any], path: Path) -> Subject:
         raise BadSubject(f"{path}: is a session; a subject is needed here, as `wepose calibrate` writes one")
     if values.get("format") != FORMAT:
         raise BadSubject(f"{path}: format = {values.get('format')!r}; this version reads format = {FORMAT}")
-    second = "is of second sensors, and a segment has one now; calibrate again with one sensor on each segment"
-    top.allow("format", "name", "note", "quality", *_TABLES, renamed={"doubled": second})
-    quality = values.get("quality", "")
-    if quality not in ("", *get_args(Quality)):
-        raise BadSubject(f"{path}: quality = {quality!r} is not known; {one_of(get_args(Quality), str(quality))}")
-    tables = {name: top.table(name, {}) for name in _TABLES}
-    learned = {name: {key: tables[name].table(key) for key in tables[name].values} for name in _LEARNED}
-    offset = {
-        segment: np.radians(entry.numbers("x_deg", "y_deg", "std_deg", most=MOST_OFFSET_DEG))
-        for segment, entry in learned["start_pose_offset"].items()
-    }
-    drift = {
-        segment: np.radians(entry.numbers("rate_deg_min", "std_deg_min", most=MOST_DRIFT_DEG_MIN)) / 60.0
-        for segment, entry in learned["heading_drift"].items()
-    }
+    if "doubled" in top:
+        raise BadSubject(
+            f"{path}: doubled is of second sensors, and a segment has one now; calibrate again with one sensor on each "
+            f"segment"
+        )
     if "lengths" not in top:
         raise BadSubject(f"{path}: lengths is missing; it needs the lengths of the body [m], none where it has none")
-    lengths = _read_lengths(tables["lengths"])
-    order, matrix = _read_covariance(tables["covariance"], tables["lengths_std"], tuple(lengths))
-    return Subject(
-        name=str(values.get("name", path.parent.name)),
-        lengths=lengths,
-        order=order,
-        covariance=matrix,
-        mounts={name: _read_unit(entry, ("qx", "qy", "qz", "qw")) for name, entry in learned["mounts"].items()},
-        note=str(values.get("note", "")),
-        hinges={joint: _read_hinge(entry) for joint, entry in learned["hinges"].items()},
-        start_pose_offset={segment: StartPoseOffset(v[:2], float(v[2])) for segment, v in offset.items()},
-        heading_drift={segment: HeadingDrift(float(rate), float(std)) for segment, (rate, std) in drift.items()},
-        girdles={
-            point: np.array(entry.numbers(*PARAMETERS, most=LONGEST)) for point, entry in learned["girdles"].items()
-        },
-        quality=quality,
-    )
+    base = Subject(path.parent.name, {}, (), np.zeros((0, 0)))
+    subject = read_record(Subject, top, base=base, others=("format", "lengths_std", "covariance"))
+    order, covariance = _read_covariance(top.table("covariance", {}), top.table("lengths_std", {}), subject.lengths)
+    mounts = {
+        name: _scale_to_unit(quat, f"{top.at('mounts')}.{name}: qx, qy, qz, qw")
+        for name, quat in subject.mounts.items()
+    }
+    hinges = {
+        name: hinge._replace(axis=_scale_to_unit(hinge.axis, f"{top.at('hinges')}.{name}: x, y, z"))
+        for name, hinge in subject.hinges.items()
+    }
+    return replace(subject, order=order, covariance=covariance, mounts=mounts, hinges=hinges)
 
 
-def _read_lengths(table: TomlTable) -> dict[str, float]:
-    """Return name → length [m]."""
-    for name, value in table.values.items():
-        if not is_number(value, LONGEST) or value <= 0.0:
-            raise BadSubject(f"{table.at(name)} = {value!r}; a number in metres is needed, above 0")
-    return {name: float(value) for name, value in table.values.items()}
+def _scale_to_unit(values: np.ndarray, where: str) -> np.ndarray:
+    """Return a vector or quaternion scaled to length 1, from which it may differ by the digits of a file."""
+    length = np.linalg.norm(values)
+    if not abs(length - 1.0) < 1e-3:
+        raise BadSubject(f"{where} must be of length 1; it is {length:.4g}")
+    return np.asarray(values / length)
 
 
 def _read_covariance(table: TomlTable, std: TomlTable, lengths: Collection[str]) -> tuple[tuple[str, ...], np.ndarray]:
@@ -516,12 +505,10 @@ def _read_covariance(table: TomlTable, std: TomlTable, lengths: Collection[str])
         order = tuple(name for name in lengths if name in std)
         return order, np.diag([float(std.values[name]) ** 2 for name in order])
     table.allow("order", "matrix")
-    order = table.values.get("order", ())
-    if not isinstance(order, list | tuple) or len(set(map(str, order))) != len(order):
-        raise BadSubject(f"{table.at('order')} = {order!r}; a list of names is needed, each once")
+    order = table.texts("order")
     for name in order:
-        if name not in lengths and not _ROW.fullmatch(str(name)):
-            raise BadSubject(f"{table.at('order')}: {name!r} is not known; {one_of(lengths, str(name))}")
+        if (name not in lengths and not _ROW.fullmatch(name)) or order.count(name) > 1:
+            raise BadSubject(f"{table.at('order')}: {name!r} is not known, or twice; {one_of(lengths, name)}")
     place = table.at("matrix")
     try:
         matrix = np.array(table.values.get("matrix"), dtype=float)
@@ -536,20 +523,4 @@ def _read_covariance(table: TomlTable, std: TomlTable, lengths: Collection[str])
         or np.linalg.eigvalsh(matrix)[0] < least
     ):
         raise BadSubject(f"{place} is not symmetric and positive semidefinite")
-    return tuple(order), matrix
-
-
-def _read_unit(table: TomlTable, names: tuple[str, ...]) -> np.ndarray:
-    """Return the vector or quaternion of these components, scaled to length 1."""
-    values = np.array(table.numbers(*names))
-    length = np.linalg.norm(values)
-    if not abs(length - 1.0) < 1e-3:
-        raise BadSubject(f"{table.where}: {', '.join(names)} must be of length 1; it is {length:.4g}")
-    return values / length
-
-
-def _read_hinge(table: TomlTable) -> Hinge:
-    axis, (std_deg,) = _read_unit(table, ("x", "y", "z")), table.numbers("std_deg")
-    if not 0.0 < np.radians(std_deg) < 1.0:
-        raise BadSubject(f"{table.at('std_deg')} = {std_deg:g}; it must be between 0 and 57")
-    return Hinge(axis, float(np.radians(std_deg)))
+    return order, matrix

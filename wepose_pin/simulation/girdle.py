@@ -65,7 +65,7 @@ def compute_girdle(along_T: np.ndarray, side: float, gain: np.ndarray | float = 
     return np.column_stack((-moved[:, 2], side * moved[:, 0], moved[:, 1]))
 
 
-class Girdle:
+class SimulatedGirdle:
     """The girdle of one person: regression, own deviation, wandering and rest place.
 
     The lengths of a simulated person are those of the mean place at rest: `shoulder_width` is the distance of the two

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from ..body import BodyModel
 from ..errors import BadOption
 from ..rotations import compose, log, quat_from_matrix, turn_about
-from .girdle import Girdle
+from .girdle import SimulatedGirdle
 from .imperfections import IDEAL_PRESET, Imperfections
 from .people import Elbow, StartPoseOffsets, Wrists
 from .signals import Process, Sway, Wander, integrate_pulse, make_pulse, make_step
@@ -101,7 +101,7 @@ class Flaws:
         self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], shoulder_width: float = 0.34
     ) -> None:
         self.sizes = sizes
-        self.girdle = Girdle(sizes, rngs, shoulder_width)
+        self.girdle = SimulatedGirdle(sizes, rngs, shoulder_width)
         self.elbow_joint = Elbow(sizes, rngs)
         self.wrists = Wrists(sizes, rngs)
         self.start_pose = StartPoseOffsets(sizes, rngs, SIDES)
