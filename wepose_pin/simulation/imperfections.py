@@ -74,7 +74,7 @@ class Imperfections:
     girdle_hysteresis : share of elevation by which girdle angles lead while the arm is raised and lag while it is
         lowered. People: 0.03 (Braman 2009, J Shoulder Elbow Surg 18, 960)
     girdle_rest : a person's shoulders at rest, times (18, 12, 13) mm (same sources as girdle_person), correlation 0.7
-        between left and right [assumption]. The lengths are those of the mean place: see `girdle.SimulatedGirdle`. People: 1
+        between left and right [assumption]. The lengths are those of the mean place: see `girdle`. People: 1
     carrying_angle : of the elbow, times 11.6 (3.2) deg for men and 16.7 (2.6) for women (Van Roy 2005, Ergonomics 48,
         1645), half in the humerus and half in the forearm. People: 1
     elbow_abduction_deg : what else the elbow does beside a hinge, rms over flexion. People: 1.5 [assumption]
