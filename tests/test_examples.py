@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from wepose_pin.body.meshes import find_example_data
+from wepose_pin.body.urdf import find_example_data
 
 EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.py"))
 WAITING = ("live_consumer.py", "robot_receiver.py")  # for ever

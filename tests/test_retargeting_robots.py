@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import wepose_pin as wp
 from wepose_pin import errors, retargeting
 from wepose_pin.body.kinematics import Pose
-from wepose_pin.body.meshes import find_example_data
+from wepose_pin.body.urdf import find_example_data
 from wepose_pin.retargeting.collision import CollisionModel
 from wepose_pin.retargeting.reconfiguration import Planner
 from wepose_pin.retargeting.targets import compute_target_reach

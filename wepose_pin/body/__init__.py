@@ -18,20 +18,18 @@ both (`Pose`), `covariance` says how well points are known.
 """
 
 from .anthropometry import SEXES, LengthPrior, compute_population_lengths, convert_breadths, list_breadths
-from .body import BodyModel, load_model, read_urdf
+from .body import BodyModel, load_model
 from .chains import Chain
 from .girdle import Girdle, GirdleMotion
 from .reaches import LinkVector
 from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, Segment
 from .table_file import find_table, load_table, read_table
-from .tree import AxisLimits
 from .visuals import Visual
 
 __all__ = [
     "DEFAULT_BODY",
     "ROOT",
     "SEXES",
-    "AxisLimits",
     "BodyModel",
     "BodyTable",
     "Chain",
@@ -50,5 +48,4 @@ __all__ = [
     "load_model",
     "load_table",
     "read_table",
-    "read_urdf",
 ]

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 
 import numpy as np
 import pinocchio as pin
@@ -15,19 +14,18 @@ import pinocchio as pin
 from ..arguments import check_arguments
 from ..assets import asset
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadModel, BadSession, MissingFile, one_of
+from ..errors import BadModel, BadSession, one_of
 from . import lengths as _lengths
 from . import visuals as _visuals
 from .anthropometry import compute_population_lengths
 from .chains import Chain, axis_in_joint, find_chains, find_parents
 from .girdle import PARAMETERS
-from .meshes import find_mesh
 from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
 from .table import DEFAULT_BODY, BodyTable, Segment
 from .table_file import find_table, load_table, parse_table, read_table
-from .tree import AxisLimits, build, check_joint_values, find_impossible_inertia, parse_tree
-from .urdf_library import import_yourdfpy
+from .tree import build, check_joint_values, find_impossible_inertia, parse_tree
+from .urdf import import_yourdfpy, read_urdf
 from .visuals import Visual
 
 # Standard deviations off the mean of adults (calibration/anthropometry.toml), above which a length is implausible.
@@ -48,7 +46,8 @@ class BodyModel:
     robot : the parsed URDF it was built from, already with its lengths and the table's names (yourdfpy)
     table : what there is on it; its links bear the names of segments and points
     joints : child link of a spherical joint → its Pinocchio joint
-    limits : the same → what its three axes may do; without an entry for a `floating` joint
+    axes : the same → (3, 3) the axes that were joined, a row each, in the joint's frame at zero; without an entry for
+        a `floating` joint
     girdles : girdle → (7,) what a person differs by from its law, `girdle.PARAMETERS`; zeros where it is not named
     loaded : the same body before its lengths were set; None: they were not
     """
@@ -57,7 +56,7 @@ class BodyModel:
     robot: Any
     table: BodyTable
     joints: Mapping[str, int]
-    limits: Mapping[str, AxisLimits]
+    axes: Mapping[str, np.ndarray]
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
     loaded: BodyModel | None = field(default=None, repr=False, compare=False)
 
@@ -360,40 +359,6 @@ def _check_girdles(robot: Any, table: BodyTable) -> None:
             raise BadModel(f"{place}: '{turning[0]}' does not slide; it is {joints[turning[0]]}, not prismatic")
 
 
-def read_urdf(path: Path) -> Any:
-    """The URDF as yourdfpy has it.
-
-    Raises
-    ------
-    MissingFile, BadModel
-        Not there; not a URDF.
-    """
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file; a URDF is wanted here")
-    try:
-        # yourdfpy's parser mends broken XML in silence: half a body would be read as a body. And it reads what entities
-        # name, on disk too.
-        _check_xml(path)
-    except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
-        raise BadModel(f"{path}: is no complete XML file, as a URDF is: {error}") from error
-    try:
-        robot = import_yourdfpy().URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
-    except Exception as error:  # yourdfpy and lxml raise many kinds
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        if isinstance(error, KeyError):
-            reason = f"an element lacks the attribute {reason}"
-        raise BadModel(f"{path}: cannot be read as a URDF: {reason}") from error
-    for shape in (shape for link in robot.links for shape in (*link.visuals, *link.collisions)):
-        mesh = None if shape.geometry is None else shape.geometry.mesh
-        if mesh is not None and mesh.filename and (file := find_mesh(mesh.filename, path)) is not None:
-            mesh.filename = str(file)
-    materials = [visual.material for link in robot.links for visual in link.visuals if visual.material is not None]
-    for material in [*robot.materials, *materials]:
-        if material.texture is not None and material.texture.filename is None:
-            material.texture = None  # <texture/>: yourdfpy cannot write what it read there
-    return robot
-
-
 def _check_segments_move(body: BodyModel, where: str) -> None:
     """Raise `BadModel` on segments that no joint moves against the one above, and on hinges between no neighbours."""
     table, tree = body.table, parse_tree(body.robot, where)
@@ -429,16 +394,6 @@ def _check_segments_move(body: BodyModel, where: str) -> None:
             )
 
 
-def _check_xml(path: Path) -> None:
-    def refuse(name: str, *_: object) -> None:
-        raise BadModel(f"{path}: declares an entity, '{name}', which no URDF needs; write out what it stands for")
-
-    parser = expat.ParserCreate()
-    parser.EntityDeclHandler = refuse
-    with path.open("rb") as file:
-        parser.ParseFile(file)
-
-
 def _body(robot: Any, table: BodyTable, where: str) -> BodyModel:
-    model, joints, limits = build(robot, where, spherical=not table.is_mechanism)
-    return BodyModel(model, robot, table, joints, limits)
+    model, joints, axes = build(robot, where, spherical=not table.is_mechanism)
+    return BodyModel(model, robot, table, joints, axes)

@@ -120,6 +120,11 @@ def join_poses(parts: Sequence[Pose]) -> Pose:
     return Pose(*(join([getattr(part, entry.name) for part in parts]) for entry in fields(Pose)))
 
 
+def find_usual_rate(time: np.ndarray) -> float:
+    """Return one over the usual step of times (n,) [s], to six digits; NaN of one sample."""
+    return float(f"{1.0 / np.median(np.diff(time)):.6g}") if len(time) > 1 else float("nan")
+
+
 def find_samples(time: np.ndarray, interval: tuple[float, float]) -> slice:
     """Return the samples of times (n,) [s] within an interval [s], both ends included.
 

@@ -18,7 +18,7 @@ from ..errors import BadModel, one_of
 from ..recording import compute_mount
 from .table import BodyTable, Point
 from .tree import Tree, copy_robot, parse_tree
-from .urdf_library import import_yourdfpy
+from .urdf import import_yourdfpy
 
 MOST_LINKS = 100  # that an error lists; a person's body has fewer
 

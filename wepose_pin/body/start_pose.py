@@ -47,7 +47,7 @@ def compute_start_configuration(
     for joint in range(1, m.njoints):
         first = m.idx_qs[joint]
         if joint in spherical:
-            R = _rotate_triple(tree.path(spherical[joint])[-3:], values) if spherical[joint] in model.limits else None
+            R = _rotate_triple(tree.path(spherical[joint])[-3:], values) if spherical[joint] in model.axes else None
             if R is not None:
                 q[first : first + 4] = Rotation.from_matrix(R).as_quat()
             continue

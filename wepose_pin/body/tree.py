@@ -22,14 +22,6 @@ _MEET_TOLERANCE = 1e-9  # [m]
 _LIGHT = 1e-3
 
 
-class AxisLimits(NamedTuple):
-    """What the three axes that were joined into a spherical joint may do, in their order."""
-
-    axes: np.ndarray  # (3, 3), a row an axis, in the joint's frame at zero
-    lower: np.ndarray  # (3,) [rad]
-    upper: np.ndarray  # (3,) [rad]
-
-
 class Tree(NamedTuple):
     """The joints of a URDF by the links they join."""
 
@@ -114,10 +106,10 @@ def parse_tree(robot: Any, where: str) -> Tree:
     return Tree(roots[0], above, below)
 
 
-def build(robot: Any, where: str, *, spherical: bool = True) -> tuple[pin.Model, dict[str, int], dict[str, AxisLimits]]:
+def build(robot: Any, where: str, *, spherical: bool = True) -> tuple[pin.Model, dict[str, int], dict[str, np.ndarray]]:
     """The Pinocchio model, depth first as Pinocchio's algorithms need it; one frame a link.
 
-    Second and third: its spherical joints and their limits, as `BodyModel` has them.
+    Second and third: its spherical joints and their axes, as `BodyModel` has them.
 
     A mimic joint follows the joint it mimics. The limits of joints that stay as they are are the URDF's. Without
     `spherical` triples of revolute joints stay as they are too.
@@ -134,7 +126,7 @@ def build(robot: Any, where: str, *, spherical: bool = True) -> tuple[pin.Model,
     model = pin.Model()
     model.name = robot.name or "body"
     joints: dict[str, int] = {}
-    limits: dict[str, AxisLimits] = {}
+    axes: dict[str, np.ndarray] = {}
 
     def carry(link: str, parent: int, M_JL: pin.SE3) -> None:
         inertial = links[link].inertial
@@ -157,7 +149,7 @@ def build(robot: Any, where: str, *, spherical: bool = True) -> tuple[pin.Model,
             child = first.child
             if triple is not None:
                 child = triple[-1].child
-                limits[child] = _limits(triple)
+                axes[child] = _axes(triple)
                 for joint in triple[1:]:
                     M_Jc = M_Jc * pin.SE3(joint_placement(joint))
             joints[child] = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
@@ -173,7 +165,7 @@ def build(robot: Any, where: str, *, spherical: bool = True) -> tuple[pin.Model,
     for joint in robot.joints:
         if joint.mimic is not None:
             model = _mimicking(model, joint, where)
-    return model, joints, limits
+    return model, joints, axes
 
 
 def joint_placement(joint: Any) -> np.ndarray:
@@ -216,11 +208,6 @@ def _axes(chain: Any) -> np.ndarray:
             axis = joint_placement(later)[:3, :3].T @ axis
         rows.append(axis)
     return np.array(rows)
-
-
-def _limits(triple: tuple[Any, Any, Any]) -> AxisLimits:
-    low, high = np.array([find_bounds(joint, np.pi) for joint in triple]).T
-    return AxisLimits(_axes(triple), low, high)
 
 
 def find_bounds(joint: Any, unbounded: float) -> tuple[float, float]:

@@ -10,8 +10,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..body import read_urdf
-from ..body.meshes import resolve_meshes
+from ..body.urdf import read_urdf, resolve_meshes
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
 from ..recording import format_span, format_time
 from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY, JointMotion

@@ -10,8 +10,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from ..assets import asset
-from ..body import read_urdf
-from ..body.meshes import find_example_data
+from ..body.urdf import find_example_data, read_urdf
 from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadModel, MissingFile, one_of
 

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
-from ..body.meshes import package_folders
+from ..body.urdf import package_folders
 from ..errors import BadModel, WrongOption, native_stderr_muted, one_of
 from .maps import AXES, ArmMap, JointLimit, LinkPoint, RobotMap
 

@@ -9,7 +9,8 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from ..body.meshes import find_mesh, package_folders, reduce_triangles, triangulate
+from ..body.urdf import find_mesh, package_folders
+from ..body.visuals import reduce_triangles, triangulate
 from .collision import list_corners
 from .robot import Robot
 from .trajectory import Trajectory

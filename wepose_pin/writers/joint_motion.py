@@ -15,15 +15,17 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from ..angles import NEAR_LOCK, euler
-from ..body import BodyModel, read_urdf
+from ..body import BodyModel
 from ..body.configuration import solve_configuration
+from ..body.kinematics import find_usual_rate
 from ..body.links import compute_joint_values
 from ..body.tree import joint_axis, joint_placement, parse_tree
+from ..body.urdf import read_urdf
 from ..errors import BadData, MissingFile
 from ..readers.tables import read_columns, read_table
 from ..recording import Intervals, select_interval
 from ..rotations import multiply
-from .motion import EVEN, SLACK_S, Motion, check_complete, find_usual_rate, make_times, resample_evenly
+from .motion import EVEN, SLACK_S, Motion, check_complete, make_times, resample_evenly
 from .result import read_phases
 
 TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
@@ -332,11 +334,11 @@ def convert_person(motion: Motion) -> JointMotion:
     check_complete(motion, "a file of joints")
     motion, _ = resample_evenly(motion)
     model, pose = motion.model, motion.pose
-    if free := [child for child in model.joints if child not in model.limits]:
+    if free := [child for child in model.joints if child not in model.axes]:
         raise BadData(f"{motion.where}: link '{free[0]}' hangs on a joint of type floating, which has no axes to state")
     q = solve_configuration(model, pose.quat_WL) if pose.q is None else pose.q
     values = compute_joint_values(model.pin, q)
-    for child in model.limits:
+    for child in model.axes:
         values |= _split_triple(model, child, q)
     names = tuple(values)
     position = np.stack([values[name] for name in names], axis=1)
@@ -360,7 +362,7 @@ def convert_person(motion: Motion) -> JointMotion:
 def _split_triple(model: BodyModel, child: str, q: np.ndarray) -> dict[str, np.ndarray]:
     """The angles (n,) [rad] of the three revolute joints that are one spherical joint of the model."""
     first = model.pin.idx_qs[model.joints[child]]
-    axes = model.limits[child].axes
+    axes = model.axes[child]
     mirrored = np.linalg.det(axes) < 0.0
     basis = axes * [[1.0], [1.0], [-1.0 if mirrored else 1.0]]
     # R = exp(a1 q1) exp(a2 q2) exp(a3 q3), in coordinates along the axes Rx Ry Rz.

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..body import BodyModel
-from ..body.kinematics import Pose, compute_pose
+from ..body.kinematics import Pose, compute_pose, find_usual_rate
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import BadData, WrongOption
 from ..recording import format_span
@@ -41,11 +41,6 @@ class Motion:
     def rate_hz(self) -> float:
         """The rate of its usual time step."""
         return find_usual_rate(self.pose.time)
-
-
-def find_usual_rate(time: np.ndarray) -> float:
-    """Return one over the usual step of times (n,) [s], to six digits: steps are differences of rounded times."""
-    return float(f"{1.0 / float(np.median(np.diff(time))):.6g}")
 
 
 def make_times(where: str, time: np.ndarray, rate_hz: float) -> np.ndarray:

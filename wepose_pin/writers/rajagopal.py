@@ -221,13 +221,11 @@ def _body_errors(
 
 
 def _solve_two_axes(axes: Sequence[np.ndarray], quat: np.ndarray) -> list[np.ndarray]:
-    """Angles (n,) [rad] about two axes whose rotations come nearest to `quat` (n, 4).
+    """Angles (n,) [rad] about two axes that come nearest to rotations (n, 4).
 
-    With half angles α, β the scalar product of the two quaternions is (cos α, sin α) m (cos β, sin β)ᵀ, that is
-    ½ [(m00 + m11) cos(α−β) + (m10 − m01) sin(α−β)] + ½ [(m00 − m11) cos(α+β) + (m10 + m01) sin(α+β)]: each bracket has
-    its largest value alone.
+    The scalar product of the two quaternions is a cosine of half their difference and one of half their sum, summed.
     """
     (a, b), v, w = axes, quat[:, :3], quat[:, 3]
-    m00, m01, m10, m11 = w, v @ b, v @ a, v @ np.cross(a, b) - w * (a @ b)
-    difference, total = np.arctan2(m10 - m01, m00 + m11), np.arctan2(m10 + m01, m00 - m11)
+    m = v @ np.cross(a, b) - w * (a @ b)
+    difference, total = np.arctan2(v @ (a - b), w + m), np.arctan2(v @ (a + b), w - m)
     return [total + difference, total - difference]

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ..body.meshes import Mesh, package_folders, reduce_triangles, triangulate
-from ..body.visuals import Visual, visuals
+from ..body.urdf import package_folders
+from ..body.visuals import Mesh, Visual, reduce_triangles, triangulate, visuals
 from ..errors import BadOption, how_to_install, native_stderr_muted
 from .joint_motion import ROBOT_URDF, JointMotion, compute_link_poses_W, compute_link_transforms
 
