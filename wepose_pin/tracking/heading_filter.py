@@ -41,7 +41,6 @@ ITERATIONS = 2  # linearizations of an update
 # A heading may be feigned by this many times the rms of the coherent misfits that no heading explains, and by no more
 # than a share of the rms misfit; found by simulated people who walk, run, throw and reach.
 COHERENT_MARGIN, LARGEST_COHERENT_SHARE = 2.0, 0.5
-_DIFFERENCE = np.array([[1.0, -1.0], [-1.0, 1.0]])
 _HINGE_COLUMNS = [0, 1, 2, 2, 3]  # of `HingeRows.H`: soft tissue twists a sensor about the same axis as the hinge's
 # Jacobian of the angle and of the two sides of a joint by its columns (`HeadingProblem.pair_columns`).
 _JOINT_JACOBIAN = np.zeros((15, 17))
@@ -100,6 +99,19 @@ class JointMisfit(NamedTuple):
         by_chance = self.variance / horizontal * correlated_samples / self.samples
         coherent = COHERENT_MARGIN**2 * max(float(np.mean(parts**2)) - by_chance, 0.0)
         return min(coherent, LARGEST_COHERENT_SHARE**2 * self.variance * 2.0 * self.samples / horizontal)
+
+
+class Information:
+    """What rows 0 = r + H (y − x) + e tell of a state y (n,), linearized at x: Σ Hᵀ W H (n, n) and Σ Hᵀ W r (n,)."""
+
+    def __init__(self, n: int) -> None:
+        self.matrix, self.vector = np.zeros((n, n)), np.zeros(n)
+
+    def add(self, columns: np.ndarray, H: np.ndarray, r: np.ndarray, weight: np.ndarray | float) -> None:
+        """Add rows r (m,), H (m, c) of these columns of the state, with weights of one over their variance."""
+        weighted = weight * H.T
+        self.matrix[columns[:, None], columns] += weighted @ H
+        self.vector[columns] += weighted @ r
 
 
 class HeadingFilter:
@@ -246,68 +258,53 @@ class HeadingFilter:
 
         It yields between parts of a millisecond or two; the state is valid after the last one.
         """
-        problem, k = self.problem, len(self.problem.names)
-        before, P = self.x, self.P
-        x, information = before, np.zeros_like(P)
-        for iteration in range(ITERATIONS):
-            information, vector = np.zeros_like(P), np.zeros(len(x))
-            self._add_joints(knot, x, information, vector, last=iteration == ITERATIONS - 1)
+        k, unreliable = len(self.problem.names), knot.lost | self._lost_before  # after a loss the tilt may be wrong
+        inside = {phase: mask_intervals(knot.time, self.phases.get(phase, ())) for phase in self.problem.closures}
+        inside = {phase: rows for phase, rows in inside.items() if rows.any()}
+        x, information, misfits = self.x, Information(len(self.x)), self._misfits
+        for _ in range(ITERATIONS):
+            information = Information(len(x))
+            misfits = self._add_joints(knot, x, information)
             yield
-            yield from self._add_hinges(knot, x, information, vector)
-            yield from self._add_closures(knot, x, information, vector)
-            x = self._fuse(x, information, vector)
+            yield from self._add_hinges(knot, x, information, unreliable)
+            for phase, rows in inside.items():
+                points = self.problem.closures[phase]
+                if not unreliable[[self.problem.names.index(name) for name in points.segments]].any():
+                    gap = whiten_gap(self.problem, points.linearize(knot.quat_WL[rows], x[:k]))
+                    self._add_gap(phase, gap, knot, information)
+                    yield
+            x = self._fuse(x, information)
             yield
-        self.x = x
-        self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + P @ information, P))
+        self._misfits, self._lost_before = misfits, knot.lost
+        self._apply(x, information)
         yield
-        closed = set(self._find_closed(knot))
-        found = self._detector.find(knot, self.x[:k], self.P[:k, :k], closed)
+        found = self._detector.find(knot, self.x[:k], self.P[:k, :k], inside)
         yield
-        if self._find_unreliable(knot).any():
-            found = {}
-        self._lost_before = knot.lost
-        for phase, rows in found.items():
-            information, vector = np.zeros_like(P), np.zeros(len(x))
-            self._add_gap(phase, rows, knot, information, vector)
-            self.x = self._fuse(self.x, information, vector)
-            self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + self.P @ information, self.P))
+        found = {} if unreliable.any() else found
+        for phase, gap in found.items():
+            information = Information(len(x))
+            self._add_gap(phase, gap, knot, information)
+            self._apply(self._fuse(self.x, information), information)
             begin = float(knot.time[0])
-            if self.clasps and begin - self.clasps[-1][1] < 1.5 * problem.knot_s:
+            if self.clasps and begin - self.clasps[-1][1] < 1.5 * self.problem.knot_s:
                 begin = self.clasps.pop()[0]
             self.clasps.append((begin, knot.end))
             yield
-        self._closed_before = closed | set(found)
+        self._closed_before = {*inside, *found}
 
-    def _find_closed(self, knot: Knot) -> dict[str, np.ndarray]:
-        """Find the phases of closures in a knot, and the samples (m,) bool in them."""
-        inside = {phase: mask_intervals(knot.time, self.phases.get(phase, ())) for phase in self.problem.closures}
-        return {phase: rows for phase, rows in inside.items() if rows.any()}
+    def _fuse(self, x: np.ndarray, information: Information) -> np.ndarray:
+        """Return the state (n,) that fits both the prediction and rows that were linearized at x (n,) best."""
+        right = self.P @ (information.matrix @ (x - self.x) - information.vector)
+        return np.asarray(self.x + np.linalg.solve(np.eye(len(x)) + self.P @ information.matrix, right))
 
-    def _add_gap(self, phase: str, rows: Rows, knot: Knot, information: np.ndarray, vector: np.ndarray) -> None:
-        """Add the rows of a closure; as many samples as its residuals are correlated over are one observation.
+    def _apply(self, x: np.ndarray, information: Information) -> None:
+        """Set the state, and the covariance that the information leaves."""
+        self.x = x
+        self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + self.P @ information.matrix, self.P))
 
-        Causally all of a clasp's first knot is one: a clasp may be shorter than its residuals are correlated.
-        """
-        problem, k = self.problem, len(self.problem.names)
-        correlated = max(1.0, problem.noise.closure_correlation_s * problem.rate_hz)
-        if problem.causal and phase not in self._closed_before:
-            correlated = float(len(knot.time))
-        information[:k, :k] += rows.H.T @ rows.H / correlated
-        vector[:k] += rows.H.T @ rows.r / correlated
-
-    def _find_unreliable(self, knot: Knot) -> np.ndarray:
-        """Find the sensors (k,) bool that lost samples in this knot or in the last one: their tilt may be wrong."""
-        return knot.lost | self._lost_before
-
-    def _fuse(self, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> np.ndarray:
-        """Minimize (y − before)ᵀ P⁻¹ (y − before) + (y − x)ᵀ Λ (y − x) + 2 vectorᵀ (y − x) over y."""
-        right = self.P @ (information @ (x - self.x) - vector)
-        return np.asarray(self.x + np.linalg.solve(np.eye(len(x)) + self.P @ information, right))
-
-    def _add_joints(
-        self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray, *, last: bool
-    ) -> None:
-        problem, noise = self.problem, self.problem.noise
+    def _add_joints(self, knot: Knot, x: np.ndarray, information: Information) -> list[JointMisfit]:
+        """Add the accelerations of joints; return the recent misfits with those of the knot."""
+        problem, noise, misfits = self.problem, self.problem.noise, list(self._misfits)
         correlated = max(1.0, noise.acceleration_correlation_s * problem.rate_hz)
         decay = np.exp(-problem.knot_s / MISFIT_MEMORY_S)
         for i, columns in enumerate(problem.pair_columns):
@@ -316,48 +313,44 @@ class HeadingFilter:
                 continue
             near_B, far_B = knot.sides[:, near], knot.sides[:, far]
             residual = linearize_joint(near_B, far_B, x[near] - x[far] + x[joint], x[columns[3:10]], x[columns[10:]])
-            misfit = self._misfits[i].add(residual, decay)
-            J = residual.jacobian.reshape(-1, residual.jacobian.shape[2])
-            JJ, Je = J.T @ J, J.T @ residual.e.ravel()
-            now = float(np.mean(residual.e**2))
-            weight = 1.0 / (max(now, misfit.variance, noise.acceleration_std**2) * correlated)
+            misfit = misfits[i] = misfits[i].add(residual, decay)
+            r, H = residual.e.ravel(), residual.jacobian.reshape(-1, len(_JOINT_JACOBIAN)) @ _JOINT_JACOBIAN
+            weight = 1.0 / (max(float(np.mean(r**2)), misfit.variance, noise.acceleration_std**2) * correlated)
             # What is coherent counts as one observation over the time that is remembered.
             knots = misfit.samples / len(residual.e)
-            weight /= 1.0 + weight * JJ[0, 0] * misfit.find_coherent_variance(correlated) * knots
-            information[columns[:, None], columns] += weight * _JOINT_JACOBIAN.T @ JJ @ _JOINT_JACOBIAN
-            vector[columns] += weight * _JOINT_JACOBIAN.T @ Je
-            if last:
-                self._misfits[i] = misfit
+            weight /= 1.0 + weight * float(H[:, 0] @ H[:, 0]) * misfit.find_coherent_variance(correlated) * knots
+            information.add(columns, H, r, weight)
+        return misfits
 
-    def _add_hinges(self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Iterator[None]:
-        """Add the hinges; yield between them."""
+    def _add_hinges(
+        self, knot: Knot, x: np.ndarray, information: Information, unreliable: np.ndarray
+    ) -> Iterator[None]:
+        """Add the hinges and their ranges; yield between them."""
         problem, noise = self.problem, self.problem.noise
         samples = max(1.0, noise.hinge_correlation_s * problem.rate_hz)
-        unreliable = self._find_unreliable(knot)
         for hinge, columns, (_, _, std) in zip(problem.hinges, problem.hinge_columns, problem.hinge_std, strict=True):
             moves, on = columns[:2]
             if unreliable[on] or unreliable[moves]:
                 continue
-            yield
             rows = linearize_hinge(hinge, knot.quat_WL[:, on], knot.quat_WL[:, moves], x[columns[:2]])
             H = rows.H[:, _HINGE_COLUMNS]
             r = rows.r + H[:, 2:] @ x[columns[2:]]
-            weight = (np.abs(r) < OUTLIER_STDS * std + HINGE_HEADING_MARGIN) / (std**2 * samples)
-            information[columns[:, None], columns] += H.T @ (weight[:, None] * H)
-            vector[columns] += H.T @ (weight * r)
-            beyond = rows.slope / (noise.range_std**2 * samples) * (rows.excess != 0.0)
-            information[columns[:2, None], columns[:2]] += beyond @ rows.slope * _DIFFERENCE
-            vector[columns[:2]] += beyond @ rows.excess * _DIFFERENCE[0]
+            is_inlier = np.abs(r) < OUTLIER_STDS * std + HINGE_HEADING_MARGIN
+            information.add(columns, H, r, is_inlier / (std**2 * samples))
+            beyond = (rows.excess != 0.0) / (noise.range_std**2 * samples)
+            information.add(columns[:2], rows.slope[:, None] * [1.0, -1.0], rows.excess, beyond)
+            yield
 
-    def _add_closures(self, knot: Knot, x: np.ndarray, information: np.ndarray, vector: np.ndarray) -> Iterator[None]:
-        """Add the closures whose phase holds; yield between them."""
-        names, unreliable = self.problem.names, self._find_unreliable(knot)
-        for phase, inside in self._find_closed(knot).items():
-            points = self.problem.closures[phase]
-            if not unreliable[[names.index(name) for name in points.segments]].any():
-                yield
-                rows = whiten_gap(self.problem, points.linearize(knot.quat_WL[inside], x[: len(names)]))
-                self._add_gap(phase, rows, knot, information, vector)
+    def _add_gap(self, phase: str, gap: Rows, knot: Knot, information: Information) -> None:
+        """Add the rows of a closure; as many samples as its residuals are correlated over are one observation.
+
+        Causally all of a clasp's first knot is one: a clasp may be shorter than its residuals are correlated.
+        """
+        problem = self.problem
+        correlated = max(1.0, problem.noise.closure_correlation_s * problem.rate_hz)
+        if problem.causal and phase not in self._closed_before:
+            correlated = float(len(knot.time))
+        information.add(problem.columns.heading, gap.H, gap.r, 1.0 / correlated)
 
 
 def mask_intervals(time: np.ndarray, intervals: Intervals) -> np.ndarray:
