@@ -274,9 +274,10 @@ def test_headings_that_may_be_far_off(pose: TrackResult) -> None:
 
 
 def test_headings_that_were_turned_far(pose: TrackResult) -> None:
-    from wepose_pin.tracking.headings import HeadingCorrection
-
-    turned = replace(pose, correction=HeadingCorrection(None, {}, {"right_forearm": 23.0, "torso": 12.0}))
+    assert pose.correction is not None
+    far_deg = {"right_forearm": 23.0, "torso": 12.0}
+    errors = np.deg2rad([[far_deg.get(name, 0.0) for name in pose.correction.segments]])
+    turned = replace(pose, correction=replace(pose.correction, errors=errors))
     corrected = the("heading-corrected-far", turned)  # a forearm's start pose may be off by as much, the torso's not
     assert (corrected.place, corrected.value) == ("torso", pytest.approx(np.deg2rad(12.0)))
 

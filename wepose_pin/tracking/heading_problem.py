@@ -195,17 +195,17 @@ def find_stride(rate_hz: float) -> int:
 
 
 def make_heading_problem(
-    recording: Recording, orientations: SegmentOrientations, subject: Subject, model: BodyModel, *, causal: bool
+    orientations: SegmentOrientations, subject: Subject, model: BodyModel
 ) -> HeadingProblem | None:
     """Return what observes the headings of these segments, and how well they are known at the start; None: nothing.
 
+    Causally, the phases of closures are not read but marked as they begin and end (`CausalHeadings.mark`).
+
     Parameters
     ----------
-    recording, orientations : the first chunk, or the one that ends with the start pose
-    causal : headings are corrected as samples come; the phases of closures are not read but marked as they begin and
-        end (`CausalHeadings.mark`)
+    orientations : of the first chunk, or of the one that ends with the start pose
     """
-    names = tuple(orientations.quat_WL)
+    recording, names, causal = orientations.recording, tuple(orientations.quat_WL), orientations.options.causal
     noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE
     raw = {name: orientations.quat_LS[name] for name in names if name in recording.imus}
     pairs = find_joint_pairs(model, raw) if recording.rate_hz >= LEAST_RATE_HZ else ()

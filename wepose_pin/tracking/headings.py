@@ -7,10 +7,9 @@ Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is correct
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,7 +18,7 @@ from .. import rotations
 from ..body.mounts import compute_start_heading_var
 from ..body.start_pose import StartFrames
 from ..observations.hinges import linearize_hinge
-from ..recording import OrientationSensor, Recording
+from ..recording import Intervals, OrientationSensor
 from .heading_filter import HeadingFilter, estimate_headings, find_care, mask_intervals, smooth
 from .heading_problem import FilterHeadings, HeadingProblem, Knot
 from .knots import E_Z, KnotReader, Samples, read_filter_headings, stack_samples
@@ -30,20 +29,62 @@ from .segment_orientations import SegmentOrientations
 SOLVE_SHARE, SOLVE_PARTS = 0.4, 20
 
 
-class HeadingCorrection(NamedTuple):
-    """The correction of headings: what was observed, residuals before and after, and the largest correction."""
+@dataclass(frozen=True)
+class HeadingCorrection:
+    """The correction of the headings of k segments at m knots, and what was observed."""
 
-    gap_rms_mm: tuple[float, float] | None  # between points that coincide, before and after; None: in no phase
-    hinge_residual_rms_deg: Mapping[str, tuple[float, float]]  # joint → segment below to its hinge's plane, the same
-    max_correction_deg: Mapping[str, float]  # segment → largest rotation about the vertical
-    joint_accelerations: tuple[str, ...] = ()  # segments whose joint to the one above has a sensor on either side
-    hinges: tuple[str, ...] = ()  # joints that were observed as hinges
-    found_clasps: tuple[tuple[float, float], ...] = ()  # [s] when the hands were found joined outside of a phase
-    segments: tuple[str, ...] = ()  # of the k rows of `covariance`
-    time: np.ndarray = np.zeros(0)  # (m,) [s] of the covariances
-    covariance: np.ndarray = np.zeros((0, 0, 0))  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
-    segment_covariance: np.ndarray = np.zeros((0, 0, 0))  # (m, k, k) [rad²] of the segments' headings
+    problem: HeadingProblem
+    time: np.ndarray  # (m,) [s] of the knots
+    errors: np.ndarray  # (m, k) [rad] that are corrected, on the left in W
+    covariance: np.ndarray  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
+    segment_covariance: np.ndarray  # (m, k, k) [rad²] of the segments' headings
+    found_clasps: Intervals = ()  # [s] when the hands were found joined outside of a phase
+    gap_rms_mm: tuple[float, float] | None = None  # between points that coincide, before and after; None: in no phase
+    # Hinge → the segment below to its plane, before and after.
+    hinge_residual_rms_deg: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     delay_s: float | None = None  # [s] after which a causal covariance is used; None: interpolated, offline
+
+    @property
+    def segments(self) -> tuple[str, ...]:
+        return self.problem.names
+
+    @property
+    def joint_accelerations(self) -> tuple[str, ...]:
+        """Segments whose joint to the one above has a sensor on either side."""
+        return tuple(pair.far for pair in self.problem.pairs)
+
+    @property
+    def hinges(self) -> tuple[str, ...]:
+        """Joints that were observed as hinges."""
+        return tuple(hinge.name for hinge in self.problem.hinges)
+
+    @property
+    def max_correction_deg(self) -> dict[str, float]:
+        """Segment → largest rotation about the vertical."""
+        largest = np.degrees(np.max(np.abs(self.errors), axis=0, initial=0.0))
+        return dict(zip(self.segments, largest.tolist(), strict=True))
+
+    def correct(self, orientations: SegmentOrientations) -> SegmentOrientations:
+        """Return a chunk's orientations with corrected headings, of a correction that is interpolated between knots."""
+        chunk, subject = orientations.recording, self.problem.subject
+        start_frames = StartFrames(table=self.problem.model.table)
+        corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
+        errors = interpolate(chunk.time, self.time, self.errors)
+        for i, name in enumerate(self.segments):
+            delta = errors[:, i]
+            corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
+            filtered = orientations.orientation.get(name)
+            if filtered is not None and filtered.attitude_cov is not None:
+                known = np.interp(chunk.time, self.time, self.segment_covariance[:, i, i])
+                covariance[name] = correct_covariance(
+                    covariance[name],
+                    (filtered.quat_VS, filtered.attitude_cov),
+                    orientations.heading_offset[name],
+                    compute_start_heading_var(chunk, name, subject, start_frames),
+                    np.stack([known, np.full(len(delta), np.inf), delta**2], axis=1),
+                    chunk.sensors[name].gap,
+                )
+        return replace(orientations, quat_WL=corrected, covariance_W=covariance)
 
     def relative_std(self, near: str, far: str, time: np.ndarray) -> np.ndarray:
         """Return the standard deviation (n,) [rad] of the heading between two segments at these times [s]."""
@@ -83,32 +124,30 @@ class HeadingCorrection(NamedTuple):
 
 
 class HeadingCorrector:
-    """Corrects the headings of a recording in two passes over its chunks.
+    """Finds the correction of the headings of a recording in two passes over its chunks.
 
-    First pass: `add_observations` of every chunk, then `solve`. Second pass: `correct` every chunk. The result does not
-    depend on the chunks, because observations are summed knot by knot.
+    First pass: `add_observations` of every chunk, then `solve`. Second pass: `HeadingCorrection.correct` of each. The
+    result does not depend on the chunks, because observations are summed knot by knot.
 
     Parameters
     ----------
-    chunk, orientations : the first chunk
+    orientations : of the first chunk
     problem : from `make_heading_problem`
     """
 
-    def __init__(self, chunk: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
+    def __init__(self, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
         self._problem, self._start_end = problem, orientations.start[1]
-        self._start_frames = StartFrames(table=problem.model.table)
-        self._measured = find_measured_headings(chunk, problem.names)
-        self._reader = KnotReader(chunk.rate_hz, orientations, problem)
+        self._measured = find_measured_headings(orientations)
+        self._reader = KnotReader(orientations, problem)
         self._knots: list[Knot] = []
-        self._errors = np.zeros((0, len(problem.names)))  # of each knot, from `solve` on; as the correction
-        self._correction: HeadingCorrection
 
-    def add_observations(self, chunk: Recording, orientations: SegmentOrientations) -> None:
+    def add_observations(self, orientations: SegmentOrientations) -> None:
         """Add the observations of a chunk, in the first pass."""
-        begin, names = int(np.searchsorted(chunk.time, self._start_end)), self._problem.names
+        chunk, names = orientations.recording, self._problem.names
+        begin = int(np.searchsorted(chunk.time, self._start_end))
         if begin == len(chunk):
             return
-        samples = stack_samples(chunk, orientations, names)
+        samples = stack_samples(orientations, names)
         if not (self._knots or self._reader.count):
             start = read_filter_headings(orientations.orientation, names, begin)
             self._problem = replace(self._problem, start=start)
@@ -120,13 +159,13 @@ class HeadingCorrector:
                 self._knots.append(self._reader.form(self._reader.take(), self._last_filters))
             begin = end
 
-    def solve(self) -> bool:
-        """Estimate the heading errors; return False where nothing observes them."""
+    def solve(self) -> HeadingCorrection | None:
+        """Estimate the heading errors; return None where nothing observes them."""
         problem = self._problem
         if self._reader.count:
             self._knots.append(self._reader.form(self._reader.take(), self._last_filters))
         if not self._knots:
-            return False
+            return None
         smoothed, clasps = smooth(problem, self._knots)
         if self._measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
             smoothed.errors[:, self._measured] = 0.0
@@ -135,52 +174,17 @@ class HeadingCorrector:
         time = np.concatenate([knot.time for knot in self._knots])
         quat_WL = np.concatenate([knot.quat_WL for knot in self._knots])
         self._knots = []
-        residuals = [
-            measure_residuals(problem, time, quat_WL, headings)
-            for headings in (np.zeros(quat_WL.shape[:2]), interpolate(time, knot_times, smoothed.errors))
-        ]
-        gaps, hinges = zip(*residuals, strict=True)
-        self._errors = smoothed.errors
-        self._correction = HeadingCorrection(
-            gap_rms_mm=None if gaps[0] is None else gaps,
-            hinge_residual_rms_deg={joint: tuple(rms[joint] for rms in hinges) for joint in hinges[0]},
-            max_correction_deg=dict(
-                zip(problem.names, np.degrees(np.abs(smoothed.errors).max(axis=0)).tolist(), strict=True)
-            ),
-            joint_accelerations=tuple(pair.far for pair in problem.pairs),
-            hinges=tuple(hinge.name for hinge in problem.hinges),
-            found_clasps=tuple(clasps),
-            segments=problem.names,
-            time=knot_times,
-            covariance=smoothed.covariance,
-            segment_covariance=smoothed.segment_covariance,
+        gap, hinges = measure_residuals(problem, time, quat_WL, np.zeros(quat_WL.shape[:2]))
+        corrections = interpolate(time, knot_times, smoothed.errors)
+        gap_after, hinges_after = measure_residuals(problem, time, quat_WL, corrections)
+        return HeadingCorrection(
+            problem,
+            knot_times,
+            *smoothed,
+            tuple(clasps),
+            None if gap is None or gap_after is None else (gap, gap_after),
+            {joint: (rms, hinges_after[joint]) for joint, rms in hinges.items()},
         )
-        return True
-
-    def correct(self, chunk: Recording, orientations: SegmentOrientations) -> SegmentOrientations:
-        """Return the chunk's orientations with corrected headings, in the second pass."""
-        corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
-        knot_times, segment_cov = self._correction.time, self._correction.segment_covariance
-        errors = interpolate(chunk.time, knot_times, self._errors)
-        for i, name in enumerate(self._problem.names):
-            delta = errors[:, i]
-            corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
-            filtered = orientations.orientation.get(name)
-            if filtered is not None and filtered.attitude_cov is not None:
-                known = np.interp(chunk.time, knot_times, segment_cov[:, i, i])
-                covariance[name] = correct_covariance(
-                    covariance[name],
-                    (filtered.quat_VS, filtered.attitude_cov),
-                    orientations.heading_offset[name],
-                    compute_start_heading_var(chunk, name, self._problem.subject, self._start_frames),
-                    np.stack([known, np.full(len(delta), np.inf), delta**2], axis=1),
-                    chunk.sensors[name].gap,
-                )
-        return replace(orientations, quat_WL=corrected, covariance_W=covariance)
-
-    def summarize(self) -> HeadingCorrection:
-        """Return what was observed and corrected, and the residuals."""
-        return self._correction
 
 
 def interpolate(time: np.ndarray, knot_times: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -219,7 +223,7 @@ class CausalHeadings:
 
     Parameters
     ----------
-    recording, orientations : up to the end of the start pose
+    orientations : up to the end of the start pose
 
     Attributes
     ----------
@@ -228,11 +232,12 @@ class CausalHeadings:
         the squared correction of the headings since the start or the last reset
     """
 
-    def __init__(self, recording: Recording, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
+    def __init__(self, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
+        recording = orientations.recording
         start = read_filter_headings(orientations.orientation, problem.names, len(recording) - 1)
         self._problem = problem = replace(problem, start=start)
         self.offset = np.array([orientations.heading_offset[name] for name in problem.names])
-        self._reader = KnotReader(recording.rate_hz, orientations, problem)
+        self._reader = KnotReader(orientations, problem)
         self._filter = HeadingFilter(problem)
         self._care = find_care(problem, self._filter.x, self._filter.P)
         self._rate_hz, self._samples = recording.rate_hz, 0
@@ -241,14 +246,14 @@ class CausalHeadings:
         self._solving: Iterator[None] | None = None  # the last knot, until its correction is applied
         self._record = False
         self._begin, self._end, self._at_reset = np.zeros((3, len(problem.names)))
-        self._measured = find_measured_headings(recording, problem.names)
+        self._measured = find_measured_headings(orientations)
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
         self._var_at_knot = np.zeros(len(problem.names))  # [rad²] of the filters, at the last knot that is solved
+        self._knot_end = 0.0  # [s] of that knot
         self._update_estimate()
         self.variance = self._find_variances()
-        self._max_correction = np.zeros(len(problem.names))
         self._marked: dict[str, list[tuple[int, int | None]]] = {}  # phase → first sample, and the one after the last
-        self._history: list[tuple[float, np.ndarray, np.ndarray]] = []
+        self._history: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []  # of knots, as the correction
 
     @property
     def phases(self) -> set[str]:
@@ -315,9 +320,7 @@ class CausalHeadings:
         yield from self._filter.update(knot)
         self._care = find_care(self._problem, self._filter.x, self._filter.P)
         self._update_estimate()
-        self._var_at_knot = np.nan_to_num(filters.var)
-        if self._record:
-            self._history.append((self._start_end + knot.end, *self._estimate[1:]))
+        self._var_at_knot, self._knot_end = np.nan_to_num(filters.var), knot.end
 
     def _update_estimate(self) -> None:
         self._estimate = estimate_headings(self._problem, self._filter.x, self._filter.P, self._care)
@@ -333,7 +336,8 @@ class CausalHeadings:
         if self._measured.any() and not self._corrects_measured:
             self._corrects_measured = exceed_uncertainty(self._end[None], self._estimate.covariance[None])
             self._end[self._measured] *= self._corrects_measured
-        self._max_correction = np.maximum(self._max_correction, np.abs(self._end))
+        if self._record:
+            self._history.append((self._start_end + self._knot_end, self._end, *self._estimate[1:]))
         self.variance = self._find_variances()
 
     def reset(self, heading_offset: np.ndarray) -> None:
@@ -354,25 +358,22 @@ class CausalHeadings:
 
     def summarize(self) -> HeadingCorrection:
         """Return what was observed and corrected so far, without residuals: they are not computed causally."""
-        names = self._problem.names
+        k, history = len(self._problem.names), self._history
         return HeadingCorrection(
-            gap_rms_mm=None,
-            hinge_residual_rms_deg={},
-            max_correction_deg=dict(zip(names, np.degrees(self._max_correction).tolist(), strict=True)),
-            joint_accelerations=tuple(pair.far for pair in self._problem.pairs),
-            hinges=tuple(hinge.name for hinge in self._problem.hinges),
-            found_clasps=tuple((self._start_end + a, self._start_end + b) for a, b in self._filter.clasps),
-            segments=names,
-            time=np.array([time for time, _, _ in self._history]),
-            covariance=np.array([cov for _, cov, _ in self._history]),
-            segment_covariance=np.array([cov for _, _, cov in self._history]),
+            self._problem,
+            np.array([time for time, *_ in history]),
+            np.array([errors for _, errors, _, _ in history]).reshape(-1, k),
+            np.array([cov for _, _, cov, _ in history]).reshape(-1, k, k),
+            np.array([cov for _, _, _, cov in history]).reshape(-1, k, k),
+            tuple((self._start_end + a, self._start_end + b) for a, b in self._filter.clasps),
             delay_s=self._problem.knot_s,
         )
 
 
-def find_measured_headings(recording: Recording, names: Sequence[str]) -> np.ndarray:
+def find_measured_headings(orientations: SegmentOrientations) -> np.ndarray:
     """Find (k,) bool the segments whose sensors measure orientations."""
-    return np.array([isinstance(recording.sensors[name], OrientationSensor) for name in names], dtype=bool)
+    sensors = orientations.recording.sensors
+    return np.array([isinstance(sensors[name], OrientationSensor) for name in orientations.quat_WL], dtype=bool)
 
 
 def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:

@@ -24,12 +24,11 @@ class KnotReader:
 
     Parameters
     ----------
-    rate_hz : of the samples
-    orientations : with the mounts and heading offsets of the problem's segments
+    orientations : of a chunk, with the mounts and heading offsets of the problem's segments
     """
 
-    def __init__(self, rate_hz: float, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
-        names, R_WK = problem.names, problem.model.neutral_rotations
+    def __init__(self, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
+        names, R_WK, rate_hz = problem.names, problem.model.neutral_rotations, orientations.recording.rate_hz
         self._stride = find_stride(rate_hz)
         self.size = self._stride * problem.samples_per_knot
         k = len(names)
@@ -110,9 +109,9 @@ class JointAccelerationFilter:
         return self._band.push(B.reshape(len(B), -1)).reshape(B.shape)
 
 
-def stack_samples(chunk: Recording, orientations: SegmentOrientations, names: Sequence[str]) -> Samples:
+def stack_samples(orientations: SegmentOrientations, names: Sequence[str]) -> Samples:
     """Stack the samples of these segments' sensors."""
-    quats = []
+    chunk, quats = orientations.recording, []
     for name in names:
         sensor = chunk.sensors[name]
         filtered = sensor if isinstance(sensor, OrientationSensor) else orientations.orientation[name]

@@ -125,9 +125,9 @@ class SegmentEstimator:
         self._var_at_reset: np.ndarray | None = None  # (k,) [rad²] of heading that a reset took away
         return self._place_chunk(first, orientation)
 
-    def correct_headings(self, problem: HeadingProblem, first: Recording, segments: SegmentOrientations) -> None:
-        """Correct headings from now on; `first` and `segments` are the first chunk, which ended with the start pose."""
-        self.headings = CausalHeadings(first, segments, problem)
+    def correct_headings(self, problem: HeadingProblem, first: SegmentOrientations) -> None:
+        """Correct headings from now on; `first` is of the first chunk, which ended with the start pose."""
+        self.headings = CausalHeadings(first, problem)
         self._variance = self.headings.variance
 
     @property

@@ -20,7 +20,7 @@ from ..filters import OFFLINE
 from ..filters.noise import BEGINNING_S
 from ..recording import Recording
 from .heading_problem import HeadingProblem, make_heading_problem
-from .headings import HeadingCorrector
+from .headings import HeadingCorrection, HeadingCorrector
 from .result import TrackResult
 from .segment_orientations import SegmentOrientations, TrackOptions
 from .segments import SegmentEstimator
@@ -111,13 +111,14 @@ class Tracker:
             start, chunk = found
             self._estimator = self._make_estimator()
             segments = self._estimator.push(start)
-            problem = self._make_problem(start, segments)
+            problem = self._make_problem(segments)
             if problem is not None:
-                self._estimator.correct_headings(problem, start, segments)
+                self._estimator.correct_headings(problem, segments)
         if not len(chunk):
             return None
         self._has_tracked = True
-        return self._solve_pose(chunk, self._estimator.push(chunk))
+        segments, headings = self._estimator.push(chunk), self._estimator.headings
+        return self._solve_pose(segments, None if headings is None else headings.summarize())
 
     def _push_offline(self, chunk: Recording) -> TrackResult | None:
         is_first = self._estimator is None
@@ -127,11 +128,11 @@ class Tracker:
             raise BadOption(f"method '{self.options.method}' takes the whole recording as one chunk")
         segments = self._estimator.push(chunk)
         if is_first:
-            problem = self._make_problem(chunk, segments)
-            self._headings = None if problem is None else HeadingCorrector(chunk, segments, problem)
+            problem = self._make_problem(segments)
+            self._headings = None if problem is None else HeadingCorrector(segments, problem)
         if self._headings is None:
-            return self._solve_pose(chunk, segments)
-        self._headings.add_observations(chunk, segments)
+            return self._solve_pose(segments)
+        self._headings.add_observations(segments)
         self._chunks.append(chunk)
         self._only = segments if is_first else None
         return None
@@ -148,36 +149,28 @@ class Tracker:
             raise BadPhase(self._start.explain_end())
         if self._headings is None:
             return
-        if not self._headings.solve():
-            self._headings = None
-        if self._only is not None:
-            yield self._solve_pose(self._chunks[0], self._only)
-            return
-        estimator = self._make_estimator()
+        correction, estimator = self._headings.solve(), self._make_estimator()
         for chunk in self._chunks:
-            yield self._solve_pose(chunk, estimator.push(chunk))
+            segments = self._only or estimator.push(chunk)
+            yield self._solve_pose(segments if correction is None else correction.correct(segments), correction)
 
     def _make_estimator(self) -> SegmentEstimator:
         return SegmentEstimator(self._subject, self.options, self._start_frames)
 
-    def _make_problem(self, first: Recording, segments: SegmentOrientations) -> HeadingProblem | None:
+    def _make_problem(self, first: SegmentOrientations) -> HeadingProblem | None:
         """Return what observes the headings of a recording whose first chunk this is; None: nothing."""
-        if self.options.open_loop or any(sensor.aligned for sensor in first.sensors.values()):
+        if self.options.open_loop or any(sensor.aligned for sensor in first.recording.sensors.values()):
             return None
-        return make_heading_problem(first, segments, self._person, self._body, causal=self.options.causal)
+        return make_heading_problem(first, self._person, self._body)
 
-    def _solve_pose(self, recording: Recording, segments: SegmentOrientations) -> TrackResult:
-        """Return a chunk with its pose, after its headings have been corrected."""
-        person, body = self._person, self._body
-        if self._headings is not None:
-            segments = self._headings.correct(recording, segments)
+    def _solve_pose(self, segments: SegmentOrientations, correction: HeadingCorrection | None = None) -> TrackResult:
+        """Return a chunk with its pose; its headings have been corrected."""
+        recording, person, body = segments.recording, self._person, self._body
         if self._kinematics is None:
             self._kinematics = KinematicsSolver(
                 body, segments.quat_WL, limits=self.options.limits, start=self._start_frames.q
             )
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
-        headings = self._headings or (self._estimator.headings if self._estimator is not None else None)
-        correction = None if headings is None else headings.summarize()
         point_cov: dict[str, np.ndarray] = {}
         if self._with_point_cov:
             segment_cov, shape_cov = segments.covariance_W, person.shape_covariance(body.table)
