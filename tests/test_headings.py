@@ -297,7 +297,7 @@ def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tm
     path.write_text(subject_toml(subject).replace("[hinges.left_elbow]", "[hinges.middle_elbow]"))
     with pytest.raises(BadSubject, match="hinges: 'middle_elbow' is not known; did you mean"):
         load_subject(path).check_body(TABLE)
-    path.write_text(subject_toml(subject).replace("y = 1.0", "y = 2.0"))
+    path.write_text(subject_toml(subject).replace("y = 1.0", "y = 0.5"))
     with pytest.raises(BadSubject, match=r"hinges\.left_elbow: x, y, z must be of length 1"):
         load_subject(path)
 
