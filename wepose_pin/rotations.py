@@ -232,6 +232,26 @@ def up_in_sensor(quat):  # type: ignore[no-untyped-def]
     return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
 
 
+def compute_turns(quat: np.ndarray) -> np.ndarray:
+    """Rotation vectors (n − 1, 3) [rad], in the rotating frame, between neighbours of orientations (n, 4) xyzw."""
+    return log(multiply(conjugate(quat[:-1]), quat[1:]))
+
+
+@compiled
+def unroll(rotvec, vectors):  # type: ignore[no-untyped-def]
+    """Vectors (n, 3), each turned by all of `rotvec` (n, 3) [rad] up to its own; one that is no number is no turn."""
+    quat, R, out = np.array([0.0, 0.0, 0.0, 1.0]), np.empty((3, 3)), np.empty((len(vectors), 3))
+    for k in range(len(vectors)):
+        x, y, z = rotvec[k]
+        x, y, z = x if np.isfinite(x) else 0.0, y if np.isfinite(y) else 0.0, z if np.isfinite(z) else 0.0
+        rotate_by_vector(quat, x, y, z)
+        fill_matrix(quat, R)
+        a, b, c = vectors[k]
+        for i in range(3):
+            out[k, i] = R[i, 0] * a + R[i, 1] * b + R[i, 2] * c
+    return out
+
+
 @compiled
 def integrate(rotvec):  # type: ignore[no-untyped-def]
     """Orientations (n + 1, 4) xyzw from the identity on, each turned by the next of `rotvec` (n, 3) [rad]."""

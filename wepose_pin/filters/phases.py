@@ -198,7 +198,7 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
     sensor, measured = recording.sensors[segment], recording.find_measured(segment, interval)
     if isinstance(sensor, OrientationSensor):
         R = Rotation.from_quat(sensor.quat_VS[measured])
-        rate = rotations.log(rotations.compose(R[:-1].inv(), R[1:]).as_quat()) * recording.rate_hz
+        rate = rotations.compute_turns(sensor.quat_VS[measured]) * recording.rate_hz
     else:
         rate = sensor.gyro_S[measured]
         R = Rotation.from_quat(rotations.integrate((rate - rate.mean(axis=0)) / recording.rate_hz))

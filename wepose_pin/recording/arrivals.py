@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..compilation import inlined, kernel
+from ..compilation import kernel
 from .clocks import LONGEST_GAP_S
 from .faults import AT_RANGE, FROZEN_SAMPLES, NOISY_S, SAME_RANGE, TURNS_BACK, TURNS_BACK_HZ
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED, NARROWEST_GYRO_RANGE
@@ -40,17 +40,46 @@ USUAL_CHANGES = 32.0  # number of changes in the average
 MISSING, LATE, DUPLICATE, BAD, TAKEN, FROZEN, CUT_OFF = range(7)
 COUNTS = ("missing", "late", "duplicate", "bad", "taken", "frozen", "cut_off")
 
+_OUT = 1024  # ticks in a block
 # A row of a sensor's buffer: time, gyro, accel.
-_T, _GX, _AX, _WIDTH = 0, 1, 4, 7
-_OUT = 1024
-# Memory of a sensor. For each of the six signals: newest value, its step, largest size, number of reversals in this
-# second, whether it changed. For all signals together: start of this second and its number of samples; start of the
-# current repetition, its length and the longest before; [s] of noise; number of changes; newest time. For each axis of
-# gyro: smallest step, recent steps, samples at the same value, saturation level, usual change from step to step.
-_LAST, _STEP, _SIZE, _TURNS, _CHANGES, _DIGIT, _ENTRY, _STANDS, _LEVEL = 0, 6, 12, 18, 24, 30, 33, 36, 39
-_SECOND, _SAMPLES, _SINCE, _REPEATS, _MOST, _NOISY, _VALUES, _TIME = 42, 43, 44, 45, 46, 47, 48, 49
-_CHANGE, _MEMORY = 50, 53
-_TICK, _NEWEST = 0, 1  # the scalars: number of ticks so far, newest time of all sensors
+_T, _WIDTH = 0, 7
+# What is known of a sensor. Its six signals are the axes of gyro and accel.
+SENSOR = np.dtype(
+    [
+        ("is_orientation", np.bool_),
+        ("lost", np.bool_),
+        ("frozen", np.bool_),
+        ("counts", np.int64, len(COUNTS)),
+        ("buffered", np.int64),  # rows of its buffer in use
+        ("jumps", np.int64),  # samples in a row that were too far ahead
+        ("jump_time", float),  # [s] of the last of these
+        # of each signal
+        ("value", float, 6),  # the newest
+        ("step", float, 6),  # to it
+        ("size", float, 6),  # largest so far
+        ("turns", float, 6),  # reversals in this second
+        ("changes", float, 6),  # in this second
+        # of all signals together
+        ("second", float),  # [s] start of this second
+        ("samples", float),  # in this second
+        ("since", float),  # [s] start of the current repetition
+        ("repeats", float),  # its length
+        ("most_repeats", float),  # the longest before
+        ("noisy_s", float),  # [s] of noise
+        ("values", np.int64),  # number of different values so far
+        ("newest", float),  # [s]
+        # of each axis of gyro
+        ("digit", float, 3),  # smallest step
+        ("entry", float, 3),  # recent steps
+        ("stands", float, 3),  # samples at the same value
+        ("level", float, 3),  # [rad/s] of saturation
+        ("change", float, 3),  # the usual one from step to step
+    ],
+    align=True,
+)
+CLOCK = np.dtype(
+    [("begin", float), ("dt", float), ("wait_s", float), ("tick", np.int64), ("newest", float)], align=True
+)  # `tick` of the next one, `newest` time [s] of all sensors
 
 
 class Samples(NamedTuple):
@@ -144,30 +173,28 @@ class StreamSynchronizer:
     ) -> None:
         self.sensors, self.rate_hz, self.begin, self.wait_s = tuple(sensors), rate_hz, begin, wait_s
         k = len(self.sensors)
-        self.counts = np.zeros((k, len(COUNTS)), dtype=np.int64)
-        self._measured = np.array([name in orientations for name in self.sensors], dtype=np.bool_)
-        self.lost = np.zeros(k, dtype=np.bool_)
-        self.frozen = np.zeros(k, dtype=np.bool_)
-        self._memory = np.zeros((k, _MEMORY))
-        self._memory[:, _DIGIT:_ENTRY] = self._memory[:, _LEVEL:_SECOND] = np.inf
+        self._sensors, self._clock = np.zeros(k, SENSOR), np.zeros(1, CLOCK)
+        self._sensors["is_orientation"] = [name in orientations for name in self.sensors]
+        self._sensors["digit"] = self._sensors["level"] = np.inf
+        self._clock[0] = (begin, 1.0 / rate_hz, wait_s, 0, -np.inf)
+        self.counts: np.ndarray = self._sensors["counts"]
+        self.lost: np.ndarray = self._sensors["lost"]
+        self.frozen: np.ndarray = self._sensors["frozen"]
         # A sensor may be much faster than the ticks.
         room = 4096 + int(8.0 * rate_hz * max(wait_s, REORDER_S, LONGEST_GAP_S))
-        self._buffers, self._lengths = np.zeros((k, room, _WIDTH)), np.zeros(k, dtype=np.int64)
-        self._jump = np.zeros((k, 2))  # samples in a row that were too far ahead, and the last of their times
-        self._scalars = np.array([0.0, -np.inf])
-        self._settings = np.array([begin, 1.0 / rate_hz, wait_s])
+        self._buffers = np.zeros((k, room, _WIDTH))
         self._out = np.empty((_OUT, k, 6)), np.empty((_OUT, k), dtype=np.bool_)
         self._none = Ticks(0, np.empty(0), np.empty((0, k, 3)), np.empty((0, k, 3)), np.empty((0, k), dtype=np.bool_))
 
     @property
     def next_tick(self) -> int:
         """Number of the next tick."""
-        return int(self._scalars[_TICK])
+        return int(self._clock["tick"][0])
 
     @property
     def newest(self) -> float:
         """Time [s] of the newest sample of all; −inf before the first."""
-        return float(self._scalars[_NEWEST])
+        return float(self._clock["newest"][0])
 
     def push(self, arrivals: Arrivals) -> Ticks:
         """Take samples and return the ticks that they complete, often none."""
@@ -182,242 +209,208 @@ class StreamSynchronizer:
         After an hour of silence there are millions.
         """
         values, lost = self._out
+        samples = np.column_stack([arrivals.time, arrivals.gyro_S, arrivals.accel_S])
         next_sample, count = 0, _OUT
-        while next_sample < len(arrivals.time) or count == _OUT:
+        while next_sample < len(samples) or count == _OUT:
             first = self.next_tick
             next_sample, count = _take_samples(
-                self._buffers,
-                self._lengths,
-                self._jump,
-                self._scalars,
-                self._settings,
-                self.counts,
-                self.lost,
-                self.frozen,
-                self._memory,
-                self._measured,
-                *arrivals,
-                next_sample,
-                values,
-                lost,
+                self._clock, self._sensors, self._buffers, arrivals.which, samples, next_sample, values, lost
             )
             if count:
                 time, block = self.begin + np.arange(first, first + count) / self.rate_hz, values[:count].copy()
                 yield Ticks(first, time, block[:, :, :3], block[:, :, 3:], lost[:count].copy())
 
 
+# The kernels below take `clock` and `sensor` as records of `CLOCK` and `SENSOR`, and a `sample` as a row of a buffer.
+
+
 @kernel
-def _take_samples(  # type: ignore[no-untyped-def]
-    buffers,
-    lengths,
-    jump,
-    scalars,
-    settings,
-    counts,
-    lost,
-    frozen,
-    memory,
-    measured,
-    which,
-    time,
-    gyro,
-    accel,
-    next_sample,
-    out,
-    out_lost,
-):
+def _take_samples(clocks, sensors, buffers, which, samples, next_sample, out, out_lost):  # type: ignore[no-untyped-def]
     """Take samples from `next_sample` on; returns the next sample and the number of ticks, at most `len(out)`."""
-    count = 0
+    clock, count = clocks[0], 0
     while True:
-        while count < len(out) and _is_complete(buffers, lengths, scalars, settings, lost):
-            _write_tick(
-                buffers, lengths, scalars, settings, counts, lost, memory, measured, out[count], out_lost[count]
-            )
+        while count < len(out) and _is_complete(clock, sensors, buffers):
+            _write_tick(clock, sensors, buffers, out[count], out_lost[count])
             count += 1
-        if count == len(out) or next_sample == len(time):
+        if count == len(out) or next_sample == len(samples):
             return next_sample, count
-        s, t = which[next_sample], time[next_sample]
-        if _is_sound(jump, scalars, counts, s, t, gyro[next_sample], accel[next_sample]):
-            if not measured[s] and (t > memory[s, _TIME] or memory[s, _VALUES] == 0.0):
-                frozen[s] = _repeats_itself(memory, frozen[s], s, t, gyro[next_sample], accel[next_sample])
-            if frozen[s] and t > memory[s, _SINCE]:
-                counts[s, FROZEN] += 1
-                scalars[_NEWEST] = max(scalars[_NEWEST], t)
+        sample, i = samples[next_sample], which[next_sample]
+        sensor, t = sensors[i], sample[_T]
+        if _is_sound(clock, sensor, sample):
+            if not sensor.is_orientation and (t > sensor.newest or sensor.values == 0):
+                sensor.frozen = _repeats_itself(sensors, sensor, sample)
+            if sensor.frozen and t > sensor.since:
+                sensor.counts[FROZEN] += 1
+                clock.newest = max(clock.newest, t)
             else:
-                _insert_sample(
-                    buffers, lengths, scalars, settings, counts, lost, s, t, gyro[next_sample], accel[next_sample]
-                )
+                _insert_sample(clock, sensor, buffers[i], sample)
         next_sample += 1
 
 
 @kernel
-def _is_sound(jump, scalars, counts, s, t, gyro, accel):  # type: ignore[no-untyped-def]
+def _is_sound(clock, sensor, sample):  # type: ignore[no-untyped-def]
     """Return whether a sample and its time are plausible."""
-    size = gyro[0] * gyro[0] + gyro[1] * gyro[1] + gyro[2] * gyro[2]
-    force = accel[0] * accel[0] + accel[1] * accel[1] + accel[2] * accel[2]
+    t, gx, gy, gz, ax, ay, az = sample
+    size, force = gx * gx + gy * gy + gz * gz, ax * ax + ay * ay + az * az
     if not (abs(t) < 1e12 and size < HIGHEST_RATE_SQUARED and force < HIGHEST_ACCEL_SQUARED):
-        counts[s, BAD] += 1
+        sensor.counts[BAD] += 1
         return False
-    if t > scalars[_NEWEST] + JUMP_S and scalars[_NEWEST] > -np.inf:
+    if t > clock.newest + JUMP_S and clock.newest > -np.inf:
         # A single time-stamp outlier must not make hours of ticks; after a real jump several samples continue from it.
-        continues = jump[s, 0] > 0.0 and 0.0 < t - jump[s, 1] < 1.0
-        jump[s, 0] = jump[s, 0] + 1.0 if continues else 1.0
-        jump[s, 1] = t
-        if jump[s, 0] < 4.0:
-            counts[s, BAD] += 1
+        continues = sensor.jumps > 0 and 0.0 < t - sensor.jump_time < 1.0
+        sensor.jumps = sensor.jumps + 1 if continues else 1
+        sensor.jump_time = t
+        if sensor.jumps < 4:
+            sensor.counts[BAD] += 1
             return False
-    jump[s, 0] = 0.0
+    sensor.jumps = 0
     return True
 
 
 @kernel
-def _repeats_itself(memory, frozen, s, t, gyro, accel):  # type: ignore[no-untyped-def]
-    """Return whether sensor s is frozen at this sample, its newest; `frozen`: it was frozen before."""
-    m = memory[s]
-    same = m[_VALUES] > 0.0
+def _repeats_itself(sensors, sensor, sample):  # type: ignore[no-untyped-def]
+    """Return whether a sensor is frozen at this sample, its newest."""
+    t, same = sample[_T], sensor.values > 0
     for k in range(6):
-        same = same and m[_LAST + k] == (gyro[k] if k < 3 else accel[k - 3])
-    m[_TIME] = t
+        same = same and sensor.value[k] == sample[1 + k]
+    sensor.newest = t
     if not same:
-        if not frozen:
-            m[_MOST] = max(m[_MOST], m[_REPEATS], 1.0)
-        _store_sample(m, t, gyro, accel)
+        if not sensor.frozen:
+            sensor.most_repeats = max(sensor.most_repeats, sensor.repeats, 1.0)
+        _store_sample(sensor, sample)
         return False
-    m[_REPEATS] += 1.0
-    lasts = t - m[_SINCE]
-    if m[_REPEATS] < FROZEN_SAMPLES or lasts <= LONGEST_GAP_S * (1.0 + 1e-6):
+    sensor.repeats += 1.0
+    lasts = t - sensor.since
+    if sensor.repeats < FROZEN_SAMPLES or lasts <= LONGEST_GAP_S * (1.0 + 1e-6):
         return False
-    if m[_NOISY] >= NOISY_S:
-        return m[_REPEATS] > MOST_REPEATS * m[_MOST]
+    if sensor.noisy_s >= NOISY_S:
+        return sensor.repeats > MOST_REPEATS * sensor.most_repeats
     # A sensor that was constant from the beginning shows no noise; the others are of the same kind.
     others_noisy = False
-    for other in range(len(memory)):
-        others_noisy = others_noisy or memory[other, _NOISY] >= NOISY_S
-    return others_noisy and m[_VALUES] == 1.0 and lasts >= NOISY_S
+    for other in range(len(sensors)):
+        others_noisy = others_noisy or sensors[other].noisy_s >= NOISY_S
+    return others_noisy and sensor.values == 1 and lasts >= NOISY_S
 
 
 @kernel
-def _store_sample(m, t, gyro, accel):  # type: ignore[no-untyped-def]
+def _store_sample(sensor, sample):  # type: ignore[no-untyped-def]
     """Store a sample that differs from the one before, and detect noise by the reversals in each second."""
-    if m[_VALUES] == 0.0:
-        m[_SECOND] = t
-    m[_REPEATS], m[_SINCE] = 0.0, t
-    m[_VALUES] += 1.0
-    m[_SAMPLES] += 1.0
+    t = sample[_T]
+    if sensor.values == 0:
+        sensor.second = t
+    sensor.repeats, sensor.since = 0.0, t
+    sensor.values += 1
+    sensor.samples += 1.0
     for k in range(6):
-        value = gyro[k] if k < 3 else accel[k - 3]
-        step = value - m[_LAST + k] if m[_VALUES] > 1.0 else 0.0
-        m[_SIZE + k] = max(m[_SIZE + k], abs(value))
-        if abs(step) < ROUNDING * m[_SIZE + k]:
+        value = sample[1 + k]
+        step = value - sensor.value[k] if sensor.values > 1 else 0.0
+        sensor.size[k] = max(sensor.size[k], abs(value))
+        if abs(step) < ROUNDING * sensor.size[k]:
             step = 0.0
-        if step * m[_STEP + k] < 0.0:
-            m[_TURNS + k] += 1.0
+        if step * sensor.step[k] < 0.0:
+            sensor.turns[k] += 1.0
         if k < 3:
-            m[_CHANGE + k] += (abs(step - m[_STEP + k]) - m[_CHANGE + k]) / USUAL_CHANGES
+            sensor.change[k] += (abs(step - sensor.step[k]) - sensor.change[k]) / USUAL_CHANGES
         if step != 0.0:
-            m[_CHANGES + k] = 1.0
-        m[_LAST + k], m[_STEP + k] = value, step
-    _find_saturation(m)
-    seconds = t - m[_SECOND]
+            sensor.changes[k] = 1.0
+        sensor.value[k], sensor.step[k] = value, step
+    _find_saturation(sensor)
+    seconds = t - sensor.second
     if seconds >= 1.0:
-        least = m[_SAMPLES] * min(TURNS_BACK, TURNS_BACK_HZ * seconds / m[_SAMPLES])
-        changes, turns = False, m[_SAMPLES] >= 2.0 * FROZEN_SAMPLES
+        least = sensor.samples * min(TURNS_BACK, TURNS_BACK_HZ * seconds / sensor.samples)
+        changes, turns = False, sensor.samples >= 2.0 * FROZEN_SAMPLES
         for k in range(6):
-            if m[_CHANGES + k] > 0.0:
-                changes, turns = True, turns and m[_TURNS + k] > least
-            m[_TURNS + k], m[_CHANGES + k] = 0.0, 0.0
+            if sensor.changes[k] > 0.0:
+                changes, turns = True, turns and sensor.turns[k] > least
+            sensor.turns[k] = sensor.changes[k] = 0.0
         if changes and turns:
-            m[_NOISY] += seconds
-        m[_SECOND], m[_SAMPLES] = t, 0.0
+            sensor.noisy_s += seconds
+        sensor.second, sensor.samples = t, 0.0
 
 
 @kernel
-def _find_saturation(m):  # type: ignore[no-untyped-def]
+def _find_saturation(sensor):  # type: ignore[no-untyped-def]
     """Find the saturation level of each axis of gyro, as `plausibility.find_cut_off`, from the samples so far."""
-    largest = max(m[_SIZE], m[_SIZE + 1], m[_SIZE + 2])
+    largest = max(sensor.size[0], sensor.size[1], sensor.size[2])
     for k in range(3):
-        value, step = abs(m[_LAST + k]), abs(m[_STEP + k])
-        if m[_SIZE + k] > m[_LEVEL + k] or (1.0 - SAME_RANGE) * largest > m[_LEVEL + k]:
-            m[_LEVEL + k] = np.inf  # larger rates exist
+        value, step = abs(sensor.value[k]), abs(sensor.step[k])
+        if sensor.size[k] > sensor.level[k] or (1.0 - SAME_RANGE) * largest > sensor.level[k]:
+            sensor.level[k] = np.inf  # larger rates exist
         if step > 0.0:
-            m[_DIGIT + k], m[_STANDS + k] = min(m[_DIGIT + k], step), 1.0
-            m[_ENTRY + k] = max(step, 0.75 * m[_ENTRY + k])  # the last step may be cut off itself
+            sensor.digit[k], sensor.stands[k] = min(sensor.digit[k], step), 1.0
+            sensor.entry[k] = max(step, 0.75 * sensor.entry[k])  # the last step may be cut off itself
             continue
-        m[_STANDS + k] += 1.0
-        steep = m[_ENTRY + k] > STEEP * m[_DIGIT + k] and value > FEWEST_DIGITS * m[_DIGIT + k]
-        steep = steep and m[_ENTRY + k] * (m[_STANDS + k] / STANDS) ** 1.5 > ROUGH * m[_CHANGE + k]
-        at_extreme = value == m[_SIZE + k] and value >= max(NARROWEST_GYRO_RANGE, (1.0 - SAME_RANGE) * largest)
-        if steep and at_extreme and m[_STANDS + k] >= STANDS:
-            m[_LEVEL + k] = value
-
-
-@inlined
-def _saturation(m):  # type: ignore[no-untyped-def]
-    """Return the rate [rad/s] at which gyro saturates; infinite: not detected."""
-    return min(m[_LEVEL], m[_LEVEL + 1], m[_LEVEL + 2])
+        sensor.stands[k] += 1.0
+        steep = sensor.entry[k] > STEEP * sensor.digit[k] and value > FEWEST_DIGITS * sensor.digit[k]
+        steep = steep and sensor.entry[k] * (sensor.stands[k] / STANDS) ** 1.5 > ROUGH * sensor.change[k]
+        at_extreme = value == sensor.size[k] and value >= max(NARROWEST_GYRO_RANGE, (1.0 - SAME_RANGE) * largest)
+        if steep and at_extreme and sensor.stands[k] >= STANDS:
+            sensor.level[k] = value
 
 
 @kernel
-def _insert_sample(buffers, lengths, scalars, settings, counts, lost, s, t, gyro, accel):  # type: ignore[no-untyped-def]
+def _insert_sample(clock, sensor, buffer, sample):  # type: ignore[no-untyped-def]
     """Insert a sample into its sensor's buffer, in order of time."""
-    dt = settings[1]
-    last = settings[0] + (scalars[_TICK] - 1.0) * dt  # time of the last complete tick
-    buffer, n = buffers[s], lengths[s]
+    dt, t, n = clock.dt, sample[_T], sensor.buffered
+    last = clock.begin + (clock.tick - 1.0) * dt  # time of the last complete tick
     if t < last + SAME * dt:
         # Only the first tick has no tick before it: a sample before the beginning is the start of its step.
         if n > 0 and abs(buffer[0, _T] - t) < SAME * dt:
-            counts[s, DUPLICATE] += 1
+            sensor.counts[DUPLICATE] += 1
             return
-        if scalars[_TICK] > 0.0:
-            counts[s, LATE] += 1
-            if t > scalars[_NEWEST] - settings[2]:
-                lost[s] = False  # the next tick waits for it again
+        if clock.tick > 0:
+            sensor.counts[LATE] += 1
+            if t > clock.newest - clock.wait_s:
+                sensor.lost = False  # the next tick waits for it again
             return
     i = n
     while i > 0 and buffer[i - 1, _T] > t - SAME * dt:
         i -= 1
     if i < n and abs(buffer[i, _T] - t) <= SAME * dt:
-        counts[s, DUPLICATE] += 1
+        sensor.counts[DUPLICATE] += 1
         return
     if n == len(buffer):  # the sensor is ahead by a full buffer and no tick is complete: drop the oldest sample
-        for j in range(n - 1):
-            for m in range(_WIDTH):
-                buffer[j, m] = buffer[j + 1, m]
+        _drop(sensor, buffer, 1)
         n -= 1
         i = max(i - 1, 0)
     for j in range(n, i, -1):
         for m in range(_WIDTH):
             buffer[j, m] = buffer[j - 1, m]
-    buffer[i, _T] = t
-    for m in range(3):
-        buffer[i, _GX + m], buffer[i, _AX + m] = gyro[m], accel[m]
-    lengths[s] = n + 1
-    lost[s] = False
-    counts[s, TAKEN] += 1
-    if t > scalars[_NEWEST]:
-        scalars[_NEWEST] = t
+    for m in range(_WIDTH):
+        buffer[i, m] = sample[m]
+    sensor.buffered = n + 1
+    sensor.lost = False
+    sensor.counts[TAKEN] += 1
+    clock.newest = max(clock.newest, t)
 
 
 @kernel
-def _is_complete(buffers, lengths, scalars, settings, lost):  # type: ignore[no-untyped-def]
+def _drop(sensor, buffer, count):  # type: ignore[no-untyped-def]
+    """Drop the oldest samples of a buffer."""
+    for j in range(sensor.buffered - count):
+        for m in range(_WIDTH):
+            buffer[j, m] = buffer[j + count, m]
+    sensor.buffered -= count
+
+
+@kernel
+def _is_complete(clock, sensors, buffers):  # type: ignore[no-untyped-def]
     """Return whether the next tick is complete."""
-    begin, dt, wait = settings[0], settings[1], settings[2]
-    t = begin + scalars[_TICK] * dt
-    newest = scalars[_NEWEST]
-    if newest < t - SAME * dt:
+    dt, t = clock.dt, clock.begin + clock.tick * clock.dt
+    if clock.newest < t - SAME * dt:
         return False
-    if newest >= t + wait:
+    if clock.newest >= t + clock.wait_s:
         return True
-    for s in range(len(lengths)):
-        if lost[s]:
+    for s in range(len(sensors)):
+        if sensors[s].lost:
             continue
-        buffer, n = buffers[s], lengths[s]
+        buffer, n = buffers[s], sensors[s].buffered
         if n == 0 or buffer[n - 1, _T] < t - SAME * dt:
             return False
         if buffer[n - 1, _T] >= t + REORDER_S:
             continue
         i = _find_sample(buffer, n, t, dt)
-        if i > 0 and buffer[i, _T] - buffer[i - 1, _T] > HOLE * dt and buffer[i - 1, _T] > t - wait:
+        if i > 0 and buffer[i, _T] - buffer[i - 1, _T] > HOLE * dt and buffer[i - 1, _T] > t - clock.wait_s:
             return False  # a sample in the gap may still arrive
     return True
 
@@ -432,36 +425,31 @@ def _find_sample(buffer, n, t, dt):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _write_tick(  # type: ignore[no-untyped-def]
-    buffers, lengths, scalars, settings, counts, lost, memory, measured, out, out_lost
-):
+def _write_tick(clock, sensors, buffers, out, out_lost):  # type: ignore[no-untyped-def]
     """Write the next tick into `out` (k, 6), and drop the samples that no later tick needs."""
-    dt = settings[1]
-    t = settings[0] + scalars[_TICK] * dt
-    for s in range(len(lengths)):
-        buffer, n = buffers[s], lengths[s]
+    dt, t = clock.dt, clock.begin + clock.tick * clock.dt
+    for s in range(len(sensors)):
+        sensor, buffer, n = sensors[s], buffers[s], sensors[s].buffered
         i = _find_sample(buffer, n, t, dt)
         if i == n:
-            lost[s] = True
-        if not _write_value(buffer, n, i, t, dt, measured[s], out[s]):
-            counts[s, MISSING] += 1
+            sensor.lost = True
+        saturation = min(sensor.level[0], sensor.level[1], sensor.level[2])  # infinite: not detected
+        if not _write_value(buffer, n, i, t, dt, sensor.is_orientation, out[s]):
+            sensor.counts[MISSING] += 1
             out[s, :] = np.nan
-        elif max(abs(out[s, 0]), abs(out[s, 1]), abs(out[s, 2])) >= (1.0 - AT_RANGE) * _saturation(memory[s]):
-            counts[s, CUT_OFF] += 1
+        elif max(abs(out[s, 0]), abs(out[s, 1]), abs(out[s, 2])) >= (1.0 - AT_RANGE) * saturation:
+            sensor.counts[CUT_OFF] += 1
             out[s, :] = np.nan
-        out_lost[s] = lost[s]
+        out_lost[s] = sensor.lost
         # The next step begins at the last sample at or before the tick.
         done = i if i < n and buffer[i, _T] <= t + SAME * dt else i - 1
         if done > 0:
-            for j in range(n - done):
-                for m in range(_WIDTH):
-                    buffer[j, m] = buffer[j + done, m]
-            lengths[s] = n - done
-    scalars[_TICK] += 1.0
+            _drop(sensor, buffer, done)
+    clock.tick += 1
 
 
 @kernel
-def _write_value(buffer, n, i, t, dt, measured, out):  # type: ignore[no-untyped-def]
+def _write_value(buffer, n, i, t, dt, is_orientation, out):  # type: ignore[no-untyped-def]
     """Write the sensor's values at `t` into `out` (6,); `i` is its first sample from `t` on. False: not known."""
     if i == n:
         return False
@@ -474,42 +462,36 @@ def _write_value(buffer, n, i, t, dt, measured, out):  # type: ignore[no-untyped
     bridged = max(LONGEST_GAP_S, dt) * (1.0 + 1e-6)  # [s] as in `clocks`: a single lost sample is always bridged
     if first or step - dt > bridged:
         return False
-    if measured:
-        _interpolate_orientation(buffer[i - 1], buffer[i], (t - buffer[i - 1, _T]) / step, out)
+    before, after, share = buffer[i - 1], buffer[i], (t - buffer[i - 1, _T]) / step
+    if is_orientation:
+        _interpolate_orientation(before, after, share, out)
         return True
+    share = share if step > HOLE * dt else min(1.0, share)
+    for m in range(6):
+        out[m] = before[1 + m] + share * (after[1 + m] - before[1 + m])
     if step > HOLE * dt:
-        share = (t - buffer[i - 1, _T]) / step
-        for m in range(6):
-            out[m] = buffer[i - 1, 1 + m] + share * (buffer[i, 1 + m] - buffer[i - 1, 1 + m])
         return True
     # Mean rate over (t − dt, t], each sample's rate from the one before to it; mean force of the samples within, or
     # with fewer than two samples the force at t.
-    for m in range(6):
-        out[m] = 0.0
-    covered, inside = 0.0, 0
-    j = i
+    rate_x = rate_y = rate_z = force_x = force_y = force_z = covered = 0.0
+    inside, j = 0, i
     while j > 0 and buffer[j, _T] > t - dt:
-        begin, end = max(buffer[j - 1, _T], t - dt), min(buffer[j, _T], t)
-        width = max(0.0, end - begin)
+        width = max(0.0, min(buffer[j, _T], t) - max(buffer[j - 1, _T], t - dt))
         covered += width
-        for m in range(3):
-            out[m] += width * buffer[j, _GX + m]
+        rate_x += width * buffer[j, 1]
+        rate_y += width * buffer[j, 2]
+        rate_z += width * buffer[j, 3]
         if buffer[j, _T] <= t + SAME * dt:
             inside += 1
-            for m in range(3):
-                out[3 + m] += buffer[j, _AX + m]
+            force_x += buffer[j, 4]
+            force_y += buffer[j, 5]
+            force_z += buffer[j, 6]
         j -= 1
     if covered <= 0.0:
         return False
-    for m in range(3):
-        out[m] /= covered
+    out[0], out[1], out[2] = rate_x / covered, rate_y / covered, rate_z / covered
     if inside >= 2:
-        for m in range(3):
-            out[3 + m] /= inside
-    else:
-        share = min(1.0, (t - buffer[i - 1, _T]) / step)
-        for m in range(3):
-            out[3 + m] = buffer[i - 1, _AX + m] + share * (buffer[i, _AX + m] - buffer[i - 1, _AX + m])
+        out[3], out[4], out[5] = force_x / inside, force_y / inside, force_z / inside
     return True
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,8 +26,6 @@ WITHIN_PACKET, SAME_SIZE, FEWEST_PACKETS = 0.5, 0.8, 5
 # Clocks that agree to this share of a step are one clock.
 SAME = 0.01
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-# Number of times that are processed together; it bounds the extra memory.
-BLOCK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -65,8 +63,8 @@ def build_clock(time: np.ndarray, place: str) -> Clock:
         raise BadData(f"{place}: {len(time)} samples; a recording has at least 2")
     packet, time = _spread_packets(time)
     check_time(place, time)
-    usual = np.diff(time[: BLOCK + 1])  # the first block is enough for the usual step
-    step = float(np.median(usual))
+    steps = np.diff(time)
+    step = float(np.median(steps))
     if step > LONGEST_STEP_S:
         unit = guess_time_unit(step)
         guess = f'; time_unit = "{unit}" would fit' if unit else ""
@@ -75,13 +73,13 @@ def build_clock(time: np.ndarray, place: str) -> Clock:
         raise BadData(
             f"{place}: time grows by {step:g} s from row to row, faster than any body sensor; is it in seconds?"
         )
-    wide = np.concatenate([first + np.flatnonzero(s > (1.0 + UNEVEN) * step) for first, s in _iterate_steps(time)])
-    lost = np.round((time[wide + 1] - time[wide]) / step) - 1.0
-    if np.quantile(np.abs(usual / step - 1.0), 0.75) > REGULAR:
+    wide = np.flatnonzero(steps > (1.0 + UNEVEN) * step)
+    lost = np.round(steps[wide] / step) - 1.0
+    if np.quantile(np.abs(steps / step - 1.0), 0.75) > REGULAR:
         # The clock has no rate that shows lost rows: up to a long gap, a sample's rate holds for its whole step.
         lost[lost * step <= max(LONGEST_GAP_S, step)] = 0.0
     if lost.sum() > 10 * len(time) + 1000:
-        k = int(wide[np.argmax(time[wide + 1] - time[wide])])
+        k = int(np.argmax(steps))
         raise BadData(
             f"{place}: time jumps from {format_span(time[k : k + 2])} in row {k + 2}, by more than the recording "
             f"is long; cut the recording there"
@@ -92,7 +90,7 @@ def build_clock(time: np.ndarray, place: str) -> Clock:
     counts[wide] = lost.astype(int)
     row = np.repeat(np.arange(len(time)), counts + 1)
     nth = np.arange(len(row)) - np.searchsorted(row, row)  # 0 is the row itself; lost rows after it count from 1
-    filled = time[row] + nth * np.append(np.diff(time) / (counts[:-1] + 1), 0.0)[row]
+    filled = time[row] + nth * np.append(steps / (counts[:-1] + 1), 0.0)[row]
     return Clock(filled, np.where(nth == 0, row, -1), step, packet)
 
 
@@ -134,12 +132,6 @@ def guess_time_unit(step: float) -> str | None:
     return next((name for name, unit in TIME_UNITS.items() if 1e-4 < step * unit < LONGEST_STEP_S), None)
 
 
-def _iterate_steps(time: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Iterate over the steps in blocks, each with the index of its first time."""
-    for first in range(0, len(time) - 1, BLOCK):
-        yield first, np.diff(time[first : first + BLOCK + 1])
-
-
 def measure_rate(time: np.ndarray) -> float:
     """Measure the mean rate [Hz] of even times (n,) [s].
 
@@ -165,9 +157,8 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
     """
     first = next(iter(clocks.values()))
     distinct = list({id(clock): clock for clock in clocks.values()}.values())  # usually one for all sensors
-    uneven = max(
-        float(np.max(np.abs(s / clock.step - 1.0))) for clock in distinct for _, s in _iterate_steps(clock.time)
-    )
+    steps = [np.diff(clock.time) for clock in distinct]
+    uneven = max(float(np.max(np.abs(each / clock.step - 1.0))) for clock, each in zip(distinct, steps, strict=True))
     shared = all(_agree(clock, first) for clock in clocks.values())
     drift = max(_compute_drift(clock) for clock in distinct)
     if shared and uneven <= UNEVEN + 1e-9 and drift <= DRIFT:
@@ -182,9 +173,8 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
         )
     dt = 1.0 / float(np.round(1.0 / usual, 3 if usual < 0.1 else 6))
     time = np.minimum(begin + dt * np.arange(int((end - begin) / dt + 1e-6) + 1), end)
-    smallest = min(float(s.min()) for clock in distinct for _, s in _iterate_steps(clock.time))
-    largest = max(float(s.max()) for clock in distinct for _, s in _iterate_steps(clock.time))
-    facts: dict[str, float | str] = {"start": begin, "end": float(time[-1]), "shortest": smallest, "longest": largest}
+    shortest, longest = min(float(each.min()) for each in steps), max(float(each.max()) for each in steps)
+    facts: dict[str, float | str] = {"start": begin, "end": float(time[-1]), "shortest": shortest, "longest": longest}
     if shared:
         facts |= {"variant": "uneven", "off": uneven} if uneven > UNEVEN else {"variant": "changing", "off": drift}
     return time, (Diagnostic("time-resampled", INFO, value=1.0 / dt, facts=facts),)
@@ -203,8 +193,6 @@ def _compute_drift(clock: Clock) -> float:
     drift = 0.0
     for seconds in (1.0, 10.0):
         size = min(n - 1, max(1, round(seconds / mean)))
-        for first in range(0, n - size, BLOCK):
-            last = min(first + BLOCK, n - size)
-            spans = time[first + size : last + size] - time[first:last]
-            drift = max(drift, float(np.max(np.abs(spans - size * mean)) - mean) / (size * mean))
+        spans = time[size:] - time[:-size]
+        drift = max(drift, float(np.max(np.abs(spans - size * mean)) - mean) / (size * mean))
     return drift

@@ -26,7 +26,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
 from .. import rotations
@@ -354,7 +353,7 @@ def _compute_up_change(time: np.ndarray, gyro: np.ndarray, accel: np.ndarray) ->
     edges = np.searchsorted(window, np.arange(count + 1))
     if count < 3 or (np.diff(edges) == 0).any():
         return 0.0
-    force = Rotation.from_quat(rotations.integrate(gyro[1:] * np.diff(time)[:, None])).apply(accel)
+    force = rotations.unroll(gyro * np.diff(time, prepend=time[0])[:, None], accel)
     mean = np.add.reduceat(force, edges[:-1])[:count] / np.diff(edges)[:, None]
     size = np.linalg.norm(mean, axis=1)
     known = np.abs(size / STANDARD_GRAVITY - 1.0) < UP_FORCE

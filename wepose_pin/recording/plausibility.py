@@ -15,7 +15,7 @@ from scipy.special import ndtr, ndtri
 from ..compilation import compiled
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongUnit
-from ..rotations import fill_matrix, rotate_by_vector
+from ..rotations import unroll
 from .gaps import find_runs
 from .intervals import format_span
 from .limits import (
@@ -201,8 +201,8 @@ def find_unseen_rate(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) ->
     up = accel_S.mean(axis=0)
     if not np.linalg.norm(up) > 0.0 or _tilt_most(accel_S, rate_hz) > STEADY:
         return np.nan
-    halves = np.array_split(_turn_by(gyro_S / rate_hz, up), 2)  # in both: a lost sample is no unit
-    turned = min(_tilt_most(half, rate_hz) for half in halves)
+    ups = unroll(gyro_S / rate_hz, np.tile(up, (len(gyro_S), 1)))
+    turned = min(_tilt_most(half, rate_hz) for half in np.array_split(ups, 2))  # in both: a lost sample is no unit
     return float(np.linalg.norm(gyro_S, axis=1).max()) if turned > TURNED else np.nan
 
 
@@ -217,43 +217,15 @@ def _tilt_most(vectors: np.ndarray, rate_hz: float) -> float:
     return float(np.arccos(np.clip(means @ means[0] / (lengths * lengths[0]), -1.0, 1.0)).max())
 
 
-@compiled
-def _turn_by(rotvec, vector):  # type: ignore[no-untyped-def]
-    """Return a vector (3,) turned by each of `rotvec` (n, 3) [rad] after all before it, (n, 3)."""
-    turned = np.empty_like(rotvec)
-    quat, R = np.array([0.0, 0.0, 0.0, 1.0]), np.empty((3, 3))
-    for n in range(len(rotvec)):
-        rotate_by_vector(quat, rotvec[n, 0], rotvec[n, 1], rotvec[n, 2])
-        fill_matrix(quat, R)
-        for i in range(3):
-            turned[n, i] = R[i, 0] * vector[0] + R[i, 1] * vector[1] + R[i, 2] * vector[2]
-    return turned
-
-
 def _average_coherence(scale: float, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
     """Average the coherence, 0 to 1, of `scale` times the rates over windows (k, n, 3).
 
     It is how near the mean specific force, rotated by the gyroscope, is to gravity. The specific force of a swinging
     arm is several times gravity and points along the arm in the sensor frame; its mean in the world is gravity.
     """
-    means_W = np.linalg.norm(_average_rotated(scale / rate_hz * gyro_S, accel_S), axis=1)
+    forces = unroll(scale / rate_hz * gyro_S.reshape(-1, 3), accel_S.reshape(-1, 3))  # one world for all windows
+    means_W = np.linalg.norm(forces.reshape(accel_S.shape).mean(axis=1), axis=1)
     return float(np.mean(np.maximum(0.0, 1.0 - np.abs(means_W / STANDARD_GRAVITY - 1.0))))
-
-
-@compiled
-def _average_rotated(rotvec, vectors):  # type: ignore[no-untyped-def]
-    """Mean (k, 3) of vectors (k, n, 3) that turn from one to the next by `rotvec` (k, n, 3) [rad]."""
-    means, R = np.zeros((len(vectors), 3)), np.empty((3, 3))
-    for k in range(len(vectors)):
-        quat = np.array([0.0, 0.0, 0.0, 1.0])
-        for n in range(vectors.shape[1]):
-            if n:
-                rotate_by_vector(quat, rotvec[k, n, 0], rotvec[k, n, 1], rotvec[k, n, 2])
-            fill_matrix(quat, R)
-            for i in range(3):
-                turned = R[i, 0] * vectors[k, n, 0] + R[i, 1] * vectors[k, n, 1] + R[i, 2] * vectors[k, n, 2]
-                means[k, i] += turned / vectors.shape[1]
-    return means
 
 
 def _check_range(time: np.ndarray, values: np.ndarray, most: float, unit: str, place: str) -> None:

@@ -28,7 +28,7 @@ def resample(sensor: Sensor, clock: np.ndarray, time: np.ndarray) -> Sensor:
         return replace(sensor, quat_VS=Slerp(clock, Rotation.from_quat(sensor.quat_VS))(within).as_quat(), gap=gap)
     quat = rotations.integrate(sensor.gyro_S[1:] * np.diff(clock)[:, None])
     R = Slerp(clock, Rotation.from_quat(quat))(within)
-    rate = rotations.log(rotations.compose(R[:-1].inv(), R[1:]).as_quat()) / np.diff(time)[:, None]
+    rate = rotations.compute_turns(R.as_quat()) / np.diff(time)[:, None]
     dt = float(time[1] - time[0])
     if dt < (1.0 + UNEVEN) * float(np.median(np.diff(clock))):
         accel = np.column_stack([np.interp(within, clock, axis) for axis in sensor.accel_S.T])

@@ -121,6 +121,5 @@ def compute_rate(sensor: Sensor, rate_hz: float) -> np.ndarray:
     """
     if isinstance(sensor, ImuSensor):
         return sensor.gyro_S
-    R = Rotation.from_quat(sensor.quat_VS)
-    rate = rotations.log(rotations.compose(R[:-1].inv(), R[1:]).as_quat()) * rate_hz
+    rate = rotations.compute_turns(sensor.quat_VS) * rate_hz
     return np.concatenate([rate[:1], rate])
