@@ -54,13 +54,15 @@ def make_options(
     known: Mapping[str, str] | None = None,
     mounts: Mapping[str, np.ndarray] | None = None,
     protocol_name: str = "clasp",
+    clasp_s: float = CLASP_S,
+    given: Mapping[str, float] = MEASURED,
 ) -> GuideOptions:
     """A guide whose clasp is short, and which estimates nothing on the way."""
     protocol, model = load_protocol(protocol_name), load_model()
-    steps = tuple(step._replace(seconds=CLASP_S) if step.phase == "clasp" else step for step in protocol.steps)
+    steps = tuple(step._replace(seconds=clasp_s) if step.phase == "clasp" else step for step in protocol.steps)
 
     def calibrate_file(path: Path, measured: Mapping[str, float]) -> Calibrated:
-        return Calibrated(calibrate(load_session(path), measured={**MEASURED, **measured}), folder)
+        return Calibrated(calibrate(load_session(path), measured={**given, **measured}), folder)
 
     def estimate(_: Recording) -> Calibration:
         raise BadSession("nothing is estimated here")
@@ -91,12 +93,14 @@ class Session:
         known: Mapping[str, str] | None = None,
         orientations: str = "",
         protocol: str = "clasp",
+        clasp_s: float = CLASP_S,
+        given: Mapping[str, float] = MEASURED,
     ) -> None:
         self.person = GuidedPerson(perform(*PERSON), orientations=orientations)
         self.source = PersonSource(self.person)
         # The closure does not show how a tracker on the torso is turned, and it has no accelerometer to tell.
         mounts = {"torso": perform(*PERSON).quat_LS["torso"]} if orientations == "sensor" else {}
-        self.guide = make_guide(self.source, make_options(folder, known, mounts, protocol))
+        self.guide = make_guide(self.source, make_options(folder, known, mounts, protocol, clasp_s, given))
         self.clicks: list[str] = []
         self.obeys: Callable[[str, GuideView], str] = lambda _step, view: view.highlight
 
@@ -117,7 +121,7 @@ class Session:
             view, step = guide.view(), guide.step.name
             self.person.follow(step, self.obeys(step, view), view.countdown)
             yield Moment(self.source.clock(), step, view)
-            first = view.actions[0].kind if view.actions else ""
+            first = view.actions[0].name if view.actions else ""
             if (step, first) in PRESSED:
                 self.clicks.append(first)
                 guide.ask(Request(first))
@@ -198,7 +202,7 @@ def test_an_accelerometer_in_g_is_not_calibrated(tmp_path: Path) -> None:
     view = session.run(lambda m: bool(m.view.reasons))[-1].view
     assert "accel: norm 1" in view.reasons[0]
     assert ": g? The source must give rad/s and m/s^2" in view.reasons[0]
-    assert [action.kind for action in view.actions] == ["again"]
+    assert [action.name for action in view.actions] == ["again"]
     session.guide.close()
 
 
@@ -252,25 +256,31 @@ def test_a_short_loss_pauses_and_a_long_one_needs_the_start_pose_again(tmp_path:
     session.guide.close()
 
 
-def test_too_little_motion_asks_for_more_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(f"{__name__}.CLASP_S", 6.0)
-    view = Session(tmp_path).run(lambda m: bool(m.view.quality))[-1].view
+def test_too_little_motion_asks_for_more_of_it(tmp_path: Path) -> None:
+    view = Session(tmp_path, clasp_s=6.0).run(lambda m: bool(m.view.quality))[-1].view
     assert view.quality == "fail"
     assert view.sentence == "There was too little of the motion. More of it may be enough."
-    assert [action.kind for action in view.actions] == ["more", "restart"]
+    assert [action.name for action in view.actions] == ["more", "restart"]
 
 
-def test_a_length_that_cannot_be_is_refused_and_the_result_stays(tmp_path: Path) -> None:
-    session = Session(tmp_path)
+def test_a_length_gives_the_scale_and_one_that_cannot_be_is_refused(tmp_path: Path) -> None:
+    session = Session(tmp_path, given={})
     guide = session.guide
-    before = session.run(lambda m: m.view.quality == "pass")[-1].view
-    guide.ask(Request("measure", "shoulder_width"))
-    assert guide.view() == before
-    guide.ask(Request("measure", "shoulder_width", -0.3))
+    before = session.run(lambda m: bool(m.view.quality))[-1].view
+    assert before.quality == "poor"
+    assert before.actions[-1].entry.endswith("[cm]")
+    guide.ask(Request("measure", "wide"))
+    assert guide.view() == before._replace(note="'wide' is no length in cm, such as 38.5.")
+    guide.ask(Request("measure", "-30"))
     assert guide.view().quality == ""
     after = session.run(lambda m: bool(m.view.quality))[-1].view
-    assert "shoulder_width" in after.note
+    assert "-0.3" in after.note
     assert after._replace(note="") == before
+    breadth = 100.0 * MEASURED["shoulder_width"]
+    name = next(action.entry for action in after.actions if action.name == "measure")
+    guide.ask(Request("measure", f"{breadth:.1f}".replace(".", ",")))
+    measured = session.run(lambda m: bool(m.view.quality))[-1].view
+    assert name not in [action.entry for action in measured.actions]
     guide.close()
 
 
@@ -299,7 +309,7 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     assert session.guide.step.name == "clasp"
     session.guide.ask(Request("restart"))
     assert session.guide.step.name == "start"
-    session.guide.ask(Request("go", "assignment"))
+    session.guide.ask(Request("assignment"))
     assert (session.guide.step.name, session.guide.segments) == ("assignment", {})
     session.run(lambda m: m.step == "start")
     assert session.guide.segments == worn
@@ -311,16 +321,16 @@ def test_who_goes_back_by_mistake_keeps_what_was_done(tmp_path: Path) -> None:
     session = Session(tmp_path)
     guide = session.guide
     begin(session, "clasp", 5.0)
-    guide.ask(Request("go", "static"))
+    guide.ask(Request("static"))
     guide.ask(Request("skip"))
-    assert [action.kind for action in guide.view().actions] == ["next", "skip"]
+    assert [action.name for action in guide.view().actions] == ["next", "skip"]
     guide.ask(Request("skip"))
     begin(session, "clasp", 8.0)
     assert guide.attempts == 1
     assert [name for name, spans in guide.attempt.recording().phases.items() for _ in spans] == ["start"] + 2 * [
         "clasp"
     ]
-    guide.ask(Request("go", "assignment"))
+    guide.ask(Request("assignment"))
     assert guide.segments == {}
     guide.ask(Request("skip"))
     assert (guide.step.name, guide.segments) == ("static", session.person.worn)
@@ -331,7 +341,7 @@ def test_a_part_of_a_joined_protocol_is_skipped_and_more_motion_is_of_the_longes
     session = Session(tmp_path, protocol="clasp+t_pose")
     guide = session.guide
     session.run(lambda m: m.step == "t_pose")
-    assert [action.kind for action in guide.view().actions] == ["restart", "skip"]
+    assert [action.name for action in guide.view().actions] == ["restart", "skip"]
     guide.ask(Request("skip"))
     session.run(lambda m: bool(m.view.quality))
     assert set(guide.attempt.recording().phases) == {"start", "clasp"}
@@ -400,8 +410,8 @@ class Follower(Output):
         self.person.follow(step, guide.highlight, guide.countdown)
         if step not in self.steps:
             self.steps.append(step)
-        if guide.actions and (step, guide.actions[0].kind) in PRESSED:
-            self._requests = [Request(guide.actions[0].kind)]
+        if guide.actions and (step, guide.actions[0].name) in PRESSED:
+            self._requests = [Request(guide.actions[0].name)]
 
     def take_requests(self) -> list[Request]:
         requests, self._requests = self._requests, []

@@ -113,11 +113,11 @@ def test_from_nothing_to_tracking_in_the_browser(tmp_path: Path) -> None:
             reader.until(state="ready", seconds=180.0)
             assert reader.steps == STEPS
             assert reader.clicks == ["next", "next", "accept"]
-            browser.run("document.getElementById('take').click()")
-            browser.wait("document.getElementById('take').getAttribute('aria-pressed') === 'true'")
+            browser.run("document.querySelector('[data-action=take]').click()")
+            browser.wait("document.querySelector('[data-action=take]')?.ariaPressed === 'true'")
             time.sleep(2.0)
-            browser.run("document.getElementById('take').click()")
-            browser.wait("document.getElementById('take').getAttribute('aria-pressed') === 'false'")
+            browser.run("document.querySelector('[data-action=take]').click()")
+            browser.wait("document.querySelector('[data-action=take]')?.ariaPressed === null")
             browser.wait(
                 "!document.getElementById('curves').hidden && document.getElementById('joint').value === 'elbow'"
             )

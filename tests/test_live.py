@@ -174,9 +174,9 @@ def test_rates_in_deg_s_are_said_while_the_person_waits(
 
 def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Recording, tmp_path: Path) -> None:
     file = tmp_path / "a.mcap"
-    take, begin, end = Request("take"), Request("begin", "clasp"), Request("end", "clasp")
-    asked = [(9.0, take), (12.0, Request("mark", "trial 3")), (15.0, take), (16.0, begin), (17.0, begin), (18.0, end)]
-    asked += [(19.0, end), (20.0, take), (21.0, Request("mark")), (22.0, Request("nonsense"))]
+    take, phase = Request("take"), Request("phase", "clasp")
+    asked = [(9.0, take), (12.0, Request("text", "trial 3")), (15.0, take), (16.0, phase), (18.0, phase), (20.0, take)]
+    asked += [(21.0, Request("mark")), (22.0, Request("nonsense"))]
     names = tuple(recording.sensors)
     arrivals = [(float(t), single(recording, name, k)) for k, t in enumerate(recording.time) for name in names]
     source = Chaos(recording, arrivals)
@@ -191,9 +191,13 @@ def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Record
     tracked = track(log.recording, causal=True)  # with the clasp that was marked
     for i, name in enumerate(names):
         assert np.array_equal(log.quat_WL[:, i], tracked.quat_WL[name])
-    assert [(round(mark.time), mark.text) for mark in log.recording.marks] == [(12, "trial 3")]
-    assert watcher.statuses[0].open_phases == ()
-    assert watcher.statuses[-1].open_phases == ("take_2",)
+    assert [(round(mark.time), mark.text) for mark in log.recording.marks] == [
+        (12, "trial 3"),
+        (21, "mark"),
+    ]
+    assert [action.name for action in watcher.statuses[0].actions] == ["reset"]
+    labels = {(action.label, action.is_on) for status in watcher.statuses for action in status.actions}
+    assert {("Begin take", False), ("End take 1", True), ("End clasp", True), ("End take 2", True)} <= labels
     # Without a recording the first take begins one, which is as one from the beginning.
     late = tmp_path / "late.mcap"
     setup = SensorSetup.from_recording(recording)

@@ -35,6 +35,7 @@ from wepose_pin.errors import BadOption
 from wepose_pin.live.encoder import AngleCurves, PoseEncoder, RobotFigure
 from wepose_pin.live.page import LivePage
 from wepose_pin.live.state import (
+    Action,
     LivePose,
     Request,
     SensorStatus,
@@ -73,7 +74,8 @@ class Person:
             SensorStatus(s, 99.8, s in lost, s == "torso", (0.002, -0.005, 0.0), math.nan, 3.0, 1, 2, 3, False)
             for s in self.info.segments
         )
-        return Status(state, message, 0.4, 12.0, sensors, (3.2, 8.4), 7.0, {"bad checksums": 3})
+        actions = (Action("reset", "Reset headings", "r"),)
+        return Status(state, message, 0.4, 12.0, sensors, (3.2, 8.4), 7.0, {"bad checksums": 3}, actions)
 
 
 @pytest.fixture
@@ -303,10 +305,7 @@ def test_a_foreign_origin_gets_no_poses(page: LivePage) -> None:
         connection.close()
 
 
-def test_who_does_not_take_gets_no_more_and_then_the_newest(
-    page: LivePage, person: Person, model: BodyModel, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(AngleCurves, "take", lambda _: None)  # no joint angles between the frames
+def test_who_does_not_take_gets_no_more_and_then_the_newest(page: LivePage, person: Person, model: BodyModel) -> None:
     page.start(person.info)
 
     async def slow(connection: WebSocketClientConnection) -> None:
@@ -364,19 +363,18 @@ def test_who_takes_at_once_gets_no_more_than_sixty_a_second(page: LivePage, pers
 
 def test_keys_and_nonsense(page: LivePage) -> None:
     async def press(connection: WebSocketClientConnection) -> None:
-        reset, quit_, nameless = '{"kind": "reset"}', '{"kind": "quit"}', '{"kind": "mark", "name": "\\u0000"}'
+        reset, quit_, nameless = '{"action": "reset"}', '{"action": "quit"}', '{"action": "text", "text": "\\u0000"}'
         for message in (reset, quit_, "reset", "{}", "[1]", "1", nameless, b"\xff\x00", "taken", "taken", "taken"):
             await connection.write_message(message, binary=isinstance(message, bytes))
-        await connection.write_message('{"kind": "measure", "name": "stature", "value": 1.8}')
         for _ in range(100):
-            await connection.write_message('{"kind": "mark", "name": "trial 3"}')
+            await connection.write_message('{"action": "text", "text": "trial 3"}')
         await connection.write_message("x" * 100_000)  # too long: that browser is shown the door
         while await connection.read_message() is not None:
             pass
 
     talk(page, press)
     asked = page.take_requests()
-    assert asked == [Request("mark", "trial 3")] * 16  # the newest; what came before is dropped
+    assert asked == [Request("text", "trial 3")] * 16  # the newest; what came before is dropped
     assert page.take_requests() == []
     assert get(page.url)[0] == 200
 
@@ -490,7 +488,7 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
         until = time.monotonic() + 10.0
         while (asked := page.take_requests()) == []:
             assert time.monotonic() < until
-        assert [request.kind for request in asked] == ["reset"]
+        assert [request.action for request in asked] == ["reset"]
         assert browser.errors == []
 
 

@@ -3,44 +3,36 @@
 from __future__ import annotations
 
 import io
-import math
 import os
 import pty
+import select
 import subprocess
 import sys
 import termios
 import textwrap
 import time
-from types import SimpleNamespace
 
 import pytest
 
-from wepose_pin.live.state import GuideAction, GuideStep, GuideView, Request, SensorStatus, Status
-from wepose_pin.live.terminal import TerminalView
+from wepose_pin.live.state import Action, GuideView, Request, SensorStatus, Status
+from wepose_pin.live.terminal import Keyboard, TerminalView
 
 
 def sensor(segment: str = "torso", **other: object) -> SensorStatus:
-    usual = {"rate_hz": 99.8, "lost": False, "static": False, "gyro_bias": (0.002, -0.005, 0.0)}
-    usual |= {
-        "heading_std": math.radians(1.3),
-        "heading_age": 34.4,
-        "missing": 2,
-        "late": 1,
-        "duplicate": 0,
-        "frozen": False,
-    }
+    usual = {"rate_hz": 99.8, "lost": False}
     return SensorStatus(segment, **(usual | other))  # type: ignore[arg-type]
 
 
 def status(state: str = "ready", message: str = "Tracking.", sensors: tuple = (), **other: object) -> Status:
     usual = {"progress": 1.0, "time": 12.5, "latency_ms": (3.2, 8.4), "recorded_s": 0.0, "problems": {}}
     usual |= {"state": state, "message": message, "sensors": sensors or (sensor(),)}
+    usual |= {"actions": (Action("reset", "Reset headings", "r"),)}
     return Status(**(usual | other))  # type: ignore[arg-type]
 
 
 def test_without_a_terminal_a_line_a_change() -> None:
     file, time_s = io.StringIO(), 0.0
-    with TerminalView(file, keys=False, clock=lambda: time_s) as view:
+    with TerminalView(file, clock=lambda: time_s) as view:
         time_s = 12.5
         for left in (3, 2, 1):
             view.status(status("start_pose", f"Stand still: {left} s more."))
@@ -70,58 +62,68 @@ SESSION = """
 import sys, time
 sys.path.insert(0, {tests!r})
 from test_live_terminal import status
-from wepose_pin.live.terminal import TerminalView
-view = TerminalView()
+from wepose_pin.live.terminal import Keyboard, TerminalView
+view = TerminalView(keyboard=Keyboard())
 try:
     view.status(status())
-    kinds = []
-    while "quit" not in kinds:
-        kinds += [request.kind for request in view.take_requests()]
+    asked = []
+    while "quit" not in asked:
+        asked += [request.action for request in view.take_requests()]
         time.sleep(0.01)
 finally:
     view.close()
-print("asked", *kinds)
+print("asked", *asked)
 """
 
 
-def press(view: TerminalView, keys: str, now: Status) -> list[Request]:
-    """What keys ask for, one after the other."""
-    view.status(now)
-    requests = []
-    for key in keys:
-        view._keyboard = SimpleNamespace(take=lambda key=key: [key], open=lambda: None, close=lambda: None)  # type: ignore
-        requests += view.take_requests()
-    return requests
+class Keys(Keyboard):
+    """A keyboard on which a test presses keys."""
+
+    def __init__(self) -> None:
+        self.pressed = ""
+
+    def open(self) -> None: ...
+
+    def take(self) -> list[str]:
+        keys, self.pressed = self.pressed, ""
+        return list(keys)
+
+    def close(self) -> None: ...
 
 
-def test_keys_while_tracking_mark_phases_and_texts() -> None:
-    view, live = TerminalView(io.StringIO()), status()
-    assert press(view, "tMr", live) == [Request("take"), Request("mark", "mark"), Request("reset")]
-    assert press(view, "nTrialx\x7f 3\r", live) == [Request("mark", "Trial 3")]
-    assert press(view, "n\r", live) == [Request("mark", "mark")]
-    assert press(view, "nq\x1bq", live) == [Request("quit")]
-    assert press(view, "p\rpbox\n", live) == [Request("begin", "clasp"), Request("begin", "box")]
-    assert press(view, "p", status(open_phases=("take_1", "clasp"))) == [Request("end", "clasp")]
-    assert press(view, "pn", status("start_pose", "Stand still.")) == []
+def test_keys_ask_for_what_is_offered_with_the_text_that_is_typed() -> None:
+    keys, file = Keys(), io.StringIO()
+    view = TerminalView(file, keys)
+    take, phase = Action("take", "Begin take", "t"), Action("phase", "Begin phase", "p", "name of the phase")
+    for actions, pressed, requests in (
+        ((take, phase), "tTx", [Request("take"), Request("take")]),
+        ((take, phase), "pBoxx\x7f 3\rt", [Request("phase", "Box 3"), Request("take")]),
+        ((take, phase), "p\rp1\n", [Request("phase"), Request("phase", "1")]),
+        ((take, phase), "pq\x1bq", [Request("quit")]),
+        ((phase._replace(label="End box", entry="", is_on=True),), "pt", [Request("phase")]),
+        ((), "tp", []),
+    ):
+        view.status(status(actions=actions))
+        keys.pressed = pressed
+        assert view.take_requests() == requests
+    assert "    keys: t Begin take, p Begin phase, q end\n" in file.getvalue()
+    assert "    keys: p End box, q end\n" in file.getvalue()
 
 
-def test_keys_of_the_guide_go_back_and_enter_a_length() -> None:
-    states = {"a": "done", "b": "skipped", "c": "now"}
-    steps = tuple(GuideStep(name, name.title(), state) for name, state in states.items())
-    guide = GuideView("Result.", steps=steps, actions=(GuideAction("accept", "Accept", "y"),), measurable="biacromial")
-    view, shown = TerminalView(io.StringIO()), status("guide", "Result.", guide=guide)
-    assert press(view, "y2q", shown) == [Request("accept"), Request("go", "b"), Request("quit")]
-    assert press(view, "3", shown) == []
-    assert press(view, "l40.5\rl40,5\rlwide\r", shown) == 2 * [Request("measure", "biacromial", pytest.approx(0.405))]
-    assert "y Accept, l enter the breadth of the shoulders, from acromion to acromion, 1 A again, 2 B again, q end" in (
-        view._file.getvalue()  # type: ignore[attr-defined]
+def test_the_guide_says_why_and_what_can_be_done() -> None:
+    file = io.StringIO()
+    guide = GuideView("Result.", "Too wide.", reasons=("The scale is uncertain.",))
+    TerminalView(file, Keys()).status(
+        status("guide", "Result.", guide=guide, actions=(Action("accept", "Accept", "y"),))
     )
+    lines = [line.partition(" s  ")[2] or line for line in file.getvalue().splitlines()]
+    assert lines == ["Result. Too wide.", "    The scale is uncertain.", "    keys: y Accept, q end"]
 
 
-def read_until(master: int, wanted: bytes, seconds: float = 60.0) -> bytes:
+def read_until(master: int, wanted: bytes, seconds: float = 30.0) -> bytes:
     got, until = b"", time.monotonic() + seconds
     while wanted not in got:
-        assert time.monotonic() < until, got
+        assert select.select([master], [], [], until - time.monotonic())[0], got
         try:
             got += os.read(master, 65536)
         except OSError:

@@ -359,7 +359,10 @@ def requests() -> list[bytes]:
         b"GET /stream HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://127.0.0.1\r\nUpgrade: websocket\r\n"
         b"Connection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
     )
-    return [get, upgrade + b"".join(_masked(word) for word in (b'{"kind": "reset"}', b"taken", b'{"kind": "quit"}'))]
+    return [
+        get,
+        upgrade + b"".join(_masked(word) for word in (b'{"action": "reset"}', b"taken", b'{"action": "quit"}')),
+    ]
 
 
 def _masked(text: bytes) -> bytes:

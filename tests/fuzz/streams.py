@@ -205,7 +205,7 @@ def page(_folder: Path, data: bytes) -> object:
         assert line.recv(64).startswith(b"HTTP/1.1 404"), "the page serves no more"
     asked = live.take_requests()
     assert len(asked) <= MAX_REQUESTS
-    assert "quit" not in [request.kind for request in asked]
+    assert "quit" not in [request.action for request in asked]
     if heard.records:
         raise AssertionError("; ".join(heard.records))
     return asked

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..body import BodyModel
 from ..diagnostics import INFO, WARNING, Diagnostic
-from ..recording import format_span
+from ..recording import format_span, format_time
 from .conditions import Loop, choose_variant, find_segments
 from .least_squares import Observations
 from .problem import CalibrationProblem
@@ -119,4 +119,5 @@ def find_intervals(time: np.ndarray, mask: np.ndarray) -> list[tuple[float, floa
 def format_longest(intervals: Sequence[tuple[float, float]]) -> str:
     """The text of the longest intervals [s], in the order of time."""
     longest = sorted(intervals, key=lambda interval: interval[0] - interval[1])[:MOST_INTERVALS]
-    return ", ".join(format_span((round(a, 1), round(b, 1))) for a, b in sorted(longest))
+    rounded = [(round(a, 1) + 0.0, round(b, 1) + 0.0) for a, b in sorted(longest)]  # without a negative zero
+    return ", ".join(f"{format_time(a)} s" if a == b else format_span((a, b)) for a, b in rounded)

@@ -139,7 +139,7 @@ def run_guide(
     write_segments(folder, guide.segments)
     subject_text = (folder / "subject.toml").read_text(encoding="utf-8")
     tracked = replace(setup, subject=load_subject(folder), subject_text=subject_text, remounted=False, mounts={})
-    return GuidedOutcome(guide.assigned(), tracked, folder, calibrated)
+    return GuidedOutcome(guide.assign_source(), tracked, folder, calibrated)
 
 
 def _make_folder(out: Path | None, force: bool) -> Path:

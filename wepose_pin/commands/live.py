@@ -163,7 +163,7 @@ def live(
     from ..live.robot import connect_robot, read_robot
     from ..live.session import warm_up
     from ..live.setup import build_subject_model, check_mounts
-    from ..live.terminal import TerminalView
+    from ..live.terminal import Keyboard, TerminalView
     from ..retargeting.targets import check_person_arms
     from .guide import run_guide
 
@@ -192,7 +192,7 @@ def live(
     if not guide:
         check_mounts(samples, worn)  # before the page opens
     print_diagnostics(body.diagnostics)
-    outputs: list[Output] = list(views or [TerminalView()])
+    outputs: list[Output] = list(views or [TerminalView(keyboard=Keyboard())])
     driven: RobotOutput | None = None
     served = _open_page(body, out.absolute().name if out is not None else worn.name, host, port, open) if page else None
     if served is not None:

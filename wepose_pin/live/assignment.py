@@ -23,20 +23,24 @@ SHAKE_RATIO = 1.6  # of the shaken sensor's rms to that of every other candidate
 
 
 class ShakeDetector:
-    """Detects which sensor is shaken; after one was found, all must come to rest before the next."""
+    """Detects which sensor is shaken; after one was found, all must come to rest before the next.
+
+    Attributes
+    ----------
+    is_calm : whether all have come to rest since the last shake: the next one counts
+    """
 
     def __init__(self) -> None:
+        self.is_calm = False
         self._recent: dict[str, deque[tuple[float, float]]] = {}  # sensor → time [s], squared rate [rad²/s²]
-        self._calm = False
         self._last: dict[str, tuple[float, np.ndarray]] = {}  # sensor → time [s] and (4,) of its last orientation
 
     def push(self, samples: Iterable[Samples], measured: Collection[str] = ()) -> None:
         """Add samples of any sensors; those of `measured` are orientations."""
         for chunk in samples:
             recent = self._recent.setdefault(chunk.sensor, deque())
-            squares = np.sum(chunk.gyro_S**2, axis=1)
-            if chunk.sensor in measured:
-                squares = self._square_rates(chunk)
+            is_measured = chunk.sensor in measured
+            squares = self._square_rates(chunk) if is_measured else np.sum(chunk.gyro_S**2, axis=1)
             recent.extend(zip(chunk.time.tolist(), squares.tolist(), strict=True))
             while recent and recent[0][0] < recent[-1][0] - SHAKE_WINDOW_S:
                 recent.popleft()
@@ -53,30 +57,24 @@ class ShakeDetector:
 
     def find(self, candidates: Sequence[str]) -> str | None:
         """The candidate that is shaken; None: none, several, or those of the last shake still move."""
-        rates = {sensor: self._rate(sensor) for sensor in self._recent}
-        if not self._calm:
-            self._calm = all(rate < CALM_RATE for rate in rates.values())
+        if not self.is_calm:
+            self.is_calm = all(self._rate(sensor) < CALM_RATE for sensor in self._recent)
             return None
-        ranked = sorted(candidates, key=lambda sensor: rates.get(sensor, 0.0), reverse=True)
-        if not ranked or rates.get(ranked[0], 0.0) < SHAKE_RATE or not self._lasts(ranked[0]):
+        ranked = sorted(candidates, key=self._rate, reverse=True)
+        if not ranked or not self.is_shaken(ranked[0]):
             return None
-        if len(ranked) > 1 and rates[ranked[0]] < SHAKE_RATIO * rates.get(ranked[1], 0.0):
+        if len(ranked) > 1 and self._rate(ranked[0]) < SHAKE_RATIO * self._rate(ranked[1]):
             return None
-        self._calm = False
+        self.is_calm = False
         return ranked[0]
 
     def is_shaken(self, sensor: str) -> bool:
         """Whether a sensor moves as one that is shaken, and not still from the last shake."""
-        return self._calm and self._rate(sensor) > SHAKE_RATE and self._lasts(sensor)
+        return self.is_calm and self._rate(sensor) >= SHAKE_RATE and self._lasts(sensor)
 
     def list_moving(self) -> list[str]:
         """The sensors that have not come to rest."""
         return [sensor for sensor in self._recent if self._lasts(sensor) and self._rate(sensor) > CALM_RATE]
-
-    @property
-    def is_calm(self) -> bool:
-        """Whether all have come to rest since the last shake: the next one counts."""
-        return self._calm
 
     def _lasts(self, sensor: str) -> bool:
         """Whether it was seen for as long as a shake takes."""
@@ -107,8 +105,11 @@ class AssignedSource(Source):
 
     @property
     def orientations(self) -> dict[str, bool]:
-        """As of the source, by segment."""
         return {self.segments[name]: own for name, own in self.source.orientations.items() if name in self.segments}
+
+    @property
+    def batteries(self) -> dict[str, float]:
+        return {self.segments[name]: charge for name, charge in self.source.batteries.items() if name in self.segments}
 
     def open(self) -> None:
         """Open the source; of one that is open already, leave out what has come so far."""
@@ -119,7 +120,6 @@ class AssignedSource(Source):
             self.source.open()
 
     def connect(self, timeout_s: float) -> bool:
-        """As of the source."""
         return self._is_open or self.source.connect(timeout_s)
 
     def read(self, timeout_s: float) -> list[Samples] | None:
@@ -129,21 +129,12 @@ class AssignedSource(Source):
 
     def rename(self, samples: Iterable[Samples]) -> list[Samples]:
         """The samples of the assigned sensors, named by their segments."""
-        return [
-            chunk._replace(sensor=self.segments[chunk.sensor]) for chunk in samples if chunk.sensor in self.segments
-        ]
-
-    @property
-    def batteries(self) -> dict[str, float]:
-        """Segment → share of its sensor's charge, 0 to 1, where it is known."""
-        return {self.segments[name]: charge for name, charge in self.source.batteries.items() if name in self.segments}
+        return [each._replace(sensor=self.segments[each.sensor]) for each in samples if each.sensor in self.segments]
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        """As of the source."""
         return self.source.describe_awaited([name for name, own in self.segments.items() if own in sensors])
 
     def explain_unit(self, key: str, unit: str) -> str:
-        """As of the source."""
         return self.source.explain_unit(key, unit)
 
     def clock(self) -> float:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -40,8 +41,7 @@ class RobotFigure:
 
     def __init__(self, robot: Robot, model: BodyModel, position: Callable[[], np.ndarray | None]) -> None:
         parts = build_parts(robot)
-        data = pin.Data(model.pin)
-        pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
+        data = place_n_pose(model)
         shoulders = [find_person_arm(model.table, arm.side).points[0] for arm in robot.arms]
         heights = [data.oMf[model.pin.getFrameId(model.point_frames[point])].translation[2] for point in shoulders]
         self._robot, self._position = robot, position
@@ -76,7 +76,8 @@ class PoseEncoder:
     ----------
     links : visible links, in the order of the frames: `body_links`, then those of the robot
     newest : the pose to draw; None: the N-pose
-    measured : the links that the sensors determine; None before the start
+    info : of the poses; None before the start
+    angles : joint angles of the poses
     """
 
     def __init__(self, model: BodyModel, robot: RobotFigure | None = None) -> None:
@@ -84,42 +85,54 @@ class PoseEncoder:
         self.body_links = tuple(dict.fromkeys(visual.link for visual in self.visuals))
         self.links = self.body_links + (() if robot is None else robot.links)
         self.newest: LivePose | None = None
-        self.measured: MeasuredLinks | None = None
+        self.info: StreamInfo | None = None
         self.angles = AngleCurves()
-        self._model = model
+        self._model, self._lock = model, threading.Lock()  # the page encodes in a thread of its own
+        self._frames = [model.pin.getFrameId(link) for link in self.body_links]
+        data = place_n_pose(model)
+        self._neutral = _stack([data.oMf[frame] for frame in self._frames])
+        self._known = np.ones(len(self._frames), dtype=bool)
 
     def points(self, segments: tuple[str, ...]) -> tuple[str, ...]:
         """The points that sensors on these segments determine."""
         return KinematicsSolver(self._model, segments).points
 
     def start(self, info: StreamInfo) -> None:
-        self.newest = None  # it may be of another stream
-        self.measured = MeasuredLinks(self._model, self.body_links, info)
-        self.angles = AngleCurves(info.segments)
+        """From now on draw only what these segments determine."""
+        model, kinematics = self._model, KinematicsSolver(self._model, info.segments)
+        known = find_known_links(model, info.segments)
+        moved = {chain.joints[-1]: segment for segment, chain in model.chains.items() if chain.joints}
+        sensors = []  # of each link the row of the sensor that places it; -1: none
+        for frame in self._frames:
+            joint = model.pin.frames[frame].parentJoint
+            while joint and moved.get(joint) not in info.segments:
+                joint = model.pin.parents[joint]
+            sensors.append(info.segments.index(moved[joint]) if joint else -1)
+        with self._lock:
+            self._kinematics, self._placed = kinematics, [kinematics.data.oMf[frame] for frame in self._frames]
+            self._known = np.array([link in known for link in self.body_links], dtype=bool)
+            self._sensors = np.array(sensors, dtype=int)
+            self._paths = [info.points.index(point) if point in info.points else -1 for point in model.table.paths]
+            self.newest = None  # it may be of another stream
+            self.angles, self.info = AngleCurves(info.segments), info
 
     def encode(self, pose: LivePose | None) -> bytes:
         """Little endian: time (float64, NaN before the start), of each link R_WL row by row and p_WL (12 float32),
         points whose paths are drawn (3 float32 each), of each link whether its sensor is lost (1 byte). NaN: not known.
         """
-        measured = self.measured
-        if pose is None or measured is None or len(pose.quat_WL) != len(measured.segments):
-            data = pin.Data(self._model.pin)
-            pin.framesForwardKinematics(self._model.pin, data, pin.neutral(self._model.pin))
-            placements = _stack([data.oMf[self._model.pin.getFrameId(link)] for link in self.body_links])
-            if measured is not None:
-                placements[~measured.known] = np.nan
-            paths = np.full((len(self._model.table.paths), 3), np.nan)
-            return self._pack(math.nan, placements, paths, np.zeros(len(placements), dtype=bool))
-        placements, points = measured.place(pose.quat_WL), measured.find_path_points(pose.points)
-        return self._pack(pose.time, placements, points, measured.lost(pose.lost))
-
-    def _pack(self, time: float, placements: np.ndarray, points: np.ndarray, lost: np.ndarray) -> bytes:
-        """A frame of the body's links, followed by those of the robot."""
+        time, placements, lost = math.nan, self._neutral, np.zeros(len(self.links), dtype=bool)
+        points = np.full((len(self._model.table.paths), 3), np.nan, "<f4")
+        with self._lock:
+            if pose is not None and self.info is not None and len(pose.quat_WL) == len(self.info.segments):
+                self._kinematics.compute_points(pose.quat_WL)
+                time, placements = pose.time, _stack(self._placed)
+                for k, row in enumerate(self._paths):
+                    points[k] = pose.points[row] if row >= 0 else np.nan
+                lost[: len(self._sensors)] = (self._sensors >= 0) & pose.lost[self._sensors]
+            placements = np.where(self._known[:, None], placements, np.float32(np.nan))
         if self.robot is not None:
-            robot = self.robot.place()
-            placements = np.concatenate([placements, robot])
-            lost = np.concatenate([lost, np.zeros(len(robot), dtype=bool)])
-        return np.array(time, "<f8").tobytes() + placements.tobytes() + points.astype("<f4").tobytes() + lost.tobytes()
+            placements = np.concatenate([placements, self.robot.place()])
+        return np.array(time, "<f8").tobytes() + placements.tobytes() + points.tobytes() + lost.tobytes()
 
 
 class AngleCurves:
@@ -153,57 +166,28 @@ class AngleCurves:
             joints = joint_angles(Pose(time, quat_WL, {})).joints
         except WeposeError:  # no two segments make a joint
             return None
-        return {
-            "time": np.round(time, 3).tolist(),
-            "joints": {
-                name: {
-                    angle: [round_finite(value, 1) for value in np.degrees(joint.values[:, k])]
-                    for k, angle in enumerate(joint.names)
-                }
-                for name, joint in joints.items()
-            },
+
+        def list_degrees(values: np.ndarray) -> list[float | None]:
+            return [round_finite(value, 1) for value in np.degrees(values)]
+
+        curves = {
+            name: {angle: list_degrees(joint.values[:, k]) for k, angle in enumerate(joint.names)}
+            for name, joint in joints.items()
         }
+        return {"time": np.round(time, 3).tolist(), "joints": curves}
 
 
-class MeasuredLinks:
-    """The visible links of a body of which some segments are measured."""
-
-    def __init__(self, model: BodyModel, links: tuple[str, ...], info: StreamInfo) -> None:
-        self.segments = info.segments
-        self._kinematics = KinematicsSolver(model, info.segments)
-        frames = [model.pin.getFrameId(link) for link in links]
-        self._views = [self._kinematics.data.oMf[frame] for frame in frames]
-        known = set(find_known_links(model, info.segments))
-        self.known = np.array([link in known for link in links], dtype=bool)
-        self._paths = [info.points.index(point) if point in info.points else -1 for point in model.table.paths]
-        moved = {chain.joints[-1]: segment for segment, chain in model.chains.items() if chain.joints}
-        self._rows = []  # of each link the sensor that places it; -1: none
-        for frame in frames:
-            joint = model.pin.frames[frame].parentJoint
-            while joint and moved.get(joint) not in info.segments:
-                joint = model.pin.parents[joint]
-            self._rows.append(info.segments.index(moved[joint]) if joint else -1)
-
-    def place(self, quat_WL: np.ndarray) -> np.ndarray:
-        """Placements (m, 12) of the links; NaN where not known."""
-        self._kinematics.compute_points(quat_WL)
-        placements = _stack(self._views)
-        placements[~self.known] = np.nan
-        return placements
-
-    def find_path_points(self, points: np.ndarray) -> np.ndarray:
-        """Points (p, 3) [m] whose paths are drawn; NaN where not known."""
-        return np.array([points[k] if k >= 0 else [np.nan] * 3 for k in self._paths]).reshape(-1, 3)
-
-    def lost(self, lost: np.ndarray) -> np.ndarray:
-        """(m,) bool: the sensor that places a link is lost."""
-        return np.array([row >= 0 and bool(lost[row]) for row in self._rows], dtype=bool)
+def place_n_pose(model: BodyModel) -> pin.Data:
+    """Pinocchio's data with the frames of the N-pose."""
+    data = model.pin.createData()
+    pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
+    return data
 
 
-def _stack(views: list[Any]) -> np.ndarray:
+def _stack(placements: Sequence[Any]) -> np.ndarray:
     """(m, 12): R_WL row by row, p_WL."""
-    placements = np.empty((len(views), 12), dtype="<f4")
-    for k, view in enumerate(views):
-        placements[k, :9] = view.rotation.ravel()
-        placements[k, 9:] = view.translation
-    return placements
+    rows = np.empty((len(placements), 12), dtype="<f4")
+    for k, placement in enumerate(placements):
+        rows[k, :9] = placement.rotation.ravel()
+        rows[k, 9:] = placement.translation
+    return rows

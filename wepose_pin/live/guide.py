@@ -1,8 +1,9 @@
 """The guided session: from sensors that send to a calibrated subject.
 
-`steps.make_steps` is the table of its steps. A step is a generator: it yields what to tell the person, gets what the
-person asks for, and returns the `Turn` that follows. Samples and ticks that came meanwhile are in the guide's
-attributes. Steps can be repeated, and all but the start pose skipped. Times are those of the source's clock.
+`steps.make_steps` is the table of its steps. A step is a generator: it yields what to tell the person, gets the action
+that the person asks for, None where there is none, and returns the `Turn` that follows. Samples and ticks that came
+meanwhile, and the text that was typed, are in the guide's attributes. Steps can be repeated, and all but the start pose
+skipped. Times are those of the source's clock.
 """
 
 from __future__ import annotations
@@ -26,11 +27,10 @@ from .monitor import SensorMonitor
 from .setup import SensorSetup
 from .sources.base import Source
 from .stage import Stage
-from .state import GuideStep, GuideView, Output, Request, SensorStatus, Status, join_names
+from .state import Action, GuideStep, GuideView, Output, SensorStatus, Status, join_names
 from .ticks import TickStream
 
 SILENCE_S = 1.0  # [s] without a sample after which a sensor counts as silent
-NOTHING = Request("")
 
 
 class Calibrated(NamedTuple):
@@ -77,7 +77,7 @@ class Turn(NamedTuple):
     skipped: bool = False  # the step that ends was skipped
 
 
-StepRun = Generator[GuideView, Request, Turn]
+StepRun = Generator[GuideView, Action | None, Turn]
 
 
 class Step(NamedTuple):
@@ -102,6 +102,7 @@ class Guide(Stage):
     ----------
     now : [s] on the source's clock
     samples, ticks : that came since the step has last yielded; ticks are those of the attempt
+    text : that the person typed for the action
     segments : sensor → segment that it is assigned to
     attempt : the recording of the current attempt; None before
     measured : lengths [m] that the person entered
@@ -117,7 +118,9 @@ class Guide(Stage):
         super().__init__(source, outputs)
         self.options, self.steps, self.monitor = options, tuple(steps), SensorMonitor()
         self._figure, self._figure_due = Demonstration(options.model, options.protocol) if outputs else None, 0.0
-        self.now = 0.0
+        self.order = tuple(options.model.table.segments)  # segments in the order of the body
+        self.needs = options.protocol.needs  # segments that must carry a sensor
+        self.now, self.text = 0.0, ""
         self.samples: Sequence[Samples] = ()
         self.ticks: list[Ticks] = []
         self.segments: dict[str, str] = {}
@@ -136,16 +139,6 @@ class Guide(Stage):
         return self.steps[self._index]
 
     @property
-    def order(self) -> tuple[str, ...]:
-        """Segments in the order of the body."""
-        return tuple(self.options.model.table.segments)
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Segments that must carry a sensor."""
-        return self.options.protocol.needs
-
-    @property
     def sending(self) -> list[str]:
         """Sensors that have sent something."""
         return self.monitor.sending
@@ -154,6 +147,14 @@ class Guide(Stage):
     def silent(self) -> list[str]:
         """Sensors that have sent nothing for a while."""
         return self.monitor.list_silent(self.segments or self.sending, self.now, SILENCE_S)
+
+    @property
+    def actions(self) -> tuple[Action, ...]:
+        """Those of the step, and to go back to an earlier one."""
+        back = [
+            Action(step.name, f"{step.title} again", str(k + 1)) for k, step in enumerate(self.steps[: self._index])
+        ]
+        return (*self._view.actions, *back)
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> Calibrated | None:
         """Lead the person until a calibration is accepted; None: the person, the source or `should_stop` ended it."""
@@ -165,23 +166,21 @@ class Guide(Stage):
             self.send_status()
         return self.accepted
 
-    @property
-    def is_over(self) -> bool:
-        return self.accepted is not None
+    def accept(self, calibrated: Calibrated) -> None:
+        """End with this calibration."""
+        self.accepted, self.is_over = calibrated, True
 
     def process(self, samples: list[Samples]) -> None:
         """Guide the person by what came since the last call, and move the figure."""
         self.now, self.samples, self.ticks = self.source.clock(), samples, []
         self.monitor.push(samples, self.source.orientations)
-        if self.attempt is None:
-            self._postponed = []
-        else:
+        if self.attempt is not None:
             self._postponed.append(samples)
             if self.step.records:
                 postponed, self._postponed = self._postponed, []
                 self.ticks = [ticks for each in postponed for ticks in self.attempt.push(each)]
                 self.attempt.log.flush_if_due()
-        self._go_on(NOTHING)
+        self._go_on(None)
         now = time.monotonic()
         if self._figure is not None and now >= self._figure_due:
             self._figure_due = now + 1.0 / RATE_HZ
@@ -189,21 +188,18 @@ class Guide(Stage):
             for output in self.outputs:
                 output.demonstrate(pose, self._figure.segments)
 
-    def ask(self, request: Request) -> None:
-        """Do what the person asks for; what the step does not offer is ignored."""
-        names = [step.name for step in self.steps[: self._index]]
-        self.samples, self.ticks = (), []
-        if request.kind == "go" and request.name in names:
+    def do(self, action: Action, text: str) -> None:
+        """Go back to an earlier step, or hand the action to the step of now."""
+        self.samples, self.ticks, self.text = (), [], text
+        if action in self._view.actions:
+            self._go_on(action)
+        else:
             self._running.close()
-            self._begin(Turn(request.name, again=True))
-        elif request.kind == "mark" and self.attempt is not None:
-            self.attempt.mark("mark", text=request.name, time=self.attempt.newest)
-        elif request.kind == "measure" or request.kind in [action.kind for action in self._view.actions]:
-            self._go_on(request)
+            self._begin(Turn(action.name, again=True))
 
-    def _go_on(self, request: Request) -> None:
+    def _go_on(self, action: Action | None) -> None:
         try:
-            self._view = self._running.send(request)
+            self._view = self._running.send(action)
         except StopIteration as ended:
             if ended.value.skipped:
                 self._skipped.add(self.step.name)
@@ -232,12 +228,12 @@ class Guide(Stage):
             self.attempts += 1
             while (path := self.options.folder / f"calibration-{self.attempts}.mcap").exists():
                 self.attempts += 1
-            source = self.assigned()
+            source = self.assign_source()
             header = self.options.setup.header(source.sensors, source.orientations) | {"method": self.options.method}
-            self.attempt = Attempt(path, source, header)
+            self.attempt, self._postponed = Attempt(path, source, header), []
         return self.attempt
 
-    def assigned(self) -> AssignedSource:
+    def assign_source(self) -> AssignedSource:
         """The source with the sensors named by their segments."""
         return AssignedSource(self.source, self.segments, self.order, is_open=True)
 
@@ -249,7 +245,7 @@ class Guide(Stage):
     def close(self) -> None:
         """End the recording; may be called twice."""
         if self.attempt is not None:
-            self.attempt.close()
+            self.attempt.log.close()
             self.attempt = None
 
     def view(self) -> GuideView:
@@ -262,20 +258,18 @@ class Guide(Stage):
 
     def build_status(self) -> Status:
         """The state of the guide and of each sensor now."""
-        view, rates, batteries = self.view(), self.monitor.measure_rates(self.now), self.source.batteries
+        rates, batteries = self.monitor.measure_rates(self.now), self.source.batteries
         sensors = []
         for name in sorted(rates):
             segment = self.segments.get(name, "")
             label = f"{segment} ({name})" if segment and segment != name else name
             missing, battery = self.monitor.count_missing(name, self.now), batteries.get(name, math.nan)
             sensors.append(SensorStatus(label, rates[name], name in self.silent, missing=missing, battery=battery))
-        state, message = "guide", view.sentence
+        status = Status("guide", "", 0.0, self.now, tuple(sensors), problems=dict(self.source.problems))
         if self.is_over:
-            state, message = "waiting", "The subject is saved. Tracking begins."
-        return Status(
-            state, message, view.progress, self.now, tuple(sensors), (math.nan, math.nan), 0.0,
-            dict(self.source.problems), guide=None if self.is_over else view,
-        )  # fmt: skip
+            return status._replace(state="waiting", message="The subject is saved. Tracking begins.")
+        view = self.view()
+        return status._replace(message=view.sentence, progress=view.progress, actions=self.actions, guide=view)
 
     def describe_problems(self) -> str:
         """A sentence on sensors that send nothing, else on rates in another unit; empty: there are none."""
@@ -306,10 +300,6 @@ class Attempt:
         self.stream = TickStream(source.sensors, source.rate_hz, log=self.log, orientations=source.orientations)
         self._header, self._markers = dict(header), Markers()
         self._ticks: list[Ticks] = []
-
-    @property
-    def path(self) -> Path:
-        return self.log.path
 
     @property
     def newest(self) -> float:
@@ -344,10 +334,7 @@ class Attempt:
     def recording(self) -> Recording:
         """The recording so far, as a reader of the file gets it."""
         header = self._header | {"sensors": self.segments, "phases": self._phases()}
-        return check_recording(build_recording(header, self.stream.clock.rate_hz, self._ticks, None, self.path))
-
-    def close(self) -> None:
-        self.log.close()
+        return check_recording(build_recording(header, self.stream.clock.rate_hz, self._ticks, None, self.log.path))
 
     def _phases(self) -> dict[str, Any]:
         return self._markers.phases(float(self._ticks[0].time[0]), self.newest) if self._ticks else {}

@@ -18,32 +18,33 @@ from ..body import BodyModel
 from ..body.covariance import compute_axis_std
 from ..body.kinematics import KinematicsSolver
 from ..body.start_pose import compute_start_configuration
-from ..body.table import NEUTRAL_POSE
 from ..body.table_file import check_segments
 from ..diagnostics import Diagnostic
 from ..errors import BadModel, BadSession, WeposeError
 from ..filters import BEST
 from ..readers.live_log import LONGEST_TEXT, build_recording
-from ..recording import Intervals
 from ..recording.arrivals import COUNTS, CUT_OFF, DUPLICATE, LATE, Samples, Ticks
 from ..tracking import Tracker, TrackOptions
 from ..tracking.segments import SegmentEstimator
-from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
 from .monitor import SensorMonitor, check_units
 from .setup import SensorSetup, build_subject_model
 from .sources.base import Source
 from .stage import Stage
-from .state import LivePose, Output, Request, SensorStatus, Status, StreamInfo, join_names
+from .start import StartPoseSearch
+from .state import Action, LivePose, Output, SensorStatus, Status, StreamInfo, join_names
 from .ticks import TickStream
 
 SWITCH_INTERVAL_S = 5e-4  # [s] after which page and robot hand over the interpreter to the loop; Python has 5 ms
 MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
 MAX_LATENCIES = 1000  # newest latencies in the status
-MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
-BEGUN_S = 0.5  # [s] of standing still after which a person who moves is told so
-START_POSES = {NEUTRAL_POSE: "Stand upright and still, arms hanging, palms to the thighs"}  # what to tell a person
 TAKE = "take_"  # the names of takes begin so
+
+RESET = Action("reset", "Reset headings", "r")
+BEGIN_TAKE = Action("take", "Begin take", "t")
+BEGIN_PHASE = Action("phase", "Begin phase", "p", "name of the phase, clasp without one")
+MARK = Action("mark", "Mark", "m")
+MARK_TEXT = Action("text", "Mark with text", "n", "text of the mark")
 
 
 class Latencies:
@@ -84,58 +85,6 @@ class SessionSummary(NamedTuple):
 EMPTY_SESSION = SessionSummary(0, 0.0, {}, Latencies(), (), "", None)  # ended before a sample came
 
 
-class StartPoseSearch:
-    """Finds the start pose in the ticks before tracking: stated by the session, or held for `START_POSE_HOLD_S`.
-
-    Attributes
-    ----------
-    ticks : since before the start pose
-    """
-
-    def __init__(self, stream: TickStream, stated: tuple[float, float] | None = None) -> None:
-        self._stream, self.stated = stream, stated
-        self.detector = StartPoseDetector(stream.clock.rate_hz, stream.measured)
-        self.ticks: list[Ticks] = []
-
-    def push(self, ticks: Ticks) -> tuple[int, int, int] | None:
-        """Add ticks; return the start pose's first and last tick and the row in `ticks` after it; None: not yet."""
-        self.ticks.append(ticks)
-        clock, detector = self._stream.clock, self.detector
-        for n in range(len(ticks.time)):
-            if self.stated is not None:
-                if ticks.time[n] >= self.stated[1] - 0.5 / clock.rate_hz:
-                    begin = max(0, round((self.stated[0] - clock.begin) * clock.rate_hz))
-                    return begin, ticks.first + n, n + 1
-            elif detector.push(ticks.gyro_S[n], ticks.accel_S[n]) == "ready":
-                return detector.begin, detector.end, n + 1
-        if self.stated is None and len(self.ticks) > MAX_TICK_BLOCKS:
-            self.ticks = [t for t in self.ticks if t.first + len(t.time) > detector.begin]
-        return None
-
-    @property
-    def progress(self) -> float:
-        """Progress of the start pose, 0 to 1."""
-        if self.stated is None:
-            return min(1.0, self.detector.held_s / START_POSE_HOLD_S)
-        passed_s = self._stream.clock.newest - self.stated[0]
-        return float(np.clip(passed_s / (self.stated[1] - self.stated[0]), 0.0, 1.0))
-
-
-class PhaseEdges:
-    """Where stated phases begin and end, in order of time; a phase holds from its first second to its last, both in."""
-
-    def __init__(self, phases: Mapping[str, Intervals]) -> None:
-        edges = [(a - 1e-9, name, True) for name, spans in phases.items() for a, _ in spans]
-        edges += [(b + 1e-9, name, False) for name, spans in phases.items() for _, b in spans]
-        self._edges = deque(sorted(edges))
-
-    def take_due(self, time_s: float) -> Iterator[tuple[str, bool]]:
-        """Iterate over the phases that begin (True) or have ended by this time [s], each once."""
-        while self._edges and self._edges[0][0] <= time_s:
-            _, name, begins = self._edges.popleft()
-            yield name, begins
-
-
 class LiveLoop(Stage):
     """One session, from the source's first sample to its end.
 
@@ -173,15 +122,14 @@ class LiveLoop(Stage):
             _ = self.model.reaches
         start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
         self.kinematics = KinematicsSolver(self.model, source.sensors, start=start)
-        self._instruction = START_POSES.get(setup.start_pose, f"Hold still in the start pose, {setup.start_pose}")
-        if self.model.table.is_mechanism:
-            self._instruction = f"{self.model.table.name} must stand still in its start configuration"
         self._monitor = SensorMonitor()
         self._stream = TickStream(source.sensors, source.rate_hz, begin, log, source.orientations)
         self._search: StartPoseSearch | None = None  # from when the ticks begin
-        self._stood_s = 0.0  # [s] longest time that the person stood still before tracking
         self._estimator: SegmentEstimator | None = None  # from when the start pose is found
-        self._phase_edges = PhaseEdges(self.setup.phases)
+        # Where stated phases begin (True) and end, in order of time; a phase holds its first second and its last.
+        spans = [(name, first, last) for name, spans in setup.phases.items() for first, last in spans]
+        edges = [(first - 1e-9, name, True) for name, first, _ in spans]
+        self._edges = deque(sorted(edges + [(last + 1e-9, name, False) for name, _, last in spans]))
         self._heading_reset_time = 0.0
         self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
         self._covariance: Iterator[np.ndarray | None] = iter(())  # computed in parts, one or more with each tick
@@ -210,11 +158,9 @@ class LiveLoop(Stage):
         gc.freeze()
         try:
             self.loop(should_stop)
-            self._end_message = "The session has ended."
-            self.send_status()
+            self._end("The session has ended.")
         except WeposeError as error:
-            self._end_message = f"The session has ended: {error}"
-            self.send_status()
+            self._end(f"The session has ended: {error}")
             raise
         finally:
             gc.unfreeze()
@@ -228,6 +174,10 @@ class LiveLoop(Stage):
             for output in self.outputs:
                 output.close()
         return self._summarize()
+
+    def _end(self, message: str) -> None:
+        self._end_message = message
+        self.send_status()
 
     # Samples to poses ------------------------------------------------------------------------------------------------
 
@@ -247,7 +197,7 @@ class LiveLoop(Stage):
     def _begin_search(self) -> StartPoseSearch | None:
         """The search of the start pose, which begins with the ticks; None before them."""
         if self._search is None and self._stream.synchronizer is not None:
-            self._search = StartPoseSearch(self._stream, next(iter(self.setup.phases.get("start", ())), None))
+            self._search = StartPoseSearch(self._stream, self.setup, self.model.table)
             self._covariance_ticks = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))
             self._covariance_parts = math.ceil((len(self.source.sensors) + 2) / self._covariance_ticks)
         return self._search
@@ -264,7 +214,8 @@ class LiveLoop(Stage):
             begin, end, row = start
             estimator = self._estimator = self._start_tracking(search, begin, end)
         for n in range(row, len(ticks.time)):
-            for phase, begins in self._phase_edges.take_due(ticks.time[n]):
+            while self._edges and self._edges[0][0] <= ticks.time[n]:
+                _, phase, begins = self._edges.popleft()
                 estimator.mark_phase(phase, begins=begins)
             quat_WL = estimator.step(ticks.gyro_S[n], ticks.accel_S[n])
             self._update_std(estimator, ticks.first + n)
@@ -299,8 +250,6 @@ class LiveLoop(Stage):
         tracker = Tracker(self.setup.subject, model=self.model, options=TrackOptions(self.method, causal=True))
         tracker.push(recording)
         estimator = tracker.segment_estimator
-        for phase in self._open_phases:
-            estimator.mark_phase(phase, begins=True)
         search.ticks = []
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
         self._first_pose = self._heading_reset_time = float(recording.time[-1])
@@ -310,12 +259,34 @@ class LiveLoop(Stage):
             output.start(info)
         return estimator
 
-    # Requests --------------------------------------------------------------------------------------------------------
+    # Actions ---------------------------------------------------------------------------------------------------------
 
-    def ask(self, request: Request) -> None:
+    @property
+    def actions(self) -> tuple[Action, ...]:
+        """Reset the headings; while tracking mark a take, a phase or a moment in the recording."""
+        if self._end_message:
+            return ()
+        actions = [RESET]
+        if self._estimator is not None and (self.log is not None or self._can_begin_recording()):
+            for action, name in ((BEGIN_TAKE, self._open_take), (BEGIN_PHASE, self._open_phase)):
+                end = action._replace(label=f"End {name.replace('_', ' ')}", entry="", is_on=True)
+                actions.append(end if name else action)
+            actions += [MARK, MARK_TEXT] if self.log is not None else []
+        return tuple(actions)
+
+    @property
+    def _open_take(self) -> str:
+        """The take that was begun and not ended; empty: none."""
+        return next((phase for phase in self._open_phases if phase.startswith(TAKE)), "")
+
+    @property
+    def _open_phase(self) -> str:
+        """The phase that was begun last and not ended, and is no take; empty: none."""
+        return next((phase for phase in self._open_phases if not phase.startswith(TAKE)), "")
+
+    def do(self, action: Action, text: str) -> None:
         """Reset the headings, or mark a take, a phase or a text in the recording."""
-        kind, name = request.kind, request.name[:LONGEST_TEXT]
-        if kind == "reset":
+        if action.name == RESET.name:
             if self._estimator is not None:
                 self._estimator.reset_headings()
                 self._heading_reset_time = self._stream.clock.newest
@@ -323,29 +294,31 @@ class LiveLoop(Stage):
             for output in self.outputs:
                 output.resume()
             return
-        if kind in ("take", "begin") and self.log is None:
+        text = text[:LONGEST_TEXT]
+        if self.log is None:
             self._begin_recording()
-        if self.log is None or self._stream.synchronizer is None or not self._stream.clock.next_tick:
-            return
+        if action.name == BEGIN_TAKE.name:
+            self._takes += not self._open_take
+            self._toggle_phase(self._open_take or f"{TAKE}{self._takes}")
+        elif action.name == BEGIN_PHASE.name:
+            self._toggle_phase(self._open_phase or text or "clasp")
+        elif self.log is not None:
+            self.log.event("mark", text=text or "mark", time=self._newest_tick)
+
+    @property
+    def _newest_tick(self) -> float:
+        """Time [s] of the newest tick."""
         clock = self._stream.clock
-        time_s = clock.begin + (clock.next_tick - 1) / clock.rate_hz
-        if kind == "take":
-            takes = [phase for phase in self._open_phases if phase.startswith(TAKE)]
-            self._takes += not takes
-            kind, name = ("end", takes[0]) if takes else ("begin", f"{TAKE}{self._takes}")
-        if kind == "mark" and name:
-            self.log.event("mark", text=name, time=time_s)
-        elif kind == "begin" and name and name not in self._open_phases:
-            # It holds from the next tick on: the ticks before have been tracked without it.
-            self._open_phases.append(name)
-            self.log.event("begin", phase=name, time=time_s + 1.0 / clock.rate_hz)
-        elif kind == "end" and name in self._open_phases:
-            self._open_phases.remove(name)
-            self.log.event("end", phase=name, time=time_s)
-        else:
-            return
-        if kind != "mark" and self._estimator is not None:
-            self._estimator.mark_phase(name, begins=kind == "begin")
+        return clock.begin + (clock.next_tick - 1) / clock.rate_hz
+
+    def _toggle_phase(self, name: str) -> None:
+        """Begin a phase, or end it. It holds from the next tick on: the ticks before have been tracked without it."""
+        begins = name not in self._open_phases
+        step_s = 1.0 / self._stream.clock.rate_hz if begins else 0.0
+        (self._open_phases.append if begins else self._open_phases.remove)(name)
+        if self.log is not None and self._estimator is not None:
+            self.log.event("begin" if begins else "end", phase=name, time=self._newest_tick + step_s)
+            self._estimator.mark_phase(name, begins=begins)
 
     def _record_event(self, kind: str, **values: Any) -> None:
         """Record an event that decides poses, now or once a recording begins."""
@@ -353,14 +326,16 @@ class LiveLoop(Stage):
         if self.log is not None:
             self.log.event(kind, **values)
 
+    def _can_begin_recording(self) -> bool:
+        return self._open_log is not None and self._stream.history is not None
+
     def _begin_recording(self) -> None:
         """Begin to record where nothing was recorded so far; the file holds what came before as well."""
-        if self._open_log is None or self._stream.history is None or self._estimator is None:
-            return
-        self.log = self._open_log()
-        self._stream.record(self.log)
-        for kind, values in self._events:
-            self.log.event(kind, **values)
+        if self._open_log is not None:
+            self.log = self._open_log()
+            self._stream.record(self.log)
+            for kind, values in self._events:
+                self.log.event(kind, **values)
 
     # The state -------------------------------------------------------------------------------------------------------
 
@@ -379,85 +354,53 @@ class LiveLoop(Stage):
         if estimator is not None:
             static, bias = estimator.static, estimator.gyro_bias
             heading_age = max(0.0, now - self._heading_reset_time)
-        rates, battery = self._monitor.measure_rates(now), self.source.batteries
+        rates, batteries = self._monitor.measure_rates(now), self.source.batteries
         statuses = [
             SensorStatus(
                 name,
                 rates.get(name, 0.0),
                 bool(lost[i]),
                 bool(static[i]),
-                (float(bias[i, 0]), float(bias[i, 1]), float(bias[i, 2])),
+                tuple(bias[i].tolist()),
                 float(self._heading_std[i]),
                 heading_age,
                 self._monitor.count_missing(name, now),
                 int(counts[i, LATE]),
                 int(counts[i, DUPLICATE]),
                 bool(frozen[i]),
-                battery.get(name, math.nan),
+                batteries.get(name, math.nan),
             )
             for i, name in enumerate(sensors)
         ]
-        p50, p99 = np.quantile(1e3 * np.array(self._recent_latencies or [0.0]), (0.5, 0.99))
-        state, message, progress = self._describe_state(lost, frozen)
-        return Status(
-            state, message, progress, now, tuple(statuses), (float(p50), float(p99)), recorded_s,
-            self._count_problems(counts), tuple(self._open_phases),
-        )  # fmt: skip
-
-    def _count_problems(self, counts: np.ndarray) -> dict[str, int]:
-        """Count problems that are not in a sensor's status: problem → count."""
         problems = dict(self.source.problems)
-        for name, count in zip(self.source.sensors, counts[:, CUT_OFF].tolist(), strict=True):
+        for name, count in zip(sensors, counts[:, CUT_OFF].tolist(), strict=True):
             if count:
                 problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = count
         if self.log is not None and self.log.problem:
             problems[self.log.problem] = 1
-        return problems
+        p50, p99 = np.quantile(1e3 * np.array(self._recent_latencies or [0.0]), (0.5, 0.99)).tolist()
+        description = self._describe_state(lost, frozen)
+        return Status(*description, now, tuple(statuses), (p50, p99), recorded_s, problems, self.actions)
 
     def _describe_state(self, lost: np.ndarray, frozen: np.ndarray) -> tuple[str, str, float]:
         """Return the state, the message to the person, and the progress of the start pose."""
         if self._end_message:
             return "ended", self._end_message, 1.0
+        names = np.array(self.source.sensors, dtype=object)
+        silent, repeats = list(names[lost & ~frozen]), list(names[frozen])
+        repeated = f"Repeated values from {join_names(repeats)}: switch it off and on." if repeats else ""
         if self._estimator is not None:
-            sentences = self._describe_lost(lost, frozen) or "Tracking.", *(each.describe() for each in self.outputs)
-            return "ready", " ".join(filter(None, sentences)), 1.0
-        if self._search is None:
-            missing_sensors = [name for name in self.source.sensors if name not in self._monitor.sending]
-            if not missing_sensors:
-                return "waiting", "Measuring the sampling rate.", 0.0
-            awaited = self.source.describe_awaited(missing_sensors)
-            where = f" Waiting for {awaited}." if awaited else ""
-            return "waiting", f"Nothing has come yet from {join_names(missing_sensors)}.{where}", 0.0
-        search, detector, instruction = self._search, self._search.detector, self._instruction
-        if search.stated is not None:
-            return "start_pose", f"{instruction}, until {search.stated[1]:g} s.", search.progress
-        if detector.state == "waiting":
-            missing = np.isin(np.arange(len(lost)), detector.missing)
-            text = self._describe_lost(missing & frozen, frozen) or f"Waiting for {self._join_sensors(missing)}."
-            return "waiting", text, 0.0
-        if wrong_unit := self._monitor.describe_wrong_unit(self.source):
-            return "moved", wrong_unit, search.progress
-        self._stood_s = max(self._stood_s, detector.held_s)
-        if detector.state != "moved":
-            left_s = max(0.0, START_POSE_HOLD_S - detector.held_s)
-            return "start_pose", f"{instruction}: {left_s:.0f} s more.", search.progress
-        if self._stood_s < BEGUN_S:  # the person walks to the place, or takes the pose
-            return "start_pose", f"{instruction}.", 0.0
-        moved = join_names([self.source.sensors[i] for i in detector.moving])
-        again = instruction[0].lower() + instruction[1:]
-        return "moved", f"You moved ({moved}). Once more: {again}.", search.progress
-
-    def _describe_lost(self, lost: np.ndarray, frozen: np.ndarray) -> str:
-        """Return the message on lost sensors (k,) bool; some of them are frozen. Empty: none is lost."""
-        parts = []
-        if (lost & ~frozen).any():
-            parts.append(f"No samples from {self._join_sensors(lost & ~frozen)}.")
-        if (lost & frozen).any():
-            parts.append(f"Repeated values from {self._join_sensors(lost & frozen)}: switch it off and on.")
-        return " ".join(parts)
-
-    def _join_sensors(self, mask: np.ndarray) -> str:
-        return join_names([name for name, chosen in zip(self.source.sensors, mask, strict=True) if chosen])
+            sentences = [f"No samples from {join_names(silent)}." if silent else "", repeated]
+            sentences = [sentence for sentence in sentences if sentence] or ["Tracking."]
+            return "ready", " ".join(filter(None, sentences + [each.describe() for each in self.outputs])), 1.0
+        if self._search is not None:
+            return self._search.describe(self._monitor.describe_wrong_unit(self.source), repeated)
+        missing_sensors = [name for name in self.source.sensors if name not in self._monitor.sending]
+        if not missing_sensors:
+            return "waiting", "Measuring the sampling rate.", 0.0
+        awaited = self.source.describe_awaited(missing_sensors)
+        where = f" Waiting for {awaited}." if awaited else ""
+        return "waiting", f"Nothing has come yet from {join_names(missing_sensors)}.{where}", 0.0
 
     def _summarize(self) -> SessionSummary:
         sensors, synchronizer = self.source.sensors, self._stream.synchronizer

@@ -8,13 +8,13 @@ none, and then the newest.
 until then no other comes.
 
 - Text: ``{"id": …}`` once (another id means another page to load); then each `state.Status` as JSON, five times a
-  second, in a guided session ten times, with its instructions under ``guide``; ``{"angles": …}``, joint angles in
-  degrees with their times.
+  second, in a guided session ten times, with its instructions under ``guide``, and under ``angles`` the joint angles in
+  degrees since the status before, with their times.
 - Binary: time (float64, NaN before the start); for each link its rotation row by row and its position [m] (12 float32);
   the points whose paths are drawn (3 float32 each); for each link whether its sensor is lost (1 byte). The names of the
   links are in the page; those of a robot come last.
-- To the server: ``taken``, and each `state.Request` as a JSON object, such as ``{"kind": "mark", "name": "trial 3"}``.
-  It answers only under an address or ``localhost``, and a WebSocket only from its own page.
+- To the server: ``taken``, and each `state.Request` as a JSON object, such as ``{"action": "text", "text": "box"}``. It
+  answers only under an address or ``localhost``, and a WebSocket only from its own page.
 """
 
 from __future__ import annotations
@@ -23,15 +23,14 @@ import secrets
 from collections import deque
 
 import numpy as np
-import pinocchio as pin
 
 from ..body import BodyModel
 from ..body.links import find_known_points
 from ..report.viewer import DARK, LIGHT, backdrop, choose_trail_colour, filled, find_floor, scene, view
 from .addresses import LOOPBACK
-from .encoder import PoseEncoder, RobotFigure
+from .encoder import PoseEncoder, RobotFigure, place_n_pose
 from .server import Content, Server
-from .state import LENGTH_NAMES, LivePose, Output, Request, Status, StreamInfo
+from .state import LivePose, Output, Request, Status, StreamInfo
 
 FINGERS = 0.1  # [m] beyond the end of a limb
 MAX_REQUESTS = 16  # not yet taken; more are dropped
@@ -48,19 +47,21 @@ class LivePage(Output):
         token in `url`
     port : 0 for any free one
     title : shown above the body
+
+    Attributes
+    ----------
+    url : of an open page
     """
 
     def __init__(
         self, model: BodyModel, info: StreamInfo | None = None, host: str = LOOPBACK, port: int = 0, title: str = ""
     ) -> None:
-        self._host, self._port, self._title = host, port, title
-        self._demonstrated: tuple[str, ...] = ()  # segments of the demonstrated poses
+        self._host, self._port, self._title, self.url = host, port, title, ""
         self._server: Server | None = None
         self._requests: deque[Request] = deque(maxlen=MAX_REQUESTS)
-        self.url = ""  # of an open page
         self.set_body(model)
         if info is not None:
-            self._encoder.start(info)
+            self.start(info)
 
     def open(self) -> None:
         """Serve the page from a thread of its own.
@@ -77,17 +78,15 @@ class LivePage(Output):
 
     def set_body(self, model: BodyModel, robot: RobotFigure | None = None) -> None:
         """Draw this body from now on, and a robot beside it; open browsers load the page again."""
-        self._encoder, self._demonstrated = PoseEncoder(model, robot), ()
-        identity = secrets.token_hex(8)
+        self._encoder, identity = PoseEncoder(model, robot), secrets.token_hex(8)
         self._content = Content(_fill_page(model, self._encoder, self._title, identity), identity, self._encoder)
         if self._server is not None:
             self._server.content = self._content
 
     def demonstrate(self, pose: LivePose, segments: tuple[str, ...]) -> None:
         """Draw a pose of the guide."""
-        if self._demonstrated != segments:
-            self._encoder.start(StreamInfo(segments, tuple(self._encoder.points(segments)), 0.0))
-            self._demonstrated = segments
+        if self._encoder.info is None or self._encoder.info.segments != segments:
+            self.start(StreamInfo(segments, self._encoder.points(segments), 0.0))
         self._encoder.newest = pose
 
     def start(self, info: StreamInfo) -> None:
@@ -123,8 +122,7 @@ class LivePage(Output):
 
 def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str) -> str:
     """The page; its scene is the body in the N-pose, its camera sees all that the limbs can reach."""
-    links, robot = encoder.links, encoder.robot
-    body = encoder.body_links
+    links, body, robot = encoder.links, encoder.body_links, encoder.robot
     neutral = np.frombuffer(encoder.encode(None), "<f4", 12 * len(body), offset=8).reshape(-1, 12)
     motion = np.tile([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], (len(body), 1, 1)).astype("<f4")
     motion[:, 0, 4:] = neutral[:, 9:]
@@ -137,7 +135,6 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str
         "scene": scene(encoder.visuals, links, () if robot is None else robot.meshes),
         "backdrops": {name: backdrop(colours, floor) for name, colours in (("light", LIGHT), ("dark", DARK))},
         "view": view(encoder.visuals, body, motion, reach),
-        "length_names": LENGTH_NAMES,
         "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.paths],
     }
     return filled("live/templates/live.html.j2", data, title or "wepose live")
@@ -145,8 +142,7 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str
 
 def _find_reach(model: BodyModel) -> np.ndarray:
     """Points (n, 3) [m] that the ends of limbs reach in front, at their side and up."""
-    data = pin.Data(model.pin)
-    pin.framesForwardKinematics(model.pin, data, pin.neutral(model.pin))
+    data = place_n_pose(model)
     known = find_known_points(model, model.chains)
     p_W = {point: data.oMf[model.pin.getFrameId(model.point_frames[point])].translation for point in known}
     ends = [np.zeros(3)]

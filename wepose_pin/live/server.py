@@ -11,25 +11,24 @@ import re
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Any
 
 from tornado.httpserver import HTTPServer
-from tornado.web import Application, RequestHandler
+from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from ..errors import BadOption
 from .addresses import name_host
 from .encoder import PoseEncoder
-from .state import Request, Status, round_finite
+from .state import QUIT, Request, Status, round_finite
 
 FRAME_S = 1.0 / 60.0
 MAX_CLIENTS = 16
 MAX_BYTES = 1024  # of a message from the page
 PING_S, PONG_S = 5.0, 4.0
-CURVES_S = 0.4  # between joint angles
 GOODBYE_S = 0.5  # that a browser has to answer when the page ends
 DIGITS = 6  # after the point
 HEADERS = {
@@ -87,7 +86,7 @@ class Server:
         self.content, self.requests, self.token, self._host = content, requests, token, host
         self.status: Status | None = None
         self.clients: set[Stream] = set()
-        self._curves, self._curves_due = "", 0.0
+        self._encoded: tuple[Status | None, str] = None, ""  # the newest status that was sent, and as what
         if not host:  # to the system that would be every interface
             raise BadOption("the live page needs an address to listen on; 127.0.0.1 is this machine only")
         if not 0 <= port < 65536:
@@ -113,9 +112,8 @@ class Server:
         self._thread.join()
 
     async def _serve(self) -> None:
-        handlers = [("/", Page, {"server": self}), ("/stream", Stream, {"server": self})]
         application = Application(
-            handlers,
+            [("/", Page, {"server": self}), ("/stream", Stream, {"server": self})],
             log_function=lambda _handler: None,
             websocket_ping_interval=PING_S,
             websocket_ping_timeout=PONG_S,
@@ -126,45 +124,42 @@ class Server:
         time = asyncio.get_running_loop().time
         due = time()
         while not self._closing.is_set():
-            self._send_newest(time())
+            self._send_newest()
             due = max(due + FRAME_S, time())
             await asyncio.sleep(max(due - time(), 0.001))
         server.stop()
         for client in list(self.clients):
-            client.say_goodbye()
+            if self.status is not None:
+                client.send(self._encode_status(self.status))
+            client.close(1001, "ended")
         until = time() + GOODBYE_S
         while self.clients and time() < until:
             await asyncio.sleep(0.01)
         await server.close_all_connections()
 
-    def _send_newest(self, now: float) -> None:
+    def _send_newest(self) -> None:
         """Send what is new to every browser that has drawn what it got."""
-        ready = [client for client in self.clients if client.pending == 0]
-        if not ready:
-            return
         content, status = self.content, self.status
-        encoder = content.encoder
-        if now >= self._curves_due:
-            self._curves_due = now + CURVES_S
-            curves = encoder.angles.take()
-            self._curves = self._curves if curves is None else json.dumps({"angles": curves}, allow_nan=False)
-        pose, curves_text = encoder.newest, self._curves
-        messages: dict[str, tuple[Any, Callable[[], str | bytes]]] = {  # kind → what it is made of, and how
-            "status": (status, lambda: status_json(status)),
-            "curves": (curves_text, lambda: curves_text),
-            "pose": (pose or encoder.measured or encoder, lambda: encoder.encode(pose)),
-        }
-        encoded: dict[str, str | bytes] = {}
-        for client in ready:
-            if client.sent.get("content") is not content:  # it loads the new page
+        pose, frame = content.encoder.newest, b""
+        drawn = content.encoder.info if pose is None else pose  # without a pose that of the start is drawn
+        for client in [client for client in self.clients if client.pending == 0]:
+            if client.content is not content:  # it loads the new page
                 client.greet()
                 continue
-            for kind, (source, encode) in messages.items():
-                if source and client.sent.get(kind) is not source:
-                    if kind not in encoded:
-                        encoded[kind] = encode()
-                    client.send(encoded[kind])
-                    client.sent[kind] = source
+            if status is not None and client.status is not status:
+                client.status = status
+                client.send(self._encode_status(status))
+            if client.drawn is not drawn:
+                client.drawn = drawn
+                frame = frame or content.encoder.encode(pose)
+                client.send(frame)
+
+    def _encode_status(self, status: Status) -> str:
+        """A status and the joint angles since the one before as JSON: its fields, null for what is not known."""
+        if self._encoded[0] is not status:
+            fields = _to_json(status) | {"angles": self.content.encoder.angles.take()}
+            self._encoded = status, json.dumps(fields, allow_nan=False)
+        return self._encoded[1]
 
     def accepts_host(self, host: str) -> bool:
         """Whether the Host of a request is an address, localhost, or the host that was asked for.
@@ -172,16 +167,11 @@ class Server:
         The name of a foreign page may resolve to 127.0.0.1, and its scripts would then be of our origin.
         """
         parts = re.fullmatch(r"(?:\[([0-9a-f:.]+)\]|([\w.-]+))(?::\d{1,5})?", host.lower(), flags=re.ASCII)
-        if parts is None:
-            return False
-        name = parts[1] or parts[2]
-        if name in ("localhost", self._host.lower()):
-            return True
+        name = parts[1] or parts[2] if parts else ""
         try:
-            ip_address(name)
+            return name in ("localhost", self._host.lower()) or bool(ip_address(name))
         except ValueError:
             return False
-        return True
 
 
 class Guarded(RequestHandler):  # type: ignore[misc]
@@ -193,15 +183,14 @@ class Guarded(RequestHandler):  # type: ignore[misc]
     def prepare(self) -> None:
         host, origin, token = self.request.host, self.request.headers.get("Origin"), self.server.token
         if not self.server.accepts_host(host):
-            self._refuse("This page is known by address, or as localhost.")
-        elif origin is not None and origin != f"http://{host}":
-            self._refuse("This page speaks to itself only.")
-        elif token and not hmac.compare_digest(self.get_query_argument("token", "").encode(), token.encode()):
-            self._refuse("The address of this page has a token, as the terminal shows it.")
+            raise HTTPError(403, reason="This page is known by address, or as localhost.")
+        if origin is not None and origin != f"http://{host}":
+            raise HTTPError(403, reason="This page speaks to itself only.")
+        if token and not hmac.compare_digest(self.get_query_argument("token", "").encode(), token.encode()):
+            raise HTTPError(403, reason="The address of this page has a token, as the terminal shows it.")
 
-    def _refuse(self, reason: str) -> None:
-        self.set_status(403)
-        self.finish(reason)
+    def write_error(self, status_code: int, **_: Any) -> None:  # noqa: ARG002
+        self.finish(self._reason)
 
 
 class Page(Guarded):
@@ -228,12 +217,15 @@ class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
     Attributes
     ----------
     pending : messages that the browser has not drawn yet
-    sent : kind of message → what was sent last
+    content, status, drawn : what was sent last
     """
 
     def initialize(self, server: Server) -> None:
         super().initialize(server)
-        self.pending, self.sent = 0, dict[str, Any]()
+        self.pending = 0
+        self.content: Content | None = None
+        self.status: Status | None = None
+        self.drawn: object = self  # nothing
 
     def open(self, *_: str, **__: str) -> None:
         if len(self.server.clients) >= MAX_CLIENTS:
@@ -244,15 +236,15 @@ class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
 
     def greet(self) -> None:
         """Say which page is shown."""
-        self.sent["content"] = self.server.content
-        self.send(json.dumps({"id": self.server.content.identity}))
+        self.content = self.server.content
+        self.send(json.dumps({"id": self.content.identity}))
 
     def on_message(self, message: str | bytes) -> None:
         if message == "taken":
             self.pending = max(0, self.pending - 1)
         elif isinstance(message, str):
             request = Request.parse(message)
-            if request is not None and request.kind != "quit":  # who watches does not end the session
+            if request is not None and request.action != QUIT.action:  # who watches does not end the session
                 self.server.requests.append(request)
 
     def on_close(self) -> None:
@@ -267,22 +259,12 @@ class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
         else:  # a browser that leaves during the transfer is no error
             sent.add_done_callback(lambda done: done.cancelled() or done.exception())
 
-    def say_goodbye(self) -> None:
-        """Send the last status, and close."""
-        if self.server.status is not None:
-            self.send(status_json(self.server.status))
-        self.close(1001, "ended")
-
-
-def status_json(status: Status | None) -> str:
-    """A status for the page, as an object with the fields' names; null for what is not known."""
-    return json.dumps(_to_json(status), allow_nan=False)
-
 
 def _to_json(value: Any) -> Any:
+    """What JSON holds of a value; named tuples as objects, null for a number that is not known."""
     if isinstance(value, float):
         return round_finite(value, DIGITS)
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {key: _to_json(item) for key, item in value.items()}
     if isinstance(value, tuple):
         names = getattr(value, "_fields", None)

@@ -23,7 +23,7 @@ from .loop import EMPTY_SESSION, LiveLoop, SessionSummary
 from .setup import SensorSetup, check_mounts
 from .sources.base import Source
 from .sources.replay import ReplaySource
-from .state import Output, Status
+from .state import QUIT, Output, Status
 
 CONNECT_S = 0.2  # [s] for which a source searches before the user is asked again
 
@@ -96,10 +96,10 @@ def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[],
         while not source.connect(CONNECT_S):
             message = f"Waiting for {source.describe_awaited()}."
             for output in outputs:
-                output.status(Status("waiting", message, 0.0, 0.0, (), (0.0, 0.0), 0.0, dict(source.problems)))
+                output.status(Status("waiting", message, problems=dict(source.problems)))
             if until():
                 raise KeyboardInterrupt
-            if "quit" in [request.kind for output in outputs for request in output.take_requests()]:
+            if QUIT in [request for output in outputs for request in output.take_requests()]:
                 source.close()
                 return False
     except BaseException:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 from ..recording.arrivals import Samples
 from .sources.base import Source
-from .state import Output, Request, Status
+from .state import QUIT, Action, Output, Request, Status
 
 
 class Stage(ABC):
@@ -17,30 +17,38 @@ class Stage(ABC):
     Attributes
     ----------
     source, outputs : stay open
+    is_over : there is nothing more to do
     """
 
     READ_TIMEOUT_S = 0.05  # [s]; requests and the status wait for a read
     STATUS_PERIOD_S = 0.2  # [s]
 
     def __init__(self, source: Source, outputs: Sequence[Output]) -> None:
-        self.source, self.outputs = source, tuple(outputs)
+        self.source, self.outputs, self.is_over = source, tuple(outputs), False
 
     @property
-    def is_over(self) -> bool:
-        """Whether there is nothing more to do."""
-        return False
+    @abstractmethod
+    def actions(self) -> tuple[Action, ...]:
+        """What the person may ask for now."""
+
+    @abstractmethod
+    def do(self, action: Action, text: str) -> None:
+        """Do what the person asks for, with the text that was typed for it."""
 
     @abstractmethod
     def process(self, samples: list[Samples]) -> None:
         """Take the samples of one read, perhaps none."""
 
     @abstractmethod
-    def ask(self, request: Request) -> None:
-        """Do what the person asks for; what cannot be done now is ignored."""
-
-    @abstractmethod
     def build_status(self) -> Status:
         """The state now."""
+
+    def ask(self, request: Request) -> None:
+        """Do what the person asks for; what is not offered now is ignored."""
+        for action in self.actions:
+            if action.name == request.action:
+                self.do(action, request.text)
+                return
 
     def loop(self, should_stop: Callable[[], bool]) -> None:
         """Read, until this is over, the source ends, the person quits or `should_stop` returns True."""
@@ -50,8 +58,9 @@ class Stage(ABC):
             if samples is None:
                 return
             self.process(samples)
-            for request in [request for output in self.outputs for request in output.take_requests()]:
-                if request.kind == "quit":
+            requests = [request for output in self.outputs for request in output.take_requests()]
+            for request in requests:
+                if request == QUIT:
                     return
                 self.ask(request)
             if time.monotonic() >= due:

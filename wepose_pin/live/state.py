@@ -1,15 +1,17 @@
-"""What the loop hands to its outputs: what the stream holds, the newest pose, the state of each sensor."""
+"""What the stages of a live session and their outputs tell each other: poses, the state, what may be asked for."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
 LENGTH_NAMES = {"biacromial": "breadth of the shoulders, from acromion to acromion", "stature": "body height"}
-LONGEST_NAME = 120  # letters of a name that is asked for
+LONGEST_TEXT = 120  # letters that a person may type
 
 
 class StreamInfo(NamedTuple):
@@ -38,7 +40,7 @@ class SensorStatus(NamedTuple):
     rate_hz: float  # samples a second over the last second, on the source's clock
     lost: bool  # silent for longer than the loop waits, or frozen
     static: bool = False
-    gyro_bias: tuple[float, float, float] = (math.nan, math.nan, math.nan)  # [rad/s]
+    gyro_bias: tuple[float, ...] = (math.nan, math.nan, math.nan)  # [rad/s]
     heading_std: float = math.nan  # [rad]; NaN where the filter has no covariance
     heading_age: float = math.nan  # [s] since the start, or the last reset of the headings
     missing: int = 0  # samples that never came
@@ -48,34 +50,38 @@ class SensorStatus(NamedTuple):
     battery: float = math.nan  # share of its charge, 0 to 1; NaN where it is not known
 
 
-class Request(NamedTuple):
-    """What a person asks for by a key of the terminal or a button of the page."""
+class Action(NamedTuple):
+    """Something that the person may ask for now, by a button of the page or a key."""
 
-    kind: str  # quit, reset, take, mark, begin, end, go, measure, or that of a `GuideAction`
-    name: str = ""  # of a phase, a step or a length; the text of a mark
-    value: float = math.nan  # a length [m]
+    name: str  # of the `Request`
+    label: str
+    key: str
+    entry: str = ""  # what the person types for it; empty: nothing
+    is_on: bool = False  # it is going on, and asking ends it
+
+
+class Request(NamedTuple):
+    """What a person asks for: an `Action` that is offered, or to quit."""
+
+    action: str  # its name
+    text: str = ""  # that was typed for it
 
     @classmethod
     def parse(cls, text: str) -> Request | None:
         """The request in a JSON object with the fields' names; None: it is none."""
         try:
             fields = json.loads(text)
-            request = cls(str(fields["kind"]), str(fields.get("name", "")), float(fields.get("value", math.nan)))
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+            request = cls(str(fields["action"]), str(fields.get("text", "")))
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return None
-        return request if request.name.isprintable() and len(request.name) <= LONGEST_NAME else None
+        return request if request.text.isprintable() and len(request.text) <= LONGEST_TEXT else None
 
 
-class GuideAction(NamedTuple):
-    """Something that the person may ask the guide for: a `Request` of this kind."""
-
-    kind: str
-    label: str  # of a button
-    key: str  # of a terminal
+QUIT = Request("quit")
 
 
 class GuideStep(NamedTuple):
-    """A step of the guided session."""
+    """A step of the guided session; one that is done or skipped is an action of this name."""
 
     name: str
     title: str
@@ -99,14 +105,13 @@ class GuideView(NamedTuple):
     remaining: float | None = None  # [s] of motion that are left
     progress: float = 0.0  # 0 to 1 of this step
     steps: tuple[GuideStep, ...] = ()
-    actions: tuple[GuideAction, ...] = ()  # the first is the usual one
+    actions: tuple[Action, ...] = ()  # of this step; the first is the usual one
     highlight: str = ""  # segment to draw apart from the others
     demonstration: str = ""  # phase of the protocol to draw; empty: the start pose
     lengths: tuple[LengthEstimate, ...] = ()
     sample_size: tuple[float, float] | None = None  # effective sample size so far, and what is enough
     quality: str = ""  # of the calibration: pass, poor, fail; empty before
     reasons: tuple[str, ...] = ()  # what to do more so far, or why it does not pass
-    measurable: str = ""  # length that the person may measure to fix the scale; empty: none
 
 
 class Status(NamedTuple):
@@ -114,13 +119,13 @@ class Status(NamedTuple):
 
     state: str  # "guide", "waiting" for sensors, "start_pose" the start pose, "moved" in it, "ready", "ended"
     message: str  # the state as a sentence to the person
-    progress: float  # 0 to 1 of the start pose; 1 when ready
-    time: float  # [s] on the source's clock
-    sensors: tuple[SensorStatus, ...]
-    latency_ms: tuple[float, float]  # p50, p99 of the last poses
-    recorded_s: float  # [s] in the file of --record; 0 without one
-    problems: dict[str, int]  # problem → count: of the source, the sensors, the recording
-    open_phases: tuple[str, ...] = ()  # of the recording, that were begun and not ended
+    progress: float = 0.0  # 0 to 1 of the start pose; 1 when ready
+    time: float = 0.0  # [s] on the source's clock
+    sensors: tuple[SensorStatus, ...] = ()
+    latency_ms: tuple[float, float] = (math.nan, math.nan)  # p50, p99 of the last poses
+    recorded_s: float = 0.0  # [s] in the file of --record; 0 without one
+    problems: Mapping[str, int] = MappingProxyType({})  # problem → count: of the source, the sensors, the recording
+    actions: tuple[Action, ...] = ()
     guide: GuideView | None = None  # None: no guided session, or it is over
 
 
@@ -157,11 +162,6 @@ class Output:
 def round_finite(value: float, digits: int) -> float | None:
     """A number for JSON; None for NaN and infinity."""
     return round(float(value), digits) if math.isfinite(value) else None
-
-
-def name_length(name: str) -> str:
-    """A measured length in words."""
-    return LENGTH_NAMES.get(name, name.replace("_", " "))
 
 
 def join_names(segments: list[str]) -> str:

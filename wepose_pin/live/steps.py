@@ -7,11 +7,10 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
-from ..body import BodyModel
 from ..calibration import Calibration, Protocol
 from ..calibration.observability import format_longest
 from ..calibration.protocols import Axis
@@ -19,12 +18,11 @@ from ..calibration.protocols import Step as ProtocolStep
 from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals
 from ..diagnostics import Diagnostic, render, render_all
 from ..errors import BadData, WeposeError
-from ..recording.arrivals import Ticks
-from ..tracking.start_pose import StartPoseDetector
 from .assignment import ShakeDetector
-from .guide import Attempt, Calibrated, Guide, Step, StepRun, Turn
+from .guide import Calibrated, Guide, Step, StepRun, Turn
 from .monitor import check_units
-from .state import GuideAction, GuideView, LengthEstimate, join_names
+from .state import LENGTH_NAMES, Action, GuideView, LengthEstimate, join_names
+from .ticks import StillPose
 
 STATIC_S = 2.0  # [s] of standing still in which the sensors are checked
 START_POSE_S = 4.0  # [s] where the protocol does not say how long
@@ -41,23 +39,24 @@ STATURE = "stature"  # that a person may enter in place of a length
 # Codes of reasons that more motion takes away, or begin so.
 TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain", "closure-open")
 # Code → what to do, of those whose remedy is an option of a command: here it is asked for.
-MEASURE = "Measure what is asked for and enter it here."
-REMEDIES = dict.fromkeys(("scale-from-prior", "scale-uncertain", "limb-scale-from-prior"), MEASURE) | {
+MEASURE_IT = "Measure what is asked for and enter it here."
+REMEDIES = dict.fromkeys(("scale-from-prior", "scale-uncertain", "limb-scale-from-prior"), MEASURE_IT) | {
     "sensors-exchanged": "Exchange them here.",
     "length-uncertain": "Move further and faster, through the whole reach.",
 }
 
-CONTINUE = GuideAction("next", "Continue", "n")
-READY = GuideAction("next", f"I am ready ({GET_READY_S:.0f} s to take the pose)", "n")
-FINISH = GuideAction("next", "Finish", "n")
-AGAIN = GuideAction("again", "Once more", "a")
-ANEW = GuideAction("again", "Assign all anew", "a")
-RESTART = GuideAction("restart", "All again from the start pose", "a")
-SKIP = GuideAction("skip", "Skip", "s")
-KEEP = GuideAction("skip", "Keep as it was", "s")
-ACCEPT = GuideAction("accept", "Accept and track", "y")
-MORE = GuideAction("more", f"{MORE_S:.0f} s more motion", "m")
-EXCHANGE = GuideAction("exchange", "Exchange these sensors", "x")
+CONTINUE = Action("next", "Continue", "n")
+READY = Action("next", f"I am ready ({GET_READY_S:.0f} s to take the pose)", "n")
+FINISH = Action("next", "Finish", "n")
+AGAIN = Action("again", "Once more", "a")
+ANEW = Action("again", "Assign all anew", "a")
+RESTART = Action("restart", "All again from the start pose", "a")
+SKIP = Action("skip", "Skip", "s")
+KEEP = Action("skip", "Keep as it was", "s")
+ACCEPT = Action("accept", "Accept and track", "y")
+MORE = Action("more", f"{MORE_S:.0f} s more motion", "m")
+EXCHANGE = Action("exchange", "Exchange these sensors", "x")
+MEASURE = Action("measure", "Use this length", "l")  # its entry names the length
 
 T = TypeVar("T")
 
@@ -96,7 +95,7 @@ def find_sensors(guide: Guide, _: Turn) -> StepRun:
             reasons=warnings,
             actions=(CONTINUE,) if count >= needed else (),
         )
-        if asked.kind == "next":
+        if asked is CONTINUE:
             return Turn()
 
 
@@ -120,9 +119,8 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
     if turn.again and needs <= set(guide.segments.values()):
         before = guide.segments
     elif not turn.again:
-        names = {name: name for name in guide.sending if name in guide.order}
-        known = names | dict(guide.options.known) | guide.segments
-        known = {name: segment for name, segment in known.items() if name in guide.sending}
+        known = {name: name for name in guide.order} | dict(guide.options.known) | guide.segments
+        known = {name: known[name] for name in guide.sending if name in known}
         if needs <= set(known.values()):
             guide.segments = known
             return Turn()
@@ -130,7 +128,8 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
     while True:
         shakes.push(guide.samples, guide.source.orientations)
         free = [name for name in guide.sending if name not in guide.segments]
-        if (shaken := shakes.find(free)) is not None:
+        shaken = shakes.find(free)
+        if shaken is not None:
             guide.segments[shaken] = _list_open(guide)[0]
             free.remove(shaken)
         if len(free) == len(_list_open(guide)) == 1:
@@ -145,23 +144,21 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
             highlight=segments[0],
             actions=(*[ANEW] * bool(guide.segments), *[KEEP] * bool(before)),
         )
-        if asked.kind == "skip":
+        if asked is KEEP:
             guide.segments = before
             return Turn()
-        if asked.kind == "again":
+        if asked is ANEW:
             guide.segments, shakes = {}, ShakeDetector()
 
 
 def _list_open(guide: Guide) -> list[str]:
     """Segments without a sensor, the ends of limbs first: the forearm moves when the upper arm is shaken."""
+
+    def count_above(segment: str | None) -> int:
+        return 0 if segment is None else 1 + count_above(guide.options.model.parents.get(segment))
+
     segments = [name for name in guide.needs if name not in guide.segments.values()]
-    return sorted(segments, key=lambda name: -_count_above(guide.options.model, name))
-
-
-def _count_above(model: BodyModel, segment: str) -> int:
-    """Number of segments between this one and the root."""
-    above = model.parents.get(segment)
-    return 0 if above is None else 1 + _count_above(model, above)
+    return sorted(segments, key=count_above, reverse=True)
 
 
 def _describe_shaking(guide: Guide, shakes: ShakeDetector) -> str:
@@ -181,62 +178,58 @@ def _describe_shaking(guide: Guide, shakes: ShakeDetector) -> str:
 
 
 class Stillness:
-    """Waits in the ticks of an attempt until no sensor has moved for some seconds."""
+    """Waits in the ticks of the guide's attempt until no sensor has moved for some seconds."""
 
-    def __init__(self, attempt: Attempt, seconds: float) -> None:
-        self._attempt, self.seconds = attempt, seconds
-        self._detector: StartPoseDetector | None = None
+    def __init__(self, guide: Guide, seconds: float) -> None:
+        self._guide, self._attempt, self.seconds = guide, guide.begin_attempt(), seconds
+        self._pose: StillPose | None = None  # from the first tick on
 
-    def push(self, block: Sequence[Ticks]) -> tuple[float, float] | None:
-        """Add ticks; return the begin and end [s] of standing still once the seconds are full; None: not yet."""
-        for ticks in block:
-            if self._detector is None:
-                stream = self._attempt.stream
-                self._detector = StartPoseDetector(stream.clock.rate_hz, stream.measured, self.seconds)
-            for n, (gyro_S, accel_S) in enumerate(zip(ticks.gyro_S, ticks.accel_S, strict=True)):
-                if self._detector.push(gyro_S, accel_S) == "ready":
-                    end = float(ticks.time[n])
-                    return end - (self._detector.held_s - 1.0 / self._attempt.stream.clock.rate_hz), end
+    def take(self) -> tuple[float, float] | None:
+        """Take the newest ticks; return begin and end [s] of standing still once the seconds are full."""
+        for ticks in self._guide.ticks:
+            self._pose = self._pose or StillPose(self._attempt.stream, self.seconds)
+            row = self._pose.push_ticks(ticks)
+            if row is not None:
+                end = float(ticks.time[row])
+                return end - self.seconds + 1.0 / self._attempt.stream.clock.rate_hz, end
         return None
 
     @property
     def progress(self) -> float:
-        return 0.0 if self._detector is None else self._detector.held_s / self.seconds
+        return 0.0 if self._pose is None else self._pose.held_s / self.seconds
 
     @property
     def moving(self) -> str:
         """The segments that have just moved, as words; empty: none."""
-        if self._detector is None or self._detector.state != "moved":
+        if self._pose is None or self._pose.state != "moved":
             return ""
-        return join_names([self._attempt.segments[k] for k in self._detector.moving])
+        return join_names([self._attempt.segments[k] for k in self._pose.moving])
 
 
 def check_sensors(guide: Guide, _: Turn) -> StepRun:
     """Check the units of the sensors while the person stands still."""
-    attempt = guide.begin_attempt()
-    still, faults, actions = Stillness(attempt, STATIC_S), list[str](), [SKIP]
+    attempt, still = guide.begin_attempt(), Stillness(guide, STATIC_S)
+    faults, actions = list[str](), [SKIP]
     while True:
-        held = still.push(guide.ticks)
-        if held is not None and not faults:
+        held = None if faults else still.take()
+        if held is not None:
             recording = replace(attempt.recording(), phases={"static": ((held[1] - STATIC_S, held[1]),)})
             try:
                 diagnostics = check_units(recording, guide.source)
             except BadData as error:
                 faults, actions = [str(error)], [AGAIN]
             else:
-                faults = [render(each).line() for each in diagnostics if each.code == "accel-scale"]
-                actions = [AGAIN, SKIP]
+                faults, actions = [render(d).line() for d in diagnostics if d.code == "accel-scale"], [AGAIN, SKIP]
                 if not faults:
                     return Turn()
         moved = f"{still.moving.capitalize()} moved." if still.moving else ""
         note = guide.describe_problems() or moved
-        sentence = "Stand still for a moment."
-        view = GuideView(sentence, note, progress=still.progress, reasons=tuple(faults), actions=tuple(actions))
-        asked = yield view
-        if asked.kind == "skip":
+        view = GuideView("Stand still for a moment.", note, progress=still.progress, actions=tuple(actions))
+        asked = yield view._replace(reasons=tuple(faults))
+        if asked is SKIP:
             return Turn(skipped=True)
-        if asked.kind == "again":
-            still, faults, actions = Stillness(attempt, STATIC_S), [], [SKIP]
+        if asked is AGAIN:
+            still, faults, actions = Stillness(guide, STATIC_S), [], [SKIP]
 
 
 def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
@@ -246,19 +239,19 @@ def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
     seconds = stated[0].seconds if stated else START_POSE_S
     do = stated[0].do if stated else "Stand still in the start pose."
     while True:
-        offered = (READY, KEEP) if attempt.measured_s("start") > 0.0 else (READY,)
-        asked = yield GuideView(do, guide.describe_problems() or reason, actions=offered)
-        if asked.kind == "skip":
-            return Turn()
-        if asked.kind != "next":
-            continue
+        asked = None
+        while asked is not READY:
+            offered = (READY, KEEP) if attempt.measured_s("start") > 0.0 else (READY,)
+            asked = yield GuideView(do, guide.describe_problems() or reason, actions=offered)
+            if asked is KEEP:
+                return Turn()
         reason = ""
         guide.discard_phases()
-        begin, still = guide.now + GET_READY_S, Stillness(attempt, seconds)
-        while asked.kind != "again":
+        begin, still = guide.now + GET_READY_S, Stillness(guide, seconds)
+        while asked is not AGAIN:
             countdown, note = begin - guide.now, guide.describe_problems()
             if countdown <= 0.0:
-                held = still.push(guide.ticks)
+                held = still.take()
                 if held is not None:
                     attempt.mark("begin", phase="start", time=held[0])
                     attempt.mark("end", phase="start", time=held[1])
@@ -336,7 +329,7 @@ def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
         target_s = max(target_s, done_s + min(MORE_S, target_s))
     elif done_s >= target_s:  # the person came back to an earlier step, and kept it
         return Turn()
-    marker, estimates = PhaseMarker(guide, phase), estimate_gradually(guide, attempt, phase)
+    marker, estimates = PhaseMarker(guide, phase), estimate_gradually(guide, phase)
     try:
         while True:
             reason = marker.update()
@@ -356,12 +349,13 @@ def perform_motion(motion: ProtocolStep, guide: Guide, turn: Turn) -> StepRun:
                 actions=(*finish, RESTART, *[SKIP] * (phase in guide.options.optional)),
                 demonstration=phase,
             )
-            asked = yield _add_estimate(view, next(estimates), marker, motion)
-            if asked.kind == "next":
+            estimate = next(estimates)
+            asked = yield view if estimate is None else _add_estimate(view, estimate, marker, motion)
+            if asked is FINISH:
                 return Turn()
-            if asked.kind == "restart":
+            if asked is RESTART:
                 return Turn("start")
-            if asked.kind == "skip":
+            if asked is SKIP:
                 marker.pause(attempt.newest)
                 attempt.mark("discard", phase=phase)
                 return Turn(skipped=True)
@@ -376,27 +370,44 @@ def _choose_sentence(motion: ProtocolStep, done_s: float) -> str:
     return sentences[0] if turn == 0 else further[(turn - 1) % len(further)]
 
 
-def estimate_gradually(guide: Guide, attempt: Attempt, phase: str) -> Iterator[Calibration | None]:
+class Calculation(Generic[T]):
+    """A calculation in a thread of its own, which does not hold up the end of the program."""
+
+    def __init__(self, compute: Callable[[], T]) -> None:
+        self._compute, self._future = compute, Future[T]()
+        threading.Thread(target=self._run, name="calibration", daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            self._future.set_result(self._compute())
+        except BaseException as error:
+            self._future.set_exception(error)
+
+    def take(self) -> T | WeposeError | None:
+        """The result, or its `WeposeError`, or None while it is calculated; other errors are raised."""
+        try:
+            return self._future.result() if self._future.done() else None
+        except WeposeError as error:
+            return error
+
+
+def estimate_gradually(guide: Guide, phase: str) -> Iterator[Calibration | None]:
     """Calibrate the recording so far again and again; iterate over the newest result, None where there is none."""
-    newest, estimated_s = None, 0.0
-    calculation: Future[Calibration] | None = None
+    attempt, newest, estimated_s = guide.begin_attempt(), None, 0.0
+    calculation: Calculation[Calibration] | None = None
     while True:
         done_s = attempt.measured_s(phase)
-        if calculation is not None and calculation.done():
-            outcome, calculation = take_result(calculation), None
-            newest = outcome if isinstance(outcome, Calibration) else newest
+        outcome = None if calculation is None else calculation.take()
+        if outcome is not None:
+            calculation, newest = None, outcome if isinstance(outcome, Calibration) else newest
         elif calculation is None and done_s >= max(FIRST_ESTIMATE_S, estimated_s + ESTIMATE_PERIOD_S):
             estimated_s = done_s
-            calculation = compute_in_thread(partial(guide.options.estimate, attempt.recording()))
+            calculation = Calculation(partial(guide.options.estimate, attempt.recording()))
         yield newest
 
 
-def _add_estimate(
-    view: GuideView, calibration: Calibration | None, marker: PhaseMarker, motion: ProtocolStep
-) -> GuideView:
+def _add_estimate(view: GuideView, calibration: Calibration, marker: PhaseMarker, motion: ProtocolStep) -> GuideView:
     """The view with what the motion has determined so far."""
-    if calibration is None:
-        return view
     newest = calibration.gap[calibration.time > calibration.time[-1] - APART_S]
     if calibration.exchanged and not marker.interruption:
         view = view._replace(note="Some sensors seem to sit on other segments than assigned: finish, and see.")
@@ -404,16 +415,13 @@ def _add_estimate(
         view = view._replace(note=f"{_choose_sentence(motion, 0.0)} They seem to be apart.")
     elif marker.running and calibration.quality.quality == "pass":
         view = view._replace(sentence="This is enough: finish, or go on for smaller uncertainties.")
-    return view._replace(
-        lengths=_list_lengths(calibration),
-        sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES),
-        reasons=() if calibration.exchanged else _advise(calibration),
-    )
+    return _add_lengths(view, calibration)._replace(reasons=() if calibration.exchanged else _advise(calibration))
 
 
-def _list_lengths(calibration: Calibration) -> tuple[LengthEstimate, ...]:
+def _add_lengths(view: GuideView, calibration: Calibration) -> GuideView:
     subject = calibration.subject
-    return tuple(LengthEstimate(name, metres, subject.std(name)) for name, metres in subject.lengths.items())
+    lengths = tuple(LengthEstimate(name, metres, subject.std(name)) for name, metres in subject.lengths.items())
+    return view._replace(lengths=lengths, sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES))
 
 
 def _advise(calibration: Calibration) -> tuple[str, ...]:
@@ -427,76 +435,61 @@ def _advise(calibration: Calibration) -> tuple[str, ...]:
 # The result ----------------------------------------------------------------------------------------------------------
 
 
-def compute_in_thread(compute: Callable[[], T]) -> Future[T]:
-    """Begin a calculation in a thread of its own, which does not hold up the end of the program."""
-    future: Future[T] = Future()
-
-    def run() -> None:
-        try:
-            future.set_result(compute())
-        except BaseException as error:
-            future.set_exception(error)
-
-    threading.Thread(target=run, name="calibration", daemon=True).start()
-    return future
-
-
-def take_result(future: Future[T]) -> T | WeposeError:
-    """The result of a calculation that is done, or its `WeposeError`; other errors are raised."""
-    try:
-        return future.result()
-    except WeposeError as error:
-        return error
-
-
 def show_result(guide: Guide, _: Turn) -> StepRun:
     """Calibrate the recording, and ask whether the result is accepted."""
     attempt, options = guide.begin_attempt(), guide.options
     attempt.log.flush()
-    calibrate = partial(options.calibrate, attempt.path)
-    calculation = compute_in_thread(partial(calibrate, dict(guide.measured)))
-    result: Calibrated | WeposeError | None = None
-    before: Calibrated | WeposeError | None = None  # the result before a length was entered
+
+    def calibrate() -> Calculation[Calibrated]:
+        return Calculation(partial(options.calibrate, attempt.log.path, dict(guide.measured)))
+
+    calculation, result, before = calibrate(), None, None  # `before`: the result before a length was entered
     entered = refused = ""  # its name, and why it cannot be
     while True:
-        if result is None and calculation.done():
-            result = take_result(calculation)
+        if result is None:
+            result = calculation.take()
             if entered and isinstance(result, WeposeError):  # the result before it stays
                 del guide.measured[entered]
                 refused, result, entered = str(result), before, ""
-        asked = yield _view_result(guide, result, refused)
-        if asked.kind == "accept" and isinstance(result, Calibrated):
-            guide.accepted = result
-        elif asked.kind == "more":
+        view, length = _view_result(guide, result)
+        asked = yield view._replace(note=refused)
+        if asked is ACCEPT and isinstance(result, Calibrated):
+            guide.accept(result)
+        elif asked is MORE:
             motions = [step for step in options.protocol.steps if step.phase != "start"]
             return Turn(max(motions, key=lambda step: step.seconds).phase, again=True)
-        elif asked.kind == "restart":
+        elif asked is RESTART:
             return Turn("start")
-        elif asked.kind == "exchange" and isinstance(result, Calibrated):
-            _exchange(guide, attempt, result.calibration)
+        elif asked is EXCHANGE and isinstance(result, Calibrated):
+            _exchange(guide, result.calibration)
             return Turn("quality", again=True)
-        elif asked.kind == "measure" and np.isfinite(asked.value):
-            guide.measured[asked.name] = asked.value
-            entered, before, result, refused = asked.name, result, None, ""
-            calculation = compute_in_thread(partial(calibrate, dict(guide.measured)))
+        elif asked is not None and asked.name == MEASURE.name:
+            try:
+                guide.measured[length] = 0.01 * float(guide.text.replace(",", "."))
+            except ValueError:
+                refused = f"'{guide.text}' is no length in cm, such as 38.5."
+            else:
+                entered, before, result, refused = length, result, None, ""
+                calculation = calibrate()
 
 
-def _exchange(guide: Guide, attempt: Attempt, calibration: Calibration) -> None:
+def _exchange(guide: Guide, calibration: Calibration) -> None:
     """Assign the sensors as the calibration found them."""
     segments = {label: segment for segment, label in calibration.exchanged.items()}
-    attempt.exchange(segments)
+    guide.begin_attempt().exchange(segments)
     guide.segments = {sensor: segments.get(segment, segment) for sensor, segment in guide.segments.items()}
 
 
-def _view_result(guide: Guide, result: Calibrated | WeposeError | None, refused: str) -> GuideView:
+def _view_result(guide: Guide, result: Calibrated | WeposeError | None) -> tuple[GuideView, str]:
+    """What to say of the result, and the length that the person may measure; empty: none."""
     if result is None:
-        return GuideView("The motion is being evaluated. You may move freely.", actions=(RESTART,))
+        return GuideView("The motion is being evaluated. You may move freely.", actions=(RESTART,)), ""
     if isinstance(result, WeposeError):
         sentence = "This motion cannot be evaluated."
-        return GuideView(sentence, actions=(RESTART, MORE), quality="fail", reasons=(str(result),))
+        return GuideView(sentence, actions=(RESTART, MORE), quality="fail", reasons=(str(result),)), ""
     calibration, quality = result.calibration, result.calibration.quality
     lacks_motion = bool(quality.reasons) and all(reason.code.startswith(TOO_LITTLE) for reason in quality.reasons)
-    actions: tuple[GuideAction, ...] = (ACCEPT, MORE, RESTART)
+    actions = [ACCEPT, MORE, RESTART]
     sentence = {
         "pass": "The calibration is good.",
         "poor": "The calibration can be used, and more motion makes it better.",
@@ -507,7 +500,7 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None, refused:
         if calibration.problem.scale_lengths:
             sentence = "The proportions are good. The scale is still uncertain."
     elif quality.quality == "fail":
-        actions = (MORE, RESTART) if lacks_motion else (RESTART, MORE)
+        actions = [MORE, RESTART] if lacks_motion else [RESTART, MORE]
         if lacks_motion:
             sentence = "There was too little of the motion. More of it may be enough."
     diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "phase-not-used")]
@@ -515,23 +508,18 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None, refused:
     reasons = [text.line() for _, text in render_all(counted, REMEDIES)]
     if calibration.exchanged:  # all other reasons follow from this one
         sentence = "Some sensors sit on other segments than assigned. The same motion will do."
-        reasons, actions = reasons[:1], (EXCHANGE, RESTART)
-    return GuideView(
-        sentence,
-        refused,
-        progress=1.0,
-        actions=actions,
-        lengths=_list_lengths(calibration),
-        sample_size=(calibration.effective_sample_size, ENOUGH_SAMPLES),
-        quality=quality.quality,
-        reasons=tuple(reasons),
-        measurable=_choose_measurable(guide, calibration),
-    )
+        reasons, actions = reasons[:1], [EXCHANGE, RESTART]
+    length = _choose_length(guide, calibration)
+    if length:
+        name = LENGTH_NAMES.get(length, length.replace("_", " "))
+        actions.append(MEASURE._replace(entry=f"{name} [cm]"))
+    view = GuideView(sentence, progress=1.0, actions=tuple(actions), quality=quality.quality, reasons=tuple(reasons))
+    return _add_lengths(view, calibration), length
 
 
-def _choose_measurable(guide: Guide, calibration: Calibration) -> str:
+def _choose_length(guide: Guide, calibration: Calibration) -> str:
     """What to measure next for the scale, where it is uncertain; empty: nothing."""
-    if not any(REMEDIES.get(reason.code) == MEASURE for reason in calibration.quality.reasons):
+    if not any(REMEDIES.get(reason.code) == MEASURE_IT for reason in calibration.quality.reasons):
         return ""
     best = calibration.problem.measured_example.partition("=")[0]
     choices = (STATURE, best) if calibration.problem.scale_lengths else (best, STATURE)

@@ -1,4 +1,4 @@
-"""`TickStream`: arrivals of a source → ticks of one clock, from when the sensors and the rate are known."""
+"""Arrivals of a source → ticks of one clock, from when the sensors and the rate are known; a pose held in them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import BadData
 from ..recording.arrivals import JUMP_S, Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
+from ..tracking.start_pose import StartPoseDetector
 from ..writers.live_log import LiveLog
 from .monitor import measure_step
 
@@ -112,3 +113,17 @@ class TickStream:
         if self.log is not None and self.synchronizer is not None:
             clock = self.synchronizer
             self.log.event("clock", rate_hz=clock.rate_hz, begin=clock.begin, wait_s=clock.wait_s)
+
+
+class StillPose(StartPoseDetector):
+    """Detects in the ticks of a stream that no sensor has moved for `hold_s` [s]."""
+
+    def __init__(self, stream: TickStream, hold_s: float) -> None:
+        super().__init__(stream.clock.rate_hz, stream.measured, hold_s)
+
+    def push_ticks(self, ticks: Ticks) -> int | None:
+        """Add ticks; return the row of the one at which the pose has been held so long; None: not yet."""
+        for row, (gyro_S, accel_S) in enumerate(zip(ticks.gyro_S, ticks.accel_S, strict=True)):
+            if self.push(gyro_S, accel_S) == "ready":
+                return row
+        return None

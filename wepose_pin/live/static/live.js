@@ -103,44 +103,66 @@ function small(id, value, unit) {
   text($(id), "small", unit);
 }
 
+// ---- what the person may ask for: actions that are offered, by buttons and keys
+const PAST = ["done", "skipped"];                                        // steps of the guide that can be repeated
+let actions = [], steps = [], shownActions = "";
+function ask(action, text = "") {
+  const through = socket.readyState === WebSocket.OPEN;
+  if (through) socket.send(JSON.stringify({ action, text }));
+  return through;
+}
+function press({ name, label }, typed) {
+  $("answer").textContent = ask(name, typed) ? `${label}: asked for.` : "Not connected: nothing was asked for.";
+  setTimeout(() => { $("answer").textContent = ""; }, 3000);
+}
+function control(action) {
+  const form = document.createElement("form"), button = text(form, "button", `${action.label} `);
+  text(button, "kbd", action.key.toUpperCase());
+  button.dataset.action = action.name;
+  if (action.is_on) button.setAttribute("aria-pressed", "true");
+  if (action.entry) form.prepend(Object.assign(document.createElement("input"), { maxLength: 120, placeholder: action.entry, ariaLabel: action.entry }));
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    press(action, form.querySelector("input")?.value.trim());
+    form.reset();
+  });
+  return form;
+}
+function showActions() {
+  const offered = actions.filter(({ name }) => !steps.some((step) => step.name === name));
+  const shown = JSON.stringify([guided, offered]);
+  if (shown === shownActions) return;                                    // a button stays while it is pressed, a text while it is typed
+  shownActions = shown;
+  $("actions").replaceChildren(...offered.filter(({ entry }) => guided && !entry).map(control));
+  $("controls").replaceChildren(...offered.filter(({ entry }) => !guided || entry).map(control));
+}
+
 // ---- the guided session
-const MAIN = ["next", "accept", "exchange", "more"], PAST = ["done", "skipped"];
 let guided = false, guideSays = "", spokenCount = null, voice = false;
 function speak(what) {
   if (!voice || !what) return;
   speechSynthesis.cancel();
   speechSynthesis.speak(new SpeechSynthesisUtterance(what));
 }
-function button({ kind, label, key }, main) {
-  const element = text($("actions"), "button", label, `key ${key.toUpperCase()}`);
-  element.className = main ? "main" : "";
-  element.dataset.action = kind;
-  element.addEventListener("click", () => ask(kind));
-}
 function showGuide(guide) {
   guided = guide !== null;
+  steps = guide?.steps ?? [];
   document.body.classList.toggle("guided", guided);
   $("steps").hidden = $("result").hidden = guide === null;
   $("note").hidden = !guide?.note;
-  if (guide === null) { $("actions").replaceChildren(); return; }
+  if (guide === null) return;
   $("note").textContent = guide.note;
-  $("steps").replaceChildren(...guide.steps.map(({ name, title, state }) => {
+  $("steps").replaceChildren(...steps.map(({ name, title, state }) => {
     const item = Object.assign(document.createElement("li"), { className: state });
     const inner = text(item, PAST.includes(state) ? "button" : "span", title);
-    if (PAST.includes(state)) inner.addEventListener("click", () => ask("go", name));
+    if (PAST.includes(state)) inner.addEventListener("click", () => ask(name));
     if (state === "now") item.setAttribute("aria-current", "step");
     return item;
   }));
-  const now = guide.steps.find((step) => step.state === "now"), count = guide.countdown;
+  const now = steps.find((step) => step.state === "now"), count = guide.countdown;
   const left = guide.remaining === null ? "" : ` · ${known(guide.remaining, 0)} s`;
   $("say").querySelector("strong").textContent = count === null ? now.title + left : Math.ceil(count);
   $("say").classList.toggle("counting", count !== null);
-  const offered = guide.actions.map((action) => action.kind + action.label).join();
-  if ($("actions").dataset.offered !== offered) {                        // a button stays while it is pressed
-    $("actions").dataset.offered = offered;
-    $("actions").replaceChildren();
-    guide.actions.forEach((action, k) => button(action, k === 0 && MAIN.includes(action.kind)));
-  }
   showResult(guide);
   if (guideSays !== guide.note + guide.sentence) speak(guide.note || guide.sentence);
   else if (count !== null && count <= 3.2 && Math.ceil(count) !== spokenCount) speak(String(Math.ceil(count)));
@@ -163,37 +185,20 @@ function showResult(guide) {
     bar.style.width = `${Math.min(100, 2500 * std)}%`;
     return row;
   }));
-  $("measure").hidden = !guide.measurable;
-  $("measure").querySelector("span").textContent = `Measured ${data.length_names[guide.measurable] ?? words(guide.measurable)}:`;
-  $("measure").dataset.name = guide.measurable;
   $("sample-size").textContent = guide.sample_size === null ? ""
     : `Effective sample size ${known(guide.sample_size[0], 1)}; ${known(guide.sample_size[1], 0)} are enough.`;
 }
-function ask(kind, name = "", value = null) {
-  const through = socket.readyState === WebSocket.OPEN;
-  if (through) socket.send(JSON.stringify(value === null ? { kind, name } : { kind, name, value }));
-  return through;
-}
-
-let state = "", offers = [], steps = [], phase = "";                        // phase: open, and no take
+let state = "";
 function show(status) {
   state = status.state;
-  offers = status.guide?.actions ?? [];
-  steps = status.guide?.steps ?? [];
+  actions = status.actions;
   const begun = state === "ready" || state === "ended";                  // before, nothing is estimated
   $("say").className = `${begun ? "small" : ""} ${state}`;
   $("say").querySelector("strong").textContent = SAYS[state] ?? state;
   $("say").querySelector("span").textContent = status.message;
   showGuide(status.guide);
   $("curves").hidden = !begun;
-  $("markers").hidden = state !== "ready";
-  $("mark").disabled = !status.recorded_s;
-  const taking = status.open_phases.some((name) => name.startsWith("take_"));
-  $("take").setAttribute("aria-pressed", taking);
-  $("take").firstChild.textContent = taking ? `End ${words(status.open_phases.find((name) => name.startsWith("take_")))} ` : "Begin take ";
-  phase = status.open_phases.filter((name) => !name.startsWith("take_")).at(-1) ?? "";
-  $("phase").setAttribute("aria-pressed", phase !== "");
-  namePhase();
+  showActions();
   $("progress").querySelector("i").style.width = `${100 * status.progress}%`;
   $("progress").hidden = state === "waiting";
   $("rows").replaceChildren(...status.sensors.map((sensor) => {
@@ -300,9 +305,9 @@ function connect() {
     owed++;
     if (typeof message !== "string") { newestFrame = message; return; }
     const said = JSON.parse(message);
-    if ("state" in said) newestStatus = said;
-    else if ("angles" in said) addAngles(said.angles);
-    else if (said.id !== data.id) location.reload();                     // another session at the same address
+    if (!("state" in said)) { if (said.id !== data.id) location.reload(); return; }    // another session at the same address
+    newestStatus = said;
+    if (said.angles) addAngles(said.angles);
   };
   socket.onclose = () => {
     const ended = (newestStatus?.state ?? state) === "ended";
@@ -313,42 +318,16 @@ function connect() {
   };
 }
 
-function reset() {
-  $("answer").textContent = !ask("reset") ? "Not connected: nothing was asked for."
-    : state === "ready" ? "Asked for new headings." : "Headings are set when the start pose has been held.";
-  setTimeout(() => { $("answer").textContent = ""; }, 4000);
-}
-function toggleTrails() {
+$("trails").addEventListener("click", () => {
   trailsShown = !trailsShown;
   $("trails").setAttribute("aria-pressed", trailsShown);
   viewer.set_dirty();
-}
-function mark() {
-  ask("mark", typed() || "mark");
-  $("answer").textContent = "Marked.";
-  setTimeout(() => { $("answer").textContent = ""; }, 2000);
-}
-const typed = () => $("mark-text").value.trim();
-function namePhase() {
-  $("phase").firstChild.textContent = phase ? `End ${words(phase)} ` : `Begin ${typed() || "clasp"} `;
-}
-function togglePhase() { ask(phase ? "end" : "begin", phase || typed() || "clasp"); }
-$("mark-text").addEventListener("input", namePhase);
-$("phase").addEventListener("click", togglePhase);
-$("measure").addEventListener("submit", (event) => {
-  event.preventDefault();
-  ask("measure", $("measure").dataset.name, Number($("measured").value) / 100);
-  $("measured").value = "";
 });
-$("take").addEventListener("click", () => ask("take"));
-$("markers").addEventListener("submit", (event) => { event.preventDefault(); mark(); });
 $("voice").addEventListener("click", () => {
   voice = !voice;
   $("voice").setAttribute("aria-pressed", voice);
   if (voice) speak("Voice on"); else speechSynthesis.cancel();
 });
-$("reset").addEventListener("click", reset);
-$("trails").addEventListener("click", toggleTrails);
 $("details").addEventListener("click", () => {
   $("details").setAttribute("aria-pressed", document.body.classList.toggle("detailed"));
 });
@@ -356,14 +335,10 @@ $("camera").addEventListener("click", () => { moved = false; fit(); });
 addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
   if (event.target instanceof HTMLInputElement) return;
-  const key = event.key.toLowerCase(), offered = offers.find((action) => action.key === key);
-  if (offered || (key === " " && offers.length)) ask((offered ?? offers[0]).kind);
-  else if (PAST.includes(steps[key - 1]?.state)) ask("go", steps[key - 1].name);
-  else if (state === "ready" && key === "t") ask("take");
-  else if (state === "ready" && key === "m") mark();
-  else if (state === "ready" && key === "p") togglePhase();
-  else if (!offers.length && (key === " " || key === "r")) reset();
-  else return;
+  const key = event.key.toLowerCase(), action = key === " " ? actions[0] : actions.find((each) => each.key === key);
+  if (!action) return;
+  const input = document.querySelector(`[data-action="${action.name}"]`)?.form.querySelector("input");
+  if (input) input.focus(); else press(action);
   event.preventDefault();
 });
 addEventListener("keyup", (event) => {                                   // space would press a focused button, too
