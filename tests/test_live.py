@@ -172,7 +172,10 @@ def test_rates_in_deg_s_are_said_while_the_person_waits(
     assert "rad/s while gravity does not turn: deg/s? The source must give rad/s" in said[1]
 
 
-def test_takes_and_marks_are_phases_and_texts_of_the_recording(recording: Recording, tmp_path: Path) -> None:
+def test_takes_and_marks_are_phases_and_texts_of_the_recording(
+    recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Stage, "STATUS_PERIOD_S", 1e-3)
     file = tmp_path / "a.mcap"
     take, phase = Request("take"), Request("phase", "clasp")
     asked = [(9.0, take), (12.0, Request("text", "trial 3")), (15.0, take), (16.0, phase), (18.0, phase), (20.0, take)]
