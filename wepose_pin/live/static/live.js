@@ -62,7 +62,7 @@ function pose(buffer) {
 }
 
 // ---- the camera
-const fit = () => fitCamera(viewer, stage, data.view, 80);
+const fit = () => fitCamera(viewer, stage, data.view, 48);
 let moved = false;                                                       // by the user: then a resize leaves it alone
 viewer.controls.addEventListener("start", () => { moved = true; });
 new ResizeObserver(() => {                                               // a resized canvas is empty until it is drawn
@@ -112,7 +112,8 @@ function ask(action, text = "") {
   return through;
 }
 function press({ name, label }, typed) {
-  $("answer").textContent = ask(name, typed) ? `${label}: asked for.` : "Not connected: nothing was asked for.";
+  const through = ask(name, typed);
+  $("answer").textContent = !through ? "Not connected: nothing was asked for." : guided ? "" : `${label}: asked for.`;
   setTimeout(() => { $("answer").textContent = ""; }, 3000);
 }
 function control(action) {
@@ -120,7 +121,12 @@ function control(action) {
   text(button, "kbd", action.key.toUpperCase());
   button.dataset.action = action.name;
   if (action.is_on) button.setAttribute("aria-pressed", "true");
-  if (action.entry) form.prepend(Object.assign(document.createElement("input"), { maxLength: 120, placeholder: action.entry, ariaLabel: action.entry }));
+  if (action.entry) {
+    const label = document.createElement("label");
+    text(label, "span", action.entry);
+    label.append(Object.assign(document.createElement("input"), { maxLength: 120, placeholder: action.entry }));
+    form.prepend(label);
+  }
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     press(action, form.querySelector("input")?.value.trim());
