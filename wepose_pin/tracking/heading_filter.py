@@ -15,7 +15,9 @@ They are states, so that a long recording does not average them away.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import tempfile
+import weakref
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -413,24 +415,51 @@ def _information_by_care(problem: HeadingProblem) -> np.ndarray:
     return np.asarray((CAREFUL_SHARE**-2 - 1.0) / problem.start_var)
 
 
-def smooth(problem: HeadingProblem, knots: Sequence[Knot]) -> tuple[HeadingEstimate, list[tuple[float, float]]]:
-    """Filter and smooth the knots (Rauch, Tung, Striebel 1965).
+class HeadingSmoother:
+    """Filters knots one by one, and smooths them after the last (Rauch, Tung, Striebel 1965).
 
-    Return the headings at the knots, and the intervals [s] in which points were found to coincide.
+    What the way back needs of each knot is in a temporary file: of a day it is gigabytes.
+
     """
-    forward = HeadingFilter(problem)
-    filtered, changes = [], []
-    for knot in knots:
-        changes.append(forward.step(knot))
-        filtered.append((forward.x, forward.P))
-    x, P = filtered[-1]
-    care = find_care(problem, x, P)
-    estimates = [estimate_headings(problem, x, P, care)]
-    for i in range(len(knots) - 2, -1, -1):
-        forward.x, forward.P = filtered[i]
-        forward.predict(changes[i + 1])
-        gain = np.linalg.solve(forward.P, forward.advance(filtered[i][1], changes[i + 1])).T
-        x = filtered[i][0] + gain @ (x - forward.x)
-        P = _symmetric(filtered[i][1] + gain @ (P - forward.P) @ gain.T)
-        estimates.append(estimate_headings(problem, x, P, care))
-    return HeadingEstimate(*(np.array(each[::-1]) for each in zip(*estimates, strict=True))), forward.clasps
+
+    def __init__(self, problem: HeadingProblem) -> None:
+        self._problem, self._filter = problem, HeadingFilter(problem)
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115  it lasts as long as this object
+        weakref.finalize(self, self._file.close)
+        self._times: list[float] = []  # [s] of the knots' middles
+
+    def add(self, knot: Knot) -> None:
+        """Filter the next knot."""
+        change = self._filter.step(knot)
+        np.concatenate([self._filter.x, self._filter.P.ravel(), *change]).tofile(self._file)
+        self._times.append(0.5 * (knot.time[0] + knot.end))
+
+    def _read(self, i: int) -> tuple[np.ndarray, np.ndarray, KnotChange]:
+        """Read the state and its covariance after knot i, and the change that led to it."""
+        n, k = self._problem.columns.size, len(self._problem.names)
+        size = n + n**2 + k * len(KnotChange._fields)
+        self._file.seek(8 * size * i)
+        x, P, change = np.split(np.fromfile(self._file, count=size), [n, n + n**2])
+        return x, P.reshape(n, n), KnotChange(*change.reshape(-1, k))
+
+    def smooth(self) -> tuple[np.ndarray, HeadingEstimate, list[tuple[float, float]]]:
+        """Smooth all m knots.
+
+        Return the times (m,) [s] of their middles, the headings at them, and the intervals [s] in which points were
+        found to coincide.
+        """
+        problem, forward = self._problem, self._filter
+        x, P, change = self._read(len(self._times) - 1)
+        care = find_care(problem, x, P)
+        estimates = [estimate_headings(problem, x, P, care)]
+        for i in range(len(self._times) - 2, -1, -1):
+            before_x, before_P, change_before = self._read(i)
+            forward.x, forward.P = before_x, before_P
+            forward.predict(change)
+            gain = np.linalg.solve(forward.P, forward.advance(before_P, change)).T
+            x = before_x + gain @ (x - forward.x)
+            P = _symmetric(before_P + gain @ (P - forward.P) @ gain.T)
+            estimates.append(estimate_headings(problem, x, P, care))
+            change = change_before
+        headings = HeadingEstimate(*(np.array(each[::-1]) for each in zip(*estimates, strict=True)))
+        return np.array(self._times), headings, forward.clasps

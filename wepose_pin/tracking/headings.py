@@ -19,8 +19,8 @@ from ..body.mounts import compute_start_heading_var
 from ..body.start_pose import StartFrames
 from ..observations.hinges import linearize_hinge
 from ..recording import Intervals, OrientationSensor
-from .heading_filter import HeadingFilter, estimate_headings, find_care, mask_intervals, smooth
-from .heading_problem import FilterHeadings, HeadingProblem, Knot
+from .heading_filter import HeadingFilter, HeadingSmoother, estimate_headings, find_care, mask_intervals
+from .heading_problem import FilterHeadings, HeadingProblem
 from .knots import E_Z, KnotReader, Samples, read_filter_headings, stack_samples
 from .segment_orientations import SegmentOrientations
 
@@ -139,7 +139,8 @@ class HeadingCorrector:
         self._problem, self._start_end = problem, orientations.start[1]
         self._measured = find_measured_headings(orientations)
         self._reader = KnotReader(orientations, problem)
-        self._knots: list[Knot] = []
+        self._smoother: HeadingSmoother | None = None  # from the first knot on
+        self._samples: list[tuple[np.ndarray, np.ndarray]] = []  # time and orientations of each knot
 
     def add_observations(self, orientations: SegmentOrientations) -> None:
         """Add the observations of a chunk, in the first pass."""
@@ -148,32 +149,36 @@ class HeadingCorrector:
         if begin == len(chunk):
             return
         samples = stack_samples(orientations, names)
-        if not (self._knots or self._reader.count):
+        if self._smoother is None:
             start = read_filter_headings(orientations.orientation, names, begin)
             self._problem = replace(self._problem, start=start)
+            self._smoother = HeadingSmoother(self._problem)
         while begin < len(chunk):
             end = min(len(chunk), begin + self._reader.remaining)
             self._reader.push(*(values[begin:end] for values in samples))
             self._last_filters = read_filter_headings(orientations.orientation, names, end - 1)
             if not self._reader.remaining:
-                self._knots.append(self._reader.form(self._reader.take(), self._last_filters))
+                self._close_knot(self._smoother)
             begin = end
+
+    def _close_knot(self, smoother: HeadingSmoother) -> None:
+        knot = self._reader.form(self._reader.take(), self._last_filters)
+        smoother.add(knot)
+        self._samples.append((knot.time, knot.quat_WL))
 
     def solve(self) -> HeadingCorrection | None:
         """Estimate the heading errors; return None where nothing observes them."""
-        problem = self._problem
-        if self._reader.count:
-            self._knots.append(self._reader.form(self._reader.take(), self._last_filters))
-        if not self._knots:
+        problem, smoother = self._problem, self._smoother
+        if smoother is None:
             return None
-        smoothed, clasps = smooth(problem, self._knots)
+        if self._reader.count:
+            self._close_knot(smoother)
+        knot_times, smoothed, clasps = smoother.smooth()
         if self._measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
             smoothed.errors[:, self._measured] = 0.0
         # The errors are constant before the first and after the last.
-        knot_times = np.array([0.5 * (knot.time[0] + knot.end) for knot in self._knots])
-        time = np.concatenate([knot.time for knot in self._knots])
-        quat_WL = np.concatenate([knot.quat_WL for knot in self._knots])
-        self._knots = []
+        time, quat_WL = (np.concatenate(values) for values in zip(*self._samples, strict=True))
+        self._samples, self._smoother = [], None
         gap, hinges = measure_residuals(problem, time, quat_WL, np.zeros(quat_WL.shape[:2]))
         corrections = interpolate(time, knot_times, smoothed.errors)
         gap_after, hinges_after = measure_residuals(problem, time, quat_WL, corrections)
