@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import compute_pose
+from wepose_pin.body.start_pose import StartPose
 from wepose_pin.observations.closures import PointPair
 from wepose_pin.observations.hinges import HingePlane, linearize_hinge
 from wepose_pin.observations.joint_accelerations import find_joint_pairs, linearize_joint
-from wepose_pin.observations.paths import StartPose
 
 
 def differentiate(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> np.ndarray:

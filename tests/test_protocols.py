@@ -11,6 +11,7 @@ from bodies import LENGTHS, TABLE
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.body import BodyModel, load_model
+from wepose_pin.body.start_pose import StartPose
 from wepose_pin.calibration import PROTOCOLS, Calibration, calibrate, load_protocol
 from wepose_pin.calibration.conditions import Loop, find_segments, resolve_conditions
 from wepose_pin.calibration.equations import Layout
@@ -19,7 +20,7 @@ from wepose_pin.calibration.protocols import Closure, Direction
 from wepose_pin.commands import main
 from wepose_pin.errors import BadOption, BadPhase, BadSession, MissingFile
 from wepose_pin.observations.hinges import find_hinges
-from wepose_pin.observations.paths import StartPose, find_girdles
+from wepose_pin.observations.paths import find_girdles
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import (

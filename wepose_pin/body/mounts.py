@@ -3,7 +3,7 @@
 A filter observes the vertical and not the heading: its world V differs from W by a rotation about the vertical,
 R_WV = Rz(ψ). Alignment works with the frame L' of each segment that equals W in the start pose: the mount in it is
 R_L'S = R_WS(start) = Rz(ψ) R_VS(start). Gravity gives its tilt; ψ is the angle that makes it nearest to the stated or
-calibrated mount. A calibrated mount is fused with the start pose, whose standard deviation is `StartFrames.std`. A
+calibrated mount. A calibrated mount is fused with the start pose, whose standard deviation is `StartPose.std`. A
 person's segment frames L equal W in the N-pose; in another start pose R_LS = R_WL(start)ᵀ R_L'S.
 """
 
@@ -18,7 +18,7 @@ from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadSession
 from ..recording import OrientationSensor, Recording, format_span
-from .start_pose import N_POSE, StartFrames
+from .start_pose import N_POSE, StartPose
 from .subject import Subject
 from .table import BodyTable
 
@@ -37,7 +37,7 @@ PALM_SLIP_STD = 0.005  # [m] by which joined palms slip
 
 
 def collect_nominal_mounts(
-    recording: Recording, subject: Subject | None, start_frames: StartFrames
+    recording: Recording, subject: Subject | None, start_pose: StartPose
 ) -> dict[str, np.ndarray]:
     """Return segment → nominal mount `quat_LS` (4,) xyzw of every sensor.
 
@@ -46,7 +46,7 @@ def collect_nominal_mounts(
     BadSession
         Neither the subject nor the session has the mount of a sensor.
     """
-    nominal = {segment: find_nominal_mount(recording, segment, subject, start_frames) for segment in recording.sensors}
+    nominal = {segment: find_nominal_mount(recording, segment, subject, start_pose) for segment in recording.sensors}
     mounts = {segment: mount for segment, mount in nominal.items() if mount is not None}
     missing = [segment for segment in nominal if segment not in mounts]
     if missing:
@@ -57,7 +57,7 @@ def collect_nominal_mounts(
             problem += " (remounted = true: the subject's are of another mounting)"
         elif subject is not None and subject.mounts:
             problem += f"; the subject '{subject.name}' has none for it"
-        raise BadSession(f"{recording.where()}: {problem}: {suggest_mounts(missing, start_frames.table)}")
+        raise BadSession(f"{recording.where()}: {problem}: {suggest_mounts(missing, start_pose.table)}")
     return mounts
 
 
@@ -82,7 +82,7 @@ def align_sensors(
     subject: Subject | None,
     R_VS_start: Mapping[str, Rotation],
     start: tuple[float, float],
-    start_frames: StartFrames = N_POSE,
+    start_pose: StartPose = N_POSE,
 ) -> tuple[dict[str, Rotation], dict[str, float], list[Diagnostic]]:
     """Compute mounts R_LS and heading offsets ψ [rad] of all sensors, with the diagnostics of the mounts.
 
@@ -91,7 +91,7 @@ def align_sensors(
     recording : the one that was filtered, or its chunk that contains the start pose
     subject : its mounts are used in place of those that the session states; None: the stated ones are used
     R_VS_start, start : mean orientations of the sensors in the start pose, and its interval [s]
-    start_frames : `find_start_frames` of the body; left out: the N-pose
+    start_pose : `find_start_pose` of the body; left out: the N-pose
 
     Raises
     ------
@@ -100,20 +100,20 @@ def align_sensors(
     """
     diagnostics: list[Diagnostic] = []
     facts: dict[str, float | str] = {"variant": "guessed"} if _start_is_guessed(recording) else {}
-    nominal_mounts = collect_nominal_mounts(recording, subject, start_frames)
+    nominal_mounts = collect_nominal_mounts(recording, subject, start_pose)
     mounts: dict[str, Rotation] = {}
     heading_offsets: dict[str, float] = {}
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
         # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
         first = aligned[0]
-        R_WL_start = start_frames.to_world(first, Rotation.identity())
+        R_WL_start = start_pose.to_world(first, Rotation.identity())
         aligned_heading_offset = compute_heading_offset(R_VS_start[first], R_WL_start)
     for segment, R_VS in R_VS_start.items():
         if recording.sensors[segment].aligned:
             mounts[segment], heading_offsets[segment] = Rotation.identity(), aligned_heading_offset
             continue
-        R_WS_nominal = start_frames.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
+        R_WS_nominal = start_pose.to_world(segment, Rotation.from_quat(nominal_mounts[segment]))
         psi = compute_heading_offset(R_VS, R_WS_nominal)
         R_WS_start = Rotation.from_rotvec([0.0, 0.0, psi]) * R_VS
         tilt_error_deg = np.degrees((R_WS_start * R_WS_nominal.inv()).magnitude())
@@ -122,26 +122,26 @@ def align_sensors(
         if tilt_error_deg > MOUNT_WARNING_DEG:
             value, limit = float(np.deg2rad(tilt_error_deg)), float(np.deg2rad(MOUNT_WARNING_DEG))
             diagnostics.append(Diagnostic("mount-contradicts-gravity", WARNING, segment, value, limit, facts))
-        mount_cov = find_start_mount_covariance(recording, segment, subject, start_frames)
+        mount_cov = find_start_mount_covariance(recording, segment, subject, start_pose)
         if mount_cov is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
             # the mount's heading changes by correlation alone.
             misfit = (R_WS_start * R_WS_nominal.inv()).as_rotvec()[:2]
-            misfit_cov = mount_cov[:2, :2] + np.diag(start_frames.std(segment)[:2] ** 2)
+            misfit_cov = mount_cov[:2, :2] + np.diag(start_pose.std(segment)[:2] ** 2)
             R_WS_start = Rotation.from_rotvec(mount_cov[:, :2] @ np.linalg.solve(misfit_cov, misfit)) * R_WS_nominal
             psi = compute_heading_offset(R_VS, R_WS_start)
             calibrated_offset = subject.start_pose_offset.get(segment) if subject is not None else None
             if calibrated_offset is not None:
                 # The calibrated mount has the same error as the tilt of its start pose; only repeatability is left.
                 misfit = misfit - calibrated_offset.tilt
-                misfit_cov = np.diag(start_frames.repeat_std(segment)[:2] ** 2)
+                misfit_cov = np.diag(start_pose.repeat_std(segment)[:2] ** 2)
             squared_stds = float(misfit @ np.linalg.solve(misfit_cov, misfit))
             if squared_stds > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
                 limit = value * MOUNT_MOVED_STDS / squared_stds**0.5  # [rad] in the direction of the misfit
                 stds = {"stds": MOUNT_MOVED_STDS}
                 diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, limit, facts | stds))
-        mounts[segment], heading_offsets[segment] = start_frames.to_segment(segment, R_WS_start), psi
+        mounts[segment], heading_offsets[segment] = start_pose.to_segment(segment, R_WS_start), psi
     return mounts, heading_offsets, diagnostics
 
 
@@ -174,7 +174,7 @@ def compute_heading_offset(R_VS: Rotation, R_WS: Rotation) -> float:
 
 
 def find_nominal_mount(
-    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames = N_POSE
+    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose = N_POSE
 ) -> np.ndarray | None:
     """Find the mount `quat_LS` (4,) xyzw: the calibrated one, else the stated one; None: unknown.
 
@@ -187,13 +187,13 @@ def find_nominal_mount(
     sensor = recording.sensors[segment]
     if stated is None and isinstance(sensor, OrientationSensor) and (sensor.aligned or not recording.remounted):
         return np.array([0.0, 0.0, 0.0, 1.0])
-    if stated is None or segment not in start_frames.R_WL:
+    if stated is None or segment not in start_pose.R_WK:
         return stated
-    return start_frames.to_segment(segment, Rotation.from_quat(stated)).as_quat()
+    return start_pose.to_segment(segment, Rotation.from_quat(stated)).as_quat()
 
 
 def compute_start_heading_var(
-    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames
+    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose
 ) -> float:
     """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset.
 
@@ -201,10 +201,10 @@ def compute_start_heading_var(
     poses of one person: the mount contains the heading error of the calibration's start pose. With a stated mount it is
     the variance of people off the stated pose.
     """
-    if segment == start_frames.table.reference:
+    if segment == start_pose.table.reference:
         return 0.0
     calibrated = find_mount_covariance(recording, segment, subject) is not None
-    std = start_frames.repeat_std(segment) if calibrated else start_frames.std(segment)
+    std = start_pose.repeat_std(segment) if calibrated else start_pose.std(segment)
     return float(std[2] ** 2)
 
 
@@ -214,11 +214,11 @@ def find_mount_covariance(recording: Recording, segment: str, subject: Subject |
 
 
 def find_start_mount_covariance(
-    recording: Recording, segment: str, subject: Subject | None, start_frames: StartFrames
+    recording: Recording, segment: str, subject: Subject | None, start_pose: StartPose
 ) -> np.ndarray | None:
     """Find the covariance (3, 3) [rad²] of a calibrated mount's error in L'; None: as `find_mount_covariance`."""
     cov = find_mount_covariance(recording, segment, subject)
-    if cov is None or segment not in start_frames.R_WL:
+    if cov is None or segment not in start_pose.R_WK:
         return cov
-    R = start_frames.R_WL[segment].as_matrix()
+    R = start_pose.R_WK[segment]
     return R @ cov @ R.T

@@ -1,8 +1,8 @@
-"""The configuration of a body in its start pose, and its segment frames there."""
+"""The configuration of a body in its start pose, and its links there."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadSession, one_of
 from ..recording import CONFIGURATION, Recording
 from .body import BodyModel
-from .table import NEUTRAL_POSE, BodyTable
+from .table import NEUTRAL_POSE, BodyTable, Vector
 from .table_file import load_table
 from .tree import check_joint_values, joint_axis, joint_placement, parse_tree
 
@@ -70,17 +70,17 @@ def _rotate_triple(joints: list[Any], values: Mapping[str, float]) -> np.ndarray
 
 
 @dataclass(frozen=True)
-class StartFrames:
-    """The segment frames in the start pose.
+class StartPose:
+    """The links of a body in the start pose, where the frame L' of each equals W.
 
     Parameters
     ----------
-    R_WL : segment → its orientation; a segment that is not named has the frame of W
+    R_WK : link → its orientation (3, 3); a link that is not named has the frame of W
     table : of the body
     q : (nq,) its configuration; None: not known
     """
 
-    R_WL: Mapping[str, Rotation] = field(default_factory=dict)
+    R_WK: Mapping[str, np.ndarray] = field(default_factory=dict)
     table: BodyTable = field(default_factory=load_table)
     q: np.ndarray | None = None
 
@@ -92,30 +92,36 @@ class StartFrames:
         """Return (3,) [rad], one standard deviation about each axis between two start poses of one person."""
         return np.array(self.table.segments[segment].repeat_std)
 
+    def rotation(self, link: str) -> np.ndarray:
+        """Return the orientation (3, 3) of a link."""
+        return self.R_WK.get(link, np.eye(3))
+
+    def turn(self, link: str, vector: Collection[float]) -> Vector:
+        """Return a vector (3,) of a link's frame, in L'."""
+        x, y, z = self.R_WK[link] @ np.array(vector) if link in self.R_WK else vector
+        return float(x), float(y), float(z)
+
     def to_world(self, segment: str, R_LS: Rotation) -> Rotation:
         """Return R_L'S of a mount R_LS: the sensor's orientation in W in the start pose."""
-        return self.R_WL[segment] * R_LS if segment in self.R_WL else R_LS
+        return Rotation.from_matrix(self.R_WK[segment]) * R_LS if segment in self.R_WK else R_LS
 
     def to_segment(self, segment: str, R_WS: Rotation) -> Rotation:
         """Return the mount R_LS of a sensor whose orientation in the start pose is R_WS."""
-        return self.R_WL[segment].inv() * R_WS if segment in self.R_WL else R_WS
+        return Rotation.from_matrix(self.R_WK[segment]).inv() * R_WS if segment in self.R_WK else R_WS
 
 
-N_POSE = StartFrames()
+N_POSE = StartPose()
 
 
-def find_start_frames(body: BodyModel, recording: Recording) -> StartFrames:
-    """Find the segment frames of a body in the start pose of its recording.
+def find_start_pose(body: BodyModel, recording: Recording) -> StartPose:
+    """Find the links of a body in the start pose of its recording.
 
     Raises
     ------
     BadSession
         A start pose or a joint that the body does not have.
     """
-    table = body.table
     q = compute_start_configuration(body, recording.start_pose, recording.joints, recording.where())
-    R_WL: dict[str, Rotation] = {}
-    if table.is_mechanism or recording.start_pose != NEUTRAL_POSE:
-        R_WK = body.orient_links(q)
-        R_WL = {segment: Rotation.from_matrix(R_WK[segment]) for segment in recording.sensors}
-    return StartFrames(R_WL, table, q)
+    # A person's segment frames equal W in the N-pose, whatever the pose of a body whose joints are at zero.
+    is_neutral = recording.start_pose == NEUTRAL_POSE and not body.table.is_mechanism
+    return StartPose({} if is_neutral else body.orient_links(q), body.table, q)

@@ -9,10 +9,11 @@ import numpy as np
 
 from ..body import BodyModel, BodyTable
 from ..body.reaches import UNIVERSE
+from ..body.start_pose import StartPose
 from ..body.table_file import check_segments
 from ..errors import BadOption, BadSession
 from ..observations.directions import Level, Pointing
-from ..observations.paths import ZERO_LENGTH, PointPath, SegmentVector, StartPose, find_path
+from ..observations.paths import ZERO_LENGTH, PointPath, SegmentVector, find_path
 from .protocols import Axis, Closure, Direction, Protocol
 
 

@@ -32,11 +32,11 @@ from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel
 from ..body.mounts import PALM_SLIP_STD, align_sensors
+from ..body.start_pose import StartPose
 from ..body.subject import Subject
 from ..body.table import NEUTRAL_POSE
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, NoSolution, one_of
-from ..observations.paths import StartPose
 from .conditions import Constraint, Loop, resolve_conditions
 from .least_squares import MIN_LENGTH, QUIET_QP, Observations
 from .observability import diagnose_lengths

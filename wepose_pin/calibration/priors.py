@@ -129,7 +129,7 @@ def _mount_prior(problem: CalibrationProblem, segment: str, heading: float | Non
     The person stands nearly in the start pose. A mount R_LS = exp(m) R_0 has a small error m = μ − ε + ψ e_z, with μ
     the misfit of the start pose at the heading nearest to R_0.
     """
-    R_start = problem.start_pose.R_WK[segment]
+    R_start = problem.start_pose.rotation(segment)
     start_cov = R_start @ np.diag(np.square(problem.model.table.segments[segment].start_std)) @ R_start.T
     information = np.zeros((3, 3))
     information[:2, :2] = np.linalg.inv(start_cov[:2, :2])
@@ -156,7 +156,7 @@ def _mount_information(problem: CalibrationProblem, segment: str) -> np.ndarray:
     recording, prior = problem.recording, problem.prior
     covariance = find_mount_covariance(recording, segment, prior)
     if covariance is not None:
-        R_start = problem.start_pose.R_WK[segment]
+        R_start = problem.start_pose.rotation(segment)
         return np.linalg.inv(R_start @ covariance @ R_start.T + 1e-12 * np.eye(3))
     calibrated = segment in prior.mounts and not recording.remounted
     if calibrated or segment not in recording.imus:

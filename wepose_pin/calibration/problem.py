@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel, Segment, list_breadths
 from ..body.mounts import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
-from ..body.start_pose import compute_start_configuration
+from ..body.start_pose import StartPose, find_start_pose
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, BadSession
@@ -20,7 +20,7 @@ from ..filters.sensors import FilteredRecording
 from ..observations.directions import Level, Pointing
 from ..observations.hinges import find_hinges
 from ..observations.joint_accelerations import find_neighbours
-from ..observations.paths import StartPose, find_girdles
+from ..observations.paths import find_girdles
 from ..recording import Intervals, Recording, format_span
 from .conditions import Constraint, Loop, Moving, group_lengths, resolve_conditions
 from .equations import Layout
@@ -69,10 +69,8 @@ class CalibrationProblem:
 
     @cached_property
     def start_pose(self) -> StartPose:
-        """The orientation of the links in the start pose."""
-        recording, model = self.recording, self.model
-        q = compute_start_configuration(model, recording.start_pose, recording.joints, recording.where())
-        return StartPose(model.orient_links(q))
+        """The links of the body in the start pose."""
+        return find_start_pose(self.model, self.recording)
 
     @cached_property
     def conditions(self) -> tuple[Constraint, ...]:
@@ -171,7 +169,7 @@ class CalibrationProblem:
 
     def start_rotation(self, segment: str) -> Rotation:
         """Return R_WL of a segment in the start pose; L is the segment's frame."""
-        return Rotation.from_matrix(self.start_pose.R_WK[segment])
+        return Rotation.from_matrix(self.start_pose.rotation(segment))
 
     def stated_headings(self, segments: Collection[str]) -> dict[str, float]:
         """Return segment → ψ [rad] by its mount, of those of these segments whose mount is known."""

@@ -10,10 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.girdle import PARAMETERS
+from ..body.start_pose import StartPose
 from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject, mount_rows
 from ..errors import NoSolution
 from ..observations.hinges import find_hinges
-from ..observations.paths import StartPose
 from .ambiguity import OtherMinimum, diagnose_ambiguity, find_other_minima, widen_covariance
 from .conditions import is_scale_observed
 from .equations import HINGE_STD, Layout
@@ -206,5 +206,5 @@ def _project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose
         own = np.zeros((3, layout.size))
         own[[0, 1], layout.tilt[i]] = -1.0
         own[2, layout.heading[i]] = 1.0
-        T[K + 3 * i : K + 3 * i + 3] = start.R_WK[name].T @ own
+        T[K + 3 * i : K + 3 * i + 3] = start.rotation(name).T @ own
     return (*layout.lengths, *rows, *of_girdles), T @ covariance @ T.T

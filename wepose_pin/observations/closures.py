@@ -11,7 +11,8 @@ import numpy as np
 from ..body import BodyModel
 from ..body.girdle import PARAMETERS
 from ..body.reaches import UNIVERSE
-from .paths import BodySymbols, StartPose, express_covariance, express_path, find_girdles, find_path
+from ..body.start_pose import StartPose
+from .paths import BodySymbols, express_covariance, express_path, find_girdles, find_path
 from .symbols import about_z, evaluate, product, rotate, rotate_back
 
 
@@ -62,7 +63,7 @@ class PointPair:
         off_law = ca.SX.zeros(3, 3)
         for name, _ in between.girdles:
             girdle = table.girdles[name]
-            for axis, std in zip(start.R_WK[girdle.on].T, girdle.residual_std, strict=True):
+            for axis, std in zip(start.rotation(girdle.on).T, girdle.residual_std, strict=True):
                 off = std * rotate(body.quat_WL[girdle.on], ca.DM(axis))
                 off_law += off @ off.T
         by_attitude = express_covariance(vectors, 0.0, dict.fromkeys(vectors, 1.0))

@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 
 from ..body import BodyModel
+from ..body.start_pose import StartPose
 from ..body.table import Vector
-from .paths import StartPose
 from .symbols import about_z, evaluate, product, rotate, rotate_back
 
 LEAST_SQUARED_BEND_PART = 0.1  # of e in the plane across the axis, below which its angle has no larger slope

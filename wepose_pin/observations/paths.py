@@ -8,7 +8,6 @@ from one to the other is zero; its covariance weighs what is left of it.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import casadi as ca
@@ -18,24 +17,12 @@ from ..body import BodyModel, Girdle
 from ..body.girdle import displace, find_girdle_scale
 from ..body.links import find_carrier
 from ..body.reaches import UNIVERSE
+from ..body.start_pose import StartPose
 from ..body.table import Vector
 from ..errors import BadSession
 from .symbols import rotate, rotate_back
 
 ZERO_LENGTH = 1e-12  # [m] below which a vector is zero; its derivatives by the lengths alike
-
-
-@dataclass(frozen=True)
-class StartPose:
-    """The orientation of the links of a body in the start pose, link → R_WK (3, 3)."""
-
-    R_WK: Mapping[str, np.ndarray]
-
-    def turn(self, link: str, vector: Collection[float]) -> Vector:
-        """Return a vector (3,) of a link's frame, in L'."""
-        R = self.R_WK.get(link)
-        x, y, z = vector if R is None else R @ np.array(vector)
-        return float(x), float(y), float(z)
 
 
 class SegmentVector(NamedTuple):
@@ -137,7 +124,7 @@ def find_path(
         carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
         if carrier is None:
             raise BadSession(_describe_missing_sensor(model, link, [point for point, _ in points]))
-        R = start.R_WK.get(link, np.eye(3))
+        R = start.rotation(link)
         B, c = sums.get(carrier, (np.zeros((3, lengths)), np.zeros(3)))
         sums[carrier] = B + R @ by_length, c + R @ constant
     vectors = []
@@ -169,6 +156,6 @@ def find_girdles(model: BodyModel, start: StartPose, sensors: Collection[str]) -
     for name, girdle in model.table.girdles.items():
         if {girdle.on, girdle.moves} <= set(sensors):
             along = start.turn(girdle.moves, model.table.segments[girdle.moves].along)
-            R_on = tuple(float(v) for v in start.R_WK[girdle.on].ravel())
+            R_on = tuple(float(v) for v in start.rotation(girdle.on).ravel())
             terms.append(GirdleTerm(name, girdle, along, R_on, find_girdle_scale(girdle, model.lengths)))
     return tuple(terms)

@@ -16,14 +16,13 @@ import numpy as np
 
 from ..body import BodyModel
 from ..body.mounts import compute_start_heading_var, find_mount_covariance
-from ..body.start_pose import StartFrames
+from ..body.start_pose import StartPose
 from ..body.subject import Subject
 from ..calibration import PROTOCOLS, load_protocol
 from ..errors import BadSession
 from ..observations.closures import PointPair
 from ..observations.hinges import HingePlane, find_hinges
 from ..observations.joint_accelerations import LEAST_RATE_HZ, JointPair, find_joint_pairs
-from ..observations.paths import StartPose
 from ..recording import Intervals, Recording
 from .segment_orientations import SegmentOrientations
 
@@ -252,7 +251,7 @@ def find_start_variances(recording: Recording, segment: str, subject: Subject, m
     mount_var = LEAST_MOUNT_VAR if mount_cov is None else max(float(mount_cov[2, 2]), LEAST_MOUNT_VAR)
     if segment == table.reference:
         return float(REFERENCE_START_STD**2), mount_var
-    return compute_start_heading_var(recording, segment, subject, StartFrames(table=table)), mount_var
+    return compute_start_heading_var(recording, segment, subject, StartPose(table=table)), mount_var
 
 
 def _find_hinges(

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..body.mounts import compute_start_heading_var
-from ..body.start_pose import StartFrames
+from ..body.start_pose import StartPose
 from ..observations.hinges import linearize_hinge
 from ..recording import Intervals, OrientationSensor
 from .heading_filter import HeadingFilter, HeadingSmoother, estimate_headings, find_care, mask_intervals
@@ -67,7 +67,7 @@ class HeadingCorrection:
     def correct(self, orientations: SegmentOrientations) -> SegmentOrientations:
         """Return a chunk's orientations with corrected headings, of a correction that is interpolated between knots."""
         chunk, subject = orientations.recording, self.problem.subject
-        start_frames = StartFrames(table=self.problem.model.table)
+        start_pose = StartPose(table=self.problem.model.table)
         corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
         errors = interpolate(chunk.time, self.time, self.errors)
         for i, name in enumerate(self.segments):
@@ -80,7 +80,7 @@ class HeadingCorrection:
                     covariance[name],
                     (filtered.quat_VS, filtered.attitude_cov),
                     orientations.heading_offset[name],
-                    compute_start_heading_var(chunk, name, subject, start_frames),
+                    compute_start_heading_var(chunk, name, subject, start_pose),
                     np.stack([known, np.full(len(delta), np.inf), delta**2], axis=1),
                     chunk.sensors[name].gap,
                 )

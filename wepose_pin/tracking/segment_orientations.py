@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..body import BodyTable
 from ..body.mounts import MEASURED_ORIENTATION_STD, compute_start_heading_var, find_start_mount_covariance
-from ..body.start_pose import StartFrames
+from ..body.start_pose import StartPose
 from ..body.subject import Subject
 from ..diagnostics import Diagnostic
 from ..errors import BadOption
@@ -123,7 +123,7 @@ def compute_segment_covariance(
     quat_WS: np.ndarray,
     R_LS: Rotation,
     attitude_cov: np.ndarray,
-    start_frames: StartFrames,
+    start_pose: StartPose,
 ) -> np.ndarray:
     """Compute a segment's covariance (n, 3, 3) [rad²] in W, error on the left: `SegmentOrientations.covariance_W`.
 
@@ -136,9 +136,9 @@ def compute_segment_covariance(
     cov_W += ACCEL_BIAS_STD**2 * np.diag([1.0, 1.0, 0.0])
     # A mount's error ε in L' becomes the error R_WL' ε in W. The heading offset ψ, computed with the same mount, takes
     # off the vertical component ε_z, so that in the start pose the heading has no error but that of the pose itself.
-    R_WL = R @ start_frames.to_world(segment, R_LS).inv().as_matrix()
-    mount_cov = find_start_mount_covariance(recording, segment, subject, start_frames)
-    start_var = start_frames.std(segment) ** 2
+    R_WL = R @ start_pose.to_world(segment, R_LS).inv().as_matrix()
+    mount_cov = find_start_mount_covariance(recording, segment, subject, start_pose)
+    start_var = start_pose.std(segment) ** 2
     vertical = np.array([0.0, 0.0, 1.0])
     if mount_cov is not None and subject is not None:  # whose mount it is
         error_jacobian = R_WL - np.outer(vertical, vertical)
@@ -147,14 +147,14 @@ def compute_segment_covariance(
             # offset of the calibration's own start pose: then the start pose tells nothing new.
             tilt = mount_cov[:2]
             mount_cov = mount_cov - tilt.T @ np.linalg.solve(tilt[:, :2] + np.diag(start_var[:2]), tilt)
-        if segment != start_frames.table.reference:
+        if segment != start_pose.table.reference:
             # By how much the person turned the segment about the vertical in the calibration's start pose is not known.
             cov_W += start_var[2] * np.einsum("na,nb->nab", R_WL[:, :, 2], R_WL[:, :, 2])
     else:
         # The tilt of a stated mount is gravity's in the start pose, so that it has the error of the start pose.
         error_jacobian, mount_cov = R_WL, np.diag([start_var[0], start_var[1], 0.0])
     cov_W += error_jacobian @ mount_cov @ error_jacobian.swapaxes(1, 2)
-    cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_frames)
+    cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_pose)
     return cov_W
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from .. import rotations
 from ..body.mounts import align_sensors, collect_nominal_mounts, compute_heading_offset, compute_start_heading_var
-from ..body.start_pose import N_POSE, StartFrames
+from ..body.start_pose import N_POSE, StartPose
 from ..body.subject import Subject
 from ..compilation import kernel
 from ..filters import AboutVertical, Orientation
@@ -51,7 +51,7 @@ class SegmentEstimator:
     subject : its calibrated mounts are used in place of those that the session states; None: the stated ones
     options : None: the default ones. While measured orientations are lost, the last one stands where `causal`; else
         they are interpolated, as the reader does
-    start_frames : of the body; left out: the N-pose
+    start_pose : of the body; left out: the N-pose
 
     Attributes
     ----------
@@ -66,9 +66,9 @@ class SegmentEstimator:
         self,
         subject: Subject | None = None,
         options: TrackOptions | None = None,
-        start_frames: StartFrames = N_POSE,
+        start_pose: StartPose = N_POSE,
     ) -> None:
-        self._subject, self._options, self._start_frames = subject, options or TrackOptions(), start_frames
+        self._subject, self._options, self._start_pose = subject, options or TrackOptions(), start_pose
         self.names: tuple[str, ...] = ()
         self.headings: CausalHeadings | None = None
 
@@ -97,18 +97,16 @@ class SegmentEstimator:
 
     def _begin(self, first: Recording) -> SegmentOrientations:
         """Filter and align the first chunk."""
-        collect_nominal_mounts(first, self._subject, self._start_frames)  # an error before anything is filtered
+        collect_nominal_mounts(first, self._subject, self._start_pose)  # an error before anything is filtered
         self._filters = filters = SensorFilters(
             first,
             method=self._options.method,
             static_test=self._options.static_test,
-            sways=not self._start_frames.table.is_mechanism,
+            sways=not self._start_pose.table.is_mechanism,
         )
         orientation = filters.push(first)
         R_VS_start = find_start_orientations(first, orientation, filters.start)
-        mounts, headings, diagnostics = align_sensors(
-            first, self._subject, R_VS_start, filters.start, self._start_frames
-        )
+        mounts, headings, diagnostics = align_sensors(first, self._subject, R_VS_start, filters.start, self._start_pose)
         self.diagnostics = (*filters.diagnostics, *diagnostics)
         self.names, self.rate_hz, self._first = tuple(first.sensors), first.rate_hz, first.cut(slice(0, 1))
         self._measured = np.array([isinstance(each, OrientationSensor) for each in first.sensors.values()], dtype=bool)
@@ -209,7 +207,7 @@ class SegmentEstimator:
                 lost = count_lost_samples(sensor, self._lost[i])
                 covs[name], self._lost[i] = compute_measured_covariance(lost / self.rate_hz), lost[-1]
         by_name = {name: quat_WL[:, i] for i, name in enumerate(self.names)}
-        soft = compute_soft_tissue_covariances(self._start_frames.table, by_name) if covs else {}
+        soft = compute_soft_tissue_covariances(self._start_pose.table, by_name) if covs else {}
         return SegmentOrientations(
             recording=chunk,
             options=self._options,
@@ -277,7 +275,7 @@ class SegmentEstimator:
         mean /= np.linalg.norm(mean, axis=1)[:, None]
         offset = np.zeros(len(self.names))
         for i in range(len(self.names)):
-            R_WS_start = self._start_frames.to_world(self.names[i], Rotation.from_quat(self._quat_LS[i]))
+            R_WS_start = self._start_pose.to_world(self.names[i], Rotation.from_quat(self._quat_LS[i]))
             offset[i] = compute_heading_offset(Rotation.from_quat(mean[i]), R_WS_start)
         self.heading_offset = offset
         if self.headings is not None:
@@ -328,7 +326,7 @@ class SegmentEstimator:
             newest = self._recent[self._oldest - 1].copy()
             variance = np.array(self._variance)
             soft = compute_soft_tissue_covariances(
-                self._start_frames.table, {name: self.quat_WL[i : i + 1] for i, name in enumerate(self.names)}
+                self._start_pose.table, {name: self.quat_WL[i : i + 1] for i, name in enumerate(self.names)}
             )
             yield None
             for i, name in enumerate(self.names):
@@ -349,17 +347,17 @@ class SegmentEstimator:
         quat_WS = rotations.multiply(_quat_about_z(self.heading_offset[i : i + 1]), quat_VS)
         R_LS = Rotation.from_quat(self._quat_LS[i])
         cov = compute_segment_covariance(
-            self._first, self.names[i], self._subject, quat_WS, R_LS, attitude_cov, self._start_frames
+            self._first, self.names[i], self._subject, quat_WS, R_LS, attitude_cov, self._start_pose
         )
         if self.headings is not None:
-            start_var = compute_start_heading_var(self._first, self.names[i], self._subject, self._start_frames)
+            start_var = compute_start_heading_var(self._first, self.names[i], self._subject, self._start_pose)
             cov = correct_covariance(cov, (quat_VS, attitude_cov), self.heading_offset[i], start_var, variance)
         if self._var_at_reset is not None and np.isfinite(self._var_at_reset[i]):
             var = compute_heading_variance(quat_VS, attitude_cov)
             grown = np.maximum(0.0, var - self._var_at_reset[i])
             # The mount's part of the heading stays: the reset has set that of the start pose alone.
             of_mount = np.maximum(cov[:, 2, 2] - var, 0.0)
-            start_var = self._start_frames.repeat_std(self.names[i])[2] ** 2
+            start_var = self._start_pose.repeat_std(self.names[i])[2] ** 2
             std_ratio = np.sqrt((of_mount + grown + start_var) / cov[:, 2, 2])
             cov[:, 2, :] *= std_ratio[:, None]
             cov[:, :, 2] *= std_ratio[:, None]

@@ -12,7 +12,7 @@ from ..body import BodyModel
 from ..body.body import load_sensed_model
 from ..body.covariance import compute_point_covariances
 from ..body.kinematics import KinematicsSolver
-from ..body.start_pose import StartFrames, find_start_frames
+from ..body.start_pose import StartPose, find_start_pose
 from ..body.subject import Subject, population_subject
 from ..body.table_file import check_segments
 from ..errors import BadOption, BadPhase, BadSession
@@ -63,7 +63,7 @@ class Tracker:
         self._subject, self._model = subject, model
         self._person: Subject  # as used; it and the next two from the first chunk on
         self._body: BodyModel
-        self._start_frames: StartFrames
+        self._start_pose: StartPose
         self._is_begun = False
         self._start = StartPoseCutter()  # of a causal tracker
         self._estimator: SegmentEstimator | None = None  # after the start pose
@@ -98,7 +98,7 @@ class Tracker:
         """
         if not self._is_begun:
             self._is_begun = True
-            self._person, self._body, self._start_frames = _fit_body(self._subject, self._model, chunk)
+            self._person, self._body, self._start_pose = _fit_body(self._subject, self._model, chunk)
         if chunk.resets and (self.options.open_loop or not self.options.causal):
             chunk = replace(chunk, resets=())
         return self._push_causal(chunk) if self.options.causal else self._push_offline(chunk)
@@ -155,7 +155,7 @@ class Tracker:
             yield self._solve_pose(segments if correction is None else correction.correct(segments), correction)
 
     def _make_estimator(self) -> SegmentEstimator:
-        return SegmentEstimator(self._subject, self.options, self._start_frames)
+        return SegmentEstimator(self._subject, self.options, self._start_pose)
 
     def _make_problem(self, first: SegmentOrientations) -> HeadingProblem | None:
         """Return what observes the headings of a recording whose first chunk this is; None: nothing."""
@@ -168,7 +168,7 @@ class Tracker:
         recording, person, body = segments.recording, self._person, self._body
         if self._kinematics is None:
             self._kinematics = KinematicsSolver(
-                body, segments.quat_WL, limits=self.options.limits, start=self._start_frames.q
+                body, segments.quat_WL, limits=self.options.limits, start=self._start_pose.q
             )
         pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
         point_cov: dict[str, np.ndarray] = {}
@@ -231,7 +231,7 @@ def track_chunks(
 
 def _fit_body(
     subject: Subject | None, model: BodyModel | str | Path | None, recording: Recording
-) -> tuple[Subject, BodyModel, StartFrames]:
+) -> tuple[Subject, BodyModel, StartPose]:
     """Return the person and the body of a recording with their lengths, and its segment frames in the start pose.
 
     The body is `model`, else the one that the recording names, else the upper body. Without a subject the lengths are
@@ -246,9 +246,9 @@ def _fit_body(
     chosen = model or recording.model or None
     body = chosen if isinstance(chosen, BodyModel) else load_sensed_model(chosen, recording.sensors, where)
     check_segments(body.table, recording.sensors, f"{where}: sensors.", BadSession)
-    start_frames = find_start_frames(body, recording)
+    start_pose = find_start_pose(body, recording)
     person = subject or population_subject(body=body)
     person.check_body(body.table)
     if subject is None and chosen is not None:  # a chosen model has its person's lengths
         person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
-    return person, person.shape(body), start_frames
+    return person, person.shape(body), start_pose
