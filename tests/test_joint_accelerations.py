@@ -15,7 +15,7 @@ from wepose_pin.observations.joint_accelerations import JointPair, linearize_joi
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
-from wepose_pin.tracking import TrackResult, summarize, track
+from wepose_pin.tracking import TrackResult, track
 from wepose_pin.tracking.heading_filter import HeadingFilter
 from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, Knot
 from wepose_pin.tracking.knots import JointAccelerationFilter
@@ -63,7 +63,6 @@ def test_exact_motion_fits_with_the_true_levers() -> None:
     near, far = (np.concatenate((lever, np.zeros(4))) for lever in levers)
     R_WS = np.stack([Rotation.from_quat(simulation.quat_WS[name]).as_matrix() for name in names], axis=1)
     accel_S = np.stack([simulation.accel_S[name] for name in names], axis=1)
-    n = len(simulation.time)
     whole = JointAccelerationFilter(2, simulation.rate_hz).push(R_WS, accel_S)[::12]
     for angle, least, most in ((0.0, 0.0, 0.02), (0.2, 0.05, 1.0)):
         residual = linearize_joint(whole[:, 0], whole[:, 1], angle, near, far)
@@ -77,10 +76,6 @@ def test_exact_motion_fits_with_the_true_levers() -> None:
     delay = np.concatenate((far[:6], [step / simulation.rate_hz]))
     known, unknown = (linearize_joint(B[:, 0], B[:, 1], 0.0, near, side).e for side in (delay, far))
     assert np.mean(known**2) < 0.1 * np.mean(unknown**2)
-    # Cut into pieces it is the same.
-    pieces = JointAccelerationFilter(2, simulation.rate_hz)
-    cut = [pieces.push(R_WS[at : at + 12], accel_S[at : at + 12])[:1] for at in range(0, n - n % 12, 12)]
-    np.testing.assert_allclose(np.concatenate(cut), whole[: len(cut)], atol=1e-9)
 
 
 def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_joint() -> None:
@@ -122,7 +117,6 @@ def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving
         errors = heading_errors(moving, tracked, 30.0)
         rms[open_loop] = {pair: float(np.sqrt(np.mean(error**2))) for pair, error in errors.items()}
     elbow = LIMB[1:]
-    print(rms)
     assert rms[True][elbow] > 5.0
     assert rms[False][elbow] < 2.0
     correction = tracked.correction
@@ -135,9 +129,6 @@ def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving
     for near, far in pairwise(LIMB):
         by_std = heading_errors(moving, tracked, 30.0)[near, far] / np.degrees(correction.relative_std(near, far, rows))
         assert np.sqrt(np.mean(by_std**2)) < 1.6
-    summary = summarize(tracked).content["heading_correction"]
-    assert summary["hinges"] == ["left_elbow", "right_elbow"]
-    assert len(summary["joint_accelerations"]) == 4
 
 
 @pytest.mark.parametrize("causal", [False, True])

@@ -111,7 +111,6 @@ def test_soft_tissue_of_the_torso_is_no_heading(seed: int, monkeypatch: pytest.M
         error = Rotation.from_quat(subject.mounts["torso"]) * Rotation.from_quat(simulation.quat_LS["torso"]).inv()
         off[coupled] = abs(float(np.degrees(error.as_rotvec()[2])))
         assert off[coupled] < 2.0 * np.degrees(subject.std("mounts.torso.z"))
-    print(off)
     assert off[False] > 5.0
     assert off[True] < 0.5 * off[False]
 
