@@ -17,7 +17,7 @@ from ..body.start_pose import StartPose
 from ..body.table import Vector
 from .symbols import about_z, evaluate, product, rotate, rotate_back
 
-LEAST_SQUARED_BEND_PART = 0.1  # of e in the plane across the axis, below which its angle has no larger slope
+LEAST_IN_PLANE = 0.1  # squared length of e's part in the plane, below which the slope of its angle grows no more
 
 
 class HingePlane(NamedTuple):
@@ -88,7 +88,7 @@ def _linearization(hinge: HingePlane) -> ca.Function:
     excess = ca.sign(off) * ca.fmax(ca.fabs(off) - half, 0.0)
     by_sine, by_cosine = (ca.jacobian(part, headings[0]) for part in (sine, cosine))
     squared = sine**2 + cosine**2
-    slope = (by_sine * cosine - by_cosine * sine) / ca.fmax(squared, LEAST_SQUARED_BEND_PART)
+    slope = (by_sine * cosine - by_cosine * sine) / ca.fmax(squared, LEAST_IN_PLANE)
     rows = [ca.densify(value) for value in (r, H, excess, slope)]
     return ca.Function("hinge", [on, moves, headings], rows, {"cse": True})
 
