@@ -414,6 +414,20 @@ def test_only_joints_with_both_segments_are_there() -> None:
         joint_angles(Pose(whole.time, {"left_forearm": whole.quat_WL["left_forearm"]}, {}))
 
 
+@pytest.mark.parametrize(("abducted_deg", "sequence"), [(10.0, "XZY"), (90.0, "YXY")])
+def test_the_sequence_that_is_chosen_is_determined_while_arms_hang(abducted_deg: float, sequence: str) -> None:
+    """Arms that hang, or are raised to the side, and swing by 5°."""
+    n = 200
+    swing = 5.0 * np.sin(np.linspace(0.0, 20.0, n))
+    arms = {}
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        angles_deg = np.column_stack([np.full(n, sign * (abducted_deg if abducted_deg > 45.0 else 1.0)), swing])
+        arms[f"{side}_upper_arm"] = Rotation.from_euler("XY", angles_deg, degrees=True).as_quat()
+    angles = joint_angles(pose_with({"torso": np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), **arms}), "auto")
+    assert {angles[name].sequence for name in ("left_shoulder", "right_shoulder")} == {sequence}
+    assert not angles["left_shoulder"].near_lock.any()
+
+
 def test_bad_options_are_named() -> None:
     pose = pose_with({"torso": turned(x=5.0)})
     with pytest.raises(BadOption, match=r"shoulder sequence 'YXZ' is not known; .*YXY, XZY, ZXY"):

@@ -116,7 +116,7 @@ def test_what_the_links_leave_open_is_named_and_the_rest_is_right(urdf: Path) ->
     np.testing.assert_allclose(joints["shoulder_pan_joint"], q[:, 0], atol=np.deg2rad(1.0))
     both = joints["shoulder_lift_joint"] + joints["elbow_joint"]
     np.testing.assert_allclose(both, q[:, 1] + q[:, 2], atol=np.deg2rad(1.0))
-    (diagnostic,) = [d for d in summarize(tracked).content["diagnostics"] if d["code"] == "joints-undetermined"]
+    (diagnostic,) = [d for d in summarize(tracked).content["diagnostics"] if d["code"] == "sensors-missing"]
     assert diagnostic["facts"]["joints"].startswith("shoulder_lift_joint, elbow_joint")
 
 

@@ -127,7 +127,7 @@ def test_a_chain_whose_limb_is_drawn_is_assessed(urdf: Path) -> None:  # noqa: F
     arm = load_model(table)
     short = calibrate_arm(arm, move_arm(arm, 0, seconds=12.0))
     reasons = assess(short).reasons
-    assert "motion-too-short" in {diagnostic.code for diagnostic in reasons}
+    assert "motion-too-small" in {diagnostic.code for diagnostic in reasons}
     words = " ".join(text.line() for _, text in render_all(reasons))
     assert not re.search("hand|palm|anatom|person", words)
 

@@ -209,7 +209,7 @@ def test_a_session_that_lacks_sensors_says_what_is_not_known(
     write_session(tmp_path, replace(half_minute, sensors=fewer))
     assert run("track", tmp_path, "-o", tmp_path / "result") == 0
     summary = json.loads((tmp_path / "result" / "summary.json").read_text())
-    (unknown,) = [each for each in summary["diagnostics"] if each["code"] == "points-unknown"]
+    (unknown,) = [each for each in summary["diagnostics"] if each["code"] == "sensors-missing"]
     assert unknown["facts"] == {"segments": "right_forearm", "points": "right_wrist, right_palm"}
     assert unknown["text"]["what"] in capsys.readouterr().err
 

@@ -21,6 +21,7 @@ from wepose_pin.diagnostics import (
     as_json,
     catalogue,
     document,
+    drop_consequences,
     example,
     from_json,
     gravest_first,
@@ -99,9 +100,10 @@ def test_every_text_is_filled_by_its_example_and_needs_all_of_it(code: str, vari
         assert "{" not in part.replace("{ up", "")
     assert text.line().startswith(text.what)
     entry = catalogue()[code]
-    parts = [part for each in (entry.text, *entry.variants.values()) for part in each]
+    parts = [*entry.text, *(part for each in entry.variants.values() for part in each.values())]
     fields = {name for part in parts for _, name, _, _ in string.Formatter().parse(part) if name}
-    own = {name for part in entry.variants.get(variant, entry.text) for _, name, _, _ in string.Formatter().parse(part)}
+    replaced = entry.text._replace(**entry.variants.get(variant, {}))
+    own = {name for part in replaced for _, name, _, _ in string.Formatter().parse(part)}
     assert own & {"place", "value", "limit"} <= set(entry.examples[variant])
     facts = set(entry.examples[variant]) - {"variant", "place", "value", "limit"}
     assert facts <= fields, f"the texts do not use {facts - fields}"
@@ -113,7 +115,8 @@ def test_tables_of_the_catalogue_have_nothing_else() -> None:
     assert len(codes) == len(set(codes)), "a code stands in two groups"
     for tables in groups.values():
         for code, table in tables.items():
-            assert set(table) - {"variants"} == {*Text._fields, "example"}, code
+            assert set(table) - {"variants", "follows"} == {*Text._fields, "example"}, code
+            assert set(table.get("follows", ())) <= set(codes), code
             for variant in table.get("variants", {}).values():
                 assert set(variant) <= {*Text._fields, "example"}, code
 
@@ -127,20 +130,35 @@ def test_a_code_or_a_fact_that_is_not_there_fails() -> None:
     with pytest.raises(KeyError, match="no-such-code"):
         render(Diagnostic("no-such-code", INFO))
     with pytest.raises(KeyError, match="method"):
-        render(Diagnostic("method-needs-static", WARNING))
-    with pytest.raises(KeyError, match="sideways"):
-        render(Diagnostic("heading-uncertain", WARNING, "left_elbow", 0.2, 0.17, {"variant": "sideways"}))
+        render(Diagnostic("static-phase-missing", WARNING))
+
+
+def test_words_of_a_variant_replace_parts_one_after_the_other() -> None:
+    facts = {"variant": "position no-clasp"}
+    text = render(Diagnostic("heading-uncertain", WARNING, "left_palm", 0.12, 0.1, facts))
+    assert text.what.startswith("The position of the left palm may be off by ± 120 mm")
+    assert text.do == "Let the person rest for a second now and then, or hold the hands together (phase `clasp`)."
+
+
+def test_what_follows_from_a_cause_is_not_shown_beside_it() -> None:
+    moved = Diagnostic("start-pose-motion", WARNING, "torso")
+    others = [Diagnostic(code, WARNING, "left_elbow") for code in ("mount-contradicted", "hinge-implausible")]
+    assert drop_consequences([*others, moved, Diagnostic("samples-lost", WARNING)]) == [
+        moved,
+        Diagnostic("samples-lost", WARNING),
+    ]
+    assert drop_consequences(others) == others
 
 
 def test_json_holds_data_and_text_and_comes_back() -> None:
-    facts = {"joint": "elbow", "above": "upper arm", "below": "forearm"}
-    diagnostic = Diagnostic("hinge-overflexed", ERROR, "left_elbow", 2.967, float("nan"), facts)
+    facts = {"variant": "overflexed", "joint": "elbow", "above": "upper arm", "below": "forearm"}
+    diagnostic = Diagnostic("hinge-implausible", ERROR, "left_elbow", 2.967, float("nan"), facts)
     content = json.loads(json.dumps(as_json(diagnostic), allow_nan=False))
     assert content["text"]["what"].startswith("The left elbow bends by up to 170°")
     assert content["limit"] is None
-    assert from_json(content) == Diagnostic("hinge-overflexed", ERROR, "left_elbow", 2.967, None, facts)
+    assert from_json(content) == Diagnostic("hinge-implausible", ERROR, "left_elbow", 2.967, None, facts)
     content["text"] = {"title": "another"}
-    assert from_json(content).code == "hinge-overflexed"
+    assert from_json(content).code == "hinge-implausible"
 
 
 @pytest.mark.parametrize(
@@ -167,12 +185,17 @@ def test_numbers_have_two_digits_at_least_and_their_unit(value: float | None, un
 
 
 def test_alike_are_told_together_the_gravest_first() -> None:
-    lost = [Diagnostic("samples-lost", WARNING, name, 0.02 + 0.01 * k, 0.01) for k, name in enumerate("abcde")]
-    dead, slow = Diagnostic("orientation-constant", WARNING, "e", 900), Diagnostic("start-pose-late", INFO, value=12.0)
-    texts = render_all([Diagnostic("population-lengths", INFO), *lost, lost[0], dead, slow])
+    lost = [
+        Diagnostic("samples-lost", WARNING, name, 0.02 + 0.01 * k, 0.01, {"variant": "short", "longest": 0.02})
+        for k, name in enumerate("abcde")
+    ]
+    dead = Diagnostic("sensor-frozen", WARNING, "e", facts={"variant": "orientation", "rows": 900})
+    slow = Diagnostic("start-pose-late", INFO, value=12.0)
+    resets = Diagnostic("heading-resets-not-repeated", INFO, "live.mcap", 2)
+    texts = render_all([resets, *lost, lost[0], dead, slow])
     titles = [text.title for _, text in texts]
-    assert titles[:2] == ["Samples lost", "Orientation never changes"]
-    assert titles[2] == "Lengths of the population prior"
+    assert titles[:2] == ["Samples lost", "Sensor frozen"]
+    assert titles[2] == "Live heading resets not repeated"
     assert texts[0][0] == WARNING
     assert texts[0][1].what.count("lost") == 3
     assert texts[0][1].what.endswith("So it is in 2 more: d, e.")

@@ -162,7 +162,7 @@ def test_an_ordinary_arm_is_no_warning_and_one_with_a_wrong_heading_is(tmp_path:
     upper = Rotation.from_rotvec(-swing[:, None] * [0.0, 1.0, 0.0])
     fore = upper * Rotation.from_rotvec(-bend[:, None] * [0.0, 1.0, 0.0])
     turned = Rotation.from_euler("z", 50.0, degrees=True) * fore
-    for name, forearm, codes in (("right", fore, set()), ("wrong", turned, {"opensim-axes-too-few"})):
+    for name, forearm, codes in (("right", fore, set()), ("wrong", turned, {"orientation-residual"})):
         quat_WL = {"torso": np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)), "left_upper_arm": upper.as_quat()}
         quat_WL["left_forearm"] = forearm.as_quat()
         folder = write_folder(tmp_path / name, compute_pose(load_model(lengths=LENGTHS), time, quat_WL))
@@ -174,7 +174,7 @@ def test_an_ordinary_arm_is_no_warning_and_one_with_a_wrong_heading_is(tmp_path:
 
 
 def test_the_scale_tool_is_told_the_subjects_lengths(result: Path, tmp_path: Path) -> None:
-    assert [each.code for each in export(result, tmp_path / "anna.xml", "scale").diagnostics] == ["osim-scaled"]
+    assert not export(result, tmp_path / "anna.xml", "scale").diagnostics
     tool = ElementTree.parse(tmp_path / "anna.xml").getroot()[0]
     assert tool.tag == "ScaleTool"
     assert tool.findtext("GenericModelMaker/model_file") == "Rajagopal_2015.osim"
@@ -259,7 +259,7 @@ def test_mot_gives_opensims_model_the_pose_back(peer: Callable[..., Any], tmp_pa
 def test_opensense_finds_the_same_angles_from_the_sto(peer: Callable[..., Any], tmp_path: Path) -> None:
     pose = pose_by_opensim(peer, motion(12), noise=0.15)  # what no elbow of two axes follows
     folder = write_folder(tmp_path / "r", pose)
-    assert "opensim-axes-too-few" in {
+    assert "orientation-residual" in {
         each.code for each in export(folder, tmp_path / "x.mot", names="opensim").diagnostics
     }
     export(folder, tmp_path / "x.sto")

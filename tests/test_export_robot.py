@@ -159,14 +159,14 @@ def test_an_episode_that_the_trajectory_cuts_is_named(trajectory: Path, tmp_path
     whole = export(trajectory, tmp_path / "whole", "lerobot", episodes="repetitions")
     cut = export(trajectory, tmp_path / "cut", "lerobot", episodes="reach", interval=(1.5, 3.7))
     [diagnostic] = cut.diagnostics
-    assert (diagnostic.code, diagnostic.place, diagnostic.value) == ("episode-shortened", "reach", 1.0)
+    assert (diagnostic.code, diagnostic.place, diagnostic.value) == ("episodes-cut", "reach", 1.0)
     assert diagnostic.facts["span"] == "3 to 4.2 s"
     assert whole.diagnostics == []
 
 
 def test_an_interval_outside_is_left_out_and_the_others_are_episodes(trajectory: Path, tmp_path: Path) -> None:
     exported = export(trajectory, tmp_path / "data", "lerobot", episodes="reach", interval=(1.5, 2.6))
-    assert [(each.code, each.value) for each in exported.diagnostics] == [("episode-outside", 1.0)]
+    assert [(each.code, each.value) for each in exported.diagnostics] == [("episodes-cut", 1.0)]
     assert json.loads((tmp_path / "data" / "meta" / "info.json").read_text())["total_episodes"] == 1
 
 

@@ -240,7 +240,6 @@ def test_lost_samples_are_bridged_as_in_a_users_file(realistic: Simulation, tmp_
     assert sum(np.isnan(sensor.gyro_S[:, 0]).sum() for sensor in raw.values()) > 10
     write_session(tmp_path, Recording("raw", recorded.time, recorded.rate_hz, raw, recorded.phases))
     read = load_session(tmp_path)
-    assert "short-gaps-bridged" in {each.code for each in read.diagnostics}
     for segment, sensor in recorded.sensors.items():
         np.testing.assert_allclose(read.sensors[segment].gyro_S, sensor.gyro_S, rtol=1e-12)
         np.testing.assert_allclose(read.sensors[segment].accel_S, sensor.accel_S, rtol=1e-12)

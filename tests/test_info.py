@@ -90,7 +90,7 @@ def test_files_of_one_recording_make_one_session(capsys: pytest.CaptureFixture[s
     dot(tmp_path / "D3.csv", tag="D422CD00")
     (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
     text = info(capsys, tmp_path / "D2.csv")
-    assert diagnosed(tmp_path / "D2.csv")["sensor-segments-unknown"].facts == {"sensors": "D3.csv"}
+    assert diagnosed(tmp_path / "D2.csv")["sensors-left-out"].facts["devices"] == "D3.csv"
     assert '# [sensors.SEGMENT]\n# file = "D3.csv"' in text
     recording = written(capsys, tmp_path / "D2.csv")
     assert set(recording.sensors) == {"torso", "left_forearm"}
@@ -382,7 +382,7 @@ def test_sensors_without_a_segment_are_left_to_the_user(capsys: pytest.CaptureFi
     frames = [table(f"seg{k}_gyr_{{}} seg{k}_acc_{{}}", sensor=k).drop("time") for k in (1, 2, 3)]
     pl.concat([table().select("time"), *frames], how="horizontal").write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv")
-    assert diagnosed(tmp_path / "a.csv")["sensor-segments-unknown"].facts == {"sensors": "seg1, seg2, seg3"}
+    assert diagnosed(tmp_path / "a.csv")["sensors-left-out"].facts["devices"] == "seg1, seg2, seg3"
     assert text.count("# [sensors.SEGMENT]") == 3
     assert "[sensors.torso]" not in text
     assert "write its segment in place of SEGMENT" in info(capsys, tmp_path / "a.csv", "--write")

@@ -500,7 +500,7 @@ def test_a_file_that_breaks_off_anywhere_is_read_up_to_there(recording: Recordin
     )  # more than an index, which nothing of ours is read from
     part.write_bytes(damaged)
     (killed,) = read_live_log(part).recording.diagnostics
-    assert (killed.code, killed.place) == ("live-recording-incomplete", "part.mcap")
+    assert (killed.code, killed.place) == ("file-incomplete", "part.mcap")
 
 
 def test_other_programs_read_the_recording(recording: Recording, tmp_path: Path) -> None:

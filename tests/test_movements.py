@@ -214,7 +214,7 @@ def test_two_sessions_become_tables_figures_and_a_page(
     assert "low-passed at 6 Hz" in printed
     tables = {path.stem: pl.read_csv(path) for path in out.glob("*.csv")}
     assert set(tables) == {
-        *("sessions", "repetitions", "phases", "summary", "curves", "comparison", "definitions"),
+        *("angles", "sessions", "repetitions", "phases", "summary", "curves", "comparison", "definitions"),
     }
     assert tables["sessions"].select("session", "n", "low_pass_hz").rows() == [("before", 7, 6.0), ("after", 7, 6.0)]
     elbow = (pl.col("joint") == "right_elbow") & (pl.col("angle") == "flexion")
@@ -234,10 +234,13 @@ def test_two_sessions_become_tables_figures_and_a_page(
     curve = tables["curves"].filter(elbow & (pl.col("session") == "after"))
     assert curve["percent"].to_list() == list(range(101))
     assert curve["mean_deg"].max() == pytest.approx(70.0, abs=4.0)
+    over_time = tables["angles"].filter(pl.col("session") == "before")
+    assert over_time.height == 1401
+    assert over_time["right_elbow_flexion_deg"].max() == pytest.approx(true.max(), abs=0.3)
     phases = tables["phases"].filter(elbow & (pl.col("session") == "before"))
     assert phases["phase"].to_list() == ["all", "start", "bend", "bend", "bend"]
     assert phases["highest_deg"][2] == pytest.approx(true[1], abs=0.3)
-    for picture in ("repetitions", "curves-elbow", "curves-shoulder", "curves-thorax"):
+    for picture in ("repetitions", "curves-elbow", "curves-shoulder", "curves-thorax", "angles-1", "angles-2"):
         ET.fromstring((out / f"{picture}.svg").read_text(encoding="utf-8"))
     page = (out / "angles.html").read_text(encoding="utf-8")
     for words in (
@@ -265,7 +268,8 @@ def test_where_nothing_repeats_there_are_phases_all_the_same(
     assert run("angles", results[0], "-o", tmp_path / "a", "--phase", "start") == 0
     assert "no repetitions by right_elbow_flexion: the angle goes out and back" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "a").iterdir()} == {
-        *("sessions.csv", "phases.csv", "definitions.csv", "repetitions.svg", "angles.html", "provenance.json"),
+        *("angles.csv", "sessions.csv", "phases.csv", "definitions.csv", "repetitions.svg", "angles.svg"),
+        *("angles.html", "provenance.json"),
     }
     assert "goes out and back" in (tmp_path / "a" / "angles.html").read_text(encoding="utf-8")
 
@@ -296,11 +300,13 @@ def test_a_mistake_is_one_line_and_exit_2(
 def test_curves_have_a_line_a_session_and_their_number_of_repetitions() -> None:
     movements = [analyze_movement(name, pose_of(seed), {}, MovementOptions()) for name, seed in (("a", 1), ("b", 2))]
     figures = draw_figures(movements)
-    assert list(figures) == ["repetitions", "curves-thorax", "curves-shoulder", "curves-elbow"]
+    assert list(figures) == [
+        *("repetitions", "curves-thorax", "curves-shoulder", "curves-elbow", "angles-1", "angles-2")
+    ]
     panels = {ax.get_title("left"): ax for ax in figures["curves-elbow"].axes}
-    assert [line.get_label() for line in panels["right flexion [°]"].lines] == ["a, n = 7", "b, n = 7"]
+    assert [line.get_label() for line in panels["right elbow: flexion [°]"].lines] == ["a, n = 7", "b, n = 7"]
     alone = {ax.get_title("left"): ax for ax in draw_figures(movements[:1])["curves-elbow"].axes}
-    assert len(alone["right flexion [°]"].lines) == 1 + 7  # and each repetition
+    assert len(alone["right elbow: flexion [°]"].lines) == 1 + 7  # and each repetition
 
 
 # Definitions ------------------------------------------------------------------------------------------------------

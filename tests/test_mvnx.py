@@ -259,7 +259,7 @@ def test_arms_in_the_frames_of_the_isb(t_pose: str | None, tmp_path: Path) -> No
         np.testing.assert_allclose(ours.apply([0.0, 0.0, -1.0]), theirs.apply([0.0, 0.0, -1.0]), atol=1e-6)
         inward = [np.cos(np.radians(palm)), np.sin(np.radians(palm)), 0.0]  # what is -y, inward, of our frame
         np.testing.assert_allclose(ours.apply([0.0, -1.0, 0.0]), theirs.apply(inward), atol=1e-6)
-    assert [each.code for each in device.diagnostics] == ["arm-frames-assumed"] * (t_pose is None)
+    assert [each.code for each in device.diagnostics] == ["file-assumption"] * (t_pose is None)
     torso = device.sensors["T8"].signals["orientation"]
     np.testing.assert_allclose(torso, quat[:, 1][:, [1, 2, 3, 0]], atol=1e-8)
 
@@ -315,9 +315,8 @@ def test_lost_frames_are_gaps(tmp_path: Path) -> None:
     path = mvnx(tmp_path, turning(58), index=index)
     recording = wp.load_session(session(tmp_path, path.name, ("torso",)))
     assert len(recording) == 60
-    (gap,) = (each for each in recording.diagnostics if each.code != "arm-frames-assumed")
-    assert (gap.code, gap.place, gap.facts["gaps"]) == ("short-gaps-bridged", "torso", 1)
-    assert gap.facts["samples"] == 2
+    (lost,) = (each for each in recording.diagnostics if each.code == "samples-lost")
+    assert (lost.place, lost.value) == ("torso", pytest.approx(2 / 60))
     path = mvnx(tmp_path, turning(58), index=[k + 40 * (k > 20) for k in range(58)])
     with pytest.raises(BadData, match=r"rows are missing after row 21"):
         wp.load_session(session(tmp_path, path.name, ("torso",)))

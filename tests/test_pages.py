@@ -85,7 +85,7 @@ def test_an_arm_that_hangs_throughout_is_tracked(
     assert names(tmp_path / "out") == RESULT | {"view.html", "report.html"}
     assert "cannot be made" not in capsys.readouterr().err
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "left shoulder, plane of elevation" in page
+    assert "left shoulder, adduction" in page
     assert "cannot be made" not in page
 
 
@@ -150,7 +150,7 @@ def test_a_page_that_fails_is_a_warning(
     (line,) = [line for line in captured.err.splitlines() if page in line]
     assert "ValueError: cannot convert float NaN to integer" in line
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    (saved,) = [each for each in summary["diagnostics"] if (each["code"], each["place"]) == ("page-incomplete", page)]
+    (saved,) = [each for each in summary["diagnostics"] if (each["code"], each["place"]) == ("output-incomplete", page)]
     assert saved["text"]["what"] in line
     for name in left:
         assert "of another motion" not in (tmp_path / "out" / name).read_text()
@@ -171,7 +171,7 @@ def test_a_motion_that_cannot_be_assessed_is_written_all_the_same(
     assert names(tmp_path / "gathered") == RESULT | {"view.html"}
     summary = json.loads((tmp_path / "gathered" / "summary.json").read_text())
     codes = {(each["code"], each["place"]) for each in summary["diagnostics"]}
-    failed = {("motion-not-assessed", ""), ("page-incomplete", "report.html")}
+    failed = {("output-incomplete", ""), ("output-incomplete", "report.html")}
     assert failed <= codes
 
 
@@ -210,5 +210,5 @@ def test_a_calibration_outlasts_its_report(
     assert names(tmp_path / "anna") == {"subject.toml", "subject.urdf", "calibration.json"} | left
     (line,) = [line for line in capsys.readouterr().err.splitlines() if "ValueError" in line]
     diagnostics = json.loads((tmp_path / "anna" / "calibration.json").read_text())["diagnostics"]
-    (saved,) = [each for each in diagnostics if each["code"] == "page-incomplete"]
+    (saved,) = [each for each in diagnostics if each["code"] == "output-incomplete"]
     assert saved["text"]["what"] in line

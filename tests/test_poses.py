@@ -81,7 +81,7 @@ def test_a_bow_shows_where_the_torso_faces_to_sensors_without_accelerations() ->
     hands, bowed = (solve(person, recording, protocol) for protocol in ("clasp", "clasp+bow"))
     assert torso_heading_std(bowed) < 5.0 < torso_heading_std(hands)
     assert np.abs(headings_by_std(bowed, simulation)).max() < 2.5
-    assert "phase-not-used" not in [each.code for each in bowed.diagnostics]
+    assert "pose-contradicted" not in [each.code for each in bowed.diagnostics]
 
 
 SLOW = ("a bow to the side", "arms forwards", "arms that hang")
@@ -95,7 +95,7 @@ def test_another_pose_than_the_protocols_is_said_and_left_out(what: str, monkeyp
     monkeypatch.undo()
     recording = simulation.recording()
     calibration, hands = (solve(person, recording, each) for each in (protocol, "clasp"))
-    [left_out] = [each for each in calibration.diagnostics if each.code == "phase-not-used"]
+    [left_out] = [each for each in calibration.diagnostics if each.code == "pose-contradicted"]
     assert left_out.place == protocol.removeprefix("clasp+")
     assert left_out.value is not None
     assert left_out.value > 3.0

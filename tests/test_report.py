@@ -127,5 +127,5 @@ def test_one_hand_at_a_point(made: Made, tmp_path: Path) -> None:
 def test_the_effective_sample_size_has_its_limits(made: Made) -> None:
     for size, wanted in ((6.0, "pass"), (5.9, "poor"), (2.0, "poor"), (1.9, "fail")):
         checks = assess(replace(made[0], effective_sample_size=size)).checks
-        (check,) = [each for each in checks if each.diagnostic.code == "motion-too-short"]
+        (check,) = [each for each in checks if each.diagnostic.code == "motion-too-small"]
         assert (check.value, check.quality) == (size, wanted)

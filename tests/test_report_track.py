@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.body.covariance import compute_axis_std
 from wepose_pin.body.kinematics import Pose
-from wepose_pin.body.subject import Hinge, Subject, population_subject
+from wepose_pin.body.subject import Hinge, population_subject
 from wepose_pin.commands import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import OrientationSensor, Recording
@@ -96,7 +96,7 @@ def test_it_begins_with_what_can_be_relied_on(page: str, pose: TrackResult) -> N
     assert found is not None
     least = re.search(r"Least certain: [\w ]+, ± \d+°\.", text)
     assert least is not None
-    assert found.end() < least.start() < text.index("What to know")
+    assert found.end() < least.start() < text.index("No warnings.")
 
 
 def test_it_gives_the_sensors_and_joints_in_numbers(page: str, pose: TrackResult) -> None:
@@ -112,21 +112,22 @@ def test_it_gives_the_sensors_and_joints_in_numbers(page: str, pose: TrackResult
     assert ["right elbow", f"{np.median(elbow):.1f}°", f"{elbow.max():.1f}°"] in [row[:3] for row in table]
 
 
-def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackResult, page: str) -> None:
+def test_warnings_come_first_each_in_words_and_with_what_to_do(pose: TrackResult) -> None:
     guessed = Diagnostic("start-pose-guessed", WARNING, facts={"start": 0.5, "end": 2.5})
     warned = replace(pose, source=replace(pose.segments, diagnostics=(guessed,)))
     text = without_frame(render_track_report(summarize(warned)))
     assert '<section class="banner poor">' in text
     first = text.index(render(guessed).what)
     assert first < text.index(render(guessed).do) < text.index("<h2") < text.index("<figure")
-    assert '<section class="banner info">' in page  # lengths of the population prior are only worth knowing
-    assert "of the population prior" in text_of(page)
 
 
-def test_a_known_person_and_nothing_to_say(pose: TrackResult) -> None:
+def test_a_known_person_and_nothing_to_say(pose: TrackResult, page: str) -> None:
+    assert "wepose calibrate measures those of the person" in text_of(page)
     quiet = replace(pose, subject=replace(pose.subject, name="anna", note=""))
     assert summarize(quiet).diagnostics == ()
-    assert "No warnings." in text_of(render_track_report(summarize(quiet)))
+    text = text_of(render_track_report(summarize(quiet)))
+    assert "No warnings." in text
+    assert "wepose calibrate" not in text
 
 
 def test_it_opens_offline_and_has_a_dark_side(page: str) -> None:
@@ -166,7 +167,6 @@ def test_ready_orientations_and_one_arm(simulation: Simulation, pose: TrackResul
     page = render_track_report(summarize(ready))
     assert headings(page) == SECTIONS
     assert "The device states no uncertainty" in text_of(page)
-    assert the("measured-orientations", ready).facts["segments"] == "torso, right_upper_arm, right_forearm"
     assert not any(row[0] == "left palm" for row in rows(page))
 
 
@@ -211,9 +211,7 @@ def test_gaps(simulation: Simulation) -> None:
     recording = simulation.recording("gaps")
     gap = np.zeros(len(recording), dtype=bool)
     gap[3000:3400] = True
-    page = render_track_report(summarize(pose := track(changed(recording, "torso", gap=gap))))
-    lost = the("samples-lost", pose)
-    assert (lost.place, lost.value) == ("torso", pytest.approx(400 / len(gap)))
+    page = render_track_report(summarize(track(changed(recording, "torso", gap=gap))))
     assert any("4.00 s" in row for row in rows(page) if row[0] == "torso")
     assert "Lines break where samples are lost" in text_of(page)
 
@@ -235,12 +233,6 @@ def test_gravity_bias_and_stamps(simulation: Simulation) -> None:
     uneven = the("time-stamps-uneven", pose)
     assert uneven.value is not None
     assert uneven.value > 0.2
-    ours = pose.segments.orientation["torso"]
-    drifted = ours._replace(
-        gyro_bias=ours.gyro_bias + np.linspace(0.0, np.deg2rad(0.5), len(time))[:, None] * [1, 0, 0]
-    )
-    warm = replace(pose, source=replace(pose.segments, orientation={**pose.segments.orientation, "torso": drifted}))
-    assert the("gyro-bias-changed", warm).value == pytest.approx(np.deg2rad(0.5), abs=np.deg2rad(0.1))
 
 
 def test_a_person_who_never_rests(pose: TrackResult) -> None:
@@ -267,10 +259,9 @@ def test_headings_that_may_be_far_off(pose: TrackResult) -> None:
     assert "which correct the headings as the joints move" in render(uncertain[0]).do
     assert [d.value for d in uncertain] == sorted((d.value for d in uncertain), reverse=True)  # type: ignore[type-var]
     assert len(compute_joint_heading_stds(compute_heading_uncertainties(wide), wide.model)) == 4
-    assert (
-        the("method-needs-static", replace(wide, source=replace(wide.segments, options=TrackOptions("smekf")))).severity
-        == WARNING
-    )
+    smekf = replace(wide, source=replace(wide.segments, options=TrackOptions("smekf")))
+    needs_static = next(d for d in summarize(smekf).diagnostics if d.code == "heading-uncertain")
+    assert "Use the method amekf" in render(needs_static).do
 
 
 def test_headings_that_were_turned_far(pose: TrackResult) -> None:
@@ -300,20 +291,17 @@ def test_elbows_that_cannot_be(pose: TrackResult) -> None:
     n = len(pose.time)
     usual = {each.code for each in summarize(with_elbow(pose, np.linspace(-10.0, 140.0, n))).diagnostics}
     assert not any(code.startswith("hinge-") for code in usual)
-    back = the("hinge-hyperextended", with_elbow(pose, np.full(n, -30.0)))
+    back = the("hinge-implausible", with_elbow(pose, np.full(n, -30.0)))
     assert (back.severity, back.place, back.value) == (WARNING, "left_elbow", pytest.approx(np.deg2rad(30.0)))
-    folded = the("hinge-overflexed", with_elbow(pose, np.full(n, 170.0)))
+    folded = the("hinge-implausible", with_elbow(pose, np.full(n, 170.0)))
     assert (folded.severity, folded.place, folded.value) == (WARNING, "left_elbow", pytest.approx(np.deg2rad(170.0)))
-    turned = the("hinge-out-of-plane", with_elbow(pose, np.full(n, 90.0), 40.0))
+    turned = the("hinge-implausible", with_elbow(pose, np.full(n, 90.0), 40.0))
     assert turned.value == pytest.approx(np.deg2rad(40.0))
-    drifting = the("hinge-out-of-plane", with_elbow(pose, np.full(n, 90.0), np.linspace(0.0, 60.0, n)))
+    drifting = the("hinge-implausible", with_elbow(pose, np.full(n, 90.0), np.linspace(0.0, 60.0, n)))
     assert "by 15° in the first half of the recording and by 45° in the second" in render(drifting).what
 
 
-def test_new_strapping_and_a_late_start_pose(simulation: Simulation, pose: TrackResult) -> None:
-    known: Subject = replace(pose.subject, mounts={"torso": np.array([0.0, 0.0, 0.0, 1.0])})
-    anew = track(replace(simulation.recording("new"), remounted=True), known)
-    assert the("sensors-remounted", anew).severity == INFO
+def test_a_late_start_pose(pose: TrackResult) -> None:
     late = replace(pose, source=replace(pose.segments, start=(40.0, 44.0)))
     assert the("start-pose-late", late).value == pytest.approx(40.0)
 
@@ -427,8 +415,8 @@ def test_track_writes_it_unless_told_not_to(tmp_path: Path, capsys: pytest.Captu
         assert (tmp_path / folder / "report.html").exists() == (not options)
         assert (tmp_path / folder / "view.html").exists()
         saved = json.loads((tmp_path / folder / "summary.json").read_text(encoding="utf-8"))["diagnostics"]
-        assert [each["code"] for each in saved] == ["population-lengths"]  # of the motion, with a report or without
-        assert f"info: {saved[0]['text']['what']}" in captured.err
+        assert saved == []  # of a good recording
+        assert "lengths: population prior" in captured.out
     assert "Motion of short" in (tmp_path / "with" / "report.html").read_text(encoding="utf-8")
 
 
@@ -460,8 +448,8 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
         render_track_report(summarize(late), view="<p>")
     )
     most = max(float(compute_axis_std(peak.pose.point_cov[name]).max()) for name in POINTS)
-    assert the("position-uncertain-before-start", peak).value == pytest.approx(most)
-    assert not any(each.code.endswith("-before-start") for each in summarize(late).diagnostics)
+    assert the("start-pose-late", peak).facts["position"] == pytest.approx(most)
+    assert not any(each.code == "start-pose-late" for each in summarize(late).diagnostics)
     text = text_of(render_track_report(summarize(peak), view="<p>"))
     assert "No warnings" not in text
     assert "the 7 s before its end are left out" in text
@@ -469,7 +457,7 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
 
 def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackResult) -> None:
     cov = {name: np.broadcast_to(0.12**2 * np.eye(3), cov.shape) for name, cov in pose.pose.point_cov.items()}
-    uncertain = the("position-uncertain", with_pose(pose, point_cov=cov), "right_palm")
+    uncertain = the("heading-uncertain", with_pose(pose, point_cov=cov), "right_palm")
     assert uncertain.severity == WARNING
     assert "The position of the right palm may be off by ± 120 mm" in render(uncertain).what
 

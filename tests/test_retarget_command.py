@@ -122,9 +122,7 @@ def test_a_hand_that_stays_off_a_target_within_reach_ends_in_exit_code_3(
     code, _ = run(capsys, "retarget", str(result), "--robot", str(write_arm(tmp_path)), "-o", str(tmp_path / "out"))
     assert code == 3
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert [each["code"] for each in summary["diagnostics"] if each["severity"] == "error"] == [
-        "reachable-target-missed"
-    ]
+    assert [each["code"] for each in summary["diagnostics"] if each["severity"] == "error"] == ["robot-hand-off-target"]
     assert summary["missed_targets"] == [{"side": "right", "begin": 3.0, "end": 5.5, "error": 0.4}]
 
 
@@ -137,7 +135,7 @@ def test_a_robot_without_shapes_is_said_to_be_unchecked(
     assert code == 0
     assert "No self-collision" not in text
     diagnostics = json.loads((tmp_path / "out" / "summary.json").read_text())["diagnostics"]
-    assert "robot-self-collision-unchecked" in [each["code"] for each in diagnostics]
+    assert "robot-shapes-missing" in [each["code"] for each in diagnostics]
 
 
 @pytest.mark.parametrize(
@@ -183,7 +181,7 @@ def test_meshes_are_found_in_the_written_robot_and_a_missing_one_is_left_out_of_
     assert code == 0, text
     assert (out / "view.html").is_file()
     codes = [each["code"] for each in json.loads((out / "summary.json").read_text())["diagnostics"]]
-    assert "visual-mesh-missing" in codes
+    assert "robot-shapes-missing" in codes
     wp.export(out, tmp_path / "robot.urdf")
     for file in (out / "robot.urdf", tmp_path / "robot.urdf"):
         meshes = re.findall('filename="(.*?)"', file.read_text())

@@ -86,5 +86,5 @@ def test_a_page_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert writer.write("b.html", lambda _: 1 / 0) is None  # type: ignore[arg-type,return-value]
     assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
     (diagnostic,) = writer.diagnostics
-    assert (diagnostic.code, diagnostic.place) == ("page-incomplete", "b.html")
+    assert (diagnostic.code, diagnostic.place) == ("output-incomplete", "b.html")
     assert "ZeroDivisionError" in render(diagnostic).what

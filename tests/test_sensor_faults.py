@@ -190,7 +190,7 @@ def test_a_clean_sensor_that_repeats_its_values_while_others_change_is_named(
         gyro_S[at_rest] = 0.01
         recording = with_sensor(recording, name, gyro_S=gyro_S)
     read = load_session(written(tmp_path, recording) / "session.toml")
-    assert [d.place for d in read.diagnostics if d.code == "sensor-repeats"] == named
+    assert [d.place for d in read.diagnostics if d.code == "sensor-frozen"] == named
 
 
 def axis_stopped(recording: Recording, axis: str, first: float, value: float | None = None) -> Recording:

@@ -78,8 +78,9 @@ class Entry(NamedTuple):
 
     group: str
     text: Text  # with fields in braces: place, value, limit and facts, each with its unit
-    variants: Mapping[str, Text]
+    variants: Mapping[str, Mapping[str, str]]  # word of the fact `variant` → the parts of the text that it replaces
     examples: Mapping[str, Mapping[str, float | str]]  # variant (or "") → place, value, limit and facts
+    follows: frozenset[str]  # codes of causes, beside which it is not shown
 
 
 def render(diagnostic: Diagnostic) -> Text:
@@ -88,11 +89,12 @@ def render(diagnostic: Diagnostic) -> Text:
     Raises
     ------
     KeyError
-        The catalogue has no such code or variant, or the text needs a fact that is not there.
+        The catalogue has no such code, or the text needs a fact that is not there.
     """
     entry = catalogue()[diagnostic.code]
-    variant = str(diagnostic.facts.get("variant", ""))
-    template = entry.variants[variant] if variant else entry.text
+    template = entry.text
+    for word in str(diagnostic.facts.get("variant", "")).split():
+        template = template._replace(**entry.variants.get(word, {}))
     known = {"place": diagnostic.place, "value": diagnostic.value, "limit": diagnostic.limit, **diagnostic.facts}
     return Text(*(_fill(part, known) for part in template))
 
@@ -139,6 +141,13 @@ def merge(diagnostics: Sequence[Diagnostic], others: Iterable[Diagnostic]) -> tu
     """`diagnostics`, then those of `others` whose code and place are not among them: two rooms may find the same."""
     known = {(diagnostic.code, diagnostic.place) for diagnostic in diagnostics}
     return (*diagnostics, *(each for each in others if (each.code, each.place) not in known))
+
+
+def drop_consequences(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:
+    """The diagnostics without those that follow from another of them, as a tilted segment from a moved start pose."""
+    diagnostics = list(diagnostics)
+    codes = {diagnostic.code for diagnostic in diagnostics}
+    return [each for each in diagnostics if not codes & catalogue()[each.code].follows]
 
 
 def as_json(diagnostic: Diagnostic) -> dict[str, Any]:
@@ -240,14 +249,14 @@ def catalogue() -> Mapping[str, Entry]:
 
 def _parse_entry(group: str, table: Mapping[str, Any]) -> Entry:
     variants = table.get("variants", {})
-    base = {part: table[part] for part in Text._fields}
     examples = {"": table["example"]} | {
         name: table["example"] | {"variant": name} | variant.get("example", {}) for name, variant in variants.items()
     }
     texts = {
-        name: Text(*(variant.get(part, base[part]) for part in Text._fields)) for name, variant in variants.items()
+        name: {part: variant[part] for part in Text._fields if part in variant} for name, variant in variants.items()
     }
-    return Entry(group, Text(**base), texts, examples)
+    text = Text(*(table[part] for part in Text._fields))
+    return Entry(group, text, texts, examples, frozenset(table.get("follows", ())))
 
 
 def example(code: str, variant: str = "") -> Diagnostic:

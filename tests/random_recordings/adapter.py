@@ -41,20 +41,18 @@ EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet",
 # case has them.
 CAUSES = {
     "range": {"signal-saturated"},
-    "fault": {"sensor-frozen", "sensor-repeats", "orientation-constant", "long-gaps-bridged"},
+    "fault": {"sensor-frozen", "samples-lost"},
     "identical": {"orientations-copied"},
     "swapped": {"sensors-exchanged"},
-    "gap": {"long-gaps-bridged"},
+    "gap": {"samples-lost"},
     "start": {
         "start-pose-guessed",
-        "start-pose-sway",
+        "start-pose-motion",
         "static-phase-trimmed",
-        "mount-contradicts-gravity",
-        "mount-moved",
+        "mount-contradicted",
     },
-    "bias": {"person-rotates"},
 }
-ALWAYS = ("start", "bias")
+ALWAYS = ("start",)
 
 
 @dataclass

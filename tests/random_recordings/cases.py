@@ -114,9 +114,9 @@ def stream(seed: int, name: str) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
-def draw_case(seed: int, seconds: float | None = None) -> Case:
+def draw_case(seed: int, seconds: float | None = None, ordinary: bool = False) -> Case:
     """The case of a seed: always the same. With `seconds`, one as long as that, at 25, 50, 100 Hz by turns,
-    of five sensors, wholly ordinary.
+    of five sensors, wholly ordinary; `ordinary`: without what is out of the ordinary.
     """
     person = draw_person(stream(seed, "person"))
     clock = _clock(stream(seed, "clock"))
@@ -160,7 +160,7 @@ def draw_case(seed: int, seconds: float | None = None) -> Case:
         f"start pose stated {spans['start'][0]:.2f} to {spans['start'][1]:.2f} s",
     ]
     _commands(case, stream(seed, "commands"))
-    if seconds is None:
+    if seconds is None and not ordinary:
         draw_oddities(case, stream(seed, "oddities"))
     case.about.append(f"by {case.method} {' '.join(sorted(case.options))}, then {', '.join(case.steps)}")
     return case

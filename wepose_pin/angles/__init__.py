@@ -12,6 +12,7 @@ axes and sequence, and carries the uncertainty; `tables` gives ranges, rates and
 """
 
 from .joints import (
+    AUTO,
     JOINTS,
     NEAR_LOCK,
     SHOULDER_SEQUENCES,
@@ -24,6 +25,7 @@ from .joints import (
 from .tables import angle_table, summary, summary_table
 
 __all__ = [
+    "AUTO",
     "JOINTS",
     "NEAR_LOCK",
     "SHOULDER_SEQUENCES",

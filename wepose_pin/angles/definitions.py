@@ -30,7 +30,7 @@ POSITIVE = {
     ("thorax", "lateral_flexion_right"): "leaning to the right",
     ("thorax", "axial_rotation_left"): "turned to the left",
     ("shoulder", "plane_of_elevation"): "0° out to the side, 90° forward, −90° backward",
-    ("shoulder", "elevation"): "negative where the arm is raised: −90° is horizontal",
+    ("shoulder", "elevation"): "on the far side of the plane of elevation; −90° is horizontal in that plane",
     ("shoulder", "internal_rotation"): "inward",
     ("shoulder", "adduction"): "arm towards the body (abduction is negative)",
     ("shoulder", "flexion"): "arm forward",

@@ -48,12 +48,14 @@ MAX_NEAR_LOCK = 0.01  # of the samples: of an angle that is read as a whole
 # Nearer than this [rad] the first and third angle follow from noise, whatever the sensors.
 LEAST_NEAR_LOCK = np.radians(2.0)
 
-# The names say where an angle is positive. Elevation alone is negative where the arm is raised, as the ISB has it.
+# The names say where an angle is positive. Elevation alone is negative where the arm is raised in the plane of
+# elevation, as the ISB has it.
 SHOULDER_SEQUENCES = {
     "YXY": ("plane_of_elevation", "elevation", "internal_rotation"),  # Wu 2005, 2.4.7
     "XZY": ("adduction", "flexion", "internal_rotation"),
     "ZXY": ("flexion", "adduction", "internal_rotation"),
 }
+AUTO = "auto"  # the sequence of `choose_shoulder_sequence`
 
 
 class Joint(NamedTuple):
@@ -213,7 +215,9 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY", near_lock: flo
     pose : Pose or TrackResult
         What `track` or `load_result` gives, or its `pose`; n samples.
     sequence : str
-        Intrinsic axes of the shoulder's angles: "YXY", "XZY" or "ZXY"; all other joints have ZXY.
+        Intrinsic axes of the shoulder's angles: "YXY", "XZY" or "ZXY"; all other joints have ZXY. "auto": the first,
+        or where it is near gimbal lock for more than 1 % of the time, the one that is so for the least time;
+        ``angles["right_shoulder"].sequence`` names it.
     near_lock : float
         [rad], 10° by default. Samples nearer to gimbal lock are flagged; after them angles go on as before.
 
@@ -243,8 +247,10 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY", near_lock: flo
     check_arguments(joint_angles, locals())
     if isinstance(pose, TrackResult):
         pose = pose.pose
+    if sequence == AUTO:
+        sequence = choose_shoulder_sequence(pose)
     if sequence not in SHOULDER_SEQUENCES:
-        raise BadOption(f"shoulder sequence '{sequence}' is not known; {one_of(SHOULDER_SEQUENCES, sequence)}")
+        raise BadOption(f"shoulder sequence '{sequence}' is not known; {one_of((*SHOULDER_SEQUENCES, AUTO), sequence)}")
     if not LEAST_NEAR_LOCK <= near_lock <= np.pi / 4.0:
         raise BadOption(f"near_lock of {np.degrees(near_lock):g} degrees; between 2 and 45 degrees are needed")
     joints = {}
@@ -263,12 +269,35 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY", near_lock: flo
     return Angles(pose.time, joints)
 
 
-def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngles:
-    n = len(pose.time)
+def choose_shoulder_sequence(pose: Pose) -> str:
+    """Choose the sequence by which the angles of both shoulders are near gimbal lock for the least time.
+
+    It is YXY, which the ISB recommends, where that is near the lock for no more than `MAX_NEAR_LOCK` of the samples. An
+    arm that hangs is in its lock.
+    """
+    shares = dict.fromkeys(SHOULDER_SEQUENCES, 0.0)
+    for name in ("left_shoulder", "right_shoulder"):
+        joint = JOINTS[name]
+        if {joint.proximal, joint.distal} <= set(pose.quat_WL):
+            quat, _, known = _rotation(pose, joint, name.startswith("left_"))
+            for sequence in shares if known.any() else ():
+                share = float(np.mean(euler.decompose(quat, sequence).gimbal < NEAR_LOCK))
+                shares[sequence] = max(shares[sequence], share)
+    return "YXY" if shares["YXY"] <= MAX_NEAR_LOCK else min(shares, key=lambda sequence: shares[sequence])
+
+
+def _rotation(pose: Pose, joint: Joint, left: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotations of the distal segment in the proximal one and of this in W (m, 4), of the known ones of n samples."""
     members = [segment for segment in (joint.proximal, joint.distal) if segment != "world"]
     known = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in members], axis=0)
     quat_WP, quat_WD = (_joint_frame(pose, joint, segment, left, known) for segment in (joint.proximal, joint.distal))
-    quat = multiply(conjugate(quat_WP), quat_WD)
+    return multiply(conjugate(quat_WP), quat_WD), quat_WP, known
+
+
+def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngles:
+    n = len(pose.time)
+    members = [segment for segment in (joint.proximal, joint.distal) if segment != "world"]
+    quat, quat_WP, known = _rotation(pose, joint, left)
     angles = euler.decompose(quat, joint.sequence)
     values = euler.follow(angles, joint.sequence, near_lock)
     values = euler.drop_turns(values, angles.gimbal, joint.sequence, near_lock)

@@ -14,7 +14,7 @@ from ..errors import WrongOption, one_of
 from ..recording import Intervals
 from .curves import MeanCurve, compute_mean_curves
 from .euler import round_to_turns, wrap
-from .joints import Angles, JointAngles, joint_angles
+from .joints import AUTO, Angles, JointAngles, joint_angles
 from .repetitions import Repetitions, find_repetitions
 from .smoothing import smooth_pose
 from .tables import summarize_joint
@@ -31,13 +31,13 @@ class MovementOptions:
 
     Parameters
     ----------
-    sequence : of the shoulder, one of `SHOULDER_SEQUENCES`
+    sequence : of the shoulder, one of `SHOULDER_SEQUENCES`, or `AUTO`
     cutoff_hz : of the low-pass (`smooth_pose`); None: none
     phase : takes each of its intervals as a repetition; None: repetitions are found
     main_angle, rising, cycles : of `find_repetitions`
     """
 
-    sequence: str = "YXY"
+    sequence: str = AUTO
     cutoff_hz: float | None = None
     phase: str | None = None
     main_angle: str | None = None
@@ -82,6 +82,11 @@ class Movement:
     measures: Mapping[str, JointMeasures]
     curves: Mapping[str, tuple[MeanCurve, MeanCurve, MeanCurve]]
     cutoff_hz: float | None
+
+    @property
+    def sequence(self) -> str:
+        """That of the shoulder's angles; empty: there is none."""
+        return next((each.sequence for name, each in self.angles.joints.items() if name.endswith("_shoulder")), "")
 
     @property
     def duration(self) -> Statistics:

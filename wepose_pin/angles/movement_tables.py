@@ -11,12 +11,19 @@ import polars as pl
 from .curves import PERCENT
 from .definitions import SOURCE, define_angles
 from .movement import MEASURES, JointMeasures, Movement, compare_curves, compare_measures, measure_spans
+from .tables import angle_table
 
 
 def build_definition_table(movements: Sequence[Movement]) -> pl.DataFrame:
     """What each angle is: sequence, axis, where it is positive, and the source."""
     definitions = define_angles(movement.angles for movement in movements)
     return pl.DataFrame([{**each._asdict(), "source": SOURCE} for each in definitions]).rename({"group": "joint"})
+
+
+def build_angle_table(movements: Sequence[Movement]) -> pl.DataFrame:
+    """A row a sample of each session: its angles as `angle_table` has them."""
+    tables = [angle_table(each.angles).select(pl.lit(each.name).alias("session"), pl.all()) for each in movements]
+    return pl.concat(tables, how="diagonal")
 
 
 def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:

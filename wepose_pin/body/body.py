@@ -133,20 +133,20 @@ class BodyModel:
             if abs(value - mean) > FAR_OFF * std:
                 plausible = {"shortest": max(0.0, mean - FAR_OFF * std), "longest": mean + FAR_OFF * std}
                 facts: dict[str, float | str] = {"model": name, "deviations": FAR_OFF, **plausible}
-                diagnostics.append(Diagnostic("model-length-implausible", WARNING, length, value, facts=facts))
+                diagnostics.append(Diagnostic("model-implausible", WARNING, length, value, facts=facts))
         mass = sum(inertia.mass for inertia in self.pin.inertias)
         if mass and people.names and not LIGHTEST <= mass <= HEAVIEST:
-            facts = {"lightest": LIGHTEST, "heaviest": HEAVIEST}
-            diagnostics.append(Diagnostic("model-mass-implausible", WARNING, name, mass, facts=facts))
+            facts = {"variant": "mass", "mass": mass, "lightest": LIGHTEST, "heaviest": HEAVIEST}
+            diagnostics.append(Diagnostic("model-implausible", WARNING, name, facts=facts))
         impossible = find_impossible_inertia(self.robot)
         if impossible:
-            facts = {"links": ", ".join(impossible)}
-            diagnostics.append(Diagnostic("model-inertia-impossible", WARNING, name, facts=facts))
+            facts = {"variant": "inertia", "links": ", ".join(impossible)}
+            diagnostics.append(Diagnostic("model-implausible", WARNING, name, facts=facts))
         first = self.table.reference
         if not self.table.is_mechanism and not self.chains[first].joints:
             rigid = ", ".join(joint.name for joint in parse_tree(self.robot, name).path(first))
-            facts = {"joints": rigid or "the root", "segment": first}
-            diagnostics.append(Diagnostic("model-torso-fixed", WARNING, name, facts=facts))
+            facts = {"variant": "fixed", "joints": rigid or "the root", "segment": first}
+            diagnostics.append(Diagnostic("model-implausible", WARNING, name, facts=facts))
         return tuple(diagnostics)
 
     @cached_property

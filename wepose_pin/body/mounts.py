@@ -99,7 +99,6 @@ def align_sensors(
         No mount is known for a sensor, or gravity contradicts it.
     """
     diagnostics: list[Diagnostic] = []
-    facts: dict[str, float | str] = {"variant": "guessed"} if _start_is_guessed(recording) else {}
     nominal_mounts = collect_nominal_mounts(recording, subject, start_pose)
     mounts: dict[str, Rotation] = {}
     heading_offsets: dict[str, float] = {}
@@ -121,7 +120,7 @@ def align_sensors(
             raise BadSession(_describe_mount_error(recording, segment, subject, tilt_error_deg, start))
         if tilt_error_deg > MOUNT_WARNING_DEG:
             value, limit = float(np.deg2rad(tilt_error_deg)), float(np.deg2rad(MOUNT_WARNING_DEG))
-            diagnostics.append(Diagnostic("mount-contradicts-gravity", WARNING, segment, value, limit, facts))
+            diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit))
         mount_cov = find_start_mount_covariance(recording, segment, subject, start_pose)
         if mount_cov is not None:
             # Kalman update of the mount by the two observed components of tilt. The start pose observes no heading;
@@ -139,8 +138,8 @@ def align_sensors(
             if squared_stds > MOUNT_MOVED_STDS**2:
                 value = float(np.linalg.norm(misfit))
                 limit = value * MOUNT_MOVED_STDS / squared_stds**0.5  # [rad] in the direction of the misfit
-                stds = {"stds": MOUNT_MOVED_STDS}
-                diagnostics.append(Diagnostic("mount-moved", WARNING, segment, value, limit, facts | stds))
+                facts: dict[str, float | str] = {"variant": "calibrated", "stds": MOUNT_MOVED_STDS}
+                diagnostics.append(Diagnostic("mount-contradicted", WARNING, segment, value, limit, facts))
         mounts[segment], heading_offsets[segment] = start_pose.to_segment(segment, R_WS_start), psi
     return mounts, heading_offsets, diagnostics
 

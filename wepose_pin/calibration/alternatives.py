@@ -71,7 +71,7 @@ def leave_out_poses(best: Calibration) -> Calibration:
     deviation = loose.posed[phase]
     if deviation <= CONTRADICTED:
         return best
-    unused = Diagnostic("phase-not-used", WARNING, phase, deviation, CONTRADICTED)
+    unused = Diagnostic("pose-contradicted", WARNING, phase, deviation, CONTRADICTED, {"variant": "unused"})
     return leave_out_poses(replace(loose, remarks=(unused, *loose.remarks)))
 
 

@@ -41,16 +41,18 @@ class LimbMotion(NamedTuple):
     @property
     def contradiction(self) -> Diagnostic:
         """The value that is furthest beyond its limit."""
-        return max(self.doubts, key=_doubt)
+        return max(self.doubts, key=lambda each: float(each.value or 0.0))
 
     @property
     def doubt(self) -> float:
         """The largest ratio of a value to its limit; above 1 a person cannot move so."""
-        return _doubt(self.contradiction)
+        return float(self.contradiction.value or 0.0)
 
 
-def _doubt(diagnostic: Diagnostic) -> float:
-    return float((diagnostic.value or 0.0) / (diagnostic.limit or np.inf))
+def _diagnose_motion(variant: str, size: float, most: float, joint: str = "") -> Diagnostic:
+    """Return the diagnostic of a value, [SI], of which a person has at most `most`; its own value is their ratio."""
+    facts: dict[str, float | str] = {"variant": variant, "size": size, "most": most}
+    return Diagnostic("limb-motion-implausible", ERROR, joint, size / most, 1.0, facts)
 
 
 def measure_rotation(calibration: Calibration) -> float:
@@ -73,10 +75,7 @@ def measure_limbs(calibration: Calibration) -> LimbMotion:
     if closed.any():
         gap = float(np.sqrt(np.average(calibration.gap[closed] ** 2, weights=calibration.contact[closed])))
     behind = _share_behind(calibration, R)
-    doubts = [
-        Diagnostic("calibration-points-behind", ERROR, "", behind, BEHIND),
-        Diagnostic("calibration-chain-open", ERROR, "", gap, OPEN),
-    ]
+    doubts = [_diagnose_motion("behind", behind, BEHIND), _diagnose_motion("open", gap, OPEN)]
     flexion = {}
     for joint, hinge in table.hinges.items():
         if hinge.on not in R or hinge.moves not in R:
@@ -86,8 +85,8 @@ def measure_limbs(calibration: Calibration) -> LimbMotion:
         low, high = hinge.range
         backward = float(np.mean((angle < low) | (angle > high)))
         sideways = float(np.linalg.svd(along, compute_uv=False)[-1] / np.sqrt(len(along)))
-        doubts.append(Diagnostic("calibration-hinge-backward", ERROR, joint, backward, BACKWARD))
-        doubts.append(Diagnostic("calibration-hinge-sideways", ERROR, joint, sideways, SIDEWAYS))
+        doubts.append(_diagnose_motion("backwards", backward, BACKWARD, joint))
+        doubts.append(_diagnose_motion("sideways", sideways, SIDEWAYS, joint))
         flexion[joint] = np.degrees(angle if high > -low else -angle)
     return LimbMotion(flexion, tuple(doubts), gap)
 
@@ -128,11 +127,11 @@ def _share_behind(calibration: Calibration, R: Mapping[str, Rotation]) -> float:
     return max(shares)
 
 
-def diagnose_labels(calibration: Calibration, doubt: float) -> Diagnostic:
-    """Return the sensors that sit on other segments, or that a person cannot move so."""
+def diagnose_labels(calibration: Calibration, contradiction: Diagnostic) -> Diagnostic:
+    """Return the sensors that sit on other segments, or else the contradiction to a person's limbs."""
     problem, moved = calibration.problem, calibration.exchanged
     if not moved:
-        return Diagnostic("limb-motion-implausible", ERROR, "", doubt, 1.0)
+        return contradiction
     place = ", ".join(f"{label} sits on the {place}" for place, label in sorted(moved.items()))
     variant, table = {"variant": "mixed"}, problem.model.table
     if all(moved[b] == a for a, b in moved.items()):  # pairs of sensors, exchanged
@@ -142,4 +141,4 @@ def diagnose_labels(calibration: Calibration, doubt: float) -> Diagnostic:
         places = set(problem.sensors) & set(table.needed)
         sides = {(left, right) for left, right in table.pairs.items() if {left, right} <= places}
         variant = {"variant": "sides"} if pairs == sides else {}
-    return Diagnostic("sensors-exchanged", ERROR, place, doubt, 1.0, variant)
+    return Diagnostic("sensors-exchanged", ERROR, place, contradiction.value, 1.0, variant)

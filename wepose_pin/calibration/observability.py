@@ -15,7 +15,6 @@ from .problem import CalibrationProblem
 from .protocols import PROTOCOLS, load_protocol
 from .result import MIN_CONTACT
 
-LOOSE_SCALE = 0.6  # of the prior's relative standard deviation, above which a measured length shows little of limbs
 MOST_OPEN = 0.10  # share of a phase in which the closure may be open
 MOST_INTERVALS = 3  # of an open closure that are named, the longest
 
@@ -41,8 +40,8 @@ def diagnose_lengths(
         return [Diagnostic("lengths-not-observed", INFO, facts=names)]
     diagnostics = []
     if free_scale_std is not None:
-        facts = names | {"measured": problem.measured_example}
-        diagnostics.append(Diagnostic("scale-from-prior", INFO, value=free_scale_std, facts=facts))
+        facts = names | {"variant": "prior", "measured": problem.measured_example}
+        diagnostics.append(Diagnostic("scale-uncertain", INFO, value=free_scale_std, facts=facts))
     table, names_of_lengths = problem.model.table, list(problem.model.lengths)
     chain = problem.lengths_in_closures
     of_limbs = [
@@ -53,14 +52,6 @@ def diagnose_lengths(
             for part in table.lengths[name].stretches
         )
     ]
-    rows = [names_of_lengths.index(name) for name in of_limbs]
-    share = np.zeros(len(lengths))
-    share[rows] = 1.0 / lengths[rows] / max(len(rows), 1)
-    covariance_before = prior.lengths_covariance(names_of_lengths)
-    scale_std, before = (float(np.sqrt(share @ C @ share)) for C in (covariance, covariance_before))
-    if free_scale_std is None and scale_std > LOOSE_SCALE * before:
-        facts = {"before": before, "measured": problem.measured_example}
-        diagnostics.append(Diagnostic("limb-scale-from-prior", INFO, value=scale_std, facts=facts))
     # Closures show proportions: those must be known better than from the prior and the measured lengths.
     first = [name for name in of_limbs if _is_first(problem, name)]
     for a, b in ((name, other) for name in first for other in chain if other not in first):
@@ -71,7 +62,7 @@ def diagnose_lengths(
             break
     else:
         if first:
-            diagnostics.append(Diagnostic("lengths-mostly-prior", WARNING, facts={"protocol": protocol.title}))
+            diagnostics.append(Diagnostic("lengths-not-observed", WARNING, facts=names | {"variant": "hardly"}))
     return diagnostics
 
 

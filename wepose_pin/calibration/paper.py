@@ -35,7 +35,6 @@ from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.start_pose import StartPose
 from ..body.subject import Subject
 from ..body.table import NEUTRAL_POSE
-from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, NoSolution, one_of
 from .conditions import Constraint, Loop, resolve_conditions
 from .least_squares import MIN_LENGTH, QUIET_QP, Observations
@@ -124,7 +123,6 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
             *filtered.diagnostics,
             *mount_diagnostics,
             *diagnose_lengths(problem, lengths, covariance, measured_covariance, None),
-            Diagnostic("lengths-alone-estimated", WARNING),
         ),
         time=recording.time[samples],
         gap=gap,

@@ -194,9 +194,10 @@ class CalibrationProblem:
         self, angles_deg: Mapping[str, float], limit_deg: float, variant: str = ""
     ) -> CalibrationProblem:
         """Return the same problem without mounts that are off by these angles, which it states."""
-        facts: dict[str, float | str] = {"variant": variant} if variant else {}
+        facts: dict[str, float | str] = {"variant": f"unused {variant}".strip()}
+        limit = float(np.deg2rad(limit_deg))
         unused = [
-            Diagnostic("mount-not-used", WARNING, name, float(np.deg2rad(angle)), float(np.deg2rad(limit_deg)), facts)
+            Diagnostic("mount-contradicted", WARNING, name, float(np.deg2rad(angle)), limit, facts)
             for name, angle in angles_deg.items()
         ]
         return replace(self.remove_mounts(angles_deg), unused_mounts=(*self.unused_mounts, *unused))

@@ -124,7 +124,7 @@ def calibrate(
     >>> calibration.quality.quality
     'poor'
     >>> [diagnostic.code for diagnostic in calibration.diagnostics]
-    ['motion-too-short']
+    ['motion-too-small']
     >>> wp.track(recording, calibration).subject.quality
     'poor'
     """

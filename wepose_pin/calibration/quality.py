@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body.subject import Quality
 from ..body.table import MECHANISM, ROOT
-from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity
+from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, Severity, drop_consequences
 from .anatomy import LEAST_ROTATION, diagnose_labels, measure_limbs, measure_rotation, reach_limbs
 from .conditions import Loop, choose_variant, group_lengths, is_scale_observed
 from .observability import MOST_OPEN, find_intervals, format_longest
@@ -67,11 +67,11 @@ DOUBT = QualityLimits(1.0, 1.0)  # of anatomy, see `anatomy`
 
 # A motion smaller than this [rad] is the cause of an uncertainty.
 ENOUGH = {
-    "motion-elevation-small": np.deg2rad(40.0),
-    "motion-sideways-small": np.deg2rad(35.0),
-    "motion-bend-small": np.deg2rad(40.0),
-    "motion-lean-small": np.deg2rad(8.0),
-    "motion-twist-small": np.deg2rad(12.0),
+    "elevation": np.deg2rad(40.0),
+    "sideways": np.deg2rad(35.0),
+    "bend": np.deg2rad(40.0),
+    "lean": np.deg2rad(8.0),
+    "twist": np.deg2rad(12.0),
 }
 ENOUGH_SAMPLES = 12.0  # effective sample size that a minute of motion reaches
 
@@ -83,8 +83,7 @@ def assess(calibration: Calibration) -> CalibrationQuality:
     doubt = 0.0 if is_mechanism else limbs.doubt
     motion, checks = _measure_motion(calibration, limbs.flexion), list[Check]()
     if not is_mechanism:
-        cause = limbs.contradiction if doubt > 1.0 else None
-        checks.append(_check(diagnose_labels(calibration, doubt), DOUBT, cause))
+        checks.append(_check(diagnose_labels(calibration, limbs.contradiction), DOUBT))
     for mount in problem.unused_mounts:
         checks.append(_check(mount, QualityLimits(float(mount.limit or 0.0), np.pi), quality="poor"))
     if not problem.protocol.closures:  # nothing tells which of them is wrong
@@ -95,13 +94,16 @@ def assess(calibration: Calibration) -> CalibrationQuality:
         checks += _check_scale(calibration) + _check_residuals(calibration)
     if rotation < LEAST_ROTATION and not is_mechanism and any(check.quality == "fail" for check in checks):
         # All that fails follows from it.
-        checks = [_check(Diagnostic("motion-too-small", INFO, value=rotation), ROTATION, quality="fail")]
+        hardly_any = Diagnostic("motion-too-small", INFO, value=rotation, facts={"variant": "soft-tissue"})
+        checks = [_check(hardly_any, ROTATION, quality="fail")]
     reasons = _reasons(checks)
+    shown = drop_consequences((*reasons, *calibration.remarks))
+    reasons = tuple(each for each in reasons if each in shown) or reasons
     return CalibrationQuality(
         quality=max((check.quality for check in checks), key=QUALITIES.index),
         checks=tuple(checks),
         reasons=reasons,
-        further=tuple(each for each in calibration.remarks if each.code not in {reason.code for reason in reasons}),
+        further=tuple(each for each in shown if each.code not in {reason.code for reason in reasons}),
         motion=motion,
         directions=_find_directions(calibration),
         doubt=doubt,
@@ -109,16 +111,14 @@ def assess(calibration: Calibration) -> CalibrationQuality:
 
 
 def _reasons(checks: list[Check]) -> tuple[Diagnostic, ...]:
-    """Diagnostics that do not pass, the worst first; a cause once, behind the first that it explains."""
-    reasons: list[Diagnostic] = []
+    """Diagnostics that do not pass, the worst first; the cause of several once, in their place."""
     failing = [check for check in checks if check.quality != "pass"]
-    for check in sorted(failing, key=lambda check: (check.quality != "fail", -check.excess)):
-        if check.diagnostic.code in {check.cause.code for check in failing if check.cause is not None}:
-            continue  # it is the cause of another
-        reasons.append(check.diagnostic)
-        if check.cause is not None and check.cause.code not in {each.code for each in reasons}:
-            reasons.append(check.cause)
-    return tuple(reasons)
+    failing.sort(key=lambda check: (check.quality != "fail", -check.excess))
+    reasons: dict[tuple[str, str, float | str], Diagnostic] = {}
+    for check in failing:
+        each = check.cause or check.diagnostic
+        reasons.setdefault((each.code, each.place, each.facts.get("variant", "")), each)
+    return tuple(reasons.values())
 
 
 def _check(
@@ -145,11 +145,11 @@ def _check_scale(calibration: Calibration) -> list[Check]:
     problem = calibration.problem
     if is_scale_observed(problem.conditions):
         return []
-    code, facts = "scale-uncertain", {"measured": problem.measured_example}
+    facts = {"measured": problem.measured_example}
     if not problem.scale_lengths:
-        code = "scale-from-prior"
-        facts |= {"prior": problem.prior.note or problem.prior.name, "protocol": problem.protocol.name}
-    return [_check(Diagnostic(code, INFO, value=calibration.scale_std, facts=facts), SCALE)]
+        facts |= {"variant": "prior", "prior": problem.prior.note or problem.prior.name}
+        facts |= {"protocol": problem.protocol.name}
+    return [_check(Diagnostic("scale-uncertain", INFO, value=calibration.scale_std, facts=facts), SCALE)]
 
 
 def _check_lengths(calibration: Calibration, motion: MotionRange) -> list[Check]:
@@ -237,16 +237,15 @@ def _find_cause(calibration: Calibration, motion: MotionRange, causes: tuple[str
         "lean": motion.lean,
         "twist": motion.twist.size if motion.twist else np.nan,
     }
-    facts = {"variant": _find_variant(calibration)}
-    codes = {f"motion-{name}-small": np.deg2rad(sizes[name]) for name in causes if np.isfinite(sizes[name])}
-    least = min(codes, key=lambda code: codes[code] / ENOUGH[code], default="")
-    if least and codes[least] < ENOUGH[least]:
-        return Diagnostic(least, WARNING, "", float(codes[least]), float(ENOUGH[least]), facts)
+    closure = _find_variant(calibration)
+    angles = {name: float(np.deg2rad(sizes[name])) for name in causes if np.isfinite(sizes[name])}
+    least = min(angles, key=lambda name: angles[name] / ENOUGH[name], default="")
+    if least and angles[least] < ENOUGH[least]:
+        facts = {"variant": f"{least} {closure}"}
+        return Diagnostic("motion-too-small", WARNING, "", angles[least], float(ENOUGH[least]), facts)
     samples = calibration.effective_sample_size
-    if samples < SAMPLES.passes:
-        return Diagnostic("motion-too-short", WARNING, "", samples, SAMPLES.passes, facts)
     if samples < ENOUGH_SAMPLES:
-        return Diagnostic("motion-short", WARNING, "", samples, ENOUGH_SAMPLES)
+        return Diagnostic("motion-too-small", WARNING, "", samples, ENOUGH_SAMPLES, {"variant": closure})
     return None
 
 
@@ -259,7 +258,7 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
         intervals = {"intervals": format_longest(find_open_intervals(calibration))}
         checks += [
             _check(Diagnostic("closure-gap-large", INFO, value=calibration.rms_gap, facts=facts), GAP),
-            _check(Diagnostic("motion-too-short", INFO, value=calibration.effective_sample_size, facts=facts), SAMPLES),
+            _check(Diagnostic("motion-too-small", INFO, value=calibration.effective_sample_size, facts=facts), SAMPLES),
             _check(Diagnostic("closure-open", INFO, value=share, facts=facts | intervals), OPEN_SHARE),
         ]
     tilts = {name: float(np.linalg.norm(offset.tilt)) for name, offset in calibration.subject.start_pose_offset.items()}
@@ -270,9 +269,7 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
         lengths: dict[str, float | str] = {"measured": length.metres, "expected": length.expected, "std": length.std}
         if calibration.formulation == "paper":
             lengths["variant"] = "paper"
-        checks.append(
-            _check(Diagnostic("measured-length-contradicted", INFO, name, length.deviation, facts=lengths), MEASURED)
-        )
+        checks.append(_check(Diagnostic("length-contradicted", INFO, name, length.deviation, facts=lengths), MEASURED))
     if any(length.deviation > MEASURED.passes for length in calibration.measured_lengths.values()):
         return checks  # all lengths have followed a wrong measured one
     prior, subject = problem.prior, calibration.subject
@@ -281,10 +278,11 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
     if not z:
         return checks
     name = max(z, key=lambda n: z[n])
-    unusual: dict[str, float | str] = {"metres": float(subject.lengths[name])}
-    if problem.model.table.is_mechanism:
-        unusual["variant"] = MECHANISM
-    return [*checks, _check(Diagnostic("length-unusual", INFO, name, z[name], facts=unusual), UNUSUAL)]
+    unusual: dict[str, float | str] = {
+        "variant": MECHANISM if problem.model.table.is_mechanism else "estimated",
+        "metres": float(subject.lengths[name]),
+    }
+    return [*checks, _check(Diagnostic("length-contradicted", INFO, name, z[name], facts=unusual), UNUSUAL)]
 
 
 def _measure_motion(calibration: Calibration, flexion: Mapping[str, np.ndarray]) -> MotionRange:

@@ -29,7 +29,7 @@ def angles(
     repetitions: Annotated[PhaseName | None, MORE] = None,
     main_angle: Annotated[Angle | None, MORE] = None,
     cycles: Annotated[bool, MORE] = False,
-    shoulder: Annotated[Literal["YXY", "XZY", "ZXY"], MORE] = "YXY",
+    shoulder: Annotated[Literal["auto", "YXY", "XZY", "ZXY"], MORE] = "auto",
 ) -> None:
     """Write the joint angles of results as tables and figures for a paper.
 
@@ -46,10 +46,11 @@ def angles(
     further
         Further results, each compared with the first one.
     out
-        Write to this folder: repetitions.csv (lowest, highest, range, peak rate of each angle in each repetition),
-        phases.csv (the same in the whole time and in each phase), summary.csv (mean and standard deviation over
-        repetitions), curves.csv (0 to 100 %), comparison.csv (of several results), sessions.csv, definitions.csv
-        (sequences and signs), the figures as .svg, and angles.html, which shows all of it.
+        Write to this folder: angles.csv (all angles over time), repetitions.csv (lowest, highest, range, peak rate of
+        each angle in each repetition), phases.csv (the same in the whole time and in each phase), summary.csv (mean and
+        standard deviation over repetitions), curves.csv (0 to 100 %), comparison.csv (of several results),
+        sessions.csv, definitions.csv (sequences and signs), the figures as .svg, and angles.html, which shows all of
+        it.
     low_pass_hz
         Low-pass the orientations at this frequency (Butterworth, second order, forwards and backwards; half the
         amplitude at HZ). Without it they are not filtered.
@@ -61,7 +62,8 @@ def angles(
         Let a repetition last until the next one begins, as a gait cycle does, and not only until the angle is back.
     shoulder
         Use this sequence for the shoulder: YXY (plane of elevation, elevation, internal rotation), XZY or ZXY (flexion
-        and adduction: no gimbal lock where the arm hangs).
+        and adduction: no gimbal lock where the arm hangs). auto: YXY, or if it is near gimbal lock in the first result
+        for more than 1 % of the time, the one that is so least.
     """
     options = dict(locals())
     from polars import selectors
@@ -86,6 +88,7 @@ def angles(
             movements = _analyze((result, *further), chosen, interval, phase, progress)
             progress("writing", 0.7)
             builders = {
+                "angles": tables.build_angle_table,
                 "sessions": tables.build_session_table,
                 "repetitions": tables.build_repetition_table,
                 "phases": tables.build_phase_table,
@@ -111,7 +114,9 @@ def angles(
         _print_repetitions(movement)
     _print_ranges(movements)
     filtered = "not low-passed" if low_pass_hz is None else f"low-passed at {low_pass_hz:g} Hz (half amplitude)"
-    say(f"Orientations {filtered}; shoulder {'-'.join(shoulder)}; ± between repetitions: one standard deviation")
+    sequence = movements[0].sequence
+    by = f"; shoulder {'-'.join(sequence)}{', chosen by gimbal lock' if shoulder == 'auto' else ''}" if sequence else ""
+    say(f"Orientations {filtered}{by}; ± between repetitions: one standard deviation")
     say_pages(out, {"Page": PAGE})
     say(f"Tables and figures: {out}")
 
@@ -142,6 +147,7 @@ def _analyze(
         except WrongOption as error:
             raise BadOption(f"{folder}: {error}" if len(folders) > 1 else str(error)) from None
         found = movement.repetitions
+        options = replace(options, sequence=movement.sequence or options.sequence)
         if options.phase is None and len(found.spans):
             options = replace(options, main_angle=found.source, rising=found.rising)
         movements.append(movement)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from cyclopts import Group, Parameter
 
 from ..assets import find_plugins, load_plugin
-from ..diagnostics import INFO, WARNING, Diagnostic
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadOption, one_of
 from .options import (
     MORE,
@@ -225,7 +225,7 @@ def live(
                 factor = float(speed.replace("max", "inf")) if replays else 1.0
                 driven, samples = connect_robot(following, samples, worn, factor, body.table)
                 if not driven.stream.checks_contact:
-                    print_diagnostics([Diagnostic("robot-self-collision-unchecked", WARNING, driven.robot.map.name)])
+                    print_diagnostics([Diagnostic("robot-shapes-missing", WARNING, driven.robot.map.name)])
             if served is not None and (guide or driven is not None):
                 served.set_body(body, None if driven is None else driven.figure(body))
             if driven is not None:
@@ -261,8 +261,8 @@ def _print_end(ended: Live, record: Path | None) -> None:
     if ended.robot is not None:
         _print_robot(ended.robot)
     if session.problem:
-        reason = {"reason": session.problem}
-        print_diagnostics([Diagnostic("live-recording-incomplete", WARNING, str(session.record), facts=reason)])
+        facts = {"variant": "disk", "reason": session.problem}
+        print_diagnostics([Diagnostic("file-incomplete", WARNING, str(session.record), facts=facts)])
     elif session.record is not None:
         again = f"  (wepose track {session.record} -o DIR gives these poses again)"
         say(f"Recorded: {session.record}{again}")
@@ -300,7 +300,7 @@ def _open_page(model: BodyModel, title: str, host: str | None, port: int, in_bro
         import webbrowser
 
         if not webbrowser.open(page.url):
-            print_diagnostics([Diagnostic("browser-not-started", INFO)])
+            say("No browser could be started: open the page yourself.")
     return page
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from ..diagnostics import INFO, Diagnostic
 from ..errors import BadOption, MissingFile
 from .options import MORE, Force, Interval, OutFile, Phase
-from .output import print_diagnostics, progress_bar, say
+from .output import progress_bar, say
 
 
 def view(
@@ -59,5 +58,5 @@ def view(
                 partial.write_text(text, encoding="utf-8")
     say(f"Motion:  {page}")
     if open and not webbrowser.open(page.absolute().as_uri()):
-        print_diagnostics([Diagnostic("browser-not-started", INFO)])
+        say("No browser could be started: open the page yourself.")
     return page

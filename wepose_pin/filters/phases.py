@@ -181,8 +181,8 @@ def check_common_rotation(
     for segment, noise in noises.items():
         up = up_S[segment]
         noises[segment] = replace(noise, gyro_bias_cov=noise.gyro_bias_cov + mean**2 * np.outer(up, up))
-    facts = {"rotation": float(np.deg2rad(turn_deg))}
-    return [Diagnostic("person-rotates", WARNING, value=abs(mean), limit=limit, facts=facts)]
+    facts: dict[str, float | str] = {"variant": "rotates", "rotation": float(np.deg2rad(turn_deg))}
+    return [Diagnostic("start-pose-motion", WARNING, value=abs(mean), limit=limit, facts=facts)]
 
 
 def check_motion(recording: Recording, segment: str, interval: tuple[float, float], phase: str) -> list[Diagnostic]:
@@ -221,5 +221,5 @@ def check_motion(recording: Recording, segment: str, interval: tuple[float, floa
             "end": interval[1],
         }
         limit = float(np.deg2rad(SWAYS_DEG_S))
-        return [Diagnostic("start-pose-sway", WARNING, segment, float(np.deg2rad(rms)), limit, facts)]
+        return [Diagnostic("start-pose-motion", WARNING, segment, float(np.deg2rad(rms)), limit, facts)]
     return []

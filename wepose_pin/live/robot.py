@@ -59,10 +59,13 @@ class RobotSummary(NamedTuple):
     def diagnostics(self) -> list[Diagnostic]:
         """Commands that did not reach the robot, steps in which it braked to stay clear of itself, hands that stuck."""
         diagnostics = [
-            Diagnostic("robot-commands-skipped", WARNING, self.robot, self.skipped),
+            Diagnostic("robot-commands-lost", WARNING, self.robot, self.skipped),
             Diagnostic("robot-stopped-for-clearance", WARNING, self.robot, self.stopping),
-            Diagnostic("robot-commands-dropped", WARNING, self.robot, self.dropped),
-            *(Diagnostic("robot-hand-stuck", WARNING, side, off, STUCK_M) for side, off in self.stuck.items()),
+            Diagnostic("robot-commands-lost", WARNING, self.robot, self.dropped, facts={"variant": "unsent"}),
+            *(
+                Diagnostic("robot-hand-off-target", WARNING, side, off, STUCK_M, {"variant": "live"})
+                for side, off in self.stuck.items()
+            ),
         ]
         return [diagnostic for diagnostic in diagnostics if diagnostic.value]
 

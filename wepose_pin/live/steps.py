@@ -40,7 +40,8 @@ STATURE = "stature"  # that a person may enter in place of a length
 TOO_LITTLE = ("motion-", "scale-", "length-uncertain", "mount-heading-uncertain", "closure-open")
 # Code → what to do, of those whose remedy is an option of a command: here it is asked for.
 MEASURE_IT = "Measure what is asked for and enter it here."
-REMEDIES = dict.fromkeys(("scale-from-prior", "scale-uncertain", "limb-scale-from-prior"), MEASURE_IT) | {
+REMEDIES = {
+    "scale-uncertain": MEASURE_IT,
     "sensors-exchanged": "Exchange them here.",
     "length-uncertain": "Move further and faster, through the whole reach.",
 }
@@ -503,7 +504,7 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None) -> tuple
         actions = [MORE, RESTART] if lacks_motion else [RESTART, MORE]
         if lacks_motion:
             sentence = "There was too little of the motion. More of it may be enough."
-    diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "phase-not-used")]
+    diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "pose-contradicted")]
     counted = [count_from_begin(each, calibration) for each in diagnostics]
     reasons = [text.line() for _, text in render_all(counted, REMEDIES)]
     if calibration.exchanged:  # all other reasons follow from this one

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..body import load_table
-from ..diagnostics import INFO, WARNING, Diagnostic
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, MissingFile, one_of
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from .guess import guess_unit
@@ -113,8 +113,7 @@ def make_device(
         for signal in NEEDED[kind]:
             check_measured(path, signals[signal].values, f"{signal} of {label}")
         place = path.name if len(found) == 1 else f"{path.name} {label}"
-        time, values, joined = join_signals(place, {name: signals[name] for name in NEEDED[kind]})
-        diagnostics += joined
+        time, values = join_signals(place, {name: signals[name] for name in NEEDED[kind]})
         if len(time) < FEWEST:
             raise BadData(f"{path}: holds {len(time)} samples of {label}; the export is empty or cut off")
         texts = [label, *([hints[label]] if hints else []), *([path.absolute().stem] if len(chosen) == 1 else [])]
@@ -123,7 +122,7 @@ def make_device(
     left_out = [label for label in found if label not in chosen]
     if left_out:
         facts = {"devices": ", ".join(left_out), "signals": " and ".join(NEEDED[kind])}
-        diagnostics.append(Diagnostic("devices-left-out", WARNING, path.name, len(left_out), facts=facts))
+        diagnostics.append(Diagnostic("sensors-left-out", WARNING, path.name, len(left_out), facts=facts))
     return Device(kind, sensors, diagnostics=tuple(diagnostics))
 
 
@@ -153,10 +152,8 @@ def spread_equal_times(time: np.ndarray) -> np.ndarray:
     return np.asarray(np.interp(np.arange(len(time)), [*new, len(time)], [*time[new], last]))
 
 
-def join_signals(
-    place: str, signals: Mapping[str, Signal]
-) -> tuple[np.ndarray, dict[str, np.ndarray], tuple[Diagnostic, ...]]:
-    """Join signals of different clocks on that of the first: times (n,), values by signal, and what was done.
+def join_signals(place: str, signals: Mapping[str, Signal]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Join signals of different clocks on that of the first: times (n,) and values by signal.
 
     Values of the second signal between two samples are interpolated, NaN where these are further apart than
     `LONGEST_STEPS`.
@@ -168,13 +165,13 @@ def join_signals(
     """
     (name, first), *rest = signals.items()
     if all(signal.time is first.time for _, signal in rest):
-        return first.time, {name: signal.values for name, signal in signals.items()}, ()
+        return first.time, {name: signal.values for name, signal in signals.items()}
     ((other, second),) = rest
     (time, rates), (own, forces) = _drop_missing(first), _drop_missing(second)
     if len(time) < 2 or len(own) < 2 or min(time[-1], own[-1]) <= max(time[0], own[0]):
         raise BadData(f"{place}: {name} and {other} have no time in common, of {len(time)} and {len(own)} rows")
     if np.array_equal(time, own):
-        return time, {name: rates, other: forces}, ()
+        return time, {name: rates, other: forces}
     inside = (time >= own[0]) & (time <= own[-1])
     time, rates = time[inside], rates[inside]
     after = np.clip(np.searchsorted(own, time), 1, len(own) - 1)
@@ -182,8 +179,7 @@ def join_signals(
     joined = np.column_stack([np.interp(time, own, axis) for axis in forces.T])
     off = np.minimum(time - own[after - 1], own[after] - time)
     joined[(steps > LONGEST_STEPS * np.median(np.diff(own))) & (off > 0.0)] = np.nan
-    facts = {"off": float(np.max(off, initial=0.0))}
-    return time, {name: rates, other: joined}, (Diagnostic("signals-joined", INFO, place, facts=facts),)
+    return time, {name: rates, other: joined}
 
 
 def _drop_missing(signal: Signal) -> Signal:

@@ -115,7 +115,7 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         signals = {label: {"orientation": quat} for label, quat in _read_orientations(path, frames).items()}
         kind = "orientation"
         if frames.t_pose is None:
-            diagnostics = (Diagnostic("arm-frames-assumed", WARNING, path.name),)
+            diagnostics = (Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "frames"}),)
     sensors = {
         label: DeviceSensor(frames.time, values, SEGMENT_OF[label])
         for label, values in signals.items()

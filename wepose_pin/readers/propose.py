@@ -81,8 +81,8 @@ class Proposal:
     def warn_of_unknown(self, place: str, sensors: Sequence[str]) -> None:
         """Say which sensors are on segments that are not known."""
         if sensors:
-            facts = {"sensors": ", ".join(sensors)}
-            self.diagnostics.append(Diagnostic("sensor-segments-unknown", WARNING, place, len(sensors), facts=facts))
+            facts: dict[str, float | str] = {"variant": "unnamed", "devices": ", ".join(sensors)}
+            self.diagnostics.append(Diagnostic("sensors-left-out", WARNING, place, len(sensors), facts=facts))
 
     def read(self, session: Path, name: str) -> Recording | None:
         """Read the recording as a session file would, and settle units; None: the data `name` cannot be read.
@@ -140,8 +140,8 @@ def propose_from_device(path: Path, folder: Path, name: str, table: BodyTable) -
         try:
             _, segments, lacks_rate = _read(file, name, table)
         except WeposeError as error:
-            facts = {"reason": str(error)}
-            proposal.diagnostics.append(Diagnostic("device-file-left-out", WARNING, file.name, facts=facts))
+            facts: dict[str, float | str] = {"variant": "unreadable", "reason": str(error)}
+            proposal.diagnostics.append(Diagnostic("sensors-left-out", WARNING, file.name, facts=facts))
             continue
         (label, segment), *_ = segments.items()
         where = segment if segment and segment not in proposal.sensors else f"?{file.name}"

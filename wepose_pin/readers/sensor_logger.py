@@ -55,7 +55,7 @@ def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None
     signals = {name: _read_signal(path, name, tables[name]) for name in COLUMNS if name in tables}
     total = signals.get("TotalAcceleration")
     if total is None and {"Accelerometer", "Gravity"} <= set(signals):
-        time, parts, _ = join_signals(path.name, {name: signals[name] for name in ("Accelerometer", "Gravity")})
+        time, parts = join_signals(path.name, {name: signals[name] for name in ("Accelerometer", "Gravity")})
         total = Signal(time, parts["Accelerometer"] + parts["Gravity"])
     found, diagnostics = {}, []
     if total is not None and "Gyroscope" in signals:
@@ -63,7 +63,7 @@ def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None
         platform = str(about.get("platform") or "").lower()
         standard = str(about.get("standardisation") or about.get("standardization")).lower() == "true"
         if not platform and use != "orientation":
-            diagnostics.append(Diagnostic("accel-sign-assumed", WARNING, path.name))
+            diagnostics.append(Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "sign"}))
         sign = -1.0 if platform == "ios" and not standard else 1.0
         found = {"gyro": signals["Gyroscope"], "accel": Signal(total.time, sign * total.values)}
     if "Orientation" in signals:

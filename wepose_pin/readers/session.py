@@ -48,6 +48,7 @@ from .tables import read_columns, read_table
 
 # Allowed error of a quaternion's norm, from rounded decimals.
 NORM_ERROR = 1e-2
+MOST_LOST = 0.01  # share of samples lost in short gaps, above which it is a diagnostic
 # Optional keys of [data] → why one has no effect; a key that no sensor uses is an error.
 _UNUSED = {
     "file": "every sensor names a file of its own",
@@ -164,7 +165,8 @@ class _Files:
         for device in self._devices.values():
             yield from device.diagnostics
         for name, packet in self._packets.items():
-            yield Diagnostic("packet-times-spread", INFO, name, packet)
+            facts: dict[str, float | str] = {"variant": "packets", "packet": packet}
+            yield Diagnostic("time-stamps-uneven", INFO, name, facts=facts)
 
     def _find_file(self, keys: TomlTable) -> Path:
         file = (keys if "file" in keys else self._data).text("file", None)
@@ -445,9 +447,14 @@ def _explain_gap_limit(clock: Clock) -> str:
 
 
 def _report_bridged_gaps(segment: str, marks: np.ndarray, step: float) -> Iterator[Diagnostic]:
-    """Report the bridged gaps of a sensor, from the marks (n,) of its samples and their usual step [s]."""
-    for mark, code, severity in ((LONG, "long-gaps-bridged", WARNING), (BRIDGED, "short-gaps-bridged", INFO)):
-        spans = [last - first for first, last in find_runs(marks == mark)]
-        if spans:
-            facts = {"samples": sum(spans), "gaps": len(spans)}
-            yield Diagnostic(code, severity, segment, max(spans) * step, max(LONGEST_GAP_S, step), facts)
+    """Report the bridged gaps of a sensor, from the marks (n,) of its samples and their usual step [s].
+
+    Short gaps are reported where they are many.
+    """
+    long, short = ([last - first for first, last in find_runs(marks == mark)] for mark in (LONG, BRIDGED))
+    if long:
+        facts: dict[str, float | str] = {"samples": sum(long), "gaps": len(long)}
+        yield Diagnostic("samples-lost", WARNING, segment, max(long) * step, max(LONGEST_GAP_S, step), facts)
+    elif sum(short) > MOST_LOST * len(marks):
+        facts = {"variant": "short", "longest": max(short) * step}
+        yield Diagnostic("samples-lost", WARNING, segment, sum(short) / len(marks), MOST_LOST, facts)

@@ -105,7 +105,7 @@ def choose_label(keys: TomlTable, device: Device, segment: str, path: Path) -> s
         if label not in device.sensors:
             raise BadSession(f"{keys.at('label')} = '{label}' is not in {path.name}; {one_of(device.sensors, label)}")
         return label
-    incomplete = any(each.code == "devices-left-out" for each in device.diagnostics)
+    incomplete = any(each.code == "sensors-left-out" for each in device.diagnostics)
     alone = len(device.sensors) == 1 and (
         not incomplete or any(sensor.segment is None for sensor in device.sensors.values())
     )

@@ -71,7 +71,7 @@ def read_xdf(path: Path, use: str | None = None, rate_hz: float | None = None) -
                     read = convert(path, signal, read, unit, channels[0])
                     if not units[channels[0]]:
                         facts = {"columns": channels[0], "unit": unit}
-                        diagnostics.append(Diagnostic("units-assumed", WARNING, path.name, facts=facts))
+                        diagnostics.append(Diagnostic("file-assumption", WARNING, path.name, facts=facts))
                 sensors.setdefault(label, {}).setdefault(signal, Signal(stream["time_stamps"], read))
     return make_device(path, _join_streams(sensors), NEEDS, use, rate_hz, diagnostics)
 
@@ -92,7 +92,7 @@ def _check_complete(path: Path, stream: Mapping[str, Any], count: int) -> list[D
         stated = int(stream["footer"]["info"]["sample_count"][0])
     except (KeyError, IndexError, TypeError, ValueError):
         stated = count + 1
-    return [Diagnostic("samples-missing-in-file", WARNING, path.name, count, stated)] if stated > count else []
+    return [Diagnostic("file-incomplete", WARNING, path.name, count, stated)] if stated > count else []
 
 
 def _guess_unit(signal: str, values: np.ndarray) -> str:

@@ -174,10 +174,10 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
     dt = 1.0 / float(np.round(1.0 / usual, 3 if usual < 0.1 else 6))
     time = np.minimum(begin + dt * np.arange(int((end - begin) / dt + 1e-6) + 1), end)
     shortest, longest = min(float(each.min()) for each in steps), max(float(each.max()) for each in steps)
+    variant, off = ("uneven", uneven) if uneven > UNEVEN else ("changing", drift)
     facts: dict[str, float | str] = {"start": begin, "end": float(time[-1]), "shortest": shortest, "longest": longest}
-    if shared:
-        facts |= {"variant": "uneven", "off": uneven} if uneven > UNEVEN else {"variant": "changing", "off": drift}
-    return time, (Diagnostic("time-resampled", INFO, value=1.0 / dt, facts=facts),)
+    facts |= {"variant": variant if shared else "clocks", "rate": 1.0 / dt}
+    return time, (Diagnostic("time-stamps-uneven", INFO, value=off if shared else None, facts=facts),)
 
 
 def _agree(a: Clock, b: Clock) -> bool:

@@ -430,7 +430,9 @@ def check_sensors(
     for name, (_, *values) in samples.items():
         known = values[0][np.isfinite(values[0]).all(axis=1) & values[0].any(axis=1)]  # zeros mark a lost sample
         if name not in scans and len(known) >= FROZEN_SAMPLES and (known == known[0]).all():
-            diagnostics.append(Diagnostic("orientation-constant", WARNING, name, len(known)))
+            diagnostics.append(
+                Diagnostic("sensor-frozen", WARNING, name, facts={"variant": "orientation", "rows": len(known)})
+            )
     return SensorCheck(faults, {name: scan.gyro_range for name, scan in scans.items()}, diagnostics)
 
 
@@ -469,6 +471,6 @@ def _find_repeats(scans: Mapping[str, SensorScan], faults: Mapping[str, list[Fau
             repeated_s = [sum(max(0.0, min(last, b) - max(first, a)) for a, b in each) for each in spans.values()]
             explained = any(fault.first <= first and last <= fault.last for fault in faults.get(name, []))
             if min(repeated_s) < 0.5 * (last - first) and not explained:
-                facts: dict[str, float | str] = {"start": first, "end": last}
-                diagnostics.append(Diagnostic("sensor-repeats", WARNING, name, last - first, facts=facts))
+                facts: dict[str, float | str] = {"variant": "repeats", "start": first, "end": last}
+                diagnostics.append(Diagnostic("sensor-frozen", WARNING, name, last - first, facts=facts))
     return diagnostics

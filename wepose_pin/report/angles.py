@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..angles import group_sides
+from ..angles import Angles, JointAngles, group_sides
 from ..angles.curves import PERCENT, MeanCurve
 from ..angles.movement import (
     RANGE,
@@ -20,12 +20,26 @@ from ..angles.movement import (
 )
 from ..angles.repetitions import list_angles
 from ..body.kinematics import Pose
-from .figures import BAND, SESSION_COLOURS, SHADE, SOFT, Figures, ReportFigure, envelope, shade, styled
+from .figures import (
+    BAND,
+    SESSION_COLOURS,
+    SHADE,
+    SOFT,
+    Figures,
+    ReportFigure,
+    draw_over_time,
+    envelope,
+    line_style,
+    shade,
+    styled,
+)
 from .page import MOST_FIGURES, Item, Page, Table
 from .words import intervals, listed, plain, signed
 
 HEADINGS = ("lowest [°]", "highest [°]", "range [°]", "peak rate [°/s]")  # of MEASURES
 CLEAR = 2.0  # standard deviations that the poses state; a smaller difference may be an error that a session shares
+MOST_OVER_TIME = 1  # figures of angles over time that the page shows
+FULL_TURN = 2.0 * np.pi - 1e-9
 MOST_CURVES = 60  # of single repetitions that are drawn behind their mean
 
 
@@ -38,25 +52,28 @@ def render_angles_page(movements: Sequence[Movement], figures: Figures, failures
     failures : gets a line for each section that cannot be made
     """
     page = Page(f"Joint angles of {' and '.join(movement.name for movement in movements)}", failures)
-    shown = dict([*figures.items()][:MOST_FIGURES])
-    over_time = [shown.pop("repetitions")] if "repetitions" in shown else []
+    over_time = [figure for name, figure in figures.items() if name.startswith("angles")][:MOST_OVER_TIME]
+    shown = {name: figure for name, figure in figures.items() if not name.startswith("angles")}
+    others = [name for name in figures if name not in shown][MOST_OVER_TIME:]
+    others += [*shown][MOST_FIGURES - len(over_time) :]
+    shown = dict([*shown.items()][: MOST_FIGURES - len(over_time)])
+    main_angle = [shown.pop("repetitions")] if "repetitions" in shown else []
     repetitions: list[Item] = [
         f"{movement.name}: no repetitions{_by(movement)}: {movement.repetitions.reason}."
         for movement in movements
         if movement.repetitions.reason
     ]
-    repetitions += [*([ADVICE] if repetitions else []), *over_time]
+    repetitions += [*([ADVICE] if repetitions else []), *main_angle]
     page.add("What can be relied on", lambda: [_describe_reliance(movements)], heading=False)
     page.add("Sessions", lambda: [_tabulate_sessions(movements), _describe(movements)], heading=False)
     page.add("Repetitions", lambda: repetitions)
     if shown:
-        others = listed([f"`{name}.svg`" for name in figures if name not in shown and name != "repetitions"])
-        rest = f" Beside this page: {others}." if others else ""
+        rest = f" Beside this page: {listed([f'`{name}.svg`' for name in others])}." if others else ""
         page.add("Mean curves", lambda: [CURVES + rest, *shown.values()])
         page.add("Means over the repetitions", lambda: [MEANS, _tabulate_measures(movements)])
     if len([movement for movement in movements if movement.curves]) > 1:
         page.add("Sessions compared", lambda: [COMPARISON, *_tabulate_comparisons(movements)])
-    page.add("All of the time", lambda: [WHOLE_TIME, *_tabulate_whole_time(movements)])
+    page.add("All of the time", lambda: [WHOLE_TIME, *over_time, *_tabulate_whole_time(movements)])
     return page.html()
 
 
@@ -76,7 +93,7 @@ COMPARISON = (
 )
 WHOLE_TIME = (
     "± is what the pose states. Samples in gaps count nowhere, those near gimbal lock only in the range of the second "
-    "angle. `phases.csv` has the same for each phase."
+    "angle. `phases.csv` has the same for each phase, `angles.csv` all angles over time."
 )
 
 
@@ -243,7 +260,7 @@ def _span_cells(values: np.ndarray, stds: np.ndarray) -> list[str]:
 
 @styled
 def draw_figures(movements: Sequence[Movement]) -> Figures:
-    """Draw the repetitions over time, then the mean curves of each kind of joint, in the order of the page."""
+    """Draw the repetitions over time, the mean curves of each kind of joint, and all angles over time."""
     figures = Figures()
     repeating = [(k, each) for k, each in enumerate(movements) if each.repetitions.source in list_angles(each.angles)]
     if repeating:  # a phase does not mark them in all
@@ -253,7 +270,35 @@ def draw_figures(movements: Sequence[Movement]) -> Figures:
     for group, members in group_sides(joints).items():
         sessions = [(k, movement) for k, movement in shown if set(members.values()) & set(movement.curves)]
         figures[f"curves-{group}"] = _draw_curves(sessions, group, members)
+    for k, movement in enumerate(movements, 1):
+        name = f"angles-{k}" if len(movements) > 1 else "angles"
+        figures[name] = draw_joint_angles(movement.angles, f"{movement.name}: joint angles over time.")
     return figures
+
+
+def draw_joint_angles(angles: Angles, caption: str = "Joint angles over time.") -> ReportFigure:
+    """Draw a row for each kind of joint, as the elbows, with its three angles."""
+    panels: dict[str, dict[str, np.ndarray]] = {}
+    styles: dict[str, dict[str, Any]] = {}
+    for group, members in group_sides(angles.joints).items():
+        for k, name in enumerate(angles[next(iter(members.values()))].names):
+            lines = {side: np.degrees(_break_line(angles[joint], k)) for side, joint in members.items()}
+            panels[f"{plain(group)}: {plain(name)} [°]"] = lines
+        styles |= {side: line_style(side, side) for side in members}
+    if any((joint.near_lock | joint.gap).any() for joint in angles.joints.values()):
+        caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
+    return draw_over_time(angles.time, panels, caption, styles, columns=3)
+
+
+def _break_line(joint: JointAngles, k: int) -> np.ndarray:
+    """An angle with its line broken where it is not determined; within ± half a turn where it passed the lock."""
+    hidden = joint.hidden(k)
+    values = np.where(hidden, np.nan, joint.values[:, k])
+    if hidden.all() or not joint.near_lock.any() or np.nanmax(values) - np.nanmin(values) < FULL_TURN:
+        return values  # a real whole turn
+    values = (values + np.pi) % FULL_TURN - np.pi
+    values[1:][np.abs(np.diff(values)) > np.pi] = np.nan
+    return values
 
 
 def _session_style(k: int) -> dict[str, Any]:
@@ -288,11 +333,9 @@ def _draw_curves(sessions: Sequence[tuple[int, Movement]], group: str, members: 
         f"repetitions. Band: ± one standard deviation between them.{' Thin: the repetitions.' * (len(sessions) == 1)}",
         1.7 * len(members),
     )
-    for row, (side, joint) in zip(
-        figure.grid(len(members), 3, sharex=True, sharey="col"), members.items(), strict=True
-    ):
+    for row, joint in zip(figure.grid(len(members), 3, sharex=True, sharey="col"), members.values(), strict=True):
         for place, ax in enumerate(row):
-            ax.set_title(f"{'' if side == joint else f'{side} '}{plain(first.names[place])} [°]")
+            ax.set_title(f"{plain(joint)}: {plain(first.names[place])} [°]")
             ax.set_xlim(0.0, 100.0)
             for k, movement in sessions:
                 if joint in movement.curves:

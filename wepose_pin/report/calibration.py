@@ -72,7 +72,8 @@ def render_calibration_report(
             tracker = Tracker(calibration.subject, model=model, options=options, with_point_cov=False)
             tracked = tracker.push(recording) or next(tracker.smooth())
         except Exception as error:
-            untracked = [Diagnostic("motion-not-shown", WARNING, facts={"reason": str(error)})]
+            facts = {"variant": "motion", "reason": str(error)}
+            untracked = [Diagnostic("output-incomplete", WARNING, facts=facts)]
             if not isinstance(error, WeposeError) and failures is not None:
                 failures.append(f"the motion cannot be tracked: {reason(error)}")
     page = Page(f"Calibration of {recording.name or 'a recording'}", failures)
@@ -113,6 +114,8 @@ def _describe_reliance(calibration: Calibration) -> str:
         worst = max(stds, key=stds.__getitem__)
         text = f"Lengths are known to ± {stds[worst]:.0f} mm or better ({plain(worst)})"
         text += f", their common scale to ± {100 * calibration.scale_std:.1f} %." if chain else "."
+        if calibration.formulation == "paper":
+            text += " These ± leave out errors of mounts, headings and soft tissue, and are too small."
     mounts = {name: _mount_stds(subject, name) for name in subject.mounts}
     mounts = {name: std for name, std in mounts.items() if np.isfinite(std).all()}
     if mounts:

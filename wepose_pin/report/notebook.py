@@ -11,13 +11,14 @@ from pathlib import Path
 
 from markupsafe import escape
 
-from ..angles import joint_angles
+from ..angles import AUTO, joint_angles
 from ..documents import whole_file
 from ..errors import BadData
 from ..tracking import TrackResult
 from ..tracking.measures import measure_tips
+from .angles import draw_joint_angles
 from .figures import Figures
-from .track import draw_joint_angles, draw_tips, group_tips
+from .track import draw_tips, group_tips
 from .viewer import pose_html
 
 FRAME_HEIGHT = 560  # [px] of the view page in a notebook
@@ -30,7 +31,7 @@ def draw_figures(result: TrackResult) -> Figures:
     if tips:
         figures |= draw_tips(result.time, group_tips(tips, table, result.subject.lengths), table)
     with contextlib.suppress(BadData):  # no joint has both of its segments
-        figures["angles"] = draw_joint_angles(joint_angles(result.pose))
+        figures["angles"] = draw_joint_angles(joint_angles(result.pose, AUTO))
     return figures
 
 

@@ -211,10 +211,10 @@ class PageWriter:
             with whole_file(path, force=True) as partial:
                 partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         except (OSError, WeposeError) as error:  # a full disk, say: what is there stays as it was
-            facts = {"reason": reason(error)}
-            self.diagnostics.append(Diagnostic("diagnostics-not-saved", WARNING, file, facts=facts))
+            facts = {"variant": "diagnostics", "reason": reason(error)}
+            self.diagnostics.append(Diagnostic("output-incomplete", WARNING, file, facts=facts))
 
 
 def page_incomplete(name: str, failure: str) -> Diagnostic:
     """A page, or a section of it, that cannot be made: why."""
-    return Diagnostic("page-incomplete", WARNING, name, facts={"reason": failure})
+    return Diagnostic("output-incomplete", WARNING, name, facts={"reason": failure})

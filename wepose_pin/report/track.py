@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..angles import Angles, JointAngles, group_sides, joint_angles, summary
+from ..angles import AUTO, Angles, group_sides, joint_angles, summary
 from ..body import ROOT, BodyTable
 from ..errors import BadData
 from ..tracking import TrackResult, TrackSummary
@@ -26,6 +26,7 @@ from ..tracking.measures import (
     longest_run_s,
 )
 from ..tracking.pose_diagnostics import GRAVITY_OFF, describe_heading_remedy
+from .angles import FULL_TURN, draw_joint_angles
 from .figures import (
     ALARM,
     COLOURS,
@@ -45,7 +46,6 @@ from .words import capital, degrees, intervals, kinds, listed, plain, plural, wh
 
 LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 PATH_POINTS = 1000
-FULL_TURN = 2.0 * np.pi - 1e-9
 METHODS_WITH_COVARIANCE = "amekf, smoother, smekf and smekf_published"
 
 
@@ -137,6 +137,8 @@ def _list_facts(tracked: TrackResult, measures: Measures) -> list[Item]:
         f"{len(measures.signals)} sensors. Lengths: {plain(tracked.subject.note or tracked.subject.name)}. ± is one "
         "standard deviation throughout: two times out of three the truth lies within."
     )
+    if tracked.subject.is_population and not tracked.model.table.is_mechanism:
+        text += " `wepose calibrate` measures those of the person."
     if measures.samples > len(recording):
         text += (
             f" Angles and positions are shown for {len(recording)} samples, one in "
@@ -433,32 +435,6 @@ def draw_tips(time: np.ndarray, groups: Sequence[TipGroup], table: BodyTable) ->
     return {"paths": paths, "reach": draw_over_time(time, panels, capital(f"{caption}, over time."), styles)}
 
 
-def draw_joint_angles(angles: Angles) -> ReportFigure:
-    """Draw a row for each kind of joint, as the elbows, with its three angles."""
-    panels: dict[str, dict[str, np.ndarray]] = {}
-    styles: dict[str, dict[str, Any]] = {}
-    for group, members in group_sides(angles.joints).items():
-        for k, name in enumerate(angles[next(iter(members.values()))].names):
-            lines = {side: np.degrees(_break_line(angles[joint], k)) for side, joint in members.items()}
-            panels[f"{plain(group)}: {plain(name)} [°]"] = lines
-        styles |= {side: line_style(side, side) for side in members}
-    caption = "Joint angles over time."
-    if any((joint.near_lock | joint.gap).any() for joint in angles.joints.values()):
-        caption += " Lines break where samples are lost, and near gimbal lock, where an angle is not determined."
-    return draw_over_time(angles.time, panels, caption, styles, columns=3)
-
-
-def _break_line(joint: JointAngles, k: int) -> np.ndarray:
-    """An angle with its line broken where it is not determined; within ± half a turn where it passed the lock."""
-    hidden = joint.hidden(k)
-    values = np.where(hidden, np.nan, joint.values[:, k])
-    if hidden.all() or not joint.near_lock.any() or np.nanmax(values) - np.nanmin(values) < FULL_TURN:
-        return values  # a real whole turn
-    values = (values + np.pi) % FULL_TURN - np.pi
-    values[1:][np.abs(np.diff(values)) > np.pi] = np.nan
-    return values
-
-
 def _style_segments(names: Iterable[str], table: BodyTable) -> dict[str, dict[str, Any]]:
     """Styles of the segments' lines: colour by side, dashes by the place among the segments of that side."""
     ranks = {
@@ -470,7 +446,7 @@ def _style_segments(names: Iterable[str], table: BodyTable) -> dict[str, dict[st
 def _find_joint_angles(tracked: TrackResult) -> Angles | None:
     """The joint angles; None where no joint has both of its segments."""
     try:
-        return joint_angles(tracked.pose)
+        return joint_angles(tracked.pose, AUTO)
     except BadData:
         return None
 

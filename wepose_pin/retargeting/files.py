@@ -217,14 +217,15 @@ def diagnose_trajectory(
         first = {"first": collisions.first}
         diagnostics.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
     if not collisions.pairs:
-        diagnostics.append(Diagnostic("robot-self-collision-unchecked", WARNING, name))
+        diagnostics.append(Diagnostic("robot-shapes-missing", WARNING, name))
     if missing := find_missing_visuals(trajectory.robot):
-        diagnostics.append(Diagnostic("visual-mesh-missing", WARNING, name, len(missing), facts={"first": missing[0]}))
+        facts = {"variant": "visual", "first": missing[0]}
+        diagnostics.append(Diagnostic("robot-shapes-missing", WARNING, name, len(missing), facts=facts))
     for side in dict.fromkeys(target.side for target in missed):
         spans = [format_span((target.begin, target.end)) for target in missed if target.side == side]
         error = max(target.error for target in missed if target.side == side)
         moments = ", ".join(spans[:MAX_MOMENTS])
-        diagnostics.append(Diagnostic("reachable-target-missed", ERROR, side, error, LOST_M, {"moments": moments}))
+        diagnostics.append(Diagnostic("robot-hand-off-target", ERROR, side, error, LOST_M, {"moments": moments}))
     if changes := trajectory.change_times:
         facts = {"moments": f"{', '.join(map(format_time, changes[:MAX_MOMENTS]))} s"}
         diagnostics.append(Diagnostic("robot-posture-changed", WARNING, name, len(changes), facts=facts))

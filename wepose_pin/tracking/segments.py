@@ -17,6 +17,7 @@ from ..body.mounts import align_sensors, collect_nominal_mounts, compute_heading
 from ..body.start_pose import N_POSE, StartPose
 from ..body.subject import Subject
 from ..compilation import kernel
+from ..diagnostics import drop_consequences
 from ..filters import AboutVertical, Orientation
 from ..filters.sensors import SensorFilters, find_start_orientations
 from ..recording import ImuSensor, OrientationSensor, Recording
@@ -107,7 +108,7 @@ class SegmentEstimator:
         orientation = filters.push(first)
         R_VS_start = find_start_orientations(first, orientation, filters.start)
         mounts, headings, diagnostics = align_sensors(first, self._subject, R_VS_start, filters.start, self._start_pose)
-        self.diagnostics = (*filters.diagnostics, *diagnostics)
+        self.diagnostics = tuple(drop_consequences((*filters.diagnostics, *diagnostics)))
         self.names, self.rate_hz, self._first = tuple(first.sensors), first.rate_hz, first.cut(slice(0, 1))
         self._measured = np.array([isinstance(each, OrientationSensor) for each in first.sensors.values()], dtype=bool)
         self._lost = np.zeros(len(self.names), dtype=int)  # samples since a measured orientation

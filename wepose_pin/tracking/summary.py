@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..body.kinematics import Pose, join_poses
-from ..diagnostics import INFO, WARNING, Diagnostic, as_json, gravest_first, merge
+from ..diagnostics import INFO, WARNING, Diagnostic, as_json, drop_consequences, gravest_first, merge
 from ..errors import BadData, reason
 from ..filters import Orientation, join_orientations
 from ..recording import Recording
@@ -133,8 +133,9 @@ class SummaryAccumulator:
             measures = measure(tracked, recording, static, budget, self._peak_speed)
             of_motion = diagnose_pose(tracked, measures)
         except Exception as error:
-            of_motion = [Diagnostic("motion-not-assessed", WARNING, facts={"reason": reason(error)})]
-        diagnostics = tuple(gravest_first(merge(self._diagnose(), of_motion)))
+            facts = {"variant": "checks", "reason": reason(error)}
+            of_motion = [Diagnostic("output-incomplete", WARNING, facts=facts)]
+        diagnostics = tuple(gravest_first(drop_consequences(merge(self._diagnose(), of_motion))))
         return TrackSummary(self._compose(recording, diagnostics), diagnostics, tracked, measures)
 
     def _decimate(self) -> tuple[TrackResult, Recording]:
@@ -254,10 +255,11 @@ def _diagnose_unknown_points(tracked: TrackResult) -> list[Diagnostic]:
     if not missing or not lacking:
         return []
     facts = {"segments": ", ".join(lacking), "points": ", ".join(missing)}
-    return [Diagnostic("points-unknown", INFO, facts=facts)]
+    return [Diagnostic("sensors-missing", INFO, facts=facts)]
 
 
 def _diagnose_undetermined_joints(tracked: TrackResult) -> list[Diagnostic]:
     """The joints that sensors are too few to tell apart."""
     joints = tracked.find_undetermined_joints()
-    return [Diagnostic("joints-undetermined", WARNING, facts={"joints": ", ".join(joints)})] if joints else []
+    facts = {"variant": "joints", "joints": ", ".join(joints)}
+    return [Diagnostic("sensors-missing", WARNING, facts=facts)] if joints else []

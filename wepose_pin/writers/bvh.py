@@ -144,7 +144,7 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
         A segment to which the rest is tied is not known, or a sample has no orientation.
     """
     check_complete(motion, "a .bvh")
-    motion, diagnostics = resample_evenly(motion)
+    motion = resample_evenly(motion)
     root = build_skeleton(motion)
     columns = [100.0 * _to_file_axes(_root_position(motion, root)), *_rotations(motion, root, None)]
     lines = ["HIERARCHY", *_hierarchy(root, root.at, 0), "MOTION"]
@@ -152,7 +152,7 @@ def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
     with path.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(lines) + "\n")
         np.savetxt(file, np.column_stack(columns), fmt="%.6f")
-    return [*diagnostics, *diagnose_gaps(motion)]
+    return diagnose_gaps(motion)
 
 
 def _root_position(motion: Motion, root: Bone) -> np.ndarray:

@@ -40,7 +40,7 @@ def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
         import ezc3d
     except ImportError:
         raise BadOption(f"--format c3d: needs ezc3d: {how_to_install('ezc3d')}") from None
-    motion, diagnostics = resample_evenly(motion)
+    motion = resample_evenly(motion)
     points = find_measured_points(motion)
     n = len(motion.pose.time)
     if n > MOST_FRAMES:
@@ -73,7 +73,7 @@ def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
         named.replace(path)
     finally:
         named.unlink(missing_ok=True)
-    return diagnostics
+    return []
 
 
 def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:

@@ -332,7 +332,7 @@ def convert_person(motion: Motion) -> JointMotion:
         A sample has no orientation.
     """
     check_complete(motion, "a file of joints")
-    motion, _ = resample_evenly(motion)
+    motion = resample_evenly(motion)
     model, pose = motion.model, motion.pose
     if free := [child for child in model.joints if child not in model.axes]:
         raise BadData(f"{motion.where}: link '{free[0]}' hangs on a joint of type floating, which has no axes to state")

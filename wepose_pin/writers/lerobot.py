@@ -79,14 +79,15 @@ def diagnose_episodes(motion: JointMotion, by: str | None) -> list[Diagnostic]:
     slack_s = 1.0 / motion.rate_hz + SLACK_S
     shortened = [(a, b) for a, b in spans if (a, b) not in outside and max(first - a, b - last) > slack_s]
     diagnostics = []
-    for code, affected in (("episode-outside", outside), ("episode-shortened", shortened)):
+    for variant, affected in (("outside", outside), ("", shortened)):
         if affected:
             facts: dict[str, float | str] = {
+                "variant": variant,
                 "count": float(len(spans)),
                 "span": "{:g} to {:g} s".format(*affected[0]),
                 "recorded": f"{first:g} to {last:g} s",
             }
-            diagnostics.append(Diagnostic(code, WARNING, by, float(len(affected)), facts=facts))
+            diagnostics.append(Diagnostic("episodes-cut", WARNING, by, float(len(affected)), facts=facts))
     return diagnostics
 
 

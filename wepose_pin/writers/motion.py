@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..body import BodyModel
 from ..body.kinematics import Pose, compute_pose, find_usual_rate
-from ..diagnostics import INFO, WARNING, Diagnostic
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongOption
 from ..recording import format_span
 
@@ -61,15 +61,12 @@ def make_times(where: str, time: np.ndarray, rate_hz: float) -> np.ndarray:
     return np.asarray(time[0] + np.arange(samples) / rate_hz)
 
 
-def resample_evenly(motion: Motion) -> tuple[Motion, list[Diagnostic]]:
-    """The motion on even times, and what to know of them if they are new."""
+def resample_evenly(motion: Motion) -> Motion:
+    """The motion on even times."""
     time = motion.pose.time
     grid = time[0] + np.arange(len(time)) * (time[-1] - time[0]) / (len(time) - 1)
     off = float(np.max(np.abs(time - grid))) * motion.rate_hz
-    if off <= EVEN:
-        return motion, []
-    rate_hz = motion.rate_hz
-    return resampled(motion, rate_hz), [Diagnostic("export-resampled", INFO, "", off, EVEN, {"rate": rate_hz})]
+    return motion if off <= EVEN else resampled(motion, motion.rate_hz)
 
 
 def check_rate(rate_hz: float) -> None:
@@ -135,7 +132,10 @@ def check_complete(motion: Motion, format_name: str) -> None:
 def diagnose_gaps(motion: Motion) -> list[Diagnostic]:
     """Segments with gaps, where a format has no way to mark them."""
     gaps = {segment: int(np.count_nonzero(gap)) for segment, gap in motion.pose.gap.items()}
-    return [Diagnostic("export-gaps-unmarked", WARNING, segment, count) for segment, count in gaps.items() if count]
+    unmarked = {"variant": "unmarked"}
+    return [
+        Diagnostic("samples-lost", WARNING, segment, count, facts=unmarked) for segment, count in gaps.items() if count
+    ]
 
 
 def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:

@@ -26,7 +26,7 @@ import numpy as np
 import polars as pl
 
 from ..angles import diagnose_lock, joint_angles
-from ..diagnostics import INFO, WARNING, Diagnostic
+from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadOption
 from ..readers.opensim import OWN
 from .motion import Motion, check_complete, check_joint_names, diagnose_gaps, find_measured_points, resample_evenly
@@ -78,7 +78,7 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
         turned, residuals = coordinates(orientations(motion.pose.quat_WL))
         columns |= turned
         diagnostics += [
-            Diagnostic("opensim-axes-too-few", WARNING, body, float(angle), MOST_MISSED)
+            Diagnostic("orientation-residual", WARNING, body, float(angle), MOST_MISSED, {"variant": "opensim"})
             for body, angle in residuals.items()
             if angle > MOST_MISSED
         ]
@@ -197,7 +197,7 @@ def _add_properties(parent: Element, properties: Mapping[str, Any]) -> None:
 
 
 def write_scale(path: Path, motion: Motion, model: str = GENERIC_MODEL) -> list[Diagnostic]:
-    """Write the set-up of OpenSim's Scale Tool that gives the generic model the subject's lengths; give the factors.
+    """Write the set-up of OpenSim's Scale Tool that gives the generic model the subject's lengths; with the factors.
 
     The factors are over the lengths of Rajagopal's model. Masses stay. No markers are placed, so
     the tool's part for them is left out.
@@ -212,12 +212,10 @@ def write_scale(path: Path, motion: Motion, model: str = GENERIC_MODEL) -> list[
         The subject has no length that the model has.
     """
     factors: dict[str, dict[str, float]] = {}
-    words = []
     for length, span in SPANS.items():
         if length not in motion.model.lengths:
             continue
         factor = motion.model.lengths[length] / span.generic
-        words.append(f"{', '.join(span.bodies)} by {factor:.4f} along {span.axes} ({length})")
         for body in span.bodies:
             factors.setdefault(body, dict.fromkeys("xyz", 1.0)).update(dict.fromkeys(span.axes, factor))
     if not factors:
@@ -236,7 +234,7 @@ def write_scale(path: Path, motion: Motion, model: str = GENERIC_MODEL) -> list[
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", motion.name) or "subject"
     tool = {"GenericModelMaker": {"model_file": model}, "ModelScaler": scaler}
     _write_setup(path, "ScaleTool", {"mass": "-1", **tool}, name)
-    return [Diagnostic("osim-scaled", INFO, facts={"scales": "; ".join(words)})]
+    return []
 
 
 def _bodies(motion: Motion) -> dict[str, np.ndarray]:
@@ -266,7 +264,7 @@ def write_trc(path: Path, motion: Motion) -> list[Diagnostic]:
     BadData
         No point is known.
     """
-    motion, diagnostics = resample_evenly(motion)
+    motion = resample_evenly(motion)
     points = find_measured_points(motion)
     n, rate = len(motion.pose.time), f"{motion.rate_hz:g}"
     keys = "\t".join(_TRC_KEYS)
@@ -279,7 +277,7 @@ def write_trc(path: Path, motion: Motion) -> list[Diagnostic]:
     rows = pl.DataFrame({"Frame#": np.arange(1, n + 1), "Time": motion.pose.time, **columns, "": [None] * n})
     header = [f"PathFileType\t4\t(X/Y/Z)\t{path.name.removeprefix('.').removesuffix('.partial')}", keys, values]
     _write(path, [*header, labels, axes, ""], rows, labels=False)
-    return diagnostics
+    return []
 
 
 def _mm(p_W: np.ndarray) -> np.ndarray:
