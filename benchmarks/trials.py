@@ -16,9 +16,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from wepose_pin import rotations
+from wepose_pin.data_tables import read_columns, read_table
 from wepose_pin.errors import BadData, MissingFile
 from wepose_pin.readers.arrays import read_mat
-from wepose_pin.readers.tables import read_columns, read_table
 
 RING_SEGMENTS = ("seg1", "seg2", "seg3", "seg4", "seg5")
 RING_MOUNTS = ("rigid", "loose")

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin import load_session, rotations
 from wepose_pin.commands import main
+from wepose_pin.data_tables import read_table
 from wepose_pin.diagnostics import Diagnostic, as_json, render
 from wepose_pin.errors import BadData
-from wepose_pin.readers.tables import read_table
 from wepose_pin.recording import ImuSensor, Recording, Sensor
 from wepose_pin.recording.clocks import build_clock
 from wepose_pin.recording.gaps import bridge, mark_lost_samples

@@ -12,9 +12,9 @@ from test_formats import ACCEL, GYRO, TIME, N
 from test_info import info
 
 import wepose_pin as wp
+from wepose_pin.data_tables import read_layout, read_table
 from wepose_pin.errors import BadData
 from wepose_pin.readers.guess import guess_columns
-from wepose_pin.readers.tables import read_layout, read_table
 from wepose_pin.recording import Recording
 
 G = 9.80665

@@ -53,9 +53,9 @@ def result(folder: Path, data: bytes) -> object:
     import polars as pl
 
     from wepose_pin.body.pose_table import parse_pose_table
+    from wepose_pin.data_tables import read_table
     from wepose_pin.errors import WeposeError
     from wepose_pin.evaluation import evaluate
-    from wepose_pin.readers.tables import read_table
     from wepose_pin.report.viewer import pose_html
     from wepose_pin.writers.export import export
     from wepose_pin.writers.result import read_result

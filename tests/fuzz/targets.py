@@ -162,7 +162,7 @@ def _live(path: Path) -> object:
 
 def _pose(path: Path) -> object:
     from wepose_pin.body.pose_table import parse_pose_table
-    from wepose_pin.readers.tables import read_table
+    from wepose_pin.data_tables import read_table
 
     return parse_pose_table(read_table(path), str(path))
 
@@ -236,7 +236,7 @@ def _device(name: str, format: str) -> Callable[[Path, bytes], object]:
 
 
 TARGETS = (
-    Target("csv", lambda: [seeds.csv(), seeds.wild_csv()], _session("arm.csv", TABLE), LINES, "readers.tables"),
+    Target("csv", lambda: [seeds.csv(), seeds.wild_csv()], _session("arm.csv", TABLE), LINES, "data_tables"),
     Target("mvnx", lambda: [seeds.mvnx(True), seeds.mvnx(False)], _device("a.mvnx", "mvnx"), XML, "readers.mvnx"),
     Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES, "readers.table_format"),
     Target("dot", seeds.dot, _device("a.csv", "dot"), LINES, "readers.table_format"),

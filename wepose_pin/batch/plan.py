@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 from ..body import load_table
 from ..body.anthropometry import check_stature
 from ..commands.command_line import APP, parse
+from ..data_tables import read_table
 from ..documents import TomlTable, read_toml
 from ..errors import BadData, BadPlan, BadSession, WeposeError, WrongOption, one_of
-from ..readers.tables import read_table
 from .storage import find_urls, is_remote
 
 # Step → what its command takes by position; in the order in which they run.

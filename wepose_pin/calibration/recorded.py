@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..data_tables import read_columns, read_table
 from ..errors import BadSession
-from ..readers.tables import read_columns, read_table
 from ..recording import Recording
 from .protocols import Closure
 

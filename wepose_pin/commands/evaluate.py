@@ -82,10 +82,10 @@ def _compare(
     """The errors of a result; the reference is brought to its clock and world where that is needed."""
     from ..body.kinematics import Pose
     from ..body.pose_table import parse_pose_table
+    from ..data_tables import read_table
     from ..evaluation import evaluate, register
     from ..readers import load_session
     from ..readers.reference import is_reference, read_reference
-    from ..readers.tables import read_table
     from ..recording import select_interval
     from ..writers import read_result
     from ..writers.result import read_phases

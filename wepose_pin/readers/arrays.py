@@ -17,7 +17,7 @@ import polars as pl
 from scipy.io import loadmat
 
 from ..errors import BadData, UnknownColumn, one_of
-from .libraries import check_file, import_library, library_errors
+from ..libraries import check_file, import_library, library_errors
 
 SUFFIXES = (".h5", ".hdf5", ".mat")
 KIND = "an HDF5 or MATLAB file"

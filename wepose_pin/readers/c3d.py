@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import BadData, one_of
+from ..libraries import import_library, library_errors
 from .device import check_measured
-from .libraries import import_library, library_errors
 from .markers import MarkerTable, Reference, locate
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "meters": 1.0, "millimeters": 1e-3}

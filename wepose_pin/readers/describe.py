@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..body import load_table
+from ..data_tables import FORMATS as TABLES
+from ..data_tables import read_names
 from ..diagnostics import Diagnostic
 from ..documents import is_number, read_toml
 from ..errors import BadData, MissingFile
@@ -31,8 +33,6 @@ from .propose import (
 from .reference import read_reference
 from .registry import detect_format
 from .session import read_session
-from .tables import FORMATS as TABLES
-from .tables import read_names
 
 
 class Description(NamedTuple):

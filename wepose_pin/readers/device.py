@@ -15,9 +15,9 @@ import numpy as np
 from ..body import load_table
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, MissingFile, one_of
+from ..libraries import library_errors
 from ..recording.limits import LARGEST_NUMBER, STANDARD_GRAVITY
 from .guess import guess_unit
-from .libraries import library_errors
 
 # What a sensor is read for → the signals that it needs.
 NEEDED = {"raw": ("gyro", "accel"), "orientation": ("orientation",)}

@@ -24,8 +24,8 @@ from ..body import load_table
 from ..body.table import ROOT
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
+from ..libraries import library_errors
 from .device import Device, DeviceSensor, check_measured
-from .libraries import library_errors
 from .markers import Reference
 
 SEGMENT_OF = {

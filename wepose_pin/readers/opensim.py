@@ -16,10 +16,10 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
+from ..data_tables import read_body
 from ..errors import BadData
+from ..libraries import library_errors
 from .device import Device, Signal, make_device, read_first_lines
-from .libraries import library_errors
-from .tables import read_body
 
 # The header line of our own files. OpenSim takes it for a remark.
 OWN = ("Frames", "bodies of Rajagopal's model in ground")

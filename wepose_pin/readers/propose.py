@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 
 from ..body import BodyTable
+from ..data_tables import read_columns, read_names, read_table
 from ..diagnostics import ERROR, WARNING, Diagnostic
 from ..documents import parse_toml, toml_key, toml_string, toml_strings
 from ..errors import BadData, MissingRate, WeposeError, WrongUnit, one_of
@@ -29,7 +30,6 @@ from .guess import Guess
 from .live_log import read_live_log
 from .registry import detect_format, look_up_format, read_device
 from .session import read_session
-from .tables import read_columns, read_names, read_table
 
 # A line of a file that says its rate.
 _STATED_RATE = re.compile(r"(sampl\w*|frame|data)[ _]*(frequency|rate)[^0-9]{0,12}(?P<rate>\d+(\.\d+)?)", re.IGNORECASE)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..libraries import check_file
 from .c3d import read_c3d
-from .libraries import check_file
 from .markers import Reference, read_marker_table
 from .mvnx import read_mvnx_reference
 from .trc import read_trc

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..assets import find_plugins, load_plugin
 from ..errors import BadData, BadSession, WeposeError, one_of
+from ..libraries import check_file
 from .device import Device, read_first_lines
-from .libraries import check_file
 from .live_log import is_live_log, read_live_device
 from .mvnx import read_mvnx
 from .opensim import read_opensim

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadData
+from ..libraries import import_library, library_errors
 from .device import Device, Signal, make_device
-from .libraries import import_library, library_errors
 
 SUFFIXES = (".db3", ".mcap", ".bag")
 MESSAGE = "sensor_msgs/msg/Imu"

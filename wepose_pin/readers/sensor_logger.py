@@ -16,10 +16,10 @@ from pathlib import Path
 
 import polars as pl
 
+from ..data_tables import read_columns, read_table
 from ..diagnostics import WARNING, Diagnostic
+from ..libraries import library_errors
 from .device import Device, Signal, join_signals, make_device, open_folder, read_first_lines
-from .libraries import library_errors
-from .tables import read_columns, read_table
 
 NS = 1e-9
 COLUMNS = {

@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 
 from ..body.table import NEUTRAL_POSE
+from ..data_tables import read_columns, read_table
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..documents import TomlTable
 from ..errors import BadData, BadSession, MissingFile, printable
@@ -44,7 +45,6 @@ from .session_file import (
     read_sensor_keys,
     read_session_file,
 )
-from .tables import read_columns, read_table
 
 # Allowed error of a quaternion's norm, from rounded decimals.
 NORM_ERROR = 1e-2

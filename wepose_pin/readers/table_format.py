@@ -19,6 +19,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
+from ..data_tables import parse_rows, read_body, read_columns
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import TomlTable, read_toml
 from ..errors import BadData, BadSession, MissingFile, MissingRate
@@ -33,7 +34,6 @@ from .device import (
     read_first_lines,
     spread_equal_times,
 )
-from .tables import parse_rows, read_body, read_columns
 
 FOLDER = Path(__file__).parent / "formats"
 SEPARATORS = "\t,; "

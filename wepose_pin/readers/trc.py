@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from ..data_tables import read_body
 from ..errors import BadData, one_of
+from ..libraries import library_errors
 from .device import check_measured, read_first_lines
-from .libraries import library_errors
 from .markers import MarkerTable, Reference, locate
-from .tables import read_body
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 

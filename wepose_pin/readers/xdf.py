@@ -19,10 +19,10 @@ import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
+from ..libraries import import_library, library_errors
 from ..recording.limits import STANDARD_GRAVITY
 from .device import ACCEL_UNITS, Device, Signal, convert, make_device
 from .guess import group_columns
-from .libraries import import_library, library_errors
 
 NEEDS = "gyroscope and accelerometer, nor orientation, by the labels of its channels; they need labels as gyr_x"
 MAGIC = b"XDF:", b"\x1f\x8b"  # the latter of gzip

@@ -21,8 +21,8 @@ from ..body.kinematics import find_usual_rate
 from ..body.links import compute_joint_values
 from ..body.tree import joint_axis, joint_placement, parse_tree
 from ..body.urdf import read_urdf
+from ..data_tables import read_columns, read_table
 from ..errors import BadData, MissingFile
-from ..readers.tables import read_columns, read_table
 from ..recording import Intervals, select_interval
 from ..rotations import multiply
 from .motion import EVEN, SLACK_S, Motion, check_complete, make_times, resample_evenly

@@ -27,9 +27,9 @@ from ..body.kinematics import Pose, find_samples
 from ..body.pose_table import build_pose_table, parse_pose_table
 from ..body.subject import Subject, load_subject, subject_toml
 from ..body.table_file import MODEL_TABLE, format_table
+from ..data_tables import open_source, read_columns, read_table
 from ..diagnostics import from_json
 from ..errors import BadData, ExistingOutput, MissingFile
-from ..readers.tables import open_source, read_columns, read_table
 from ..recording import Intervals, Mark, select_interval
 from ..tracking import TrackResult, TrackSummary
 

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
-from ..errors import BadData, MissingFile, UnknownColumn, one_of
+from .errors import BadData, MissingFile, UnknownColumn, one_of
 from .libraries import library_errors
 
 FORMATS = (".csv", ".tsv", ".txt", ".parquet")

@@ -10,7 +10,7 @@ from typing import Any
 
 import polars as pl
 
-from ..errors import BadData, MissingFile, WeposeError, how_to_install, native_stderr_muted, reason
+from .errors import BadData, MissingFile, WeposeError, how_to_install, native_stderr_muted, reason
 
 
 def check_file(path: Path, kind: str) -> None:
