@@ -29,7 +29,6 @@ def main() -> int:
     saving.add_argument("--inputs", type=Path, help="recordings of another run (its inputs/) in place of new ones")
     saving.add_argument("--only", default="*", metavar="PATTERN", help="only tasks of such names, as 'mild/*'")
     saving.add_argument("--jobs", type=int, default=2, help="processes (2)")
-    saving.add_argument("--loop", action="store_true", help="solve calibrations by the Gauss-Newton loop")
     comparing = commands.add_parser("compare", help="hold two folders of `save` against each other, bit for bit")
     comparing.add_argument("old", type=Path)
     comparing.add_argument("new", type=Path)
@@ -39,7 +38,7 @@ def main() -> int:
     given = parser.parse_args()
     try:
         if given.command == "save":
-            return save(given.folder, given.inputs, _folder_of_data(), given.only, given.jobs, given.loop)
+            return save(given.folder, given.inputs, _folder_of_data(), given.only, given.jobs)
         renames = read_renames(given.renames)
         found = compare(Folder(given.old), Folder(given.new), renames, given.only)
     except WrongUsage as error:

@@ -202,13 +202,6 @@ class Outcome:
     error: str
 
 
-def solve_by_loop() -> None:
-    """Solve calibrations by the Gauss-Newton loop from now on, in this process."""
-    from ..calibration import exchange_solver, solve_without_bounds
-
-    exchange_solver(solve_without_bounds)
-
-
 def run(argv: list[str]) -> Outcome:
     """Run a command in this process."""
     from wepose_pin.commands import main

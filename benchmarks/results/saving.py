@@ -48,8 +48,8 @@ def run_task(name: str, out: Path, data: Path | None) -> Report:
     return Report(name, time.process_time() - begin, len(arrays))
 
 
-def save(out: Path, inputs: Path | None, data: Path | None, only: str, jobs: int, loop: bool = False) -> int:
-    """Store all results in `out`; the exit code. `loop`: calibrations are solved by the Gauss-Newton loop."""
+def save(out: Path, inputs: Path | None, data: Path | None, only: str, jobs: int) -> int:
+    """Store all results in `out`; the exit code."""
     chosen = [task for task in tasks() if fnmatch.fnmatch(task.name, only)]
     if not chosen:
         raise WrongUsage(f"--only {only}: matches none of {', '.join(task.name for task in tasks())}")
@@ -64,7 +64,7 @@ def save(out: Path, inputs: Path | None, data: Path | None, only: str, jobs: int
     else:
         adapter.copy_inputs(inputs, out / "inputs")
     print(f"{time.perf_counter() - begin:5.0f} s  inputs", flush=True)
-    reports = list(_run(chosen, out, data, jobs, loop))
+    reports = list(_run(chosen, out, data, jobs))
     print(f"{sum(each.keys for each in reports)} keys in {time.perf_counter() - begin:.0f} s: {out}")
     for each in reports:
         if each.missing:
@@ -76,10 +76,9 @@ def save(out: Path, inputs: Path | None, data: Path | None, only: str, jobs: int
     return int(any(each.failed for each in reports))
 
 
-def _run(chosen: list[Task], out: Path, data: Path | None, jobs: int, loop: bool) -> list[Report]:
+def _run(chosen: list[Task], out: Path, data: Path | None, jobs: int) -> list[Report]:
     reports, begin = [], time.perf_counter()
-    initializer = adapter.solve_by_loop if loop else None
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=initializer) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         running = [pool.submit(run_task, task.name, out, data) for task in chosen]
         for done in as_completed(running):
             reports.append(done.result())

@@ -19,7 +19,7 @@ from ..observations.joint_accelerations import BAND_HZ, LEAST_RATE_HZ, compute_s
 from ..recording import Recording
 from .equations import Layout
 from .least_squares import Gaussian
-from .sample_losses import find_sample_losses, mask_connected
+from .sample_losses import find_sample_losses, find_samples, mask_connected, mask_measured
 
 SAMPLES_HZ = 10.0
 # Errors of orientations are slow: two samples closer than this [s] are never independent, however white the residual
@@ -62,16 +62,10 @@ def estimate_couplings(
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
     if recording.rate_hz < LEAST_RATE_HZ or not pairs:
         return []
-    inside = np.zeros(len(recording), dtype=bool)
-    for span in spans:
-        inside[recording.span(span)] = True
-    for name in names:
-        gap = recording.sensors[name].gap
-        if gap is not None:
-            inside &= ~gap
-    samples = np.flatnonzero(inside)
+    samples = find_samples(recording, spans)
     # Beyond a loss the headings are others.
-    samples = samples[mask_connected(find_sample_losses(recording, filtered.start, names), samples)]
+    connected = mask_connected(find_sample_losses(recording, filtered.start, names), samples)
+    samples = samples[mask_measured(recording, names, samples) & connected]
     if len(samples) < LEAST_S * recording.rate_hz:
         return []
     samples = samples[:: max(1, round(recording.rate_hz / SAMPLES_HZ))]

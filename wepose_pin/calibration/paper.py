@@ -36,7 +36,7 @@ from ..body.start_pose import StartPose
 from ..body.subject import Subject
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, NoSolution, one_of
-from .conditions import Constraint, Loop, resolve_conditions
+from .conditions import Loop, group_lengths, resolve_conditions
 from .least_squares import MIN_LENGTH, QUIET_QP, Observations
 from .observability import diagnose_lengths
 from .priors import combine_lengths
@@ -47,7 +47,6 @@ from .weights import LEAST_VARIANCE, count_correlated_samples, min_correlation
 
 Formulation = Literal["full", "paper"]
 LEAST_EFFECT = 1e-6  # of a change of the lengths on the gaps, beside that of the change with the largest effect
-DECIMALS = 9  # of a length's effect on the chain, by which lengths that rotate together are found
 
 
 def check_paper_formulation(
@@ -72,7 +71,7 @@ def check_paper_formulation(
             f"such as clasp; not '{protocol.name}'"
         )
     neutral = StartPose(model.neutral_rotations)
-    groups = _find_groups(resolve_conditions(protocol, model, neutral, sensors), tuple(model.lengths))
+    groups = group_lengths(resolve_conditions(protocol, model, neutral, sensors), model.lengths).values()
     if not any(set(group) <= set(measured) for group in groups):
         names = [group[0] for group in groups if len(group) == 1]
         raise BadOption(
@@ -99,7 +98,7 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
         for name, R_VS in filtered.R_VS.items()
     }
     A = compute_gap_matrices(observations, quat_WL)
-    constraints = _state_constraints(problem, _find_groups(problem.conditions, tuple(problem.model.lengths)))
+    constraints = _state_constraints(problem)
     try:
         lengths = _minimise(A, constraints, tuple(problem.model.lengths))
     except NoSolution as error:
@@ -160,18 +159,9 @@ class _Constraints(NamedTuple):
         return null_space(self.E)
 
 
-def _find_groups(conditions: Collection[Constraint], lengths: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """The lengths in the chain; those that always rotate together are one group, of which the gap shows the sum."""
-    columns = [np.array(part.by_length) for loop in conditions if isinstance(loop, Loop) for part in loop.parts]
-    groups: dict[tuple[float, ...], list[str]] = {}
-    for name, column in zip(lengths, np.round(np.vstack(columns), DECIMALS).T, strict=True):
-        if np.any(column):
-            groups.setdefault(tuple(column.tolist()), []).append(name)
-    return [tuple(group) for group in groups.values()]
-
-
-def _state_constraints(problem: CalibrationProblem, groups: list[tuple[str, ...]]) -> _Constraints:
-    """Measured lengths, and the population's proportions and lengths where the gap shows none."""
+def _state_constraints(problem: CalibrationProblem) -> _Constraints:
+    """Return measured lengths, and the population's proportions and lengths where the gap shows none."""
+    groups = group_lengths(problem.conditions, problem.model.lengths).values()
     names, prior, measured = tuple(problem.model.lengths), problem.prior, problem.measured
     K, unit = len(names), dict(zip(names, np.eye(len(names)), strict=True))
     assumed = []

@@ -28,7 +28,7 @@ from .joints import Coupling, estimate_couplings
 from .least_squares import Observations
 from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 from .recorded import read_recorded_places
-from .sample_losses import SampleLoss, find_sample_losses, mask_connected
+from .sample_losses import SampleLoss, find_sample_losses, find_samples, mask_connected, mask_measured
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
@@ -269,7 +269,7 @@ class CalibrationProblem:
             A condition has too few samples at which all sensors measure, connected with the start pose.
         """
         recording, filtered, protocol = self.recording, self.filtered, self.protocol
-        total = sum(len(self._find_samples(condition, 1)) for condition in protocol.conditions)
+        total = sum(len(self._find_samples(condition)) for condition in protocol.conditions)
         stride = max(1, round(recording.rate_hz / rate_hz), total // MOST_SAMPLES)
         start, sensors = self.start_pose, self.sensors
         layout = Layout(
@@ -285,8 +285,8 @@ class CalibrationProblem:
         )
         parts, places = [], []
         for condition, constraint in zip(protocol.conditions, self.conditions, strict=True):
-            phase = self._find_samples(condition, stride)
-            measured = phase[self._mask_measured(phase) & mask_connected(self._losses, phase)]
+            phase = self._find_samples(condition)[::stride]
+            measured = phase[mask_measured(recording, recording.sensors, phase) & mask_connected(self._losses, phase)]
             place = np.zeros((len(measured), 3))
             unseen = ""
             if isinstance(constraint, Loop) and constraint.kind == "recorded":
@@ -317,17 +317,9 @@ class CalibrationProblem:
     def _losses(self) -> list[SampleLoss]:
         return find_sample_losses(self.recording, self.filtered.start, self.sensors)
 
-    def _find_samples(self, condition: Condition, stride: int) -> np.ndarray:
-        """Return the numbers (n,) of the samples in which a condition holds, every `stride`-th."""
-        holds = np.zeros(len(self.recording), dtype=bool)
-        for interval in self.intervals(condition):  # they may overlap: each sample counts once
-            holds[self.recording.span(interval)] = True
-        return np.flatnonzero(holds)[::stride]
-
-    def _mask_measured(self, samples: np.ndarray) -> np.ndarray:
-        """Return (n,) bool: all sensors measured these samples (n,)."""
-        gaps = [sensor.gap[samples] for sensor in self.recording.sensors.values() if sensor.gap is not None]
-        return ~np.any(gaps, axis=0) if gaps else np.ones(len(samples), dtype=bool)
+    def _find_samples(self, condition: Condition) -> np.ndarray:
+        """Return the numbers (n,) of the samples in which a condition holds."""
+        return find_samples(self.recording, self.intervals(condition))
 
     def _describe_losses(self, phase: np.ndarray) -> str:
         """Return what a refusal says of losses between the start pose and the samples (n,) of a phase."""
@@ -345,7 +337,7 @@ class CalibrationProblem:
         """Return what is not used of each phase, as a sensor was lost between it and the start pose."""
         diagnostics, rate_hz = [], self.recording.rate_hz
         for condition in self.protocol.conditions:
-            phase = self._find_samples(condition, 1)
+            phase = self._find_samples(condition)
             unused = ~mask_connected(self._losses, phase)
             if unused.any():
                 worst = max(self._losses, key=lambda loss: np.count_nonzero(loss.beyond(phase)))

@@ -5,7 +5,7 @@ After lost samples a filter recovers the tilt from gravity, but never the headin
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +45,20 @@ def find_sample_losses(recording: Recording, start: tuple[float, float], sensors
             if end - first > LONGEST_LOSS_S * recording.rate_hz:
                 losses.append(SampleLoss(name, first, end - 1, first >= begin))
     return losses
+
+
+def find_samples(recording: Recording, intervals: Iterable[tuple[float, float]]) -> np.ndarray:
+    """Return the numbers (n,) of the samples in intervals [s], which may overlap: each sample counts once."""
+    inside = np.zeros(len(recording), dtype=bool)
+    for interval in intervals:
+        inside[recording.span(interval)] = True
+    return np.flatnonzero(inside)
+
+
+def mask_measured(recording: Recording, sensors: Collection[str], samples: np.ndarray) -> np.ndarray:
+    """Return (n,) bool: all of these sensors measured these samples (n,)."""
+    gaps = [recording.sensors[name].gap for name in sensors]
+    return ~np.any([np.zeros(len(samples), dtype=bool), *(gap[samples] for gap in gaps if gap is not None)], axis=0)
 
 
 def mask_connected(losses: Sequence[SampleLoss], samples: np.ndarray) -> np.ndarray:
