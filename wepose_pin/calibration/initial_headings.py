@@ -81,7 +81,7 @@ def wrap_angle(angle: np.ndarray) -> np.ndarray:
 def _collect_terms(observations: Observations, x: np.ndarray, couplings: Sequence[Coupling]) -> _Terms:
     """Return the terms of closures, at some of their samples, of poses and bows on average, and of couplings."""
     layout, sensors = observations.layout, observations.layout.sensors
-    terms: list[_Terms] = []
+    terms = [_Terms(np.zeros((0, 3)), np.zeros((len(sensors), 5, 0, 3)))]
 
     def add(std: float, constant: np.ndarray, parts: Mapping[str, np.ndarray], *, free: bool = False) -> None:
         """Add n samples with the constant (n, 3) and the harmonics (5, n, 3) of sensors; `free`: of any mean."""
@@ -171,7 +171,7 @@ def _descend(psi: np.ndarray, terms: _Terms, center: np.ndarray, information: np
         slope = np.stack([0.0 * psi, -h[..., 2], h[..., 1], -2.0 * h[..., 4], 2.0 * h[..., 3]], axis=-1)
         r = terms.constant.ravel() + h.reshape(len(psi), -1) @ F.reshape(5 * m, -1)
         J = (slope.swapaxes(0, 1) @ F).swapaxes(0, 1)
-        size = 1.0 + np.sum(r.reshape(-1, n, 3) ** 2, axis=2) / OUTLIER**2
+        size = 1.0 + np.sum(r.reshape(len(psi), n, 3) ** 2, axis=2) / OUTLIER**2
         weighted = J * np.repeat(size**-2, 3, axis=1)[:, None]
         off = psi - center
         cost = OUTLIER**2 * np.sum(1.0 - 1.0 / size, axis=1) + off**2 @ information

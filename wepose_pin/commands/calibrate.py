@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic, lines
-from ..errors import WrongOption, one_of
+from ..errors import WrongOption
 from .options import (
     RESEARCH,
     Force,
@@ -23,7 +23,6 @@ from .options import (
 from .output import print_diagnostics, print_lengths, print_table, progress_bar, say, say_indented, say_pages
 
 if TYPE_CHECKING:
-    from ..body import BodyModel
     from ..body.subject import Subject as Person
     from ..calibration import Calibration, CalibrationQuality, Protocol
 
@@ -117,7 +116,6 @@ def calibrate(
     """
     options = dict(locals())
     from .. import calibration as room
-    from ..body import list_breadths, load_model
     from ..body.body import load_sensed_model
     from ..calibration.protocols import choose_protocol
     from ..readers import load_session
@@ -127,26 +125,16 @@ def calibrate(
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance
 
-    def check_measured(body: BodyModel) -> None:
-        known = (*body.lengths, *list_breadths(body.table))
-        for name, metres in (measured or {}).items():
-            if name not in known:
-                raise WrongOption("measured", f"{name}={metres:g}", f"'{name}' is not a length; {one_of(known, name)}")
-
     if prior is not None and (stature is not None or sex is not None):
         raise WrongOption(
             "prior", prior, "has the lengths of a person; --stature and --sex narrow those of the population"
         )
-    # A URDF without a table has the sensors' links as segments, and those are in the session.
-    if model is not None and not model.lower().endswith(".urdf"):
-        check_measured(load_model(model))
     with progress_bar() as progress:
         with result_folder(out, force) as folder:
             progress("reading", 0.0)
             recording = load_session(session, gaps=gaps)
             steps = room.load_protocol(protocol or choose_protocol(recording.phases, formulation))
             body = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
-            check_measured(body)
             earlier = None if prior is None else read_subject(prior)
             progress("calibrating", 1 / 3)
             calibration = room.calibrate(
