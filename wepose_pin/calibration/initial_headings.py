@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from ..body.reaches import UNIVERSE
 from ..observations.directions import Level, Pointing
 from .conditions import Loop
-from .joints import Coupling
+from .couplings import Coupling
 from .least_squares import Observations
 
 STARTS, NEARER = 256, 64  # starts, and how many of the best continue after some rounds

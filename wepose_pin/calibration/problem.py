@@ -23,8 +23,8 @@ from ..observations.joint_accelerations import find_neighbours
 from ..observations.paths import find_girdles
 from ..recording import Intervals, Recording, format_span
 from .conditions import Constraint, Loop, Moving, group_lengths, resolve_conditions
+from .couplings import Coupling, estimate_couplings
 from .equations import Layout
-from .joints import Coupling, estimate_couplings
 from .least_squares import Observations
 from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 from .recorded import read_recorded_places

@@ -17,7 +17,7 @@ a length of the chain is known as it is on a robot, which decides the form of th
 - Sensors may sit anywhere: where no mount is stated, headings come from the closure, and nobody holds the start pose
   exactly. Without a magnetometer headings drift, and soft tissue moves under the sensors. None of this is noise that
   averages out over the phase, so all of it is estimated beside the lengths (`equations`), with priors (`priors`).
-- The accelerations of shoulders and elbows, which two sensors each measure, show headings as well (`joints`).
+- The accelerations of shoulders and elbows, which two sensors each measure, show headings as well (`couplings`).
 - The weight of the samples is measured, not assumed (`weights`).
 """
 

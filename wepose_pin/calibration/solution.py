@@ -16,9 +16,9 @@ from ..errors import NoSolution
 from ..observations.hinges import find_hinges
 from .ambiguity import OtherMinimum, diagnose_ambiguity, find_other_minima, widen_covariance
 from .conditions import is_scale_observed
+from .couplings import add_couplings
 from .equations import HINGE_STD, Layout
 from .initial_headings import search_headings
-from .joints import add_couplings
 from .least_squares import MIN_LENGTH, Gaussian
 from .observability import diagnose_closures, diagnose_lengths, diagnose_mounts
 from .priors import build_prior, place_points

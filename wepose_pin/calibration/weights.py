@@ -14,8 +14,8 @@ import numpy as np
 
 from ..observations.directions import Level, Pointing
 from .conditions import Loop, Moving
+from .couplings import LEAST_CORRELATION_S
 from .equations import GAP_ROWS, HINGE_STD, Layout
-from .joints import LEAST_CORRELATION_S
 from .least_squares import STEPS, Estimate, Gaussian, LeastSquares, Observations, solve
 from .result import MIN_CONTACT, MeasuredLength
 

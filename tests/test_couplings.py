@@ -14,7 +14,7 @@ from benchmarks.validation.real import RING_SEGMENTS, assume_noise, register_rin
 from wepose_pin import rotations
 from wepose_pin.body.mounts import compute_heading_offset
 from wepose_pin.calibration import calibrate, problem
-from wepose_pin.calibration.joints import (
+from wepose_pin.calibration.couplings import (
     MAX_STD,
     SYSTEMATIC_STD,
     compute_joint_sides,
