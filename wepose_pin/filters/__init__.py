@@ -22,10 +22,9 @@ from .amekf import Amekf, AmekfParams
 from .base import AboutVertical, FilterRun, OrientationFilter
 from .gdc import Gdc, GdcParams
 from .ncf import Ncf, NcfParams
-from .noise import SensorNoise, estimate_noise
+from .noise import MOVING_TILT_STD, SensorNoise, StartTilt, estimate_noise, estimate_start_tilt
 from .smekf import PublishedSmekf, Smekf, SmekfParams, starting_params
 from .smoother import Smoother
-from .start import MOVING_TILT_STD, StartTilt, estimate_start_tilt
 from .static import USUAL_TEST, StaticDetector, StaticTest
 
 __all__ = [

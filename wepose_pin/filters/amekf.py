@@ -37,11 +37,11 @@ from .base import (
     VERTICAL_COLUMNS,
     FilterRun,
     add_correction,
+    into_sensor,
     make_run,
     prepare_samples,
     store_sample,
 )
-from .covariance import into_sensor
 from .noise import SensorNoise
 from .static import static_step
 

@@ -1,13 +1,15 @@
-"""Sensor noise and bias from a static phase (Lisini Baldi 2019, the Σ̂ of the static test)."""
+"""Sensor noise, bias and tilt from a static phase (Lisini Baldi 2019, the Σ̂ of the static test)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from .. import rotations
 from ..compilation import compiled
-from ..errors import BadPhase
+from ..errors import BadData, BadPhase
 from ..recording import ImuSensor, Recording
 
 # Smallest standard deviations: a quantised signal may be constant, but no MEMS sensor is more precise, and the
@@ -28,6 +30,9 @@ PRIOR_BLOCKS = 4.0  # weight of `SWAY_RATE_STD` as a number of blocks
 SWAY_CORRELATION_S = 2.0  # half a sway period: half-second means are correlated for so long
 STEADY_TURN_S = 20.0  # longest steady rotation of a person, as on an office chair
 LEAST_SWAY_STD = float(np.deg2rad(0.03))  # [rad/s] of the means of blocks beyond white noise; a person sways more
+
+ACCEL_BIAS_STD = 0.003  # [rad] tilt error from the bias of a calibrated MEMS accelerometer (3 mg: our assumption)
+MOVING_TILT_STD = 0.2  # [rad] tilt error of an accelerometer in motion
 
 # Without stated phases the most static window of this length in the beginning is used.
 WINDOW_S = 2.0
@@ -156,6 +161,45 @@ def _compute_half_second_cov(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray |
 
 def _apply_floor(cov: np.ndarray, std: float) -> np.ndarray:
     return cov if np.linalg.eigvalsh(cov)[0] >= std**2 else cov + std**2 * np.eye(3)
+
+
+class StartTilt(NamedTuple):
+    """Orientation of a sensor before the first sample of its start phase."""
+
+    quat_VS: np.ndarray  # (4,) xyzw, zero heading
+    tilt_std: float  # [rad] one standard deviation of roll and of pitch
+
+
+def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNoise, rate_hz: float) -> StartTilt:
+    """Estimate the tilt before the first of some static samples from their mean specific force.
+
+    The gyroscope rotates each sample's force into the sensor frame of the first, so that sway does not blur the mean.
+    NaN samples are left out.
+
+    Parameters
+    ----------
+    gyro_S, accel_S : (n, 3) [rad/s], (n, 3) [m/s²]
+
+    Raises
+    ------
+    BadData
+        The samples have no gravity.
+    """
+    force = rotations.unroll((gyro_S - noise.gyro_bias) * (1.0 / rate_hz), np.ascontiguousarray(accel_S))
+    if not np.isfinite(force).all():
+        force = force[np.isfinite(force).all(axis=1)]
+    mean = average_blocks(force, len(force))[0] if len(force) else np.zeros(3)
+    norm = float(np.linalg.norm(mean))
+    if not norm > 0.0:
+        raise BadData("accel is zero in the start phase; the filter starts from the direction of gravity")
+    across = force - (force @ mean)[:, None] * mean / norm**2
+    size = max(1, round(BLOCK_S * rate_hz))
+    blocks = len(across) // size
+    if blocks >= 4:
+        variance = float(average_blocks(across, size).var(axis=0, ddof=1).sum()) / 2.0 / blocks
+    else:  # too short for sway to average out
+        variance = float(across.var(axis=0).sum()) / 2.0
+    return StartTilt(rotations.quat_from_gravity(mean), float(np.hypot(ACCEL_BIAS_STD, np.sqrt(variance) / norm)))
 
 
 def find_static_window(recording: Recording) -> tuple[float, float]:

@@ -12,8 +12,7 @@ from ..diagnostics import Diagnostic
 from ..errors import BadData, WeposeError
 from ..recording import OrientationSensor, Recording
 from . import BEST, OFFLINE, FilterSettings, Orientation, SensorRun, amekf, check_method, smekf
-from .base import FilterRun, run_in_parallel
-from .covariance import symmetric
+from .base import FilterRun, run_in_parallel, symmetric
 from .noise import SensorNoise, estimate_noise
 from .phases import check_common_rotation, check_motion, find_reference_phases
 from .static import StaticState, StaticTest

@@ -36,10 +36,9 @@ from .base import (
     make_run,
     prepare_samples,
     store_sample,
+    symmetric,
 )
-from .covariance import symmetric
-from .noise import SWAY_CORRELATION_S, SensorNoise
-from .start import ACCEL_BIAS_STD
+from .noise import ACCEL_BIAS_STD, SWAY_CORRELATION_S, SensorNoise
 from .static import static_step
 
 GYRO_SCALE_STD = 0.002  # of a calibrated MEMS gyroscope, as in `amekf.AmekfParams.gyro_matrix_std`

@@ -18,8 +18,7 @@ import numpy as np
 from ..compilation import compiled, inlined
 from ..rotations import fill_matrix, rotate_by_world_vector
 from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, Amekf, AmekfParams
-from .base import RATE_VAR, VERTICAL_COLUMNS, FilterRun
-from .covariance import fill_symmetric, into_sensor
+from .base import RATE_VAR, VERTICAL_COLUMNS, FilterRun, fill_symmetric, into_sensor
 from .noise import SensorNoise
 
 COUNT = len(SMOOTHED_STATES)

@@ -245,34 +245,26 @@ def _clear(sums):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _widen(detector, gx, gy, gz):  # type: ignore[no-untyped-def]
-    """Take a sample of gyro into the range of the others; return whether the range is too wide for a static window.
+def _widen(least, most, limit, gx, gy, gz):  # type: ignore[no-untyped-def]
+    """Take a sample of gyro into the range of others; return the range, and whether it is too wide for a static window.
 
-    Two samples that differ by d make (N − 1) S ≥ d²/2; twice the limit is beyond rounding. NaN is no motion.
+    Two samples that differ by d make (N − 1) S ≥ d²/2; twice the `limit` is beyond rounding. NaN is no motion.
     """
-    least, most, limit = detector.least, detector.most, detector.gyro_limit
-    least[0], most[0] = gx if gx < least[0] else least[0], gx if gx > most[0] else most[0]
-    least[1], most[1] = gy if gy < least[1] else least[1], gy if gy > most[1] else most[1]
-    least[2], most[2] = gz if gz < least[2] else least[2], gz if gz > most[2] else most[2]
+    least = gx if gx < least[0] else least[0], gy if gy < least[1] else least[1], gz if gz < least[2] else least[2]
+    most = gx if gx > most[0] else most[0], gy if gy > most[1] else most[1], gz if gz > most[2] else most[2]
     x, y, z = most[0] - least[0], most[1] - least[1], most[2] - least[2]
-    return x * x > 4.0 * limit[0] or y * y > 4.0 * limit[3] or z * z > 4.0 * limit[5]
-
-
-@inlined
-def _forget_range(detector):  # type: ignore[no-untyped-def]
-    detector.moves = False
-    for i in range(3):
-        detector.least[i], detector.most[i] = np.inf, -np.inf
+    return least, most, x * x > 4.0 * limit[0] or y * y > 4.0 * limit[3] or z * z > 4.0 * limit[5]
 
 
 @inlined
 def _sum_up(detector, tail, block, anchor):  # type: ignore[no-untyped-def]
     """Fill `tail` with the sums from each sample of the block to its end, back to the one before which it moved."""
     last = len(block) - 1
-    _forget_range(detector)
+    least, most = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
     detector.moves_until = -1
     for at in range(last, -1, -1):
-        if _widen(detector, block[at, 0], block[at, 1], block[at, 2]):
+        least, most, moves = _widen(least, most, detector.gyro_limit, block[at, 0], block[at, 1], block[at, 2])
+        if moves:
             detector.moves_until = at
             break
         if at == last:
@@ -280,7 +272,9 @@ def _sum_up(detector, tail, block, anchor):  # type: ignore[no-untyped-def]
             _add(tail[last], tail[last], block, last, anchor)
         else:
             _add(tail[at], tail[at + 1], block, at, anchor)
-    _forget_range(detector)
+    detector.moves = False
+    for i in range(3):
+        detector.least[i], detector.most[i] = np.inf, -np.inf
 
 
 @inlined
@@ -366,7 +360,12 @@ def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[
     if first < n:
         detector.samples = first
         if not detector.moves:
-            detector.moves = _widen(detector, gx, gy, gz)
+            low, high = detector.least, detector.most
+            least, most, detector.moves = _widen(
+                (low[0], low[1], low[2]), (high[0], high[1], high[2]), detector.gyro_limit, gx, gy, gz
+            )
+            low[0], low[1], low[2] = least
+            high[0], high[1], high[2] = most
             _add(head, head, block, at, anchor)
             # No window needs the sums of the block before from here; those up to here serve condition (6).
             gyro = tail[at].gyro

@@ -45,7 +45,8 @@ def bridge(values: np.ndarray, marks: np.ndarray, clock: Clock, *, rate: bool = 
     for k in range(values.shape[1]):
         filled[lost, k] = np.interp(time[lost], time[~lost], values[~lost, k])
     if rate and (marks == LONG).any():
-        static = _estimate_static_rate(values, ~lost, clock)
+        second = find_static_second(values, ~lost, 1.0 / clock.step)
+        static = values[second].mean(axis=0) if len(second) else np.zeros(values.shape[1])
         for first, last in find_runs(marks == LONG):
             edges = [edge for edge in (first - 1, last) if 0 <= edge < len(time)]
             near = [np.clip(1.0 - np.abs(time[first:last] - time[edge]) / FADE_S, 0.0, None) for edge in edges]
@@ -69,12 +70,14 @@ def bridge_quat(quat: np.ndarray, marks: np.ndarray, clock: Clock) -> np.ndarray
     return filled
 
 
-def _estimate_static_rate(gyro_S: np.ndarray, good: np.ndarray, clock: Clock) -> np.ndarray:
-    """Estimate the static sensor's rate (3,): the mean of the complete second with least variance; zero without one."""
-    size = max(2, round(1.0 / clock.step))
-    blocks = len(gyro_S) // size
-    whole = good[: blocks * size].reshape(blocks, size).all(axis=1)
-    seconds = gyro_S[: blocks * size].reshape(blocks, size, 3)[whole]
-    if not len(seconds):
-        return np.zeros(3)
-    return seconds[int(np.argmin(seconds.var(axis=1).sum(axis=1)))].mean(axis=0)
+def find_static_second(gyro_S: np.ndarray, good: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Find the samples of the second, without any that is not `good` (n,), in which the rate (n, 3) varies least.
+
+    They are none where each second has a sample that is not good.
+    """
+    size = min(len(gyro_S), max(2, round(rate_hz)))
+    count = len(gyro_S) // size
+    motion = gyro_S[: count * size].reshape(count, size, 3).var(axis=1).sum(axis=1)
+    motion[~good[: count * size].reshape(count, size).all(axis=1)] = np.inf
+    first = int(np.argmin(motion))
+    return np.arange(first * size, (first + 1) * size) if np.isfinite(motion[first]) else np.empty(0, dtype=int)

@@ -16,7 +16,7 @@ from ..compilation import compiled
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongUnit
 from ..rotations import unroll
-from .gaps import find_runs
+from .gaps import find_runs, find_static_second
 from .intervals import format_span
 from .limits import (
     GRAVITY_ERROR_NOTED,
@@ -89,7 +89,10 @@ def _check_gravity(recording: Recording, segment: str, sensor: ImuSensor, place:
     if name:
         static, when = recording.find_measured(segment, recording.phases[name][0]), f"in phases.{name}"
     else:
-        static, when = _find_static_second(recording, sensor), "in the second in which it turns most evenly"
+        good = (np.abs(sensor.gyro_S) < sensor.gyro_range).all(axis=1)  # a rate at the limit varies least of all
+        good = good if sensor.gap is None else good & ~sensor.gap
+        static = find_static_second(sensor.gyro_S, good, recording.rate_hz)
+        when = "in the second in which it turns most evenly"
     if len(static) < 2:
         return []
     first, last = (float(recording.time[k]) for k in static[[0, -1]])
@@ -122,20 +125,6 @@ def _explain_norm(norm: float) -> str:
     if norm < 0.5:
         return "gravity seems to have been taken out; specific force is needed, +g up of a static sensor"
     return "check the unit and the sensor's calibration, and that it is static there"
-
-
-def _find_static_second(recording: Recording, sensor: ImuSensor) -> np.ndarray:
-    """Find the samples of the second in which the rate varies least, without gaps and saturation; empty: none."""
-    n = len(recording)
-    size = min(n, max(2, round(recording.rate_hz)))
-    count = n // size
-    motion = sensor.gyro_S[: count * size].reshape(count, size, 3).var(axis=1).sum(axis=1)
-    if sensor.gap is not None:
-        motion[sensor.gap[: count * size].reshape(count, size).any(axis=1)] = np.inf
-    saturated = (np.abs(sensor.gyro_S) >= sensor.gyro_range).any(axis=1)  # a rate at the limit varies least of all
-    motion[saturated[: count * size].reshape(count, size).any(axis=1)] = np.inf
-    first = int(np.argmin(motion))
-    return np.arange(first * size, (first + 1) * size) if np.isfinite(motion[first]) else np.empty(0, dtype=int)
 
 
 def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:

@@ -16,8 +16,8 @@ from ..body.subject import Subject
 from ..diagnostics import Diagnostic
 from ..errors import BadOption
 from ..filters import BEST, OFFLINE, Orientation, check_method, join_orientations
+from ..filters.noise import ACCEL_BIAS_STD
 from ..filters.smekf import HOLD_S, LOST_RATE_STD
-from ..filters.start import ACCEL_BIAS_STD
 from ..filters.static import StaticTest
 from ..recording import OrientationSensor, Recording
 
