@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,13 +12,7 @@ from ..observations.closures import GapRows
 from .heading_problem import HeadingProblem, Knot
 
 OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
-
-
-class Rows(NamedTuple):
-    """Whitened measurements 0 = r + H δ + e, of variance 1."""
-
-    r: np.ndarray  # (m,)
-    H: np.ndarray  # (m, k), δ of the segments in their order
+Rows = tuple[np.ndarray, np.ndarray]  # r (m,) and H (m, k) of measurements 0 = r + H δ + e, of variance 1
 
 
 def whiten_gap(problem: HeadingProblem, rows: GapRows, slip_std: float = PALM_SLIP_STD) -> Rows:
@@ -29,32 +22,19 @@ def whiten_gap(problem: HeadingProblem, rows: GapRows, slip_std: float = PALM_SL
     whiten = np.linalg.inv(np.linalg.cholesky(covariance)) if len(covariance) else covariance
     r, H = (whiten @ rows.gap[:, :, None])[..., 0], whiten @ rows.H
     is_inlier = np.sum(r**2, axis=1) < OUTLIER_STDS**2 * 3.0  # three axes
-    return Rows(r[is_inlier].ravel(), H[is_inlier].reshape(-1, H.shape[2]))
+    return r[is_inlier].ravel(), H[is_inlier].reshape(-1, H.shape[2])
 
 
 @dataclass(frozen=True)
 class ClaspTest:
-    """When points of a closure are found to coincide; lengths are rms over the time.
+    """When points of a closure are found to coincide; lengths are rms over the time."""
 
-    With the lengths of the population or stated mounts the joined hands of simulated people seem up to 25 cm apart, and
-    hands apart seem joined: clasps are found where all mounts between the points are calibrated.
-
-    Parameters
-    ----------
-    seconds : [s] for which they do
-    gap : [m] most between them, once the headings have closed it as far as their uncertainty lets them
-    change : [m] most around the mean of that gap
-    height : [m] most of the gap's vertical part
-    speed : [m/s] least of each of them in the frame of the reference segment
-    speed_ratio : most of the gap's rate against that
-    """
-
-    seconds: float = 2.0
-    gap: float = 0.06
-    change: float = 0.03
-    height: float = 0.12
-    speed: float = 0.08
-    speed_ratio: float = 0.3
+    seconds: float = 2.0  # [s] for which they do
+    gap: float = 0.06  # [m] most between them, once headings have closed it as far as their uncertainty lets them
+    change: float = 0.03  # [m] most around the mean of that gap
+    height: float = 0.12  # [m] most of the gap's vertical part
+    speed: float = 0.08  # [m/s] least of each of them in the frame of the reference segment
+    speed_ratio: float = 0.3  # most of the gap's rate against that
 
 
 OFFLINE_CLASP = ClaspTest()
@@ -67,6 +47,9 @@ class ClaspDetector:
 
     The gap between them, once the headings have closed it as far as their uncertainty lets them, is short and constant,
     and its rate is small beside those of the points in the frame of the reference segment.
+
+    With the lengths of the population or stated mounts the joined hands of simulated people seem up to 25 cm apart, and
+    hands apart seem joined: clasps are found where all mounts between the points are calibrated.
     """
 
     def __init__(self, problem: HeadingProblem) -> None:

@@ -348,11 +348,11 @@ class HeadingFilter:
 
         Causally all of a clasp's first knot is one: a clasp may be shorter than its residuals are correlated.
         """
-        problem = self.problem
+        problem, (r, H) = self.problem, gap
         correlated = max(1.0, problem.noise.closure_correlation_s * problem.rate_hz)
         if problem.causal and phase not in self._closed_before:
             correlated = float(len(knot.time))
-        information.add(problem.columns.heading, gap.H, gap.r, 1.0 / correlated)
+        information.add(problem.columns.heading, H, r, 1.0 / correlated)
 
 
 def mask_intervals(time: np.ndarray, intervals: Intervals) -> np.ndarray:
