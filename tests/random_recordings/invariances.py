@@ -25,9 +25,10 @@ THRESHOLD_SHARE = 0.1  # of the stated standard deviation
 # gdc states none, and its step has one size: at its solution it goes to and fro, and the tenth digit of the sampling
 # time decides in which phase.
 CHATTER_DEG = 0.5
-# The others give a filter more, or other samples of the same noise: two estimates of one thing, each within its ±, of
-# which this many together are allowed; where nothing is stated, so many degrees.
-MOST_Z, UNSTATED_DEG = 4.0, 5.0
+# The others give a filter more or less of the same samples, or the same noise at another rate. That may move a pose by
+# a share of its ±; where nothing is stated, by so many degrees.
+MOST_Z, UNSTATED_DEG = 1.0 / 3.0, 5.0
+STANDING_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,13 @@ INVARIANCES: Mapping[str, Invariance] = {
     "units changed": Invariance(Variant(other_units=True)),
     "mirrored": Invariance(Variant(mirrored=True)),
     "time shifted by 1.7e9 s": Invariance(Variant(shift=1.7e9), unstated_deg=CHATTER_DEG),
-    "stillness before": Invariance(Variant(stillness=6.0), most_deg=None),
+    "stillness before": Invariance(
+        Variant(before=STANDING_S), Variant(before=STANDING_S, written=(0.0, np.inf)), most_deg=None
+    ),
+    "stillness after": Invariance(
+        Variant(after=STANDING_S), Variant(after=STANDING_S, written=(-np.inf, 1.0)), most_deg=None
+    ),
+    "end cut off": Invariance(Variant(written=(-np.inf, 0.8)), most_deg=None),
     "rate doubled": Invariance(Variant(finer=2), Variant(half=2), most_deg=None),
 }
 
@@ -61,21 +68,30 @@ class Deviation:
     of: str
 
 
-def choose(case: Case) -> str:
-    """The invariance that is tried on this case, or "" for none."""
-    rng = case.stream("invariance")
-    if rng.random() > 0.4 or case.refusal or case.suspects or any(s.axes is None for s in case.worn.values()):
-        return ""
+def choose(case: Case) -> list[str]:
+    """The invariance that is tried on this case, or none."""
+    rng, fits = case.stream("invariance"), list_fitting(case)
+    return [str(rng.choice(fits))] if fits and rng.random() < 0.4 else []
+
+
+def list_fitting(case: Case) -> list[str]:
+    """The invariances that can be tried on this case."""
+    if case.refusal or case.suspects or any(sensor.axes is None for sensor in case.worn.values()):
+        return []
     clock = case.clock
     fits = ["sensor axes rotated", "units changed", "mirrored"]
     if clock.stamps != "none" and not clock.origin > 1e9 and not clock.separate:
         fits.append("time shifted by 1.7e9 s")
     plain = not clock.lost and not clock.separate and not clock.twice and clock.stamps in ("even", "none")
-    if plain and not case.begins_in_motion and case.start is not None and "causal" not in case.options:
+    if plain and not case.begins_in_motion and case.start is not None:
         fits.append("stillness before")
+    if plain and case.start is not None:
+        fits.append("stillness after")
+        if max(span[1] for span in (case.start, case.clasp) if span is not None) < 0.75 * case.duration:
+            fits.append("end cut off")
     if plain and clock.rate_hz <= 240 and "causal" not in case.options:
         fits.append("rate doubled")
-    return str(rng.choice(fits))
+    return fits
 
 
 def compare(case: Case, name: str, folder: Path, as_process: bool) -> tuple[Deviation | None, list[Failure], list]:
@@ -124,8 +140,7 @@ def _deviation(
         k = int(np.argmax(angle))
         degrees, z = float(np.degrees(angle[k])), 0.0
         if std is not None and of.most_deg is None:
-            second = two.quat_std[segment][rows_two]
-            ratio = np.maximum(angle - FLOOR_RAD, 0.0) / (ALL_AXES * np.maximum(std[rows] + second, 1e-9))
+            ratio = np.maximum(angle - FLOOR_RAD, 0.0) / (ALL_AXES * np.maximum(std[rows], 1e-9))
             z = float(ratio.max())
         if degrees > largest.degrees:
             largest.degrees, largest.of = degrees, segment

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from .activities import Scene, stand
 from .cases import Case
 from .people import joint_points
 from .sensors import Signals, Worn, axes_rotation, measure, peak_share
@@ -26,7 +27,9 @@ class Variant:
     other_units: bool = False
     mirrored: bool = False
     shift: float = 0.0  # [s] on the clock
-    stillness: float = 0.0  # [s] of standing before
+    before: float = 0.0  # [s] of standing before
+    after: float = 0.0  # and after
+    written: tuple[float, float] = (-np.inf, np.inf)  # shares of the case's duration from and to which samples are
     finer: int = 1  # times the rate
     half: int = 1  # the noise is that of so many times the rate, averaged
 
@@ -57,22 +60,30 @@ def record(case: Case, variant: Variant | None = None) -> Recorded:
     """The samples of a case."""
     v = variant or Variant()
     clock = case.clock
-    begin = -v.stillness
-    rate = clock.rate_hz * v.finer
+    begin, motion, duration = -v.before, case.motion, case.duration + v.after
+    if v.after:
+        standing = stand(Scene(case.stream("after"), case.person, case.duration, duration))
+        activities, begins = [*motion.activities, standing], [*motion.begins, case.duration]
+        motion = replace(motion, activities=activities, begins=begins, joins=[*motion.joins, 2.0])
     rng = case.stream("clock-noise")
     origin = clock.origin + v.shift
     groups = [[name] for name in case.worn] if clock.separate else [list(case.worn)]
     tables, axes, shares = [], {}, {}
     for group in groups:
         ahead, own_rate = (
-            (rng.uniform(-0.3, 0.0), rate * (1.0 + rng.choice([0.0, 2e-3]))) if clock.separate else (0.0, rate)
+            (rng.uniform(-0.3, 0.0), clock.rate_hz * (1.0 + rng.choice([0.0, 2e-3])))
+            if clock.separate
+            else (0.0, clock.rate_hz)
         )
-        n = int((case.duration - begin - ahead) * own_rate)
+        n = int((duration - begin - ahead) * own_rate)
         t = begin + ahead + np.arange(n) / own_rate
+        if v.finer > 1:  # those whose noise `_averaged` takes for the coarser ones
+            own_rate *= v.finer
+            t = t[0] + np.arange(1 - v.finer, 1 - v.finer + v.finer * n) / own_rate
         if clock.stamps == "uneven":
             t = t + 0.3 / own_rate * rng.uniform(-1.0, 1.0, n)
         worn = {name: case.worn[name] for name in group}
-        signals = _averaged(case, worn, t, v.half) if v.half > 1 else measure(case.motion, worn, t, case.noise)
+        signals = _averaged(case, worn, t, v.half) if v.half > 1 else measure(motion, worn, t, case.noise)
         shares |= {name: peak_share(signals[name], case.worn[name].errors) for name in group}
         for begin_gap, lasts, segment in clock.lost:
             away = (t >= begin_gap) & (t < begin_gap + lasts)
@@ -85,6 +96,9 @@ def record(case: Case, variant: Variant | None = None) -> Recorded:
                 keep = ~away
                 t = t[keep]
                 signals = {name: _rows(s, keep) for name, s in signals.items()}
+        keep = (t >= v.written[0] * case.duration) & (t < v.written[1] * case.duration)
+        t, signals = t[keep], {name: _rows(s, keep) for name, s in signals.items()}
+        begin = float(t[0]) if clock.stamps == "none" else begin
         stamps = t + _stamp_errors(clock.stamps, t, own_rate, rng) + origin
         if clock.stamps == "rounded":
             stamps = np.round(stamps, 3)

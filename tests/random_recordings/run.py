@@ -24,13 +24,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from random_recordings.summary import summary_text  # noqa: E402
 
 
-def try_one(task: tuple[int, bool]) -> dict[str, Any]:
+def try_one(task: tuple[int, bool, bool]) -> dict[str, Any]:
     """One seed's report as JSON; an error of the harness itself is a failure of the seed too."""
     from random_recordings.trial import try_seed
 
-    seed, as_process = task
+    seed, as_process, invariances_alone = task
     try:
-        return try_seed(seed, as_process=as_process).as_json()
+        return try_seed(seed, None, as_process, invariances_alone).as_json()
     except Exception:
         failure = {"oracle": "the harness itself", "command": "", "message": traceback.format_exc()[-1500:]}
         return {
@@ -39,18 +39,18 @@ def try_one(task: tuple[int, bool]) -> dict[str, Any]:
             "failures": [failure],
             "commands": [],
             "accuracy": {},
-            "deviation": {},
+            "deviations": [],
             "recorded_s": 0.0,
             "seconds": 0.0,
         }
 
 
-def run_seeds(seeds: list[int], out: Path, jobs: int, as_process: bool) -> None:
+def run_seeds(seeds: list[int], out: Path, jobs: int, as_process: bool, invariances_alone: bool) -> None:
     """Try those seeds that have no line yet."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / "seeds.jsonl"
     done = {report["seed"] for report in read_reports(file)}
-    tasks = [(seed, as_process) for seed in seeds if seed not in done]
+    tasks = [(seed, as_process, invariances_alone) for seed in seeds if seed not in done]
     with multiprocessing.get_context("spawn").Pool(jobs, maxtasksperchild=200) as pool, file.open("a") as lines:
         for k, report in enumerate(pool.imap_unordered(try_one, tasks), 1):
             lines.write(json.dumps(report) + "\n")
@@ -88,13 +88,14 @@ def main() -> int:
     parser.add_argument(
         "--as-process", action="store_true", help="every command in a process of its own, as a user does"
     )
+    parser.add_argument("--invariances", action="store_true", help="only the invariances, of each seed all that fit")
     parser.add_argument("--report", action="store_true", help="only say what DIR holds")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / ".random_recordings")
     options = parser.parse_args()
     if options.seed is not None:
         from random_recordings.trial import try_seed
 
-        report = try_seed(options.seed, options.keep, options.as_process)
+        report = try_seed(options.seed, options.keep, options.as_process, options.invariances)
         print(json.dumps(report.as_json(), indent=1))
         return 1 if report.failures else 0
     first, _, last = options.seeds.partition(":")
@@ -102,7 +103,7 @@ def main() -> int:
     if last:
         seeds = list(dict.fromkeys([*failed_once(), *seeds]))
     if not options.report:
-        run_seeds(seeds, options.out, options.jobs, options.as_process)
+        run_seeds(seeds, options.out, options.jobs, options.as_process, options.invariances)
     reports = [report for report in read_reports(options.out / "seeds.jsonl") if report["seed"] in set(seeds)]
     text = summary_text(reports)
     (options.out / "summary.md").write_text(text, encoding="utf-8")

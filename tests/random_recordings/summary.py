@@ -42,17 +42,14 @@ def summary_text(reports: list[dict[str, Any]]) -> str:
 
 def _invariances(reports: list[dict[str, Any]]) -> list[str]:
     largest: dict[tuple[str, str], tuple[float, float, int, int]] = {}
-    for report in reports:
-        deviation = report["deviation"]
-        if not deviation:
-            continue
+    for seed_, deviation in ((report["seed"], each) for report in reports for each in report["deviations"]):
         key = deviation["invariance"], deviation["method"]
-        degrees, z, seed, count = largest.get(key, (0.0, 0.0, report["seed"], 0))
+        degrees, z, seed, count = largest.get(key, (0.0, 0.0, seed_, 0))
         if deviation["degrees"] >= degrees:
-            degrees, seed = deviation["degrees"], report["seed"]
+            degrees, seed = deviation["degrees"], seed_
         largest[key] = degrees, max(z, deviation["z"]), seed, count + 1
     rows = [
-        [name, method, str(count), f"{degrees:.3g}", f"{z:.1f}", str(seed)]
+        [name, method, str(count), f"{degrees:.3g}", f"{z:.2f}", str(seed)]
         for (name, method), (degrees, z, seed, count) in sorted(largest.items())
     ]
     return _table(["what differs", "method", "tried", "largest [deg]", "z", "seed"], rows)

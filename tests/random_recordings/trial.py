@@ -13,7 +13,7 @@ from typing import Any
 from . import adapter
 from .adapter import Outcome, Result
 from .cases import Case, draw_case
-from .invariances import choose, compare
+from .invariances import choose, compare, list_fitting
 from .oracles import Accuracy, Failure, of_acceptance, of_errors, of_outcome, of_result, of_same_table
 from .recordings import Recorded, record
 
@@ -29,7 +29,7 @@ class Report:
     failures: list[Failure] = field(default_factory=list)
     commands: list[tuple[str, int]] = field(default_factory=list)  # command, exit code
     accuracy: dict[str, Any] = field(default_factory=dict)
-    deviation: dict[str, Any] = field(default_factory=dict)
+    deviations: list[dict[str, Any]] = field(default_factory=list)  # one for each invariance
     recorded_s: float = 0.0
     seconds: float = 0.0
 
@@ -55,20 +55,20 @@ class Trial:
         self.result_folder = folder / "result"
         self.result: Result | None = None
 
-    def run(self) -> Report:
+    def run(self, invariances_alone: bool = False) -> Report:
+        """Run the steps and one invariance, or all invariances that can be tried and no step."""
         begin = time.perf_counter()
         (self.folder / "about.txt").write_text(self.case.describe() + "\n", encoding="utf-8")
-        for step in self.case.steps:
+        for step in [] if invariances_alone else self.case.steps:
             if step in ("calibrate", "track", "info") or self.result is not None:
                 STEPS[step](self)
-        invariance = choose(self.case)
-        if invariance:
-            deviation, failures, outcomes = compare(self.case, invariance, self.folder / "same", self.as_process)
+        for invariance in list_fitting(self.case) if invariances_alone else choose(self.case):
+            deviation, failures, outcomes = compare(self.case, invariance, self.folder / invariance, self.as_process)
             self.report.failures += failures
             for outcome in outcomes:
                 self._count(outcome)
             if deviation is not None:
-                self.report.deviation = asdict(deviation)
+                self.report.deviations.append(asdict(deviation))
         self.report.seconds = time.perf_counter() - begin
         return self.report
 
@@ -190,15 +190,15 @@ def _rounded(accuracy: Accuracy) -> dict[str, Any]:
     return {name: round(value, 3) if isinstance(value, float) else value for name, value in values.items()}
 
 
-def try_seed(seed: int, keep: Path | None = None, as_process: bool = False) -> Report:
+def try_seed(seed: int, keep: Path | None = None, as_process: bool = False, invariances_alone: bool = False) -> Report:
     """Everything of one seed, in a folder that is removed, or kept under `keep`."""
     case = draw_case(seed)
     if keep is not None:
         shutil.rmtree(keep, ignore_errors=True)
         keep.mkdir(parents=True)
-        return Trial(case, keep, as_process).run()
+        return Trial(case, keep, as_process).run(invariances_alone)
     with tempfile.TemporaryDirectory(prefix="random-recording-") as folder:
-        report = Trial(case, Path(folder), as_process).run()
+        report = Trial(case, Path(folder), as_process).run(invariances_alone)
         for failure in report.failures:
             failure.command = failure.command.replace(folder, "DIR")
             failure.message = failure.message.replace(folder, "DIR")
