@@ -268,6 +268,9 @@ class _Files:
             signal: units.get(signal, 1.0) * read_columns(table, names, str(path), f"{self._path}: {place}.{signal}")
             for signal, names in signals.items()
         }
+        if path in self._tables:  # columns that have been read make room: of a day the table is gigabytes
+            read = [name for names in signals.values() for name in names]
+            self._tables[path] = table.with_columns(pl.lit(None).alias(name) for name in read)
         aligned = _read_aligned(keys, stated, signals, False)
         return _Measured(place, path, signals, self._clocks[key], values, units, stated.mount, aligned)
 

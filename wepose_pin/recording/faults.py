@@ -442,7 +442,9 @@ def _take_numbers(*values: np.ndarray) -> tuple[np.ndarray, ...]:
         good = np.all([np.isfinite(each[:, None] if each.ndim == 1 else each).all(axis=1) for each in values], axis=0)
         values = tuple(each[good] for each in values)
     time, *signals = values
-    return time, *(np.clip(signal, -LARGEST, LARGEST) for signal in signals)
+    # Without larger ones no copy is made: of a day it is gigabytes.
+    most = max(max(signal.max(initial=0.0), -signal.min(initial=0.0)) for signal in signals)
+    return time, *(np.clip(signal, -LARGEST, LARGEST) if most > LARGEST else signal for signal in signals)
 
 
 def _find_copies(samples: Mapping[str, tuple[np.ndarray, ...]]) -> list[tuple[str, str, int]]:

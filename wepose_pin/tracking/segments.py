@@ -119,9 +119,8 @@ class SegmentEstimator:
         self._oldest = 0  # row of `_recent` with the oldest sample
         self.quat_WL = np.zeros((len(self.names), 4))
         self._uncorrected = np.zeros(len(self.names))
-        # [rad²] `CausalHeadings.variance` at the last step
+        # [rad²] `CausalHeadings.variance` at the last step; NaN: the heading's variance is that of its filter
         self._variance = (np.full(len(self.names), np.nan),) * 3
-        self._var_at_reset: np.ndarray | None = None  # (k,) [rad²] of heading that a reset took away
         return self._place_chunk(first, orientation)
 
     def correct_headings(self, problem: HeadingProblem, first: SegmentOrientations) -> None:
@@ -245,12 +244,9 @@ class SegmentEstimator:
     def _place(
         self, chunk: Recording, orientation: Mapping[str, Orientation], quat_VS: np.ndarray, quat_WL: np.ndarray
     ) -> np.ndarray:
-        """Fill `quat_WL` (n, k, 4), knot by knot; return `CausalHeadings.variance` (n, 3, k) [rad²] of each sample.
-
-        It is NaN where headings are not corrected.
-        """
+        """Fill `quat_WL` (n, k, 4), knot by knot; return `CausalHeadings.variance` (n, 3, k) [rad²] of each sample."""
         n = len(chunk)
-        variance = np.full((n, 3, len(self.names)), np.nan)
+        variance = np.tile(self._variance, (n, 1, 1))
         if self.headings is None:
             _place_segments(self._quat_WV, self._correction(), quat_VS, self._quat_LS, self.quat_WL, quat_WL)
             return variance
@@ -284,8 +280,13 @@ class SegmentEstimator:
             self.headings.reset(offset)
             self._variance = self.headings.variance
             return
-        self._quat_WV = _quat_about_z(offset)
-        self._var_at_reset = self.heading_var()
+        self._quat_WV, var = _quat_about_z(offset), self.heading_var()
+        if var is not None:  # as after the start pose: what the filters have added since is gone
+            start_var = np.array([self._find_start_var(name) for name in self.names])
+            self._variance = start_var, var, np.full(len(var), np.inf)
+
+    def _find_start_var(self, name: str) -> float:
+        return compute_start_heading_var(self._first, name, self._subject, self._start_pose)
 
     def heading_var(self) -> np.ndarray | None:
         """Return the variance (k,) [rad²] of each heading by its filter alone now, NaN without a filter.
@@ -339,9 +340,7 @@ class SegmentEstimator:
     def _covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Return the covariance (n, 3, 3) [rad²] of sensor i's segment, error on the left of `quat_WL`, in W.
 
-        `variance` (n, 3) [rad²] is `CausalHeadings.variance` of the sensor.
-
-        It lacks soft tissue. After a reset the heading's error is that of the start pose and the drift since.
+        It lacks soft tissue. `variance` (n, 3) [rad²] is `CausalHeadings.variance` of the sensor.
         """
         if self._first.sensors[self.names[i]].aligned:
             return attitude_cov
@@ -350,19 +349,10 @@ class SegmentEstimator:
         cov = compute_segment_covariance(
             self._first, self.names[i], self._subject, quat_WS, R_LS, attitude_cov, self._start_pose
         )
-        if self.headings is not None:
-            start_var = compute_start_heading_var(self._first, self.names[i], self._subject, self._start_pose)
-            cov = correct_covariance(cov, (quat_VS, attitude_cov), self.heading_offset[i], start_var, variance)
-        if self._var_at_reset is not None and np.isfinite(self._var_at_reset[i]):
-            var = compute_heading_variance(quat_VS, attitude_cov)
-            grown = np.maximum(0.0, var - self._var_at_reset[i])
-            # The mount's part of the heading stays: the reset has set that of the start pose alone.
-            of_mount = np.maximum(cov[:, 2, 2] - var, 0.0)
-            start_var = self._start_pose.repeat_std(self.names[i])[2] ** 2
-            std_ratio = np.sqrt((of_mount + grown + start_var) / cov[:, 2, 2])
-            cov[:, 2, :] *= std_ratio[:, None]
-            cov[:, :, 2] *= std_ratio[:, None]
-        return cov
+        if np.isnan(variance).any():
+            return cov
+        start_var = self._find_start_var(self.names[i])
+        return correct_covariance(cov, (quat_VS, attitude_cov), self.heading_offset[i], start_var, variance)
 
     def _order_recent(self) -> np.ndarray:
         return np.concatenate([self._recent[self._oldest :], self._recent[: self._oldest]])
