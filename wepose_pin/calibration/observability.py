@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
@@ -42,35 +43,27 @@ def diagnose_lengths(
     if free_scale_std is not None:
         facts = names | {"variant": "prior", "measured": problem.measured_example}
         diagnostics.append(Diagnostic("scale-uncertain", INFO, value=free_scale_std, facts=facts))
-    table, names_of_lengths = problem.model.table, list(problem.model.lengths)
-    chain = problem.lengths_in_closures
-    of_limbs = [
-        name
-        for name in chain
-        if not any(
-            table.segments[part.segment].spine or table.segments[part.segment].rigid_without_sensor
-            for part in table.lengths[name].stretches
-        )
-    ]
     # Closures show proportions: those must be known better than from the prior and the measured lengths.
-    first = [name for name in of_limbs if _is_first(problem, name)]
-    for a, b in ((name, other) for name in first for other in chain if other not in first):
-        share = np.zeros(len(lengths))
-        for name, sign in ((a, 1.0), (b, -1.0)):
-            share[names_of_lengths.index(name)] = sign / lengths[names_of_lengths.index(name)]
-        if share @ covariance @ share < 0.5 * share @ prior_covariance @ share:
-            break
-    else:
-        if first:
-            diagnostics.append(Diagnostic("lengths-not-observed", WARNING, facts=names | {"variant": "hardly"}))
+    names_of_lengths = list(problem.model.lengths)
+    chain = {name: names_of_lengths.index(name) for name in problem.lengths_in_closures}
+    first = [k for name, k in chain.items() if _is_first(problem, name)]
+    others = [k for k in chain.values() if k not in first]
+    after, before = (C / np.outer(lengths, lengths) for C in (covariance, prior_covariance))
+    for a, b in product(first, others):
+        if after[a, a] + after[b, b] - 2.0 * after[a, b] < 0.5 * (before[a, a] + before[b, b] - 2.0 * before[a, b]):
+            return diagnostics
+    if first:
+        diagnostics.append(Diagnostic("lengths-not-observed", WARNING, facts=names | {"variant": "hardly"}))
     return diagnostics
 
 
 def _is_first(problem: CalibrationProblem, length: str) -> bool:
-    """Whether a length is that of a limb's first segment."""
+    """Return whether a length is that of a limb's first segment."""
     segments, parents = problem.model.table.segments, problem.model.parents
-    above = [parents[part.segment] for part in problem.model.table.lengths[length].stretches]
-    return all(segment is None or segments[segment].spine for segment in above)
+    own = [part.segment for part in problem.model.table.lengths[length].stretches]
+    if any(segments[name].spine or segments[name].rigid_without_sensor for name in own):
+        return False
+    return all((above := parents[name]) is None or segments[above].spine for name in own)
 
 
 def diagnose_mounts(segments: Sequence[str], problem: CalibrationProblem) -> list[Diagnostic]:

@@ -23,13 +23,12 @@ from .conditions import Loop, choose_variant, group_lengths, is_scale_observed
 from .observability import MOST_OPEN, find_intervals, format_longest
 from .result import (
     MIN_CONTACT,
+    AngleRange,
     Calibration,
     CalibrationQuality,
     Check,
-    InformationDirection,
     MotionRange,
     QualityLimits,
-    Range,
 )
 from .weights import CONTRADICTED
 
@@ -105,7 +104,7 @@ def assess(calibration: Calibration) -> CalibrationQuality:
         reasons=reasons,
         further=tuple(each for each in shown if each.code not in {reason.code for reason in reasons}),
         motion=motion,
-        directions=_find_directions(calibration),
+        information=_find_information(calibration),
         doubt=doubt,
     )
 
@@ -227,7 +226,7 @@ def _find_cause(calibration: Calibration, motion: MotionRange, causes: tuple[str
     if not calibration.problem.closure_kind:
         return None
 
-    def size(values: Mapping[str, Range]) -> float:
+    def size(values: Mapping[str, AngleRange]) -> float:
         return min((value.size for limb, value in values.items() if not side or limb == side), default=np.nan)
 
     sizes = {
@@ -320,29 +319,19 @@ def _azimuth(v: np.ndarray) -> np.ndarray:
     return np.degrees(np.angle(turn * np.conj(mean)) + np.angle(mean))
 
 
-def _range(values: np.ndarray) -> Range:
-    return Range(*(float(v) for v in np.percentile(values, (2, 98))))
+def _range(values: np.ndarray) -> AngleRange:
+    return AngleRange(*(float(v) for v in np.percentile(values, (2, 98))))
 
 
-def _find_directions(calibration: Calibration) -> tuple[InformationDirection, ...]:
-    """The information of the motion in units of the prior's: eigenvectors of one covariance in the other."""
+def _find_information(calibration: Calibration) -> tuple[float, ...]:
+    """Return the information of the motion in units of the prior's: of one covariance in the other."""
     # Without what the prior knows exactly.
     unknown = np.flatnonzero(np.diag(calibration.prior_covariance) > 0.0)
-    names = [calibration.subject.order[k] for k in unknown]
-    if not names:
-        return ()
     scale = np.sqrt(np.diag(calibration.prior_covariance)[unknown])
     before = calibration.prior_covariance[np.ix_(unknown, unknown)] / np.outer(scale, scale)
     after = calibration.subject.covariance[np.ix_(unknown, unknown)] / np.outer(scale, scale)
-    shares, vectors = eigh(after, before)
-    directions = []
-    for share, vector in zip(shares, vectors.T, strict=True):
-        way = before @ vector  # along which x moves, where vector weighs it
-        way = way / np.linalg.norm(way) * np.sign(way[np.argmax(np.abs(way))])
-        largest = [k for k in np.argsort(-np.abs(way))[:4] if abs(way[k]) > 0.2]
-        parts = {names[k]: round(float(way[k]), 2) for k in largest}
-        directions.append(InformationDirection(max(1.0 / float(share) - 1.0, 0.0), parts))
-    return tuple(directions)
+    shares = eigh(after, before, eigvals_only=True) if len(unknown) else np.empty(0)
+    return tuple(max(1.0 / float(share) - 1.0, 0.0) for share in shares)
 
 
 def find_open_intervals(calibration: Calibration) -> list[tuple[float, float]]:

@@ -13,7 +13,7 @@ from ..diagnostics import Diagnostic, notebook_html, render
 from .problem import CalibrationProblem
 
 MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
-MIN_INFORMATION = 1e-2  # of a direction, in units of the prior's, below which the motion does not show it
+MIN_INFORMATION = 1e-2  # of a combination, in units of the prior's, below which the motion does not show it
 
 
 class MeasuredLength(NamedTuple):
@@ -64,7 +64,7 @@ class Check(NamedTuple):
         return value / max(limit, 1e-9)
 
 
-class Range(NamedTuple):
+class AngleRange(NamedTuple):
     """From the 2nd to the 98th percentile [deg]."""
 
     low: float
@@ -78,18 +78,11 @@ class Range(NamedTuple):
 class MotionRange(NamedTuple):
     """How far the body moved while the chain was closed; keys are limbs, by side or by their last point."""
 
-    elevation: dict[str, Range]  # of the limb's first segment in the one above, 0 hanging, 90 level
-    sideways: dict[str, Range]  # azimuth of the limb's end from its beginning in the segment above, positive left
-    bend: dict[str, Range]  # flexion of its hinge, 0 straight
+    elevation: dict[str, AngleRange]  # of the limb's first segment in the one above, 0 hanging, 90 level
+    sideways: dict[str, AngleRange]  # azimuth of the limb's end from its beginning in the segment above, positive left
+    bend: dict[str, AngleRange]  # flexion of its hinge, 0 straight
     lean: float  # [deg] of the first segment's axis from its mean, 98th percentile
-    twist: Range | None  # heading of the first segment
-
-
-class InformationDirection(NamedTuple):
-    """A combination of lengths and mounts, and how much information the motion gives on it."""
-
-    information: float  # in units of the prior's: 0 none, 1 as much again
-    parts: dict[str, float]  # its largest parts, each in units of its standard deviation before
+    twist: AngleRange | None  # heading of the first segment
 
 
 @dataclass(frozen=True)
@@ -103,7 +96,8 @@ class CalibrationQuality:
     reasons : why it does not pass, the worst first, each followed by its cause
     further : what else the user should know
     motion : how far the body moved
-    directions : of lengths and mounts jointly, best determined first
+    information : of the motion on independent combinations of lengths and mounts, in units of the prior's: 0 none, 1 as
+        much again
     doubt : of the labels, above 1 where a person cannot move so
     """
 
@@ -112,7 +106,7 @@ class CalibrationQuality:
     reasons: tuple[Diagnostic, ...] = ()
     further: tuple[Diagnostic, ...] = ()
     motion: MotionRange = field(default_factory=lambda: MotionRange({}, {}, {}, np.nan, None))
-    directions: tuple[InformationDirection, ...] = ()
+    information: tuple[float, ...] = ()
     doubt: float = 0.0
 
     def __repr__(self) -> str:
@@ -127,23 +121,23 @@ class CalibrationQuality:
     @property
     def unknowns(self) -> int:
         """Number of lengths and mounts' angles that are not known exactly."""
-        return len(self.directions)
+        return len(self.information)
 
     @property
     def rank(self) -> int:
-        """How many directions the motion shows."""
-        return sum(d.information > MIN_INFORMATION for d in self.directions)
+        """How many combinations the motion shows."""
+        return sum(each > MIN_INFORMATION for each in self.information)
 
     @property
     def determined(self) -> int:
-        """How many directions the motion determines better than the prior."""
-        return sum(d.information > 1.0 for d in self.directions)
+        """How many combinations the motion determines better than the prior."""
+        return sum(each > 1.0 for each in self.information)
 
     @property
     def condition(self) -> float:
         """Largest over smallest standard deviation after the motion, each in units of that before."""
-        after = [1.0 / (1.0 + d.information) for d in self.directions]
-        return float(np.sqrt(max(after) / min(after))) if after else float("nan")
+        least, most = min(self.information, default=np.nan), max(self.information, default=np.nan)
+        return float(np.sqrt((1.0 + most) / (1.0 + least)))
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,6 @@ def _document(calibration: Calibration, quality: CalibrationQuality) -> dict[str
             "rank": quality.rank,
             "determined": quality.determined,
             "condition": _number(quality.condition),
-            "directions": quality.directions,
         },
         "motion_deg": {**quality.motion._asdict(), "lean": _number(quality.motion.lean)},
         "labels": {"doubt": _number(quality.doubt), "moved": dict(calibration.exchanged)},
