@@ -89,4 +89,4 @@ def _keep_prior(calibration: Calibration) -> Calibration:
         note="sensors sit elsewhere than labelled: nothing of the motion is used",
     )
     scale_std = float(np.sqrt(lengths @ information @ lengths) ** -1)
-    return replace(calibration, subject=subject, scale_std=scale_std, hinge_rms={})
+    return replace(calibration, subject=subject, scale_std=scale_std, hinge_rms={}, remarks=())
