@@ -9,7 +9,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `wepose` has it; a busy
 import argparse
 import json
 import sys
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from wepose_pin.errors import BadOption, ExistingOutput, WeposeError
 
@@ -93,68 +95,33 @@ def chosen_sections(options: argparse.Namespace) -> dict[str, Section]:
         raise BadOption("--live, --minutes: go with headings, which is not asked for")
     if options.minutes is not None and not (options.live and 5.0 <= options.minutes <= 600.0):
         raise BadOption(f"--minutes {options.minutes:g}: goes with --live, from 5 to 600")
-    named = options.data or os.environ.get("WEPOSE_DATA")
     chosen: dict[str, Section] = {}
     for kind in options.kinds:
-        if kind == "filters":
-            from .filters import FULL, QUICK, sections
-
-            chosen |= sections(QUICK if options.quick else FULL, Path(named) if named else None)
-        elif kind == "calibration":
-            from . import calibration
-
-            chosen |= calibration.sections(options.quick)
-        elif kind == "live":
-            from . import live
-
-            chosen |= live.sections(options.quick)
-        elif kind == "batch":
-            from . import batch
-
-            chosen |= batch.sections(options.quick, options.sessions)
-        elif kind == "headings" and options.live:
-            from . import live_headings
-
-            quick = 10.0 if options.quick else live_headings.MINUTES
-            chosen |= live_headings.sections(options.minutes or quick)
-        elif kind == "headings":
-            from . import headings
-
-            chosen |= headings.sections(options.quick)
-        elif kind == "harm":
-            from . import harm
-
-            chosen |= harm.sections(options.quick)
-        elif kind == "protocols":
-            from . import protocols
-
-            chosen |= protocols.sections(options.persons, options.results, options.page)
-        elif kind == "robots":
-            from . import robots
-
-            chosen |= robots.sections(options.quick, Path(named) if named else None, options.robot)
-        elif kind == "bodies":
-            from . import bodies
-
-            chosen |= bodies.sections(options.quick, Path(named) if named else None)
-        elif kind == "diagnostics":
-            from . import diagnostics
-
-            chosen |= diagnostics.sections(options.quick)
-        elif kind == "kinematics":
-            from . import kinematics
-
-            chosen |= kinematics.sections(options.quick)
-        elif kind == "validation":
-            from . import validation
-
-            data = Path(named) if named else None
-            chosen |= validation.sections(options.quick, data, options.only, options.results, options.page)
-        else:
-            from . import long_recordings
-
-            chosen |= long_recordings.sections(options.quick)
+        module = "live_headings" if kind == "headings" and options.live else {"long": "long_recordings"}.get(kind, kind)
+        sections = import_module(f".{module}", __package__).sections
+        chosen |= sections(*_choose_arguments(module, options))
     return chosen
+
+
+def _choose_arguments(module: str, options: argparse.Namespace) -> tuple[Any, ...]:
+    """The arguments of a module's `sections`."""
+    named, quick = options.data or os.environ.get("WEPOSE_DATA"), options.quick
+    data = Path(named) if named else None
+    if module == "filters":
+        from .filters import FULL, QUICK
+
+        return (QUICK if quick else FULL, data)
+    if module == "live_headings":
+        from .live_headings import MINUTES
+
+        return (options.minutes or (10.0 if quick else MINUTES),)
+    return {
+        "batch": (quick, options.sessions),
+        "protocols": (options.persons, options.results, options.page),
+        "robots": (quick, data, options.robot),
+        "bodies": (quick, data),
+        "validation": (quick, data, options.only, options.results, options.page),
+    }.get(module, (quick,))
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -22,10 +22,10 @@ import pytest
 from arms import write_arm
 
 import wepose_pin as wp
+from docs.diagnostics_page import list_examples
 from wepose_pin.body.subject import subject_toml
 from wepose_pin.commands import main
 from wepose_pin.commands.track import track as track_session
-from wepose_pin.diagnostics import example
 from wepose_pin.errors import how_to_install
 from wepose_pin.recording import find_mount_axes
 from wepose_pin.simulation import Imperfections, ImuNoise, Simulation
@@ -290,7 +290,7 @@ def test_objects_show_themselves_in_a_notebook(simulated: Simulation, result: wp
 
 
 def test_a_diagnostic_prints_its_text() -> None:
-    text = str(example("length-uncertain"))
+    text = str(list_examples()["length-uncertain", ""])
     assert text.startswith("warning: ")
     assert "{" not in text
 

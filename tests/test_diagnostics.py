@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import wepose_pin
+from docs.diagnostics_page import document, list_examples
 from wepose_pin.diagnostics import (
     ERROR,
     INFO,
@@ -20,9 +21,7 @@ from wepose_pin.diagnostics import (
     Text,
     as_json,
     catalogue,
-    document,
     drop_consequences,
-    example,
     from_json,
     gravest_first,
     merge,
@@ -34,7 +33,7 @@ from wepose_pin.diagnostics import (
 PACKAGE = Path(wepose_pin.__file__).parent
 # Functions that make a diagnostic of the code that is their first argument, beside `Diagnostic` itself.
 CONSTRUCTORS = {"Diagnostic"}
-ALL = [(code, variant) for code, entry in catalogue().items() for variant in ("", *entry.variants)]
+EXAMPLES = list_examples()
 
 
 def calls() -> Iterator[tuple[str, ast.Call]]:
@@ -85,14 +84,15 @@ def test_facts_of_each_call_are_those_of_its_text() -> None:
         keys = {key.value for key in facts.keys if isinstance(key, ast.Constant)}
         if len(keys) == len(facts.keys):
             seen += 1
-            known = {name for example in catalogue()[str(code.value)].examples.values() for name in example}
+            known = {name for (other, _), example in EXAMPLES.items() if other == code.value for name in example.facts}
             assert keys <= known | {"variant"}, f"{place}: the catalogue's example has no {keys - known}"
     assert seen > 10
 
 
-@pytest.mark.parametrize(("code", "variant"), ALL)
+@pytest.mark.parametrize(("code", "variant"), EXAMPLES)
 def test_every_text_is_filled_by_its_example_and_needs_all_of_it(code: str, variant: str) -> None:
-    text = render(example(code, variant))
+    example = EXAMPLES[code, variant]
+    text = render(example)
     assert text.title
     for part in text[1:]:
         assert part.endswith((".", "!")), part
@@ -104,8 +104,8 @@ def test_every_text_is_filled_by_its_example_and_needs_all_of_it(code: str, vari
     fields = {name for part in parts for _, name, _, _ in string.Formatter().parse(part) if name}
     replaced = entry.text._replace(**entry.variants.get(variant, {}))
     own = {name for part in replaced for _, name, _, _ in string.Formatter().parse(part)}
-    assert own & {"place", "value", "limit"} <= set(entry.examples[variant])
-    facts = set(entry.examples[variant]) - {"variant", "place", "value", "limit"}
+    assert all(getattr(example, name) not in ("", None) for name in own & {"place", "value", "limit"})
+    facts = set(example.facts) - {"variant"}
     assert facts <= fields, f"the texts do not use {facts - fields}"
 
 
@@ -123,7 +123,7 @@ def test_tables_of_the_catalogue_have_nothing_else() -> None:
 
 def test_the_page_of_codes_is_up_to_date() -> None:
     page = PACKAGE.parent / "docs" / "diagnostics.md"
-    assert page.read_text(encoding="utf-8") == document(), "python -m wepose_pin.diagnostics > docs/diagnostics.md"
+    assert page.read_text(encoding="utf-8") == document(), "python docs/diagnostics_page.py"
 
 
 def test_a_code_or_a_fact_that_is_not_there_fails() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from wepose_pin import load_session, rotations
 from wepose_pin.commands import main
 from wepose_pin.data_tables import read_table
 from wepose_pin.diagnostics import Diagnostic, as_json, render
-from wepose_pin.errors import BadData
+from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.recording import ImuSensor, Recording, Sensor
 from wepose_pin.recording.clocks import build_clock
 from wepose_pin.recording.gaps import bridge, mark_lost_samples
@@ -445,3 +446,16 @@ def test_the_upper_body_session_reads_without_a_diagnostic(data: Path) -> None:
     for segment, sensor in recording.sensors.items():
         np.testing.assert_array_equal(sensor.gyro_S, table[[f"{segment}_gyr_{axis}" for axis in "xyz"]])
     assert same(recording, recording)
+
+
+def test_a_phase_may_exceed_the_file_by_a_few_samples(tmp_path: Path) -> None:
+    """Who states 0 s means the beginning of a file whose clock shows 0.011 s there."""
+    path = write(tmp_path, table_at(0.011 + 0.01 * np.arange(1000)))
+    for begin, is_right in ((0.0, True), (-1.0, False)):
+        text = re.sub(r"(?m)^start = .*$", f"start = [[{begin}, 3.0]]", path.read_text(encoding="utf-8"))
+        path.write_text(text, encoding="utf-8")
+        if is_right:
+            assert load_session(path).phases["start"] == ((0.0, 3.0),)
+        else:
+            with pytest.raises(BadPhase, match=r"outside the recording, which runs from 0\.011"):
+                load_session(path)

@@ -495,6 +495,12 @@ def test_numbers_beyond_any_sensor_are_refused_with_their_unit() -> None:
             wp.estimate_orientation(*wrong, 100.0, static=(0.5, 4.5))
 
 
+def test_the_name_that_is_meant_may_differ_in_case_and_hyphens() -> None:
+    recording = replace(right()["track"]["recording"], start_pose="N-Pose")
+    with pytest.raises(wp.WeposeError, match="did you mean 'n_pose'"):
+        wp.track(recording)
+
+
 def test_an_unknown_point_lists_the_known_ones() -> None:
     pose = right()["evaluate"]["pose"]
     motion = TrackResult("x", pose, wp.load_model(), wp.population_subject())

@@ -1,7 +1,7 @@
 """What a user should know, as data: `Diagnostic`, and the catalogue of its texts.
 
 A room that finds something says it as a `Diagnostic`; `render` makes words of it where it is shown. The texts of all
-codes stand in ``diagnostics.toml``. ``python -m wepose_pin.diagnostics > docs/diagnostics.md`` lists them.
+codes stand in ``diagnostics.toml``; ``docs/diagnostics.md`` lists them.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import re
 import string
-import sys
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -76,10 +75,8 @@ class Text(NamedTuple):
 class Entry(NamedTuple):
     """A code of the catalogue."""
 
-    group: str
     text: Text  # with fields in braces: place, value, limit and facts, each with its unit
     variants: Mapping[str, Mapping[str, str]]  # word of the fact `variant` → the parts of the text that it replaces
-    examples: Mapping[str, Mapping[str, float | str]]  # variant (or "") → place, value, limit and facts
     follows: frozenset[str]  # codes of causes, beside which it is not shown
 
 
@@ -244,52 +241,13 @@ def catalogue() -> Mapping[str, Entry]:
     """Code → its texts."""
     with Path(__file__).with_suffix(".toml").open("rb") as file:
         groups = tomllib.load(file)
-    return {code: _parse_entry(group, table) for group, codes in groups.items() for code, table in codes.items()}
+    return {code: _parse_entry(table) for codes in groups.values() for code, table in codes.items()}
 
 
-def _parse_entry(group: str, table: Mapping[str, Any]) -> Entry:
-    variants = table.get("variants", {})
-    examples = {"": table["example"]} | {
-        name: table["example"] | {"variant": name} | variant.get("example", {}) for name, variant in variants.items()
+def _parse_entry(table: Mapping[str, Any]) -> Entry:
+    parts = Text._fields
+    variants = {
+        name: {part: variant[part] for part in parts if part in variant}
+        for name, variant in table.get("variants", {}).items()
     }
-    texts = {
-        name: {part: variant[part] for part in Text._fields if part in variant} for name, variant in variants.items()
-    }
-    text = Text(*(table[part] for part in Text._fields))
-    return Entry(group, text, texts, examples, frozenset(table.get("follows", ())))
-
-
-def example(code: str, variant: str = "") -> Diagnostic:
-    """The diagnostic that the documentation shows for a code."""
-    known = dict(catalogue()[code].examples[variant])
-    place, value, limit = str(known.pop("place", "")), known.pop("value", None), known.pop("limit", None)
-    assert not isinstance(value, str)
-    assert not isinstance(limit, str)
-    return Diagnostic(code, WARNING, place, value, limit, known)
-
-
-def document() -> str:
-    """``docs/diagnostics.md``."""
-    lines = [
-        "# Troubleshooting",
-        "",
-        "Look a message up here by its words or by its code: what is wrong, and **what to do**. The message also",
-        "says why it matters. Its severity is *info* (good to know), *warning* (results may be wrong or uncertain) or",
-        "*error* (do not use the results). `summary.json` and `calibration.json` hold all messages of a result under",
-        "`diagnostics`, with code, place, value and limit in SI units. The numbers here are examples; ± is one",
-        "standard deviation. Some texts vary with the case. Words: [glossary](glossary.md).",
-        "",
-        "`python -m wepose_pin.diagnostics > docs/diagnostics.md` writes this page from `wepose_pin/diagnostics.toml`.",
-    ]
-    group = ""
-    for code, entry in catalogue().items():
-        if entry.group != group:
-            group = entry.group
-            lines += ["", f"## {group.replace('-', ' ').capitalize()}"]
-        text = render(example(code))
-        lines += ["", f"### {code}", "", text.what, f"**{text.do}**"]
-    return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    sys.stdout.write(document())
+    return Entry(Text(*(table[part] for part in parts)), variants, frozenset(table.get("follows", ())))

@@ -10,12 +10,13 @@ import contextlib
 import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from difflib import SequenceMatcher, get_close_matches
+from difflib import SequenceMatcher
 from typing import TypeVar
 
 T = TypeVar("T")
 
 LONGEST = 2000  # letters of an error's text
+ALIKE = 0.6  # likeness of two names, from which on one may be meant by the other
 _END = 500  # of these, what is kept of the end, where it says what would be right
 
 
@@ -193,9 +194,16 @@ def one_of(names: Iterable[str], value: str | None = None, most: int = 12) -> st
     Of more than `most` those are listed that are nearest to `value`, the nearest first.
     """
     choices = list(names)
-    nearest = choices
-    if value and len(choices) > most:
-        nearest = sorted(choices, key=lambda name: -SequenceMatcher(None, value.lower(), name.lower()).ratio())
-    listed = ", ".join(nearest[:most]) + (f", … ({len(choices)} in all)" if len(choices) > most else "")
-    close = get_close_matches(value, choices, n=1) if value else []
-    return f"did you mean '{close[0]}'? there is: {listed}" if close else f"there is: {listed or 'none'}"
+    likeness = {name: _compare(value or "", name) for name in choices}
+    nearest = sorted(choices, key=lambda name: -likeness[name])
+    shown = nearest if value and len(choices) > most else choices
+    listed = ", ".join(shown[:most]) + (f", … ({len(choices)} in all)" if len(choices) > most else "")
+    if value and choices and likeness[nearest[0]] >= ALIKE:
+        return f"did you mean '{nearest[0]}'? there is: {listed}"
+    return f"there is: {listed or 'none'}"
+
+
+def _compare(name: str, other: str) -> float:
+    """Likeness of two names, 1 where they differ in case and hyphens alone."""
+    plain, other = (each.lower().replace("-", "_").replace(" ", "_") for each in (name, other))
+    return SequenceMatcher(None, plain, other).ratio()

@@ -275,29 +275,22 @@ def choose_shoulder_sequence(pose: Pose) -> str:
     It is YXY, which the ISB recommends, where that is near the lock for no more than `MAX_NEAR_LOCK` of the samples. An
     arm that hangs is in its lock.
     """
-    shares = dict.fromkeys(SHOULDER_SEQUENCES, 0.0)
-    for name in ("left_shoulder", "right_shoulder"):
-        joint = JOINTS[name]
-        if {joint.proximal, joint.distal} <= set(pose.quat_WL):
-            quat, _, known = _rotation(pose, joint, name.startswith("left_"))
-            for sequence in shares if known.any() else ():
-                share = float(np.mean(euler.decompose(quat, sequence).gimbal < NEAR_LOCK))
-                shares[sequence] = max(shares[sequence], share)
+    shoulders = {name: JOINTS[name] for name in ("left_shoulder", "right_shoulder")}
+    known = {name: joint for name, joint in shoulders.items() if {joint.proximal, joint.distal} <= set(pose.quat_WL)}
+    shares = {}
+    for sequence, names in SHOULDER_SEQUENCES.items():
+        chosen = [(joint._replace(sequence=sequence, names=names), name) for name, joint in known.items()]
+        near = [_angles(pose, joint, name.startswith("left_"), NEAR_LOCK).near_lock for joint, name in chosen]
+        shares[sequence] = max((float(np.mean(each)) for each in near), default=0.0)
     return "YXY" if shares["YXY"] <= MAX_NEAR_LOCK else min(shares, key=lambda sequence: shares[sequence])
-
-
-def _rotation(pose: Pose, joint: Joint, left: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotations of the distal segment in the proximal one and of this in W (m, 4), of the known ones of n samples."""
-    members = [segment for segment in (joint.proximal, joint.distal) if segment != "world"]
-    known = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in members], axis=0)
-    quat_WP, quat_WD = (_joint_frame(pose, joint, segment, left, known) for segment in (joint.proximal, joint.distal))
-    return multiply(conjugate(quat_WP), quat_WD), quat_WP, known
 
 
 def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngles:
     n = len(pose.time)
     members = [segment for segment in (joint.proximal, joint.distal) if segment != "world"]
-    quat, quat_WP, known = _rotation(pose, joint, left)
+    known = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in members], axis=0)
+    quat_WP, quat_WD = (_joint_frame(pose, joint, segment, left, known) for segment in (joint.proximal, joint.distal))
+    quat = multiply(conjugate(quat_WP), quat_WD)
     angles = euler.decompose(quat, joint.sequence)
     values = euler.follow(angles, joint.sequence, near_lock)
     values = euler.drop_turns(values, angles.gimbal, joint.sequence, near_lock)

@@ -131,9 +131,11 @@ def _refuse_nan(_kind: type, value: Any) -> None:
 
 APP = App(
     name="wepose",
-    help="Upper-body pose from wearable IMUs without magnetometers. `wepose demo` shows all of it.",
+    help="Upper-body pose from wearable IMUs without magnetometers. `wepose demo` shows the "
+    "steps from a recording to its pose.",
     help_epilogue="wepose COMMAND --help says what a command does, with its options and an example. Exit code: 0 "
-    "success, 2 invalid options or input. Terms: docs/glossary.md.",
+    "success; 2 invalid options or input; 3 or 4 where the output must be checked or must not be used, as the help of "
+    "calibrate, retarget and batch says; 130 stopped. Terms: docs/glossary.md.",
     version=f"wepose-pin {__version__}",
     version_flags=("--version", "-V"),
     help_format="plaintext",

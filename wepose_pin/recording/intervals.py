@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import BadData, BadPhase, WrongOption, one_of
 
 Intervals = tuple[tuple[float, float], ...]
+MOST_BEYOND = 5.0  # samples by which an interval may exceed a recording: who states 0 s means its beginning
 
 
 def format_time(time: float, decimals: int = 3) -> str:
@@ -41,20 +42,20 @@ def check_time(where: str, time: np.ndarray) -> None:
 
 
 def check_phases(where: str, time: np.ndarray, phases: Mapping[str, Sequence[tuple[float, float]]]) -> None:
-    """Check that every interval [s] has a positive length and lies in the recording, to one sample."""
-    step = _find_step(time)
+    """Check that every interval [s] has a positive length and lies in the recording, to `MOST_BEYOND` samples."""
+    beyond = _find_slack(time)
     for name, intervals in phases.items():
         for first, last in intervals:
             place = f"{where}: phases.{name}: [{format_time(first)}, {format_time(last)}]"
             if not first < last:
                 raise BadPhase(f"{place} is empty; the first number is the earlier one, in seconds")
-            if first < time[0] - step or last > time[-1] + step:
+            if first < time[0] - beyond or last > time[-1] + beyond:
                 raise BadPhase(f"{place} is outside the recording, which runs from {time[0]:.3f} to {time[-1]:.3f} s")
 
 
-def _find_step(time: np.ndarray) -> float:
-    """Find the time [s] from one sample to the next, and a little more."""
-    return 1.01 * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+def _find_slack(time: np.ndarray) -> float:
+    """Find the time [s] by which an interval may exceed the recording at each end."""
+    return MOST_BEYOND * float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
 # What the options --interval and --phase select ----------------------------------------------------------------------
@@ -81,7 +82,7 @@ def select_interval(
 
     Parameters
     ----------
-    time : (n,) [s]; the interval may exceed it by one sample at each end
+    time : (n,) [s]; the interval may exceed it by `MOST_BEYOND` samples at each end
     phases : name → intervals [s]
     phase : a name; of a phase with several intervals ``NAME:2`` is the second
 
@@ -94,8 +95,8 @@ def select_interval(
     if phase is not None:
         return _find_phase(phases, phase)
     if interval is not None:
-        step = _find_step(time)
-        if interval[0] < time[0] - step or interval[1] > time[-1] + step:
+        beyond = _find_slack(time)
+        if interval[0] < time[0] - beyond or interval[1] > time[-1] + beyond:
             shown = f"{format_time(interval[0])} {format_time(interval[1])}"
             raise WrongOption("interval", shown, f"the recording runs from {format_span((time[0], time[-1]))}")
     return interval
