@@ -27,7 +27,7 @@ IDENTIFIER = re.compile(rf"(left|right)_({'|'.join(PARTS)})|\b({'|'.join(name fo
 ALLOWED = {
     "angles/definitions.py": "definitions of joint angles",
     "angles/joints.py": "definitions of joint angles",
-    "live/sources/packets.py": "the numbers of a format",
+    "live/sources/udp.py": "the numbers of a format",
     "live/sources/slimevr.py": "the numbers of a format",
     "report/words.py": "a plural of English",
     "readers/mvnx.py": "the names of a format",
@@ -41,7 +41,7 @@ ALLOWED = {
 # Of these only the tables name them: no function does.
 TABLES_ALONE = (
     "angles/definitions.py",
-    "live/sources/packets.py",
+    "live/sources/udp.py",
     "live/sources/slimevr.py",
     "readers/mvnx.py",
     "writers/bvh.py",

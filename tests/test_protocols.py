@@ -208,6 +208,8 @@ def test_wrong_requests_are_one_line_that_names_them() -> None:
     fewer = replace(recording, sensors={k: v for k, v in recording.sensors.items() if k != "torso"})
     for error, match, asked in (
         (BadOption, "protocol 'clap' is not known; did you mean 'clasp'", lambda: load_protocol("clap")),
+        (BadOption, "'clasp_measured' is no longer there; use clasp with", lambda: load_protocol("clasp_measured")),
+        (BadOption, "protocol 'swing' is no longer there", lambda: load_protocol("clasp+swing")),
         (MissingFile, "mine.toml: no such file; a protocol is wanted here", lambda: load_protocol("mine.toml")),
         (BadPhase, r"phases\.clasp is needed here", lambda: run(without(recording, "clasp"), "clasp")),
         (BadPhase, r"phases\.t_pose is needed here", lambda: run(recording, "t_pose")),

@@ -34,6 +34,20 @@ from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, one_of
 
 PROTOCOLS = ("bow", "clasp", "free", "t_pose", "table", "tip")
+_OF_CLASP = "clasp with a measured length, as in --measured biacromial=0.41"
+_OWN = "a protocol of your own whose point stays at a fixed place (docs/protocols.md)"
+# Protocols of earlier versions → what to do instead.
+REMOVED = {
+    "clasp_measured": _OF_CLASP,
+    "elbows": "clasp+t_pose",
+    "feet": _OWN,
+    "handle": _OF_CLASP,
+    "poses": "t_pose+bow",
+    "swing": "clasp+t_pose",
+    "touch_body": "clasp+t_pose",
+    "touch_left": _OWN,
+    "touch_right": _OWN,
+}
 DEFAULT = "clasp"
 GUIDED, BOW = "clasp+t_pose", "bow"  # the best of docs/validation.md in a minute; for whom hands alone are not enough
 ALSO = ("t_pose", BOW)  # what makes it better within the same minute, by phases of their names
@@ -196,6 +210,8 @@ def load_protocol(name: str | Path) -> Protocol:
     if len(names) > 1:
         return _join_protocols(str(name), [load_protocol(each) for each in names])
     own = str(name).endswith(".toml")
+    if name in REMOVED:
+        raise BadOption(f"protocol '{name}' is no longer there; use {REMOVED[str(name)]}")
     if not own and name not in PROTOCOLS:
         raise BadOption(
             f"protocol '{name}' is not known; {one_of(PROTOCOLS, str(name))}; or the path of a .toml of one's own"
