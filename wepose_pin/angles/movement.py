@@ -14,7 +14,7 @@ from ..errors import WrongOption, one_of
 from ..recording import Intervals
 from .curves import MeanCurve, compute_mean_curves
 from .euler import round_to_turns, wrap
-from .joints import AUTO, Angles, JointAngles, joint_angles
+from .joints import AUTO, JOINTS, Angles, JointAngles, joint_angles
 from .repetitions import Repetitions, find_repetitions
 from .smoothing import smooth_pose
 from .tables import summarize_joint
@@ -86,7 +86,7 @@ class Movement:
     @property
     def sequence(self) -> str:
         """That of the shoulder's angles; empty: there is none."""
-        return next((each.sequence for name, each in self.angles.joints.items() if name.endswith("_shoulder")), "")
+        return next((each.sequence for name, each in self.angles.joints.items() if not JOINTS[name].sequence), "")
 
     @property
     def duration(self) -> Statistics:
