@@ -306,20 +306,25 @@ class SensorRun:
             self._test = replace(self._test, rate_stds=np.inf)
         self.detector = StaticDetector(noise, rate_hz, self._test)
         self.filter: Any = None
-        self._before_cov: np.ndarray | None = None  # attitude_cov before the start phase, until it is returned
 
     def push(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> Orientation:
         """Filter a chunk: (n, 3) [rad/s], (n, 3) [m/s²]."""
         before = self._begin(gyro_S, accel_S) if self.filter is None else None
         if before is None or self._method in OFFLINE:
             static = self.detector.run(gyro_S, accel_S)
-            return self._orientation(self.filter.run(gyro_S, accel_S, static), static)
-        backward, static_before = before
-        rest = slice(len(static_before), None)
-        static = self.detector.run(gyro_S[rest], accel_S[rest])
-        run = backward.extended(len(gyro_S))
-        self.filter.run(gyro_S[rest], accel_S[rest], static, run.part(rest))
-        return self._orientation(run, np.concatenate([static_before, static]))
+            run = self.filter.run(gyro_S, accel_S, static)
+            if before is not None:
+                # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
+                run.attitude_cov[: len(before[1])] = before[0].attitude_cov
+        else:
+            backward, static_before = before
+            rest = slice(len(static_before), None)
+            static = self.detector.run(gyro_S[rest], accel_S[rest])
+            run = backward.extended(len(gyro_S))
+            self.filter.run(gyro_S[rest], accel_S[rest], static, run.part(rest))
+            static = np.concatenate([static_before, static])
+        quat_VS, gyro_bias, attitude_cov, about_vertical = run
+        return Orientation(quat_VS, gyro_bias, static, attitude_cov, self._noise, about_vertical=about_vertical)
 
     def _begin(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> tuple[FilterRun, np.ndarray] | None:
         """Create the filter; return the samples before its first one filtered, and whether they are static."""
@@ -337,7 +342,6 @@ class SensorRun:
                 turn = np.nan_to_num(gyro_S[0] - run.gyro_bias[0]) / self._rate_hz
                 # The forward run alone uses these samples.
                 start = StartTilt(rotations.turned(run.quat_VS[0], -turn), MOVING_TILT_STD)
-                self._before_cov = run.attitude_cov
         self.filter = self._create_filter(self._method, self._noise, start)
         return before
 
@@ -370,16 +374,6 @@ class SensorRun:
         if method in ("amekf", "smoother", "smekf") and gyro_range < params.gyro_range:
             params = replace(params, gyro_range=gyro_range)
         return METHODS[method](noise, self._rate_hz, start.quat_VS, params)
-
-    def _orientation(self, run: FilterRun, static: np.ndarray) -> Orientation:
-        """Return a run as orientations."""
-        if self._before_cov is not None and run.attitude_cov is not None:
-            # The smoother's heading is exact where the recording begins; the headings are aligned in the start phase.
-            run.attitude_cov[: len(self._before_cov)] = self._before_cov
-            self._before_cov = None
-        return Orientation(
-            run.quat_VS, run.gyro_bias, static, run.attitude_cov, self._noise, about_vertical=run.about_vertical
-        )
 
 
 def run_filter(
