@@ -93,8 +93,10 @@ def test_a_replay_and_causal_tracking_give_the_same_table(session: Path, tmp_pat
 def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "there.mcap"
     file.write_bytes(b"something")
-    replay = f"replay:{session}"
+    replay, unknown = f"replay:{session}", "mounted is not known: find it out with --guide"
     for arguments, said in (
+        (["--source", "mti:/dev/null=torso"], f"how the sensor of torso is {unknown}"),
+        (["--source", "udp:9000"], f"how the sensors are {unknown}"),
         (["--source", "telepathy:9"], "source 'telepathy:9' is none; there is: "),
         (["--source", "replay:nowhere"], "nowhere: no such file"),
         (["--source", replay, "--speed", "-1"], "speed: '-1'; a positive number"),
@@ -144,22 +146,6 @@ def test_a_live_recording_is_described_and_gets_its_phases_by_a_session(
     (tmp_path / "session.toml").write_text(re.sub(r"# clasp = \[\[.*?\]\]", "clasp = [[20.0, 30.0]]", text))
     assert load_session(tmp_path / "session.toml").phases["clasp"] == ((20.0, 30.0),)
     run("track", str(tmp_path / "session.toml"), "-o", str(tmp_path / "result"), "--no-report")
-
-
-def test_unknown_mounts_are_said_before_anybody_stands_still(capsys: pytest.CaptureFixture[str]) -> None:
-    run("live", "--source", "mti:/dev/null=torso", "--no-page", code=2)
-    err = capsys.readouterr().err.strip()
-    assert "how the sensor of torso is mounted is not known: find it out with --guide" in err
-    assert len(err.splitlines()) == 1
-
-
-def test_raw_sensors_without_any_mount_are_refused_before_they_are_waited_for(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    run("live", "--source", "udp:9000", "--no-page", code=2)
-    err = capsys.readouterr().err.strip()
-    assert "how the sensors are mounted is not known: find it out with --guide" in err
-    assert len(err.splitlines()) == 1
 
 
 def test_ctrl_c_stops_the_wait_for_senders_at_once(tmp_path: Path) -> None:

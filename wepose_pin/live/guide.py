@@ -8,7 +8,6 @@ skipped. Times are those of the source's clock.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +26,7 @@ from .monitor import SensorMonitor
 from .setup import SensorSetup
 from .sources.base import Source
 from .stage import Stage
-from .state import Action, GuideStep, GuideView, Output, SensorStatus, Status, join_names
+from .state import Action, GuideStep, GuideView, Output, Status, join_names
 from .ticks import TickStream
 
 SILENCE_S = 1.0  # [s] without a sample after which a sensor counts as silent
@@ -42,30 +41,18 @@ class Calibrated(NamedTuple):
 
 @dataclass(frozen=True)
 class GuideOptions:
-    """What a guided session does.
+    """What a guided session does."""
 
-    Parameters
-    ----------
-    folder : where recordings, calibrations and the sensors' setup go
-    setup : name, start pose and body of the session; its mounts, where known
-    calibrate : calibrates a recorded file, with lengths [m] that the person measured, or "stature"
-    estimate : calibrates the recording so far
-    method : of the filter, for the recording's header
-    known : sensor → segment, as in an earlier session
-    optional : phases of the protocol that may be skipped
-    measured : names of the lengths that are given already, "stature" among them where it is
-    """
-
-    folder: Path
+    folder: Path  # where recordings, calibrations and the sensors' setup go
     protocol: Protocol
-    setup: SensorSetup
+    setup: SensorSetup  # name, start pose and body of the session; its mounts, where known
     model: BodyModel
-    calibrate: Callable[[Path, Mapping[str, float]], Calibrated]
-    estimate: Callable[[Recording], Calibration]
-    method: str
-    known: Mapping[str, str] = field(default_factory=dict)
-    optional: frozenset[str] = frozenset()
-    measured: frozenset[str] = frozenset()
+    calibrate: Callable[[Path, Mapping[str, float]], Calibrated]  # of a file, with lengths [m] or "stature" measured
+    estimate: Callable[[Recording], Calibration]  # of the recording so far
+    method: str  # of the filter, for the recording's header
+    known: Mapping[str, str] = field(default_factory=dict)  # sensor → segment, as in an earlier session
+    optional: frozenset[str] = frozenset()  # phases of the protocol that may be skipped
+    measured: frozenset[str] = frozenset()  # lengths that are given already, "stature" among them where it is
 
 
 class Turn(NamedTuple):
@@ -258,13 +245,11 @@ class Guide(Stage):
 
     def build_status(self) -> Status:
         """The state of the guide and of each sensor now."""
-        rates, batteries = self.monitor.measure_rates(self.now), self.source.batteries
         sensors = []
-        for name in sorted(rates):
-            segment = self.segments.get(name, "")
-            label = f"{segment} ({name})" if segment and segment != name else name
-            missing, battery = self.monitor.count_missing(name, self.now), batteries.get(name, math.nan)
-            sensors.append(SensorStatus(label, rates[name], name in self.silent, missing=missing, battery=battery))
+        for name, known in sorted(self.monitor.list_statuses(self.now, self.source.batteries).items()):
+            segment = self.segments.get(name, name)
+            label = name if segment == name else f"{segment} ({name})"
+            sensors.append(known._replace(segment=label, lost=name in self.silent))
         status = Status("guide", "", 0.0, self.now, tuple(sensors), problems=dict(self.source.problems))
         if self.is_over:
             return status._replace(state="waiting", message="The subject is saved. Tracking begins.")

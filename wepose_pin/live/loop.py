@@ -42,7 +42,7 @@ TAKE = "take_"  # the names of takes begin so
 
 RESET = Action("reset", "Reset headings", "r")
 BEGIN_TAKE = Action("take", "Begin take", "t")
-BEGIN_PHASE = Action("phase", "Begin phase", "p", "name of the phase, clasp without one")
+BEGIN_PHASE = Action("phase", "Begin phase", "p", "name of the phase (clasp)")
 MARK = Action("mark", "Mark", "m")
 MARK_TEXT = Action("text", "Mark with text", "n", "text of the mark")
 
@@ -354,21 +354,17 @@ class LiveLoop(Stage):
         if estimator is not None:
             static, bias = estimator.static, estimator.gyro_bias
             heading_age = max(0.0, now - self._heading_reset_time)
-        rates, batteries = self._monitor.measure_rates(now), self.source.batteries
+        known = self._monitor.list_statuses(now, self.source.batteries)
         statuses = [
-            SensorStatus(
-                name,
-                rates.get(name, 0.0),
-                bool(lost[i]),
-                bool(static[i]),
-                tuple(bias[i].tolist()),
-                float(self._heading_std[i]),
-                heading_age,
-                self._monitor.count_missing(name, now),
-                int(counts[i, LATE]),
-                int(counts[i, DUPLICATE]),
-                bool(frozen[i]),
-                batteries.get(name, math.nan),
+            known.get(name, SensorStatus(name))._replace(
+                lost=bool(lost[i]),
+                static=bool(static[i]),
+                gyro_bias=tuple(bias[i].tolist()),
+                heading_std=float(self._heading_std[i]),
+                heading_age=heading_age,
+                late=int(counts[i, LATE]),
+                duplicate=int(counts[i, DUPLICATE]),
+                frozen=bool(frozen[i]),
             )
             for i, name in enumerate(sensors)
         ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from ..recording import Recording
 from ..recording.arrivals import Samples
 from ..recording.plausibility import check_signals, find_unseen_rate
 from .sources.base import Source
-from .state import join_names
+from .state import SensorStatus, join_names
 
 RATE_WINDOW_S = 1.0  # [s] over which samples are counted
 UNIT_WINDOW_S = 4.0  # [s] newest samples of which rates are compared with the direction of gravity
@@ -62,17 +62,19 @@ class SensorMonitor:
         """The sensors without a sample for longer than `silence_s` [s]."""
         return [name for name in sensors if name not in self._even or now - self._even[name].newest > silence_s]
 
-    def measure_rates(self, now: float) -> dict[str, float]:
-        """Samples a second [Hz] of each sensor over the last second; called a few times a second."""
+    def list_statuses(self, now: float, batteries: Mapping[str, float]) -> dict[str, SensorStatus]:
+        """Rate over the last second, missing samples and battery of each sensor; called a few times a second."""
         totals = {name: even.total for name, even in self._even.items()}
         self._history.append((now, totals))
         while self._history[0][0] < now - RATE_WINDOW_S and len(self._history) > 2:
             self._history.popleft()
         begin, before = self._history[0]
-        return {
-            name: (count - before.get(name, 0)) / (now - begin) if now > begin else 0.0
-            for name, count in totals.items()
-        }
+        statuses = {}
+        for name, count in totals.items():
+            rate_hz = (count - before.get(name, 0)) / (now - begin) if now > begin else 0.0
+            missing, battery = self.count_missing(name, now), batteries.get(name, math.nan)
+            statuses[name] = SensorStatus(name, rate_hz, missing=missing, battery=battery)
+        return statuses
 
     def count_missing(self, sensor: str, now: float) -> int:
         """Count the samples of a sensor that have not come by `now` [s]; 0 before its step is known."""

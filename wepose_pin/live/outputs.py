@@ -66,22 +66,18 @@ class UdpSender:
         except (OSError, UnicodeError) as error:
             raise BadOption(f"{option} {to}: no host '{host}' ({error}); a name or an address, as 127.0.0.1") from None
         self._address: Any = address
-        self._socket: socket.socket | None = socket.socket(family, kind)
+        self._socket = socket.socket(family, kind)
         self._socket.setblocking(False)
         self.dropped = 0
 
     def send(self, data: bytes) -> None:
-        if self._socket is None:
-            return
         try:
             self._socket.sendto(data, self._address)
-        except OSError:  # BlockingIOError: no room; else no receiver, or no network for now
+        except OSError:  # BlockingIOError: no room; else no receiver, no network for now, or it is closed
             self.dropped += 1
 
     def close(self) -> None:
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        self._socket.close()
 
 
 class UdpOutput(Output):

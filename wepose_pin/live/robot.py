@@ -275,16 +275,10 @@ class RobotOutput(Output):
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """A robot that follows.
+    """A robot that follows."""
 
-    Parameters
-    ----------
-    robot : of `load_robot`
-    to : ``PORT`` or ``HOST:PORT`` of the receiver
-    """
-
-    robot: Robot
-    to: str = str(PORT)
+    robot: Robot  # of `load_robot`
+    to: str = str(PORT)  # ``PORT`` or ``HOST:PORT`` of the receiver
     stream: StreamOptions = field(default_factory=StreamOptions)
 
 

@@ -43,16 +43,10 @@ HEADERS = {
 
 @dataclass(frozen=True)
 class Content:
-    """What the server shows: a page, and what draws its frames.
+    """What the server shows: a page, and what draws its frames."""
 
-    Parameters
-    ----------
-    page : HTML
-    identity : of this page; a browser that reconnects with another one reloads
-    """
-
-    page: str
-    identity: str
+    page: str  # HTML
+    identity: str  # of this page; a browser that reconnects with another one reloads
     encoder: PoseEncoder
 
     @property

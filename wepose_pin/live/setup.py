@@ -22,22 +22,13 @@ from .sources.replay import ReplaySource
 
 @dataclass(frozen=True)
 class SensorSetup:
-    """A subject and the mounts of the sensors.
-
-    Parameters
-    ----------
-    subject : lengths and calibrated mounts; None: the population prior and stated mounts
-    subject_text : the ``subject.toml`` it was read from, if any
-    mounts : segment → stated `quat_LS` (4,) xyzw
-    phases : of a replay: `start` and `static` [s]; without `start` the loop searches the start pose
-    start_pose, joints, model : as in `Recording`
-    """
+    """A subject and the mounts of the sensors; `start_pose`, `joints` and `model` as in `Recording`."""
 
     name: str = "live"
-    subject: Subject | None = None
-    subject_text: str = ""
-    mounts: Mapping[str, np.ndarray] = field(default_factory=dict)
-    phases: Mapping[str, Intervals] = field(default_factory=dict)
+    subject: Subject | None = None  # lengths and calibrated mounts; None: the population prior and stated mounts
+    subject_text: str = ""  # the ``subject.toml`` it was read from, if any
+    mounts: Mapping[str, np.ndarray] = field(default_factory=dict)  # segment → stated `quat_LS` (4,) xyzw
+    phases: Mapping[str, Intervals] = field(default_factory=dict)  # [s]; without `start` the loop searches it
     start_pose: str = NEUTRAL_POSE
     remounted: bool = False
     joints: Mapping[str, float] = field(default_factory=dict)

@@ -37,8 +37,8 @@ class SensorStatus(NamedTuple):
     """State of one sensor."""
 
     segment: str
-    rate_hz: float  # samples a second over the last second, on the source's clock
-    lost: bool  # silent for longer than the loop waits, or frozen
+    rate_hz: float = 0.0  # samples a second over the last second, on the source's clock
+    lost: bool = False  # silent for longer than the loop waits, or frozen
     static: bool = False
     gyro_bias: tuple[float, ...] = (math.nan, math.nan, math.nan)  # [rad/s]
     heading_std: float = math.nan  # [rad]; NaN where the filter has no covariance

@@ -24,24 +24,14 @@ IMPLAUSIBLE = "samples with values that no body sensor gives"
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a source is opened.
+    """How a source is opened."""
 
-    Parameters
-    ----------
-    spec : the text that names it, for messages
-    sensors : to take; None: all that it has
-    segments : names that sensors may have
-    any_name : sensors may have any name, and begin to send at any time; they are assigned to segments later
-    speed : of a replay: 1.0 its own, 4.0 four times that, "max" as fast as possible
-    baud : of serial ports
-    """
-
-    spec: str
-    sensors: tuple[str, ...] | None
-    segments: tuple[str, ...]
-    any_name: bool = False
-    speed: float | str = 1.0
-    baud: int = 115200
+    spec: str  # the text that names it, for messages
+    sensors: tuple[str, ...] | None  # to take; None: all that it has
+    segments: tuple[str, ...]  # names that sensors may have
+    any_name: bool = False  # sensors have any names, begin to send at any time, and are assigned to segments later
+    speed: float | str = 1.0  # of a replay: 1.0 its own, 4.0 four times that, "max" as fast as possible
+    baud: int = 115200  # of serial ports
 
     def error(self, reason: str) -> BadOption:
         """The error that refuses the spec."""
@@ -75,16 +65,10 @@ class SourceOptions:
 
 
 class SourceKind(NamedTuple):
-    """A kind of sources, which an entry point of `wepose.sources` names.
+    """A kind of sources, which an entry point of `wepose.sources` names."""
 
-    Parameters
-    ----------
-    form : what to write, as ``udp:PORT``
-    open_spec : what stands after the colon, and options → the source, not yet opened
-    """
-
-    form: str
-    open_spec: Callable[[str, SourceOptions], Source]
+    form: str  # what to write, as ``udp:PORT``
+    open_spec: Callable[[str, SourceOptions], Source]  # what stands after the colon, and options → the source, not open
 
 
 class Source(ABC):

@@ -60,21 +60,13 @@ _MAC_AT = 12 + 7 * 4  # of a handshake, after seven numbers; then comes the firm
 
 @dataclass
 class Tracker:
-    """A tracker and the sensors on it.
+    """A tracker and the sensors on it."""
 
-    Parameters
-    ----------
-    mac : six bytes as text, or empty where the tracker has not told it
-    number : of its newest packet
-    places : sensor → segment by its place on the body
-    battery : share, 0 to 1; NaN: not known
-    """
-
-    mac: str
+    mac: str  # six bytes as text, or empty where the tracker has not told it
     newest_time: float  # [s] at which it last sent
-    number: int = 0
-    places: dict[int, str] = field(default_factory=dict)
-    battery: float = math.nan
+    number: int = 0  # of its newest packet
+    places: dict[int, str] = field(default_factory=dict)  # sensor → segment by its place on the body
+    battery: float = math.nan  # share, 0 to 1; NaN: not known
 
 
 def open_spec(rest: str, options: SourceOptions) -> SlimeVrSource:
