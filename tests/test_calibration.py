@@ -220,7 +220,7 @@ def test_hands_that_hardly_move_leave_the_headings_open(
         assert abs(off[2]) < 4.0 * calibration.subject.std(f"mounts.{name}.z"), name
     assert assess(calibration).quality == "fail"
     assert calibration.subject.std("mounts.torso.z") > np.deg2rad(40.0)
-    assert ("headings-ambiguous" in codes(calibration)) == several
+    assert "headings-ambiguous" in codes(calibration)
 
 
 def test_a_motion_that_tells_the_headings_has_no_other(simulation: Simulation, person: Person) -> None:
