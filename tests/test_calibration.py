@@ -198,13 +198,9 @@ def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:
     assert measured.subject.lengths["trunk"] == pytest.approx(0.5, abs=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("seed", "several"), [(1, True), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((6, False), (4, True)))]
-)
-def test_hands_that_hardly_move_leave_the_headings_open(
-    seed: int, several: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The closure has several minima then, or one that is wide: ± 2.4 deg of one of them was stated at 118 deg off."""
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (4, 6))])
+def test_hands_that_hardly_move_leave_the_headings_open(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The closure has several minima then: ± 2.4 deg of one of them was stated at 118 deg off."""
     scale = 0.05
     point, wander = Motion._clasp_point, Wander.__call__
     monkeypatch.setattr(Motion, "_clasp_point", lambda self, t, moving: point(self, t, scale * moving))
