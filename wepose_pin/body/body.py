@@ -18,7 +18,7 @@ from ..errors import BadModel, BadSession, one_of
 from . import lengths as _lengths
 from . import visuals as _visuals
 from .anthropometry import compute_population_lengths
-from .chains import Chain, axis_in_joint, find_chains, find_parents
+from .chains import Chain, axis_in_joint, find_chains
 from .girdle import PARAMETERS
 from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
@@ -92,7 +92,7 @@ class BodyModel:
     @cached_property
     def parents(self) -> dict[str, str | None]:
         """Segment → the segment above it; None for the first."""
-        return find_parents(self.pin, self.table)
+        return {name: self.chains[name].above for name in self.table.segments if name in self.chains}
 
     @cached_property
     def reaches(self) -> dict[str, dict[str, LinkVector]]:

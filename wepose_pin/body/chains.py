@@ -22,6 +22,7 @@ class Chain(NamedTuple):
 
     joints: tuple[int, ...]  # empty where the segment is rigid with the one above
     spherical: int | None  # the one nearest to the segment, which takes what the others leave; None: there is none
+    above: str | None  # the segment above; of segments on one joint the later ones are on the first; None: the root
 
     @property
     def exact(self) -> bool:
@@ -37,10 +38,12 @@ def find_chains(model: pin.Model, table: BodyTable) -> dict[str, Chain]:
     BadModel
         A mimic joint lies between two segments.
     """
-    frames = _find_frames(model, table)
-    at = _first_segments(frames)
-    between = {segment: _joints_below(model, joint, set(at)) for joint, segment in at.items()}
-    for segment, joints in between.items():
+    frames = {name: model.frames[model.getFrameId(name)] for name in table.segments if model.existFrame(name)}
+    at: dict[int, str] = {}  # joint → the first of the segments that it carries; the others are rigid with that
+    for segment, frame in frames.items():
+        at.setdefault(frame.parentJoint, segment)
+    paths = {segment: _find_path(model, joint, at) for joint, segment in at.items()}
+    for segment, (_, joints) in paths.items():
         for joint in joints:
             if "Mimic" in model.joints[joint].shortname():
                 raise BadModel(
@@ -48,30 +51,16 @@ def find_chains(model: pin.Model, table: BodyTable) -> dict[str, Chain]:
                     f"free or fixed for the segment to be followed"
                 )
     # A joint that moves two segments at once rests.
-    times = Counter(joint for joints in between.values() for joint in joints)
+    times = Counter(joint for _, joints in paths.values() for joint in joints)
     chains = {}
-    for segment, _ in sorted(frames.items(), key=lambda item: item[1].parentJoint):
-        free = [j for j in between.get(segment, []) if times[j] == 1 and "Prismatic" not in model.joints[j].shortname()]
+    for segment, frame in sorted(frames.items(), key=lambda item: item[1].parentJoint):
+        above, joints = paths.get(segment, (at[frame.parentJoint], []))
+        free = [j for j in joints if times[j] == 1 and "Prismatic" not in model.joints[j].shortname()]
         if not table.segments[segment].spine:
             free = _take_nearest_three(model, free)
         spherical = [joint for joint in free if model.nvs[joint] == 3]
-        chains[segment] = Chain(tuple(free), spherical[-1] if spherical else None)
+        chains[segment] = Chain(tuple(free), spherical[-1] if spherical else None, above)
     return chains
-
-
-def find_parents(model: pin.Model, table: BodyTable) -> dict[str, str | None]:
-    """Find segment → the segment above it, None for the first; of segments on one joint the later are on the first."""
-    frames = _find_frames(model, table)
-    at = _first_segments(frames)
-    parents: dict[str, str | None] = {}
-    for segment, frame in frames.items():
-        joint = frame.parentJoint
-        if at[joint] != segment:
-            parents[segment] = at[joint]
-            continue
-        above = [j for j in reversed(model.supports[joint].tolist()) if j != joint and j in at]
-        parents[segment] = at[above[0]] if above else None
-    return parents
 
 
 def axis_in_joint(model: pin.Model, joint: int) -> np.ndarray:
@@ -82,23 +71,11 @@ def axis_in_joint(model: pin.Model, joint: int) -> np.ndarray:
     return np.asarray(data.S)[3:].copy()
 
 
-def _find_frames(model: pin.Model, table: BodyTable) -> dict[str, pin.Frame]:
-    return {name: model.frames[model.getFrameId(name)] for name in table.segments if model.existFrame(name)}
-
-
-def _first_segments(frames: Mapping[str, pin.Frame]) -> dict[int, str]:
-    """Return joint → the first of the segments that it carries; the others are rigid with that."""
-    at: dict[int, str] = {}
-    for segment, frame in frames.items():
-        at.setdefault(frame.parentJoint, segment)
-    return at
-
-
-def _joints_below(model: pin.Model, joint: int, stops: set[int]) -> list[int]:
-    """Return the joints from below the next one that carries a segment, or from the root, down to `joint`."""
+def _find_path(model: pin.Model, joint: int, at: Mapping[int, str]) -> tuple[str | None, list[int]]:
+    """Find the segment above that which `joint` carries, None: the root, and the joints from there down to `joint`."""
     path = model.supports[joint].tolist()[1:]
-    carrying = [k for k, above in enumerate(path[:-1]) if above in stops]
-    return path[carrying[-1] + 1 :] if carrying else path
+    above = [k for k, other in enumerate(path[:-1]) if other in at]
+    return (at[path[above[-1]]], path[above[-1] + 1 :]) if above else (at.get(0) if joint else None, path)
 
 
 def _take_nearest_three(model: pin.Model, joints: list[int]) -> list[int]:
