@@ -22,7 +22,7 @@ from ..errors import BadData, BadModel
 from ..rotations import conjugate, exp, log, multiply, product, rotation_about
 from .body import BodyModel
 from .chains import axis_in_joint
-from .girdle import displace, find_girdle_scale
+from .girdle import displace_one, find_girdle_scale
 from .links import compute_link_poses, find_columns
 from .table_file import check_segments
 
@@ -431,37 +431,33 @@ def compute_orientation_residuals(
 
 
 class _PlacedGirdle:
-    """A girdle whose joints follow its limb."""
+    """A girdle whose joints follow its limb, or rest where that is not known."""
 
     def __init__(self, model: BodyModel, name: str, segments: Sequence[str]) -> None:
-        self._girdle = girdle = model.table.girdles[name]
-        self._on = segments.index(girdle.on)
-        self._moves = segments.index(girdle.moves) if girdle.moves in segments else None
-        self._along = np.array(model.table.segments[girdle.moves].along)
-        self._scale = find_girdle_scale(girdle, model.lengths)
-        self._parameters = model.girdle_parameters(name).tolist()
-        self._at = [model.pin.idx_qs[model.pin.getJointId(joint)] for joint in girdle.joints]
+        girdle = model.table.girdles[name]
+        moves = segments.index(girdle.moves) if girdle.moves in segments else -1
+        self._rows = segments.index(girdle.on), moves, np.array(model.table.segments[girdle.moves].along)
+        self._law = girdle.law, find_girdle_scale(girdle, model.lengths), model.girdle_parameters(name)
+        self._at = np.array([model.pin.idx_qs[model.pin.getJointId(joint)] for joint in girdle.joints])
 
     def place(self, q: np.ndarray, quat_WL: np.ndarray) -> None:
-        """Write its joints into `q` (n, nq), from `quat_WL` (n, k, 4) xyzw; where the limb is not known, at rest."""
-        law, s = (0.0, 0.0, 0.0), 0.0
-        if self._moves is not None:
-            along = np.empty((3, len(q)))
-            _turn_relatively(quat_WL, self._moves, self._on, self._along, along)
-            # The law of plain numbers is ten times as fast as that of arrays of one.
-            law, s = displace(self._girdle, along if len(q) > 1 else along[:, 0].tolist(), self._scale, np)
-        share, rest, raised = 1.0 + self._parameters[0], self._parameters[1:4], self._parameters[4:]
-        for at, by_law, at_rest, at_raised in zip(self._at, law, rest, raised, strict=True):
-            q[:, at] = share * by_law + at_rest + s * at_raised
+        """Write its joints into `q` (n, nq), from `quat_WL` (n, k, 4) xyzw."""
+        _place_girdle(quat_WL, *self._rows, *self._law, self._at, q)
 
 
 @kernel
-def _turn_relatively(quat, row, above, v, out):  # type: ignore[no-untyped-def]
-    """Write a vector `v` (3,) of row `row` of `quat` (n, k, 4) xyzw in the frame of row `above` into `out` (3, n)."""
+def _place_girdle(quat, on, moves, along, law, scale, parameters, at, q):  # type: ignore[no-untyped-def]
+    """Write a girdle's joints at `at` (3,) into `q` (n, nq), as `move_girdles`; without `moves`, -1, at rest."""
     for i in range(len(quat)):
-        a, b = quat[i, above], quat[i, row]
-        x, y, z, w = product(-a[0], -a[1], -a[2], a[3], b[0], b[1], b[2], b[3])
-        tx, ty, tz, tw = product(x, y, z, w, v[0], v[1], v[2], 0.0)
-        rx, ry, rz, _ = product(tx, ty, tz, tw, -x, -y, -z, w)
-        scale = 1.0 / (x * x + y * y + z * z + w * w)
-        out[0, i], out[1, i], out[2, i] = rx * scale, ry * scale, rz * scale
+        dx, dy, dz, s = 0.0, 0.0, 0.0, 0.0
+        if moves >= 0:
+            a, b = quat[i, on], quat[i, moves]
+            x, y, z, w = product(-a[0], -a[1], -a[2], a[3], b[0], b[1], b[2], b[3])
+            tx, ty, tz, tw = product(x, y, z, w, along[0], along[1], along[2], 0.0)
+            rx, ry, rz, _ = product(tx, ty, tz, tw, -x, -y, -z, w)
+            norm = x * x + y * y + z * z + w * w
+            dx, dy, dz, s = displace_one(law, rx / norm, ry / norm, rz / norm, scale)
+        share = 1.0 + parameters[0]
+        q[i, at[0]] = share * dx + parameters[1] + s * parameters[4]
+        q[i, at[1]] = share * dy + parameters[2] + s * parameters[5]
+        q[i, at[2]] = share * dz + parameters[3] + s * parameters[6]

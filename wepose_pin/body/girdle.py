@@ -12,11 +12,13 @@ that segment [m] a place at rest, and a displacement at 90° that grows with s.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
+from ..compilation import inlined
 from ..documents import Key
 from ..recording.sensors import AXES
 
@@ -71,35 +73,44 @@ class Girdle(NamedTuple):
     residual_std: _Std = (0.0, 0.0, 0.0)
 
     @property
+    def law(self) -> tuple[float, ...]:
+        """(10,) the numbers of the law: `outward`, `up`, `middle`, `back`, `back_angle`."""
+        return (*self.outward, *self.up, *self.middle, *self.back, self.back_angle)
+
+    @property
     def parameter_std(self) -> np.ndarray:
         """(7,) of `PARAMETERS`, before a calibration."""
         return np.array((self.law_std, *self.rest_std, *self.raised_std))
 
 
-def displace(girdle: Girdle, along: Any, scale: Any, math: Any) -> tuple[tuple[Any, Any, Any], Any]:
-    """The law's displacement (x, y, z) [m] in the frame of `on`, and s.
+def _make_law(sqrt: Any, arctan2: Any, fmin: Any, exp: Any) -> Any:
+    """Make the law of these functions: displacement x, y, z [m] and s, by `Girdle.law`, a direction and the scale."""
+
+    def law(g, x, y, z, scale):  # type: ignore[no-untyped-def]
+        sine = sqrt(x * x + y * y + _LEAST_SINE)
+        e = fmin(arctan2(sine, -z), MAX_ELEVATION)
+        s, cos_phi = e / (0.5 * np.pi), (x * g[0] + y * g[1] + z * g[2]) / sine
+        up, middle = (g[3] + g[4] * cos_phi) * s, (g[5] + g[6] * cos_phi) * s
+        back = g[7] * s * s + g[8] * (1.0 - exp(-e / g[9])) * cos_phi
+        return scale * (-back - middle * g[0]), -scale * middle * g[1], scale * (up - middle * g[2]), s
+
+    return law
+
+
+displace_one = inlined(_make_law(math.sqrt, math.atan2, min, math.exp))
+
+
+def displace(girdle: Girdle, along: Any, scale: Any, functions: Any) -> tuple[tuple[Any, Any, Any], Any]:
+    """Return the law's displacement (x, y, z) [m] in the frame of `on`, and s.
 
     Parameters
     ----------
     along : (x, y, z) of the limb's unit direction, from its first point on, in the frame of `on`
-    math : `numpy`, or `casadi` for symbols
+    functions : `numpy`, or `casadi` for symbols
     """
-    x, y, z = along
-    outward = sum(part * axis for part, axis in zip(along, girdle.outward, strict=True) if axis)
-    sine = math.sqrt(x * x + y * y + _LEAST_SINE)
-    e = math.fmin(math.arctan2(sine, -z), MAX_ELEVATION)
-    s, cos_phi = e / (0.5 * np.pi), outward / sine
-    up = (girdle.up[0] + girdle.up[1] * cos_phi) * s
-    middle = (girdle.middle[0] + girdle.middle[1] * cos_phi) * s
-    back = girdle.back[0] * s * s + girdle.back[1] * (1.0 - math.exp(-e / girdle.back_angle)) * cos_phi
-    return (
-        (
-            scale * (-back - middle * girdle.outward[0]),
-            -scale * middle * girdle.outward[1],
-            scale * (up - middle * girdle.outward[2]),
-        ),
-        s,
-    )
+    law = _make_law(functions.sqrt, functions.arctan2, functions.fmin, functions.exp)
+    x, y, z, s = law(girdle.law, *along, scale)
+    return (x, y, z), s
 
 
 def find_girdle_scale(girdle: Girdle, lengths: Mapping[str, float]) -> float:
