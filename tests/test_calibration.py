@@ -215,7 +215,6 @@ def test_hands_that_hardly_move_leave_the_headings_open(seed: int, monkeypatch: 
         off = (Rotation.from_quat(quat) * Rotation.from_quat(made.quat_LS[name]).inv()).as_rotvec()
         assert abs(off[2]) < 4.0 * calibration.subject.std(f"mounts.{name}.z"), name
     assert assess(calibration).quality == "fail"
-    assert calibration.subject.std("mounts.torso.z") > np.deg2rad(40.0)
     assert "headings-ambiguous" in codes(calibration)
 
 

@@ -22,6 +22,7 @@ from .chains import Chain, axis_in_joint, find_chains
 from .girdle import PARAMETERS
 from .naming import MOST_LINKS, format_closest_links, rename_links
 from .reaches import LinkVector, measure_reaches
+from .soft_tissue import TissueMean
 from .table import DEFAULT_BODY, BodyTable, Segment
 from .table_file import find_table, load_table, parse_table, read_table
 from .tree import build, check_joint_values, find_impossible_inertia, parse_tree
@@ -49,6 +50,7 @@ class BodyModel:
     axes : the same → (3, 3) the axes that were joined, a row each, in the joint's frame at zero; without an entry for
         a `floating` joint
     girdles : girdle → (7,) what a person differs by from its law, `girdle.PARAMETERS`; zeros where it is not named
+    tissue_means : segment → what a person's has turned beyond its sensor; nothing where it is not named
     loaded : the same body before its lengths were set; None: they were not
     """
 
@@ -58,6 +60,7 @@ class BodyModel:
     joints: Mapping[str, int]
     axes: Mapping[str, np.ndarray]
     girdles: Mapping[str, np.ndarray] = field(default_factory=dict)
+    tissue_means: Mapping[str, TissueMean] = field(default_factory=dict)
     loaded: BodyModel | None = field(default=None, repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -173,7 +176,7 @@ class BodyModel:
                     f"{self.robot.name}: length {name} = {value!r} is no length of a body: above 0 and below 10 m"
                 )
         body = _body(_lengths.with_lengths(self.robot, self.table, lengths), self.table, self.robot.name)
-        return replace(body, girdles=self.girdles, loaded=self.loaded or self)
+        return replace(body, girdles=self.girdles, tissue_means=self.tissue_means, loaded=self.loaded or self)
 
     def urdf(self) -> str:
         """This body as the text of a URDF that any tool reads."""

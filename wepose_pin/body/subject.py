@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..arguments import (
     NonNegative,
@@ -39,6 +40,7 @@ from ..errors import BadData, BadModel, BadOption, BadSubject, one_of
 from .anthropometry import compute_population_lengths
 from .body import BodyModel
 from .girdle import PARAMETERS
+from .soft_tissue import TissueMean
 from .table import BodyTable
 from .table_file import load_table
 
@@ -49,6 +51,10 @@ LONGEST = 3.0  # [m] of a plausible length
 FORMAT = 2
 Quality = Literal["pass", "poor", "fail"]  # of a calibration
 POPULATION = "population"  # name of the prior of a body's lengths
+# [rad] by which the plane of a hinge is rotated about the segment above it against that segment's frame; assumption, of
+# simulated people, whose forearms bend aside as they turn.
+HINGE_PLANE_STD = np.deg2rad(10.0)
+MOST_TISSUE_SHARE = 1.5  # of the population's mean soft tissue that a person has
 
 # Limits of a file; whether numbers are plausible says the quality of the calibration.
 _OFFSET = Key(unit="deg", least=-180.0, most=180.0, digits=4)
@@ -71,6 +77,8 @@ class Hinge(NamedTuple):
     axis: Annotated[np.ndarray, replace(_UNIT, each=("x", "y", "z"))]
     # [rad] by which the segment below leaves the plane across it, with soft tissue
     std: Annotated[NonNegative, Key(unit="deg", least=1e-3, most=57.3, digits=3)]
+    # [rad/rad] by which the sensor above lags behind the twist that it shows; None: not known
+    twist_lag: Annotated[float | None, Key(least=-10.0, most=10.0, digits=4)] = None
 
 
 class StartPoseOffset(NamedTuple):
@@ -241,10 +249,50 @@ class Subject:
         except BadOption as error:
             raise BadSubject(str(error)) from None
 
-    def shape(self, body: BodyModel) -> BodyModel:
-        """Return the body with this person's lengths and shoulder girdles."""
+    def shape(self, body: BodyModel, *, remounted: bool = False) -> BodyModel:
+        """Return the body with this person's lengths, shoulder girdles and means of soft tissue.
+
+        Of `remounted` sensors the means are not known.
+        """
         body = body.with_lengths({name: self.lengths[name] for name in body.lengths if name in self.lengths})
-        return replace(body, girdles={name: own for name, own in self.girdles.items() if name in body.table.girdles})
+        girdles = {name: own for name, own in self.girdles.items() if name in body.table.girdles}
+        return replace(body, girdles=girdles, tissue_means={} if remounted else self.find_tissue_means(body))
+
+    def find_tissue_means(self, body: BodyModel) -> dict[str, TissueMean]:
+        """Find segment → what it has turned beyond its sensor in this person's mean; nothing where no hinge shows it.
+
+        A hinge shows how far the sensor above it lags behind a twist. The share of the usual lag that it has is
+        assumed for all soft tissue. The axis of a hinge also shows how far the person twists the segment above it, and
+        what hangs on that, in the start pose.
+        """
+        segments, hinges, means = body.table.segments, body.table.hinges, dict[str, TissueMean]()
+        shown = {hinges[joint].on: joint for joint, hinge in self.hinges.items() if hinge.twist_lag is not None}
+        usual = sum(segments[name].soft_tissue.mean_per_twist for name in shown)
+        if not usual:
+            return {}
+        share = sum(self.hinges[joint].twist_lag or 0.0 for joint in shown.values()) / usual
+        share = min(max(share, 0.0), MOST_TISSUE_SHARE)
+        for name, segment in segments.items():
+            lag, start = share * segment.soft_tissue.mean_per_twist, share * segment.start_mean[2]
+            carrier = body.parents.get(name)
+            if carrier in means:
+                start += means[carrier].start
+            if name in shown:
+                usual_axis, hinge = np.array(hinges[shown[name]].axis), self.hinges[shown[name]]
+                start_var = segment.start_std[2] ** 2
+                angle = np.arctan2(np.cross(usual_axis, hinge.axis)[2], usual_axis @ hinge.axis)
+                lag, start = hinge.twist_lag or 0.0, float(start_var / (start_var + HINGE_PLANE_STD**2) * angle)
+            means[name] = TissueMean(share, lag, start)
+        return means
+
+    def turn_hinges(self, body: BodyModel) -> dict[str, Hinge]:
+        """Return the hinges with their axes in the segments as the means of soft tissue correct them."""
+        hinges = {}
+        for joint, hinge in self.hinges.items():
+            mean = body.tissue_means.get(body.table.hinges[joint].on)
+            turn = Rotation.from_rotvec([0.0, 0.0, 0.0 if mean is None else -mean.start])
+            hinges[joint] = hinge._replace(axis=turn.apply(hinge.axis))
+        return hinges
 
     def fix_girdles(self, table: BodyTable) -> Subject:
         """Return the subject with shoulders fixed on the trunk: its girdles move nothing."""

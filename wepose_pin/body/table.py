@@ -44,6 +44,8 @@ class SoftTissue(NamedTuple):
     per_twist : [rad/rad] about the long axis, per angle by which the segment is rotated about it since the start pose
     raised : segments on which it depends too, such as the arms for a sensor on the torso
     per_raised : (3,) [rad/rad] per mean angle of their long axes off hanging
+    mean_per_tilt, mean_per_twist, mean_per_raised : by how much the segment has turned beyond its sensor in the mean of
+        people; the standard deviations contain it
     """
 
     std: Angles = ZERO
@@ -52,6 +54,9 @@ class SoftTissue(NamedTuple):
     per_twist: float = 0.0
     raised: tuple[str, ...] = ()
     per_raised: Annotated[Vector, Key(least=0.0, omit_zero=True)] = ZERO
+    mean_per_tilt: Annotated[Vector, Key(omit_zero=True)] = ZERO
+    mean_per_twist: float = 0.0
+    mean_per_raised: Annotated[Vector, Key(omit_zero=True)] = ZERO
 
 
 def _same(degrees: float) -> tuple[float, float, float]:
@@ -73,9 +78,7 @@ class Segment(NamedTuple):
     rigid_without_sensor : without a sensor it is rigid with the segment above; False: it is unknown then
     labels : a regular expression of words that mean it in a sensor's name
     joint : the name of the joint to the segment above, where no point names it
-    soft_tissue_std : (3,) [rad/rad] of the rotation of a sensor by soft tissue, about the segment's axes, per rotation
-        of the segment, in a calibration
-    soft_tissue : the same while the body is tracked
+    soft_tissue : how far soft tissue rotates its sensor
     start_mean : (3,) [rad] mean rotation vector, in its axes, of people off the neutral pose
     start_std : (3,) [rad] about its axes, one standard deviation of its rotation off the start pose among people
     repeat_std : (3,) [rad] the same between two start poses of one person
@@ -89,7 +92,6 @@ class Segment(NamedTuple):
     rigid_without_sensor: Annotated[bool, Key("without_sensor", words={"rigid": True, "unknown": False})] = False
     labels: str = ""
     joint: str = ""
-    soft_tissue_std: Annotated[Vector, Key("soft_tissue_deg", "deg", least=0.0)] = _same(0.6)
     soft_tissue: SoftTissue = SoftTissue(_same(1.5))
     start_mean: Annotated[Vector, Key(unit="deg")] = ZERO
     start_std: Angles = _same(4.0)
@@ -98,15 +100,8 @@ class Segment(NamedTuple):
     @classmethod
     def of_mechanism(cls, link: str) -> Segment:
         """Return a segment of a mechanism: no soft tissue, and a start configuration to 0.5° (assumption)."""
-        rigid = SoftTissue()
-        return cls(
-            link,
-            rigid_without_sensor=True,
-            soft_tissue_std=(0.0, 0.0, 0.0),
-            soft_tissue=rigid,
-            start_std=_same(0.5),
-            repeat_std=_same(0.5),
-        )
+        half = _same(0.5)
+        return cls(link, rigid_without_sensor=True, soft_tissue=SoftTissue(), start_std=half, repeat_std=half)
 
 
 class Point(NamedTuple):

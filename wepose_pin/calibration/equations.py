@@ -8,12 +8,12 @@ For each sensor i the filter gives R_VS(t) in a world V of its own heading, and 
 the frame of its segment that equals W in the start pose (L' in `observations`). With a start pose that is ε off the
 stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
 
-    R_WL(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
+    R_WL(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε)
 
-with ψ the heading, d its drift since the start, and A the soft-tissue artefact: soft tissue rotates a sensor as the
-direction of gravity in the segment changes. A segment's points may move, as the shoulders do by collarbones and
-shoulder blades while the arms are raised (`model.girdle`). d, A and the hinges are nuisance parameters: the covariance
-of lengths and mounts includes their effect.
+with ψ the heading and d its drift since the start. Skin lags behind a bone that twists: a segment above a hinge has
+turned about its long axis by g times the twist that its sensor shows. A segment's points may move, as the shoulders do
+by collarbones and shoulder blades while the arms are raised (`body.girdle`). d, g and the hinges are nuisance
+parameters: the covariance of lengths and mounts includes their effect.
 
 Each sample belongs to one condition of the protocol. A closure (`Loop`) gives the gap, whitened by the covariance that
 errors of the orientations and slipping palms give it, and of each hinge the angle by which the segment that it moves
@@ -25,21 +25,48 @@ are zero.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
+from ..body import BodyTable
 from ..body.girdle import PARAMETERS
+from ..body.soft_tissue import LEAST_TWIST_COSINE
+from ..body.table import Vector
 from ..observations.directions import Level, Pointing
 from ..observations.hinges import HingePlane
 from ..observations.paths import BodySymbols, GirdleTerm, express_covariance, express_path
-from ..observations.symbols import about_z, product, rotate_back, small_rotation
+from ..observations.symbols import about_z, product, small_rotation
 from .conditions import Constraint, Loop, Moving
 
 HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
 GAP_ROWS = 3  # residuals of a sample's condition
+
+
+class Twist(NamedTuple):
+    """A segment's rotation about its long axis `along` (3,) in L', against the segment `above`, both with a sensor.
+
+    `std` [rad/rad] is how far sensors lag behind it, per angle that they show.
+    """
+
+    segment: str
+    above: str
+    along: Vector
+    std: float
+
+
+def find_twists(table: BodyTable, hinges: Sequence[HingePlane], sensors: Sequence[str]) -> tuple[Twist, ...]:
+    """Find the twists that hinges show: of the segments above them."""
+    tissues = [(hinge, table.segments[hinge.on].soft_tissue) for hinge in hinges]
+    return tuple(
+        Twist(hinge.on, tissue.relative_to, hinge.along_on, tissue.per_twist)
+        for hinge, tissue in tissues
+        if tissue.per_twist and tissue.relative_to in sensors
+    )
 
 
 @dataclass(frozen=True)
@@ -51,10 +78,10 @@ class Layout:
     lengths : names, in the order of the table
     sensors : names of their segments, in the order of the table
     hinges, girdles : between segments of these sensors
+    twists : of the segments above the hinges
     fixed : number of unknown fixed points
     planes : number of level planes of unknown height
     recorded : the samples have a recorded place
-    rigid : sensors without a soft-tissue artefact
     attitude_std : [rad] of each sensor's orientation about an axis across its segment; only the ratios matter
     """
 
@@ -62,10 +89,10 @@ class Layout:
     sensors: tuple[str, ...]
     hinges: tuple[HingePlane, ...] = ()
     girdles: tuple[GirdleTerm, ...] = ()
+    twists: tuple[Twist, ...] = ()
     fixed: int = 0
     planes: int = 0
     recorded: bool = False
-    rigid: tuple[str, ...] = ()
     attitude_std: tuple[float, ...] = ()
 
     length: np.ndarray = field(init=False, compare=False)  # (lengths,) [m]
@@ -73,7 +100,7 @@ class Layout:
     tilt: np.ndarray = field(init=False, compare=False)  # (sensors, 2) ε about x and y of L [rad]
     drift: np.ndarray = field(init=False, compare=False)  # (sensors,) d [rad/s]
     hinge: np.ndarray = field(init=False, compare=False)  # (hinges, 2) of its axis along `across` and `tilted`
-    soft_tissue: np.ndarray = field(init=False, compare=False)  # (soft, 9) A [rad], column by column
+    twist: np.ndarray = field(init=False, compare=False)  # (twists,) g
     girdle: np.ndarray = field(init=False, compare=False)  # (girdles, 7) `model.girdle.PARAMETERS`
     point: np.ndarray = field(init=False, compare=False)  # (fixed, 3) of W [m]
     height: np.ndarray = field(init=False, compare=False)  # (planes,) of W [m]
@@ -87,7 +114,7 @@ class Layout:
             "tilt": (sensors, 2),
             "drift": (sensors,),
             "hinge": (len(self.hinges), 2),
-            "soft_tissue": (len(self.soft), 9),
+            "twist": (len(self.twists),),
             "girdle": (len(self.girdles), len(PARAMETERS)),
             "point": (self.fixed, 3),
             "height": (self.planes,),
@@ -96,11 +123,6 @@ class Layout:
             object.__setattr__(self, name, places)
             begin += places.size
         object.__setattr__(self, "size", begin)
-
-    @cached_property
-    def soft(self) -> tuple[str, ...]:
-        """Sensors with a soft-tissue artefact."""
-        return tuple(name for name in self.sensors if name not in self.rigid)
 
     @property
     def place(self) -> slice:
@@ -146,16 +168,17 @@ def sample_functions(layout: Layout, condition: Constraint) -> tuple[ca.Function
 
 
 def _orient_segments(layout: Layout, x: ca.SX, data: ca.SX) -> dict[str, ca.SX]:
-    """Return `quat_WL` (4,) of each segment with a sensor: Rz(ψ + d τ) Q Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))."""
-    quat_WL, up = {}, ca.DM([0.0, 0.0, 1.0])
+    """Return `quat_WL` (4,) of each segment with a sensor: Rz(ψ + d τ) Q Rz(−ψ) exp(ε), and the twists by g."""
+    quat_WL = {}
     for i, name in enumerate(layout.sensors):
         heading, drift = x[layout.heading[i]], x[layout.drift[i]]
         quat = product(about_z(heading + drift * data[-1]), data[4 * i : 4 * i + 4])
-        quat = product(product(quat, about_z(-heading)), _start_rotation(layout, x, name))
-        if name in layout.soft:
-            A = ca.reshape(x[layout.soft_tissue[layout.soft.index(name)]], 3, 3)
-            quat = product(quat, small_rotation(A @ (rotate_back(quat, up) - up)))
-        quat_WL[name] = quat
+        quat_WL[name] = product(product(quat, about_z(-heading)), _start_rotation(layout, x, name))
+    for (name, above, along, _), lag in zip(layout.twists, ca.vertsplit(x[layout.twist]), strict=True):
+        relative = product(ca.vertcat(-quat_WL[above][:3], quat_WL[above][3]), quat_WL[name])
+        part, w = ca.dot(relative[:3], ca.DM(along)), relative[3]
+        sine = 2.0 * part * w / ca.fmax(part**2 + w**2, LEAST_TWIST_COSINE)
+        quat_WL[name] = product(quat_WL[name], small_rotation(lag * sine * ca.DM(along)))
     return quat_WL
 
 

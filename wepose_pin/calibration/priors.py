@@ -25,7 +25,6 @@ from .problem import CalibrationProblem
 STATED_STD = np.deg2rad(10.0)  # [rad] of a stated mount's heading
 HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of an unknown heading: the whole circle
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
-LEAST_SOFT_TISSUE = 1e-4  # [rad/rad] about an axis that a table states as rigid
 LEAST_GIRDLE_STD = 1e-5  # [m] of a parameter that a table states as exact
 POINT_STD = 3.0  # [m] of an unknown point of W
 
@@ -49,10 +48,6 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
         offset, information[np.ix_(rows, rows)] = _mount_prior(problem, name, stated_headings.get(name))
         mean[rows] += offset
     information[layout.drift, layout.drift] = DRIFT_STD**-2
-    segments = problem.model.table.segments
-    for name, rows in zip(layout.soft, layout.soft_tissue, strict=True):
-        std = np.maximum(3 * segments[name].soft_tissue_std, LEAST_SOFT_TISSUE)
-        information[rows, rows] = std**-2.0
     _add_hinges(information, layout, problem.model.table)
     return Gaussian(mean, information)
 
@@ -96,7 +91,8 @@ def _add_places(mean: np.ndarray, information: np.ndarray, observations: Observa
 
 
 def _add_hinges(information: np.ndarray, layout: Layout, table: BodyTable) -> None:
-    """The axes of hinges; those of a left and a right one are partly alike."""
+    """The axes of hinges, those of a left and a right one partly alike, and how far sensors lag behind twists."""
+    information[layout.twist, layout.twist] = np.array([twist.std for twist in layout.twists]) ** -2.0
     rows = {hinge.name: places for hinge, places in zip(layout.hinges, layout.hinge, strict=True)}
     for name, (across, tilted) in rows.items():
         hinge, other = table.hinges[name], table.counterpart(name)

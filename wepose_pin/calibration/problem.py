@@ -24,7 +24,7 @@ from ..observations.paths import find_girdles
 from ..recording import Intervals, Recording, format_span
 from .conditions import Constraint, Loop, Moving, group_lengths, resolve_conditions
 from .couplings import Coupling, estimate_couplings
-from .equations import Layout
+from .equations import Layout, find_twists
 from .least_squares import Observations
 from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
 from .recorded import read_recorded_places
@@ -272,15 +272,16 @@ class CalibrationProblem:
         total = sum(len(self._find_samples(condition)) for condition in protocol.conditions)
         stride = max(1, round(recording.rate_hz / rate_hz), total // MOST_SAMPLES)
         start, sensors = self.start_pose, self.sensors
+        hinges = find_hinges(self.model, start, sensors)
         layout = Layout(
             tuple(self.model.lengths),
             sensors,
-            find_hinges(self.model, start, sensors),
+            hinges,
             find_girdles(self.model, start, sensors),
+            find_twists(self.model.table, hinges, sensors),
             sum(closure.kind == "fixed_point" for closure in protocol.closures),
             sum(closure.kind == "plane" for closure in protocol.closures),
             recorded=any(closure.kind == "recorded" for closure in protocol.closures),
-            rigid=tuple(name for name in sensors if not any(self.model.table.segments[name].soft_tissue_std)),
             attitude_std=tuple(_estimate_attitude_std(self.model.table.segments[name]) for name in sensors),
         )
         parts, places = [], []

@@ -34,6 +34,7 @@ from .weights import (
 )
 
 WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
+MOST_LAG_STD = 0.15  # [rad/rad] from which on the motion does not show how far a sensor lags behind a twist
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
 
 
@@ -182,11 +183,18 @@ def _estimate_hinges(problem: CalibrationProblem, solution: _Solution) -> Mappin
     if not len(bending):
         return {}
     terms = find_hinges(problem.model, problem.start_pose, problem.sensors)
-    for term, (across, tilted), residuals in zip(terms, fit.x[observations.layout.hinge], bending.T, strict=True):
+    layout = observations.layout
+    lags = {
+        twist.segment: float(fit.x[row])
+        for twist, row in zip(layout.twists, layout.twist, strict=True)
+        if solution.covariance[row, row] < MOST_LAG_STD**2
+    }
+    for term, (across, tilted), residuals in zip(terms, fit.x[layout.hinge], bending.T, strict=True):
         axis = np.array(term.axis) + across * np.array(term.across) + tilted * np.array(term.tilted)
         axis_L = problem.start_rotation(term.on).inv().apply(axis / np.linalg.norm(axis))
         rms = float(HINGE_STD * np.sqrt(np.mean(residuals**2)))
-        hinges[term.name] = Hinge(axis_L, max(rms, problem.model.table.hinges[term.name].softness)), rms
+        std = max(rms, problem.model.table.hinges[term.name].softness)
+        hinges[term.name] = Hinge(axis_L, std, lags.get(term.on)), rms
     return hinges
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from ..body import BodyModel
 from ..body.covariance import compute_axis_std
 from ..body.kinematics import KinematicsSolver
+from ..body.soft_tissue import SoftTissueCorrection
 from ..body.start_pose import compute_start_configuration
 from ..body.table_file import check_segments
 from ..diagnostics import Diagnostic
@@ -122,6 +123,7 @@ class LiveLoop(Stage):
             _ = self.model.reaches
         start = compute_start_configuration(self.model, setup.start_pose, setup.joints, setup.name)
         self.kinematics = KinematicsSolver(self.model, source.sensors, start=start)
+        self._soft_tissue = SoftTissueCorrection(self.model.table, self.model.tissue_means, tuple(source.sensors))
         self._monitor = SensorMonitor()
         self._stream = TickStream(source.sensors, source.rate_hz, begin, log, source.orientations)
         self._search: StartPoseSearch | None = None  # from when the ticks begin
@@ -217,7 +219,7 @@ class LiveLoop(Stage):
             while self._edges and self._edges[0][0] <= ticks.time[n]:
                 _, phase, begins = self._edges.popleft()
                 estimator.mark_phase(phase, begins=begins)
-            quat_WL = estimator.step(ticks.gyro_S[n], ticks.accel_S[n])
+            quat_WL = self._soft_tissue.correct(estimator.step(ticks.gyro_S[n], ticks.accel_S[n]))
             self._update_std(estimator, ticks.first + n)
             if self.log is not None:
                 self.log.pose(ticks.first + n, quat_WL)

@@ -152,4 +152,4 @@ def build_subject_model(
         body = load_sensed_model(body, tuple(sensors) or tuple(setup.mounts), setup.name)
     if setup.subject is None and chosen is not None:
         return body
-    return (setup.subject or population_subject(body=body)).shape(body)
+    return (setup.subject or population_subject(body=body)).shape(body, remounted=setup.remounted)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -261,7 +261,8 @@ def measure(
     """
     table, every = tracked.model.table, round(recording.rate_hz / tracked.recording.rate_hz)
     steps = 1e3 * np.diff(recording.time)
-    hinges = {name: measure_hinge(tracked.pose, table, name, tracked.subject) for name in table.hinges}
+    subject = replace(tracked.subject, hinges=tracked.subject.turn_hinges(tracked.model))
+    hinges = {name: measure_hinge(tracked.pose, table, name, subject) for name in table.hinges}
     tips = measure_tips(tracked.pose, tracked.recording.rate_hz, table)
     orientation = tracked.segments.orientation
     return Measures(

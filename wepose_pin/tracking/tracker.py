@@ -12,6 +12,7 @@ from ..body import BodyModel
 from ..body.body import load_sensed_model
 from ..body.covariance import compute_point_covariances
 from ..body.kinematics import KinematicsSolver
+from ..body.soft_tissue import SoftTissueCorrection
 from ..body.start_pose import StartPose, find_start_pose
 from ..body.subject import Subject, population_subject
 from ..body.table_file import check_segments
@@ -170,7 +171,8 @@ class Tracker:
             self._kinematics = KinematicsSolver(
                 body, segments.quat_WL, limits=self.options.limits, start=self._start_pose.q
             )
-        pose = self._kinematics.solve_chunk(recording.time, segments.quat_WL)
+        tissue = SoftTissueCorrection(body.table, body.tissue_means, tuple(segments.quat_WL))
+        pose = self._kinematics.solve_chunk(recording.time, tissue.correct_segments(segments.quat_WL))
         point_cov: dict[str, np.ndarray] = {}
         if self._with_point_cov:
             segment_cov, shape_cov = segments.covariance_W, person.shape_covariance(body.table)
@@ -251,4 +253,4 @@ def _fit_body(
     person.check_body(body.table)
     if subject is None and chosen is not None:  # a chosen model has its person's lengths
         person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
-    return person, person.shape(body), start_pose
+    return person, person.shape(body, remounted=recording.remounted), start_pose

@@ -1,0 +1,77 @@
+"""Means of soft tissue: what a hinge shows of them, and their correction in the pose."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from wepose_pin.body.soft_tissue import SoftTissueCorrection, TissueMean
+from wepose_pin.body.table_file import load_table
+from wepose_pin.calibration import calibrate
+from wepose_pin.simulation import IDEAL_PRESET, simulate, simulate_person
+from wepose_pin.tracking import track
+
+TABLE = load_table()
+SEGMENTS = ("right_upper_arm", "torso", "right_forearm")
+
+
+def correct(means: dict[str, TissueMean], **turns_deg: tuple[float, float, float]) -> dict[str, np.ndarray]:
+    """Return segment → rotation vector [deg] of its correction, of segments that are turned in W by these vectors."""
+    turns = {name: Rotation.from_rotvec(turns_deg.get(name, (0.0, 0.0, 0.0)), degrees=True) for name in SEGMENTS}
+    quats = np.array([[turns[name].as_quat() for name in SEGMENTS]])
+    corrected = SoftTissueCorrection(TABLE, means, SEGMENTS).correct(quats)[0]
+    pairs = zip(SEGMENTS, corrected, strict=True)
+    return {name: (turns[name].inv() * Rotation.from_quat(quat)).as_rotvec(degrees=True) for name, quat in pairs}
+
+
+def test_a_segment_is_turned_by_its_own_twist_tilt_and_start() -> None:
+    means = {
+        "torso": TissueMean(1.0, 0.0),
+        "right_upper_arm": TissueMean(1.0, 0.5),
+        "right_forearm": TissueMean(1.0, 0.2, 0.1),
+    }
+    still = correct(means)
+    np.testing.assert_allclose(still["right_upper_arm"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(still["right_forearm"], [0.0, 0.0, np.degrees(0.1)], atol=1e-9)
+    twisted = correct(means, right_upper_arm=(0.0, 0.0, 30.0), right_forearm=(0.0, 0.0, 30.0))
+    lag = np.degrees(0.5 * np.sin(np.pi / 6.0))
+    np.testing.assert_allclose(twisted["right_upper_arm"], [0.0, 0.0, lag], atol=1e-9)
+    # A forearm is twisted against the arm as it is corrected.
+    np.testing.assert_allclose(twisted["right_forearm"][2], np.degrees(0.1 - 0.2 * np.sin(np.radians(lag))), atol=1e-9)
+    bow = correct(means, torso=(0.0, 30.0, 0.0), right_upper_arm=(0.0, 30.0, 0.0))["torso"]
+    np.testing.assert_allclose(bow, [0.0, np.degrees(-0.107 * 0.5), 0.0], atol=1e-9)
+    np.testing.assert_allclose(
+        correct(means, right_upper_arm=(0.0, -90.0, 0.0))["torso"], [0.0, 0.036 * 90.0, 0.0], atol=1e-9
+    )
+
+
+def test_a_raised_arm_that_points_up_is_turned_smoothly() -> None:
+    means = {"right_upper_arm": TissueMean(1.0, 0.5)}
+    turns = [correct(means, right_upper_arm=(180.0 - step, step, 0.0))["right_upper_arm"] for step in (0.0, 0.1)]
+    assert np.linalg.norm(turns[1] - turns[0]) < 1.0
+
+
+def test_no_means_change_nothing() -> None:
+    quats = np.random.default_rng(0).normal(size=(5, 3, 4))
+    assert SoftTissueCorrection(TABLE, {}, SEGMENTS).correct(quats) is quats
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0])
+def test_a_hinge_shows_how_far_skin_lags_behind_a_twist(size: float) -> None:
+    person = simulate_person(3)
+    sizes = replace(IDEAL_PRESET, tissue_gain=size, upper_arm_place=0.6, forearm_place=0.85)
+    made = simulate(person.lengths, seed=3, imperfections=sizes, clasp_s=40.0, circles=2)
+    recording = made.recording()
+    subject = calibrate(recording, measured=person.measured, prior=person.prior).subject
+    tracked = track(recording, subject)
+    uncorrected = track(recording, replace(subject, hinges={}))
+    assert tracked.model.tissue_means["torso"].share == pytest.approx(size, abs=0.5)
+    errors = []
+    for pose in (tracked, uncorrected):
+        relative, true = (
+            Rotation.from_quat(quats["torso"]).inv() * Rotation.from_quat(quats["right_upper_arm"])
+            for quats in (pose.quat_WL, made.quat_WL)
+        )
+        errors.append(np.degrees(np.sqrt(np.mean((relative * true.inv()).as_rotvec() ** 2))))
+    assert errors[0] < (0.7 * errors[1] if size else errors[1] + 0.1)
