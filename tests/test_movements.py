@@ -17,7 +17,6 @@ from scipy.stats import ttest_ind
 from test_export import LENGTHS, write_folder
 
 from wepose_pin.angles import SHOULDER_SEQUENCES, group_sides, joint_angles
-from wepose_pin.angles.definitions import POSITIVE, ROTATIONS
 from wepose_pin.angles.joints import JOINTS
 from wepose_pin.angles.movement import (
     MovementOptions,
@@ -26,11 +25,10 @@ from wepose_pin.angles.movement import (
     compare_curves,
     compare_statistics,
     compute_statistics,
+    smooth_pose,
 )
-from wepose_pin.angles.movement_tables import build_comparison_table
-from wepose_pin.angles.smoothing import smooth_pose
-from wepose_pin.angles.tables import summarize_joint
-from wepose_pin.angles.uncertainty import compute_summary_std
+from wepose_pin.angles.movement_tables import POSITIVE, ROTATIONS, build_comparison_table
+from wepose_pin.angles.tables import compute_summary_std, summarize_joint
 from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import Pose, compute_pose
 from wepose_pin.report.angles import draw_figures

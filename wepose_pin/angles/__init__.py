@@ -11,30 +11,15 @@ three-dimensional motions: application to the knee", Journal of Biomechanical En
 axes and sequence, and carries the uncertainty; `tables` gives ranges, rates and the columns of a file.
 """
 
-from .joints import (
-    AUTO,
-    JOINTS,
-    NEAR_LOCK,
-    SHOULDER_SEQUENCES,
-    Angles,
-    JointAngles,
-    diagnose_lock,
-    group_sides,
-    joint_angles,
-)
-from .tables import angle_table, summary, summary_table
-
-__all__ = [
-    "AUTO",
-    "JOINTS",
-    "NEAR_LOCK",
-    "SHOULDER_SEQUENCES",
-    "Angles",
-    "JointAngles",
-    "angle_table",
-    "diagnose_lock",
-    "group_sides",
-    "joint_angles",
-    "summary",
-    "summary_table",
-]
+from .joints import AUTO as AUTO
+from .joints import JOINTS as JOINTS
+from .joints import NEAR_LOCK as NEAR_LOCK
+from .joints import SHOULDER_SEQUENCES as SHOULDER_SEQUENCES
+from .joints import Angles as Angles
+from .joints import JointAngles as JointAngles
+from .joints import diagnose_lock as diagnose_lock
+from .joints import group_sides as group_sides
+from .joints import joint_angles as joint_angles
+from .tables import angle_table as angle_table
+from .tables import summary as summary
+from .tables import summary_table as summary_table

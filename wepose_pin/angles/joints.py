@@ -275,13 +275,13 @@ def choose_shoulder_sequence(pose: Pose) -> str:
     It is YXY, which the ISB recommends, where that is near the lock for no more than `MAX_NEAR_LOCK` of the samples. An
     arm that hangs is in its lock.
     """
-    shoulders = {name: JOINTS[name] for name in ("left_shoulder", "right_shoulder")}
-    known = {name: joint for name, joint in shoulders.items() if {joint.proximal, joint.distal} <= set(pose.quat_WL)}
-    shares = {}
+    shares = dict.fromkeys(SHOULDER_SEQUENCES, 0.0)
     for sequence, names in SHOULDER_SEQUENCES.items():
-        chosen = [(joint._replace(sequence=sequence, names=names), name) for name, joint in known.items()]
-        near = [_angles(pose, joint, name.startswith("left_"), NEAR_LOCK).near_lock for joint, name in chosen]
-        shares[sequence] = max((float(np.mean(each)) for each in near), default=0.0)
+        for side in ("left", "right"):
+            joint = JOINTS[f"{side}_shoulder"]._replace(sequence=sequence, names=names)
+            if {joint.proximal, joint.distal} <= set(pose.quat_WL):
+                near_lock = _angles(pose, joint, side == "left", NEAR_LOCK).near_lock
+                shares[sequence] = max(shares[sequence], float(np.mean(near_lock)))
     return "YXY" if shares["YXY"] <= MAX_NEAR_LOCK else min(shares, key=lambda sequence: shares[sequence])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -11,18 +12,22 @@ from scipy.special import stdtrit
 
 from ..body.kinematics import Pose, find_samples
 from ..errors import WrongOption, one_of
+from ..filters.butterworth import low_pass
 from ..recording import Intervals
+from ..recording.gaps import find_runs
+from ..rotations import unwrap_signs
 from .curves import MeanCurve, compute_mean_curves
 from .euler import round_to_turns, wrap
 from .joints import AUTO, JOINTS, Angles, JointAngles, joint_angles
 from .repetitions import Repetitions, find_repetitions
-from .smoothing import smooth_pose
-from .tables import summarize_joint
-from .uncertainty import compute_summary_std
+from .tables import compute_summary_std, summarize_joint
 
 MEASURES = {"lowest": "deg", "highest": "deg", "range": "deg", "peak_rate": "deg_s"}  # units in a file
 RANGE = 2  # place of the range among them
 CONFIDENCE = 0.95  # of the interval of a difference
+# A longer time step than this many usual ones ends a run: the samples on its two sides are filtered apart.
+_LONGEST_STEP = 1.5
+_SHORTEST_RUN = 10  # samples; a shorter run is not filtered
 
 
 @dataclass(frozen=True)
@@ -125,6 +130,34 @@ def analyze_movement(name: str, pose: Pose, phases: Mapping[str, Intervals], opt
         compute_mean_curves(angles, repetitions.spans) if len(repetitions.spans) else {},
         options.cutoff_hz,
     )
+
+
+def smooth_pose(pose: Pose, cutoff_hz: float) -> Pose:
+    """Return the pose with orientations low-passed by a Butterworth filter of second order, forwards and backwards.
+
+    Nothing is delayed; at `cutoff_hz` the two passes together halve the amplitude (−6 dB). Filtered are the components
+    of the quaternions, which are normalised afterwards. Points, covariances and gaps stay.
+
+    Raises
+    ------
+    WrongOption
+        The cut-off is not above 0 and below 0.45 of the sampling rate.
+    """
+    step = float(np.median(np.diff(pose.time))) if len(pose.time) > 1 else 1.0
+    if not 0.0 < cutoff_hz < 0.45 / step:
+        raise WrongOption("low-pass-hz", f"{cutoff_hz:g}", f"above 0 and below {0.45 / step:.3g} Hz is needed here")
+    even = np.concatenate([[True], np.diff(pose.time) < _LONGEST_STEP * step])
+    quat_WL = {}
+    for segment, quat in pose.quat_WL.items():
+        smooth = quat.copy()
+        for first, last in find_runs(np.isfinite(quat).all(axis=1)):
+            starts = [first, *(first + 1 + np.flatnonzero(~even[first + 1 : last])), last]
+            for a, b in pairwise(starts):
+                if b - a >= _SHORTEST_RUN:
+                    filtered = low_pass(unwrap_signs(quat[a:b]), cutoff_hz, 1.0 / step)
+                    smooth[a:b] = filtered / np.linalg.norm(filtered, axis=1, keepdims=True)
+        quat_WL[segment] = smooth
+    return replace(pose, quat_WL=quat_WL, q=None)
 
 
 def _select_inside(time: np.ndarray, phases: Mapping[str, Intervals]) -> dict[str, Intervals]:
