@@ -12,7 +12,7 @@ from ..diagnostics import Diagnostic
 from ..errors import BadData, WeposeError
 from ..recording import OrientationSensor, Recording
 from . import BEST, OFFLINE, FilterSettings, Orientation, SensorRun, amekf, check_method, smekf
-from .base import run_in_parallel, symmetric
+from .base import FilterRun, run_in_parallel, symmetric
 from .noise import SensorNoise, estimate_noise
 from .phases import check_common_rotation, check_motion, find_reference_phases
 from .static import StaticState, StaticTest
@@ -113,19 +113,24 @@ class SensorFilters:
 
     def _share_memory(self) -> None:
         """Put the states of all sensors side by side, for `step`."""
-        self.static = np.zeros(len(self._runs), dtype=np.bool_)
-        if self._step is None:
-            self.quat_VS = np.array([run.filter.state.quat_VS for run in self._runs]).reshape(-1, 4)
-            self.gyro_bias = np.array([run.filter.state.gyro_bias for run in self._runs]).reshape(-1, 3)
-            return
-        self._states = np.concatenate([run.filter.state.record for run in self._runs])
-        self._models = np.concatenate([run.filter.model for run in self._runs])
-        detectors = zip(*(run.detector.state for run in self._runs), strict=True)
-        self._detector_states = StaticState(*map(np.concatenate, detectors))
-        self.quat_VS, self.gyro_bias = self._states["quat_VS"], self._states["gyro_bias"]
-        for i, run in enumerate(self._runs):
-            run.filter.state = type(run.filter.state)(self._states[i : i + 1])
-            run.detector.state = StaticState(*(values[i : i + 1] for values in self._detector_states))
+        filters, detectors = [run.filter for run in self._runs], [run.detector for run in self._runs]
+        k = len(filters)
+        self.static = np.zeros(k, dtype=np.bool_)
+        self.quat_VS, self.gyro_bias = np.empty((k, 4)), np.empty((k, 3))
+        if self._step is not None:
+            self._states = np.concatenate([filter_.state.record for filter_ in filters])
+            self._models = np.concatenate([filter_.model for filter_ in filters])
+            self._detector_states = StaticState(
+                *map(np.concatenate, zip(*(detector.state for detector in detectors), strict=True))
+            )
+            self.quat_VS, self.gyro_bias = self._states["quat_VS"], self._states["gyro_bias"]
+        for i, (filter_, detector) in enumerate(zip(filters, detectors, strict=True)):
+            if self._step is not None:
+                filter_.state = type(filter_.state)(self._states[i : i + 1])
+                detector.state = StaticState(*(values[i : i + 1] for values in self._detector_states))
+            else:
+                self.quat_VS[i], self.gyro_bias[i] = filter_.state.quat_VS, filter_.state.gyro_bias
+                filter_.state = type(filter_.state)(self.quat_VS[i], self.gyro_bias[i])
 
     def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """Take a sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²]; return `quat_VS` (k, 4).
@@ -140,8 +145,10 @@ class SensorFilters:
             self._step(self._states, self._models, *self._detector_states, gyro, accel, self.static)
             return self.quat_VS
         for i, run in enumerate(self._runs):
-            out = run.push(gyro[i : i + 1], accel[i : i + 1])
-            self.quat_VS[i], self.gyro_bias[i], self.static[i] = out.quat_VS[0], out.gyro_bias[0], out.static[0]
+            one = slice(i, i + 1)
+            self.static[one] = run.detector.run(gyro[one], accel[one])
+            out = FilterRun(self.quat_VS[one], self.gyro_bias[one], None)
+            run.filter.run(gyro[one], accel[one], self.static[one], out)
         return self.quat_VS
 
     @property
