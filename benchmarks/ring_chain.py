@@ -151,7 +151,8 @@ def write_ring_session(files: RingFiles, mount: str, folder: Path) -> RingSessio
         encoding="utf-8",
     )
     (folder / "ring.urdf").write_text(ring_urdf(), encoding="utf-8")
-    segments = "\n".join(f"{name} = {name!r}" for name in RING_SEGMENTS)
+    foam = "{ foam_deg = [0.6, 0.6, 0.6] }"
+    segments = "\n".join(f"{name} = {foam if mount == 'loose' else repr(name)}" for name in RING_SEGMENTS)
     table = TABLE.format(segments=segments, head=head.tolist(), end=end.tolist())
     (folder / "ring.toml").write_text(table, encoding="utf-8")
     (folder / "optical.toml").write_text(PROTOCOL, encoding="utf-8")

@@ -78,6 +78,7 @@ class Segment(NamedTuple):
     rigid_without_sensor : without a sensor it is rigid with the segment above; False: it is unknown then
     labels : a regular expression of words that mean it in a sensor's name
     joint : the name of the joint to the segment above, where no point names it
+    foam_std : (3,) [rad/rad] by which a foam under its sensor gives, about its axes, per rotation of the segment
     soft_tissue : how far soft tissue rotates its sensor
     start_mean : (3,) [rad] mean rotation vector, in its axes, of people off the neutral pose
     start_std : (3,) [rad] about its axes, one standard deviation of its rotation off the start pose among people
@@ -92,6 +93,7 @@ class Segment(NamedTuple):
     rigid_without_sensor: Annotated[bool, Key("without_sensor", words={"rigid": True, "unknown": False})] = False
     labels: str = ""
     joint: str = ""
+    foam_std: Annotated[Vector, Key("foam_deg", "deg", least=0.0, omit_zero=True)] = ZERO
     soft_tissue: SoftTissue = SoftTissue(_same(1.5))
     start_mean: Annotated[Vector, Key(unit="deg")] = ZERO
     start_std: Angles = _same(4.0)

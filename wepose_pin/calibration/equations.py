@@ -8,12 +8,13 @@ For each sensor i the filter gives R_VS(t) in a world V of its own heading, and 
 the frame of its segment that equals W in the start pose (L' in `observations`). With a start pose that is ε off the
 stated one, R_WL(start) = exp(ε), the mount is R_LS = exp(−ε) Rz(ψ) R_VS(start) and
 
-    R_WL(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε)
+    R_WL(t) = Rz(ψ + d τ) Q(t) Rz(−ψ) exp(ε) exp(A (R_WLᵀ e_z − e_z))
 
-with ψ the heading and d its drift since the start. Skin lags behind a bone that twists: a segment above a hinge has
-turned about its long axis by g times the twist that its sensor shows. A segment's points may move, as the shoulders do
-by collarbones and shoulder blades while the arms are raised (`body.girdle`). d, g and the hinges are nuisance
-parameters: the covariance of lengths and mounts includes their effect.
+with ψ the heading, d its drift since the start, and A the rotation of a sensor on a foam, which gives as the direction
+of gravity in the segment changes. Skin lags behind a bone that twists: a segment above a hinge has turned about its
+long axis by g times the twist that its sensor shows. A segment's points may move, as the shoulders do by collarbones
+and shoulder blades while the arms are raised (`body.girdle`). d, A, g and the hinges are nuisance parameters: the
+covariance of lengths and mounts includes their effect.
 
 Each sample belongs to one condition of the protocol. A closure (`Loop`) gives the gap, whitened by the covariance that
 errors of the orientations and slipping palms give it, and of each hinge the angle by which the segment that it moves
@@ -40,7 +41,7 @@ from ..body.table import Vector
 from ..observations.directions import Level, Pointing
 from ..observations.hinges import HingePlane
 from ..observations.paths import BodySymbols, GirdleTerm, express_covariance, express_path
-from ..observations.symbols import about_z, product, small_rotation
+from ..observations.symbols import about_z, product, rotate_back, small_rotation
 from .conditions import Constraint, Loop, Moving
 
 HINGE_STD = np.deg2rad(2.0)  # [rad] of a segment against its hinge's plane; the unit of these residuals
@@ -83,6 +84,7 @@ class Layout:
     planes : number of level planes of unknown height
     recorded : the samples have a recorded place
     attitude_std : [rad] of each sensor's orientation about an axis across its segment; only the ratios matter
+    soft : sensors on a foam
     """
 
     lengths: tuple[str, ...]
@@ -94,12 +96,14 @@ class Layout:
     planes: int = 0
     recorded: bool = False
     attitude_std: tuple[float, ...] = ()
+    soft: tuple[str, ...] = ()
 
     length: np.ndarray = field(init=False, compare=False)  # (lengths,) [m]
     heading: np.ndarray = field(init=False, compare=False)  # (sensors,) ψ [rad]
     tilt: np.ndarray = field(init=False, compare=False)  # (sensors, 2) ε about x and y of L [rad]
     drift: np.ndarray = field(init=False, compare=False)  # (sensors,) d [rad/s]
     hinge: np.ndarray = field(init=False, compare=False)  # (hinges, 2) of its axis along `across` and `tilted`
+    foam: np.ndarray = field(init=False, compare=False)  # (soft, 9) A [rad], column by column
     twist: np.ndarray = field(init=False, compare=False)  # (twists,) g
     girdle: np.ndarray = field(init=False, compare=False)  # (girdles, 7) `model.girdle.PARAMETERS`
     point: np.ndarray = field(init=False, compare=False)  # (fixed, 3) of W [m]
@@ -114,6 +118,7 @@ class Layout:
             "tilt": (sensors, 2),
             "drift": (sensors,),
             "hinge": (len(self.hinges), 2),
+            "foam": (len(self.soft), 9),
             "twist": (len(self.twists),),
             "girdle": (len(self.girdles), len(PARAMETERS)),
             "point": (self.fixed, 3),
@@ -168,12 +173,16 @@ def sample_functions(layout: Layout, condition: Constraint) -> tuple[ca.Function
 
 
 def _orient_segments(layout: Layout, x: ca.SX, data: ca.SX) -> dict[str, ca.SX]:
-    """Return `quat_WL` (4,) of each segment with a sensor: Rz(ψ + d τ) Q Rz(−ψ) exp(ε), and the twists by g."""
-    quat_WL = {}
+    """Return `quat_WL` (4,) of each segment with a sensor: by foam, and the twists by g, as above."""
+    quat_WL, up = {}, ca.DM([0.0, 0.0, 1.0])
     for i, name in enumerate(layout.sensors):
         heading, drift = x[layout.heading[i]], x[layout.drift[i]]
         quat = product(about_z(heading + drift * data[-1]), data[4 * i : 4 * i + 4])
-        quat_WL[name] = product(product(quat, about_z(-heading)), _start_rotation(layout, x, name))
+        quat = product(product(quat, about_z(-heading)), _start_rotation(layout, x, name))
+        if name in layout.soft:
+            A = ca.reshape(x[layout.foam[layout.soft.index(name)]], 3, 3)
+            quat = product(quat, small_rotation(A @ (rotate_back(quat, up) - up)))
+        quat_WL[name] = quat
     for (name, above, along, _), lag in zip(layout.twists, ca.vertsplit(x[layout.twist]), strict=True):
         relative = product(ca.vertcat(-quat_WL[above][:3], quat_WL[above][3]), quat_WL[name])
         part, w = ca.dot(relative[:3], ca.DM(along)), relative[3]

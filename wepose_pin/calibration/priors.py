@@ -25,6 +25,7 @@ from .problem import CalibrationProblem
 STATED_STD = np.deg2rad(10.0)  # [rad] of a stated mount's heading
 HEADING_STD = np.pi / np.sqrt(3.0)  # [rad] of an unknown heading: the whole circle
 DRIFT_STD = np.deg2rad(1.0) / 60.0  # [rad/s]
+LEAST_FOAM_STD = 1e-4  # [rad/rad] about an axis about which a table states that no foam gives
 LEAST_GIRDLE_STD = 1e-5  # [m] of a parameter that a table states as exact
 POINT_STD = 3.0  # [m] of an unknown point of W
 
@@ -48,6 +49,9 @@ def build_prior(problem: CalibrationProblem, observations: Observations) -> Gaus
         offset, information[np.ix_(rows, rows)] = _mount_prior(problem, name, stated_headings.get(name))
         mean[rows] += offset
     information[layout.drift, layout.drift] = DRIFT_STD**-2
+    for name, rows in zip(layout.soft, layout.foam, strict=True):
+        std = np.maximum(np.tile(problem.model.table.segments[name].foam_std, 3), LEAST_FOAM_STD)
+        information[rows, rows] = std**-2.0
     _add_hinges(information, layout, problem.model.table)
     return Gaussian(mean, information)
 

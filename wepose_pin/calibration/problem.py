@@ -282,6 +282,7 @@ class CalibrationProblem:
             sum(closure.kind == "fixed_point" for closure in protocol.closures),
             sum(closure.kind == "plane" for closure in protocol.closures),
             recorded=any(closure.kind == "recorded" for closure in protocol.closures),
+            soft=tuple(name for name in sensors if any(self.model.table.segments[name].foam_std)),
             attitude_std=tuple(_estimate_attitude_std(self.model.table.segments[name]) for name in sensors),
         )
         parts, places = [], []
