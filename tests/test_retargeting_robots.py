@@ -18,9 +18,9 @@ from wepose_pin import errors, retargeting
 from wepose_pin.body.kinematics import Pose
 from wepose_pin.body.urdf import find_example_data
 from wepose_pin.retargeting.collision import CollisionModel
+from wepose_pin.retargeting.placement import place_root
 from wepose_pin.retargeting.reconfiguration import Planner
 from wepose_pin.retargeting.targets import compute_target_reach
-from wepose_pin.retargeting.visuals import place_root
 
 pytest.importorskip("daqp")
 pytestmark = [

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import polars as pl
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
@@ -173,9 +174,15 @@ class Angles:
         return iter(self.joints)
 
     def _repr_html_(self) -> str:
-        from .tables import summary_table
-
-        return summary_table(self)._repr_html_()
+        """The range of each angle in degrees, a row an angle."""
+        rows = [
+            {"joint": name, "angle": angle, "lowest_deg": lowest, "highest_deg": highest}
+            for name, joint in self.joints.items()
+            for angle, lowest, highest in zip(
+                joint.names, *np.degrees(np.nanquantile(joint.values, (0.0, 1.0), axis=0)), strict=True
+            )
+        ]
+        return pl.DataFrame(rows)._repr_html_()
 
     def __repr__(self) -> str:
         return f"Angles({', '.join(self.joints)}: {len(self.time)} samples)"

@@ -18,9 +18,10 @@ from ..body.kinematics import KinematicsSolver, Pose
 from ..body.links import find_known_links
 from ..errors import WeposeError
 from ..report.viewer import Mesh, find_floor, visible
+from ..retargeting.placement import place_beside_person
 from ..retargeting.robot import Robot
 from ..retargeting.targets import find_person_arm
-from ..retargeting.visuals import build_parts, place_beside_person
+from ..retargeting.visuals import build_parts
 from .state import LivePose, StreamInfo, round_finite
 
 CURVE_RATE_HZ = 20.0  # of joint angles

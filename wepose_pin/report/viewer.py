@@ -143,8 +143,9 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
 
     The hands at their targets, beyond the reach too, are drawn translucent.
     """
+    from ..retargeting.placement import place_beside_person
     from ..retargeting.targets import find_person_arm
-    from ..retargeting.visuals import build_parts, compute_placements, compute_target_placements, place_beside_person
+    from ..retargeting.visuals import build_parts, compute_placements, compute_target_placements
 
     frames = frame_indices(trajectory.time, fps)
     nearest = np.abs(pose.time[:, None] - trajectory.recorded_time[frames][None, :]).argmin(axis=0)

@@ -10,19 +10,19 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from ..body.urdf import read_urdf, resolve_meshes
+from ..body.urdf import resolve_meshes
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
 from ..recording import format_span, format_time
-from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY, JointMotion
+from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY
 from ..writers.result import write_table
 from .checks import LimitCheck, SelfCollisions
 from .collision import AT_REST, CLEARANCE
 from .error_attribution import CLAMPED, FAR, MissedTarget, assess_reachability, attribute_errors, find_missed_targets
+from .placement import place_root
 from .reconfiguration import LOST_M
-from .robot import Robot
 from .targets import compute_target_reach
 from .trajectory import Trajectory
-from .visuals import find_missing_visuals, place_root
+from .visuals import find_missing_visuals
 
 DIGITS = 8  # of angles in text
 MAX_MOMENTS = 6  # that a diagnostic names
@@ -72,38 +72,6 @@ def _format_joint_trajectory(trajectory: Trajectory) -> str:
     )
 
 
-def build_joint_motion(trajectory: Trajectory) -> JointMotion:
-    """Return the trajectory as writers of other programs' files take it, the robot standing on the floor."""
-    robot, urdf = trajectory.robot, trajectory.robot.map.urdf
-    R_WB, p_WB = place_root(robot)
-    return JointMotion(
-        name=robot.map.name,
-        where=robot.map.name,
-        robot=read_urdf(urdf),
-        urdf=resolve_meshes(urdf),
-        joints=robot.names,
-        time=trajectory.time,
-        position=trajectory.joint_position,
-        velocity=trajectory.run.joint_velocity,
-        posture=_list_posture(robot),
-        p_WB=p_WB,
-        quat_WB=Rotation.from_matrix(R_WB).as_quat(),
-        recorded_time=trajectory.recorded_time,
-        begin=trajectory.approach_samples,
-    )
-
-
-def _list_posture(robot: Robot) -> dict[str, float]:
-    """Joint that the trajectory does not move → its value in the rest posture [rad or m]."""
-    full, posture = robot.full, {}
-    for name in full.names[1:]:
-        joint = full.getJointId(name)
-        if name not in robot.names and full.nvs[joint] == 1:
-            q = robot.rest_full[full.idx_qs[joint] :][: full.nqs[joint]]
-            posture[name] = float(q[0]) if len(q) == 1 else float(np.arctan2(q[1], q[0]))
-    return posture
-
-
 def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:
     """Contents of ``summary.json``."""
     robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
@@ -125,7 +93,7 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "robot": robot.map.name,
         "urdf": robot.map.urdf.name,
         "joints": list(robot.names),
-        "posture": _list_posture(robot),
+        "posture": robot.posture,
         "root": dict(zip(("x", "y", "z", "qx", "qy", "qz", "qw"), root, strict=True)),
         "description": robot.map.description,
         "rate_hz": round(1.0 / dt, 3),

@@ -110,6 +110,17 @@ class Robot:
         return [(self.model.idx_qs[j], self.model.nqs[j]) for j in range(1, self.model.njoints)]
 
     @property
+    def posture(self) -> dict[str, float]:
+        """Joint that does not move → its value in the rest posture [rad or m]."""
+        full, posture = self.full, {}
+        for name in full.names[1:]:
+            joint = full.getJointId(name)
+            if name not in self.names and full.nvs[joint] == 1:
+                q = self.rest_full[full.idx_qs[joint] :][: full.nqs[joint]]
+                posture[name] = float(q[0]) if len(q) == 1 else float(np.arctan2(q[1], q[0]))
+        return posture
+
+    @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Position limits (n,), (n,) within a turn to each side, for sampling."""
         return np.clip(self.lower, -np.pi, np.pi), np.clip(self.upper, -np.pi, np.pi)

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..arguments import check_arguments
 from ..body import BodyTable
 from ..body.kinematics import Pose, find_samples
+from ..body.urdf import read_urdf, resolve_meshes
 from ..errors import BadOption, NoSolution, WrongOption
 from ..recording import Intervals, select_interval
 from ..tracking import TrackResult
@@ -29,6 +30,7 @@ from .collision import CollisionModel
 from .controller import ControllerParams, JointState, PostureReference, QpController, StepReport
 from .limits import MAX_STOP_S
 from .maps import find_map, list_sides
+from .placement import place_root
 from .reconfiguration import QUINTIC_PEAK_SPEED, Planner
 from .robot import LimitMargins, Robot, load_robot
 from .targets import SMOOTHING_HZ, WEIGHT_POOR, ArmTargets, HandPath, compute_arm_targets, compute_swivel
@@ -138,10 +140,24 @@ class Trajectory:
         return np.round(self.recorded_time[states & ~np.roll(states, 1)], 2).tolist()
 
     def joint_motion(self) -> JointMotion:
-        """Return the motion as `export` takes it."""
-        from .files import build_joint_motion
-
-        return build_joint_motion(self)
+        """Return the motion as `export` takes it, the robot standing on the floor."""
+        robot, urdf = self.robot, self.robot.map.urdf
+        R_WB, p_WB = place_root(robot)
+        return JointMotion(
+            name=robot.map.name,
+            where=robot.map.name,
+            robot=read_urdf(urdf),
+            urdf=resolve_meshes(urdf),
+            joints=robot.names,
+            time=self.time,
+            position=self.joint_position,
+            velocity=self.run.joint_velocity,
+            posture=robot.posture,
+            p_WB=p_WB,
+            quat_WB=Rotation.from_matrix(R_WB).as_quat(),
+            recorded_time=self.recorded_time,
+            begin=self.approach_samples,
+        )
 
 
 def retarget(
