@@ -202,8 +202,8 @@ def _project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose
     """Return names and covariance of the lengths, mount errors and girdles, from that of x.
 
     Mounts are R_LS = exp(−ε) Rz(ψ) R_VS(start). Their errors are turned from the frames that equal W in the start pose
-    to those of the segments. By how much a person turns a segment about the vertical in the start pose is not in them:
-    no closure shows it.
+    to those of the segments. A mount's tilt is that of one recording: soft tissue in any pose is added to it. By how
+    much a person turns a segment about the vertical in the start pose is not in them: no closure shows it.
     """
     K, rows = len(layout.lengths), [row for name in layout.sensors for row in mount_rows(name)]
     of_girdles = [f"girdles.{term.name}.{parameter}" for term in layout.girdles for parameter in PARAMETERS]
@@ -215,4 +215,8 @@ def _project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose
         own[[0, 1], layout.tilt[i]] = -1.0
         own[2, layout.heading[i]] = 1.0
         T[K + 3 * i : K + 3 * i + 3] = start.rotation(name).T @ own
-    return (*layout.lengths, *rows, *of_girdles), T @ covariance @ T.T
+    projected = T @ covariance @ T.T
+    for i, name in enumerate(layout.sensors):
+        tilts = K + 3 * i + np.arange(2)
+        projected[tilts, tilts] += np.square(start.table.segments[name].soft_tissue.std[:2])
+    return (*layout.lengths, *rows, *of_girdles), projected
