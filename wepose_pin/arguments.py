@@ -74,25 +74,25 @@ def check_fields(value: Any, place: str, kind: type | None = None) -> None:
 
 def check_value(place: str, value: Any, hint: Any) -> None:
     """Check a value and its contents against an annotation; `place` begins the error's text."""
-    if get_origin(hint) is Annotated and not isinstance(get_args(hint)[1], Range):  # it says how a file has the value
-        hint = get_args(hint)[0]
+    if _origin(hint) is Annotated and not isinstance(_parts(hint)[1], Range):  # it says how a file has the value
+        hint = _parts(hint)[0]
     if type(value) is hint and hint in _PLAIN and value == value:  # the usual case, ten times as fast
         return
     if not _fits(value, hint):
         raise BadOption(f"{place} = {_format_value(value)}: {_describe_hint(hint)} is needed")
     hint = next((option for option in _list_options(hint) if _fits(value, option)), hint)
-    parts = get_args(hint)
-    if get_origin(hint) is Annotated:
+    parts = _parts(hint)
+    if _origin(hint) is Annotated:
         if value not in parts[1]:
             raise BadOption(f"{place} = {_format_value(value)}: {_describe_hint(hint)} is needed")
-    elif get_origin(hint) is Literal:
+    elif _origin(hint) is Literal:
         if value not in parts:
             raise BadOption(f"{place} = {_format_value(value)} is not known; {one_of(parts, value)}")
     elif isinstance(value, Mapping):
         for name, entry in value.items() if parts else ():
             check_value(f"{place}: name", name, parts[0])
             check_value(f"{place}.{name}", entry, parts[1])
-    elif get_origin(hint) in (tuple, Sequence):
+    elif _origin(hint) in (tuple, Sequence):
         each = [parts[0]] * len(value) if parts[-1] is ... or len(parts) == 1 else list(parts)
         if len(value) != len(each):
             raise BadOption(f"{place} = {_format_value(value)}: {len(each)} values are needed, not {len(value)}")
@@ -182,18 +182,28 @@ def _read_hints(function: Any) -> dict[str, Any]:
     return {name: hint for name, hint in hints.items() if name != "return" and not name.startswith("_")}
 
 
+@cache  # asked again for the same few annotations at each call
+def _origin(hint: Any) -> Any:
+    return get_origin(hint)
+
+
+@cache
+def _parts(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint)
+
+
 @cache
 def _list_options(hint: Any) -> tuple[Any, ...]:
-    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    return _parts(hint) if _origin(hint) in (Union, UnionType) else (hint,)
 
 
 def _fits(value: Any, hint: Any) -> bool:
     """Return whether a value has the kind of an annotation; its contents are not checked."""
-    origin = get_origin(hint)
+    origin = _origin(hint)
     if len(_list_options(hint)) > 1:
         return any(_fits(value, option) for option in _list_options(hint))
     if origin is Annotated:
-        return _fits(value, get_args(hint)[0])
+        return _fits(value, _parts(hint)[0])
     if hint is Any:
         return True
     if hint in (float, int):
@@ -209,8 +219,8 @@ def _describe_hint(hint: Any) -> str:
     """Describe an annotation in words."""
     if len(_list_options(hint)) > 1:
         return ", or ".join(dict.fromkeys(_describe_hint(option) for option in _list_options(hint)))
-    if get_origin(hint) is Annotated:
-        kind, limits = get_args(hint)[:2]
+    if _origin(hint) is Annotated:
+        kind, limits = _parts(hint)[:2]
         return f"a {'whole' if kind is int else 'finite'} number {limits}"
     words = {
         bool: "True or False",
@@ -223,9 +233,9 @@ def _describe_hint(hint: Any) -> str:
         Callable: "a function",
         NoneType: "None",
         np.ndarray: "an array of real numbers",
-        Literal: f"one of {', '.join(map(str, get_args(hint)))}",
+        Literal: f"one of {', '.join(map(str, _parts(hint)))}",
     }
-    kind = get_origin(hint) or hint
+    kind = _origin(hint) or hint
     return words.get(kind) or f"an object of class {kind.__name__}"
 
 
