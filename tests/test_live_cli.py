@@ -97,7 +97,7 @@ def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest
     for arguments, said in (
         (["--source", "mti:/dev/null=torso"], f"how the sensor of torso is {unknown}"),
         (["--source", "udp:9000"], f"how the sensors are {unknown}"),
-        (["--source", "telepathy:9"], "source 'telepathy:9' is none; there is: "),
+        (["--source", "smoke:9"], "source 'smoke:9' is none; there is: "),
         (["--source", "replay:nowhere"], "nowhere: no such file"),
         (["--source", replay, "--speed", "-1"], "speed: '-1'; a positive number"),
         (["--source", replay, "--record", str(file)], "there.mcap: exists; --force replaces it"),

@@ -15,10 +15,11 @@ They are states, so that a long recording does not average them away.
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 import weakref
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 from scipy.special import expit, logit
@@ -415,23 +416,28 @@ def _information_by_care(problem: HeadingProblem) -> np.ndarray:
     return np.asarray((CAREFUL_SHARE**-2 - 1.0) / problem.start_var)
 
 
+def _close(file: IO[bytes]) -> None:
+    """Close a temporary file; what a full disk has not taken is of no use any more."""
+    with contextlib.suppress(OSError):
+        file.close()
+
+
 class HeadingSmoother:
     """Filters knots one by one, and smooths them after the last (Rauch, Tung, Striebel 1965).
 
     What the way back needs of each knot is in a temporary file: of a day it is gigabytes.
-
     """
 
     def __init__(self, problem: HeadingProblem) -> None:
         self._problem, self._filter = problem, HeadingFilter(problem)
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  it lasts as long as this object
-        weakref.finalize(self, self._file.close)
+        weakref.finalize(self, _close, self._file)
         self._times: list[float] = []  # [s] of the knots' middles
 
     def add(self, knot: Knot) -> None:
         """Filter the next knot."""
         change = self._filter.step(knot)
-        np.concatenate([self._filter.x, self._filter.P.ravel(), *change]).tofile(self._file)
+        self._file.write(np.concatenate([self._filter.x, self._filter.P.ravel(), *change]).tobytes())
         self._times.append(0.5 * (knot.time[0] + knot.end))
 
     def _read(self, i: int) -> tuple[np.ndarray, np.ndarray, KnotChange]:
