@@ -10,7 +10,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.girdle import PARAMETERS
-from ..body.start_pose import StartPose
 from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject, mount_rows
 from ..errors import NoSolution
 from ..observations.hinges import find_hinges
@@ -132,7 +131,7 @@ def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
         gap=gap,
         prior_gap=prior_gap,
         contact=result.contact,
-        prior_covariance=_project_to_subject(layout, prior_cov, problem.start_pose)[1],
+        prior_covariance=_project_to_subject(problem, layout, prior_cov)[1],
         quat_WL=problem.orient_segments(subject.mounts, samples),
         measured_lengths=compare_measured(fit, layout, problem.measured, least_std),
         hinge_rms=hinge_rms,
@@ -158,7 +157,7 @@ def _make_subject(problem: CalibrationProblem, solution: _Solution) -> tuple[Sub
         start_W = Rotation.from_rotvec([0.0, 0.0, psi]) * filtered.R_VS_start[name]
         mounts[name] = (problem.start_rotation(name).inv() * start_W).as_quat()
     hinges = _estimate_hinges(problem, solution)
-    order, covariance = _project_to_subject(layout, solution.covariance, problem.start_pose)
+    order, covariance = _project_to_subject(problem, layout, solution.covariance)
     subject = replace(
         problem.prior,
         name=problem.recording.name,
@@ -198,12 +197,14 @@ def _estimate_hinges(problem: CalibrationProblem, solution: _Solution) -> Mappin
     return hinges
 
 
-def _project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose) -> tuple[tuple[str, ...], np.ndarray]:
+def _project_to_subject(
+    problem: CalibrationProblem, layout: Layout, covariance: np.ndarray
+) -> tuple[tuple[str, ...], np.ndarray]:
     """Return names and covariance of the lengths, mount errors and girdles, from that of x.
 
     Mounts are R_LS = exp(−ε) Rz(ψ) R_VS(start). Their errors are turned from the frames that equal W in the start pose
-    to those of the segments. A mount's tilt is that of one recording: soft tissue in any pose is added to it. By how
-    much a person turns a segment about the vertical in the start pose is not in them: no closure shows it.
+    to those of the segments. The tilt of a new mount is that of one recording: soft tissue in any pose is added to it.
+    By how much a person turns a segment about the vertical in the start pose is not in them: no closure shows it.
     """
     K, rows = len(layout.lengths), [row for name in layout.sensors for row in mount_rows(name)]
     of_girdles = [f"girdles.{term.name}.{parameter}" for term in layout.girdles for parameter in PARAMETERS]
@@ -214,9 +215,11 @@ def _project_to_subject(layout: Layout, covariance: np.ndarray, start: StartPose
         own = np.zeros((3, layout.size))
         own[[0, 1], layout.tilt[i]] = -1.0
         own[2, layout.heading[i]] = 1.0
-        T[K + 3 * i : K + 3 * i + 3] = start.rotation(name).T @ own
+        T[K + 3 * i : K + 3 * i + 3] = problem.start_pose.rotation(name).T @ own
     projected = T @ covariance @ T.T
+    known = {} if problem.recording.remounted else problem.prior.mounts
     for i, name in enumerate(layout.sensors):
-        tilts = K + 3 * i + np.arange(2)
-        projected[tilts, tilts] += np.square(start.table.segments[name].soft_tissue.std[:2])
+        if name not in known:
+            tilts = K + 3 * i + np.arange(2)
+            projected[tilts, tilts] += np.square(problem.model.table.segments[name].soft_tissue.std[:2])
     return (*layout.lengths, *rows, *of_girdles), projected
