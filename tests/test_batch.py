@@ -60,7 +60,10 @@ def test_a_study_is_made_once_and_what_fails_is_named(study: Path) -> None:
     assert (again.reused, files(study / "out" / "items")) == (2, before)
 
 
-@pytest.mark.parametrize("change", ["recording", "options", "code"])
+@pytest.mark.parametrize(
+    "change",
+    ["recording", pytest.param("options", marks=pytest.mark.slow), pytest.param("code", marks=pytest.mark.slow)],
+)
 def test_what_has_changed_is_made_again_by_force_only(study: Path, change: str) -> None:
     for name in ("two", "three"):
         shutil.rmtree(study / "data" / name)

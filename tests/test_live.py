@@ -175,7 +175,7 @@ def test_rates_in_deg_s_are_said_while_the_person_waits(
 def test_takes_and_marks_are_phases_and_texts_of_the_recording(
     recording: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Stage, "STATUS_PERIOD_S", 1e-3)
+    monkeypatch.setattr(Stage, "STATUS_PERIOD_S", 3e-2)
     file = tmp_path / "a.mcap"
     take, phase = Request("take"), Request("phase", "clasp")
     asked = [(9.0, take), (12.0, Request("text", "trial 3")), (15.0, take), (16.0, phase), (18.0, phase), (20.0, take)]
