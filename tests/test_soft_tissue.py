@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wepose_pin.body import load_model
 from wepose_pin.body.soft_tissue import SoftTissueCorrection, TissueMean
+from wepose_pin.body.subject import Hinge, population_subject
 from wepose_pin.body.table_file import load_table
 from wepose_pin.calibration import calibrate
 from wepose_pin.simulation import IDEAL_PRESET, simulate, simulate_person
@@ -55,6 +57,13 @@ def test_a_raised_arm_that_points_up_is_turned_smoothly() -> None:
 def test_no_means_change_nothing() -> None:
     quats = np.random.default_rng(0).normal(size=(5, 3, 4))
     assert SoftTissueCorrection(TABLE, {}, SEGMENTS).correct(quats) is quats
+
+
+@pytest.mark.parametrize(("shown", "used"), [(7.0, 0.675), (0.4, 0.4), (-2.0, 0.0)])
+def test_a_lag_beyond_all_people_is_no_skin(shown: float, used: float) -> None:
+    hinge = Hinge(np.array((0.0, 1.0, 0.0)), 0.05, shown)
+    subject = replace(population_subject(), hinges={"right_elbow": hinge})
+    assert subject.shape(load_model()).tissue_means["right_upper_arm"].lag == pytest.approx(used)
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0])

@@ -281,7 +281,9 @@ class Subject:
                 usual_axis, hinge = np.array(hinges[shown[name]].axis), self.hinges[shown[name]]
                 start_var = segment.start_std[2] ** 2
                 angle = np.arctan2(np.cross(usual_axis, hinge.axis)[2], usual_axis @ hinge.axis)
-                lag, start = hinge.twist_lag or 0.0, float(start_var / (start_var + HINGE_PLANE_STD**2) * angle)
+                # What a hinge shows beyond all people is no skin: a wrong axis, or a sensor that slides.
+                lag = min(max(hinge.twist_lag or 0.0, 0.0), MOST_TISSUE_SHARE * segment.soft_tissue.mean_per_twist)
+                start = float(start_var / (start_var + HINGE_PLANE_STD**2) * angle)
             means[name] = TissueMean(share, lag, start)
         return means
 
