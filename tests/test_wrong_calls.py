@@ -1,14 +1,13 @@
-"""Wrong calls of the public functions, from a table: each ends in an error that names what is wrong with it."""
+"""Wrong calls of the public functions, from a table: each ends in one line that names what is wrong with it."""
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +15,6 @@ from arms import person as moving_arm
 from arms import write_arm
 
 import wepose_pin as wp
-from wepose_pin.body.subject import HeadingDrift, Hinge, StartPoseOffset
-from wepose_pin.diagnostics import WARNING, Diagnostic
 from wepose_pin.errors import BadData
 from wepose_pin.filters import AmekfParams
 from wepose_pin.retargeting import ControllerParams
@@ -25,68 +22,12 @@ from wepose_pin.simulation import Imperfections, ImuNoise
 from wepose_pin.tracking import TrackResult
 
 NAN, INF = float("nan"), float("inf")
-ANYTHING = object()
-
-# Wrong values for a parameter of each kind; None is one of them where the parameter is not optional.
-FLAG = ("no", "true", "", 1.5, 2, [], {})
-NUMBER = ("100", "", b"1", NAN, INF, -INF, True, [1.0], {}, 1j, ANYTHING)
-POSITIVE = (*NUMBER, -1.0, 0.0)
-COUNT = (*NUMBER, -1, 1.5)
-NAME = ("nonsense", "", 3, 1.5, True, ["amekf"], {}, b"amekf", ANYTHING)
-THING = ("x", 3, NAN, True, [], {}, ANYTHING, np.zeros(3))
-PATH = (3, 1.5, True, [], {}, b"x", ANYTHING)
-INTERVAL = (
-    "x",
-    3.0,
-    (1.0,),
-    (1.0, 2.0, 3.0),
-    (NAN, 2.0),
-    ("0", "2"),
-    (2.0, 1.0),
-    (1.0, 1.0),
-    np.array([0.5, 2.0]),
-    ANYTHING,
-)
-LENGTHS = (
-    "x",
-    3.0,
-    [0.3],
-    {"nonsense": 0.3},
-    {"left_forearm": "0.3"},
-    {"left_forearm": NAN},
-    {"left_forearm": -0.3},
-    {"left_forearm": 0.0},
-    {"left_forearm": None},
-    {"left_forearm": True},
-    {"left_forearm": 25.0},
-    {3: 0.3},
-)
-SAMPLES = (
-    None,
-    "x",
-    3.0,
-    np.zeros(600),
-    np.zeros((600, 4)),
-    np.zeros((0, 3)),
-    np.zeros((599, 3)),
-    np.full((600, 3), NAN),
-    np.full((600, 3), "x"),
-    np.zeros((600, 3), dtype=complex),
-    [[0.0, 0.0]],
-    ANYTHING,
-)
-
-
-class Wrong(NamedTuple):
-    """One wrong call."""
-
-    function: str
-    names: str  # what the message must name
-    changed: dict[str, Any]  # arguments in place of those of the right call
-
-    def __str__(self) -> str:
-        shown = ", ".join(f"{name}={str(value)[:40]}" for name, value in self.changed.items())
-        return f"{self.function}({shown}) [{self.names}]"
+POSITIVE = ("100", NAN, INF, True, -1.0, 0.0)  # wrong for a number above 0
+NAME = ("nonsense", "", 3)
+PATH = (3, b"x")
+INTERVAL = ("x", (1.0,), (NAN, 2.0), (2.0, 1.0))
+LENGTHS = (*({"left_forearm": wrong} for wrong in ("0.3", NAN, -0.3, 0.0, 25.0)), {"nonsense": 0.3}, [0.3])
+SAMPLES = (None, np.zeros((600, 4)), np.zeros((599, 3)), np.full((600, 3), NAN), np.full((600, 3), "x"))
 
 
 @cache
@@ -128,90 +69,64 @@ def right() -> dict[str, dict[str, Any]]:
     }
 
 
-# Function → parameter → wrong values. One that is optional takes None.
+# Function → parameter → wrong values.
 TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
-    "load_session": {"path": (*PATH, None), "gaps": (*FLAG, None)},
-    "load_subject": {"path": (*PATH, None)},
-    "load_result": {"folder": (*PATH, None, "nowhere")},
-    "load_model": {
-        "path": PATH,
-        "lengths": LENGTHS,
-        "segments": ("x", 3, [], {"torso": 3}),
-        "points": ("x", 3, []),
-        "up": ("z", 3, None, "+w"),
-        "forward": ("x", 3, None, "+w"),
-        "root": (3, 1.5, True),
-    },
+    "load_session": {"path": PATH, "gaps": ("no", None)},
+    "load_subject": {"path": PATH},
+    "load_result": {"folder": (*PATH, "nowhere")},
+    "load_model": {"path": PATH, "lengths": LENGTHS, "segments": ("x", []), "up": ("z", "+w"), "root": (3,)},
     "population_subject": {"stature": (*POSITIVE, 175.0, 0.3), "sex": NAME},
     "estimate_orientation": {
         "gyro_S": SAMPLES,
         "accel_S": SAMPLES,
-        "rate_hz": (*POSITIVE, None),
+        "rate_hz": POSITIVE,
         "static": (*INTERVAL, (-1.0, 2.0), (0.0, 1e6)),
-        "method": (*NAME, None),
-        "params": ("x", 3, {}, AmekfParams),
-        "static_test": THING,
+        "method": NAME,
+        "params": ("x", AmekfParams),
+        "static_test": (3,),
     },
     "track": {
-        "recording": (*THING, None),
-        "subject": THING,
-        "method": (*NAME, None),
-        "model": THING,
-        "static_test": THING,
-        "open_loop": (*FLAG, None),
-        "causal": (*FLAG, None),
-        "limits": (*FLAG, None),
-        "accept_failed": (*FLAG, None),
+        "recording": ("session.toml", None),
+        "subject": ("anna",),
+        "method": NAME,
+        "model": ("upper_body.urdf",),
+        "causal": ("no",),
     },
     "calibrate": {
-        "recording": (*THING, None),
+        "recording": ("session.toml",),
         "measured": LENGTHS,
-        "prior": THING,
+        "prior": ("anna",),
         "stature": (*POSITIVE, 175.0),
         "sex": NAME,
         "protocol": NAME,
-        "method": (*NAME, None),
-        "measured_std": (*POSITIVE, None),
-        "formulation": (*NAME, None),
+        "method": NAME,
+        "measured_std": POSITIVE,
+        "formulation": NAME,
     },
-    "evaluate": {
-        "pose": (*THING, None),
-        "truth": (*THING, None),
-        "interval": (*INTERVAL, (1e6, 2e6)),
-    },
-    "joint_angles": {
-        "pose": (*THING, None),
-        "sequence": (*NAME, None),
-        "near_lock": (*POSITIVE, None, 10.0),
-    },
+    "evaluate": {"pose": ("result",), "truth": (None,), "interval": (*INTERVAL, (1e6, 2e6))},
+    "joint_angles": {"pose": ("result",), "sequence": NAME, "near_lock": (*POSITIVE, 10.0)},
     "export": {
-        "result": (*PATH, None, "nowhere"),
-        "file": (*PATH, None, "out.nonsense"),
+        "result": (*PATH, "nowhere"),
+        "file": (*PATH, "out.nonsense"),
         "format": NAME,
         "names": NAME,
         "rate_hz": POSITIVE,
-        "force": (*FLAG, None),
-        "provenance": ("x", 3, []),
     },
     "retarget": {
-        "pose": (*THING, None),
-        "robot": (*THING, None, "pandas", "nowhere.urdf"),
-        "rate_hz": (*POSITIVE, None, 1e9),
-        "params": THING,
+        "pose": (3,),
+        "robot": ("pandas", "nowhere.urdf"),
+        "rate_hz": (*POSITIVE, 1e9),
         "scale": POSITIVE,
-        "smoothing_hz": (*NUMBER, None, -1.0),
-        "strict": (*FLAG, None),
-        "progress": ("x", 3),
+        "smoothing_hz": (NAN, -1.0),
     },
     "simulate": {
-        "lengths": (*LENGTHS, None),
-        "seed": ("x", 1.5, NAN, True, None, -1),
-        "rate_hz": (*POSITIVE, None),
-        "noise": (*THING, None),
-        "imperfections": (*THING, None),
-        "clasp_s": (*POSITIVE, None),
-        "circles": (*COUNT, None),
-        "protocol": (*NAME, None),
+        "lengths": LENGTHS,
+        "seed": (1.5, -1),
+        "rate_hz": POSITIVE,
+        "noise": ("x",),
+        "clasp_s": POSITIVE,
+        "circles": (-1, 1.5),
+        "protocol": NAME,
     },
 }
 
@@ -220,260 +135,100 @@ def wrong_recordings(recording: wp.Recording) -> Iterator[tuple[str, wp.Recordin
     """What a recording made by hand may have wrong, and what its error must name."""
     time, torso = recording.time, recording.sensors["torso"]
     n = len(time)
+    gap = np.array(torso.gyro_S)
+    gap[100] = NAN
+    quat = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
 
     def sensor(**changed: Any) -> wp.Recording:
         return replace(recording, sensors={**recording.sensors, "torso": replace(torso, **changed)})
 
-    def at(values: np.ndarray, k: int, value: Any) -> np.ndarray:
-        changed = np.array(values)
-        changed[k] = value
-        return changed
-
-    for rate in (*POSITIVE, None, 10.0 * recording.rate_hz, 0.1 * recording.rate_hz, 1.05 * recording.rate_hz):
+    for rate in (*POSITIVE, 10.0 * recording.rate_hz, 1.05 * recording.rate_hz):
         yield "rate_hz", replace(recording, rate_hz=rate)
-    jump = np.where(np.arange(n) < n // 2, 0.0, 0.5)
-    for times in (
-        None,
-        "x",
-        list(time),
-        time[:, None],
-        time[: n // 2],
-        time[:0],
-        time[::-1].copy(),
-        np.zeros(n),
-        time + jump,
-        1e3 * time,
-        at(time, 100, NAN),
-        at(time, 100, INF),
-        at(time, 100, time[99]),
-        time.astype(str),
-        time.astype(complex),
-    ):
+    for times in (None, list(time), time[: n // 2], time[:0], time[::-1].copy(), 1e3 * time, time.astype(str)):
         yield "time", replace(recording, time=times)
-    for name in ("gyro_S", "accel_S"):
-        values = getattr(torso, name)
-        for samples in (
-            None,
-            "x",
-            values.tolist(),
-            values[:-1],
-            np.vstack([values, values]),
-            values[:, :2],
-            values.T,
-            values[:, 0],
-            np.full_like(values, NAN),
-            at(values, 100, NAN),
-            at(values, 100, INF),
-            values.astype(str),
-            values.astype(complex),
-        ):
-            yield "torso", sensor(**{name: samples})
-    for unit in (1.0 / 9.81, 1e3 / 9.81):
-        yield "torso.accel_S", sensor(accel_S=unit * torso.accel_S)
-    quat = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
-    for quats in (2.0 * quat, np.zeros((n, 4)), quat[:, :3], quat[:-1], at(quat, 5, NAN), quat.tolist(), "x", None):
+    for samples in (None, torso.gyro_S[:-1], torso.gyro_S.T, torso.gyro_S[:, :2], gap):
+        yield "torso", sensor(gyro_S=samples)
+    yield "torso.accel_S", sensor(accel_S=torso.accel_S / 9.81)  # in g
+    for quats in (2.0 * quat, quat[:, :3], quat[:-1]):
         yield "torso", replace(recording, sensors={**recording.sensors, "torso": wp.OrientationSensor(quats)})
-    for mount in ("+x", [0.0, 0.0, 0.0, 1.0], np.zeros(4), np.array([0.0, 0.0, 0.0, 2.0]), np.eye(3), np.full(4, NAN)):
+    for mount in ("+x", np.eye(3), np.array([0.0, 0.0, 0.0, 2.0])):
         yield "stated_quat_LS", sensor(stated_quat_LS=mount)
-    for gap in ("x", np.zeros(n), np.zeros(n - 1, dtype=bool), [False] * n):
-        yield "gap", sensor(gap=gap)
-    for aligned in ("no", None, 2):
-        fused = wp.OrientationSensor(quat, aligned=aligned)
-        yield "aligned", replace(recording, sensors={**recording.sensors, "torso": fused})
-    for sensors in (None, {}, [torso], "x", {"torso": None}, {"torso": "x"}, {3: torso}):
+    for sensors in ({}, [torso], {**recording.sensors, "left_arm": torso}):
         yield "sensors", replace(recording, sensors=sensors)
-    for name in ("trunk", "left_arm", "Torso", ""):
-        yield "sensors", replace(recording, sensors={**recording.sensors, name: torso})
-    for phases in (
-        None,
-        "start",
-        [("start", 0.5, 4.5)],
-        {"start": (0.5, 4.5)},
-        {"start": "x"},
-        {"start": ((0.5,),)},
-        {"start": ((4.5, 0.5),)},
-        {"start": ((1.0, 1.0),)},
-        {"start": ((-5.0, 4.5),)},
-        {"start": ((0.5, 1e6),)},
-        {"start": ((NAN, 4.5),)},
-        {"start": (("0.5", "4.5"),)},
-        {"start": np.array([[0.5, 4.5]])},
-        {"start": ((None, 4.5),)},
-        {3: ((0.5, 4.5),)},
-    ):
-        yield "phases", replace(recording, phases=phases)
+    for start in ((0.5, 4.5), ((4.5, 0.5),), ((0.5, 1e6),), ((NAN, 4.5),)):
+        yield "phases", replace(recording, phases={"start": start})
     for name in NAME:
         yield "start_pose", replace(recording, start_pose=name)
-    for remounted in (None, "new", 1):
-        yield "remounted", replace(recording, remounted=remounted)
-    for resets in ("x", (-1,), (n + 5,), (1.5,), (True,), 3):
-        yield "resets", replace(recording, resets=resets)
-    for joints in ("x", {"elbow": "0"}, {"elbow": NAN}, None):
-        yield "joints", replace(recording, joints=joints)
-    for name in (None, 3):
-        yield "name", replace(recording, name=name)
-    for diagnostics in ("x", None, (3,), ("start-pose-late",), (Diagnostic(3, WARNING),)):
-        yield "diagnostics", replace(recording, diagnostics=diagnostics)
+    yield "resets", replace(recording, resets=(n + 5,))
 
 
 def wrong_subjects(subject: wp.Subject) -> Iterator[tuple[str, wp.Subject]]:
-    k = len(subject.order)
-    for lengths in (None, "x", {}, *({**subject.lengths, **wrong} for wrong in LENGTHS if isinstance(wrong, dict))):
-        yield "lengths", replace(subject, lengths=lengths)
-    skew = subject.covariance.copy()
-    skew[0, 1] += 1e-3
-    for covariance in (
-        None,
-        "x",
-        subject.covariance.tolist(),
-        np.zeros((k, k - 1)),
-        np.zeros((k - 1, k - 1)),
-        -subject.covariance,
-        skew,
-        np.full((k, k), NAN),
-        subject.covariance.astype(complex),
-    ):
+    k, good = len(subject.order), subject.mounts["torso"]
+    for wrong in (length for length in LENGTHS if isinstance(length, dict)):
+        yield "lengths", replace(subject, lengths={**subject.lengths, **wrong})
+    for covariance in (None, np.zeros((k, k - 1)), np.full((k, k), NAN)):
         yield "covariance", replace(subject, covariance=covariance)
-    for order in (
-        None,
-        "x",
-        ("nonsense", *subject.order[1:]),
-        (subject.order[1], *subject.order[1:]),
-        subject.order[1:],
-    ):
-        yield "order" if order != subject.order[1:] else "covariance", replace(subject, order=order)
-    good = subject.mounts["torso"]
-    for mount in (None, "x", good.tolist(), 2.0 * good, np.zeros(4), np.zeros(3), np.full(4, NAN)):
-        yield "mounts", replace(subject, mounts={**subject.mounts, "torso": mount})
-    for mounts in (None, "x", {"arm": good}):
+    yield "order", replace(subject, order=("nonsense", *subject.order[1:]))
+    for mounts in (None, {"torso": 2.0 * good}, {"torso": np.zeros(3)}, {"arm": good}):
         yield "mounts", replace(subject, mounts=mounts)
-    for hinges in (
-        {"middle_elbow": Hinge(np.array([0.0, 1.0, 0.0]), 0.1)},
-        {"left_elbow": Hinge(np.array([0.0, 2.0, 0.0]), 0.1)},
-        {"left_elbow": Hinge(np.array([0.0, 1.0, 0.0]), -0.1)},
-        {"left_elbow": Hinge(np.array([0.0, 1.0, 0.0]), NAN)},
-        {"left_elbow": "x"},
-        None,
-    ):
-        yield "hinges", replace(subject, hinges=hinges)
-    for tilt in (
-        StartPoseOffset(np.zeros(3), 0.1),
-        StartPoseOffset(np.full(2, NAN), 0.1),
-        StartPoseOffset(np.zeros(2), -0.1),
-        "x",
-    ):
-        yield "start_pose_offset", replace(subject, start_pose_offset={"torso": tilt})
-    for drift in (HeadingDrift(NAN, 0.1), HeadingDrift(0.0, -0.1), HeadingDrift("0", 0.1), 3):
-        yield "heading_drift", replace(subject, heading_drift={"torso": drift})
-    yield "heading_drift", replace(subject, heading_drift={"arm": HeadingDrift(0.0, 0.1)})
 
 
 def wrong_poses(pose: Any) -> Iterator[tuple[str, Any]]:
     time, segment, point = pose.time, next(iter(pose.quat_WL)), next(iter(pose.points))
     n, quat, place = len(time), pose.quat_WL[segment], pose.points[point]
-    for times in (None, "x", time[:-1], time[::-1].copy(), np.zeros(n), np.full(n, NAN), time[:, None], time[:0]):
+    for times in (None, time[:-1], time[::-1].copy(), np.full(n, NAN)):
         yield "time", replace(pose, time=times)
-    for quats in (None, "x", quat[:-1], quat[:, :3], 2.0 * quat, np.zeros((n, 4)), quat.tolist(), quat.astype(str)):
+    for quats in ("x", quat[:-1], quat[:, :3], 2.0 * quat):
         yield segment, replace(pose, quat_WL={**pose.quat_WL, segment: quats})
-    for places in (None, "x", place[:-1], place[:, :2], place.astype(str), np.full((n, 3), INF), place.tolist()):
+    for places in (None, place[:-1], np.full((n, 3), INF)):
         yield point, replace(pose, points={**pose.points, point: places})
-    for name in ("quat_WL", "points", "segment_cov", "point_cov", "gap"):
-        for value in (None, "x", [quat]):
-            yield name, replace(pose, **{name: value})
-    for cov in (np.zeros((n, 3)), np.tile(-np.eye(3), (n, 1, 1)), np.tile(np.triu(np.ones((3, 3))), (n, 1, 1)), "x"):
-        yield "segment_cov", replace(pose, segment_cov={segment: cov})
-        yield "point_cov", replace(pose, point_cov={point: cov})
-    for gap in (np.zeros(n), np.zeros(n - 1, dtype=bool), "x"):
-        yield "gap", replace(pose, gap={segment: gap})
+    yield "segment_cov", replace(pose, segment_cov={segment: np.zeros((n, 3))})
+    yield "gap", replace(pose, gap={segment: np.zeros(n)})
 
 
-def wrong_options() -> Iterator[tuple[str, str, str, Any]]:
-    """Function, its parameter, what the message must name, and what makes options with a wrong value."""
-
-    def changed(options: Any, **values: Any) -> Any:
-        return partial(replace, options, **values)
-
-    for value in (*POSITIVE, None):
-        for name in ("window_s", "alpha", "beta", "gamma1", "gamma2"):
-            if value == 0.0 and name != "window_s":
-                continue  # never static: odd, and possible
-            test = changed(wp.StaticTest(), **{name: value})
-            for function in ("estimate_orientation", "track") if name == "window_s" else ("estimate_orientation",):
-                yield function, "static_test", name, test
-    for value in (*NUMBER, None, -1.0):
-        yield "retarget", "params", "position", changed(ControllerParams(), position=value)
-        yield "retarget", "params", "task_gain", changed(ControllerParams(), task_gain=value)
-        yield "simulate", "noise", "gyro_density", changed(ImuNoise(), gyro_density=value)
-        yield "simulate", "imperfections", "soft_tissue_deg", changed(Imperfections(), soft_tissue_deg=value)
-    for value in ("nonsense", 3, None):
-        yield "simulate", "imperfections", "mount", changed(Imperfections(), mount=value)
-    for value in ("100", NAN, None, [1.0]):
-        yield "estimate_orientation", "params", "block_s", changed(AmekfParams(), block_s=value)
-
-
-@cache
-def wrong_calls() -> list[Wrong]:
-    calls = [
-        Wrong(function, "length" if name == "lengths" else name, {name: value})
-        for function, parameters in TABLE.items()
-        for name, values in parameters.items()
-        for value in values
-    ]
-    arguments = right()
-    for function in ("track", "calibrate"):
-        calls += [
-            Wrong(function, name, {"recording": r}) for name, r in wrong_recordings(arguments[function]["recording"])
-        ]
-    for name, subject in wrong_subjects(arguments["track"]["subject"]):
-        calls += [Wrong("track", name, {"subject": subject}), Wrong("calibrate", name, {"prior": subject})]
-    for name, pose in wrong_poses(arguments["evaluate"]["pose"]):
-        calls += [Wrong("evaluate", name, {parameter: pose}) for parameter in ("pose", "truth")]
-        calls.append(Wrong("joint_angles", name, {"pose": pose}))
-    for name, pose in wrong_poses(arguments["retarget"]["pose"]):
-        calls.append(Wrong("retarget", name, {"pose": pose}))
-    calls += [Wrong(function, names, {parameter: options}) for function, parameter, names, options in wrong_options()]
-    calls += [Wrong(function, "nonsense", {"nonsense": 1}) for function in arguments]
-    calls += [Wrong(f, name, {name: ...}) for f, of in arguments.items() for name in of if name in _needed(f)]
-    return calls
-
-
-def _needed(function: str) -> set[str]:
-    import inspect
-
-    parameters = inspect.signature(getattr(wp, function)).parameters.values()
-    return {p.name for p in parameters if p.default is p.empty and p.kind is not p.VAR_KEYWORD}
-
-
-def outcome(wrong: Wrong) -> str:
-    """ "named", or what came instead."""
-    arguments = {k: v for k, v in (right()[wrong.function] | wrong.changed).items() if v is not ...}
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            made = {k: v() if isinstance(v, partial) else v for k, v in arguments.items()}
-            getattr(wp, wrong.function)(**made)
-    except wp.WeposeError as error:
-        text = str(error)
-        if len(text.splitlines()) != 1:
-            return f"more than a line: {text}"
-        mentioned = wrong.names in text.replace("-", "_") or str(arguments.get(wrong.names)) in text
-        return "named" if mentioned else f"not named: {text}"
-    except TypeError as error:  # as Python says of what is missing, or not a parameter
-        missing = {"nonsense", *_needed(wrong.function)} & {wrong.names} and (
-            f"'{wrong.names}'" in str(error) and "argument" in str(error)
-        )
-        return "named" if missing else f"raw: TypeError: {error}"
-    except Exception as error:
-        return f"raw: {type(error).__name__}: {error}"
-    return "accepted"
+def list_wrong_calls(function: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """What an error must name, and the wrong arguments."""
+    arguments = right()[function]
+    for name, values in TABLE[function].items():
+        yield from (("length" if name == "lengths" else name, {name: value}) for value in values)
+    if function in ("track", "calibrate"):
+        yield from ((name, {"recording": wrong}) for name, wrong in wrong_recordings(arguments["recording"]))
+        subjects = wrong_subjects(right()["track"]["subject"])
+        yield from ((name, {"subject" if function == "track" else "prior": wrong}) for name, wrong in subjects)
+    if function in ("evaluate", "joint_angles", "retarget"):
+        yield from ((name, {"pose": wrong}) for name, wrong in wrong_poses(arguments["pose"]))
 
 
 @pytest.mark.parametrize("function", TABLE)
 def test_every_wrong_call_is_refused_and_says_what_is_wrong(function: str) -> None:
     pytest.importorskip("daqp")
-    outcomes = {str(wrong): outcome(wrong) for wrong in wrong_calls() if wrong.function == function}
-    assert len(outcomes) > 5
-    assert {call: answer for call, answer in outcomes.items() if answer != "named"} == {}
+    arguments = right()[function]
+    for name, changed in list_wrong_calls(function):
+        with pytest.raises(wp.WeposeError) as raised:
+            getattr(wp, function)(**(arguments | changed))
+        text = str(raised.value)
+        assert len(text.splitlines()) == 1
+        assert name in text.replace("-", "_") or str(changed.get(name)) in text, (name, text)
+    with pytest.raises(TypeError, match="'nonsense'"):
+        getattr(wp, function)(**arguments, nonsense=1)
+
+
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        *((lambda value=value: wp.StaticTest(window_s=value), "window_s") for value in POSITIVE),
+        (lambda: wp.StaticTest(alpha=-1.0), "alpha"),
+        (lambda: AmekfParams(block_s="100"), "block_s"),
+        (lambda: Imperfections(soft_tissue_deg=-1.0), "soft_tissue_deg"),
+        (lambda: Imperfections(mount="nonsense"), "mount"),
+        (lambda: wp.retarget(**right()["retarget"], params=ControllerParams(position=-1.0)), "position"),
+        (lambda: wp.simulate(**right()["simulate"], noise=ImuNoise(gyro_density=NAN)), "gyro_density"),
+    ],
+)
+def test_options_refuse_what_is_no_number_of_theirs(make: Any, name: str) -> None:
+    pytest.importorskip("daqp")
+    with pytest.raises(wp.WeposeError, match=name):
+        make()
 
 
 def test_right_calls_go_through() -> None:

@@ -8,11 +8,11 @@ import glob
 import shutil
 import tempfile
 from collections.abc import Iterator
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from ..documents import whole_file
-from ..errors import BadData, BadOption, ExistingOutput, MissingFile, WeposeError, how_to_install
+from ..errors import BadData, BadOption, ExistingOutput, MissingFile, WeposeError, how_to_install, reason
 from ..writers.provenance import list_named_files
 
 DONE_FILE = "done.json"  # written last: a folder without it is not complete
@@ -33,12 +33,8 @@ def _open_filesystem(url: str) -> Iterator[tuple[Any, str]]:
         yield fsspec.core.url_to_fs(url, use_listings_cache=False)  # a worker lives longer than listings stay true
     except WeposeError:
         raise
-    except FileNotFoundError:
-        raise MissingFile(f"{url}: no such file") from None
     except Exception as error:
-        raise MissingFile(
-            f"{url}: cannot be reached: {' '.join(str(error).split()) or type(error).__name__}"
-        ) from error
+        raise MissingFile(f"{url}: cannot be reached: {reason(error)}") from error
 
 
 def find_urls(pattern: str) -> list[str]:
@@ -52,9 +48,7 @@ def find_urls(pattern: str) -> list[str]:
 def read_bytes(url: str) -> bytes | None:
     """Contents of a file; None where there is none."""
     if not is_remote(url):
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            return Path(url).read_bytes()
-        return None
+        return Path(url).read_bytes() if Path(url).is_file() else None
     with _open_filesystem(url) as (system, path):
         return bytes(system.cat_file(path)) if system.exists(path) else None
 
@@ -87,13 +81,12 @@ def open_study(url: str) -> Iterator[None]:
     try:
         items.mkdir(parents=True, exist_ok=True)
         lock = (place / ".lock").open("w")
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the system however this process ends
+    except BlockingIOError:
+        raise ExistingOutput(f"{url}: another wepose batch writes there; wait for it, or name another") from None
     except OSError as error:
         raise ExistingOutput(f"{url}: cannot be written: {error.strerror}") from error
     with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the system however this process ends
-        except OSError:
-            raise ExistingOutput(f"{url}: another wepose batch writes there; wait for it, or name another") from None
         for path in items.glob(".*-*"):
             shutil.rmtree(path, ignore_errors=True)
         yield
@@ -110,7 +103,7 @@ def fetch(url: str, into: Path, truth: bool = False) -> Path:
         local = into / path.rpartition("/")[2]
         system.get_file(path, str(local))
         for name in list_named_files(local, truth):
-            if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+            if not (into / name).resolve().is_relative_to(into.resolve()):
                 raise BadData(f"{url}: names '{name}', outside its own folder; only files below it are fetched")
             (into / name).parent.mkdir(parents=True, exist_ok=True)
             system.get(f"{top}/{name}", str(into / name), recursive=system.isdir(f"{top}/{name}"))
@@ -121,28 +114,25 @@ def fetch(url: str, into: Path, truth: bool = False) -> Path:
 def create_folder(url: str) -> Iterator[Path]:
     """A temporary folder that becomes `url` when the block succeeds, and vanishes otherwise.
 
-    `DONE_FILE` must be written last. A local folder is renamed into place; to a remote one files are copied, with
-    `DONE_FILE` last. What was there before is removed.
+    A local folder is renamed into place; to a remote one files are copied, with `DONE_FILE` last. What was there
+    before is removed.
     """
     place = Path(url)
     folder = Path(tempfile.mkdtemp(prefix=f".{place.name}-", dir=None if is_remote(url) else place.parent))
     try:
         yield folder
-        if is_remote(url):
-            _upload(folder, url)
-        else:
+        if not is_remote(url):
             shutil.rmtree(place, ignore_errors=True)
             folder.chmod(place.parent.stat().st_mode)  # mkdtemp's is for its owner alone
             folder.rename(place)
+            return
+        with _open_filesystem(url) as (system, path):
+            if system.exists(path):
+                system.rm(path, recursive=True)
+            for file in sorted(folder.rglob("*"), key=lambda file: file.name == DONE_FILE):
+                if file.is_file():
+                    target = f"{path}/{file.relative_to(folder).as_posix()}"
+                    system.makedirs(target.rpartition("/")[0], exist_ok=True)
+                    system.put_file(str(file), target)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def _upload(folder: Path, url: str) -> None:
-    with _open_filesystem(url) as (system, path):
-        if system.exists(path):
-            system.rm(path, recursive=True)
-        files = sorted(file.relative_to(folder).as_posix() for file in folder.rglob("*") if file.is_file())
-        for name in sorted(files, key=lambda name: name == DONE_FILE):
-            system.makedirs(f"{path}/{name}".rpartition("/")[0], exist_ok=True)
-            system.put_file(str(folder / name), f"{path}/{name}")

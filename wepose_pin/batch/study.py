@@ -11,19 +11,16 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from functools import partial
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import polars as pl
 
-from ..errors import BadOption, LostWorker, how_to_install
+from ..errors import BadOption, LostWorker, how_to_install, reason
 from ..filters.base import count_processors
-from ..writers.provenance import code
-from .items import DONE, build_failed_row, run_item
+from .items import DONE, Row, describe, fail, run_item
 from .plan import Item, Plan, read_plan
-from .steps import Row
 from .storage import is_remote, open_study, write_bytes
 
 RESULTS = "results.parquet"
@@ -73,35 +70,33 @@ def run_batch(
     out = out.rstrip("/")
     place = f"{out}/items" if is_remote(out) else str(Path(out).absolute() / "items")
     plan = read_plan(plan_file, place)
-    run = _run_here if scheduler is None else _run_on_scheduler
+    rows: dict[str, Row] = {}
     with open_study(out):
-        rows = _run_items(plan, partial(run, place=place, force=force, where=scheduler or workers), progress)
-        table = build_table([rows[item.name] for item in plan.all_items])
+        progress(0, 0, len(plan.all_items))
+        for items in (plan.calibrations, plan.items):  # sessions need the calibrations
+            if scheduler is None:
+                run = _run_here(items, workers or count_processors(), place, force)
+            else:
+                run = _run_on_scheduler(items, scheduler, place, force)
+            with contextlib.closing(run) as done:
+                for row in done:
+                    rows[row["item"]] = row
+                    progress(len(rows), sum(each["status"] != DONE for each in rows.values()), len(plan.all_items))
+        named = [dict.fromkeys(_COMMON) | rows[item.name] for item in plan.all_items]
+        reused = sum(bool(row.pop("reused", False)) and row["status"] == DONE for row in named)
+        table = pl.DataFrame(named, schema_overrides=_COMMON, infer_schema_length=None)
         content = io.BytesIO()
         table.write_parquet(content)
         write_bytes(f"{out}/{RESULTS}", content.getvalue())
-    return Study(plan, table, sum(bool(row.get("reused")) and row["status"] == DONE for row in rows.values()))
+    return Study(plan, table, reused)
 
 
-def _run_items(plan: Plan, run: Callable[[Sequence[Item]], Generator[Row]], progress: ItemProgress) -> dict[str, Row]:
-    """Item → its row; calibrations of subjects first, since sessions need them."""
-    rows: dict[str, Row] = {}
-    total = len(plan.all_items)
-    progress(0, 0, total)
-    for items in (plan.calibrations, plan.items):
-        with contextlib.closing(run(items)) as done:
-            for row in done:
-                rows[row["item"]] = row
-                progress(len(rows), sum(each["status"] != DONE for each in rows.values()), total)
-    return rows
-
-
-def _run_here(items: Sequence[Item], place: str, force: bool, where: Any) -> Generator[Row]:
+def _run_here(items: Sequence[Item], count: int, place: str, force: bool) -> Generator[Row]:
     """Rows of the items, in the order in which they are done, from processes of this machine.
 
     A process that dies takes those beside it along: their items fail, and the others go on in new processes.
     """
-    todo, count = deque(items), min(where or count_processors(), max(len(items), 1))
+    todo, count = deque(items), min(count, max(len(items), 1))
     before = set(active_children())
     with _one_thread():
         while todo:
@@ -116,7 +111,7 @@ def _run_here(items: Sequence[Item], place: str, force: bool, where: Any) -> Gen
                     process.terminate()
 
 
-def _run_on_scheduler(items: Sequence[Item], place: str, force: bool, where: Any) -> Generator[Row]:
+def _run_on_scheduler(items: Sequence[Item], address: str, place: str, force: bool) -> Generator[Row]:
     """The same by the workers of a running Dask scheduler; `LostWorker` where it goes meanwhile."""
     try:
         from distributed import Client
@@ -124,15 +119,14 @@ def _run_on_scheduler(items: Sequence[Item], place: str, force: bool, where: Any
         remedy = how_to_install("dask", "distributed")
         raise BadOption(f"wepose batch --scheduler: {error}: {remedy}") from None
     try:
-        client = Client(where, timeout=CONNECT_S)
+        client = Client(address, timeout=CONNECT_S)
     except (OSError, ValueError, TypeError) as error:
-        reason = " ".join(str(error).split())
-        raise BadOption(f"--scheduler {where}: no scheduler there, as in tcp://HOST:8786: {reason}") from None
+        raise BadOption(f"--scheduler {address}: no scheduler there, as in tcp://HOST:8786: {reason(error)}") from None
     with client, client.get_executor(pure=False) as executor:
         try:
             yield from _run_in_turn(executor, deque(items), len(items), place, force)
         except CancelledError:
-            raise LostWorker(f"{where}: the scheduler is gone; the same command goes on where it stopped") from None
+            raise LostWorker(f"{address}: the scheduler is gone; the same command goes on where it stopped") from None
 
 
 def _run_in_turn(executor: Executor, todo: deque[Item], most: int, place: str, force: bool) -> Iterator[Row]:
@@ -145,7 +139,7 @@ def _run_in_turn(executor: Executor, todo: deque[Item], most: int, place: str, f
     while running or (todo and broken is None):
         while todo and len(running) < most and broken is None:
             try:
-                running[executor.submit(run_item, todo[0], place, force, code()["code"])] = todo[0]
+                running[executor.submit(run_item, todo[0], place, force)] = todo[0]
                 todo.popleft()
             except BrokenProcessPool as died:
                 broken = died
@@ -159,22 +153,22 @@ def _run_in_turn(executor: Executor, todo: deque[Item], most: int, place: str, f
             elif type(error).__name__ != "KilledWorker":  # Dask's, after several workers died at it
                 raise error
             message = f"{item.session}: the process of this item, or of one beside it, died; it may lack memory"
-            yield build_failed_row(item, LostWorker.__name__, message)
+            yield describe(item) | fail(LostWorker.__name__, message)
     if broken is not None:
         raise broken
 
 
 def _prepare_process() -> None:
     """Ctrl-C in the terminal is for the parent; a process whose parent was killed ends itself."""
+
+    def exit_with_parent() -> None:
+        parent = parent_process()
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-
-
-def _exit_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-    os._exit(1)
+    threading.Thread(target=exit_with_parent, daemon=True).start()
 
 
 @contextlib.contextmanager
@@ -188,9 +182,3 @@ def _one_thread() -> Iterator[None]:
         for name, value in before.items():
             os.environ.pop(name)
             os.environ.update({} if value is None else {name: value})
-
-
-def build_table(rows: list[Row]) -> pl.DataFrame:
-    """The table of outcomes: a row an item; null where an item lacks a value."""
-    named = [dict.fromkeys(_COMMON) | {name: value for name, value in row.items() if name != "reused"} for row in rows]
-    return pl.DataFrame(named, schema_overrides=_COMMON, infer_schema_length=None)

@@ -12,12 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from ..arguments import (
     check_array,
-    check_covariance,
     check_fields,
     check_finite,
     check_names,
     check_unit,
-    format_object,
 )
 from ..errors import BadData
 from ..recording import EACH_TIME, check_time, format_span
@@ -59,9 +57,7 @@ class Pose:
     joints: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        return format_object(
-            self, lambda: f"{len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points"
-        )
+        return f"Pose({len(self.time)} samples; {len(self.quat_WL)} segments, {len(self.points)} points)"
 
     def cut(self, span: slice | np.ndarray) -> Pose:
         """Return the pose of a span of samples, or of samples by their numbers."""
@@ -76,7 +72,7 @@ class Pose:
         ------
         BadOption, BadData
             A field of a wrong type; a wrong shape; time that does not increase; a
-            quaternion without unit norm; a covariance that is not symmetric and positive.
+            quaternion without unit norm.
         """
         where = "pose: "
         check_fields(self, where, Pose)
@@ -99,8 +95,6 @@ class Pose:
                 check_finite(place, values, missing=True)
                 if name == "quat_WL":
                     check_unit(place, values, MAX_POSE_NORM_DEVIATION)
-                elif shape == (n, 3, 3):
-                    check_covariance(place, values)
         check_names(f"{where}gap", self.gap, tuple(self.quat_WL))
         for segment, gap in self.gap.items():
             check_array(f"{where}gap.{segment}", gap, (n,), "b", EACH_TIME)

@@ -16,12 +16,10 @@ from ..arguments import (
     NonNegative,
     check_arguments,
     check_array,
-    check_covariance,
     check_fields,
     check_finite,
     check_names,
     check_unit,
-    format_object,
 )
 from ..diagnostics import notebook_html
 from ..documents import (
@@ -136,11 +134,8 @@ class Subject:
     quality: Annotated[Literal["", "pass", "poor", "fail"], Key(comment="of the calibration: pass, poor or fail")] = ""
 
     def __repr__(self) -> str:
-        def describe() -> str:
-            quality = f", calibration {self.quality}" if self.quality else ""
-            return f"{self.name!r}: {len(self.lengths)} lengths, {len(self.mounts)} mounts{quality}"
-
-        return format_object(self, describe)
+        quality = f", calibration {self.quality}" if self.quality else ""
+        return f"Subject({self.name!r}: {len(self.lengths)} lengths, {len(self.mounts)} mounts{quality})"
 
     def _repr_html_(self) -> str:
         return notebook_html(self, tables=[self.lengths_html()])
@@ -195,8 +190,8 @@ class Subject:
         Raises
         ------
         BadOption, BadSubject
-            A field of a wrong type; a length, mount, hinge, offset or drift with an impossible value; a covariance that
-            is not symmetric and positive, or whose size is not that of `order`.
+            A field of a wrong type; a length, mount, hinge, offset or drift with an impossible value; a covariance
+            whose size is not that of `order`.
         """
         where = f"subject {self.name!r}: "
         check_fields(self, where)
@@ -210,7 +205,6 @@ class Subject:
                 raise BadData(f"{where}order = {self.order}: each name once")
             check_array(f"{where}covariance", self.covariance, (len(self.order), len(self.order)))
             check_finite(f"{where}covariance", self.covariance)
-            check_covariance(f"{where}covariance", self.covariance)
             arrays = [(f"mounts.{s}", quat, (4,)) for s, quat in self.mounts.items()]
             arrays += [(f"hinges.{joint}.axis", hinge.axis, (3,)) for joint, hinge in self.hinges.items()]
             arrays += [(f"start_pose_offset.{s}.tilt", start.tilt, (2,)) for s, start in self.start_pose_offset.items()]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arguments import Positive, check_array, check_fields, check_finite, check_unit, check_value, format_object
+from ..arguments import Positive, check_array, check_fields, check_finite, check_unit, check_value
 from ..diagnostics import Diagnostic, notebook_html
 from ..documents import TomlTable
 from ..errors import BadData, BadOption, BadPhase, one_of
@@ -79,12 +79,10 @@ class Recording:
         return len(self.time)
 
     def __repr__(self) -> str:
-        def describe() -> str:
-            phases = f", phases {', '.join(self.phases)}" if self.phases else ""
-            seconds = float(self.time[-1] - self.time[0])
-            return f"{self.name!r}: {seconds:.1f} s at {self.rate_hz:g} Hz, {len(self.sensors)} sensors{phases}"
-
-        return format_object(self, describe)
+        phases = f", phases {', '.join(self.phases)}" if self.phases else ""
+        seconds = float(self.time[-1] - self.time[0])
+        about = f"{seconds:.1f} s at {self.rate_hz:g} Hz, {len(self.sensors)} sensors"
+        return f"Recording({self.name!r}: {about}{phases})"
 
     def _repr_html_(self) -> str:
         rows = "".join(

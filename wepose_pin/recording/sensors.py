@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
-from ..arguments import format_object
 from ..documents import TomlTable
 
 # Names of sensor axes in a stated mount.
@@ -61,7 +60,7 @@ class ImuSensor:
     gyro_range: float = np.inf
 
     def __repr__(self) -> str:
-        return format_object(self, lambda: f"{len(self.gyro_S)} samples")
+        return f"ImuSensor({len(self.gyro_S)} samples)"
 
     @property
     def aligned(self) -> bool:
@@ -92,7 +91,7 @@ class OrientationSensor:
     aligned: bool = False
 
     def __repr__(self) -> str:
-        return format_object(self, lambda: f"{len(self.quat_VS)} samples")
+        return f"OrientationSensor({len(self.quat_VS)} samples)"
 
     def part(self, samples: slice | np.ndarray) -> OrientationSensor:
         """Return the sensor at these samples."""
