@@ -23,7 +23,7 @@ from wepose_pin.readers.c3d import read_c3d
 from wepose_pin.readers.markers import read_marker_table
 from wepose_pin.writers import export as writers
 from wepose_pin.writers.export import Exported, export
-from wepose_pin.writers.motion import Motion, resampled
+from wepose_pin.writers.motion import Motion, resample
 from wepose_pin.writers.result import read_result, write_table
 
 LENGTHS = {"shoulder_width": 0.41, "left_upper_arm": 0.29, "right_forearm": 0.25, "right_hand": 0.07}
@@ -125,7 +125,7 @@ def test_a_phase_is_exported_by_itself(tmp_path: Path, pose: Pose) -> None:
     ):
         with pytest.raises((BadOption, BadData), match=expected):
             export(folder, tmp_path / "a.csv", phase=phase)
-    with pytest.raises(BadOption, match="no motion in a file of format urdf"):
+    with pytest.raises(BadOption, match="not of format urdf; there is no motion in it"):
         export(folder, tmp_path / "a.urdf", phase="take_1")
 
 
@@ -171,11 +171,7 @@ def test_c3d_by_ezc3d(result: Path, pose: Pose, tmp_path: Path) -> None:
     np.testing.assert_array_equal(transforms[:, :, 3], np.broadcast_to([0.0, 0.0, 0.0, 1.0], (9, 301, 4)))
     for k, (segment, quat_WL) in enumerate(pose.quat_WL.items()):
         R = transforms[k, :, :3, :3]
-        # Orthogonal to NumPy's default tolerance, which kineticstoolkit demands: single precision alone leaves 6e-8.
-        np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), rtol=1e-5, atol=1e-8)
-        off = np.abs(R - Rotation.from_quat(quat_WL).as_matrix()).max(axis=(1, 2))
-        assert np.median(off) < 1e-7  # single precision
-        assert off.max() < 1e-5
+        np.testing.assert_allclose(R, Rotation.from_quat(quat_WL).as_matrix(), atol=1e-7)  # single precision
         begin = {"upper_arm": "shoulder", "forearm": "elbow", "hand": "wrist"}.get(segment.partition("_")[2])
         if begin:
             p_mm = 1e3 * pose.points[f"{segment.partition('_')[0]}_{begin}"]
@@ -212,20 +208,6 @@ def test_c3d_of_a_segment_whose_place_is_not_known_has_its_rotation(tmp_path: Pa
     R_WL = Rotation.from_quat(lone.quat_WL["right_forearm"]).as_matrix()
     np.testing.assert_allclose(file["data"]["rotations"][:3, :3, k].transpose(2, 0, 1), R_WL, atol=1e-7)
     np.testing.assert_array_equal(file["data"]["rotations"][:3, 3, k], 0.0)
-
-
-def test_c3d_that_ends_early_is_no_file(result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ezc3d = pytest.importorskip("ezc3d")
-    write = ezc3d.c3d.write
-
-    def cut(self: object, path: str) -> None:
-        write(self, path)
-        Path(path).write_bytes(Path(path).read_bytes()[:4096])
-
-    monkeypatch.setattr(ezc3d.c3d, "write", cut)
-    with pytest.raises(ExistingOutput, match="is the disk full"):
-        export(result, tmp_path / "x.c3d")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_c3d_without_ezc3d(result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -340,7 +322,7 @@ def test_a_result_is_of_a_person_whose_shoulders_move_as_theirs(tmp_path: Path) 
 
 def test_resampling_goes_through_the_body(pose: Pose) -> None:
     model = load_model(lengths=LENGTHS)
-    new = resampled(Motion(with_gap(pose), model, "x", "x"), 250.0).pose
+    new = resample(Motion(with_gap(pose), model, "x", "x"), 250.0).pose
     np.testing.assert_allclose(np.diff(new.time), 0.004, atol=1e-12)
     assert (new.time[0], new.time[-1]) == (2.0, pytest.approx(5.0))
     np.testing.assert_allclose(new.points["left_palm"][::5], pose.points["left_palm"][::2], atol=1e-12)
@@ -393,11 +375,11 @@ def test_a_sample_without_orientation_is_named(tmp_path: Path, pose: Pose) -> No
         (["-o", "x.trc", "--format", "tcr"], "--format tcr: not known; did you mean 'trc'?"),
         (["-o", "x.dat", "--format", "c3d"], "name it x.c3d"),
         (["-o", "x.txt", "--format", "placement"], "name it x.sto"),
-        (["-o", "x.trc", "--names", "isb"], "--names isb: only of format mot, and the format is trc"),
+        (["-o", "x.trc", "--names", "isb"], "--names isb: not of format trc; only of format mot"),
         (["-o", "x.mot", "--names", "rajagopal"], 'Invalid value "rajagopal" for --names. Choose from: "isb"'),
         (["-o", "x.trc", "--rate-hz", "0"], "--rate-hz 0: between 1 and 10000 samples a second"),
         (["-o", "x.trc", "--rate-hz", "nan"], "--rate-hz nan: between 1 and 10000"),
-        (["-o", "x.urdf", "--rate-hz", "50"], "--rate-hz 50: there is no motion in a file of format urdf"),
+        (["-o", "x.urdf", "--rate-hz", "50"], "--rate-hz 50.0: not of format urdf; there is no motion in it"),
         (["-o", "no/x.trc"], "no/x.trc: not a file that can be written"),
     ],
 )

@@ -19,7 +19,6 @@ from test_export import LENGTHS, POINTS, a_pose, smooth, with_gap, write_folder
 from wepose_pin.angles import joint_angles
 from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import Pose, compute_pose
-from wepose_pin.errors import BadOption
 from wepose_pin.readers import load_session
 from wepose_pin.readers.describe import describe_file
 from wepose_pin.writers.export import export
@@ -200,23 +199,6 @@ def test_the_setups_of_opensense_name_each_other(result: Path, tmp_path: Path) -
     assert ik.findtext("orientations_file") == "a.sto"
     begin, end = map(float, (ik.findtext("time_range") or "").split())
     assert (begin, end) == pytest.approx((1.995, 5.005))
-
-
-@pytest.mark.parametrize(
-    ("file", "format", "instead"),
-    [
-        ("x.osim", None, "--format scale -o NAME.xml"),
-        ("x", "motion-bids", "csv has the same columns"),
-        ("x.bvh", "bvh-soma", "bvh has the person's own skeleton"),
-        ("x.npz", None, "lerobot, mcap and rosbag"),
-    ],
-)
-def test_a_format_that_went_says_what_to_do_instead(
-    result: Path, tmp_path: Path, file: str, format: str | None, instead: str
-) -> None:
-    with pytest.raises(BadOption, match=instead):
-        export(result, tmp_path / file, format)
-    assert list(tmp_path.iterdir()) == []
 
 
 # OpenSim itself ---------------------------------------------------------------------------------------------------

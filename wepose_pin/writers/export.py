@@ -5,43 +5,43 @@ from __future__ import annotations
 import contextlib
 import functools
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from ..arguments import check_arguments
 from ..assets import find_plugins, load_plugin
 from ..body.kinematics import find_samples
 from ..diagnostics import Diagnostic, notebook_html
-from ..documents import whole_file, whole_folder
-from ..errors import BadData, BadOption, MissingFile, one_of
+from ..documents import whole_file
+from ..errors import BadData, BadOption, one_of
+from ..libraries import check_file
 from ..recording import select_interval
 from ..tracking import TrackResult
 from .bvh import write_bvh
 from .c3d import write_c3d
+from .folder import data_folder
 from .joint_motion import (
     ROBOT_URDF,
     TRAJECTORY,
     HasJointMotion,
-    JointMotion,
     convert_person,
     read_joint_motion,
     resample_joints,
-    select_motion,
 )
-from .lerobot import diagnose_episodes, list_episodes, write_lerobot
-from .motion import Motion, check_rate, resampled
+from .lerobot import write_lerobot
+from .motion import Motion, check_rate, resample
 from .opensim import list_setups, write_mot, write_placement, write_scale, write_setups, write_sto, write_trc
-from .provenance import provenance_file, provenance_text, write_provenance
+from .provenance import provenance_text, write_provenance
 from .result import SUBJECT_URDF, format_urdf, read_result
 from .ros import write_mcap, write_rosbag
 from .rrd import write_rrd
 from .tables import write_csv, write_parquet
 
 Result = TrackResult | HasJointMotion | str | Path
-PERSON, JOINTS, BODY = "a person's motion", "joints", "a body"  # what a format is of
+# What a format is of: a person's motion; joints of a person or a robot; motions of robots; a body without a motion.
+PERSON, JOINTS, ROBOTS, BODY = "a person's motion", "joints", "robots", "a body"
 MOTION = ("rate_hz", "interval", "phase")  # options of a format with a motion
-NAMES = ("isb", "opensim")
 
 
 class Format(NamedTuple):
@@ -49,8 +49,9 @@ class Format(NamedTuple):
 
     Parameters
     ----------
-    of : what it holds: `PERSON`; `JOINTS` of a person or a robot; `BODY`, without a motion
-    write : path, motion and own options → what the file cannot hold, or None
+    of : what it holds: `PERSON`, `JOINTS`, `ROBOTS` or `BODY`
+    write : path, motion and own options → what the file cannot hold, or None. A format of `ROBOTS` gets all motions,
+        one of `BODY` the result
     options : that it has of those of `export`
     suffix : of the file; None: the name of the format. Empty: a folder
     earlier : patterns of the files of an earlier run in the folder, which `force` replaces
@@ -63,23 +64,20 @@ class Format(NamedTuple):
     earlier: tuple[str, ...] = ()
 
 
-def write_urdf(file: Path, result: Result) -> list[Diagnostic]:
+def write_urdf(file: Path, result: Result) -> None:
     """Write the body of a person or a robot."""
     if isinstance(result, TrackResult):
         file.write_text(format_urdf(result.subject, result.model), encoding="utf-8")
     elif isinstance(result, HasJointMotion):
         file.write_text(result.joint_motion().urdf, encoding="utf-8")
     else:
-        folder = Path(str(result))
-        urdf = folder / (ROBOT_URDF if _is_of_robot(result) else SUBJECT_URDF)
-        if not urdf.is_file():
-            raise MissingFile(f"{result}: no {urdf.name} in it; a folder that `wepose track` wrote is wanted here")
+        urdf = Path(str(result)) / (ROBOT_URDF if _is_of_robot(result) else SUBJECT_URDF)
+        check_file(urdf, "a folder that `wepose track` or `wepose retarget` wrote")
         shutil.copyfile(urdf, file)
-    return []
 
 
 def _is_of_robot(result: Result) -> bool:
-    """Whether a result is a robot's trajectory, and not a person's motion."""
+    """Return whether a result is a robot's trajectory, and not a person's motion."""
     if isinstance(result, str | Path):
         return (Path(result) / TRAJECTORY).is_file()
     return not isinstance(result, TrackResult)
@@ -99,16 +97,7 @@ URDF = Format(BODY, write_urdf, ())
 ROSBAG = Format(JOINTS, write_rosbag, suffix="", earlier=("*.db3", "*.mcap", "metadata.yaml"))
 MCAP = Format(JOINTS, write_mcap)
 RRD = Format(JOINTS, write_rrd)
-EPISODES = Format(JOINTS, write_lerobot, (*MOTION, "episodes", "instruction"), "", ("data/**/*.parquet", "meta/**/*.*"))
-LEROBOT = "lerobot"
-# Format that was written before → what to do instead.
-_OF_ROBOTS = "trajectory.csv of `wepose retarget` has the joints, and lerobot, mcap and rosbag are written"
-REMOVED = {
-    "osim": "--format scale -o NAME.xml writes the set-up of OpenSim's Scale Tool, which makes the model",
-    "motion-bids": "csv has the same columns",
-    **dict.fromkeys(("bvh-lafan1", "bvh-nokov", "bvh-soma", "bvh-xsens"), "bvh has the person's own skeleton"),
-    **dict.fromkeys(("pkl", "npz", "csv-beyondmimic"), _OF_ROBOTS),
-}
+EPISODES = Format(ROBOTS, write_lerobot, (*MOTION, "episodes", "instruction"), "", ("data/**/*.parquet", "meta/**/*.*"))
 
 
 @functools.cache
@@ -141,7 +130,7 @@ def export(
     file: str | Path,
     format: str | None = None,
     *,
-    names: str | None = None,
+    names: Literal["isb", "opensim"] | None = None,
     rate_hz: float | None = None,
     interval: tuple[float, float] | None = None,
     phase: str | None = None,
@@ -164,7 +153,7 @@ def export(
         One of `list_formats`, to which plug-ins add. Of a person: "csv", "parquet", "mot", "sto", "placement", "scale",
         "trc", "c3d", "bvh". Of either: "urdf", "rosbag", "mcap", "rrd". Of a robot: "lerobot". None: by the suffix of
         `file`; a stated format needs a file with its own suffix.
-    names : str, optional
+    names : "isb" or "opensim", optional
         Of a .mot's columns: only the angles of the ISB, "isb", or only the coordinates of OpenSim's model, "opensim";
         None: both, the ISB's first.
     rate_hz : float, optional
@@ -214,93 +203,62 @@ def export(
     kind = list_formats()[name]
     stated: dict[str, Any] = {"names": names, "rate_hz": rate_hz, "interval": interval, "phase": phase}
     stated |= {"episodes": episodes, "instruction": instruction, "osim_model": osim_model}
-    _check_options(name, {option: value for option, value in stated.items() if value is not None})
-    if len(results) != 1 and name != LEROBOT:
-        raise BadOption(f"--format {name}: a file of {len(results)} results; only {LEROBOT} takes several, as episodes")
+    own = {option: value for option, value in stated.items() if value is not None}
+    for option, value in own.items():
+        if option not in kind.options:
+            having = " and ".join(each for each, other in list_formats().items() if option in other.options)
+            reason = "there is no motion in it" if option in MOTION else f"only of format {having}"
+            raise BadOption(f"--{option.replace('_', '-')} {value}: not of format {name}; {reason}")
+    if rate_hz is not None:
+        check_rate(rate_hz)
+    if len(results) != 1 and kind.of != ROBOTS:
+        raise BadOption(f"--format {name}: a file of {len(results)} results; only lerobot takes several, as episodes")
+    own = {option: value for option, value in own.items() if option not in MOTION}
     with contextlib.ExitStack() as files:
         if kind.earlier:
-            partial = files.enter_context(_replaced_folder(file, kind.earlier, force))
+            partial = files.enter_context(data_folder(file, force, kind.earlier))
         else:
             partial = files.enter_context(whole_file(file, force))
         if provenance is not None and kind.earlier:
             write_provenance(partial, provenance)
         elif provenance is not None:
-            partial_provenance = files.enter_context(whole_file(provenance_file(file), True))
-            partial_provenance.write_text(provenance_text(provenance), encoding="utf-8")
+            beside = files.enter_context(whole_file(file.with_name(f"{file.name}.provenance.json"), True))
+            beside.write_text(provenance_text(provenance), encoding="utf-8")
         if kind.of == BODY:
             return Exported(name, kind.write(partial, results[0]) or [])
-        if kind.of == PERSON:
-            motion = _read_motion(results[0], name, interval, phase, rate_hz)
-            own = {"names": names} if names is not None else {}
-            if name == "scale" and osim_model is not None:
-                own["model"] = str(osim_model)
-            diagnostics = kind.write(partial, motion, **own)
-            if name == "sto" and osim_model is not None:
-                setups = {path: files.enter_context(whole_file(path, force)) for path in list_setups(file)}
-                write_setups(file, setups, motion, str(osim_model))
-            return Exported(name, diagnostics or [])
-        motions = [_read_joint_motion(each, name, interval, phase) for each in results]
-        if rate_hz is not None:
-            motions = [resample_joints(each, rate_hz) for each in motions]
-        if name != LEROBOT:
-            return Exported(name, kind.write(partial, motions[0]) or [])
-        kind.write(partial, [one for each in motions for one in list_episodes(each, episodes, instruction)])
-        return Exported(name, [one for each in motions for one in diagnose_episodes(each, episodes)])
-
-
-def _check_options(name: str, stated: Mapping[str, Any]) -> None:
-    """Raise `BadOption` for an option that the format does not have, or a value that none is."""
-    for option, value in stated.items():
-        text = f"--{option.replace('_', '-')} {f'{value:g}' if option == 'rate_hz' else value}"
-        if option == "rate_hz":
-            check_rate(value)
-        if option in list_formats()[name].options:
-            continue
-        if option in MOTION:
-            raise BadOption(f"{text}: there is no motion in a file of format {name}")
-        having = " and ".join(each for each, format in list_formats().items() if option in format.options)
-        raise BadOption(f"{text}: only of format {having}, and the format is {name}")
-    if stated.get("names", "isb") not in NAMES:
-        raise BadOption(f"--names {stated['names']}: not known; {one_of(NAMES, stated['names'])}")
-
-
-@contextlib.contextmanager
-def _replaced_folder(out: Path, own: Sequence[str], force: bool) -> Iterator[Path]:
-    """`whole_folder` of a data set: with `force` an earlier one goes, all other files stay."""
-    with whole_folder(out, force) as folder:
-        yield folder
-        written = {path.relative_to(folder) for path in folder.rglob("*")}
-    for pattern in own:
-        for path in out.glob(pattern):
-            if path.relative_to(out) not in written:
-                path.unlink()
-
-
-def _read_joint_motion(
-    result: Result, format: str, interval: tuple[float, float] | None, phase: str | None
-) -> JointMotion:
-    """The motion of a robot, or of a person by joints, or the selected part of it."""
-    if isinstance(result, HasJointMotion):
-        return select_motion(result.joint_motion(), interval, phase)
-    if isinstance(result, str | Path) and (format == LEROBOT or _is_of_robot(result)):
-        return select_motion(read_joint_motion(Path(result)), interval, phase)
-    if format == LEROBOT:
-        raise BadOption(f"--format {format}: is of robots, and this is a person's motion; `wepose retarget` makes one")
-    return convert_person(_read_motion(result, format, interval, phase))
+        motions = [_read_motion(each, name, kind.of, interval, phase, rate_hz) for each in results]
+        if kind.of == ROBOTS:
+            return Exported(name, kind.write(partial, motions, **own) or [])
+        if name == "sto" and own:
+            setups = {path: files.enter_context(whole_file(path, force)) for path in list_setups(file)}
+            write_setups(file, setups, motions[0], str(own.pop("osim_model")))
+        return Exported(name, kind.write(partial, motions[0], **own) or [])
 
 
 def _read_motion(
     result: Result,
     format: str,
+    of: str,
     interval: tuple[float, float] | None,
     phase: str | None,
-    rate_hz: float | None = None,
-) -> Motion:
-    """The motion of a person, or the selected part of it, of at least two samples; resampled where a rate is given."""
+    rate_hz: float | None,
+) -> Any:
+    """Read the selected part of a motion, of at least two samples: a `Motion` where `of` is `PERSON`, or `JointMotion`.
+
+    It is resampled where a rate is given.
+    """
     if _is_of_robot(result):
+        if of == PERSON:
+            others = ", ".join(each for each, other in list_formats().items() if other.of != PERSON)
+            raise BadOption(
+                f"--format {format}: is of a person's motion, and {result} is a robot's trajectory, for {others}"
+            )
+        robot = result.joint_motion() if isinstance(result, HasJointMotion) else read_joint_motion(Path(str(result)))
+        robot = robot.select(interval, phase)
+        return robot if rate_hz is None else resample_joints(robot, rate_hz)
+    if of == ROBOTS:
         raise BadOption(
-            f"--format {format}: is of a person's motion, and this is a robot's trajectory; "
-            f"of that there is: {', '.join(each for each, format in list_formats().items() if format.of != PERSON)}"
+            f"--format {format}: is of a robot's trajectory, as `wepose retarget` writes it; {result} is none"
         )
     if isinstance(result, TrackResult):
         selected = select_interval(result.time, result.phases, interval, phase)
@@ -312,27 +270,22 @@ def _read_motion(
         motion = Motion(pose, model, str(summary.get("recording") or folder.name), str(folder))
     if len(motion.pose.time) < 2:
         raise BadData(f"{motion.where}: a pose of {len(motion.pose.time)} samples; a motion has at least 2")
-    return motion if rate_hz is None else resampled(motion, rate_hz)
+    motion = motion if rate_hz is None else resample(motion, rate_hz)
+    return motion if of == PERSON else convert_person(motion)
 
 
 def _choose_format(file: Path, name: str | None) -> str:
     """Choose the format that is stated, or that of the file's suffix."""
-    formats = list_formats()
+    formats, suffix = list_formats(), file.suffix.lower()
     if name is None:
-        name = file.suffix.lower().removeprefix(".")
-        if name not in formats and name not in REMOVED:
-            raise BadOption(
-                f"-o {file}: '{file.suffix}' is no format's suffix; state it by --format; {one_of(formats)}"
-            )
-    if name in REMOVED:
-        raise BadOption(f"--format {name}: no longer written; {REMOVED[name]}")
+        name = suffix.removeprefix(".")
+        if name not in formats:
+            raise BadOption(f"-o {file}: '{suffix}' is no format's suffix; state it by --format; {one_of(formats)}")
     if name not in formats:
         raise BadOption(f"--format {name}: not known; {one_of(formats, name)}")
-    suffix = f".{name}" if formats[name].suffix is None else formats[name].suffix
-    if not suffix and file.suffix.lower().removeprefix(".") in (*formats, "bag", "db3"):
-        raise BadOption(
-            f"-o {file}: format {name} is a folder; name it {file.stem}"
-        )  # readers would take it for a file
-    if suffix and file.suffix.lower() != suffix:
-        raise BadOption(f"-o {file}: format {name} is for programs that go by the suffix: name it {file.stem}{suffix}")
+    needed = f".{name}" if formats[name].suffix is None else formats[name].suffix
+    if not needed and suffix.removeprefix(".") in (*formats, "bag", "db3"):  # readers would take it for a file
+        raise BadOption(f"-o {file}: format {name} is a folder; name it {file.stem}")
+    if needed and suffix != needed:
+        raise BadOption(f"-o {file}: format {name} is for programs that go by the suffix: name it {file.stem}{needed}")
     return name

@@ -1,8 +1,8 @@
-"""The folder of a result, which may hold an earlier result, or files of the user."""
+"""The folder of a result or a data set, which may hold an earlier one, or files of the user."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,40 +14,35 @@ from .result import JOINTS
 
 
 @contextmanager
+def data_folder(out: Path, force: bool, earlier: Sequence[str]) -> Iterator[Path]:
+    """`whole_folder` of a data set: with `force` files of an earlier one, by their patterns, go; all others stay."""
+    with whole_folder(out, force) as folder:
+        yield folder
+        written = {path.relative_to(folder) for path in folder.rglob("*")}
+    for path in [path for pattern in earlier for path in out.glob(pattern)]:
+        if path.relative_to(out) not in written:
+            path.unlink()
+
+
+@contextmanager
 def result_folder(out: Path, force: bool) -> Iterator[Path]:
-    """`whole_folder` of a result; of an earlier result in `out` those files go that would be read with the new one.
+    """`data_folder` of a result; of an earlier result in `out` those files go that would be read with the new one.
 
     Raises
     ------
     ExistingOutput
-        As `whole_folder`. There are such files but no result in `out`, or a session in `out` needs a file that would
-        be replaced.
+        As `whole_folder`; a session in `out` needs a file that would be replaced.
     """
-    with whole_folder(out, force) as folder:
-        inputs = _list_inputs(out)
-        earlier = [out / name for name in (MODEL_TABLE, JOINTS) if (out / name).exists()]
-        has_result = any((out / name).is_file() for name in INSIDE)
-        for file in earlier:
-            if file.resolve() in inputs or not has_result:
-                raise ExistingOutput(
-                    f"{file}: is no file of an earlier result, and would be replaced or read with the new one; move "
-                    f"it, or name another folder by -o"
-                )
+    inputs = set()
+    if (out / "session.toml").is_file():
+        inputs = {file.resolve() for file in list_files(out, truth=True)}
+    has_result = any((out / name).is_file() for name in INSIDE)
+    stale = [name for name in (MODEL_TABLE, JOINTS) if has_result and (out / name).resolve() not in inputs]
+    with data_folder(out, force, stale) as folder:
         yield folder
-        written = {file.name for file in folder.iterdir()}
-        for name in sorted(written):
+        for name in sorted(file.name for file in folder.iterdir()):
             if (out / name).resolve() in inputs:
                 raise ExistingOutput(
                     f"{out / name}: is an input of {out / 'session.toml'}, and would be replaced; name another folder "
                     f"by -o"
                 )
-    for file in earlier:
-        if file.name not in written:
-            file.unlink(missing_ok=True)
-
-
-def _list_inputs(out: Path) -> set[Path]:
-    """What a session in the folder consists of."""
-    if not (out / "session.toml").is_file():
-        return set()
-    return {file.resolve() for file in list_files(out, truth=True)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -23,9 +22,10 @@ from ..body.tree import joint_axis, joint_placement, parse_tree
 from ..body.urdf import read_urdf
 from ..data_tables import read_columns, read_table
 from ..errors import BadData, MissingFile
+from ..libraries import library_errors
 from ..recording import Intervals, select_interval
 from ..rotations import multiply
-from .motion import EVEN, SLACK_S, Motion, check_complete, make_times, resample_evenly
+from .motion import SLACK_S, Motion, check_complete, make_times, resample_evenly
 from .result import read_phases
 
 TRAJECTORY, ROBOT_URDF = "trajectory.parquet", "robot.urdf"
@@ -124,6 +124,23 @@ class JointMotion:
         of_samples = {name: getattr(self, name)[samples] for name in ("time", "position", "velocity", "recorded_time")}
         return replace(self, **of_samples, begin=0)
 
+    def select(self, interval: tuple[float, float] | None, phase: str | None) -> JointMotion:
+        """Return the part that follows an interval [s] or a phase of the recording; both None: all of it.
+
+        Raises
+        ------
+        WrongOption, BadData
+            The recording has no such interval or phase; the robot has fewer than two samples there.
+        """
+        phases = {name: spans for name, spans in self.phases.items() if name != REPETITIONS}
+        selected = select_interval(self.recorded_time, phases, interval, phase)
+        if selected is None:
+            return self
+        part = self.cut(self.samples(selected))
+        if len(part.time) < 2:
+            raise BadData(f"{self.where}: follows no {selected[0]:g} to {selected[1]:g} s of the recording")
+        return part
+
 
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
 
@@ -191,132 +208,58 @@ def read_joint_motion(folder: Path) -> JointMotion:
     MissingFile, BadData
         No such folder, or its files are damaged.
     """
-    for name in (TRAJECTORY, ROBOT_URDF, "summary.json"):
-        if not (folder / name).is_file():
-            raise MissingFile(f"{folder}: no {name} in it; a folder that `wepose retarget` wrote is wanted here")
-    file, summary_file = folder / TRAJECTORY, folder / "summary.json"
-    try:
+    file, summary_file, urdf = folder / TRAJECTORY, folder / "summary.json", folder / ROBOT_URDF
+    for path in (file, summary_file, urdf):
+        if not path.is_file():
+            raise MissingFile(f"{folder}: no {path.name} in it; a folder that `wepose retarget` wrote is wanted here")
+    with library_errors(summary_file, "the summary of a trajectory"):
         summary = json.loads(summary_file.read_text(encoding="utf-8"))
         joints = tuple(map(str, summary["joints"]))
-        place = [float(summary["root"][key]) for key in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+        place = np.array([float(summary["root"][key]) for key in ("x", "y", "z", "qx", "qy", "qz", "qw")])
         posture = {str(joint): float(value) for joint, value in summary["posture"].items()}
         approach_s, name, source = float(summary["approach_s"]), str(summary["robot"]), str(summary["recording"])
-    except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
-        raise BadData(f"{summary_file}: is damaged, or of no trajectory: {error!r}") from error
-    if not np.isfinite(place).all() or abs(np.linalg.norm(place[3:]) - 1.0) > 1e-3:
-        raise BadData(f"{summary_file}: root is at {place}; three coordinates and a unit quaternion are needed")
+        phases, repetitions = read_phases(summary), summary.get(REPETITIONS) or {}
+        phases[REPETITIONS] = tuple((float(begin), float(end)) for begin, end in repetitions.get("spans", ()))
     columns = ["time", "recorded_time", *joints, *(f"{joint}_velocity" for joint in joints)]
     values = read_columns(read_table(file), columns, str(file), str(file))
-    if (lost := ~np.isfinite(values)).any():
-        row, column = np.argwhere(lost)[0]
-        raise BadData(f"{file}: {columns[column]} has no number in row {row + 1}; a robot needs one in every row")
     time = values[:, 0]
-    if len(time) < 2 or np.any(np.diff(time) <= 0.0):
-        raise BadData(f"{file}: {len(time)} rows whose times do not all grow; a trajectory has at least 2 that do")
-    robot = read_urdf(folder / ROBOT_URDF)
-    known = {joint.name for joint in robot.joints}
-    if unknown := [joint for joint in joints if joint not in known]:
-        raise BadData(f"{folder / ROBOT_URDF}: no joint '{unknown[0]}'; summary.json beside it names that one")
-    phases = read_phases(summary)
-    repetitions, reason = summary.get(REPETITIONS), ""
-    if isinstance(repetitions, dict):
-        with contextlib.suppress(TypeError, ValueError):
-            phases[REPETITIONS] = tuple((float(begin), float(end)) for begin, end in repetitions["spans"])
-            reason = str(repetitions.get("reason") or "")
+    if not np.isfinite(values).all() or len(time) < 2 or np.any(np.diff(time) <= 0.0):
+        raise BadData(f"{file}: needs two rows at least, a number in each cell, and times that grow")
+    robot = read_urdf(urdf)
+    if unknown := set(joints) - {joint.name for joint in robot.joints}:
+        raise BadData(f"{urdf}: no joint '{min(unknown)}'; summary.json beside it names that one")
     return JointMotion(
         name=name,
         where=str(folder),
         robot=robot,
-        urdf=(folder / ROBOT_URDF).read_text(encoding="utf-8", errors="replace"),
+        urdf=urdf.read_text(encoding="utf-8", errors="replace"),
         joints=joints,
         time=time,
         position=values[:, 2 : 2 + len(joints)],
         velocity=values[:, 2 + len(joints) :],
         posture=posture,
-        p_WB=np.array(place[:3]),
-        quat_WB=np.array(place[3:]) / np.linalg.norm(place[3:]),
+        p_WB=place[:3],
+        quat_WB=place[3:] / np.linalg.norm(place[3:]),
         recorded_time=values[:, 1],
         phases=phases,
         begin=int(np.searchsorted(time, approach_s - SLACK_S)),
         source=source,
-        no_repetitions=reason,
+        no_repetitions=str(repetitions.get("reason") or ""),
     )
 
 
-def select_motion(motion: JointMotion, interval: tuple[float, float] | None, phase: str | None) -> JointMotion:
-    """Return the part of a motion that follows an interval [s] or a phase of the recording; both None: all of it.
-
-    Raises
-    ------
-    WrongOption, BadData
-        The recording has no such interval or phase; the robot has fewer than two samples there.
-    """
-    phases = {name: spans for name, spans in motion.phases.items() if name != REPETITIONS}
-    selected = select_interval(motion.recorded_time, phases, interval, phase)
-    return motion if selected is None else cut_interval(motion, selected)
-
-
-def is_followed(motion: JointMotion, interval: tuple[float, float]) -> bool:
-    """Whether at least two samples follow an interval [s] of the recording."""
-    samples = motion.samples(interval)
-    return samples.stop - samples.start >= 2
-
-
-def cut_interval(motion: JointMotion, interval: tuple[float, float]) -> JointMotion:
-    """Return the part of a motion that follows an interval [s] of the recording.
-
-    Raises
-    ------
-    BadData
-        Fewer than two samples follow it.
-    """
-    samples = motion.samples(interval)
-    if not is_followed(motion, interval):
-        recorded = motion.recorded_time[[motion.begin, -1]]
-        raise BadData(
-            f"{motion.where}: {samples.stop - samples.start} samples follow {interval[0]:g} to {interval[1]:g} s of "
-            f"the recording; the trajectory follows {recorded[0]:g} to {recorded[1]:g} s, and 2 are needed"
-        )
-    return motion.cut(samples)
-
-
-def find_whole_rate(motion: JointMotion) -> int:
-    """Return the samples a second, for files that hold no times and a whole number.
-
-    Raises
-    ------
-    BadData
-        The times are uneven, or their rate is no whole number.
-    """
-    time, rate_hz = motion.time, round(motion.rate_hz)
-    grid = np.linspace(time[0], time[-1], len(time))
-    if np.abs(time - grid).max() * rate_hz > EVEN or abs(rate_hz - motion.rate_hz) > 1e-3:
-        raise BadData(
-            f"{motion.where}: {motion.rate_hz:g} samples a second, or times that are uneven; the file has only a whole "
-            f"number of them, which --rate-hz makes"
-        )
-    return rate_hz
-
-
 def resample_joints(motion: JointMotion, rate_hz: float) -> JointMotion:
-    """Return the motion at another rate, on the cubics through positions and velocities.
-
-    Raises
-    ------
-    BadData
-        Times so far apart that nearly all samples would be new.
-    """
-    time = make_times(motion.where, motion.time, rate_hz)
+    """Return the motion at another rate, on the cubics through positions and velocities."""
+    time = make_times(motion.time, rate_hz)
     curve = CubicHermiteSpline(motion.time, motion.position, motion.velocity)
     inside = np.minimum(time, motion.time[-1])
-    begin = int(np.searchsorted(time, motion.time[min(motion.begin, len(motion.time) - 1)] - SLACK_S))
     return replace(
         motion,
         time=time,
         position=curve(inside),
         velocity=curve.derivative()(inside),
         recorded_time=np.interp(inside, motion.time, motion.recorded_time),
-        begin=begin,
+        begin=int(np.searchsorted(time, motion.time[min(motion.begin, len(motion.time) - 1)] - SLACK_S)),
     )
 
 

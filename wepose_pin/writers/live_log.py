@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import os
-import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,7 +19,6 @@ from ..recording.arrivals import Arrivals
 
 FLUSH_S = 0.25  # [s] what a kill may cost at most
 CHUNK_BYTES = 1 << 16  # or as much, of a replay that goes faster
-SYNC_S = 1.0  # [s] what a power cut may cost at most
 LATEST_S = 1e10  # [s] of the clock of messages
 _encode = json.JSONEncoder(separators=(",", ":")).encode
 
@@ -53,11 +50,8 @@ class LiveLog:
         self._measured = [name in header["orientations"] for name in self._sensors]
         self._time_ns = 0  # of the newest sample
         self._flushed = time.monotonic()
-        self._closing = threading.Event()
         self._writer: Any = Writer(self._file, CHUNK_BYTES)
         self._write(lambda: self._begin(header))
-        self._syncer = threading.Thread(target=self._sync, name="sync of the recording", daemon=True)
-        self._syncer.start()
 
     def samples(self, came: Arrivals) -> None:
         """What arrived, in the order of arrival."""
@@ -88,17 +82,10 @@ class LiveLog:
 
     def close(self) -> None:
         """Write the rest; may be called twice."""
-        self._closing.set()
-        self._syncer.join()
-        self._write(self._finish)
-        file, self._file = self._file, None
-        if file is not None:
-            file.close()
-
-    def _finish(self) -> None:
-        self._writer.finish()
+        self._write(self._writer.finish)
         if self._file is not None:
-            self._file.flush()
+            self._write(self._file.close)
+            self._file = None
 
     def _begin(self, header: Mapping[str, Any]) -> None:
         self._writer.start(PROFILE, "wepose-pin")
@@ -125,23 +112,7 @@ class LiveLog:
             try:
                 write()
             except OSError as error:
-                self._give_up(error)
-
-    def _give_up(self, error: OSError) -> None:
-        self.problem = f"{self.path}: the recording ended: {error.strerror}"
-        file, self._file = self._file, None
-        if file is not None:
-            # What the buffer still holds cannot be written either.
-            with contextlib.suppress(OSError):
-                file.close()
-
-    def _sync(self) -> None:
-        """On a thread of its own: waiting for the disk would hold up the poses."""
-        while not self._closing.wait(SYNC_S):
-            file = self._file
-            if file is None:
-                return
-            try:
-                os.fsync(file.fileno())
-            except (OSError, ValueError):
-                return
+                self.problem = f"{self.path}: the recording ended: {error.strerror}"
+                with contextlib.suppress(OSError):  # what the buffer still holds cannot be written either
+                    self._file.close()
+                self._file = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,13 +11,10 @@ from ..body import BodyModel
 from ..body.kinematics import Pose, compute_pose, find_usual_rate
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, WrongOption
-from ..recording import format_span
 
 # Times count as even while none is off the even grid by more than this share of a step.
 EVEN = 0.1
 SLACK_S = 1e-6  # [s] by which times that are written with digits differ
-# Up to so many new samples for one, or up to a few, times are filled; 10 kHz of 100 Hz are a hundred for one.
-MOST_NEW, FEW = 200, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -43,55 +39,42 @@ class Motion:
         return find_usual_rate(self.pose.time)
 
 
-def make_times(where: str, time: np.ndarray, rate_hz: float) -> np.ndarray:
-    """Return even times (m,) [s] at this rate, from the first of the times (n,) to the last.
-
-    Raises
-    ------
-    BadData
-        A time gap so long that nearly all new samples would be interpolated.
-    """
-    samples = int(np.floor((time[-1] - time[0]) * rate_hz + SLACK_S)) + 1
-    if samples > max(FEW, MOST_NEW * len(time)):
-        jump = int(np.argmax(np.diff(time)))
-        raise BadData(
-            f"{where}: time jumps from {format_span((time[jump], time[jump + 1]))} in row {jump + 2} of its table; at "
-            f"{rate_hz:g} Hz that is {samples} samples of {len(time)}"
-        )
-    return np.asarray(time[0] + np.arange(samples) / rate_hz)
+def make_times(time: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return even times (m,) [s] at this rate, from the first of the times (n,) to the last."""
+    return np.asarray(time[0] + np.arange(int((time[-1] - time[0]) * rate_hz + SLACK_S) + 1) / rate_hz)
 
 
-def resample_evenly(motion: Motion) -> Motion:
-    """The motion on even times."""
-    time = motion.pose.time
-    grid = time[0] + np.arange(len(time)) * (time[-1] - time[0]) / (len(time) - 1)
-    off = float(np.max(np.abs(time - grid))) * motion.rate_hz
-    return motion if off <= EVEN else resampled(motion, motion.rate_hz)
+def is_even(time: np.ndarray) -> bool:
+    """Return whether times (n,) are those of a constant rate."""
+    grid = np.linspace(time[0], time[-1], len(time))
+    return bool(np.abs(time - grid).max() * find_usual_rate(time) <= EVEN)
 
 
 def check_rate(rate_hz: float) -> None:
-    """Raises `BadOption` where no recording has that rate."""
+    """Raise `WrongOption` where no recording has that rate."""
     if not 1.0 <= rate_hz <= 10000.0:
         raise WrongOption("rate-hz", f"{rate_hz:g}", "between 1 and 10000 samples a second")
 
 
-def resampled(motion: Motion, rate_hz: float) -> Motion:
-    """The motion at another rate: orientations by the shortest way between two samples, points from the body in them.
+def resample_evenly(motion: Motion) -> Motion:
+    """Return the motion on even times."""
+    return motion if is_even(motion.pose.time) else resample(motion, motion.rate_hz)
+
+
+def resample(motion: Motion, rate_hz: float) -> Motion:
+    """Return the motion at another rate: orientations by the shortest way between two samples, points from the body.
 
     No filter comes before: what is faster than half the new rate is folded.
 
     Raises
     ------
-    BadOption
-        No rate that a recording has.
     BadData
-        An orientation is not known; a time gap so long that nearly all new samples would be interpolated.
+        An orientation is not known.
     """
-    check_rate(rate_hz)
     check_complete(motion, "resampling")
     pose = motion.pose
     old = pose.time
-    time = np.minimum(make_times(motion.where, old, rate_hz), old[-1])
+    time = np.minimum(make_times(old, rate_hz), old[-1])
     after = np.clip(np.searchsorted(old, time, side="left"), 1, len(old) - 1)
     share = (time - old[after - 1]) / (old[after] - old[after - 1])
 
@@ -113,13 +96,7 @@ def resampled(motion: Motion, rate_hz: float) -> Motion:
 
 
 def check_complete(motion: Motion, format_name: str) -> None:
-    """Every sample of every segment has an orientation.
-
-    Raises
-    ------
-    BadData
-        One has none, and `what` cannot leave it out.
-    """
+    """Raise `BadData` where a sample of a segment has no orientation, which the format cannot leave out."""
     for segment, quat in motion.pose.quat_WL.items():
         lost = ~np.isfinite(quat).all(axis=1)
         if lost.any():
@@ -130,7 +107,7 @@ def check_complete(motion: Motion, format_name: str) -> None:
 
 
 def diagnose_gaps(motion: Motion) -> list[Diagnostic]:
-    """Segments with gaps, where a format has no way to mark them."""
+    """List the segments with gaps, where a format has no way to mark them."""
     gaps = {segment: int(np.count_nonzero(gap)) for segment, gap in motion.pose.gap.items()}
     unmarked = {"variant": "unmarked"}
     return [
@@ -157,16 +134,3 @@ def find_measured_points(motion: Motion) -> dict[str, np.ndarray]:
         lost = [pose.gap[link] for link in motion.model.reaches[point] if link in pose.gap]
         points[point] = np.where(np.any(lost, axis=0)[:, None], np.nan, p_W) if lost else p_W
     return points
-
-
-def check_joint_names(motion: Motion, columns: Collection[str]) -> None:
-    """Check that no joint of a mechanism is named as one of the table's own columns.
-
-    Raises
-    ------
-    BadData
-        One is: it would replace that column.
-    """
-    for name in motion.pose.joints:
-        if name in columns:
-            raise BadData(f"{motion.where}: the joint '{name}' is named as a column of the file; rename it in the URDF")

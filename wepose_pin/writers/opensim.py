@@ -29,7 +29,7 @@ from ..angles import diagnose_lock, joint_angles
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData, BadOption
 from ..readers.opensim import OWN
-from .motion import Motion, check_complete, check_joint_names, diagnose_gaps, find_measured_points, resample_evenly
+from .motion import Motion, check_complete, diagnose_gaps, find_measured_points, resample_evenly
 from .rajagopal import SPANS, coordinates, in_ground, orientations
 
 _TRC_KEYS = (
@@ -64,7 +64,6 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
     if motion.pose.joints:
         if names is not None:
             raise BadOption(f"--names {names}: {motion.where} is of a mechanism, whose joints have their own names")
-        check_joint_names(motion, ("time",))
         _write_coordinates(path, motion, _convert_joints(motion))
         return diagnostics
     columns, marks = dict[str, np.ndarray](), dict[str, np.ndarray]()
@@ -196,7 +195,7 @@ def _add_properties(parent: Element, properties: Mapping[str, Any]) -> None:
 # The model --------------------------------------------------------------------------------------------------------
 
 
-def write_scale(path: Path, motion: Motion, model: str = GENERIC_MODEL) -> list[Diagnostic]:
+def write_scale(path: Path, motion: Motion, osim_model: str | Path = GENERIC_MODEL) -> list[Diagnostic]:
     """Write the set-up of OpenSim's Scale Tool that gives the generic model the subject's lengths; with the factors.
 
     The factors are over the lengths of Rajagopal's model. Masses stay. No markers are placed, so
@@ -204,7 +203,7 @@ def write_scale(path: Path, motion: Motion, model: str = GENERIC_MODEL) -> list[
 
     Parameters
     ----------
-    model : name of the generic model
+    osim_model : name of the generic model
 
     Raises
     ------
@@ -232,7 +231,7 @@ def write_scale(path: Path, motion: Motion, model: str = GENERIC_MODEL) -> list[
         "output_model_file": f"{path.name.removeprefix('.').removesuffix('.partial').removesuffix('.xml')}.osim",
     }
     name = re.sub(r"[^A-Za-z0-9_.-]+", "_", motion.name) or "subject"
-    tool = {"GenericModelMaker": {"model_file": model}, "ModelScaler": scaler}
+    tool = {"GenericModelMaker": {"model_file": str(osim_model)}, "ModelScaler": scaler}
     _write_setup(path, "ScaleTool", {"mass": "-1", **tool}, name)
     return []
 

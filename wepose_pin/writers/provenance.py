@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import platform
+import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,69 +20,54 @@ from .result import versions
 
 FORMAT = 1
 CALL = "wepose_pin.track"  # in place of a command, of a result that `TrackResult.save` wrote
-ALONE = "provenance.json"  # beside results that have no JSON of their own
-INSIDE = ("summary.json", "calibration.json")
+INSIDE = ("summary.json", "calibration.json")  # files of a result that hold its provenance
 # Of a result folder, what others are made from; pages and what was exported into it are not.
 _RESULT = ("pose.parquet", "joints.parquet", "subject.toml", "subject.urdf", "model.toml")
-_NOT_OPTIONS = ("out", "force")
 _PACKAGE = Path(__file__).resolve().parent.parent
 
 
 @lru_cache(maxsize=1)
 def code() -> dict[str, str | None]:
-    """Version, commit where it is known (`+` where files were changed since), hash of the code and data that ran."""
+    """Return version, commit where it is known (`+`: files were changed since), and the hash of code and data."""
     digest = hashlib.sha256()
     for folder in (_PACKAGE, asset("urdf", "upper_body.urdf").parent, asset("calibration", "clasp.toml").parent):
         files = (path.relative_to(folder) for path in folder.rglob("*") if path.suffix in (".py", ".toml", ".urdf"))
         for file in sorted(file for file in files if file.parts[0] != "_assets"):  # a wheel has the data in the package
             digest.update(file.as_posix().encode() + b"\0" + (folder / file).read_bytes() + b"\0")
-    return {"version": __version__, "commit": _commit(), "code": digest.hexdigest()}
-
-
-@lru_cache(maxsize=1)
-def machine() -> str:
-    """System and processor: another kind of processor may round the last bits otherwise."""
-    name = platform.processor()
-    with contextlib.suppress(OSError):
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
-    return f"{platform.system()} {platform.machine()}" + (f", {name}" if name else "")
-
-
-def _commit() -> str | None:
-    if not (_PACKAGE.parent / ".git").exists():  # a wheel; a repository further up is another one
-        return None
-    try:
-        described = subprocess.run(
-            ["git", "-C", str(_PACKAGE.parent), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"],
-            capture_output=True,
-            text=True,
-            timeout=10.0,
-            check=True,
-        )
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return described.stdout.strip()
+    commit = ""
+    if (_PACKAGE.parent / ".git").exists() and shutil.which("git"):  # no wheel
+        words = ["git", "-C", str(_PACKAGE.parent), "describe", "--always", "--dirty=+", "--abbrev=12", "--exclude=*"]
+        commit = subprocess.run(words, capture_output=True, text=True).stdout.strip()
+    return {"version": __version__, "commit": commit or None, "code": digest.hexdigest()}
 
 
 def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The provenance of what a command makes.
+    """Collect the provenance of what a command makes.
 
     Parameters
     ----------
     command : as on the command line, or `CALL`
-    values : the fields of its job; those that name existing files are inputs, the others options, seeds among them
+    values : its options; those that name existing files are inputs
 
     Raises
     ------
     MissingFile
         An input cannot be read.
     """
-    inputs = {name: path for name, value in values.items() if (path := _input_path(name, value)) is not None}
-    several = {name: value for name, value in values.items() if isinstance(value, tuple) and value}
-    several = {name: value for name, value in several.items() if all(isinstance(each, Path) for each in value)}
-    inputs |= {f"{name}.{i}": path for name, paths in several.items() for i, path in enumerate(paths)}
-    options = {name: value for name, value in values.items() if name not in (*inputs, *several, *_NOT_OPTIONS)}
+    inputs: dict[str, Path] = {}
+    options: dict[str, Any] = {}
+    for name, value in values.items():
+        if name in ("out", "force"):
+            continue
+        several = list(value) if isinstance(value, tuple) and all(isinstance(each, Path) for each in value) else []
+        # A text may name a file, as that of --protocol.
+        is_path = isinstance(value, Path) or (isinstance(value, str) and value.endswith((".toml", ".urdf")))
+        if several:
+            inputs |= {f"{name}.{i}": path for i, path in enumerate(several)}
+        elif is_path and Path(value).exists():
+            inputs[name] = Path(value)
+        else:
+            options[name] = value
     return {
         "format": FORMAT,
         "command": command,
@@ -90,53 +75,59 @@ def collect_provenance(command: str, values: Mapping[str, Any]) -> dict[str, Any
         "options": json.loads(json.dumps(options, default=str)),
         "inputs": {name: {"path": str(path.absolute()), "files": file_hashes(path)} for name, path in inputs.items()},
         "packages": versions(),
-        "machine": machine(),
+        "machine": f"{platform.system()} {platform.machine()}",
     }
 
 
-def _input_path(name: str, value: Any) -> Path | None:
-    """The path that an option names, if it is that of something read."""
-    if name in _NOT_OPTIONS or not isinstance(value, str | Path):
-        return None
-    if isinstance(value, str) and not value.endswith((".toml", ".urdf")):  # text that may name a file, as --protocol
-        return None
-    return Path(value) if Path(value).exists() else None
-
-
 def file_hashes(path: Path, truth: bool = False) -> dict[str, str]:
-    """SHA-256 of all that an input consists of, by its name relative to the input's folder.
-
-    Of a session or a model's table the files that it names too; of a URDF the tables beside it that are read with it;
-    of a result what others are made from.
+    """Compute SHA-256 of all that an input consists of (`list_files`), by its name relative to the input's folder.
 
     Raises
     ------
     MissingFile
-        One is not there, or cannot be read.
+        A file is missing, or cannot be read.
     """
     top = path if path.is_dir() else path.parent
-    return {_relative_name(file, top): file_hash(file) for file in list_files(path, truth)}
+    hashes = {}
+    for file in list_files(path, truth):
+        name = file.relative_to(top) if file.is_relative_to(top) else file
+        try:
+            with file.open("rb") as opened:
+                hashes[name.as_posix()] = hashlib.file_digest(opened, "sha256").hexdigest()
+        except OSError as error:
+            raise MissingFile(f"{file}: cannot be read: {error.strerror}") from error
+    return hashes
 
 
 def list_files(path: Path, truth: bool = False) -> list[Path]:
-    """List the files that an input consists of, each followed by those that it needs."""
+    """List the files that an input consists of, each followed by those that it needs.
+
+    Of a session or a model's table the files that it names too; of a URDF the tables beside it that are read with it;
+    of a result what others are made from.
+    """
     if (path / "session.toml").is_file():
         path = path / "session.toml"
     if path.is_dir():
-        return [path / name for name in _RESULT if (path / name).is_file()] or sorted(_list_all(path))
+        return [path / name for name in _RESULT if (path / name).is_file()] or _list_folder(path)
     files = [path]
     for file in files:
         needed = [file.parent / name for name in list_named_files(file, truth)]
         if file.suffix == ".urdf":  # the map of a robot, or the table of a body, is read where it lies beside
             needed += [table for table in (file.with_suffix(".toml"), file.with_name("model.toml")) if table.is_file()]
-        # A map may name a URDF of example-robot-data, which lies elsewhere and has a version of its own.
-        files += [each for each in needed if each not in files and (each.exists() or each.suffix != ".urdf")]
+        for each in needed:
+            # A map may name a URDF of example-robot-data, which lies elsewhere and has a version of its own.
+            new = _list_folder(each) if each.is_dir() else [each] if each.exists() or each.suffix != ".urdf" else []
+            files += [file for file in new if file not in files]
     return files
+
+
+def _list_folder(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
 
 
 def list_named_files(path: Path, truth: bool = False) -> list[str]:
     """List the files and folders that a session, or a model's table, names, as they stand there."""
-    if path.suffix != ".toml" or not path.is_file():  # a pipe would hold us up
+    if path.suffix != ".toml" or not path.is_file():  # a pipe would block
         return []
     try:
         content = parse_toml(path.read_bytes().decode("utf-8"))
@@ -153,50 +144,11 @@ def list_named_files(path: Path, truth: bool = False) -> list[str]:
     return sorted({name for name in names if isinstance(name, str) and name})
 
 
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file, or of the names and contents of all in a folder.
-
-    Raises
-    ------
-    MissingFile
-        It is not there, or cannot be read.
-    """
-    try:
-        if path.is_dir():
-            listing = "".join(f"{_relative_name(file, path)} {file_hash(file)}\n" for file in sorted(_list_all(path)))
-            return hashlib.sha256(listing.encode()).hexdigest()
-        if path.exists() and not path.is_file():
-            raise MissingFile(f"{path}: is no regular file")
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _list_all(folder: Path) -> Iterator[Path]:
-    return (path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
-
-
-def _relative_name(file: Path, top: Path) -> str:
-    try:
-        return file.relative_to(top).as_posix()
-    except ValueError:
-        return file.as_posix()
-
-
-# Where it is kept ----------------------------------------------------------------------------------------------------
-
-
-def provenance_file(file: Path) -> Path:
-    """``FILE.provenance.json``, where the provenance of a file stands."""
-    return file.with_name(f"{file.name}.{ALONE}")
-
-
 def write_provenance(folder: Path, provenance: Mapping[str, Any]) -> None:
-    """``provenance.json`` in a folder."""
-    (folder / ALONE).write_text(provenance_text(provenance), encoding="utf-8")
+    """Write ``provenance.json`` into a folder."""
+    (folder / "provenance.json").write_text(provenance_text(provenance), encoding="utf-8")
 
 
 def provenance_text(provenance: Mapping[str, Any]) -> str:
-    """A provenance as a file of its own holds it."""
+    """Format a provenance as a file of its own holds it."""
     return json.dumps(provenance, indent=1, ensure_ascii=False) + "\n"

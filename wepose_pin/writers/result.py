@@ -22,14 +22,15 @@ import polars as pl
 from .. import __version__
 from ..angles.torques import Torques, torque_table
 from ..arguments import check_arguments
-from ..body import BodyModel, BodyTable, load_model, load_table
+from ..body import BodyModel, load_model, load_table
 from ..body.kinematics import Pose, find_samples
 from ..body.pose_table import build_pose_table, parse_pose_table
 from ..body.subject import Subject, load_subject, subject_toml
 from ..body.table_file import MODEL_TABLE, format_table
 from ..data_tables import open_source, read_columns, read_table
 from ..diagnostics import from_json
-from ..errors import BadData, ExistingOutput, MissingFile
+from ..errors import ExistingOutput, MissingFile
+from ..libraries import library_errors
 from ..recording import Intervals, Mark, select_interval
 from ..tracking import TrackResult, TrackSummary
 
@@ -65,7 +66,7 @@ def write_poses(folder: Path, chunks: Iterable[TrackResult], covariance: bool = 
     for tracked in chunks:
         tables = {POSE: build_pose_table(tracked.pose, covariance)}
         if tracked.joints:
-            tables[JOINTS] = build_joint_table(tracked.pose)
+            tables[JOINTS] = pl.DataFrame({"time": tracked.pose.time, **tracked.pose.joints})
         for name, table in tables.items():
             files = parts.setdefault(name, [])
             files.append(folder / f"{name}.{len(files):06d}")
@@ -110,11 +111,6 @@ def write_about(
     (folder / "summary.json").write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
 
 
-def build_joint_table(pose: Pose) -> pl.DataFrame:
-    """Build the table of ``joints.parquet``: ``time``, and a column a joint of one axis [rad or m]."""
-    return pl.DataFrame({"time": pose.time, **pose.joints})
-
-
 def write_table(path: Path, table: pl.DataFrame) -> None:
     """Write a Parquet file.
 
@@ -141,7 +137,8 @@ def write_subject(folder: Path, subject: Subject, model: BodyModel) -> None:
     """``subject.toml``, and ``subject.urdf``: the body with the subject's lengths; of another body ``model.toml``."""
     (folder / "subject.toml").write_text(subject_toml(subject), encoding="utf-8")
     (folder / SUBJECT_URDF).write_text(format_urdf(subject, model), encoding="utf-8")
-    if _strip_origin(model.table) != _strip_origin(load_table()):
+    own, upper_body = (replace(table, name="", where="") for table in (model.table, load_table()))
+    if own != upper_body:
         (folder / MODEL_TABLE).write_text(format_table(model.table, SUBJECT_URDF), encoding="utf-8")
 
 
@@ -152,15 +149,9 @@ def format_urdf(subject: Subject, model: BodyModel) -> str:
         f"{name} {value:.4f}" + (f" ± {subject.std(name):.4f}" if np.isfinite(subject.std(name)) else "")
         for name, value in subject.lengths.items()
     )
-    comment = re.sub(
-        "-(?=-)", "- ", f"{subject.name}: lengths in metres ± one standard deviation. {text}"
-    )  # no -- in XML
+    text = f"{subject.name}: lengths in metres ± one standard deviation. {text}"
+    comment = re.sub("-(?=-)", "- ", text)  # no -- in XML
     return f"{head}\n<!-- {comment} -->\n{body}"
-
-
-def _strip_origin(table: BodyTable) -> BodyTable:
-    """A table without what says where it is from."""
-    return replace(table, name="", where="")
 
 
 def read_result(
@@ -181,14 +172,12 @@ def read_result(
         raise MissingFile(f"{folder}: no pose.parquet in it; a folder that `wepose track` wrote is wanted here")
     pose = parse_pose_table(read_table(folder / "pose.parquet"), str(folder / "pose.parquet"))
     if (folder / JOINTS).is_file():
-        pose = replace(pose, joints=_read_joints(folder / JOINTS, len(pose.time)))
+        table, place = read_table(folder / JOINTS), str(folder / JOINTS)
+        joints = {name: read_columns(table, [name], place, place)[:, 0] for name in table.columns if name != "time"}
+        pose = replace(pose, joints=joints)
     summary_file = folder / "summary.json"
-    try:
-        summary = json.loads(summary_file.read_text(encoding="utf-8")) if summary_file.is_file() else {}
-    except (ValueError, RecursionError) as error:
-        raise BadData(f"{summary_file}: is damaged, no JSON: {error}") from error
-    if not isinstance(summary, dict):
-        raise BadData(f"{summary_file}: is damaged: {str(summary)[:40]!r} in place of an object")
+    with library_errors(summary_file, "the summary of a result"):
+        summary = dict(json.loads(summary_file.read_text(encoding="utf-8"))) if summary_file.is_file() else {}
     model, subject_file = load_model(folder / SUBJECT_URDF), folder / "subject.toml"
     if model.table.girdles and subject_file.is_file():
         model = replace(model, girdles=load_subject(subject_file).girdles)
@@ -223,19 +212,16 @@ def load_result(folder: str | Path) -> TrackResult:
     check_arguments(load_result, locals())
     folder = Path(folder)
     pose, model, summary = read_result(folder)
-    try:
+    with library_errors(folder / "summary.json", "the summary of a result"):
         diagnostics = tuple(from_json(each) for each in summary.get("diagnostics", ()))
-        recorded = summary.get("recorded_phases", {}).items()
-        phases = {phase: tuple((float(begin), float(end)) for begin, end in spans) for phase, spans in recorded}
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise BadData(f"{folder / 'summary.json'}: is damaged: {error}") from error
+        marks = tuple(Mark(float(time), str(text)) for time, text in summary.get("recorded_marks", ()))
     return TrackResult(
         str(summary.get("recording") or folder.name),
         pose,
         model,
         load_subject(folder),
-        phases,
-        read_marks(summary),
+        read_phases(summary),
+        marks,
         source=folder,
         summary=summary,
         diagnostics=diagnostics,
@@ -243,31 +229,12 @@ def load_result(folder: str | Path) -> TrackResult:
 
 
 def read_phases(summary: Mapping[str, Any]) -> dict[str, Intervals]:
-    """Read the phases of the recording from a result's summary; what is no list of intervals is left out."""
-    phases, recorded = {}, summary.get("recorded_phases")
-    for name, spans in (recorded if isinstance(recorded, dict) else {}).items():
-        with contextlib.suppress(TypeError, ValueError):
+    """Read the phases of the recording from a result's summary; a damaged one has none."""
+    phases = {}
+    with contextlib.suppress(AttributeError, TypeError, ValueError):
+        for name, spans in summary.get("recorded_phases", {}).items():
             phases[name] = tuple((float(begin), float(end)) for begin, end in spans)
     return phases
-
-
-def read_marks(summary: Mapping[str, Any]) -> tuple[Mark, ...]:
-    """Read the marked texts of the recording from a result's summary; what is none is left out."""
-    marks, recorded = [], summary.get("recorded_marks")
-    for mark in recorded if isinstance(recorded, list) else ():
-        with contextlib.suppress(TypeError, ValueError):
-            time, text = mark
-            marks.append(Mark(float(time), str(text)))
-    return tuple(marks)
-
-
-def _read_joints(file: Path, samples: int) -> dict[str, np.ndarray]:
-    """Joint → its values (n,) [rad or m]."""
-    table = read_table(file)
-    if len(table) != samples:
-        raise BadData(f"{file}: {len(table)} rows, and pose.parquet beside it has {samples}; they must be as many")
-    names = [name for name in table.columns if name != "time"]
-    return dict(zip(names, read_columns(table, names, str(file), str(file)).T, strict=True))
 
 
 @cache

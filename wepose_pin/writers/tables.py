@@ -10,15 +10,13 @@ from ..angles import angle_table, diagnose_lock, joint_angles
 from ..body.pose_table import build_pose_table
 from ..diagnostics import Diagnostic
 from ..errors import BadData
-from .motion import Motion, check_joint_names
+from .motion import Motion
 from .result import write_table
 
 
-def table(motion: Motion) -> tuple[pl.DataFrame, list[Diagnostic]]:
-    """`build_pose_table`, and beside it `angle_table` where a joint has both of its segments; a mechanism's joints."""
-    pose = build_pose_table(motion.pose)
-    check_joint_names(motion, pose.columns)
-    pose = pose.with_columns(**motion.pose.joints)
+def build_table(motion: Motion) -> tuple[pl.DataFrame, list[Diagnostic]]:
+    """Build the table of the pose, and beside it that of the angles where a joint has both of its segments."""
+    pose = build_pose_table(motion.pose).with_columns(**motion.pose.joints)
     try:
         angles = joint_angles(motion.pose)
     except BadData:
@@ -27,19 +25,19 @@ def table(motion: Motion) -> tuple[pl.DataFrame, list[Diagnostic]]:
 
 
 def write_parquet(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Every number to its last bit; what is not known is NaN."""
-    rows, diagnostics = table(motion)
+    """Write every number to its last bit; what is not known is NaN."""
+    rows, diagnostics = build_table(motion)
     write_table(path, rows)
     return diagnostics
 
 
 def write_csv(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Every number to its last bit (the shortest text that reads back as it); what is not known is empty."""
-    rows, diagnostics = table(motion)
+    """Write every number to its last bit (the shortest text that reads back as it); what is not known is empty."""
+    rows, diagnostics = build_table(motion)
     write_table_csv(path, rows)
     return diagnostics
 
 
 def write_table_csv(path: Path, table: pl.DataFrame) -> None:
-    """A CSV file; what is not known is empty."""
+    """Write a CSV file; what is not known is empty."""
     table.fill_nan(None).write_csv(path)
