@@ -64,7 +64,9 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
     if motion.pose.joints:
         if names is not None:
             raise BadOption(f"--names {names}: {motion.where} is of a mechanism, whose joints have their own names")
-        _write_coordinates(path, motion, _convert_joints(motion))
+        slides = {joint.name for joint in motion.model.robot.joints if joint.type == "prismatic"}
+        joints = {name: each if name in slides else np.degrees(each) for name, each in motion.pose.joints.items()}
+        _write_coordinates(path, motion, joints)
         return diagnostics
     columns, marks = dict[str, np.ndarray](), dict[str, np.ndarray]()
     if names != "opensim":
@@ -87,12 +89,6 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
         )
     _write_coordinates(path, motion, {name: np.degrees(angle) for name, angle in columns.items()} | marks)
     return diagnostics
-
-
-def _convert_joints(motion: Motion) -> dict[str, np.ndarray]:
-    """The joints of a mechanism, in degrees and m."""
-    slides = {joint.name for joint in motion.model.robot.joints if joint.type == "prismatic"}
-    return {name: each if name in slides else np.degrees(each) for name, each in motion.pose.joints.items()}
 
 
 def _write_coordinates(path: Path, motion: Motion, columns: Mapping[str, np.ndarray]) -> None:
@@ -131,47 +127,31 @@ def list_setups(sto: Path) -> list[Path]:
 
 
 def write_setups(sto: Path, written: Mapping[Path, Path], motion: Motion, model: str) -> None:
-    """Write what OpenSense needs beside the .sto and the subject's model.
+    """Write what OpenSense needs beside the .sto of a motion: each of `list_setups` where `written` has it.
 
-    Parameters
-    ----------
-    sto : the file of orientations; the set-ups are read from its folder
-    written : each of `list_setups` → where to write it now
-    motion : whose .sto it is
-    model : name of the subject's model
-
-    Raises
-    ------
-    BadData
-        No segment is a body of the model.
+    `model` is the name of the subject's model.
     """
     placement, placer, ik = list_setups(sto)
     placed_model = f"{sto.stem}_placed.osim"  # with sensors, which the IMU Placer writes
     write_placement(written[placement], motion)
-    _write_setup(
-        written[placer],
-        "IMUPlacer",
-        {
-            "model_file": model,
-            "sensor_to_opensim_rotations": "0 0 0",
-            "orientation_file_for_calibration": placement.name,
-            "output_model_file": placed_model,
-        },
-    )
+    placer_keys = {
+        "model_file": model,
+        "sensor_to_opensim_rotations": "0 0 0",
+        "orientation_file_for_calibration": placement.name,
+        "output_model_file": placed_model,
+    }
+    _write_setup(written[placer], "IMUPlacer", placer_keys)
     step = 0.5 / motion.rate_hz  # past the last sample, whose time is rounded in the file
-    _write_setup(
-        written[ik],
-        "IMUInverseKinematicsTool",
-        {
-            "model_file": placed_model,
-            "orientations_file": sto.name,
-            "sensor_to_opensim_rotations": "0 0 0",
-            "time_range": f"{motion.pose.time[0] - step:.6f} {motion.pose.time[-1] + step:.6f}",
-            "report_errors": "true",
-            "results_directory": ".",
-            "output_motion_file": f"{sto.stem}_ik.mot",
-        },
-    )
+    ik_keys = {
+        "model_file": placed_model,
+        "orientations_file": sto.name,
+        "sensor_to_opensim_rotations": "0 0 0",
+        "time_range": f"{motion.pose.time[0] - step:.6f} {motion.pose.time[-1] + step:.6f}",
+        "report_errors": "true",
+        "results_directory": ".",
+        "output_motion_file": f"{sto.stem}_ik.mot",
+    }
+    _write_setup(written[ik], "IMUInverseKinematicsTool", ik_keys)
 
 
 def _write_setup(path: Path, tool: str, properties: Mapping[str, Any], name: str = "") -> None:
@@ -271,16 +251,14 @@ def write_trc(path: Path, motion: Motion) -> list[Diagnostic]:
     labels = "Frame#\tTime\t" + "\t\t\t".join(points) + "\t\t"
     axes = "\t\t" + "\t".join(f"{axis}{k}" for k in range(1, len(points) + 1) for axis in "XYZ")
     columns = {
-        f"{point}_{axis}": p_G for point, p_W in points.items() for axis, p_G in zip("XYZ", _mm(p_W), strict=True)
+        f"{point}_{axis}": 1e3 * p_G
+        for point, p_W in points.items()
+        for axis, p_G in zip("XYZ", in_ground(p_W).T, strict=True)
     }
     rows = pl.DataFrame({"Frame#": np.arange(1, n + 1), "Time": motion.pose.time, **columns, "": [None] * n})
     header = [f"PathFileType\t4\t(X/Y/Z)\t{path.name.removeprefix('.').removesuffix('.partial')}", keys, values]
     _write(path, [*header, labels, axes, ""], rows, labels=False)
     return []
-
-
-def _mm(p_W: np.ndarray) -> np.ndarray:
-    return 1e3 * in_ground(p_W).T
 
 
 def _write(path: Path, header: list[str], rows: pl.DataFrame, labels: bool = True) -> None:

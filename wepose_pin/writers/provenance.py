@@ -15,7 +15,7 @@ from typing import Any
 from .. import __version__
 from ..assets import asset
 from ..documents import parse_toml
-from ..errors import MissingFile
+from ..libraries import check_file, library_errors
 from .result import versions
 
 FORMAT = 1
@@ -84,18 +84,16 @@ def file_hashes(path: Path, truth: bool = False) -> dict[str, str]:
 
     Raises
     ------
-    MissingFile
+    MissingFile, BadData
         A file is missing, or cannot be read.
     """
     top = path if path.is_dir() else path.parent
     hashes = {}
     for file in list_files(path, truth):
         name = file.relative_to(top) if file.is_relative_to(top) else file
-        try:
-            with file.open("rb") as opened:
-                hashes[name.as_posix()] = hashlib.file_digest(opened, "sha256").hexdigest()
-        except OSError as error:
-            raise MissingFile(f"{file}: cannot be read: {error.strerror}") from error
+        check_file(file, "an input")
+        with library_errors(file, "an input"), file.open("rb") as opened:
+            hashes[name.as_posix()] = hashlib.file_digest(opened, "sha256").hexdigest()
     return hashes
 
 
