@@ -105,12 +105,11 @@ def test_trackers_without_a_place_are_named_and_can_be_assigned(sender: socket.s
     assigned.open()
     try:
         sender.sendto(HANDSHAKE, assigned.address)
-        # The older packets: a rotation of the first sensor, and one of sixteen bits.
-        sender.sendto(struct.pack(">IQ4f", 16, 9, 0.0, 0.0, 1.0, 0.0), assigned.address)
-        sender.sendto(struct.pack(">IQB4h3h", 23, 10, 1, 0, 0, 23170, 23170, 0, 0, 0), assigned.address)
-        rotations = read_all(assigned, 2)["head"]
-        np.testing.assert_allclose(rotations[0], [0.0, 0.0, 1.0, 0.0], atol=1e-7)
-        np.testing.assert_allclose(rotations[1], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-7)
+        sender.sendto(ROTATION, assigned.address)
+        sender.sendto(ROTATION.replace(b"\x2a", b"\x2b")[:20], assigned.address)
+        np.testing.assert_allclose(read_all(assigned)["head"], [[0.0, 0.0, 0.0, 1.0]], atol=1e-7)
+        assert not read_all_for(assigned, 0.2)
+        assert assigned.problems == {"SlimeVR packets of a wrong length": 1}
     finally:
         assigned.close()
 

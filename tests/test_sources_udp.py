@@ -19,7 +19,6 @@ from sampling import collect, connected, find_free_port
 
 from wepose_pin.errors import BadSource
 from wepose_pin.live.sources import open_source
-from wepose_pin.live.sources.base import MAX_KINDS
 from wepose_pin.live.sources.udp import NUMBERS, UdpSource, decode
 from wepose_pin.recording.limits import STANDARD_GRAVITY
 
@@ -46,11 +45,10 @@ def sender() -> Iterator[socket.socket]:
 
 
 def test_a_json_line_may_say_the_charge_of_the_battery(source: UdpSource, sender: socket.socket) -> None:
-    for line in (GOOD, GOOD | {"t": 12.355, "battery": 0.4}, GOOD | {"t": 12.365}, GOOD | {"t": 12.375, "battery": 40}):
+    for line in (GOOD, GOOD | {"t": 12.355, "battery": 0.4}, GOOD | {"t": 12.365}):
         sender.sendto(json.dumps(line).encode(), source.address)
     assert len(collect(source, 3)["torso"].time) == 3
     assert source.batteries == {"torso": 0.4}
-    assert source.problems == {"JSON lines whose battery is not a share, 0 to 1": 1}
 
 
 def test_a_json_line_of_one_sample(source: UdpSource, sender: socket.socket) -> None:
@@ -107,32 +105,31 @@ def test_a_binary_packet(source: UdpSource, sender: socket.socket) -> None:
     np.testing.assert_allclose(np.diff(samples.time), 0.001, atol=1e-6)
 
 
-def test_the_numbers_of_sensors_are_all_segments() -> None:
-    assert sorted(NUMBERS) == sorted(SEGMENTS)
-
-
 @pytest.mark.parametrize(
     ("datagram", "problem"),
     [
-        (b"hello", "lines that are no JSON"),
-        (b"\xff\xfe\x00", "lines that are no JSON"),
-        (b"[" * 60000, "lines that are no JSON"),
-        (b'{"t": ' + b"9" * 5000 + b"}", "lines that are no JSON"),
-        (b"[1, 2]", "JSON lines without sensor, t, gyro and accel"),
+        *(
+            (line, "lines that are not as")
+            for line in (
+                b"hello",
+                b"\xff\xfe\x00",
+                b"[" * 60000,
+                b'{"t": ' + b"9" * 5000 + b"}",
+                b"[1, 2]",
+                json.dumps({**GOOD, "t": "now"}).encode(),
+                json.dumps({**GOOD, "t": 10**400}).encode(),
+                json.dumps({**GOOD, "gyro": [0, 0]}).encode(),
+                json.dumps({**GOOD, "t": [1.0, 2.0]}).encode(),
+                json.dumps({**GOOD, "battery": "full"}).encode(),
+            )
+        ),
         (json.dumps({**GOOD, "sensor": "trunk"}).encode(), "samples of an unknown sensor: 'trunk'"),
         (json.dumps({**GOOD, "sensor": ["torso"]}).encode(), "samples of an unknown sensor: \"['torso']\""),
-        (json.dumps({**GOOD, "t": float("nan")}).encode(), "JSON lines with NaN, which is no number"),
-        (json.dumps({**GOOD, "t": "12"}).encode(), "JSON lines with something else than numbers"),
-        (json.dumps({**GOOD, "t": 10**400}).encode(), "JSON lines with something else than numbers"),
-        (json.dumps({**GOOD, "gyro": [True, 0, 0]}).encode(), "JSON lines with something else than numbers"),
-        (json.dumps({**GOOD, "gyro": [0, 0]}).encode(), "JSON lines whose gyro or accel is not three numbers"),
-        (
-            json.dumps({**GOOD, "t": [], "gyro": [], "accel": []}).encode(),
-            "JSON lines with something else than numbers",
-        ),
-        (json.dumps({**GOOD, "t": [1.0, 2.0]}).encode(), "JSON lines whose t, gyro and accel differ in length"),
+        (json.dumps({**GOOD, "battery": 40}).encode(), "lines without samples, or whose battery is not a share"),
+        (json.dumps({**GOOD, "t": [], "gyro": [], "accel": []}).encode(), "lines without samples"),
+        (json.dumps({**GOOD, "t": float("nan")}).encode(), "samples with times that no clock has"),
+        (b'{"sensor": "torso", "t": 1e999, "gyro": [0, 0, 0], "accel": [0, 0, 0]}', "samples with times"),
         (json.dumps({**GOOD, "gyro": [1e9, 0, 0]}).encode(), "samples with values that no body sensor gives"),
-        (b'{"sensor": "torso", "t": 1e999, "gyro": [0, 0, 0], "accel": [0, 0, 0]}', "samples with values"),
         (binary(0, [1.0], [[0.0] * 6])[:-1], "binary packets of a wrong length"),
         (binary(0, [1.0], [[0.0] * 6]) + b"\0", "binary packets of a wrong length"),
         (b"WPIN", "binary packets of a wrong length"),
@@ -168,6 +165,7 @@ def test_the_examples_of_the_page_are_read() -> None:
     np.testing.assert_allclose(
         batch.values, [[0.1, -0.2, 0.3, 0, 0.5, 9.81], [0.125, -0.25, 0.5, 0, 0.5, 9.75]], rtol=1e-7
     )
+    assert sorted(NUMBERS) == sorted(SEGMENTS)
     for number, name in enumerate(NUMBERS):
         assert f"{number} {name}" in page
 
@@ -191,11 +189,11 @@ def test_a_sensor_that_is_not_tracked_is_counted(sender: socket.socket) -> None:
 
 
 def test_kinds_of_problems_are_bounded(source: UdpSource, sender: socket.socket) -> None:
-    for k in range(3 * MAX_KINDS):
+    for k in range(100):
         sender.sendto(json.dumps({**GOOD, "sensor": f"sensor {k}"}).encode(), source.address)
     source.read(0.2)
-    assert len(source.problems) == MAX_KINDS + 1
-    assert sum(source.problems.values()) == 3 * MAX_KINDS
+    assert len(source.problems) < 30
+    assert sum(source.problems.values()) == 100
 
 
 def test_sensors_are_found_where_they_are_not_given(sender: socket.socket) -> None:

@@ -16,7 +16,7 @@ from scipy.io import savemat
 import wepose_pin
 from wepose_pin.assets import asset
 from wepose_pin.body.subject import population_subject, subject_toml
-from wepose_pin.live.sources import xbus
+from wepose_pin.live.sources import mti
 from wepose_pin.live.sources.udp import CRC, HEADER, MAGIC, SAMPLE
 
 N = 12
@@ -263,12 +263,11 @@ def serial() -> bytes:
     """Bytes of an MTi: two packets of data, an acknowledgement and noise."""
     stream = b"\x00\xfa"
     for k in range(2):
-        data = struct.pack(">HBHHBI", 0x1020, 2, k, 0x1060, 4, 100 * k)
-        data += struct.pack(">HB3f", xbus.RATE_OF_TURN, 12, 0.1, 0.2, 0.3)
-        data += struct.pack(">HB3d", xbus.ACCELERATION | 3, 24, 0.0, 0.0, 9.8)
-        stream += xbus.build_frame(xbus.DATA, data)
-    outputs = xbus.build_output_items(100, xbus.RATE_OF_TURN, xbus.ACCELERATION)
-    return stream + xbus.build_frame(xbus.SET_OUTPUT + 1, outputs)
+        data = struct.pack(">HBI", mti.SAMPLE_TIME, 4, 100 * k)
+        for kind in mti.OUTPUTS[0][1:]:
+            data += struct.pack(">HB3f", kind, 12, 0.1, 0.2, 9.8)
+        stream += mti.build_frame(mti.DATA, data)
+    return stream + mti.build_frame(mti.SET_OUTPUT + 1, struct.pack(">4H", 0x8020, 100, 0x4020, 100))
 
 
 def pose() -> bytes:

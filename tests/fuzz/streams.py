@@ -70,18 +70,12 @@ def _sound(came: list[Any]) -> None:
 
 def serial(_folder: Path, data: bytes) -> object:
     """Bytes of an MTi, decoded."""
-    from wepose_pin.live.sources import xbus
+    from wepose_pin.live.sources import mti
 
-    stream, joiner = xbus.Frames(), xbus.Joiner()
-    half = len(data) // 2
-    for frame in stream.feed(data[:half]) + stream.feed(data[half:]):
-        xbus.read_rates(frame.data)
-        xbus.describe_error(frame.data)
-        try:
-            joiner.add(xbus.parse_packet(frame.data))
-        except xbus.Malformed:
-            continue
-    return joiner.take()
+    buffer, half = bytearray(data[: len(data) // 2]), data[len(data) // 2 :]
+    frames = mti.take_frames(buffer)[0]
+    buffer += half
+    return [mti.parse_packet(content) for _, content in frames + mti.take_frames(buffer)[0]]
 
 
 def lsl(_folder: Path, data: bytes) -> object:
@@ -90,7 +84,7 @@ def lsl(_folder: Path, data: bytes) -> object:
 
     stream, *rest = data.decode("utf-8", errors="replace").split("\n")
     labels, units = rest[::2], rest[1::2]
-    return find_channels(stream, "imu", labels, units, len(labels), TORSO_HEAD)
+    return find_channels(stream, "imu", labels, units + [""] * len(labels), TORSO_HEAD)
 
 
 SAMPLE = np.dtype([("which", "u1"), ("time", "<f8"), ("gyro", "<f4", 3), ("accel", "<f4", 3)])
@@ -121,7 +115,7 @@ class _Wild:
         return STEP * self._at
 
     def read(self, _timeout_s: float) -> list[Any] | None:
-        from wepose_pin.live.sources.base import find_plausible
+        from wepose_pin.live.sources.base import MAX_VALUES
         from wepose_pin.recording.arrivals import Samples
 
         self._at += 1
@@ -133,7 +127,7 @@ class _Wild:
             return None
         row = self._rows[k]
         time, values = np.array([float(row["time"])]), np.hstack([row["gyro"], row["accel"]])[None].astype(float)
-        if not find_plausible(time, values).all():
+        if not (np.abs(time[0]) < 1e10 and (np.abs(values) <= MAX_VALUES).all()):
             return []
         return [Samples(self.sensors[int(row["which"]) % 2], time, values[:, :3], values[:, 3:])]
 

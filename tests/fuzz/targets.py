@@ -261,7 +261,7 @@ TARGETS = (
     Target("srdf", lambda: [seeds.SRDF], file("arm.srdf", _srdf), XML, "retargeting.collision"),
     Target("datagram", seeds.datagrams, streams.datagram, JSON, "live.sources.udp"),
     Target("udp", lambda: [streams.APART.join(seeds.datagrams())], streams.udp, JSON, "live.sources.udp"),
-    Target("xbus", lambda: [seeds.serial()], streams.serial, (), "live.sources.xbus"),
+    Target("mti", lambda: [seeds.serial()], streams.serial, (), "live.sources.mti"),
     Target("lsl", lambda: [LSL], streams.lsl, (), "live.sources.lsl"),
     Target("live_loop", lambda: [seeds.wild()], streams.loop, (), "live.loop"),
     Target("live_page", seeds.requests, streams.page, HTTP, "live.server"),

@@ -20,24 +20,15 @@ BUFFER_S = 1  # [s] of an LSL stream that liblsl keeps for a slow receiver
 
 
 class RateLimiter:
-    """Accepts no more than `rate_hz` poses a second on average; None: all.
+    """Accepts `RATE_HZ` poses a second on average, by their own time: a fast replay sends more."""
 
-    Measured on the poses' own time: a replay at ten times its speed sends ten times as many.
-    """
-
-    def __init__(self, rate_hz: float | None) -> None:
-        if rate_hz is not None and not rate_hz > 0.0:
-            raise BadOption(f"rate: {rate_hz:g} poses a second; a positive number, or none for every pose")
-        self._step = 0.0 if rate_hz is None else 1.0 / rate_hz
+    def __init__(self) -> None:
         self._due = -np.inf
 
     def accepts(self, time: float) -> bool:
-        if self._step == 0.0:
-            return True
-        if self._due - 2.0 * self._step < time < self._due - 1e-6:
+        if self._due - 1.0 < time < self._due - 1e-6:
             return False
-        on_time = 0.0 <= time - self._due + 1e-6 < self._step
-        self._due = (self._due if on_time else time) + self._step
+        self._due = max(self._due + 1.0 / RATE_HZ, time) if abs(time - self._due) < 1.0 else time + 1.0 / RATE_HZ
         return True
 
 
@@ -81,21 +72,20 @@ class UdpSender:
 
 
 class UdpOutput(Output):
-    """Sends each pose as JSON in a datagram of its own.
+    """Sends each pose as JSON in a datagram of its own, `RATE_HZ` a second at most.
 
     Parameters
     ----------
     to : ``PORT`` of this machine, or ``HOST:PORT``
-    rate_hz : poses a second at most; None: every pose
 
     Raises
     ------
     BadOption
-        No such host, port or rate.
+        No such host or port.
     """
 
-    def __init__(self, to: str, rate_hz: float | None = RATE_HZ) -> None:
-        self._limiter, self._sender = RateLimiter(rate_hz), UdpSender(to, "--udp", PORT)
+    def __init__(self, to: str) -> None:
+        self._limiter, self._sender = RateLimiter(), UdpSender(to, "--udp", PORT)
         self._info: StreamInfo | None = None
 
     def start(self, info: StreamInfo) -> None:
@@ -131,35 +121,29 @@ def _rounded_rows(values: np.ndarray) -> list[Any]:
 
 
 class LslOutput(Output):
-    """Sends the pose as one LSL stream of type "Pose", which other programs find by its name.
+    """Sends the pose as one LSL stream `name` of type "Pose", `RATE_HZ` a second at most.
 
     It is announced on this machine only, or as far as the user's own ``LSLAPICFG`` says where that is set. liblsl has
     no setting for the address of its data ports: they listen on every interface for as long as the stream exists.
 
-    Parameters
-    ----------
-    name : of the stream
-    rate_hz : poses a second at most; None: every pose
-
     Raises
     ------
     WeposeError
-        pylsl is missing, or already searches a wider network.
+        pylsl is missing, or the name is empty.
     """
 
-    def __init__(self, name: str = "WeposePose", rate_hz: float | None = RATE_HZ) -> None:
+    def __init__(self, name: str = "WeposePose") -> None:
         from .sources.lsl import configure_pylsl
 
         if not name:
             raise BadOption("LSL out: a stream needs a name, as WeposePose")
-        self._name, self._rate, self._limiter = name, rate_hz, RateLimiter(rate_hz)
-        self._lsl, _ = configure_pylsl(None)
+        self._name, self._limiter, self._lsl = name, RateLimiter(), configure_pylsl()
         self._outlet: Any = None
 
     def start(self, info: StreamInfo) -> None:
         """Announce the stream, with a label for each channel."""
         channels = list_channels(info)
-        rate = info.rate_hz if self._rate is None else min(info.rate_hz, self._rate)
+        rate = min(info.rate_hz, RATE_HZ)
         stream = self._lsl.StreamInfo(
             self._name, "Pose", len(channels), rate, self._lsl.cf_float32, f"wepose-pin {self._name}"
         )

@@ -15,7 +15,7 @@ from ...errors import BadOption, one_of
 from ...recording.arrivals import Samples
 from ...recording.limits import HIGHEST_ACCEL, HIGHEST_RATE
 
-MAX_KINDS = 24  # of problems
+MAX_PROBLEMS = 24  # kinds
 # Seconds since 1970 have ten digits; larger times are in another unit, or damaged.
 MAX_TIME = 1e10  # [s]
 MAX_VALUES = np.repeat([HIGHEST_RATE, HIGHEST_ACCEL], 3)
@@ -78,6 +78,9 @@ class Source(ABC):
     ----------
     sensors : segments, in the order in which results name them
     rate_hz : nominal samples a second of each; None where it has to be measured
+    orientations : sensors whose samples are measured orientations (`pack_orientations`) → whether these are the
+        segment's own, in one world; else they are the sensor's, in a world of its own
+    batteries : sensor → share of its charge, 0 to 1, of those that have said it
     problems : problem → count of what was dropped so far ("bad checksums": 3)
     measures_orientations : whether it has orientations in place of rates and specific forces
     """
@@ -90,15 +93,10 @@ class Source(ABC):
 
     @property
     def orientations(self) -> Mapping[str, bool]:
-        """Sensors whose samples are measured orientations (`pack_orientations`) → whether these are the segment's own.
-
-        Then they are in one world; else they are the sensor's, in a world of its own.
-        """
         return {}
 
     @property
     def batteries(self) -> Mapping[str, float]:
-        """Sensor → share of its charge, 0 to 1, of those that have said it."""
         return {}
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:  # noqa: ARG002
@@ -131,19 +129,14 @@ class Source(ABC):
 
     def count(self, problem: str, number: int = 1) -> None:
         """Count a problem."""
-        if problem not in self.problems and len(self.problems) >= MAX_KINDS:
+        if problem not in self.problems and len(self.problems) >= MAX_PROBLEMS:
             problem = "other problems"
         self.problems[problem] += number
 
     def keep_plausible(self, sensor: str, time: np.ndarray, values: np.ndarray) -> list[Samples]:
         """The plausible of these samples, times (m,) [s] and values (m, 6) [rad/s, m/s²], as one `Samples` or none."""
-        plausible = find_plausible(time, values)
+        plausible = (np.abs(time) < MAX_TIME) & (np.abs(values) <= MAX_VALUES).all(axis=1)  # a NaN is neither
         if not plausible.all():
             self.count(IMPLAUSIBLE, len(time) - int(plausible.sum()))
             time, values = time[plausible], values[plausible]
         return [Samples(sensor, time, values[:, :3], values[:, 3:])] if len(time) else []
-
-
-def find_plausible(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(m,) bool: time (m,) [s] and values (m, 6) [rad/s, m/s²] of a sample are finite and not too large."""
-    return (np.abs(time) < MAX_TIME) & (np.abs(values) <= MAX_VALUES).all(axis=1)  # a NaN is neither

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import select
 import socket
 import time
@@ -15,7 +14,6 @@ from ...recording.arrivals import Samples
 from ..addresses import name_host
 from .base import Source
 
-MAX_SIZE = 65536  # [bytes] of a datagram
 MAX_DATAGRAMS = 2000  # in one `read`, so that a flood delays nobody for long
 BUFFER = 4 << 20  # [bytes] that the system keeps while nobody reads: some seconds of five sensors at 1 kHz
 COLLECT_S = 1.0  # [s] after the first sample in which the other sensors may appear
@@ -33,12 +31,11 @@ class DatagramSource(Source):
 
     Attributes
     ----------
-    kind, sender, hint : of the source, who sends to it, and in what form, for messages
+    kind, sender : of the source, and who sends to it, for messages
     """
 
     kind: str
     sender: str
-    hint = ""
 
     def __init__(
         self, host: str, port: int, sensors: Sequence[str] | None = None, segments: Collection[str] | None = None
@@ -59,20 +56,18 @@ class DatagramSource(Source):
     def open(self) -> None:
         """Bind; raises `BadSource` where the address cannot be bound."""
         host, port = self.address
-        with contextlib.ExitStack() as bound:
-            try:
-                family, form, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
-                udp = bound.enter_context(socket.socket(family, form, protocol))
-                udp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
-                udp.bind(address)
-            except (OSError, UnicodeError) as error:
-                raise BadSource(
-                    f"{self.kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); "
-                    f"an address of this machine and a port that nobody uses are needed"
-                ) from None
-            udp.setblocking(False)
-            bound.pop_all()
-        self._socket, self.address = udp, udp.getsockname()[:2]
+        self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+            self._socket.bind((host, port))
+        except (OSError, UnicodeError) as error:
+            self.close()
+            raise BadSource(
+                f"{self.kind}:{host}:{port}: cannot listen there ({getattr(error, 'strerror', None) or error}); an "
+                f"address of this machine and a port that nobody uses are needed"
+            ) from None
+        self._socket.setblocking(False)
+        self.address = self._socket.getsockname()[:2]
         if self._searching:
             self.sensors = tuple(self._segments or ())
 
@@ -95,8 +90,7 @@ class DatagramSource(Source):
         host, port = self.address
         dropped = ", ".join(f"{count} {problem}" for problem, count in self.problems.items())
         here = " (this machine only)" if host.startswith("127.") or host == "::1" else ""
-        every = " (all addresses of this machine)" if host in ("0.0.0.0", "::") else ""
-        where = f"{self.sender} at UDP {name_host(host)}:{port}{here}{every}{self.hint}"
+        where = f"{self.sender} at UDP {name_host(host)}:{port}{here}"
         return where + (f"; dropped so far: {dropped}" if dropped else "")
 
     def read(self, timeout_s: float) -> list[Samples]:
@@ -112,22 +106,16 @@ class DatagramSource(Source):
             left = deadline - time.monotonic()
             self._serve(time.monotonic())
             if select.select([self._socket], [], [], max(left, 0.0))[0]:
-                samples = self._take(self._receive(self._socket), time.monotonic())
+                datagrams: list[tuple[bytes, Any]] = []
+                try:
+                    while len(datagrams) < MAX_DATAGRAMS:
+                        datagrams.append(self._socket.recvfrom(65536))
+                except OSError:  # BlockingIOError: there are no more; else an ICMP reply to another datagram
+                    pass
+                samples = self._take(datagrams, time.monotonic())
             if left <= 0.0:
                 break
         return samples
-
-    def _receive(self, udp: socket.socket) -> list[tuple[bytes, Any]]:
-        datagrams: list[tuple[bytes, Any]] = []
-        try:
-            while len(datagrams) < MAX_DATAGRAMS:
-                datagram, sender = udp.recvfrom(MAX_SIZE)
-                datagrams.append((datagram, sender[:2]))
-        except BlockingIOError:
-            pass
-        except OSError:  # an ICMP reply to another datagram
-            self.count("errors of the socket")
-        return datagrams
 
     def _tracks(self, sensor: str) -> bool:
         """Whether a sensor is tracked; where it may have any name, a new one is from now on."""

@@ -49,17 +49,16 @@ class ReplaySource(Source):
 
     def __init__(self, recording: Recording, speed: float = 1.0, block: int = 64) -> None:
         super().__init__(recording.sensors, recording.rate_hz)
-        self._numbers = dict(zip(recording.sensors, map(list_numbers, recording.sensors.values()), strict=True))
         self.recording = recording
+        self._numbers = {name: list_numbers(sensor) for name, sensor in recording.sensors.items()}
         # Samples are taken as evenly spaced: the jitter of the clock is no motion, and every sample has its own tick.
         self._time = recording.time[0] + np.arange(len(recording)) / recording.rate_hz
         self._speed, self._block, self._next, self._begin = speed, block, 0, 0.0
-        sensors = recording.sensors.items()
-        self._orientations = {name: each.aligned for name, each in sensors if isinstance(each, OrientationSensor)}
 
     @property
     def orientations(self) -> dict[str, bool]:
-        return self._orientations
+        sensors = self.recording.sensors.items()
+        return {name: each.aligned for name, each in sensors if isinstance(each, OrientationSensor)}
 
     def open(self) -> None:
         """Start: the first sample is due now."""
@@ -85,15 +84,13 @@ class ReplaySource(Source):
             time.sleep(min(max(wait, MIN_SLEEP_S), left))
         self._next = last
         samples = []
-        for segment, sensor in self.recording.sensors.items():
+        for name, sensor in self.recording.sensors.items():
             rows: slice | np.ndarray = slice(first, last)
             if sensor.gap is not None and sensor.gap[rows].any():
-                rows = first + np.flatnonzero(~sensor.gap[first:last])
-                if not rows.size:
-                    continue
-            gyro_S, accel_S = self._numbers[segment]
-            samples.append(Samples(segment, self._time[rows], gyro_S[rows], accel_S[rows]))
-        return samples
+                rows = first + np.flatnonzero(~sensor.gap[rows])
+            gyro_S, accel_S = self._numbers[name]
+            samples.append(Samples(name, self._time[rows], gyro_S[rows], accel_S[rows]))
+        return [each for each in samples if len(each.time)]
 
     def _count_due(self) -> int:
         """One past the last sample that is due."""

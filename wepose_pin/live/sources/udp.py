@@ -7,7 +7,7 @@ import math
 import struct
 import zlib
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,11 +15,11 @@ from ...errors import one_of
 from ...readers.device import ACCEL_UNITS, GYRO_UNITS
 from ...recording.arrivals import Samples
 from ..addresses import LOOPBACK, parse_address
-from .base import IMPLAUSIBLE, MAX_TIME, SourceKind, SourceOptions
+from .base import MAX_TIME, SourceKind, SourceOptions
 from .clocks import HostClock
 from .datagrams import DatagramSource
 
-MAX_CLOCKS = 64  # of senders
+MAX_CLOCKS = 64  # of senders; one that opens a new socket for each datagram has many
 MAX_NAME = 24  # letters of a sensor's name
 MAGIC, VERSION = b"WPIN", 1
 HEADER = struct.Struct("<4sBBHd")  # magic, version, sensor, count, time [s] of the first sample
@@ -71,7 +71,7 @@ class UdpSource(DatagramSource):
     units : ``gyro_unit`` and ``accel_unit`` of what does not state its own
     """
 
-    kind, sender, hint = "udp", "samples", ", in a format of docs/live-sources.md"
+    kind, sender = "udp", "samples"
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class UdpSource(DatagramSource):
     ) -> None:
         super().__init__(host, port, sensors, segments)
         self._units, self._batteries = {**SI, **(units or {})}, dict[str, float]()
-        self._clocks: dict[Any, HostClock] = {}  # sender → its clock, the one that was heard last at the end
+        self._clocks: dict[Any, HostClock] = {}  # of each sender
 
     @property
     def batteries(self) -> dict[str, float]:
@@ -99,16 +99,20 @@ class UdpSource(DatagramSource):
         by_sender: dict[Any, list[Batch]] = {}
         for datagram, sender in datagrams:
             batches, problems = decode(datagram, self._segments, self._units)
+            for batch in batches:
+                if self._tracks(batch.sensor):
+                    by_sender.setdefault(sender, []).append(batch)
+                    if math.isfinite(batch.battery):
+                        self._batteries[batch.sensor] = batch.battery
+                else:
+                    problems.append(f"samples of {batch.sensor}, which is not tracked")
             for problem in problems:
                 self.count(problem)
-            accepted = [batch for batch in batches if self._accepts(batch)]
-            if accepted:
-                by_sender.setdefault(sender, []).extend(accepted)
         parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
         for sender, batches in by_sender.items():
-            clock = self._clocks[sender] = self._clocks.pop(sender, HostClock())
-            if len(self._clocks) > MAX_CLOCKS:
-                del self._clocks[next(iter(self._clocks))]
+            if len(self._clocks) >= MAX_CLOCKS:
+                self._clocks.clear()
+            clock = self._clocks.setdefault(sender, HostClock())
             times = clock.to_host(np.concatenate([batch.time for batch in batches]), now)
             for batch in batches:
                 own, times = times[: len(batch.time)], times[len(batch.time) :]
@@ -118,18 +122,6 @@ class UdpSource(DatagramSource):
             time, values = (np.concatenate(column) for column in zip(*pieces, strict=True))
             samples += self.keep_plausible(sensor, time, values)
         return samples
-
-    def _accepts(self, batch: Batch) -> bool:
-        """Whether the batch is of a tracked sensor, with times that fit a clock."""
-        if not self._tracks(batch.sensor):
-            self.count(f"samples of {batch.sensor}, which is not tracked", len(batch.time))
-            return False
-        if not float(np.abs(batch.time).max()) < MAX_TIME:
-            self.count(IMPLAUSIBLE, len(batch.time))
-            return False
-        if math.isfinite(batch.battery):
-            self._batteries[batch.sensor] = batch.battery
-        return True
 
 
 def decode(
@@ -145,39 +137,35 @@ def decode(
     batches: list[Batch] = []
     problems: list[str] = []
     is_binary = datagram[:4] == MAGIC
-    for part in [datagram] if is_binary else datagram.splitlines():
-        if part.strip():
-            try:
-                batch, stated = _decode_packet(part, units) if is_binary else _decode_line(part, segments, units)
-            except Malformed as error:
-                problems.append(str(error))
-                continue
-            if stated != SI:
-                factors = np.repeat([known[stated[key]] for key, known in UNITS.items()], 3)
-                batch = batch._replace(values=batch.values * factors)
-            batches.append(batch)
+    for part in [datagram] if is_binary else filter(bytes.strip, datagram.splitlines()):
+        try:
+            batch, stated = _decode_packet(part, units) if is_binary else _decode_line(part, segments, units)
+        except Malformed as error:
+            problems.append(str(error))
+            continue
+        if not np.abs(batch.time).max() < MAX_TIME:  # no clock has it
+            problems.append("samples with times that no clock has")
+            continue
+        factors = np.repeat([known[stated[key]] for key, known in UNITS.items()], 3)
+        batches.append(batch._replace(values=batch.values * factors))
     return batches, problems
 
 
 def _decode_packet(datagram: bytes, units: Mapping[str, str]) -> tuple[Batch, Mapping[str, str]]:
     """The samples of a binary packet, and their units."""
-    if len(datagram) < HEADER.size + CRC.size:
-        raise Malformed("binary packets of a wrong length")
-    _, version, number, count, begin = HEADER.unpack_from(datagram)
+    try:
+        _, version, number, count, begin = HEADER.unpack_from(datagram)
+        (checksum,) = CRC.unpack(datagram[HEADER.size + count * SAMPLE.itemsize :])
+    except struct.error:
+        raise Malformed("binary packets of a wrong length") from None
     if version != VERSION:
         raise Malformed(f"binary packets of version {version}, not {VERSION}")
-    if count == 0 or len(datagram) != HEADER.size + count * SAMPLE.itemsize + CRC.size:
-        raise Malformed("binary packets of a wrong length")
-    if zlib.crc32(datagram[: -CRC.size]) != CRC.unpack_from(datagram, len(datagram) - CRC.size)[0]:
+    if zlib.crc32(datagram[: -CRC.size]) != checksum:
         raise Malformed("binary packets with a bad checksum")
-    if number >= len(NUMBERS):
+    if number >= len(NUMBERS) or count == 0:
         raise Malformed(f"samples of an unknown sensor: number {number}")
     samples = np.frombuffer(datagram, SAMPLE, count, HEADER.size)
     return Batch(NUMBERS[number], begin + samples["after"].astype(float), samples["values"].astype(float)), units
-
-
-def _refuse_constant(text: str) -> NoReturn:
-    raise Malformed(f"JSON lines with {text}, which is no number")
 
 
 def _decode_line(
@@ -185,39 +173,23 @@ def _decode_line(
 ) -> tuple[Batch, Mapping[str, str]]:
     """The samples of a line of JSON, and their units."""
     try:
-        message = json.loads(line, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError):  # UnicodeDecodeError and JSONDecodeError are ValueErrors
-        raise Malformed("lines that are no JSON") from None
-    if not isinstance(message, dict) or not message.keys() >= {"sensor", "t", "gyro", "accel"}:
-        raise Malformed("JSON lines without sensor, t, gyro and accel")
-    sensor, battery = message["sensor"], message.get("battery", math.nan)
+        message = json.loads(line)
+        sensor, battery = message["sensor"], float(message.get("battery", math.nan))
+        stated = {key: str(message.get(key, unit)) for key, unit in units.items()}
+        time, gyro, accel = (np.array(message[key], dtype=float) for key in ("t", "gyro", "accel"))
+        values = np.concatenate([gyro.reshape(-1, 3), accel.reshape(-1, 3)], axis=1)
+        time = time.reshape(len(values))
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+        raise Malformed('lines that are not as {"sensor": "torso", "t": 0.1, "gyro": [0, 0, 0], "accel": …}') from None
     is_name = isinstance(sensor, str) and 0 < len(sensor) <= MAX_NAME
     if not is_name or (segments is not None and sensor not in segments):
         raise Malformed(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
-    if type(battery) not in (int, float) or battery < 0.0 or battery > 1.0:
-        raise Malformed("JSON lines whose battery is not a share, 0 to 1")
-    stated = {key: message.get(key, unit) for key, unit in units.items()}
+    if not len(time) or battery < 0.0 or battery > 1.0:
+        raise Malformed("lines without samples, or whose battery is not a share, 0 to 1")
     for key, known in UNITS.items():
-        if not isinstance(stated[key], str) or stated[key] not in known:
-            raise Malformed(f"JSON lines with {key} {str(stated[key])[:MAX_NAME]!r}; {one_of(known)}")
-    columns = message["t"], message["gyro"], message["accel"]
-    time, gyro, accel = columns if isinstance(columns[0], list) else ([each] for each in columns)
-    if not (isinstance(gyro, list) and isinstance(accel, list) and len(time) == len(gyro) == len(accel)):
-        raise Malformed("JSON lines whose t, gyro and accel differ in length")
-    if not all(isinstance(row, list) and len(row) == 3 for row in gyro + accel):
-        raise Malformed("JSON lines whose gyro or accel is not three numbers")
-    values = np.array([_check_numbers(a + b) for a, b in zip(gyro, accel, strict=True)])
-    return Batch(sensor, np.array(_check_numbers(time)), values, float(battery)), stated
-
-
-def _check_numbers(values: list[Any]) -> list[float]:
-    """Floats of a list that is not empty and holds numbers only; true and false are none."""
-    if values and {*map(type, values)} <= {int, float}:
-        try:
-            return [float(value) for value in values]
-        except OverflowError:
-            pass
-    raise Malformed("JSON lines with something else than numbers")
+        if stated[key] not in known:
+            raise Malformed(f"JSON lines with {key} {stated[key][:MAX_NAME]!r}; {one_of(known)}")
+    return Batch(sensor, time, values, battery), stated
 
 
 KIND = SourceKind("udp:[HOST:]PORT[,gyro_unit=deg/s][,accel_unit=g]", open_spec)
