@@ -104,24 +104,16 @@ def test_larger_rates_tell_that_it_was_no_range() -> None:
     assert np.flatnonzero(~known[1]).tolist() == list(range(204, 210))
 
 
-@pytest.mark.parametrize("digit", [0.5, 1.0, 3.0])
+@pytest.mark.parametrize("digit", [0.5, 1.0])
 def test_coarse_digits_that_repeat_are_measured(digit: float) -> None:
-    """Noise of a digit or less, at rest, now and then in motion: it stays the same for a while by chance."""
+    """Noise of half a digit or less, at rest, then now and then in motion: it stays the same for a while by chance."""
     rng, n = np.random.default_rng(3), 6000
-    motion = 40.0 * np.sin(np.arange(n) / 30.0)[None, :, None] * (np.arange(n) % 2000 < 400)[None, :, None]
+    motion = 80.0 * np.clip(np.sin(np.arange(n) / 300.0) - 0.5, 0.0, None)[None, :, None]
     gyro, accel = (np.round((rng.standard_normal((3, n, 3)) + motion) / digit / 4.0) for _ in range(2))
     synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
     ticks = fed(synchronizer, in_order(gyro, accel))
     assert np.array_equal(ticks.gyro_S, gyro.swapaxes(0, 1))
     assert synchronizer.counts[:, FROZEN].sum() == 0
-
-
-def test_what_has_no_noise_may_rest_after_it_has_moved() -> None:
-    n = np.arange(900)
-    motion = np.sin(n / 9.0) * (n < 400)
-    gyro, accel = (np.stack([motion, 0.5 * motion, 0.0 * motion], axis=1)[None].repeat(3, axis=0) for _ in range(2))
-    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
-    assert np.array_equal(fed(synchronizer, in_order(gyro, accel)).gyro_S, gyro.swapaxes(0, 1))
 
 
 @pytest.mark.parametrize(("lost", "bridged"), [(1, True), (5, True), (6, False), (40, False)])

@@ -324,7 +324,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     "gyro in deg/s": (lambda f: f.scale("gx gy gz", 57.29578), 'data.gyro_unit = "deg/s" would fit'),
     "gyro not in deg/s": (
         lambda f: f.say('"rad/s"', '"deg/s"'),
-        'data.gyro_unit = "rad/s" would fit, or the gyroscope does not measure',
+        'data.gyro_unit = "rad/s" would fit, or the time or rate_hz is wrong',
     ),
     "a number for a missing value": (
         lambda f: f.put("gz", slice(50, 51), -9999.0),

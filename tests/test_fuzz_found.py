@@ -352,11 +352,9 @@ def test_what_a_killed_run_left_is_in_nobodys_way(tmp_path: Path) -> None:
 
 
 def test_numbers_whose_squares_are_none_are_scanned() -> None:
-    """A stuck axis may hold any number; the whole package warns of none."""
+    """A frozen sensor may hold any number; the whole package warns of none."""
     time_s = np.arange(900) / 100.0
     values = np.random.default_rng(1).normal(scale=1e-3, size=(900, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
-    values[:, 0] = 2.5e296
-    values[300:500] = values[300]
+    values[300:500] = 2.5e296
     samples = {"torso": (time_s, values[:, :3], values[:, 3:]), "left_forearm": (time_s, np.full((900, 4), 1e308))}
-    with pytest.raises(BadData, match="torso"):
-        check_sensors("x", samples, None)
+    assert [each.place for each in check_sensors("x", samples, None).diagnostics] == ["left_forearm"]

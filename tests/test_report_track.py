@@ -22,7 +22,7 @@ from wepose_pin.body.subject import Hinge, population_subject
 from wepose_pin.commands import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import OrientationSensor, Recording
-from wepose_pin.recording.plausibility import find_cut_off
+from wepose_pin.recording.faults import find_saturation
 from wepose_pin.report import render_track_report
 from wepose_pin.report.figures import COLUMNS, envelope
 from wepose_pin.simulation import Simulation, simulate, simulate_person
@@ -191,7 +191,7 @@ def test_motion_beyond_the_range(simulation: Simulation) -> None:
     gyro = recording.sensors["right_forearm"].gyro_S
     assert gyro is not None
     clipped = np.clip(gyro, -2.1, 2.1)
-    count = np.count_nonzero(find_cut_off(clipped, 2.0).any(axis=1))
+    count = np.count_nonzero(find_saturation(clipped, 2.0).any(axis=1))
     assert count > 10
     pose = track(changed(recording, "right_forearm", gyro_S=clipped))
     saturated = the("signal-saturated", pose)

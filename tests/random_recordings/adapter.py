@@ -42,7 +42,7 @@ EXPORTS = ("out.mot", "out.sto", "out.trc", "out.bvh", "out.csv", "out.parquet",
 CAUSES = {
     "range": {"signal-saturated"},
     "fault": {"sensor-frozen", "samples-lost"},
-    "identical": {"orientations-copied"},
+    "identical": set(),
     "swapped": {"sensors-exchanged"},
     "gap": {"samples-lost"},
     "start": {

@@ -16,7 +16,7 @@ from .. import rotations
 from ..arguments import check_arguments
 from ..diagnostics import WARNING, Diagnostic, notebook_html, render
 from ..errors import BadData, BadOption, BadPhase, WeposeWarning, one_of
-from ..recording.faults import SensorScan, find_faults
+from ..recording.faults import find_faults, find_gyro_range
 from ..recording.limits import HIGHEST_ACCEL, HIGHEST_RATE, STANDARD_GRAVITY
 from .amekf import Amekf, AmekfParams
 from .base import AboutVertical, FilterRun, OrientationFilter
@@ -223,8 +223,7 @@ def estimate_orientation(
         raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape} must both be (n, 3)")
     _check_values("gyro_S", gyro, HIGHEST_RATE, "rad/s")
     _check_values("accel_S", accel, HIGHEST_ACCEL, "m/s^2")
-    scan = SensorScan(np.arange(len(gyro)) / rate_hz, gyro, accel)
-    for fault in find_faults({"": scan}).get("", []):
+    for fault in find_faults({"": (np.arange(len(gyro)) / rate_hz, gyro, accel)}).get("", []):
         raise BadData(f"{fault.describe(max(fault.first, 0.0))}: it does not measure there; leave these samples out")
     noise, start = TYPICAL, None
     diagnostics: tuple[Diagnostic, ...] = ()
@@ -238,7 +237,9 @@ def estimate_orientation(
         if not 0 <= first < last <= len(gyro) + 1:
             raise BadPhase(f"static = {static} [s] is outside the data, which lasts {len(gyro) / rate_hz:.3f} s")
         noise, start = estimate_noise(gyro[first:last], accel[first:last], rate_hz), slice(first, last)
-    settings = FilterSettings(method, params, static_test or USUAL_TEST, start=start, gyro_range=scan.gyro_range)
+    settings = FilterSettings(
+        method, params, static_test or USUAL_TEST, start=start, gyro_range=find_gyro_range(gyro, accel)
+    )
     run = SensorRun(rate_hz, noise, settings)
     return run.push(gyro, accel)._replace(diagnostics=diagnostics)
 

@@ -13,9 +13,8 @@ import numpy as np
 
 from ..compilation import kernel
 from .clocks import LONGEST_GAP_S
-from .faults import AT_RANGE, FROZEN_SAMPLES, NOISY_S, SAME_RANGE, TURNS_BACK, TURNS_BACK_HZ
+from .faults import AT_RANGE, FROZEN_SAMPLES, PLATEAU, ROUNDING, SAME_RANGE, STEEP
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED, NARROWEST_GYRO_RANGE
-from .plausibility import ROUNDING
 from .sensors import ImuSensor, Sensor
 
 # A sample within this share of a step from a tick counts as at the tick.
@@ -26,16 +25,8 @@ REORDER_S = 0.02  # [s] a tick waits so long for a sample that a later one has o
 WAIT_S = 0.1  # [s] a tick waits so long for a silent sensor; then the sensor is lost until its next sample
 JUMP_S = 1.0  # [s] a time further ahead of all others is an error, unless the sensor continues from there
 
-# A noisy sensor is frozen when it repeats a value this many times as often as ever before.
-MOST_REPEATS = 4.0
-# Saturation of gyro: it stays at its largest value so far for `STANDS` samples, more than in a whole recording
-# (`plausibility.PLATEAU`), since larger values may follow. The value has at least `FEWEST_DIGITS` digits.
-STANDS, FEWEST_DIGITS = 5, 100.0
-# The step to that value has at least `STEEP` digits, and over `STANDS` samples at least `ROUGH` times the usual change
-# from step to step: noise flattens a peak as sharp once in a million times (five standard deviations). A longer plateau
-# is cut off further: the limit falls with its duration to the power 1.5.
-STEEP, ROUGH = 3.0, 3.5
-USUAL_CHANGES = 32.0  # number of changes in the average
+# After so many samples a sensor is frozen when it repeats one for this many times as long as ever before.
+LEARNED, MOST_REPEATS = 100, 4.0
 
 MISSING, LATE, DUPLICATE, BAD, TAKEN, FROZEN, CUT_OFF = range(7)
 COUNTS = ("missing", "late", "duplicate", "bad", "taken", "frozen", "cut_off")
@@ -43,7 +34,7 @@ COUNTS = ("missing", "late", "duplicate", "bad", "taken", "frozen", "cut_off")
 _OUT = 1024  # ticks in a block
 # A row of a sensor's buffer: time, gyro, accel.
 _T, _WIDTH = 0, 7
-# What is known of a sensor. Its six signals are the axes of gyro and accel.
+# What is known of a sensor.
 SENSOR = np.dtype(
     [
         ("is_orientation", np.bool_),
@@ -53,27 +44,17 @@ SENSOR = np.dtype(
         ("buffered", np.int64),  # rows of its buffer in use
         ("jumps", np.int64),  # samples in a row that were too far ahead
         ("jump_time", float),  # [s] of the last of these
-        # of each signal
-        ("value", float, 6),  # the newest
-        ("step", float, 6),  # to it
-        ("size", float, 6),  # largest so far
-        ("turns", float, 6),  # reversals in this second
-        ("changes", float, 6),  # in this second
-        # of all signals together
-        ("second", float),  # [s] start of this second
-        ("samples", float),  # in this second
-        ("since", float),  # [s] start of the current repetition
-        ("repeats", float),  # its length
-        ("most_repeats", float),  # the longest before
-        ("noisy_s", float),  # [s] of noise
-        ("values", np.int64),  # number of different values so far
         ("newest", float),  # [s]
+        ("value", float, 6),  # the newest sample
+        ("since", float),  # [s] since when it repeats
+        ("repeats", float),  # how often it does
+        ("most_repeats", float),  # the most before; 0: it has never changed
         # of each axis of gyro
+        ("largest", float, 3),  # [rad/s] so far
         ("digit", float, 3),  # smallest step
         ("entry", float, 3),  # recent steps
         ("stands", float, 3),  # samples at the same value
         ("level", float, 3),  # [rad/s] of saturation
-        ("change", float, 3),  # the usual one from step to step
     ],
     align=True,
 )
@@ -148,8 +129,8 @@ class StreamSynchronizer:
     sensor have overtaken and `wait_s` for a silent sensor, both measured on the samples' times. Then the sensor is
     lost, and ticks do not wait for it until its next sample. A sample at a tick is used unchanged. Between ticks the
     rate is the mean over the step (a sample's rate holds for the interval that ends there) and the specific force is
-    interpolated. Gaps of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN. A noisy sensor is frozen when
-    it repeats its values for longer than the silent bridge and than ever before; its samples are lost until they
+    interpolated. Gaps of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN. A sensor is frozen when it
+    repeats its values for longer than that and for much longer than ever before; its samples are lost until they
     change. An axis of gyro that stays at its extreme after a steep rise is saturated: from then on, ticks with a rate
     at that level are NaN, because the rotation is not known. Measured orientations between ticks are interpolated; they
     may repeat, as a device's own filter lets them.
@@ -176,6 +157,7 @@ class StreamSynchronizer:
         self._sensors, self._clock = np.zeros(k, SENSOR), np.zeros(1, CLOCK)
         self._sensors["is_orientation"] = [name in orientations for name in self.sensors]
         self._sensors["digit"] = self._sensors["level"] = np.inf
+        self._sensors["newest"] = -np.inf
         self._clock[0] = (begin, 1.0 / rate_hz, wait_s, 0, -np.inf)
         self.counts: np.ndarray = self._sensors["counts"]
         self.lost: np.ndarray = self._sensors["lost"]
@@ -237,8 +219,8 @@ def _take_samples(clocks, sensors, buffers, which, samples, next_sample, out, ou
         sample, i = samples[next_sample], which[next_sample]
         sensor, t = sensors[i], sample[_T]
         if _is_sound(clock, sensor, sample):
-            if not sensor.is_orientation and (t > sensor.newest or sensor.values == 0):
-                sensor.frozen = _repeats_itself(sensors, sensor, sample)
+            if not sensor.is_orientation and t > sensor.newest:
+                _watch_values(sensor, sample)
             if sensor.frozen and t > sensor.since:
                 sensor.counts[FROZEN] += 1
                 clock.newest = max(clock.newest, t)
@@ -268,84 +250,37 @@ def _is_sound(clock, sensor, sample):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _repeats_itself(sensors, sensor, sample):  # type: ignore[no-untyped-def]
-    """Return whether a sensor is frozen at this sample, its newest."""
-    t, same = sample[_T], sensor.values > 0
+def _watch_values(sensor, sample):  # type: ignore[no-untyped-def]
+    """Find whether a sensor is frozen at this sample, its newest, and at which rates its gyroscope saturates."""
+    t, value, same = sample[_T], sensor.value, sensor.newest > -np.inf
     for k in range(6):
-        same = same and sensor.value[k] == sample[1 + k]
+        same = same and value[k] == sample[1 + k]
     sensor.newest = t
-    if not same:
-        if not sensor.frozen:
-            sensor.most_repeats = max(sensor.most_repeats, sensor.repeats, 1.0)
-        _store_sample(sensor, sample)
-        return False
-    sensor.repeats += 1.0
-    lasts = t - sensor.since
-    if sensor.repeats < FROZEN_SAMPLES or lasts <= LONGEST_GAP_S * (1.0 + 1e-6):
-        return False
-    if sensor.noisy_s >= NOISY_S:
-        return sensor.repeats > MOST_REPEATS * sensor.most_repeats
-    # A sensor that was constant from the beginning shows no noise; the others are of the same kind.
-    others_noisy = False
-    for other in range(len(sensors)):
-        others_noisy = others_noisy or sensors[other].noisy_s >= NOISY_S
-    return others_noisy and sensor.values == 1 and lasts >= NOISY_S
-
-
-@kernel
-def _store_sample(sensor, sample):  # type: ignore[no-untyped-def]
-    """Store a sample that differs from the one before, and detect noise by the reversals in each second."""
-    t = sample[_T]
-    if sensor.values == 0:
-        sensor.second = t
-    sensor.repeats, sensor.since = 0.0, t
-    sensor.values += 1
-    sensor.samples += 1.0
-    for k in range(6):
-        value = sample[1 + k]
-        step = value - sensor.value[k] if sensor.values > 1 else 0.0
-        sensor.size[k] = max(sensor.size[k], abs(value))
-        if abs(step) < ROUNDING * sensor.size[k]:
-            step = 0.0
-        if step * sensor.step[k] < 0.0:
-            sensor.turns[k] += 1.0
-        if k < 3:
-            sensor.change[k] += (abs(step - sensor.step[k]) - sensor.change[k]) / USUAL_CHANGES
-        if step != 0.0:
-            sensor.changes[k] = 1.0
-        sensor.value[k], sensor.step[k] = value, step
-    _find_saturation(sensor)
-    seconds = t - sensor.second
-    if seconds >= 1.0:
-        least = sensor.samples * min(TURNS_BACK, TURNS_BACK_HZ * seconds / sensor.samples)
-        changes, turns = False, sensor.samples >= 2.0 * FROZEN_SAMPLES
-        for k in range(6):
-            if sensor.changes[k] > 0.0:
-                changes, turns = True, turns and sensor.turns[k] > least
-            sensor.turns[k] = sensor.changes[k] = 0.0
-        if changes and turns:
-            sensor.noisy_s += seconds
-        sensor.second, sensor.samples = t, 0.0
-
-
-@kernel
-def _find_saturation(sensor):  # type: ignore[no-untyped-def]
-    """Find the saturation level of each axis of gyro, as `plausibility.find_cut_off`, from the samples so far."""
-    largest = max(sensor.size[0], sensor.size[1], sensor.size[2])
-    for k in range(3):
-        value, step = abs(sensor.value[k]), abs(sensor.step[k])
-        if sensor.size[k] > sensor.level[k] or (1.0 - SAME_RANGE) * largest > sensor.level[k]:
-            sensor.level[k] = np.inf  # larger rates exist
-        if step > 0.0:
+    if same:
+        sensor.repeats += 1.0
+        enough = sensor.repeats >= FROZEN_SAMPLES and t - sensor.since > LONGEST_GAP_S * (1.0 + 1e-6)
+        known = sensor.most_repeats > 0.0 and sensor.counts[TAKEN] >= LEARNED
+        sensor.frozen = enough and known and sensor.repeats > MOST_REPEATS * sensor.most_repeats
+        return
+    if sensor.repeats > 0.0 and not sensor.frozen:
+        sensor.most_repeats = max(sensor.most_repeats, sensor.repeats)
+    sensor.frozen, sensor.since, sensor.repeats = False, t, 1.0
+    largest, level = sensor.largest, sensor.level
+    for k in range(3):  # as `faults.find_saturation`, of the samples so far
+        rate, step = abs(sample[1 + k]), abs(sample[1 + k] - value[k])
+        largest[k] = max(largest[k], rate)
+        least = max(NARROWEST_GYRO_RANGE, (1.0 - SAME_RANGE) * max(largest[0], largest[1], largest[2]))
+        if largest[k] > level[k] or least > level[k]:
+            level[k] = np.inf  # larger rates exist
+        if step > ROUNDING * largest[k]:
             sensor.digit[k], sensor.stands[k] = min(sensor.digit[k], step), 1.0
             sensor.entry[k] = max(step, 0.75 * sensor.entry[k])  # the last step may be cut off itself
             continue
         sensor.stands[k] += 1.0
-        steep = sensor.entry[k] > STEEP * sensor.digit[k] and value > FEWEST_DIGITS * sensor.digit[k]
-        steep = steep and sensor.entry[k] * (sensor.stands[k] / STANDS) ** 1.5 > ROUGH * sensor.change[k]
-        at_extreme = value == sensor.size[k] and value >= max(NARROWEST_GYRO_RANGE, (1.0 - SAME_RANGE) * largest)
-        if steep and at_extreme and sensor.stands[k] >= STANDS:
-            sensor.level[k] = value
+        if rate == largest[k] >= least and sensor.stands[k] >= PLATEAU and sensor.entry[k] > STEEP * sensor.digit[k]:
+            level[k] = rate
+    for k in range(6):
+        value[k] = sample[1 + k]
 
 
 @kernel

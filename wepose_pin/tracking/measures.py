@@ -15,9 +15,9 @@ from ..body.kinematics import Pose
 from ..body.subject import Subject
 from ..filters import Orientation
 from ..recording import OrientationSensor, Recording
+from ..recording.faults import find_saturation
 from ..recording.gaps import find_runs
 from ..recording.limits import NARROWEST_ACCEL_RANGE, NARROWEST_GYRO_RANGE
-from ..recording.plausibility import find_cut_off
 from ..recording.sensors import compute_rate
 from .result import TrackResult
 from .segment_orientations import compute_heading_variance
@@ -54,7 +54,7 @@ def measure_signal(
     if isinstance(sensor, OrientationSensor) or orientation is None or static is None:
         rate = np.linalg.norm(compute_rate(sensor, recording.rate_hz), axis=1)
         return Signal(np.maximum.reduceat(rate, bins), nothing[bins], gap, None, float("nan"), None)
-    cut = find_cut_off(sensor.gyro_S, NARROWEST_GYRO_RANGE) | find_cut_off(sensor.accel_S, NARROWEST_ACCEL_RANGE)
+    cut = find_saturation(sensor.gyro_S, NARROWEST_GYRO_RANGE) | find_saturation(sensor.accel_S, NARROWEST_ACCEL_RANGE)
     return Signal(
         np.maximum.reduceat(np.linalg.norm(sensor.gyro_S, axis=1), bins),
         np.logical_or.reduceat(cut.any(axis=1), bins),
