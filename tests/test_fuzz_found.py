@@ -173,7 +173,6 @@ REFUSED: list[tuple[str, Callable[[], bytes], str]] = [
     ("result", lambda: change_pose("time", 1, "-1e308"), "time does not increase"),
     ("result", lambda: change_pose("time", 1, "nan"), "time does not increase"),
     ("result", lambda: change_pose("time", 3, "1e300"), "no pose has such a number"),
-    ("result", lambda: change_pose("time", 3, "1e11"), "time jumps from 0.02 to 100000000000 s in row 4"),
     ("result", lambda: change_pose("left_palm_x", 2, "1e308"), "left_palm_x is 1e+308 in row 3"),
     ("result", lambda: change_pose("torso_std", 0, "-1e308"), "torso_std is -1e+308 in row 1"),
     ("result", lambda: change("result", "right_shoulder_x", "x"), "no columns right_shoulder_x"),
@@ -192,8 +191,6 @@ def test_what_a_file_has_wrong_is_told(name: str, make: Callable[[], bytes], say
 def test_a_summary_that_is_none(tmp_path: Path) -> None:
     for text in (b"[1]", b"3", b"[" * 5000):
         assert "damaged" in told("summary", tmp_path, text, BadData)
-    odd = b'{"sensors": 3, "points": [1.5], "warnings": "x", "recording": null}'
-    assert try_one(BY_NAME["summary"], tmp_path, odd) is None
 
 
 # Archives ----------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from ..body.body import load_sensed_model
 from ..body.subject import Subject, load_subject, parse_subject, population_subject, subject_toml
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadSession
-from ..readers.session_file import find_model, read_joints, read_phases, read_sensor_keys, read_session_file
+from ..readers.session_file import SensorKeys, find_model, read_joints, read_phases, read_sensor_keys, read_session_file
 from ..recording import Intervals, Recording
 from .sources.base import Source
 from .sources.replay import ReplaySource
@@ -110,7 +110,7 @@ def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "
     top = read_session_file(path)
     read_phases(top.table("phases", {}))
     sensors = top.table("sensors")
-    stated = {segment: read_sensor_keys(sensors.table(segment)).mount for segment in sensors.values}
+    stated = {segment: read_sensor_keys(sensors.table(segment), SensorKeys()).mount for segment in sensors.values}
     start_pose = top.text("start_pose", NEUTRAL_POSE) or NEUTRAL_POSE
     return SensorSetup(
         top.text("name", None) or Path(top.file).absolute().parent.name,

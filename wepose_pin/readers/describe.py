@@ -16,6 +16,7 @@ from ..data_tables import read_names
 from ..diagnostics import Diagnostic
 from ..documents import is_number, read_toml
 from ..errors import BadData, MissingFile
+from ..libraries import library_errors
 from ..recording import ImuSensor, Recording, format_span, format_time
 from ..recording.gaps import find_runs
 from ..recording.sensors import compute_rate
@@ -64,10 +65,7 @@ def find_file(path: Path, wearer: Wearer | None = None) -> Path:
     files = [file for file in sorted(path.iterdir()) if file.is_file()]
     data = [file for file in files if file.suffix.lower() in TABLES or is_array_file(file) or detect_format(file)]
     if not data:
-        raise MissingFile(
-            f"{path}: a folder without session.toml, subject.toml or pose.parquet, none of an x-IMU3, a phone or a ROS "
-            f"bag, and without recordings in it; name a file"
-        )
+        raise MissingFile(f"{path}: a folder without session.toml, and without a recording in it; name a file")
     table = (wearer or Wearer(load_table())).table
     return next((file for file in data if table.guess_segment(file.stem)), data[0])
 
@@ -108,12 +106,7 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
             return Description(f"{path}: a pose, as `wepose track` writes it: {len(names)} columns")
         guess = guess_columns(names, table, units)
         return _describe_data(path, folder, propose_from_names(path, folder, guess, names, None, table), wearer)
-    known = (
-        ".toml, .csv, .parquet, .tsv and .txt (tables with tabs, semicolons or commas; MT Manager), .mvnx, .sto, .h5, "
-        ".hdf5, .mat, .xdf, .db3, .mcap, .bag, .c3d, .trc, .zip and .json of phones; folders of a result, an "
-        "x-IMU3, a phone, a ROS bag"
-    )
-    raise BadData(f"{path}: is nothing that is known here; there is: {known}")
+    raise BadData(f"{path}: is nothing that is known here; docs/formats.md lists the files that are read")
 
 
 def _describe_data(path: Path, folder: Path, proposal: Proposal, wearer: Wearer) -> Description:
@@ -132,17 +125,14 @@ def _describe_data(path: Path, folder: Path, proposal: Proposal, wearer: Wearer)
 
 
 def _describe_result(path: Path) -> Description:
-    try:
+    with library_errors(path / "summary.json", "the summary of a result"):
         summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-        run = {key: summary.get(key) for key in ("recording", "method", "rate_hz", "duration_s", "samples")}
         facts = [
-            f"of {run['recording']}, by {run['method']}: {run['samples']} samples, {run['duration_s']} s at "
-            f"{run['rate_hz']} Hz",
+            f"of {summary.get('recording')}, by {summary.get('method')}: {summary.get('samples')} samples, "
+            f"{summary.get('duration_s')} s at {summary.get('rate_hz')} Hz",
             *(f"{name}: {', '.join(summary[name])}" for name in ("sensors", "points", "joints") if name in summary),
             *(f"{each['severity']}: {each['text']['what']}" for each in summary.get("diagnostics", [])),
         ]
-    except (OSError, ValueError, RecursionError, AttributeError, TypeError, KeyError):
-        return Description(f"{path}: a result of `wepose track`, without a summary.json that can be read")
     return Description(f"{path}: a result of `wepose track`", (*facts, f"look at it: wepose view {path}"))
 
 
@@ -191,16 +181,12 @@ def _list_sensors(recording: Recording, labels: Mapping[str, str]) -> tuple[tupl
     rows = []
     for segment, sensor in recording.sensors.items():
         fastest = np.degrees(np.linalg.norm(compute_rate(sensor, recording.rate_hz), axis=1).max())
+        holds, gravity = "segment's orientation" if sensor.aligned else "orientation", ""
         if isinstance(sensor, ImuSensor):
-            gravity = f"{np.median(np.linalg.norm(sensor.accel_S, axis=1)):.2f} m/s²"
-            holds = "gyro, accel"
-        else:
-            holds, gravity = "segment's orientation" if sensor.aligned else "orientation", ""
-        lost = find_runs(sensor.gap) if sensor.gap is not None else []
-        longest = max((b - a for a, b in lost), default=0) / recording.rate_hz
-        gaps = f"{len(lost)}, up to {longest:.2f} s" if lost else "none"
-        named = (segment, labels.get(segment, ""))
-        if segment.startswith("?"):
-            named = ("?", labels.get(segment, segment[1:]))
-        rows.append((*named, holds, f"{fastest:.0f} deg/s", gravity, gaps))
+            holds, gravity = "gyro, accel", f"{np.median(np.linalg.norm(sensor.accel_S, axis=1)):.2f} m/s²"
+        lost = [b - a for a, b in find_runs(sensor.gap)] if sensor.gap is not None else []
+        gaps = f"{len(lost)}, up to {max(lost) / recording.rate_hz:.2f} s" if lost else "none"
+        known = not segment.startswith("?")
+        label = labels.get(segment, "" if known else segment[1:])
+        rows.append((segment if known else "?", label, holds, f"{fastest:.0f} deg/s", gravity, gaps))
     return tuple(rows)

@@ -64,7 +64,7 @@ XDF = Format("XDF", lambda path, _: is_xdf(path), read_xdf, whole=True)
 OPENSIM = Format(
     "OpenSim table of IMU orientations", lambda path, _: _has_suffix(path, ".sto"), read_opensim, whole=True
 )
-WEPOSE_LIVE = Format("recording of wepose live", lambda path, _: is_live_log(path), read_live_device)
+WEPOSE_LIVE = Format("recording of wepose live", lambda path, _: is_live_log(path), read_live_device, whole=True)
 
 
 def _has_suffix(path: Path, *suffixes: str) -> bool:

@@ -1,18 +1,20 @@
-"""Keys of a session file on sensors, phases and truth, checked before any data are read."""
+"""Keys of a session file, checked before any data are read."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from ..documents import TomlTable, is_number, read_toml
-from ..errors import BadPhase, BadSession, MissingFile, one_of
+from ..documents import Key, TomlTable, is_number, read_record, read_toml
+from ..errors import BadPhase, BadSession, MissingFile
 from ..recording import CONFIGURATION, Intervals, compute_mount
+from ..recording.clocks import TIME_UNITS
 from ..recording.sensors import read_axes
-from .device import Device
+from .device import ACCEL_UNITS, GYRO_UNITS, NEEDED
 
 # Suffixes of data files.
 DATA = (
@@ -24,20 +26,37 @@ SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "s
 _RENAMED_PHASES = {
     "still": "is called static now: write static = [[from, to]], seconds in which the sensors lie on a table"
 }
-_RENAMED = {"strapping": 'is called remounted now: write remounted = true where it was "new", else leave it out'}
 WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
+_CHOICES: dict[str, Collection[str]] = {
+    "use": NEEDED,
+    "time_unit": TIME_UNITS,
+    "gyro_unit": GYRO_UNITS,
+    "accel_unit": ACCEL_UNITS,
+}
 
 
 class SensorKeys(NamedTuple):
-    """The keys of a sensor's table."""
+    """The keys of a sensor's table, or of [data], which hold for every sensor that does not state them."""
 
-    signals: Mapping[str, list[str]]  # signal → columns, or one array; empty where the file's format defines them
-    mount: np.ndarray | None
-    aligned: bool | None
+    file: str = ""
+    format: str = ""
+    use: Annotated[str, Key(of="use")] = ""
+    time: str = ""
+    time_unit: Annotated[str, Key(of="time_unit")] = "s"
+    rate_hz: Annotated[float | None, Key(least=1e-3)] = None
+    offset_s: float = 0.0
+    gyro_unit: Annotated[str, Key(of="gyro_unit")] = ""
+    accel_unit: Annotated[str, Key(of="accel_unit")] = ""
+    label: str = ""
+    aligned: bool | None = None
+    ignore: bool = False
+    # Signal → columns, or one array; empty where the file's format defines them.
+    signals: Annotated[Mapping[str, list[str]], None] = MappingProxyType({})
+    mount: Annotated[np.ndarray | None, None] = None  # (4,) xyzw
 
 
-def read_session_file(path: Path) -> TomlTable:
-    """Read a session file, or the one in a folder.
+def read_session_file(path: Path, values: Mapping[str, Any] | None = None) -> TomlTable:
+    """Read a session file, or the one in a folder; `values` are its contents where it does not exist yet.
 
     Raises
     ------
@@ -50,74 +69,35 @@ def read_session_file(path: Path) -> TomlTable:
             f"{path}: is a table of data by its name; a session file is wanted here, which names the table (`wepose "
             f"info {path.name} --write` writes one)"
         )
-    return check_session_keys(read_toml(path, "a session file"), path)
+    top = TomlTable(read_toml(path, "a session file") if values is None else values, str(path))
+    top.allow(*SESSION_KEYS)
+    return top
 
 
-def check_session_keys(values: Mapping[str, Any], path: Path) -> TomlTable:
-    """Check the keys of a session file and return its table."""
-    keys = TomlTable(values, str(path))
-    keys.allow(*SESSION_KEYS, renamed=_RENAMED)
-    return keys
+def read_data_keys(table: TomlTable) -> SensorKeys:
+    """Read the keys in [data]."""
+    return read_record(SensorKeys, table, _CHOICES, others=("truth",))
 
 
-def read_sensor_keys(keys: TomlTable) -> SensorKeys:
-    """Read the columns by signal, the mount, and whether the orientations are the segment's own."""
-    if "segment" in keys:
-        name, segment = keys.place[:-1], keys.text("segment", None)
-        raise BadSession(
-            f"{keys.at('segment')} = '{segment}': a segment has one sensor, and its table has the segment's name; keep "
-            f"one of [sensors.{segment}] and [{name}], and name it [sensors.{segment}]"
-        )
-    keys.allow(
-        *("gyro", "accel", "orientation", "mount", "file", "time", "time_unit", "rate_hz", "offset_s"),
-        *("format", "label", "aligned", "ignore"),
-    )
-    mount = _read_mount(keys.table("mount")) if "mount" in keys else None
-    aligned = keys.flag("aligned") if "aligned" in keys else None
-    named = [key for key in WIDTHS if key in keys]
-    if not named:
-        return SensorKeys({}, mount, aligned)
-    for key in ("label", "format"):
-        if key in keys:
-            raise BadSession(
-                f"{keys.at(key)} stands beside {named[0]}; a known format has a {key}, a table has columns"
-            )
-    if "orientation" not in keys:
-        return SensorKeys({"gyro": _read_names(keys, "gyro"), "accel": _read_names(keys, "accel")}, mount, aligned)
-    if "gyro" in keys or "accel" in keys:
-        raise BadSession(f"{keys.at('orientation')} stands beside gyro or accel; a sensor has one or the other")
-    return SensorKeys({"orientation": _read_names(keys, "orientation")}, mount, aligned)
-
-
-def _read_names(keys: TomlTable, signal: str) -> list[str]:
-    """Read the columns of a signal, or its one array."""
-    value = keys.values.get(signal)
-    return [value] if isinstance(value, str) and value else keys.names(signal, WIDTHS[signal])
-
-
-def choose_label(keys: TomlTable, device: Device, segment: str, path: Path) -> str:
-    """Choose the file's sensor on a segment: the stated label, the one with the segment's name, or the only sensor.
-
-    The only one that is left of a file, with another segment's name, is none.
-    """
-    label = keys.text("label", None)
-    if label is not None:
-        if label not in device.sensors:
-            raise BadSession(f"{keys.at('label')} = '{label}' is not in {path.name}; {one_of(device.sensors, label)}")
-        return label
-    incomplete = any(each.code == "sensors-left-out" for each in device.diagnostics)
-    alone = len(device.sensors) == 1 and (
-        not incomplete or any(sensor.segment is None for sensor in device.sensors.values())
-    )
-    matches = [name for name, sensor in device.sensors.items() if sensor.segment == segment or alone]
-    if len(matches) != 1:
-        raise BadSession(f"{keys.at('label')} is missing; which of {path.name} is it? {one_of(device.sensors)}")
-    return matches[0]
-
-
-def _read_mount(keys: TomlTable) -> np.ndarray:
-    keys.allow("up", "forward")
-    return compute_mount(*read_axes(keys))
+def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
+    """Read the keys of a sensor; those that its table lacks are those of [data]."""
+    keys = read_record(SensorKeys, table, _CHOICES, data, others=(*WIDTHS, "mount"))
+    if "time" in table or "rate_hz" in table:  # one replaces the other
+        keys = keys._replace(time=table.text("time", None) or "", rate_hz=table.number("rate_hz", None))
+    if "mount" in table:
+        axes = table.table("mount")
+        axes.allow("up", "forward")
+        keys = keys._replace(mount=compute_mount(*read_axes(axes)))
+    if not any(signal in table for signal in WIDTHS):
+        return keys
+    needed = NEEDED["orientation"] if "orientation" in table else NEEDED["raw"]
+    if other := next((signal for signal in WIDTHS if signal in table and signal not in needed), None):
+        raise BadSession(f"{table.at('orientation')} stands beside {other}; a sensor has one or the other")
+    signals = {}
+    for signal in needed:
+        value = table.values.get(signal)
+        signals[signal] = [value] if isinstance(value, str) and value else table.names(signal, WIDTHS[signal])
+    return keys._replace(signals=signals)
 
 
 def read_phases(keys: TomlTable) -> dict[str, Intervals]:
@@ -139,14 +119,10 @@ def read_phases(keys: TomlTable) -> dict[str, Intervals]:
 
 def read_joints(top: TomlTable, start_pose: str) -> dict[str, float]:
     """Read the values of joints [rad or m] in the start pose."""
-    if "joints" in top and start_pose != CONFIGURATION:
-        raise BadSession(
-            f'{top.at("joints")} stands beside start_pose = "{start_pose}"; joints have values where start_pose = '
-            f'"{CONFIGURATION}"'
-        )
     joints = top.table("joints", {})
-    values = {name: joints.number(name, None) for name in joints.values}
-    return {name: value for name, value in values.items() if value is not None}
+    if joints.values and start_pose != CONFIGURATION:
+        raise BadSession(f'{top.at("joints")} needs start_pose = "{CONFIGURATION}", and it is "{start_pose}"')
+    return {name: joints.number(name, None) or 0.0 for name in joints.values}
 
 
 def find_model(path: Path, top: TomlTable) -> str:
@@ -154,11 +130,9 @@ def find_model(path: Path, top: TomlTable) -> str:
 
     Empty where it names none.
     """
-    name = top.text("model", None)
-    if name is None:
-        return ""
+    name = top.text("model", None) or ""
     file = path.parent / name
-    if not file.is_file() and (Path(name).suffix or len(Path(name).parts) > 1):
+    if name and not file.is_file() and (Path(name).suffix or len(Path(name).parts) > 1):
         raise MissingFile(
             f"{top.at('model')}: no such file '{name}' beside {path.name}; a URDF, a TOML that names one, or the name "
             f"of a body of the package is needed"
