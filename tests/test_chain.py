@@ -217,7 +217,7 @@ mount = { up = "+z", forward = "+x" }
         ("= 0.5", "= 7.0", BadSession, r"joints\.elbow_joint = 7 is outside its limits, -6\.3 to 6\.3"),
         ("= 0.5", '= "up"', BadSession, r"joints\.elbow_joint = 'up' is not a number"),
         ("forearm_link", "forearm", BadSession, r"sensors\.forearm is no link of arm; did you mean 'forearm_link'"),
-        ('"configuration"', '"n_pose"', BadSession, "joints stands beside start_pose"),
+        ('"configuration"', '"n_pose"', BadSession, "joints needs start_pose"),
     ],
 )
 def test_what_a_session_of_a_chain_may_not_say(
