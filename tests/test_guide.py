@@ -225,7 +225,9 @@ def test_a_gentle_shake_is_seen_and_a_stronger_one_asked_for(tmp_path: Path) -> 
         return gyro + rate * np.sin(6.0 * np.pi * now) * np.array([segment == "torso" and now > 3.0, 0.0, 0.0])
 
     session.person.disturb = shake
-    assert session.run(lambda m: bool(m.view.note))[-1].view.note == "Too gentle: a7. Shake harder."
+    assert session.run(lambda m: bool(m.view.note))[-1].view.note == (
+        "Too gentle, or not alone: a7. Shake one harder, hold the others still."
+    )
     session.guide.ask(Request("again"))
     rate = 12.0
     session.run(lambda _: len(session.guide.segments) == 1)
@@ -239,7 +241,7 @@ def test_a_short_loss_pauses_and_a_long_one_needs_the_start_pose_again(tmp_path:
     session.person.silent = {"left_forearm"}
     note = session.run(lambda m: bool(m.view.note))[-1].view.note
     assert note == "No samples from left forearm: it goes on when they come again."
-    back = session.source.clock() + 0.8
+    back = session.source.clock() + 0.5
     session.run(lambda m: m.time > back)
     session.person.silent = set()
     begin(session, "clasp", 8.0)
@@ -257,7 +259,9 @@ def test_a_short_loss_pauses_and_a_long_one_needs_the_start_pose_again(tmp_path:
 
 
 def test_too_little_motion_asks_for_more_of_it(tmp_path: Path) -> None:
-    view = Session(tmp_path, clasp_s=6.0).run(lambda m: bool(m.view.quality))[-1].view
+    session = Session(tmp_path, clasp_s=6.0)
+    view = session.run(lambda m: bool(m.view.quality))[-1].view
+    session.guide.close()
     assert view.quality == "fail"
     assert view.sentence == "There was too little of the motion. More of it may be enough."
     assert [action.name for action in view.actions] == ["more", "restart"]
@@ -317,26 +321,6 @@ def test_a_step_is_repeated_and_a_known_setup_needs_no_shaking(tmp_path: Path) -
     session.guide.close()
 
 
-def test_who_goes_back_by_mistake_keeps_what_was_done(tmp_path: Path) -> None:
-    session = Session(tmp_path)
-    guide = session.guide
-    begin(session, "clasp", 5.0)
-    guide.ask(Request("static"))
-    guide.ask(Request("skip"))
-    assert [action.name for action in guide.view().actions] == ["next", "skip"]
-    guide.ask(Request("skip"))
-    begin(session, "clasp", 8.0)
-    assert guide.attempts == 1
-    assert [name for name, spans in guide.attempt.recording().phases.items() for _ in spans] == ["start"] + 2 * [
-        "clasp"
-    ]
-    guide.ask(Request("assignment"))
-    assert guide.segments == {}
-    guide.ask(Request("skip"))
-    assert (guide.step.name, guide.segments) == ("static", session.person.worn)
-    guide.close()
-
-
 def test_a_part_of_a_joined_protocol_is_skipped_and_more_motion_is_of_the_longest(tmp_path: Path) -> None:
     session = Session(tmp_path, protocol="clasp+t_pose")
     guide = session.guide
@@ -373,19 +357,11 @@ def test_who_wears_trackers_bows_unless_the_torsos_mount_is_stated(
     assert choose_protocol(opened, SensorSetup(mounts=mounts), model) == protocol
 
 
-@pytest.mark.parametrize("protocol", ["clasp", "clasp+bow"])
-def test_without_a_bow_trackers_are_told_what_is_missing(tmp_path: Path, protocol: str) -> None:
-    person = GuidedPerson(perform(*PERSON), orientations="sensor")
-    guide = make_guide(PersonSource(person), make_options(tmp_path, None, {}, protocol))
-    reasons = guide.view().reasons
-    assert [("+bow" in reason) for reason in reasons] == [True] * (protocol == "clasp")
-
-
 def test_a_setup_with_a_wrong_segment_is_refused(tmp_path: Path) -> None:
     for text, said in (
         ('format = 1\n[sensors]\na = "tail"', "sensors.a = 'tail' is not a segment"),
         ('format = 1\n[sensors]\na = "torso"\nb = "torso"', "names a segment twice"),
-        ("format = 2", "no sensor setup of format 1"),
+        ("format = 1", r"has no \[sensors\]"),
     ):
         (tmp_path / "setup.toml").write_text(text)
         with pytest.raises(BadSession, match=said):

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 from ..errors import ExistingOutput
 
@@ -24,13 +24,16 @@ if TYPE_CHECKING:
 SUBJECT_FILES = ("subject.toml", "subject.urdf", "calibration.json", "report.html")
 
 
-class GuidedOutcome(NamedTuple):
-    """What a guided session hands over to tracking."""
-
-    source: AssignedSource
-    setup: SensorSetup
-    folder: Path
-    calibrated: Calibrated
+def make_guide_folder(out: Path | None, force: bool) -> Path:
+    """Make the folder of a guided session; raises `ExistingOutput` where it holds a subject, or cannot be made."""
+    folder = out or Path(time.strftime("wepose-%Y%m%d-%H%M%S"))
+    if (folder / "subject.toml").exists() and not force:
+        raise ExistingOutput(f"{folder}: holds a subject; --force replaces it, -o names another folder")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ExistingOutput(f"{folder}: cannot be made: {error.strerror}") from error
+    return folder
 
 
 def run_guide(
@@ -40,8 +43,7 @@ def run_guide(
     views: Sequence[Output],
     until: Callable[[], bool],
     *,
-    out: Path | None,
-    force: bool,
+    folder: Path,
     protocol: str | None,
     measured: Mapping[str, float],
     stature: float | None,
@@ -49,19 +51,15 @@ def run_guide(
     subject: Path | None,
     setup_folder: Path | None,
     method: str,
-) -> GuidedOutcome | None:
+) -> tuple[AssignedSource, SensorSetup] | None:
     """Lead the person to an accepted calibration, and save its subject; None where it was ended before.
+
+    Returns the source and the setup to track with; the source stays open then, and the views always.
 
     Parameters
     ----------
-    source : not open; it stays open where there is an outcome
-    views : stay open
-    out, force, protocol, measured, stature, sex, subject, setup_folder, method : options of `wepose live`
-
-    Raises
-    ------
-    ExistingOutput
-        The folder holds a subject and `force` is not given, or it cannot be made.
+    source : not open
+    folder, protocol, measured, stature, sex, subject, setup_folder, method : as the options of `wepose live`
     """
     from ..body.subject import load_subject, population_subject
     from ..calibration import calibrate, load_protocol
@@ -77,9 +75,8 @@ def run_guide(
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance
 
-    folder = _make_folder(out, force)
     joined = protocol or choose_protocol(source, setup, model)
-    parts = split_protocol(joined)
+    later = [load_protocol(part) for part in split_protocol(joined)[1:]]
     earlier = None if subject is None else read_subject(subject)
     prior = earlier or population_subject(stature, sex, model)
 
@@ -104,14 +101,8 @@ def run_guide(
         return Calibrated(calibration, out)
 
     def estimate(recording: Recording) -> Calibration:
-        return calibrate(
-            recording,
-            measured=measured,
-            prior=prior,
-            model=model,
-            protocol=choose_parts(joined, recording.phases),
-            method=method,
-        )
+        steps = choose_parts(joined, recording.phases)
+        return calibrate(recording, measured=measured, prior=prior, model=model, protocol=steps, method=method)
 
     options = GuideOptions(
         folder,
@@ -122,7 +113,7 @@ def run_guide(
         estimate,
         method,
         {} if setup_folder is None else read_segments(setup_folder, tuple(model.table.segments)),
-        frozenset(step.phase for part in parts[1:] for step in load_protocol(part).steps if step.phase != "start"),
+        frozenset(step.phase for part in later for step in part.steps if step.phase != "start"),
         frozenset({*measured, *([STATURE] if stature is not None or subject is not None else [])}),
     )
     threading.Thread(target=warm_up, args=(method,), daemon=True).start()  # tracking begins without a wait then
@@ -137,20 +128,9 @@ def run_guide(
         if (calibrated.folder / name).is_file():
             shutil.copyfile(calibrated.folder / name, folder / name)
     write_segments(folder, guide.segments)
-    subject_text = (folder / "subject.toml").read_text(encoding="utf-8")
-    tracked = replace(setup, subject=load_subject(folder), subject_text=subject_text, remounted=False, mounts={})
-    return GuidedOutcome(guide.assign_source(), tracked, folder, calibrated)
-
-
-def _make_folder(out: Path | None, force: bool) -> Path:
-    folder = out or Path(time.strftime("wepose-%Y%m%d-%H%M%S"))
-    if (folder / "subject.toml").exists() and not force:
-        raise ExistingOutput(f"{folder}: holds a subject; --force replaces it, -o names another folder")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ExistingOutput(f"{folder}: cannot be made: {error.strerror}") from error
-    return folder
+    text = (folder / "subject.toml").read_text(encoding="utf-8")
+    tracked = replace(setup, subject=load_subject(folder), subject_text=text, remounted=False, mounts={})
+    return guide.assign_source(), tracked
 
 
 def choose_protocol(source: Source, setup: SensorSetup, model: BodyModel) -> str:
@@ -166,7 +146,5 @@ def choose_parts(protocol: str, phases: Collection[str]) -> str:
     from ..calibration import load_protocol
     from ..calibration.protocols import split_protocol
 
-    there = [
-        part for part in split_protocol(protocol) if all(step.phase in phases for step in load_protocol(part).steps)
-    ]
-    return "+".join(there) or protocol
+    parts = [part for part in split_protocol(protocol) if {s.phase for s in load_protocol(part).steps} <= {*phases}]
+    return "+".join(parts) or protocol

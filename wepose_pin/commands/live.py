@@ -165,7 +165,7 @@ def live(
     from ..live.setup import build_subject_model, check_mounts
     from ..live.terminal import Keyboard, TerminalView
     from ..retargeting.targets import check_person_arms
-    from .guide import run_guide
+    from .guide import make_guide_folder, run_guide
 
     for option, given in {"out": out, "measured": measured, "stature": stature, "sex": sex}.items():
         if given is not None and not guide:
@@ -200,14 +200,14 @@ def live(
     try:
         with contextlib.nullcontext(until) if until is not None else stop_requests() as should_stop:
             if guide:
+                folder = make_guide_folder(out, force)
                 guided = run_guide(
                     samples,
                     worn,
                     body,
                     outputs,
                     should_stop,
-                    out=out,
-                    force=force,
+                    folder=folder,
                     protocol=protocol,
                     measured=measured or {},
                     stature=stature,
@@ -219,7 +219,7 @@ def live(
                 if guided is None:
                     say("The guided session was ended before a calibration was accepted.")
                     return Live(None, None)
-                samples, worn, record = guided.source, guided.setup, record or _name_recording(guided.folder)
+                (samples, worn), record = guided, record or _name_recording(folder)
                 body = build_subject_model(worn, model, samples.sensors)
             if following is not None:
                 factor = float(speed.replace("max", "inf")) if replays else 1.0

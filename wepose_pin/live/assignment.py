@@ -14,7 +14,6 @@ from ..recording.arrivals import Samples, unpack_orientations
 from .sources.base import Source
 
 SETUP_FILE = "setup.toml"
-SETUP_FORMAT = 1
 SHAKE_WINDOW_S = 0.8  # [s] newest samples by which a shake is detected
 SHAKE_RATE = 2.5  # [rad/s] rms of a sensor that is shaken; a person who stands is below 0.1
 CALM_RATE = 0.6  # [rad/s] below which all must be before the next shake counts
@@ -57,33 +56,27 @@ class ShakeDetector:
 
     def find(self, candidates: Sequence[str]) -> str | None:
         """The candidate that is shaken; None: none, several, or those of the last shake still move."""
+        rates = self._find_rates()
         if not self.is_calm:
-            self.is_calm = all(self._rate(sensor) < CALM_RATE for sensor in self._recent)
+            self.is_calm = max(rates.values(), default=0.0) < CALM_RATE
             return None
-        ranked = sorted(candidates, key=self._rate, reverse=True)
-        if not ranked or not self.is_shaken(ranked[0]):
-            return None
-        if len(ranked) > 1 and self._rate(ranked[0]) < SHAKE_RATIO * self._rate(ranked[1]):
+        ranked = sorted((rates.get(sensor, 0.0), sensor) for sensor in candidates)[-2:]
+        if not ranked or ranked[-1][0] < SHAKE_RATE or (len(ranked) > 1 and ranked[1][0] < SHAKE_RATIO * ranked[0][0]):
             return None
         self.is_calm = False
-        return ranked[0]
-
-    def is_shaken(self, sensor: str) -> bool:
-        """Whether a sensor moves as one that is shaken, and not still from the last shake."""
-        return self.is_calm and self._rate(sensor) >= SHAKE_RATE and self._lasts(sensor)
+        return ranked[-1][1]
 
     def list_moving(self) -> list[str]:
         """The sensors that have not come to rest."""
-        return [sensor for sensor in self._recent if self._lasts(sensor) and self._rate(sensor) > CALM_RATE]
+        return [sensor for sensor, rate in self._find_rates().items() if rate > CALM_RATE]
 
-    def _lasts(self, sensor: str) -> bool:
-        """Whether it was seen for as long as a shake takes."""
-        recent = self._recent.get(sensor, deque())
-        return len(recent) > 1 and recent[-1][0] - recent[0][0] > 0.75 * SHAKE_WINDOW_S
-
-    def _rate(self, sensor: str) -> float:
-        recent = self._recent.get(sensor, ())
-        return float(np.sqrt(np.mean([square for _, square in recent]))) if recent else 0.0
+    def _find_rates(self) -> dict[str, float]:
+        """Sensor → rms rate [rad/s] of those that were seen for as long as a shake takes."""
+        return {
+            sensor: float(np.sqrt(np.mean([square for _, square in recent])))
+            for sensor, recent in self._recent.items()
+            if recent and recent[-1][0] - recent[0][0] > 0.75 * SHAKE_WINDOW_S
+        }
 
 
 class AssignedSource(Source):
@@ -153,10 +146,9 @@ def read_segments(path: Path, known: Iterable[str]) -> dict[str, str]:
         A segment is not among `known`, or is named twice.
     """
     path = path / SETUP_FILE if path.is_dir() else path
-    content = read_toml(path, "a sensor setup", BadSession)
-    segments, names = content.get("sensors"), tuple(known)
-    if content.get("format") != SETUP_FORMAT or not isinstance(segments, dict) or not segments:
-        raise BadSession(f"{path}: no sensor setup of format {SETUP_FORMAT}; `wepose live --guide` writes one")
+    segments, names = read_toml(path, "a sensor setup", BadSession).get("sensors"), tuple(known)
+    if not isinstance(segments, dict) or not segments:
+        raise BadSession(f"{path}: has no [sensors]; `wepose live --guide` writes a sensor setup")
     for sensor, segment in segments.items():
         if segment not in names:
             raise BadSession(f"{path}: sensors.{sensor} = {segment!r} is not a segment; {', '.join(names)} are")
@@ -167,7 +159,7 @@ def read_segments(path: Path, known: Iterable[str]) -> dict[str, str]:
 
 def write_segments(folder: Path, segments: Mapping[str, str]) -> None:
     """Write the setup file that `read_segments` reads."""
-    lines = [f"format = {SETUP_FORMAT}", "", "[sensors]   # name that the source gives it = segment"]
+    lines = ["format = 1", "", "[sensors]   # name that the source gives it = segment"]
     lines += [f"{toml_key(sensor)} = {toml_string(segment)}" for sensor, segment in segments.items()]
     with whole_file(folder / SETUP_FILE, force=True) as partial:
         partial.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -2,8 +2,8 @@
 
 `steps.make_steps` is the table of its steps. A step is a generator: it yields what to tell the person, gets the action
 that the person asks for, None where there is none, and returns the `Turn` that follows. Samples and ticks that came
-meanwhile, and the text that was typed, are in the guide's attributes. Steps can be repeated, and all but the start pose
-skipped. Times are those of the source's clock.
+meanwhile, and the text that was typed, are in the guide's attributes. Steps can be repeated. Times are those of the
+source's clock.
 """
 
 from __future__ import annotations
@@ -138,9 +138,7 @@ class Guide(Stage):
     @property
     def actions(self) -> tuple[Action, ...]:
         """Those of the step, and to go back to an earlier one."""
-        back = [
-            Action(step.name, f"{step.title} again", str(k + 1)) for k, step in enumerate(self.steps[: self._index])
-        ]
+        back = [Action(step.name, f"{step.title} again", str(k)) for k, step in enumerate(self.steps[: self._index], 1)]
         return (*self._view.actions, *back)
 
     def run(self, should_stop: Callable[[], bool] = lambda: False) -> Calibrated | None:
@@ -152,10 +150,6 @@ class Guide(Stage):
         if self.is_over:
             self.send_status()
         return self.accepted
-
-    def accept(self, calibrated: Calibrated) -> None:
-        """End with this calibration."""
-        self.accepted, self.is_over = calibrated, True
 
     def process(self, samples: list[Samples]) -> None:
         """Guide the person by what came since the last call, and move the figure."""
@@ -224,11 +218,6 @@ class Guide(Stage):
         """The source with the sensors named by their segments."""
         return AssignedSource(self.source, self.segments, self.order, is_open=True)
 
-    def discard_phases(self) -> None:
-        """Take back what was recorded of the protocol."""
-        for phase in ("start", *(step.phase for step in self.options.protocol.steps)):
-            self.begin_attempt().mark("discard", phase=phase)
-
     def close(self) -> None:
         """End the recording; may be called twice."""
         if self.attempt is not None:
@@ -260,13 +249,9 @@ class Guide(Stage):
         """A sentence on sensors that send nothing, else on rates in another unit; empty: there are none."""
         silent = [self.segments.get(name, name) for name in self.silent]
         if silent:
-            return f"No samples from {self.join_sensors(silent)}. Switched on and in reach?"
+            every = len(silent) == len(self.segments or self.sending) > 1
+            return f"No samples from {'any sensor' if every else join_names(silent)}. Switched on and in reach?"
         return self.monitor.describe_wrong_unit(self.source)
-
-    def join_sensors(self, names: Sequence[str]) -> str:
-        """Sensors as words."""
-        count = len(self.segments or self.sending)
-        return "any sensor" if len(names) == count > 1 else join_names(list(names))
 
 
 class Attempt:
