@@ -196,8 +196,8 @@ def _measure(recording: Recording, file: Path, outputs: Sequence[Output]) -> dic
     return {
         "ticks": float(summary.poses),
         "lost": float(lost),
-        "p50": 1e3 * summary.latency.quantile(0.5),
-        "p99": 1e3 * summary.latency.quantile(0.99),
+        "p50": 1e3 * float(np.quantile(summary.latency, 0.5)),
+        "p99": 1e3 * float(np.quantile(summary.latency, 0.99)),
         "busy_us": 1e6 * busy / max(summary.poses, 1),
         "share": 100.0 * busy / wall,
         "grown": grown / 1e6,

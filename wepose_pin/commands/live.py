@@ -88,7 +88,7 @@ def live(
 
     Stand still in the start pose until the message says that it is ready. After that, stand in the start pose again and
     press r to reset the headings. With --robot, r also lets a stopped robot move again. q or Ctrl-C ends the session.
-    If it is killed, at most the last second of --record is lost.
+    If it is killed, at most the last quarter of a second of --record is lost.
 
     Example: wepose live --source udp:9000 --subject anna --record morning.mcap
 
@@ -111,8 +111,8 @@ def live(
         With --guide: write subject, recordings and the sensors' setup to this folder. Without it to a new folder
         named by the date.
     record
-        Write all that is received and the poses to this file; `wepose track FILE` gives the same poses again. Without
-        it the first take (key T) begins such a file, which also holds what came before the take.
+        Write all that is received and the poses to this file, and let takes and moments be marked in it by keys;
+        `wepose track FILE` gives the same poses again.
     robot
         Send joint commands that let this robot follow the person (docs/live-outputs.md): one of the names of `wepose
         retarget --robot`, a URDF with a robot map beside it (ARM.urdf, ARM.toml), the robot map, or a TOML file that
@@ -322,9 +322,11 @@ def _name_recording(folder: Path) -> Path:
 
 
 def _print_session(session: SessionSummary) -> None:
+    import numpy as np
+
     title = "no poses: the start pose was not held"
     if session.poses:
-        p50, p99 = (1e3 * session.latency.quantile(share) for share in (0.5, 0.99))
+        p50, p99 = (1e3 * np.quantile(session.latency, (0.5, 0.99))).tolist()
         title = (
             f"{session.poses} poses in {session.seconds:.1f} s; from the newest sample to its pose {p50:.2f} ms (p50), "
             f"{p99:.2f} ms (p99)"
@@ -346,17 +348,19 @@ def _print_session(session: SessionSummary) -> None:
 
 
 def _print_robot(robot: RobotSummary) -> None:
+    import numpy as np
+
     title = f"{robot.robot}: {robot.commands} commands, none with a pose"
     if robot.share:
         shares = ", ".join(f"{100.0 * share:.1f} % {state}" for state, share in robot.share.items())
-        p50, p99 = (1e3 * robot.step.quantile(share) for share in (0.5, 0.99))
+        p50, p99 = (1e3 * np.quantile(robot.step, (0.5, 0.99))).tolist()
         took = f"each took {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
         title = f"{robot.robot}: {robot.commands} commands; with a pose {shares}; {took}"
     print_table(
         title,
         ("arm", "hand off its target [mm]", "in 90 % under"),
         [
-            (side, *(f"{1e3 * error.quantile(share):.1f}" if error.count else "–" for share in (0.5, 0.9)))
+            (side, *(f"{1e3 * np.quantile(error, share):.1f}" if len(error) else "–" for share in (0.5, 0.9)))
             for side, error in robot.error.items()
         ],
     )

@@ -32,13 +32,13 @@ from .monitor import SensorMonitor, check_units
 from .setup import SensorSetup, build_subject_model
 from .sources.base import Source
 from .stage import Stage
-from .start import StartPoseSearch
 from .state import Action, LivePose, Output, SensorStatus, Status, StreamInfo, join_names
-from .ticks import TickStream
+from .ticks import StartPoseSearch, TickStream
 
 SWITCH_INTERVAL_S = 5e-4  # [s] after which page and robot hand over the interpreter to the loop; Python has 5 ms
 MAX_SILENCE_S = 0.5  # [s] without a sample after which a sensor is lost, before the ticks begin
-MAX_LATENCIES = 1000  # newest latencies in the status
+MAX_LATENCIES = 100_000  # newest latencies in the summary
+SHOWN_LATENCIES = 1000  # and in the status
 TAKE = "take_"  # the names of takes begin so
 
 RESET = Action("reset", "Reset headings", "r")
@@ -48,42 +48,16 @@ MARK = Action("mark", "Mark", "m")
 MARK_TEXT = Action("text", "Mark with text", "n", "text of the mark")
 
 
-class Latencies:
-    """Histogram of latencies in bins of 2 %; its size is constant."""
-
-    MIN_LATENCY_S, BIN_RATIO = 1e-6, 1.02
-    BINS = 1024  # up to ten minutes
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._bins = [0] * self.BINS
-
-    def add(self, latency_s: float) -> None:
-        bin_index = int(math.log(max(latency_s, self.MIN_LATENCY_S) / self.MIN_LATENCY_S) / math.log(self.BIN_RATIO))
-        self._bins[min(bin_index, len(self._bins) - 1)] += 1
-        self.count += 1
-
-    def quantile(self, probability: float) -> float:
-        """Return the quantile [s], accurate to 2 %; NaN before the first latency."""
-        if not self.count:
-            return math.nan
-        bin_index = int(np.searchsorted(np.cumsum(self._bins), probability * self.count))
-        return self.MIN_LATENCY_S * self.BIN_RATIO ** (min(bin_index, len(self._bins) - 1) + 0.5)
-
-
 class SessionSummary(NamedTuple):
-    """Outcome of a session."""
+    """Outcome of a session; that of one that ended before a sample came is empty."""
 
-    poses: int
-    seconds: float  # [s] from the first pose to the last, on the source's clock
-    counts: Mapping[str, Mapping[str, int]]  # segment → each of `arrivals.COUNTS`, and "lost" samples
-    latency: Latencies  # of every tick with a sample: [s] from its time to its pose
-    diagnostics: tuple[Diagnostic, ...]
-    problem: str  # of the recording; empty where it is complete
-    record: Path | None  # the recording
-
-
-EMPTY_SESSION = SessionSummary(0, 0.0, {}, Latencies(), (), "", None)  # ended before a sample came
+    poses: int = 0
+    seconds: float = 0.0  # [s] from the first pose to the last, on the source's clock
+    counts: Mapping[str, Mapping[str, int]] = {}  # segment → each of `arrivals.COUNTS`, and "lost" samples
+    latency: np.ndarray = np.empty(0)  # (n,) [s] of the newest ticks with a sample, from its time to its pose
+    diagnostics: tuple[Diagnostic, ...] = ()
+    problem: str = ""  # of the recording; empty where it is complete
+    record: Path | None = None  # the recording
 
 
 class LiveLoop(Stage):
@@ -94,7 +68,6 @@ class LiveLoop(Stage):
     source : an open source; `run` closes it
     model : a body; None: that of the setup, with the subject's lengths
     log : the recording; `run` closes it
-    open_log : opens a recording when the person begins a take and there is none; None: there is none then
     begin : time [s] of the first tick; None: when every sensor has sent a sample
 
     Raises
@@ -111,12 +84,11 @@ class LiveLoop(Stage):
         method: str = BEST,
         model: BodyModel | str | Path | None = None,
         log: LiveLog | None = None,
-        open_log: Callable[[], LiveLog] | None = None,
         outputs: Sequence[Output] = (),
         begin: float | None = None,
     ) -> None:
         super().__init__(source, outputs)
-        self.method, self.log, self._open_log, self.setup = method, log, open_log, setup.as_recorded()
+        self.method, self.log, self.setup = method, log, setup.as_recorded()
         self.model = build_subject_model(setup, model, source.sensors)
         check_segments(self.model.table, source.sensors, f"{setup.name}: sensors.", BadSession)
         with suppress(BadModel):  # measured before samples come; the parts of the way to a point
@@ -135,11 +107,8 @@ class LiveLoop(Stage):
         self._heading_reset_time = 0.0
         self._std, self._heading_std = (np.full(len(source.sensors), np.nan) for _ in range(2))
         self._covariance: Iterator[np.ndarray | None] = iter(())  # computed in parts, one or more with each tick
-        self._covariance_ticks, self._covariance_parts = 1, 1  # from one to the next, and parts with a tick
-        self._latency = Latencies()
-        self._recent_latencies: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s] of displayed poses
+        self._latency: deque[float] = deque(maxlen=MAX_LATENCIES)  # [s]
         self._poses, self._first_pose, self._last_pose = 0, 0.0, 0.0
-        self._events: list[tuple[str, dict[str, Any]]] = []  # that decide poses
         self._open_phases: list[str] = []
         self._takes = 0
         self._end_message = ""  # empty: it goes on
@@ -189,32 +158,24 @@ class LiveLoop(Stage):
         self._monitor.push(samples, self.source.sensors if self._estimator else self.source.orientations)
         for ticks in self._stream.push(samples):
             pose = self._track(ticks) or pose
-        self._begin_search()
         if pose is not None:
             for output in self.outputs:
                 output.show(pose)
         if self.log is not None:
             self.log.flush_if_due()
 
-    def _begin_search(self) -> StartPoseSearch | None:
-        """The search of the start pose, which begins with the ticks; None before them."""
-        if self._search is None and self._stream.synchronizer is not None:
-            self._search = StartPoseSearch(self._stream, self.setup, self.model.table)
-            self._covariance_ticks = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))
-            self._covariance_parts = math.ceil((len(self.source.sensors) + 2) / self._covariance_ticks)
-        return self._search
-
     def _track(self, ticks: Ticks) -> LivePose | None:
         """Track these ticks, log every pose, and return the last one; None before tracking starts."""
-        search, estimator, row, quat_WL = self._begin_search(), self._estimator, 0, None
-        if search is None or not len(ticks.time):
+        if not len(ticks.time):
             return None
+        row, estimator, quat_WL = 0, self._estimator, None
         if estimator is None:
-            start = search.push(ticks)
+            self._search = self._search or StartPoseSearch(self._stream, self.setup, self.model.table)
+            start = self._search.push(ticks)
             if start is None:
                 return None
             begin, end, row = start
-            estimator = self._estimator = self._start_tracking(search, begin, end)
+            estimator = self._estimator = self._start_tracking(self._search, begin, end)
         for n in range(row, len(ticks.time)):
             while self._edges and self._edges[0][0] <= ticks.time[n]:
                 _, phase, begins = self._edges.popleft()
@@ -228,18 +189,17 @@ class LiveLoop(Stage):
         points = self.kinematics.compute_points(quat_WL)
         now, self._last_pose = self.source.clock(), float(ticks.time[-1])
         self._poses += len(ticks.time) - row
-        for tick in ticks.time[row:][~ticks.lost[row:].all(axis=1)].tolist():  # a tick of silent sensors is not late
-            self._latency.add(now - tick)
-        latency = now - self._last_pose
-        self._recent_latencies.append(latency)
+        with_sample = ~ticks.lost[row:].all(axis=1)  # a tick of silent sensors is not late
+        self._latency += (now - ticks.time[row:][with_sample]).tolist()
         quat_WL = self.kinematics.orient_segments(quat_WL).copy()
-        return LivePose(self._last_pose, quat_WL, points, self._std, ticks.lost[-1].copy(), latency)
+        return LivePose(self._last_pose, quat_WL, points, self._std, ticks.lost[-1].copy(), now - self._last_pose)
 
     def _update_std(self, estimator: SegmentEstimator, tick: int) -> None:
         """Compute some of the covariances; by ticks, so that a recording reproduces the values."""
-        if tick % self._covariance_ticks == 0:
+        period = max(1, round(self.STATUS_PERIOD_S * self._stream.clock.rate_hz))  # ticks from one to the next
+        if tick % period == 0:
             self._covariance = estimator.covariance_gradually()
-        for covariance in itertools.islice(self._covariance, self._covariance_parts):
+        for covariance in itertools.islice(self._covariance, math.ceil((len(self._std) + 2) / period)):
             if covariance is not None:
                 self._std, self._heading_std = compute_axis_std(covariance), np.sqrt(covariance[:, 2, 2])
 
@@ -255,11 +215,15 @@ class LiveLoop(Stage):
         search.ticks = []
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
         self._first_pose = self._heading_reset_time = float(recording.time[-1])
-        self._record_event("start", begin=begin, end=end)
+        self._log_event("start", begin=begin, end=end)
         info = StreamInfo(tuple(self.source.sensors), self.kinematics.points, rate_hz)
         for output in self.outputs:
             output.start(info)
         return estimator
+
+    def _log_event(self, kind: str, **values: Any) -> None:
+        if self.log is not None:
+            self.log.event(kind, **values)
 
     # Actions ---------------------------------------------------------------------------------------------------------
 
@@ -268,76 +232,45 @@ class LiveLoop(Stage):
         """Reset the headings; while tracking mark a take, a phase or a moment in the recording."""
         if self._end_message:
             return ()
-        actions = [RESET]
-        if self._estimator is not None and (self.log is not None or self._can_begin_recording()):
-            for action, name in ((BEGIN_TAKE, self._open_take), (BEGIN_PHASE, self._open_phase)):
-                end = action._replace(label=f"End {name.replace('_', ' ')}", entry="", is_on=True)
-                actions.append(end if name else action)
-            actions += [MARK, MARK_TEXT] if self.log is not None else []
-        return tuple(actions)
+        if self._estimator is None or self.log is None:
+            return (RESET,)
+        begin_or_end = []
+        for action, is_take in ((BEGIN_TAKE, True), (BEGIN_PHASE, False)):
+            name = self._find_open(is_take)
+            end = action._replace(label=f"End {name.replace('_', ' ')}", entry="", is_on=True)
+            begin_or_end.append(end if name else action)
+        return (RESET, *begin_or_end, MARK, MARK_TEXT)
 
-    @property
-    def _open_take(self) -> str:
-        """The take that was begun and not ended; empty: none."""
-        return next((phase for phase in self._open_phases if phase.startswith(TAKE)), "")
-
-    @property
-    def _open_phase(self) -> str:
-        """The phase that was begun last and not ended, and is no take; empty: none."""
-        return next((phase for phase in self._open_phases if not phase.startswith(TAKE)), "")
+    def _find_open(self, is_take: bool) -> str:
+        """The phase that was begun and not ended, and is a take or none; empty: there is none."""
+        return next((phase for phase in self._open_phases if phase.startswith(TAKE) == is_take), "")
 
     def do(self, action: Action, text: str) -> None:
         """Reset the headings, or mark a take, a phase or a text in the recording."""
+        text = text[:LONGEST_TEXT]
         if action.name == RESET.name:
             if self._estimator is not None:
                 self._estimator.reset_headings()
                 self._heading_reset_time = self._stream.clock.newest
-                self._record_event("reset", tick=self._stream.clock.next_tick)
+                self._log_event("reset", tick=self._stream.clock.next_tick)
             for output in self.outputs:
                 output.resume()
-            return
-        text = text[:LONGEST_TEXT]
-        if self.log is None:
-            self._begin_recording()
-        if action.name == BEGIN_TAKE.name:
-            self._takes += not self._open_take
-            self._toggle_phase(self._open_take or f"{TAKE}{self._takes}")
+        elif action.name == BEGIN_TAKE.name:
+            self._takes += not self._find_open(is_take=True)
+            self._toggle_phase(f"{TAKE}{self._takes}")
         elif action.name == BEGIN_PHASE.name:
-            self._toggle_phase(self._open_phase or text or "clasp")
-        elif self.log is not None:
-            self.log.event("mark", text=text or "mark", time=self._newest_tick)
-
-    @property
-    def _newest_tick(self) -> float:
-        """Time [s] of the newest tick."""
-        clock = self._stream.clock
-        return clock.begin + (clock.next_tick - 1) / clock.rate_hz
+            self._toggle_phase(self._find_open(is_take=False) or text or "clasp")
+        else:
+            self._log_event("mark", text=text or "mark", time=self._stream.newest)
 
     def _toggle_phase(self, name: str) -> None:
         """Begin a phase, or end it. It holds from the next tick on: the ticks before have been tracked without it."""
         begins = name not in self._open_phases
         step_s = 1.0 / self._stream.clock.rate_hz if begins else 0.0
         (self._open_phases.append if begins else self._open_phases.remove)(name)
-        if self.log is not None and self._estimator is not None:
-            self.log.event("begin" if begins else "end", phase=name, time=self._newest_tick + step_s)
+        if self._estimator is not None:
+            self._log_event("begin" if begins else "end", phase=name, time=self._stream.newest + step_s)
             self._estimator.mark_phase(name, begins=begins)
-
-    def _record_event(self, kind: str, **values: Any) -> None:
-        """Record an event that decides poses, now or once a recording begins."""
-        self._events.append((kind, values))
-        if self.log is not None:
-            self.log.event(kind, **values)
-
-    def _can_begin_recording(self) -> bool:
-        return self._open_log is not None and self._stream.history is not None
-
-    def _begin_recording(self) -> None:
-        """Begin to record where nothing was recorded so far; the file holds what came before as well."""
-        if self._open_log is not None:
-            self.log = self._open_log()
-            self._stream.record(self.log)
-            for kind, values in self._events:
-                self.log.event(kind, **values)
 
     # The state -------------------------------------------------------------------------------------------------------
 
@@ -376,7 +309,8 @@ class LiveLoop(Stage):
                 problems[f"rates of {join_names([name])} beyond the range of its gyroscope"] = count
         if self.log is not None and self.log.problem:
             problems[self.log.problem] = 1
-        p50, p99 = np.quantile(1e3 * np.array(self._recent_latencies or [0.0]), (0.5, 0.99)).tolist()
+        latency = list(itertools.islice(reversed(self._latency), SHOWN_LATENCIES)) or [0.0]
+        p50, p99 = (1e3 * np.quantile(latency, (0.5, 0.99))).tolist()
         description = self._describe_state(lost, frozen)
         return Status(*description, now, tuple(statuses), (p50, p99), recorded_s, problems, self.actions)
 
@@ -407,10 +341,10 @@ class LiveLoop(Stage):
             self._poses,
             self._last_pose - self._first_pose if self._poses else 0.0,
             {
-                name: dict(zip(COUNTS, row, strict=True)) | {"lost": self._monitor.count_missing(name, -math.inf)}
+                name: dict(zip(COUNTS, row, strict=True)) | {"lost": self._monitor.count_missing(name)}
                 for name, row in zip(sensors, counts.tolist(), strict=True)
             },
-            self._latency,
+            np.array(self._latency),
             self._diagnostics,
             "" if self.log is None else self.log.problem,
             None if self.log is None else self.log.path,

@@ -6,7 +6,7 @@ import json
 import math
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +23,7 @@ from ..retargeting import LimitMargins, Robot, find_map, load_robot
 from ..retargeting.maps import list_sides
 from ..retargeting.stream import STUCK_M, ArmObserver, Command, CommandStream, StreamOptions
 from ..retargeting.targets import check_person_arms
-from .loop import Latencies
+from .loop import MAX_LATENCIES
 from .outputs import UdpSender
 from .setup import SensorSetup
 from .sources.base import Source
@@ -52,8 +52,8 @@ class RobotSummary(NamedTuple):
     stopping: int  # steps in which the robot braked, to stay clear of itself
     stuck: Mapping[str, float]  # side → [m] by which its hand stayed off, as `CommandStream.stuck`
     share: Mapping[str, float]  # state → share of the commands that had a pose
-    step: Latencies  # [s] of computing a command
-    error: Mapping[str, Latencies]  # side → [m] of the hand while it followed
+    step: np.ndarray  # (n,) [s] of computing the newest commands
+    error: Mapping[str, np.ndarray]  # side → (n,) [m] of the hand while it followed, of the newest commands
 
     @property
     def diagnostics(self) -> list[Diagnostic]:
@@ -115,8 +115,8 @@ class RobotOutput(Output):
         self.newest: Command | None = None
         self._states: Counter[str] = Counter()
         self._skipped = 0
-        self._step = Latencies()
-        self._error = {arm.side: Latencies() for arm in self.robot.arms}
+        self._step: deque[float] = deque(maxlen=MAX_LATENCIES)
+        self._error: dict[str, deque[float]] = {arm.side: deque(maxlen=MAX_LATENCIES) for arm in self.robot.arms}
 
     def open(self) -> None:
         """Begin to send: the robot keeps its rest posture until tracking starts."""
@@ -180,8 +180,8 @@ class RobotOutput(Output):
             self.stream.stopping,
             self.stream.stuck,
             {state: count / posed for state, count in self._states.most_common()},
-            self._step,
-            self._error,
+            np.array(self._step),
+            {side: np.array(error) for side, error in self._error.items()},
         )
 
     # By this machine's clock -----------------------------------------------------------------------------------------
@@ -261,11 +261,11 @@ class RobotOutput(Output):
         self._sender.send(command_json(self.robot, command, self._speed))
         self.newest = command
         if not math.isnan(command.time):
-            self._step.add(time.perf_counter() - begin)
+            self._step.append(time.perf_counter() - begin)
             self._states[command.state] += 1
         if command.state in ("follow", "slow"):
             for arm, error in zip(self.robot.arms, command.error[:, 0].tolist(), strict=True):
-                self._error[arm.side].add(error)
+                self._error[arm.side].append(error)
         return command
 
     def _raise_failure(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from ..tracking import Tracker, TrackOptions
 from ..tracking.heading_problem import CAUSAL_KNOT_S
 from ..writers.live_log import LiveLog
 from ..writers.result import versions
-from .loop import EMPTY_SESSION, LiveLoop, SessionSummary
+from .loop import LiveLoop, SessionSummary
 from .setup import SensorSetup, check_mounts
 from .sources.base import Source
 from .sources.replay import ReplaySource
@@ -41,8 +40,6 @@ def run_session(
 ) -> SessionSummary:
     """Open the source, track it to its end, close everything.
 
-    Without `record` the first take begins a recording in the current folder, named by date and time.
-
     Raises
     ------
     WeposeError
@@ -56,7 +53,7 @@ def run_session(
     if not open_and_wait(source, outputs, until):
         for output in outputs:
             output.close()
-        return EMPTY_SESSION
+        return SessionSummary()
     log = None
     try:
         check_mounts(source, setup)
@@ -69,7 +66,6 @@ def run_session(
             method=method,
             model=model,
             log=log,
-            open_log=lambda: LiveLog(Path(time.strftime("wepose-%Y%m%d-%H%M%S.mcap")), header),
             outputs=outputs,
             begin=float(source.recording.time[0]) if isinstance(source, ReplaySource) else None,
         )

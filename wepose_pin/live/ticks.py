@@ -1,4 +1,4 @@
-"""Arrivals of a source → ticks of one clock, from when the sensors and the rate are known; a pose held in them."""
+"""Arrivals of a source → ticks of one clock, from when the sensors and the rate are known; the start pose in them."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
+from ..body import BodyTable
+from ..body.table import NEUTRAL_POSE
 from ..errors import BadData
 from ..recording.arrivals import JUMP_S, Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
-from ..tracking.start_pose import StartPoseDetector
+from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
 from .monitor import measure_step
+from .setup import SensorSetup
+from .state import join_names
 
 RATE_MEASUREMENT_S = 1.0  # [s] over which the rate is measured if the source does not know it
 MAX_ABSENCE_S = 3.0  # [s] after which ticks begin without a sensor that has sent nothing
-MAX_HISTORY = 2_000_000  # samples that wait for a recording that may begin: an hour of five sensors at 100 Hz, 110 MB
 DEFAULT_RATE_HZ = 100.0  # where none can be measured
+MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
+BEGUN_S = 0.5  # [s] of standing still after which a person who moves is told so
 
 
 class TickStream:
@@ -31,7 +36,6 @@ class TickStream:
     Attributes
     ----------
     measured : (k,) bool: the sensors of `orientations`
-    history : the arrivals so far, while nothing is recorded; None once there are more than `MAX_HISTORY`
     synchronizer : what makes the ticks; None before they begin
     """
 
@@ -46,9 +50,7 @@ class TickStream:
         self.sensors, self.log = tuple(sensors), log
         self.measured = np.array([name in orientations for name in self.sensors], dtype=np.bool_)
         self.synchronizer: StreamSynchronizer | None = None
-        self.history: list[Arrivals] | None = [] if log is None else None
         self._orientations, self._rate_hz, self._begin = orientations, rate_hz, begin
-        self._history_size = 0  # samples
         self._waiting: list[Arrivals] = []
 
     @property
@@ -58,6 +60,11 @@ class TickStream:
             raise BadData("there are no samples of all sensors yet")
         return self.synchronizer
 
+    @property
+    def newest(self) -> float:
+        """Time [s] of the newest tick."""
+        return self.clock.begin + (self.clock.next_tick - 1) / self.clock.rate_hz
+
     def push(self, samples: Sequence[Samples]) -> Iterator[Ticks]:
         """Record the samples of one read, and iterate over the ticks that they complete."""
         samples = [chunk for chunk in samples if len(chunk.time)]
@@ -66,10 +73,6 @@ class TickStream:
         arrivals = order_arrivals(samples, self.sensors)
         if self.log is not None:
             self.log.samples(arrivals)
-        elif self.history is not None:
-            self.history.append(arrivals)
-            self._history_size += len(arrivals.time)
-            self.history = self.history if self._history_size <= MAX_HISTORY else None
         self._waiting.append(arrivals)
         if self.synchronizer is None:
             self._begin_ticks()
@@ -96,29 +99,15 @@ class TickStream:
             rate = max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ
         # A time-stamp outlier must not put all other sensors before the beginning.
         begin = self._begin if self._begin is not None else float(first[first < np.median(first) + JUMP_S].max())
-        self.synchronizer = StreamSynchronizer(self.sensors, rate, begin, orientations=self._orientations)
-        self._record_clock()
-
-    def record(self, log: LiveLog) -> None:
-        """Record from now on, and what came before: the recording is as one from the beginning.
-
-        Only where there is a `history`.
-        """
-        history, self.history, self.log = self.history, None, log
-        for arrivals in history or ():
-            log.samples(arrivals)
-        self._record_clock()
-
-    def _record_clock(self) -> None:
-        if self.log is not None and self.synchronizer is not None:
-            clock = self.synchronizer
+        self.synchronizer = clock = StreamSynchronizer(self.sensors, rate, begin, orientations=self._orientations)
+        if self.log is not None:
             self.log.event("clock", rate_hz=clock.rate_hz, begin=clock.begin, wait_s=clock.wait_s)
 
 
 class StillPose(StartPoseDetector):
     """Detects in the ticks of a stream that no sensor has moved for `hold_s` [s]."""
 
-    def __init__(self, stream: TickStream, hold_s: float) -> None:
+    def __init__(self, stream: TickStream, hold_s: float = START_POSE_HOLD_S) -> None:
         super().__init__(stream.clock.rate_hz, stream.measured, hold_s)
 
     def push_ticks(self, ticks: Ticks) -> int | None:
@@ -127,3 +116,66 @@ class StillPose(StartPoseDetector):
             if self.push(gyro_S, accel_S) == "ready":
                 return row
         return None
+
+
+class StartPoseSearch:
+    """Finds the start pose in the ticks before tracking: stated by the session, or held for `START_POSE_HOLD_S`.
+
+    Attributes
+    ----------
+    ticks : since before the start pose
+    """
+
+    def __init__(self, stream: TickStream, setup: SensorSetup, table: BodyTable) -> None:
+        self._stream, self._pose = stream, StillPose(stream)
+        self._stated = next(iter(setup.phases.get("start", ())), None)
+        self._instruction = f"Hold still in the start pose, {setup.start_pose}"
+        if table.is_mechanism:
+            self._instruction = f"{table.name} must stand still in its start configuration"
+        elif setup.start_pose == NEUTRAL_POSE:
+            self._instruction = "Stand upright and still, arms hanging, palms to the thighs"
+        self._longest_s = 0.0  # [s] for which the person stood still
+        self.ticks: list[Ticks] = []
+
+    def push(self, ticks: Ticks) -> tuple[int, int, int] | None:
+        """Add ticks; return the start pose's first and last tick and the row in `ticks` after it; None: not yet."""
+        self.ticks.append(ticks)
+        clock = self._stream.clock
+        if self._stated is not None:
+            (row,) = np.nonzero(ticks.time >= self._stated[1] - 0.5 / clock.rate_hz)
+            if row.size:
+                begin = max(0, round((self._stated[0] - clock.begin) * clock.rate_hz))
+                return begin, ticks.first + int(row[0]), int(row[0]) + 1
+            return None
+        last = self._pose.push_ticks(ticks)
+        if last is not None:
+            return self._pose.begin, self._pose.end, last + 1
+        if len(self.ticks) > MAX_TICK_BLOCKS:
+            self.ticks = [each for each in self.ticks if each.first + len(each.time) > self._pose.begin]
+        return None
+
+    def describe(self, wrong_unit: str, frozen: str) -> tuple[str, str, float]:
+        """Return the state, the message to the person, and the progress, 0 to 1.
+
+        Parameters
+        ----------
+        wrong_unit, frozen : sentences on sensors in another unit, and on frozen ones; empty where there are none
+        """
+        pose, sensors = self._pose, self._stream.sensors
+        if self._stated is not None:
+            begin, end = self._stated
+            progress = float(np.clip((self._stream.clock.newest - begin) / (end - begin), 0.0, 1.0))
+            return "start_pose", f"{self._instruction}, until {end:g} s.", progress
+        if pose.state == "waiting":
+            return "waiting", frozen or f"Waiting for {join_names([sensors[k] for k in pose.missing])}.", 0.0
+        progress = min(1.0, pose.held_s / START_POSE_HOLD_S)
+        if wrong_unit:
+            return "moved", wrong_unit, progress
+        self._longest_s = max(self._longest_s, pose.held_s)
+        if pose.state != "moved":
+            left_s = max(0.0, START_POSE_HOLD_S - pose.held_s)
+            return "start_pose", f"{self._instruction}: {left_s:.0f} s more.", progress
+        if self._longest_s < BEGUN_S:  # the person walks to the place, or takes the pose
+            return "start_pose", f"{self._instruction}.", 0.0
+        moved, again = join_names([sensors[k] for k in pose.moving]), self._instruction
+        return "moved", f"You moved ({moved}). Once more: {again[0].lower()}{again[1:]}.", progress
