@@ -20,7 +20,7 @@ from wepose_pin.calibration import calibrate
 from wepose_pin.errors import BadOption
 from wepose_pin.readers import load_session
 from wepose_pin.recording import Recording
-from wepose_pin.report import render_track_report
+from wepose_pin.report.track import render_track_report
 from wepose_pin.simulation import Person, Simulation, simulate
 from wepose_pin.tracking import (
     SummaryAccumulator,

@@ -132,7 +132,7 @@ def test_calibrate_track_evaluate_view(session: Path, tmp_path: Path, capsys: py
         == 0
     )
     printed = capsys.readouterr().out
-    assert "Gap between left palm and right palm" in printed
+    assert "Palm to palm, root mean square while touching" in printed
     assert "Quality: pass" in printed
     assert run("track", session, "--subject", tmp_path / "subject", "-o", tmp_path / "result") == 0
     assert "static" in capsys.readouterr().out

@@ -22,7 +22,7 @@ def page(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Pa
     recording = simulation.recording("page")
     pose = track(recording)
     path = tmp_path_factory.mktemp("page") / "view.html"
-    path.write_text(pose_html(pose.model, pose, phases=recording.phases, title="page"), encoding="utf-8")
+    path.write_text(pose_html(pose.model, pose.pose, phases=recording.phases, title="page"), encoding="utf-8")
     return path
 
 

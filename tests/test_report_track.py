@@ -23,8 +23,8 @@ from wepose_pin.commands import main
 from wepose_pin.diagnostics import INFO, WARNING, Diagnostic, render
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.recording.faults import find_saturation
-from wepose_pin.report import render_track_report
 from wepose_pin.report.figures import COLUMNS, envelope
+from wepose_pin.report.track import render_track_report
 from wepose_pin.simulation import Simulation, simulate, simulate_person
 from wepose_pin.tracking import TrackOptions, TrackResult, summarize, track
 from wepose_pin.tracking.measures import (

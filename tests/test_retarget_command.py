@@ -88,7 +88,7 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     np.testing.assert_array_equal(frames["observation.state"].to_numpy(), motion.position.astype(np.float32))
     assert summary["within_limits"] is True
     assert summary["self_collisions"]["samples"] == 0
-    assert "Limits kept" in text
+    assert "keeps all limits" in text
     page = (tmp_path / "out" / "view.html").read_text()
     assert '"robot 0"' in page
     assert '"right_robot"' in page
@@ -133,7 +133,7 @@ def test_a_robot_without_shapes_is_said_to_be_unchecked(
     urdf.write_text(re.sub("<collision>.*?</collision>", "", urdf.read_text()))
     code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"), "--no-view")
     assert code == 0
-    assert "No self-collision" not in text
+    assert "do not collide" not in text
     diagnostics = json.loads((tmp_path / "out" / "summary.json").read_text())["diagnostics"]
     assert "robot-shapes-missing" in [each["code"] for each in diagnostics]
 

@@ -76,7 +76,7 @@ _WHERE = {
     "track": "tracking",
 }
 # What the methods of `TrackResult` call in rooms above its own.
-_OF_RESULTS = {"draw_figures": "report.notebook", "show_result": "report.notebook", "save_result": "report.pages"}
+_OF_RESULTS = {"draw_figures": "report.track", "show_result": "report.pages", "save_result": "report.pages"}
 __all__ = ["__version__", *sorted(_WHERE)]
 __version__ = "0.1.0"
 

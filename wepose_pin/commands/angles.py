@@ -69,12 +69,12 @@ def angles(
     from polars import selectors
 
     from ..angles import diagnose_lock
-    from ..angles import movement_tables as tables
+    from ..angles import movement_tables as build
     from ..angles.movement import MovementOptions
     from ..documents import whole_folder
     from ..recording import check_selection
-    from ..report.angles import draw_figures, render_angles_page
-    from ..report.page import PageWriter
+    from ..report import angles as report
+    from ..report.page import write_pages
     from ..writers.provenance import collect_provenance, write_provenance
     from ..writers.tables import write_table_csv
 
@@ -87,36 +87,36 @@ def angles(
             chosen = MovementOptions(shoulder, low_pass_hz, repetitions, main_angle, None, cycles)
             movements = _analyze((result, *further), chosen, interval, phase, progress)
             progress("writing", 0.7)
-            builders = {
-                "angles": tables.build_angle_table,
-                "sessions": tables.build_session_table,
-                "repetitions": tables.build_repetition_table,
-                "phases": tables.build_phase_table,
-                "summary": tables.build_summary_table,
-                "curves": tables.build_curve_table,
-                "comparison": tables.build_comparison_table,
-                "definitions": tables.build_definition_table,
+            tables = {
+                "angles": build.build_angle_table(movements),
+                "sessions": build.build_session_table(movements),
+                "repetitions": build.build_repetition_table(movements),
+                "phases": build.build_phase_table(movements),
+                "summary": build.build_summary_table(movements),
+                "curves": build.build_curve_table(movements),
+                "comparison": build.build_comparison_table(movements),
+                "definitions": build.build_definition_table(movements),
             }
-            for name, build in builders.items():
-                table = build(movements)
+            for name, table in tables.items():
                 if len(table):
                     write_table_csv(folder / f"{name}.csv", table.with_columns(selectors.float().round(DECIMALS)))
-            figures = draw_figures(movements)
-            for figure_name, figure in figures.items():
-                (folder / f"{figure_name}.svg").write_text(figure.svg(), encoding="utf-8")
+            figures = report.draw_figures(movements)
+            for name, figure in figures.items():
+                (folder / f"{name}.svg").write_text(figure.svg(), encoding="utf-8")
             write_provenance(folder, collect_provenance("angles", options))
         progress("making the page", 0.9)
-        writer = PageWriter(out, [PAGE])
-        writer.write(PAGE, lambda failures: render_angles_page(movements, figures, failures))
+        failures = write_pages(out, {PAGE: lambda: report.render_angles_page(movements, tables, figures)})
     lock = {each.place: each for movement in movements for each in diagnose_lock(movement.angles)}
-    print_diagnostics([*lock.values(), *writer.diagnostics])
-    for movement in movements:
-        _print_repetitions(movement)
-    _print_ranges(movements)
+    print_diagnostics([*lock.values(), *failures])
+    print_table(*report.tabulate_sessions(tables["sessions"]))
+    for text in report.explain_missing(movements):
+        say(f"{text} {report.ADVICE}")
+    if len(tables["summary"]):
+        print_table(*report.tabulate_means(tables["summary"]))
     filtered = "not low-passed" if low_pass_hz is None else f"low-passed at {low_pass_hz:g} Hz (half amplitude)"
     sequence = movements[0].sequence
     by = f"; shoulder {'-'.join(sequence)}{', chosen by gimbal lock' if shoulder == 'auto' else ''}" if sequence else ""
-    say(f"Orientations {filtered}{by}; ± between repetitions: one standard deviation")
+    say(f"Orientations {filtered}{by}")
     say_pages(out, {"Page": PAGE})
     say(f"Tables and figures: {out}")
 
@@ -152,40 +152,3 @@ def _analyze(
             options = replace(options, main_angle=found.source, rising=found.rising)
         movements.append(movement)
     return movements
-
-
-def _print_repetitions(movement: Movement) -> None:
-    repetitions = movement.repetitions
-    by = f" by {repetitions.source}" if repetitions.source else ""
-    if not len(repetitions.spans):
-        other = "take another angle with --main-angle, or mark them as a phase and name it with --repetitions"
-        say(f"{movement.name}: no repetitions{by}: {repetitions.reason}; {other}")
-        return
-    text = f"{movement.name}: {len(repetitions.spans)} repetitions{by}"
-    if repetitions.rising is not None:
-        text += f", {'rising' if repetitions.rising else 'falling'} first; CMC {repetitions.cmc:.2f}"
-    say(text + (f"; {repetitions.left_out} left out as unlike them, or in gaps" if repetitions.left_out else ""))
-
-
-def _print_ranges(movements: Sequence[Movement]) -> None:
-    import numpy as np
-
-    from ..angles.movement import RANGE
-
-    repeated = [movement for movement in movements if movement.curves]
-    rows = []
-    for joint in dict.fromkeys(joint for movement in repeated for joint in movement.curves):
-        for k in range(3):
-            cells, name = [], ""
-            for movement in repeated:
-                if joint not in movement.curves:
-                    cells.append("")
-                    continue
-                name = movement.angles[joint].names[k]
-                each = movement.measures[joint].statistics(k)[RANGE]
-                mean, sd = np.degrees(each.mean), np.degrees(each.sd)
-                cells.append(f"{mean:.1f} ± {sd:.1f}" if np.isfinite(sd) else "")
-            rows.append((f"{joint} {name}", *cells))
-    if rows:
-        names = [f"{movement.name}, n = {len(movement.repetitions.spans)}" for movement in repeated]
-        print_table("Range in a repetition [deg]: mean ± std", ("angle", *names), rows)

@@ -20,20 +20,12 @@ from .options import (
     Stature,
     Subject,
 )
-from .output import print_diagnostics, print_lengths, print_table, progress_bar, say, say_indented, say_pages
+from .output import print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
 
 if TYPE_CHECKING:
-    from ..body.subject import Subject as Person
-    from ..calibration import Calibration, CalibrationQuality, Protocol
+    from ..calibration import Calibration
 
 EXIT_CODES = {"pass": 0, "poor": 3, "fail": 4}
-COLOURS = {"pass": "green", "poor": "yellow", "fail": "red"}
-GAPS = {
-    "coincide": "Gap between {}",
-    "fixed_point": "Gap from {} to its place",
-    "plane": "Height of {} off the plane",
-    "recorded": "Gap from {} to its recorded place",
-}
 
 
 class Calibrated(NamedTuple):
@@ -117,10 +109,9 @@ def calibrate(
     options = dict(locals())
     from .. import calibration as room
     from ..body.body import load_sensed_model
-    from ..calibration.protocols import choose_protocol
     from ..readers import load_session
     from ..readers.subject import read_subject
-    from ..report import write_calibration_page
+    from ..report import calibration as report_room
     from ..writers.calibration import write_calibration
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance
@@ -133,7 +124,6 @@ def calibrate(
         with result_folder(out, force) as folder:
             progress("reading", 0.0)
             recording = load_session(session, gaps=gaps)
-            steps = room.load_protocol(protocol or choose_protocol(recording.phases, formulation))
             body = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
             earlier = None if prior is None else read_subject(prior)
             progress("calibrating", 1 / 3)
@@ -152,58 +142,15 @@ def calibrate(
         failures: list[Diagnostic] = []
         if report:
             progress("writing the report", 2 / 3)
-            failures = write_calibration_page(out, calibration, recording, method=method)
-    print_diagnostics([*calibration.quality.further, *failures])
-    _print_lengths_and_gap(calibration, steps, earlier or calibration.problem.prior)
-    if report:
-        say_pages(out, {"Report": "report.html"})
+            failures = report_room.write_calibration_page(out, calibration, recording, method=method)
+    quality = calibration.quality
+    print_diagnostics([*quality.further, *failures])
+    print_table(*report_room.tabulate_lengths(calibration))
+    print_table(*report_room.tabulate_mounts(calibration))
+    say_paragraph(report_room.describe_gap(calibration))
+    say_pages(out, {"Report": "report.html"})
     say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}  {out / 'calibration.json'}")
-    _print_quality(calibration.quality)
-    return Calibrated(calibration, failures)
-
-
-def _print_lengths_and_gap(calibration: Calibration, protocol: Protocol, prior: Person) -> None:
-    of_people = prior.is_population and not calibration.problem.model.table.is_mechanism
-    prior_name = "population prior" if of_people else "prior"
-    title = f"Lengths, by {protocol.title}"
-    measured = tuple(calibration.problem.measured)
-    print_lengths(title, calibration.subject, prior, measured, prior_name=prior_name)
-    _print_mounts(calibration)
-    if protocol.closures:
-        points = " and ".join(point.replace("_", " ") for point in protocol.closures[0].points)
-        gap = GAPS[calibration.problem.closure_kind].format(points)
-        prior_mm = f"{1e3 * calibration.prior_rms_gap:.1f} mm with the lengths of the {prior_name}"
-        say(f"{gap}: {1e3 * calibration.rms_gap:.1f} mm rms, {prior_mm}")
-        say(f"Effective sample size of the motion: {calibration.effective_sample_size:.0f}")
-
-
-def _print_mounts(calibration: Calibration) -> None:
-    import numpy as np
-
-    from ..body.subject import mount_rows
-    from ..recording import find_mount_axes
-
-    subject, rows = calibration.subject, list[tuple[str, ...]]()
-    for segment, offset in subject.start_pose_offset.items():
-        x, y, z = (np.degrees(subject.std(row)) for row in mount_rows(segment))
-        up, forward = find_mount_axes(subject.mounts[segment])
-        off_start, drift = (
-            np.degrees(np.linalg.norm(offset.tilt)),
-            60.0 * np.degrees(subject.heading_drift[segment].rate),
-        )
-        cells = f"± {z:.1f}", f"± {np.hypot(x, y) / 2**0.5:.1f}", f"{off_start:.1f}", f"{drift:+.1f}"
-        rows.append((segment, f"{up} up, {forward} ahead", *cells))
-    if not rows:
-        return
-    header = ("sensor", "nearest axes", "heading", "tilt", "off the start pose", "heading drift per min")
-    print_table("Mounts, in deg: ± is one standard deviation", header, rows)
-
-
-def _print_quality(quality: CalibrationQuality) -> None:
-    from rich.console import Console
-
-    colour = COLOURS[quality.quality]
-    determined = f"the motion determines {quality.determined} of {quality.unknowns} unknowns better than the prior"
-    Console(width=160).print(f"Quality: [bold {colour}]{quality.quality}[/] ({determined})", highlight=False)
+    say(f"Quality: {quality.quality}")
     for _, line in lines(quality.reasons):
-        say_indented(line)
+        say_paragraph(line, "  ")
+    return Calibrated(calibration, failures)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from .options import Force, Number, Out
-from .output import mean_std, print_diagnostics, print_lengths, print_table, progress_bar, say, say_pages
+from .output import print_diagnostics, print_table, progress_bar, say, say_pages
 from .simulate import PROTOCOL, check_seed
 
 
@@ -40,7 +40,7 @@ def demo(
     from ..documents import whole_folder
     from ..evaluation import evaluate
     from ..filters import BEST, METHODS
-    from ..report import write_track_pages
+    from ..report.pages import write_track_pages
     from ..simulation import CIRCLING_POINT, simulate, simulate_person
     from ..writers import write_result, write_session
     from ..writers.provenance import collect_provenance, write_provenance
@@ -85,17 +85,21 @@ def demo(
         }
         (folder / "demo.json").write_text(json.dumps(as_json(figures), indent=2) + "\n", encoding="utf-8")
         write_provenance(folder, collect_provenance("demo", options))
-    print_lengths("Lengths from the joined hands", best.subject, person.prior, person.measured, person.lengths)
+    print_table(
+        "Lengths from the joined hands [mm]",
+        ("length", "true", "estimated"),
+        [
+            (name, f"{1e3 * each['true']:.1f}", f"{1e3 * each['estimated']:.1f} ± {1e3 * each['std']:.1f}")
+            for name, each in lengths.items()
+        ],
+    )
+    places = {method: (error.position_on_limb, error.position) for method, error in errors.items()}
     print_table(
         "Right hand while drawing six circles: distance to the truth [mm], mean ± std",
         ("filter", "from the shoulders", "from the root"),
         [
-            (
-                method,
-                mean_std(error.position_on_limb[CIRCLING_POINT]),
-                mean_std(error.position[CIRCLING_POINT]),
-            )
-            for method, error in errors.items()
+            (method, *(f"{each[CIRCLING_POINT].mean:.1f} ± {each[CIRCLING_POINT].std:.1f}" for each in both))
+            for method, both in places.items()
         ],
     )
     say("One person, one motion: the order of the filters changes with both, see --seed. Each filter tracks with the")

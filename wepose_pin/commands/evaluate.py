@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from ..errors import BadOption, WrongOption
 from .options import MORE, File, Interval, Phase, Seconds
-from .output import mean_std, print_table, progress_bar, say
+from .output import print_table, progress_bar, say
 
 if TYPE_CHECKING:
     from ..evaluation import Evaluation, Registration
@@ -170,13 +170,13 @@ def _print_errors(errors: Evaluation) -> None:
             ],
         )
     if errors.position:
-        on_limb = errors.position_on_limb
+        places = errors.position, errors.position_on_limb
         print_table(
             "Position error [mm], mean ± std",
             ("point", "from the root", "from where its limb begins"),
             [
-                (name, mean_std(error), mean_std(on_limb[name]) if name in on_limb else "")
-                for name, error in errors.position.items()
+                (name, *(f"{each[name].mean:.1f} ± {each[name].std:.1f}" if name in each else "" for each in places))
+                for name in errors.position
             ],
         )
     points = {f"{name} (point)": stated for name, stated in errors.position_uncertainty.items()}

@@ -70,7 +70,7 @@ def run_guide(
     from ..live.steps import STATURE, make_steps
     from ..readers import load_session
     from ..readers.subject import read_subject
-    from ..report import write_calibration_page
+    from ..report.calibration import write_calibration_page
     from ..writers.calibration import write_calibration
     from ..writers.folder import result_folder
     from ..writers.provenance import collect_provenance

@@ -5,17 +5,12 @@ from __future__ import annotations
 import contextlib
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ..diagnostics import Diagnostic, lines
 from ..errors import printable
 from .stopping import check_stopped
-
-if TYPE_CHECKING:
-    from ..body.subject import Subject
-    from ..evaluation import PositionError
 
 WIDTH = 98  # columns of running text
 TABLE_WIDTH = 160  # rich would cut numbers off to fit a narrow terminal, which wraps by itself
@@ -26,9 +21,9 @@ def say(text: str) -> None:
     print(_shown(text))
 
 
-def say_indented(text: str) -> None:
-    """A paragraph, two columns in."""
-    say(textwrap.fill(text, WIDTH, initial_indent="  ", subsequent_indent="    "))
+def say_paragraph(text: str, indent: str = "") -> None:
+    """Running text on standard output."""
+    say(textwrap.fill(text, WIDTH, initial_indent=indent, subsequent_indent=indent * 2))
 
 
 def print_diagnostics(diagnostics: Iterable[Diagnostic]) -> None:
@@ -44,45 +39,24 @@ def say_pages(folder: Path, pages: Mapping[str, str]) -> None:
             say(f"{title}:  {folder / name}")
 
 
-def print_lengths(
-    title: str,
-    subject: Subject,
-    prior: Subject,
-    measured: Collection[str],
-    truth: Mapping[str, float] | None = None,
-    prior_name: str = "population prior",
-) -> None:
-    """Each length with its standard deviation beside the prior's, and the truth where it is known."""
-    rows = []
-    for name, value in subject.lengths.items():
-        true = [] if truth is None else [f"{1e3 * truth[name]:.1f}"]
-        before = f"{1e3 * prior.lengths[name]:.1f} ± {1e3 * prior.std(name):.1f}"
-        cells = f"{1e3 * value:.1f}", f"± {1e3 * subject.std(name):.1f}", before
-        rows.append((name, *true, *cells, "measured" if name in measured else ""))
-    columns = [] if truth is None else ["true"]
-    print_table(title, ("length [mm]", *columns, "estimated", "std", prior_name, ""), rows)
-
-
-def mean_std(error: PositionError) -> str:
-    """``mean ± std`` [mm]."""
-    return f"{error.mean:.1f} ± {error.std:.1f}"
-
-
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """A table; the first column is text, the others numbers."""
+    """A table, as reports have it; the first column is text, the others numbers. Without a header: names and values."""
     from rich import box
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD)
-    for k, name in enumerate(header):
-        table.add_column(escape(name), justify="left" if k == 0 else "right", no_wrap=True)
+    table = Table(box=box.SIMPLE_HEAD, show_header=bool(header))
+    rows = list(rows)
+    for k, name in enumerate(header or ("", "")):
+        table.add_column(escape(name), justify="right" if k and header else "left", no_wrap=bool(header))
     for row in rows:
-        table.add_row(*map(_shown, row))
+        table.add_row(*(escape(_shown(cell.replace("**", ""))) for cell in row))
     console = Console(width=TABLE_WIDTH)
-    console.print(escape(_shown(title)), style="bold", highlight=False)
-    console.print(table)
+    if title:
+        console.print(escape(_shown(title)), style="bold", highlight=False)
+    if rows:
+        console.print(table)
 
 
 @contextlib.contextmanager

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from ..diagnostics import Diagnostic, from_json
 from .options import MORE, Arms, Factor, Force, Hz, Interval, Out, Phase, Radians, RobotHz, RobotName, Share
-from .output import print_diagnostics, print_table, progress_bar, say, say_pages
+from .output import print_diagnostics, print_table, progress_bar, say, say_pages, say_paragraph
 
 if TYPE_CHECKING:
     from ..body.kinematics import Pose
@@ -101,8 +102,8 @@ def retarget(
     from .. import retargeting
     from ..documents import whole_folder
     from ..recording import check_selection
-    from ..report.page import PageWriter
-    from ..report.retargeting import render_retargeting_report
+    from ..report import retargeting as report_room
+    from ..report.page import write_pages
     from ..report.viewer import retarget_html
     from ..retargeting.targets import check_scale_and_smoothing
     from ..retargeting.trajectory import STAGES
@@ -137,33 +138,37 @@ def retarget(
             collisions = retargeting.find_self_collisions(trajectory.robot, trajectory.time, trajectory.joint_position)
             progress("writing", 0.98)
             retargeting.write_trajectory(folder, trajectory)
+            name = str(about.get("recording") or result.name)
             summary = as_json(retargeting.summarize(trajectory, check, collisions))
             summary |= {
-                "recording": str(about.get("recording") or result.name),
+                "recording": name,
                 "recorded_phases": {name: list(map(list, spans)) for name, spans in read_phases(about).items()},
                 REPETITIONS: _find_repetitions(pose, trajectory),
             }
             text = json.dumps({**summary, "provenance": collect_provenance("retarget", options)}, indent=2)
             (folder / "summary.json").write_text(text + "\n", encoding="utf-8")
         progress("making the pages", 0.99)
-        title = f"{about.get('recording') or result.name} on {trajectory.robot.map.name}"
-        pages = {"report.html": report, "view.html": view}
-        writer = PageWriter(out, [name for name, wanted in pages.items() if wanted])
-        page = None
-        if view:
-            page = writer.write("view.html", lambda _: retarget_html(body, pose, trajectory, title=title))
-        if report:
-            writer.write(
-                "report.html",
-                lambda lines: render_retargeting_report(trajectory, summary, title=title, view=page, failures=lines),
-            )
-        writer.save_diagnostics("summary.json")
-    print_diagnostics([*map(from_json, summary["diagnostics"]), *writer.diagnostics])
-    _print_arms(summary)
-    _print_checks(summary)
+        title = f"{name} on {trajectory.robot.map.name}"
+
+        @cache
+        def make_view() -> str:
+            return retarget_html(body, pose, trajectory, title=title)
+
+        def make_report() -> str:
+            page = make_view() if view else None
+            return report_room.render_retargeting_report(trajectory, summary, title=title, view=page)
+
+        pages = ({"view.html": make_view} if view else {}) | ({"report.html": make_report} if report else {})
+        failures = write_pages(out, pages, "summary.json")
+    print_diagnostics([*map(from_json, summary["diagnostics"]), *failures])
+    print_table(*report_room.tabulate_run(summary))
+    for table in report_room.tabulate_hands(summary):
+        print_table(*table)
+    say_paragraph(report_room.describe_reliance(trajectory, summary))
+    say_paragraph(report_room.describe_limits(summary))
     say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
     say_pages(out, {"Report": "report.html", "Motion": "view.html"})
-    return Retargeted(summary, writer.diagnostics, float(trajectory.time[-1]))
+    return Retargeted(summary, failures, float(trajectory.time[-1]))
 
 
 def _find_repetitions(pose: Pose, trajectory: Trajectory) -> dict[str, Any]:
@@ -185,53 +190,3 @@ def _find_repetitions(pose: Pose, trajectory: Trajectory) -> dict[str, Any]:
         spans = find_movements(targets.time, *(hand.position for hand in targets.hands))
         source, reason = ("hands between rests", "") if len(spans) else (source, reason)
     return {"source": source, "spans": spans.tolist(), "reason": reason}
-
-
-def _print_arms(summary: Mapping[str, Any]) -> None:
-    """Errors of the hands, and their causes."""
-    rows, reasons = [], []
-    for side, arm in summary["arms"].items():
-        inside, rotation, swivel, reachability = (
-            arm[key] for key in ("hand_error_mm", "hand_error_deg", "swivel_error_deg", "reachability")
-        )
-        near = reachability["hand_error_where_reachable_mm"]
-        rows.append(
-            (
-                side,
-                f"{arm['scale']:.2f}",
-                *((f"{error[key]:.1f}" if error else "") for error in (inside, near) for key in ("median", "p90")),
-                f"{rotation['median']:.1f}",
-                f"{swivel['median']:.0f}" if swivel else "",
-                f"{100 * reachability['reachable_share']:.0f}",
-            )
-        )
-        reasons.append((side, *(f"{100 * share:.1f}" for share in arm["error_attribution"].values())))
-    slowdown = summary["slowdown"]
-    hand = ("hand [mm] median", "90 %", "where reachable: median", "90 %")
-    print_table(
-        f"{summary['robot']}: {summary['duration_s']:.1f} s, of which {summary['approach_s']:.1f} s are the approach; "
-        f"{summary['recorded_s']:.1f} s recorded" + (f", {slowdown:.2f} times as long" if slowdown is not None else ""),
-        ("arm", "scale", *hand, "orientation [deg]", "elbow swivel [deg]", "reachable [%]"),
-        rows,
-    )
-    title = "Hand more than 20 mm off [% of the time], by cause; what to do: docs/retargeting.md"
-    print_table(title, ("arm", *arm["error_attribution"]), reasons)
-
-
-def _print_checks(summary: Mapping[str, Any]) -> None:
-    """Margins to the limits, self-collisions and the time of a step."""
-    margins, collisions = summary["limit_margins"], summary["self_collisions"]
-    say(
-        f"Limits {'kept' if summary['within_limits'] else 'NOT KEPT'}: position {margins['position_rad']:.4f} rad, "
-        f"velocity {100 * margins['velocity_share']:.1f} %, "
-        f"acceleration {100 * margins['acceleration_share']:.1f} %, jerk {100 * margins['jerk_share']:.1f} % to spare"
-    )
-    if not collisions["pairs"]:
-        say("Self-collision NOT CHECKED: no two shapes of the robot can meet, as its URDF has them")
-    elif not collisions["samples"]:
-        closest = collisions["min_hull_distance_mm"]
-        say("No self-collision" + ("" if closest is None else f"; at the closest, {closest:.0f} mm between hulls"))
-    braked = summary["steps"]["stopping_share"]
-    if braked:
-        say(f"Braked in {100 * braked:.2f} % of the steps, since no other kept all limits and left a way to stop")
-    say(f"Solved in {summary['solve_ms']['p50']:.2f} ms (p50), {summary['solve_ms']['p99']:.2f} ms (p99) a step")

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import polars as pl
 from matplotlib.axes import Axes
 
 from ..angles import Angles, JointAngles, group_sides
 from ..angles.curves import PERCENT, MeanCurve
-from ..angles.movement import (
-    RANGE,
-    Difference,
-    Movement,
-    Statistics,
-    compare_measures,
-    measure_spans,
-)
+from ..angles.movement import MEASURES, Movement
 from ..angles.repetitions import list_angles
-from ..body.kinematics import Pose
 from .figures import (
     BAND,
     SESSION_COLOURS,
@@ -33,50 +26,13 @@ from .figures import (
     shade,
     styled,
 )
-from .page import MOST_FIGURES, Item, Page, Table
-from .words import intervals, listed, plain, signed
+from .page import MOST_FIGURES, render_page
+from .words import Table, listed, number, plain, plus_minus
 
 HEADINGS = ("lowest [°]", "highest [°]", "range [°]", "peak rate [°/s]")  # of MEASURES
 CLEAR = 2.0  # standard deviations that the poses state; a smaller difference may be an error that a session shares
-MOST_OVER_TIME = 1  # figures of angles over time that the page shows
 FULL_TURN = 2.0 * np.pi - 1e-9
 MOST_CURVES = 60  # of single repetitions that are drawn behind their mean
-
-
-def render_angles_page(movements: Sequence[Movement], figures: Figures, failures: list[str] | None = None) -> str:
-    """Return the text of ``angles.html``, one page that opens offline and can be printed. It is deterministic.
-
-    Parameters
-    ----------
-    figures : of `draw_figures`; the page shows the first of them
-    failures : gets a line for each section that cannot be made
-    """
-    page = Page(f"Joint angles of {' and '.join(movement.name for movement in movements)}", failures)
-    over_time = [figure for name, figure in figures.items() if name.startswith("angles")][:MOST_OVER_TIME]
-    shown = {name: figure for name, figure in figures.items() if not name.startswith("angles")}
-    others = [name for name in figures if name not in shown][MOST_OVER_TIME:]
-    others += [*shown][MOST_FIGURES - len(over_time) :]
-    shown = dict([*shown.items()][: MOST_FIGURES - len(over_time)])
-    main_angle = [shown.pop("repetitions")] if "repetitions" in shown else []
-    repetitions: list[Item] = [
-        f"{movement.name}: no repetitions{_by(movement)}: {movement.repetitions.reason}."
-        for movement in movements
-        if movement.repetitions.reason
-    ]
-    repetitions += [*([ADVICE] if repetitions else []), *main_angle]
-    page.add("What can be relied on", lambda: [_describe_reliance(movements)], heading=False)
-    page.add("Sessions", lambda: [_tabulate_sessions(movements), _describe(movements)], heading=False)
-    page.add("Repetitions", lambda: repetitions)
-    if shown:
-        rest = f" Beside this page: {listed([f'`{name}.svg`' for name in others])}." if others else ""
-        page.add("Mean curves", lambda: [CURVES + rest, *shown.values()])
-        page.add("Means over the repetitions", lambda: [MEANS, _tabulate_measures(movements)])
-    if len([movement for movement in movements if movement.curves]) > 1:
-        page.add("Sessions compared", lambda: [COMPARISON, *_tabulate_comparisons(movements)])
-    page.add("All of the time", lambda: [WHOLE_TIME, *over_time, *_tabulate_whole_time(movements)])
-    return page.html()
-
-
 ADVICE = (
     "State another angle by `--main-angle`, a time by `--interval`, or mark repetitions as intervals of a phase and "
     "name it by `--repetitions`."
@@ -85,7 +41,6 @@ CURVES = (
     "Each repetition from 0 to 100 % of its own time. Where fewer than half of the repetitions are determined, as near "
     "gimbal lock, a line is broken."
 )
-MEANS = "Mean ± standard deviation between the repetitions, in square brackets what the pose states for one."
 COMPARISON = (
     "Differences of means, with the 95 % interval from the spread between repetitions (Welch 1947). They are of one "
     "person: the interval says nothing of groups, nor of errors that a session shares. Bold: it excludes zero, and the "
@@ -97,16 +52,58 @@ WHOLE_TIME = (
 )
 
 
+def render_angles_page(movements: Sequence[Movement], tables: Mapping[str, pl.DataFrame], figures: Figures) -> str:
+    """Return the text of ``angles.html``, one page that opens offline and can be printed. It is deterministic.
+
+    Parameters
+    ----------
+    tables : by the names of their files, of `movement_tables`
+    figures : of `draw_figures`; the page shows the first of them
+    """
+    over_time = [figure for name, figure in figures.items() if name.startswith("angles")][:1]
+    curves = [name for name in figures if name.startswith("curves")]
+    shown = curves[: MOST_FIGURES - len(over_time) - ("repetitions" in figures)]
+    rest = [f"`{name}.svg`" for name in curves[len(shown) :]]
+    beside = f" Beside this page: {listed(rest)}." if rest else ""
+    missing = explain_missing(movements)
+    comparisons = tabulate_comparisons(tables["comparison"])
+    return render_page(
+        f"Joint angles of {' and '.join(movement.name for movement in movements)}",
+        [_describe_reliance(tables["summary"]), tabulate_sessions(tables["sessions"]), _describe(movements)],
+        {
+            "Repetitions": [
+                *missing,
+                *([ADVICE] if missing else []),
+                *([figures["repetitions"]] if "repetitions" in figures else []),
+            ],
+            "Mean curves": [CURVES + beside, *(figures[name] for name in shown)] if shown else [],
+            "Means over the repetitions": [tabulate_means(tables["summary"])] if len(tables["summary"]) else [],
+            "Sessions compared": [COMPARISON, *comparisons] if comparisons else [],
+            "All of the time": [WHOLE_TIME, *over_time, _tabulate_whole_time(tables["phases"])],
+        },
+    )
+
+
 # Sections -------------------------------------------------------------------------------------------------------------
 
 
-def _describe_reliance(movements: Sequence[Movement]) -> str:
+def explain_missing(movements: Sequence[Movement]) -> list[str]:
+    """Why a session has no repetitions, of those that have none."""
+    return [
+        f"{each.name}: no repetitions{f' by {source}' if (source := each.repetitions.source) else ''}: "
+        f"{each.repetitions.reason}."
+        for each in movements
+        if each.repetitions.reason
+    ]
+
+
+def _describe_reliance(summary: pl.DataFrame) -> str:
     """Two sentences: what the pose states of a range, and how far the repetitions differ."""
     stated, between = {}, {}
-    for movement, joint, k, angle in _list_angles(movements):
-        each = movement.measures[joint].statistics(k)[RANGE]
-        stated[angle] = float(np.degrees(each.std))
-        between[f"{angle}{f' ({movement.name})' if len(movements) > 1 else ''}"] = float(np.degrees(each.sd))
+    for row in summary.iter_rows(named=True):
+        angle = _name(row)
+        stated[angle] = row["range_std_deg"]
+        between[f"{angle} ({row['session']})"] = row["range_sd_deg"]
     stated, between = ({name: v for name, v in each.items() if np.isfinite(v)} for each in (stated, between))
     if not between:
         return "No repetitions were found, so this page has no mean curves. The table covers the whole recording."
@@ -121,138 +118,81 @@ def _describe_reliance(movements: Sequence[Movement]) -> str:
 
 def _describe(movements: Sequence[Movement]) -> str:
     cutoff = movements[0].cutoff_hz
-    text = (
+    filtered = (
         f"Orientations were low-passed at {cutoff:g} Hz: a Butterworth filter of second order, forwards and backwards; "
         "at the cut-off the amplitude is half (−6 dB)."
         if cutoff
         else "Orientations were not low-passed."
     )
-    text += " Rates are means over 0.05 s. ± between repetitions is one standard deviation, with n − 1."
-    if any(_is_isotropic(movement.pose) for movement in movements):
-        text += (
-            " The poses state one number for all axes of a segment, so that their ± is rough for a single angle; "
-            "`wepose track --covariance` writes all of it."
-        )
     return (
-        f"{text} CMC is the coefficient of multiple correlation of the curves (Kadaba et al. 1989), at most 1. Angles "
-        "are after the International Society of Biomechanics, with the same signs left and right; `definitions.csv` "
-        "has the axes."
+        f"{filtered} Rates are means over 0.05 s. ± between repetitions is one standard deviation, with n − 1. Without "
+        "`wepose track --covariance` a pose states one number for all axes of a segment, and the ± of one angle is "
+        "rough. CMC is the coefficient of multiple correlation of the curves (Kadaba et al. 1989), at most 1. Angles "
+        "are after the International Society of Biomechanics, with the same signs left and right (`definitions.csv`)."
     )
 
 
-def _is_isotropic(pose: Pose) -> bool:
-    """Whether the pose states one standard deviation a segment, and no covariance."""
-    covariances = pose.segment_cov.values()
-    return bool(covariances) and all(np.array_equal(cov, cov[:, :1, :1] * np.eye(3)) for cov in covariances)
+def _name(row: Mapping[str, Any]) -> str:
+    return f"{plain(row['joint'])}, {plain(row['angle'])}"
 
 
-def _tabulate_sessions(movements: Sequence[Movement]) -> Table:
-    rows = []
-    for movement in movements:
-        time, repetitions = movement.angles.time, movement.repetitions
-        lasting = movement.duration
-        rows.append(
-            [
-                movement.name,
-                intervals([(float(time[0]), float(time[-1]))]),
-                plain(repetitions.source),
-                str(len(repetitions.spans)),
-                f"{_pair(lasting.mean, lasting.sd, 2)} s" if lasting.n else "",
-                f"{repetitions.cmc:.2f}" if np.isfinite(repetitions.cmc) else "",
-                str(repetitions.left_out or ""),
-            ]
-        )
-    header = ["session", "time", "repetitions by", "n", "duration", "CMC", "left out"]
-    return Table(header, rows)
-
-
-def _by(movement: Movement) -> str:
-    return f" by {plain(movement.repetitions.source)}" if movement.repetitions.source else ""
-
-
-def _tabulate_measures(movements: Sequence[Movement]) -> Table:
-    rows = []
-    for movement, joint, k, angle in _list_angles(movements):
-        cells = [_with_stated(each) for each in movement.measures[joint].statistics(k)]
-        curve = movement.curves[joint][k]
-        rows.append([angle, *_name(movements, movement), *cells, f"{curve.cmc:.2f}" if np.isfinite(curve.cmc) else ""])
-    header = ["angle", *(["session"] if len(movements) > 1 else []), *HEADINGS, "CMC"]
-    return Table(header, rows)
-
-
-def _list_angles(movements: Sequence[Movement]) -> Iterator[tuple[Movement, str, int, str]]:
-    """Session, joint, place and words of each angle that has curves; the sessions of one angle follow each other."""
-    joints = dict.fromkeys(joint for movement in movements for joint in movement.curves)
-    for joint in joints:
-        for k in range(3):
-            for movement in (movement for movement in movements if joint in movement.curves):
-                yield movement, joint, k, f"{plain(joint)}, {plain(movement.angles[joint].names[k])}"
-
-
-def _name(movements: Sequence[Movement], movement: Movement) -> list[str]:
-    return [movement.name] if len(movements) > 1 else []
-
-
-def _with_stated(each: Statistics) -> str:
-    """Mean ± standard deviation, and what is stated in brackets."""
-    if not each.n:
-        return ""
-    mean, sd, std = (float(np.degrees(value)) for value in (each.mean, each.sd, each.std))
-    return f"{_pair(mean, sd)} [{std:.1f}]" if np.isfinite(std) else _pair(mean, sd)
-
-
-def _pair(mean: float, sd: float, digits: int = 1) -> str:
-    text = f"{round(mean, digits) + 0.0:.{digits}f}".replace("-", "−")
-    return f"{text} ± {sd:.{digits}f}" if np.isfinite(sd) else text
-
-
-def _tabulate_comparisons(movements: Sequence[Movement]) -> list[Table]:
-    """A table of each further session against the first."""
-    first, *others = [movement for movement in movements if movement.curves]
-    header = ["angle", *HEADINGS]
-    tables = []
-    for other in others:
-        rows = []
-        for joint in (joint for joint in first.curves if joint in other.curves):
-            for k, angle in enumerate(first.angles[joint].names):
-                compared = compare_measures(first.measures[joint], other.measures[joint], k)
-                cells = [_describe_difference(difference) for _, _, difference in compared]
-                rows.append([f"{plain(joint)}, {plain(angle)}", *cells])
-        tables.append(Table(header, rows, f"{other.name} less {first.name}"))
-    return tables
-
-
-def _describe_difference(difference: Difference) -> str:
-    if not np.isfinite(difference.value):
-        return ""
-    value, low, high = (signed(float(np.degrees(each))) for each in difference[:3])
-    if not np.isfinite(difference.low):
-        return value
-    text = f"{value} ({low} to {high})"
-    excludes_zero = difference.low > 0.0 or difference.high < 0.0
-    return f"**{text}**" if excludes_zero and abs(difference.value) > CLEAR * np.nan_to_num(difference.std) else text
-
-
-def _tabulate_whole_time(movements: Sequence[Movement]) -> list[Table]:
-    """A table of each session's whole time."""
-    tables = []
-    for movement in movements:
-        span = (float(movement.angles.time[0]), float(movement.angles.time[-1]))
-        rows = [
-            [f"{plain(joint)}, {plain(angle)}", *_span_cells(each.values[0, k], each.std[0, k])]
-            for joint, each in measure_spans(movement.pose, movement.angles, [span]).items()
-            for k, angle in enumerate(movement.angles[joint].names)
+def tabulate_sessions(sessions: pl.DataFrame) -> Table:
+    """Each session: how its repetitions were found, how many there are and how long they last."""
+    rows = [
+        [
+            row["session"],
+            f"{row['from_s']:g} to {row['to_s']:g} s",
+            f"{plain(row['repetitions_by'])} {row['first']}".strip(),
+            str(row["n"]),
+            f"{plus_minus(row['duration_mean_s'], row['duration_sd_s'], ' s', 2)}" if row["n"] else "",
+            number(row["cmc"], 2, unknown=""),
+            str(row["left_out"] or ""),
         ]
-        tables.append(Table(["angle", *HEADINGS], rows, f"{movement.name}, {intervals([span])}"))
-    return tables
-
-
-def _span_cells(values: np.ndarray, stds: np.ndarray) -> list[str]:
-    """The measures of one angle in one span, ± as stated."""
-    return [
-        _pair(float(np.degrees(value)), float(np.degrees(std))) if np.isfinite(value) else ""
-        for value, std in zip(values, stds, strict=True)
+        for row in sessions.iter_rows(named=True)
     ]
+    return Table("", ["session", "time", "repetitions by", "n", "duration", "CMC", "left out"], rows)
+
+
+def tabulate_means(summary: pl.DataFrame) -> Table:
+    """Mean ± standard deviation between the repetitions of each angle, with what the pose states for one."""
+    rows = []
+    for row in summary.sort("joint", "angle", maintain_order=True).iter_rows(named=True):
+        cells = []
+        for measure, unit in MEASURES.items():
+            mean, sd, std = (row[f"{measure}_{part}_{unit}"] for part in ("mean", "sd", "std"))
+            cells.append(plus_minus(mean, sd) + (f" [{std:.1f}]" if np.isfinite(std) else "") if mean == mean else "")
+        rows.append([_name(row), row["session"], *cells, number(row["cmc"], 2, unknown="")])
+    title = "Mean ± standard deviation between the repetitions, in square brackets what the pose states for one"
+    return Table(title, ["angle", "session", *HEADINGS, "CMC"], rows)
+
+
+def tabulate_comparisons(comparison: pl.DataFrame) -> list[Table]:
+    """A table of each further session against the first."""
+    tables: dict[str, dict[str, list[str]]] = {}
+    for row in (
+        comparison.filter(pl.col("measure").is_in(list(MEASURES))).iter_rows(named=True) if len(comparison) else ()
+    ):
+        table = tables.setdefault(f"{row['session']} less {row['against']}", {})
+        value, low, high, std = (row[key] for key in ("difference", "ci95_low", "ci95_high", "difference_std"))
+        text = number(value, 1, sign="+", unknown="")
+        if np.isfinite(low):
+            text += f" ({number(low, 1, sign='+')} to {number(high, 1, sign='+')})"
+            if (low > 0.0 or high < 0.0) and abs(value) > CLEAR * np.nan_to_num(std):
+                text = f"**{text}**"
+        table.setdefault(_name(row), []).append(text)
+    return [
+        Table(title, ["angle", *HEADINGS], [[angle, *cells] for angle, cells in table.items()])
+        for title, table in tables.items()
+    ]
+
+
+def _tabulate_whole_time(phases: pl.DataFrame) -> Table:
+    rows = []
+    for row in phases.filter(pl.col("phase") == "all").iter_rows(named=True):
+        values = [(row[f"{measure}_{unit}"], row[f"{measure}_std_{unit}"]) for measure, unit in MEASURES.items()]
+        cells = [plus_minus(value, std) if np.isfinite(value) else "" for value, std in values]
+        rows.append([_name(row), row["session"], *cells])
+    return Table("", ["angle", "session", *HEADINGS], rows)
 
 
 # Figures --------------------------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,18 +9,18 @@ from scipy.spatial.transform import Rotation
 
 from ..body.kinematics import Pose
 from ..body.subject import Subject, mount_rows
-from ..calibration import Calibration, CalibrationQuality
+from ..calibration import Calibration
 from ..calibration.observability import find_intervals
 from ..calibration.result import MIN_CONTACT
-from ..diagnostics import WARNING, Diagnostic, lines
-from ..errors import WeposeError, reason
+from ..diagnostics import Diagnostic, lines
+from ..errors import WeposeError
 from ..filters import BEST
 from ..recording import Recording, compute_mount, find_mount_axes
 from ..tracking import Tracker, TrackOptions, TrackResult
 from .figures import BAND, COLOURS, SOFT, ReportFigure, draw_over_time, styled
-from .page import Banner, Facts, Item, Page, PageWriter, Table
+from .page import Banner, Item, render_page, write_pages
 from .viewer import show_motion
-from .words import capital, degrees, intervals, kinds, listed, plain, plus_minus, signed
+from .words import Table, capital, intervals, kinds, listed, number, plain, plus_minus
 
 QUALITIES = {
     "pass": "**Pass:** the calibration is good to use.",
@@ -31,71 +30,52 @@ QUALITIES = {
 
 
 def write_calibration_page(
-    folder: Path,
-    calibration: Calibration,
-    recording: Recording,
-    *,
-    method: str,
+    folder: Path, calibration: Calibration, recording: Recording, *, method: str
 ) -> list[Diagnostic]:
     """Write ``report.html`` beside a calibration's result; what cannot be made, as of `write_track_pages`."""
-    writer = PageWriter(folder, ["report.html"])
-    writer.write(
-        "report.html",
-        lambda failures: render_calibration_report(calibration, recording, method=method, failures=failures),
+    return write_pages(
+        folder,
+        {"report.html": lambda: render_calibration_report(calibration, recording, method=method)},
+        "calibration.json",
     )
-    writer.save_diagnostics("calibration.json")
-    return writer.diagnostics
 
 
 def render_calibration_report(
-    calibration: Calibration,
-    recording: Recording,
-    *,
-    tracked: TrackResult | None = None,
-    method: str = BEST,
-    failures: list[str] | None = None,
+    calibration: Calibration, recording: Recording, *, tracked: TrackResult | None = None, method: str = BEST
 ) -> str:
     """``report.html``: one page that opens offline and prints; equal arguments give equal text.
 
     Parameters
     ----------
-    tracked : the recording tracked with the calibrated subject, for the hands and the 3D view; None: it is tracked here
+    tracked : the recording tracked with the calibrated subject, for the 3D view; None: it is tracked here
     method : as the calibration was run
-    failures : takes a line for each section that cannot be made; the page has the line in its place
     """
-    gap = capital(_name_gap(calibration))
-    untracked: list[Diagnostic] = []
-    if tracked is None:
-        try:
-            options = TrackOptions(method)
-            model = calibration.problem.model
-            tracker = Tracker(calibration.subject, model=model, options=options, with_point_cov=False)
-            tracked = tracker.push(recording) or next(tracker.smooth())
-        except Exception as error:
-            facts = {"variant": "motion", "reason": str(error)}
-            untracked = [Diagnostic("output-incomplete", WARNING, facts=facts)]
-            if not isinstance(error, WeposeError) and failures is not None:
-                failures.append(f"the motion cannot be tracked: {reason(error)}")
-    page = Page(f"Calibration of {recording.name or 'a recording'}", failures)
-    page.add("What can be relied on", lambda: [_describe_reliance(calibration)], heading=False)
-    page.add("The quality", lambda: _list_diagnostics(calibration.quality, untracked), heading=False)
-    page.add("Lengths", lambda: _list_lengths(calibration))
-    page.add("Sensors", lambda: _list_sensors(calibration, recording))
-    page.add(f"{gap} over time", lambda: _list_gap(calibration, gap))
-    page.add("The motion in 3D", lambda: _list_view(calibration, recording, tracked))
-    page.add("What was run", lambda: _list_run(calibration, recording, method))
-    return page.html()
+    quality = calibration.quality
+    entries = lines(quality.further, titled=True)
+    return render_page(
+        f"Calibration of {recording.name or 'a recording'}",
+        [
+            _describe_reliance(calibration),
+            Banner(quality.quality, QUALITIES[quality.quality], lines(quality.reasons, titled=True)),
+            *([Banner("info", "What to know", entries)] if entries else []),
+        ],
+        {
+            "Lengths": [draw_lengths(calibration), _describe_lengths(calibration), tabulate_lengths(calibration)],
+            "Sensors": _list_sensors(calibration),
+            f"{capital(_name_gap(calibration))} over time": _list_gap(calibration),
+            "The motion in 3D": _list_view(calibration, recording, tracked, method),
+            "What was run": [_tabulate_run(calibration, recording, method)],
+        },
+    )
 
 
 def _name_gap(calibration: Calibration) -> str:
     """What the gap of the protocol's closures is, as "palm to palm"."""
     closures, table = calibration.problem.protocol.closures, calibration.problem.model.table
     points = dict.fromkeys(point for closure in closures for point in closure.points)
-    if not points:
-        return "gap"
     each = [plain(table.shared_name(point)) for point in points]
-    if len(each) == 1:
-        return f"{each[0]} to its point"
+    if len(each) < 2:
+        return f"{each[0]} to its point" if each else "gap"
     several = listed(kinds(table, points))
     gaps = {"coincide": " to ".join(each), "plane": f"{several} against the plane"}
     return gaps.get(closures[0].kind, f"{several} to their points")
@@ -116,7 +96,7 @@ def _describe_reliance(calibration: Calibration) -> str:
         text += f", their common scale to ± {100 * calibration.scale_std:.1f} %." if chain else "."
         if calibration.formulation == "paper":
             text += " These ± leave out errors of mounts, headings and soft tissue, and are too small."
-    mounts = {name: _mount_stds(subject, name) for name in subject.mounts}
+    mounts = {name: _find_mount_stds(subject, name) for name in subject.mounts}
     mounts = {name: std for name, std in mounts.items() if np.isfinite(std).all()}
     if mounts:
         worst = max(mounts, key=lambda name: max(mounts[name]))
@@ -125,25 +105,9 @@ def _describe_reliance(calibration: Calibration) -> str:
     return text
 
 
-def _list_diagnostics(quality: CalibrationQuality, untracked: Sequence[Diagnostic]) -> list[Item]:
-    banner = Banner(quality.quality, QUALITIES[quality.quality], lines(quality.reasons, titled=True))
-    entries = lines([*quality.further, *untracked], titled=True)
-    return [banner, Banner("info", "What to know", entries)] if entries else [banner]
-
-
-def _list_lengths(calibration: Calibration) -> list[Item]:
+def _describe_lengths(calibration: Calibration) -> str:
+    """What of the lengths the motion determines, and what it does not."""
     subject, problem = calibration.subject, calibration.problem
-    cells = []
-    for name in subject.lengths:
-        estimated, before = (
-            plus_minus(1e3 * person.lengths.get(name, np.nan), 1e3 * person.std(name), "mm")
-            for person in (subject, problem.prior)
-        )
-        measured = f"{1e3 * problem.measured[name][0]:.0f} mm" if name in problem.measured else ""
-        of_scale = calibration.scale_std * subject.lengths[name]
-        proportion = 1e3 * np.sqrt(max(subject.std(name) ** 2 - of_scale**2, 0.0))
-        in_chain = name in problem.lengths_in_closures and np.isfinite(proportion)
-        cells.append([plain(name), f"**{estimated}**", f"± {proportion:.0f} mm" if in_chain else "", before, measured])
     text = "± is one standard deviation throughout: two times out of three the truth lies within."
     if problem.lengths_in_closures and np.isfinite(calibration.scale_std):
         measured = listed([plain(name) for name in problem.scale_lengths])
@@ -155,35 +119,51 @@ def _list_lengths(calibration: Calibration) -> list[Item]:
     outside = [plain(n) for n in subject.lengths if n not in problem.lengths_in_closures and n not in problem.measured]
     if outside:
         text += f" Not in the chain, known by the prior's proportions alone: {', '.join(outside)}."
-    return [
-        draw_lengths(calibration),
-        text,
-        Table(["length", "estimated", "its proportion alone", "prior, before the motion", "measured"], cells),
-    ]
+    return text
 
 
-def _list_sensors(calibration: Calibration, recording: Recording) -> list[Item]:
+def tabulate_lengths(calibration: Calibration) -> Table:
+    """Each length beside the prior's and the measured one, and how well the motion shows its proportion alone."""
+    subject, problem = calibration.subject, calibration.problem
     rows = []
-    for name, quat_LS in calibration.subject.mounts.items():
-        offset, drift = calibration.subject.start_pose_offset.get(name), calibration.subject.heading_drift.get(name)
+    for name, value in subject.lengths.items():
+        estimated, before = (
+            plus_minus(1e3 * person.lengths.get(name, np.nan), 1e3 * person.std(name))
+            for person in (subject, problem.prior)
+        )
+        of_scale = calibration.scale_std * value
+        proportion = 1e3 * np.sqrt(max(subject.std(name) ** 2 - of_scale**2, 0.0))
+        in_chain = name in problem.lengths_in_closures and np.isfinite(proportion)
+        measured = number(1e3 * problem.measured[name][0], 0) if name in problem.measured else ""
+        rows.append([plain(name), f"**{estimated}**", f"± {proportion:.0f}" if in_chain else "", before, measured])
+    return Table("", ["length [mm]", "estimated", "its proportion alone", "prior", "measured"], rows)
+
+
+def tabulate_mounts(calibration: Calibration) -> Table:
+    """Each mount: its nearest axes, how well it is known, and how the segment was held in the start pose."""
+    subject, rows = calibration.subject, []
+    for name, quat_LS in subject.mounts.items():
+        offset, drift = subject.start_pose_offset.get(name), subject.heading_drift.get(name)
         up, forward = find_mount_axes(quat_LS)
         nearest = Rotation.from_quat(compute_mount(up, forward))
         off = np.degrees((nearest.inv() * Rotation.from_quat(quat_LS)).magnitude())
-        sensor = recording.sensors.get(name)
         rows.append(
             [
                 plain(name),
-                f"{up} up, {forward} forward, turned {off:.0f}°".replace("-", "−"),
-                "yes" if sensor is not None and sensor.stated_quat_LS is not None else "no",
-                *map(degrees, _mount_stds(calibration.subject, name)),
-                degrees(float(np.degrees(np.linalg.norm(offset.tilt))) if offset else np.nan),
-                f"{signed(float(np.degrees(drift.rate)) * 60.0)} °/min" if drift else "",
+                f"{up} up, {forward} ahead, turned {off:.0f}°".replace("-", "−"),
+                *(number(std, 1, "°") for std in _find_mount_stds(subject, name)),
+                number(float(np.degrees(np.linalg.norm(offset.tilt))) if offset else np.nan, 1, "°"),
+                number(float(np.degrees(drift.rate)) * 60.0, 1, " °/min", "+") if drift else "",
             ]
         )
-    if not rows:
+    return Table("", ["sensor", "nearest axes", "tilt ±", "heading ±", "off at start", "drift"], rows)
+
+
+def _list_sensors(calibration: Calibration) -> list[Item]:
+    table = tabulate_mounts(calibration)
+    if not table.rows:
         return []
-    header = ["sensor", "nearest axes in the start pose", "stated before", "tilt ±", "heading ±"]
-    soft = [f"{plain(joint)} {degrees(float(np.degrees(rms)))}" for joint, rms in calibration.hinge_rms.items()]
+    soft = [f"{plain(joint)} {np.degrees(rms):.1f}°" for joint, rms in calibration.hinge_rms.items()]
     hinges = (
         f" Out of the plane of its hinge, root mean square, a segment rotates by: {', '.join(soft)}." if soft else ""
     )
@@ -191,27 +171,39 @@ def _list_sensors(calibration: Calibration, recording: Recording) -> list[Item]:
         "Which axes of each sensor point up and forward, and the angle from there. Nobody stands exactly in the start "
         "pose: by how much each segment was off was estimated with the lengths. `subject.toml` has the directions, "
         f"and the exact rotations.{hinges}",
-        Table([*header, "off the start pose", "heading drift"], rows),
+        table,
     ]
 
 
-def _list_gap(calibration: Calibration, gap: str) -> list[Item]:
+def describe_gap(calibration: Calibration) -> str:
+    """The gap before and after, and what the motion determined."""
     quality = calibration.quality
-    if np.count_nonzero(np.isfinite(calibration.gap)) < 2:
-        return []
-    text = (
-        f"{gap}, root mean square while touching: {1e3 * calibration.prior_rms_gap:.1f} mm before, "
-        f"{1e3 * calibration.rms_gap:.1f} mm after. The effective sample size is "
+    return (
+        f"{capital(_name_gap(calibration))}, root mean square while touching: {1e3 * calibration.prior_rms_gap:.1f} mm "
+        f"before, {1e3 * calibration.rms_gap:.1f} mm after. The effective sample size is "
         f"{calibration.effective_sample_size:.0f}: neighbouring samples repeat the same information. The motion showed "
         f"{quality.rank} of {quality.unknowns} independent combinations of lengths and mounts, and determined "
         f"{quality.determined} of them better than the prior."
     )
-    return [draw_gap(calibration, gap), text]
 
 
-def _list_view(calibration: Calibration, recording: Recording, tracked: TrackResult | None) -> list[Item]:
-    if tracked is None or not len(calibration.time):
+def _list_gap(calibration: Calibration) -> list[Item]:
+    if np.count_nonzero(np.isfinite(calibration.gap)) < 2:
         return []
+    return [draw_gap(calibration, capital(_name_gap(calibration))), describe_gap(calibration)]
+
+
+def _list_view(calibration: Calibration, recording: Recording, tracked: TrackResult | None, method: str) -> list[Item]:
+    """The motion of the protocol, tracked with what was calibrated."""
+    if not len(calibration.time):
+        return []
+    if tracked is None:
+        try:
+            model, options = calibration.problem.model, TrackOptions(method)
+            tracker = Tracker(calibration.subject, model=model, options=options, with_point_cov=False)
+            tracked = tracker.push(recording) or next(tracker.smooth())
+        except WeposeError as error:
+            return [f"The motion cannot be tracked: {error}"]
     begin, end = float(calibration.time.min()), float(calibration.time.max())
     samples = slice(*np.searchsorted(tracked.time, [begin - 1e-6, end + 1e-6]))
     if samples.stop - samples.start < 2:
@@ -229,7 +221,7 @@ def _list_view(calibration: Calibration, recording: Recording, tracked: TrackRes
     return [show_motion(tracked.model, cut, shown, recording.name)]
 
 
-def _list_run(calibration: Calibration, recording: Recording, method: str) -> list[Item]:
+def _tabulate_run(calibration: Calibration, recording: Recording, method: str) -> Table:
     lengths = {name: calibration.measured_lengths[name] for name in calibration.problem.measured}
     measured = [f"{plain(n)} {1e3 * v.metres:.0f} ± {1e3 * v.measured_std:.0f} mm" for n, v in lengths.items()]
     imu, fused = len(recording.imus), len(recording.sensors) - len(recording.imus)
@@ -245,7 +237,13 @@ def _list_run(calibration: Calibration, recording: Recording, method: str) -> li
         ("prior", calibration.problem.prior.note or calibration.problem.prior.name),
         ("sensors mounted again", "yes" if recording.remounted else "no"),
     ]
-    return [Facts(rows)]
+    return Table("", (), rows)
+
+
+def _find_mount_stds(subject: Subject, segment: str) -> tuple[float, float]:
+    """Standard deviations [deg] of a mount's tilt, root mean square of both axes, and of its heading."""
+    x, y, z = np.degrees([subject.std(row) for row in mount_rows(segment)])
+    return float(np.sqrt(0.5 * (x**2 + y**2))), float(z)
 
 
 # Figures --------------------------------------------------------------------------------------------------------------
@@ -311,12 +309,3 @@ def insert_breaks(time: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Values (n,) with a NaN inserted wherever time jumps, so that a line breaks there."""
     jumps = np.flatnonzero(np.diff(time) > 3.0 * np.median(np.diff(time))) + 1
     return np.insert(values.astype(float), jumps, time[jumps] if values is time else np.nan)
-
-
-# Words and small sums -------------------------------------------------------------------------------------------------
-
-
-def _mount_stds(subject: Subject, segment: str) -> tuple[float, float]:
-    """Standard deviations [deg] of a mount's tilt, root mean square of both axes, and of its heading."""
-    x, y, z = np.degrees([subject.std(row) for row in mount_rows(segment)])
-    return float(np.sqrt(0.5 * (x**2 + y**2))), float(z)

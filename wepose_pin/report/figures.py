@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from io import StringIO
 from pathlib import Path
@@ -11,7 +12,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 from ..documents import whole_folder
@@ -122,6 +122,10 @@ class ReportFigure(Figure):
         self.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
         return file.getvalue()
 
+    def address(self) -> str:
+        """The figure as the address of an image, which no style of a page touches."""
+        return f"data:image/svg+xml;base64,{base64.b64encode(self.svg().encode()).decode('ascii')}"
+
     def _repr_svg_(self) -> str:
         return self.svg()
 
@@ -228,35 +232,3 @@ def draw_over_time(
     if len(styles) > 1:
         figure.add_legend()
     return figure
-
-
-def set_up_views(
-    axes: Iterable[Axes], width: float | None, trunk: float | None, origin: str
-) -> list[tuple[Axes, int, int]]:
-    """Plots of the body from the front, the right and above [cm], and the axes that each shows; zero is at the origin.
-
-    Parameters
-    ----------
-    width, trunk : [m] of the shoulders, or of what else the limbs hang at, and from there to the root; None: not drawn
-    origin : what the limbs hang at, as "shoulders"
-    """
-    labels = ("forwards [cm]", "to the person's left [cm]", f"above the {origin} [cm]")
-    views = []
-    for ax, (view, across, up) in zip(
-        axes, (("from the front", 1, 2), ("from the right", 0, 2), ("from above", 1, 0)), strict=True
-    ):
-        ax.set_title(view)
-        ax.set_xlabel(labels[across])
-        ax.set_ylabel(labels[up], labelpad=1)
-        ax.set_aspect("equal", adjustable="datalim")
-        ax.margins(0.05)
-        ax.invert_xaxis() if view == "from above" else None
-        if trunk is not None:
-            ax.add_patch(Circle((0.0, 0.0 if up == 0 else 20.0), 10.0, color=BAND, zorder=0.8))
-        limb: dict[str, Any] = {"color": BAND, "linewidth": 7.0, "solid_capstyle": "round", "zorder": 0.8}
-        if across == 1 and width is not None:
-            ax.plot([-50.0 * width, 50.0 * width], [0.0, 0.0], **limb)
-        if up == 2 and trunk is not None:
-            ax.plot([0.0, 0.0], [0.0, -100.0 * trunk], **limb)
-        views.append((ax, across, up))
-    return views

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template, select_autoescape
 from markupsafe import Markup, escape
 
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json, lines
 from ..documents import whole_file
-from ..errors import WeposeError, reason
-from . import words
-
-if TYPE_CHECKING:
-    from .figures import ReportFigure
+from ..errors import reason
+from ..writers.result import versions
+from .words import Table
 
 PACKAGE = Path(__file__).parent.parent  # templates are named by their path below it
 MOST_FIGURES = 5  # of a page; tables have the rest
@@ -32,28 +29,6 @@ class Banner(NamedTuple):
     kind: str
     text: str
     entries: Sequence[tuple[str, str]] = ()  # severity and text
-    macro: str = "banner"
-
-
-class Table(NamedTuple):
-    """A table; a cell may hold `code` and **bold**."""
-
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    title: str = ""
-    macro: str = "table"
-
-    @property
-    def wordy(self) -> bool:
-        """Whether cells are sentences: those are set to the left, and may break their lines."""
-        return any(len(cell) > 40 for row in self.rows for cell in row)
-
-
-class Facts(NamedTuple):
-    """Names and values."""
-
-    rows: Sequence[tuple[str, str]]
-    macro: str = "facts"
 
 
 class Frame(NamedTuple):
@@ -61,70 +36,35 @@ class Frame(NamedTuple):
 
     page: str
     more: str = ""
-    macro: str = "frame"
 
 
-class _Picture(NamedTuple):
-    """A figure as the address of an image, which no style of the page touches."""
+class Picture(Protocol):
+    """A figure, as `ReportFigure`; matplotlib loads only where one is drawn."""
 
     caption: str
-    address: str
-    macro: str = "picture"
+
+    def address(self) -> str: ...
 
 
-Item: TypeAlias = "str | Banner | Table | Facts | Frame | ReportFigure"  # a text is a paragraph
+Item: TypeAlias = str | Banner | Table | Frame | Picture  # a text is a paragraph
 
 
-class Page:
-    """A page whose sections are made one by one: one that fails leaves a line in its place and takes nothing along.
+def render_page(title: str, lead: Sequence[Item], sections: Mapping[str, Sequence[Item]]) -> str:
+    """The whole page; the same items give the same text.
 
     Parameters
     ----------
     title : the heading
-    failures : takes a line for each section that cannot be made
+    lead : what stands before all sections
+    sections : heading → items, in order; one without items is left out
     """
-
-    def __init__(self, title: str, failures: list[str] | None = None) -> None:
-        self._title = title
-        self._failures = failures if failures is not None else []
-        self._sections: list[tuple[str, list[object]]] = []
-
-    def add(self, title: str, make: Callable[[], Iterable[Item] | None], heading: bool = True) -> None:
-        """Append the items that `make` gives, in order; nothing where it gives None or none.
-
-        Parameters
-        ----------
-        title : of the section
-        heading : whether the page shows the title, and has it in its menu
-        """
-        try:
-            items = [_prepare(item) for item in make() or ()]
-        except Exception as error:
-            failure = f"the section '{title}' cannot be made: {reason(error)}"
-            self._failures.append(failure)
-            text = f"**{words.capital(failure)}.** The rest of the page is complete."
-            items, heading = [Banner("poor", text)], False
-        if items:
-            self._sections.append((title if heading else "", items))
-
-    def html(self) -> str:
-        """Return the whole page; the same sections give the same text."""
-        scripts = any(isinstance(item, Frame) for _, items in self._sections for item in items)
-        template = load_template("report/templates/page.html.j2")
-        return template.render(title=self._title, sections=self._sections, scripts=scripts)
-
-
-def _prepare(item: Item) -> object:
-    from .figures import ReportFigure
-
-    if not isinstance(item, ReportFigure):
-        return item
-    address = base64.b64encode(item.svg().encode()).decode("ascii")
-    return _Picture(item.caption, f"data:image/svg+xml;base64,{address}")
+    shown = {heading: items for heading, items in {"": lead, **sections}.items() if items}
+    scripts = any(isinstance(item, Frame) for items in shown.values() for item in items)
+    return load_template("report/templates/page.html.j2").render(title=title, sections=shown, scripts=scripts)
 
 
 def show_diagnostics(diagnostics: Sequence[Diagnostic], reliable: str, *, unusable: bool = False) -> Banner:
-    """Return the banner of a page's diagnostics.
+    """The banner of a page's diagnostics.
 
     Parameters
     ----------
@@ -152,9 +92,13 @@ def _environment() -> Environment:
         trim_blocks=True,
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    environment.filters |= {"inline": inline, "slug": words.slug}
+    environment.filters |= {
+        "inline": inline,
+        "kind": lambda item: type(item).__name__,
+        "slug": lambda text: re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-"),
+    }
     environment.globals["file"] = lambda name: Markup((PACKAGE / name).read_text(encoding="utf-8"))
-    environment.globals["versions"] = words.versions
+    environment.globals["versions"] = lambda: ", ".join(f"{name} {number}" for name, number in versions().items())
     return environment
 
 
@@ -164,57 +108,37 @@ def inline(text: str) -> Markup:
     return Markup(re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", marked))
 
 
-class PageWriter:
-    """Writes the pages of a result folder after its results have landed there, each whole or not at all.
-
-    Pages of an earlier run under these names go first: they would show another motion.
+def write_pages(folder: Path, pages: Mapping[str, Callable[[], str]], summary: str = "") -> list[Diagnostic]:
+    """Write pages beside results that are there already, each whole or not at all; those of an earlier run go first.
 
     Parameters
     ----------
-    folder : holds the result
-    names : of all pages to come
+    pages : name of a file → what makes its text
+    summary : JSON file of the result, whose ``diagnostics`` get those of the pages
 
-    Attributes
-    ----------
-    diagnostics : pages, and sections of pages, that cannot be made
+    Returns
+    -------
+    list of Diagnostic
+        Pages that cannot be made.
     """
-
-    def __init__(self, folder: Path, names: Sequence[str]) -> None:
-        self.diagnostics: list[Diagnostic] = []
-        self._folder = folder
-        for name in names:
-            with contextlib.suppress(OSError):
-                (folder / name).unlink()
-
-    def write(self, name: str, make: Callable[[list[str]], str]) -> str | None:
-        """Write a page and give its text, None where it fails; `make` is given a list for what of it fails alone."""
-        failures: list[str] = []
-        text = None
+    for name in pages:
+        with contextlib.suppress(OSError):
+            (folder / name).unlink()
+    diagnostics = []
+    for name, make in pages.items():
         try:
-            made = make(failures)
-            with whole_file(self._folder / name, force=True) as partial:
-                partial.write_text(made, encoding="utf-8")
-            text = made
+            _write(folder / name, make())
         except Exception as error:
-            failures.append(f"cannot be made: {reason(error)}")
-        self.diagnostics += [page_incomplete(name, failure) for failure in failures]
-        return text
-
-    def save_diagnostics(self, file: str) -> None:
-        """Add them to the ``diagnostics`` of a JSON file of the result, if there are any."""
-        if not self.diagnostics:
-            return
-        path = self._folder / file
-        content = json.loads(path.read_text(encoding="utf-8"))
-        content["diagnostics"] = [*content.get("diagnostics", []), *map(as_json, self.diagnostics)]
-        try:
-            with whole_file(path, force=True) as partial:
-                partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-        except (OSError, WeposeError) as error:  # a full disk, say: what is there stays as it was
-            facts = {"variant": "diagnostics", "reason": reason(error)}
-            self.diagnostics.append(Diagnostic("output-incomplete", WARNING, file, facts=facts))
+            facts = {"reason": f"cannot be made: {reason(error)}"}
+            diagnostics.append(Diagnostic("output-incomplete", WARNING, name, facts=facts))
+    if diagnostics and summary:
+        with contextlib.suppress(Exception):  # a full disk, say: what is there stays as it was
+            content: dict[str, Any] = json.loads((folder / summary).read_text(encoding="utf-8"))
+            content["diagnostics"] = [*content.get("diagnostics", []), *map(as_json, diagnostics)]
+            _write(folder / summary, json.dumps(content, indent=2) + "\n")
+    return diagnostics
 
 
-def page_incomplete(name: str, failure: str) -> Diagnostic:
-    """A page, or a section of it, that cannot be made: why."""
-    return Diagnostic("output-incomplete", WARNING, name, facts={"reason": failure})
+def _write(file: Path, text: str) -> None:
+    with whole_file(file, force=True) as partial:
+        partial.write_text(text, encoding="utf-8")

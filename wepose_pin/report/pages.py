@@ -1,20 +1,28 @@
-"""The pages of a tracked recording beside its result, and both written to a folder."""
+"""The pages of a tracked motion: beside its result, in a saved folder, and in a notebook."""
 
 from __future__ import annotations
 
 import shutil
-from dataclasses import fields
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 
+from markupsafe import escape
+
 from ..diagnostics import Diagnostic
+from ..documents import whole_file
 from ..tracking import TrackResult, TrackSummary, summarize
 from ..writers import write_result
 from ..writers.folder import result_folder
 from ..writers.provenance import CALL, collect_provenance
-from .page import PageWriter
+from .page import write_pages
 from .viewer import pose_html
 
-PAGES = ("view.html", "report.html")
+FRAME_HEIGHT = 560  # [px] of the view page in a notebook
 
 
 def write_track_pages(
@@ -30,21 +38,21 @@ def write_track_pages(
     Returns
     -------
     list of Diagnostic
-        Pages, or parts of them, that cannot be made; they stand in ``summary.json`` too.
+        Pages that cannot be made; they stand in ``summary.json`` too.
     """
-    writer = PageWriter(folder, [name for name, wanted in zip(PAGES, (view, report), strict=True) if wanted])
+    tracked, recording = summary.tracked, summary.tracked.recording
 
-    def render_view(_: list[str]) -> str:
-        tracked, recording = summary.tracked, summary.tracked.recording
+    @cache
+    def make_view() -> str:
         return pose_html(tracked.model, tracked.pose, phases=recording.phases, title=recording.name, fps=fps)
 
-    page = writer.write("view.html", render_view) if view else None
-    if report:
+    def make_report() -> str:
         from .track import render_track_report  # with it comes matplotlib
 
-        writer.write("report.html", lambda failures: render_track_report(summary, view=page, failures=failures))
-    writer.save_diagnostics("summary.json")
-    return writer.diagnostics
+        return render_track_report(summary, view=make_view() if view else None)
+
+    pages: dict[str, Callable[[], str]] = {"view.html": make_view} if view else {}
+    return write_pages(folder, pages | ({"report.html": make_report} if report else {}), "summary.json")
 
 
 def save_result(result: TrackResult, folder: str | Path, force: bool = False) -> Path:
@@ -63,3 +71,53 @@ def save_result(result: TrackResult, folder: str | Path, force: bool = False) ->
         write_result(partial, result, summary, provenance=collect_provenance(CALL, inputs))
     write_track_pages(out, summary)
     return out
+
+
+@dataclass(frozen=True)
+class ViewPage:
+    """The page that plays a motion; a notebook shows it in a frame.
+
+    Parameters
+    ----------
+    title : of the motion
+    html : the whole page, which opens offline
+    """
+
+    title: str
+    html: str
+
+    def __repr__(self) -> str:
+        return f"ViewPage({self.title!r}, {len(self.html) / 1e6:.1f} MB)"
+
+    def _repr_html_(self) -> str:
+        style = f"width:100%;height:{FRAME_HEIGHT}px;border:0"
+        return (
+            f'<iframe title="{escape(self.title)}" sandbox="allow-scripts" style="{style}" '
+            f'srcdoc="{escape(self.html)}"></iframe>'
+        )
+
+    def save(self, path: str | Path, force: bool = False) -> Path:
+        """Write the page to a file and return its path.
+
+        Raises
+        ------
+        ExistingOutput
+            The file is there and `force` is not given, or it cannot be written.
+        """
+        with whole_file(Path(path), force) as partial:
+            partial.write_text(self.html, encoding="utf-8")
+        return Path(path)
+
+    def open(self) -> bool:
+        """Open the page in the browser, from a temporary file; returns whether there is one."""
+        file = Path(tempfile.mkdtemp(prefix="wepose-")) / "view.html"
+        return webbrowser.open(self.save(file).as_uri())
+
+
+def show_result(result: TrackResult, open: bool = True) -> ViewPage:
+    """Return the page that plays the motion, and open it in the browser where `open` and this is no notebook."""
+    page = ViewPage(result.name, pose_html(result.model, result.pose, phases=result.phases, title=result.name))
+    find_shell = getattr(sys.modules.get("IPython"), "get_ipython", None)
+    if open and not (find_shell is not None and hasattr(find_shell(), "kernel")):
+        page.open()
+    return page

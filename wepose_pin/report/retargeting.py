@@ -24,20 +24,15 @@ from .figures import (
     shade,
     styled,
 )
-from .page import Facts, Frame, Item, Page, Table, show_diagnostics
-from .words import plain, whole
+from .page import Frame, Item, render_page, show_diagnostics
+from .words import Table, number, plain
 
 CAUSE_COLOURS = (ALARM, *SESSION_COLOURS, SOFT, COLOURS["other"])  # of `CAUSES`
 PAIRS = 8  # that are listed, the closest ones
 
 
 def render_retargeting_report(
-    trajectory: Trajectory,
-    summary: Mapping[str, Any],
-    *,
-    title: str = "",
-    view: str | None = None,
-    failures: list[str] | None = None,
+    trajectory: Trajectory, summary: Mapping[str, Any], *, title: str = "", view: str | None = None
 ) -> str:
     """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic.
 
@@ -46,18 +41,24 @@ def render_retargeting_report(
     summary : as in ``summary.json``
     title : what moves what, for the heading
     view : the page of `retarget_html`, embedded; None: left out
-    failures : gets a line for each section that cannot be made; the page has the line in place of the section
     """
-    page = Page(f"Motion of {title or 'a robot'}", failures)
-    page.add("What can be relied on", lambda: [_describe_reliance(trajectory, summary)], heading=False)
-    page.add("Diagnostics", lambda: _list_diagnostics(summary), heading=False)
-    page.add("The hands against their targets", lambda: _list_hands(trajectory, summary))
-    page.add("The robot's parts against each other", lambda: _list_distances(trajectory, summary))
-    page.add("The joints against their limits", lambda: _list_joints(trajectory, summary))
-    ghosts = " Translucent: the targets of the hands."
-    page.add("The motion in 3D", lambda: [] if view is None else [Frame(view, ghosts)])
-    page.add("What was run", lambda: _list_run(summary))
-    return page.html()
+    diagnostics = [from_json(entry) for entry in summary["diagnostics"]]
+    runnable = summary["within_limits"] and not summary["self_collisions"]["samples"]
+    reliable = "**Limits kept, no self-collision,** nothing had to be slowed."
+    return render_page(
+        f"Motion of {title or 'a robot'}",
+        [
+            describe_reliance(trajectory, summary),
+            show_diagnostics(diagnostics, reliable, unusable=not runnable),
+        ],
+        {
+            "The hands against their targets": [draw_hands(trajectory), *tabulate_hands(summary)],
+            "The robot's parts against each other": _list_distances(trajectory, summary),
+            "The joints against their limits": _list_joints(trajectory, summary),
+            "The motion in 3D": [] if view is None else [Frame(view, " Translucent: the targets of the hands.")],
+            "What was run": [tabulate_run(summary)],
+        },
+    )
 
 
 def _compute_hand_errors(trajectory: Trajectory) -> dict[str, np.ndarray]:
@@ -68,35 +69,44 @@ def _compute_hand_errors(trajectory: Trajectory) -> dict[str, np.ndarray]:
     }
 
 
-def _describe_reliance(trajectory: Trajectory, summary: Mapping[str, Any]) -> str:
+def describe_reliance(trajectory: Trajectory, summary: Mapping[str, Any]) -> str:
     """Two sentences: whether a robot may run it, and how well the hands follow."""
     contacts = summary["self_collisions"]["samples"]
     problems = ["leaves the robot's limits"] * (not summary["within_limits"])
     problems += [f"has self-collisions in {contacts} samples"] * bool(contacts)
-    text = f"The trajectory {' and '.join(problems) or 'keeps all limits, and its checked parts do not collide'}."
+    checked = "its checked parts do not collide" if summary["self_collisions"]["pairs"] else "no two parts can meet"
     errors = _compute_hand_errors(trajectory)
     worst = max(errors, key=lambda side: float(errors[side].max()))
     sample = int(np.argmax(errors[worst]))
-    inside = [
-        f"the {side} hand {arm['hand_error_mm']['median']:.1f} mm off its target (median)"
-        for side, arm in summary["arms"].items()
-        if arm["hand_error_mm"]
-    ]
-    follows = f"Within reach {' and '.join(inside)}; at" if inside else "At"
     return (
-        f"{text} {follows} worst, at {trajectory.time[sample]:.1f} s, the {worst} hand is "
-        f"{errors[worst][sample]:.0f} mm off."
+        f"The trajectory {' and '.join(problems) or f'keeps all limits, and {checked}'}. At worst, at "
+        f"{trajectory.time[sample]:.1f} s, the {worst} hand is {errors[worst][sample]:.0f} mm off its target."
     )
 
 
-def _list_diagnostics(summary: Mapping[str, Any]) -> list[Item]:
-    diagnostics = [from_json(entry) for entry in summary["diagnostics"]]
-    runnable = summary["within_limits"] and not summary["self_collisions"]["samples"]
-    reliable = "**Limits kept, no self-collision,** nothing had to be slowed."
-    return [show_diagnostics(diagnostics, reliable, unusable=not runnable)]
+def tabulate_hands(summary: Mapping[str, Any]) -> list[Table]:
+    """Errors of the hands, and their causes."""
+    arms, rows = summary["arms"], []
+    for side, arm in arms.items():
+        near, swivel = arm["reachability"]["hand_error_where_reachable_mm"], arm["swivel_error_deg"]
+        errors = (arm["hand_error_everywhere_mm"], arm["hand_error_mm"], near)
+        cells = [number(error[key], 1) if error else "" for error in errors for key in ("median", "p90")]
+        rotation = number(arm["hand_error_deg"]["median"], 1)
+        reachable = number(100 * arm["reachability"]["reachable_share"], 0)
+        swivel_deg = number(swivel["median"], 0) if swivel else ""
+        rows.append([side, f"{arm['scale']:.2f}", *cells, rotation, swivel_deg, reachable])
+    places = ("median", "90 %", "within reach: median", "90 %", "where reachable: median", "90 %")
+    causes = [[cause, *(f"{100.0 * arm['error_attribution'][cause]:.1f}" for arm in arms.values())] for cause in CAUSES]
+    header = ["arm", "scale", *places, "orientation [deg]", "elbow swivel [deg]", "reachable [%]"]
+    title = f"Share of the time in which a hand is over {1e3 * FAR:g} mm off, by cause; the first that applies counts"
+    return [
+        Table("Distance of each hand from its target [mm]", header, rows),
+        Table(title, ["cause", *(f"{side} [%]" for side in arms)], causes),
+    ]
 
 
-def _describe_limits(summary: Mapping[str, Any]) -> str:
+def describe_limits(summary: Mapping[str, Any]) -> str:
+    """What of the limits was never used."""
     unused = summary["limit_margins"]
     return (
         f"Never used: {100 * unused['velocity_share']:.1f} % of the velocity limits, "
@@ -107,36 +117,19 @@ def _describe_limits(summary: Mapping[str, Any]) -> str:
     )
 
 
-def _list_hands(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item]:
-    arms = summary["arms"]
-    errors = [
-        [side, *(whole(arm["hand_error_everywhere_mm"][key]) for key in ("median", "p90", "p99"))]
-        for side, arm in arms.items()
-    ]
-    causes = [[cause, *(f"{100.0 * arm['error_attribution'][cause]:.1f}" for arm in arms.values())] for cause in CAUSES]
-    return [
-        draw_hands(trajectory),
-        Table(["side", "median [mm]", "90 %", "99 %"], errors),
-        f"Share of the time in which a hand is over {1e3 * FAR:g} mm off, by cause; the first that applies counts:",
-        Table(["cause", *(f"{side} [%]" for side in arms)], causes),
-    ]
-
-
 def _list_distances(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Item]:
-    run, time, contacts = trajectory.run, trajectory.time, summary["self_collisions"]
+    report, time, contacts = trajectory.run.report, trajectory.time, summary["self_collisions"]
     rows = []
-    for pair in np.unique(run.report.nearest_pair[run.report.nearest_pair >= 0]).tolist():
-        own = np.flatnonzero(run.report.nearest_pair == pair)
-        least = own[np.argmin(run.report.hull_distance[own])]
-        share = 100.0 * len(own) / len(time)
-        rows.append(
-            (float(run.report.hull_distance[least]), trajectory.collision.name_pair(pair), float(time[least]), share)
-        )
+    for pair in np.unique(report.nearest_pair[report.nearest_pair >= 0]).tolist():
+        own = np.flatnonzero(report.nearest_pair == pair)
+        least = own[np.argmin(report.hull_distance[own])]
+        name, share = trajectory.collision.name_pair(pair), 100.0 * len(own) / len(time)
+        rows.append((float(report.hull_distance[least]), name, float(time[least]), share))
     cells = [[name, f"{1e3 * d:.1f}", f"{t:.1f}", f"{share:.0f}"] for d, name, t, share in sorted(rows)[:PAIRS]]
     header = ["pair", "least distance [mm]", "at [s]", "closest pair for [% of the time]"]
     return [
         draw_distances(trajectory),
-        *([Table(header, cells)] if cells else []),
+        *([Table("", header, cells)] if cells else []),
         "Distances are those of convex hulls, which are larger than the parts. The parts themselves, "
         f"{contacts['pairs']} pairs of them, collide in {contacts['samples']} samples.",
     ]
@@ -151,20 +144,18 @@ def _list_joints(trajectory: Trajectory, summary: Mapping[str, Any]) -> list[Ite
         name, position = robot.names[j], run.joint_position[:, j]
         limit, (factor, unit) = limits[name], _choose_unit(limits[name].kind)
         margin = factor * float(np.minimum(position - limit.lower, limit.upper - position).min())
-        rows.append(
-            [
-                plain(name),
-                f"{margin:.1f} {unit}" if np.isfinite(margin) else "no limit",
-                _format_share(np.abs(run.joint_velocity[:, j]).max(), limit.velocity),
-                _format_share(np.abs(run.joint_acceleration[:, j]).max(), robot.map.acceleration[name]),
-                _format_share(jerk[:, j].max(), robot.map.jerk[name]),
-            ]
+        used = (
+            (np.abs(run.joint_velocity[:, j]).max(), limit.velocity),
+            (np.abs(run.joint_acceleration[:, j]).max(), robot.map.acceleration[name]),
+            (jerk[:, j].max(), robot.map.jerk[name]),
         )
+        shares = [f"{100.0 * value / most:.0f} % of {most:g}" for value, most in used]
+        rows.append([plain(name), number(margin, 1, f" {unit}", unknown="no limit"), *shares])
     margins = robot.margins
     return [
         draw_joints(trajectory),
-        Table(["joint", "least distance to a position limit", "largest velocity", "acceleration", "jerk"], rows),
-        _describe_limits(summary),
+        Table("", ["joint", "least distance to a position limit", "largest velocity", "acceleration", "jerk"], rows),
+        describe_limits(summary),
         f"Limits are those of the robot's map, else of its URDF. {100 * margins.speed_scale:g} % of those of velocity, "
         f"acceleration and jerk are used (`--speed-scale`), and {margins.limit_margin:g} rad are left to each position "
         "limit (`--limit-margin`).",
@@ -175,34 +166,22 @@ def _choose_unit(kind: str) -> tuple[float, str]:
     return (1e3, "mm") if kind == "prismatic" else (180.0 / np.pi, "°")
 
 
-def _format_share(value: float, limit: float) -> str:
-    return f"{100.0 * value / limit:.0f} % of {limit:g}"
-
-
-def _list_run(summary: Mapping[str, Any]) -> list[Item]:
+def tabulate_run(summary: Mapping[str, Any]) -> Table:
+    """What was run, and how long it lasts."""
     slowed = f"; {summary['slowdown']:.2f} times as long as recorded" if summary["slowdown"] is not None else ""
-    return [
-        Facts(
-            [
-                ("robot", f"{summary['robot']}, {summary['urdf']}"),
-                ("mount and limits", summary["description"] or "as the map has them"),
-                ("rate", f"{summary['rate_hz']:g} Hz"),
-                ("recorded", f"{summary['recorded_s']:.1f} s"),
-                (
-                    "lasts",
-                    f"{summary['duration_s']:.1f} s, of which {summary['approach_s']:.1f} s are the approach{slowed}",
-                ),
-                ("steps near a singularity", f"{100.0 * summary['steps']['singular_share']:.1f} %"),
-            ]
-        )
+    rows = [
+        ("robot", f"{summary['robot']}, {summary['urdf']}"),
+        ("mount and limits", summary["description"] or "as the map has them"),
+        ("rate", f"{summary['rate_hz']:g} Hz"),
+        ("recorded", f"{summary['recorded_s']:.1f} s"),
+        ("lasts", f"{summary['duration_s']:.1f} s, of which {summary['approach_s']:.1f} s are the approach{slowed}"),
+        ("steps near a singularity", f"{100.0 * summary['steps']['singular_share']:.1f} %"),
+        ("a step", f"{summary['solve_ms']['p50']:.2f} ms (p50), {summary['solve_ms']['p99']:.2f} ms (p99)"),
     ]
+    return Table("", (), rows)
 
 
 # Figures --------------------------------------------------------------------------------------------------------------
-
-
-def _list_approach(trajectory: Trajectory) -> tuple[str, list[tuple[float, float]]]:
-    return "approach", [(0.0, float(trajectory.time[trajectory.approach_samples]))]
 
 
 @styled
@@ -214,7 +193,7 @@ def draw_hands(trajectory: Trajectory) -> ReportFigure:
         {f"{side} hand, distance from its target [mm]": {side: error} for side, error in errors.items()},
         f"The dashed line: {1e3 * FAR:g} mm. The bar below: why a hand is farther off than that.",
         {side: {**line_style(side, side), "label": None, "linestyle": "-"} for side in errors},
-        spans=_list_approach(trajectory),
+        spans=("approach", [(0.0, float(time[trajectory.approach_samples]))]),
     )
     for i, (ax, error) in enumerate(zip(figure.axes, errors.values(), strict=True)):
         most = 1.08 * max(float(error.max()), 2e3 * FAR)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..angles import AUTO, Angles, group_sides, joint_angles, summary
-from ..body import ROOT, BodyTable
+from ..angles import AUTO, Angles, joint_angles, summary
+from ..body import BodyTable
 from ..errors import BadData
 from ..tracking import TrackResult, TrackSummary
 from ..tracking.error_budget import group_by_source
@@ -24,6 +24,7 @@ from ..tracking.measures import (
     finite_median,
     has_stated_mounts,
     longest_run_s,
+    measure_tips,
 )
 from ..tracking.pose_diagnostics import GRAVITY_OFF, describe_heading_remedy
 from .angles import FULL_TURN, draw_joint_angles
@@ -31,25 +32,27 @@ from .figures import (
     ALARM,
     COLOURS,
     SOFT,
+    Figures,
     ReportFigure,
     draw_over_time,
     envelope,
     find_spans,
     line_style,
-    set_up_views,
     shade,
     styled,
 )
-from .page import Facts, Frame, Item, Page, Table, show_diagnostics
+from .page import Frame, Item, render_page, show_diagnostics
 from .viewer import show_motion
-from .words import capital, degrees, intervals, kinds, listed, plain, plural, whole
+from .words import Table, capital, intervals, kinds, listed, number, plain, plural
 
 LARGEST_VIEW = 3_000_000  # characters of a given view that the report embeds
 PATH_POINTS = 1000
 METHODS_WITH_COVARIANCE = "amekf, smoother, smekf and smekf_published"
+VIEWS = (("from the front", 1, 2), ("from the right", 0, 2), ("from above", 1, 0))  # axes across and up
+AXES = ("forwards [cm]", "to the left [cm]", "upwards [cm]")
 
 
-def render_track_report(summary: TrackSummary, *, view: str | None = None, failures: list[str] | None = None) -> str:
+def render_track_report(summary: TrackSummary, *, view: str | None = None) -> str:
     """Return the text of ``report.html``, one page that opens offline and can be printed. It is deterministic.
 
     Its size does not grow with the recording's length.
@@ -58,7 +61,6 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
     ----------
     summary : of `summarize`
     view : the page of `pose_html`, embedded up to `LARGEST_VIEW`; None: a view is made here
-    failures : gets a line for each section that cannot be made; the page has the line in place of the section
 
     Raises
     ------
@@ -68,58 +70,62 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None, failu
     tracked, measures = summary.tracked, summary.measures
     if measures is None:
         raise BadData("the motion could not be measured")
-    table = tracked.model.table
-    find_angles = cache(lambda: _find_joint_angles(tracked))
+    recording, table = tracked.recording, tracked.model.table
+    try:
+        angles = joint_angles(tracked.pose, AUTO)
+    except BadData:  # no joint has both of its segments
+        angles = None
     checked = listed(["Rates", "ranges", "static phases", "headings", *kinds(table, table.hinges)])
     reliable = f"**No warnings.** {checked} are within their limits."
-    page = Page(f"Motion of {tracked.recording.name or 'a recording'}", failures)
-    page.add("What can be relied on", lambda: _list_reliance(tracked, measures, find_angles()), heading=False)
-    page.add("Diagnostics", lambda: [show_diagnostics(summary.diagnostics, reliable)], heading=False)
-    page.add("In short", lambda: _list_facts(tracked, measures), heading=False)
-    page.add("What was recorded", lambda: _list_recorded(tracked, measures))
-    page.add("Drift of the headings", lambda: _list_drift(tracked, measures.budgets))
-    page.add(f"The {_name_tips(table)}", lambda: _list_tips(tracked, measures))
-    page.add("Joint angles", lambda: _list_angles(tracked, find_angles()))
-    page.add("The motion in 3D", lambda: _list_view(tracked, view))
-    page.add("What was run", lambda: _list_run(tracked))
-    return page.html()
+    if view is not None and len(view) <= LARGEST_VIEW:
+        frame = Frame(view)
+    else:
+        frame = show_motion(tracked.model, tracked.pose, recording.phases, recording.name)
+    return render_page(
+        f"Motion of {recording.name or 'a recording'}",
+        [
+            _describe_reliance(tracked, measures, angles),
+            show_diagnostics(summary.diagnostics, reliable),
+            _describe_recording(tracked, measures),
+        ],
+        {
+            "What was recorded": _list_recorded(tracked, measures),
+            "Drift of the headings": _list_drift(tracked, measures.budgets),
+            f"The {_name_tips(table)}": _list_tips(tracked, measures),
+            "Joint angles": _list_angles(tracked, angles) if angles is not None else [],
+            "The motion in 3D": [frame],
+            "What was run": [_tabulate_run(tracked)],
+        },
+    )
 
 
 # Sections -------------------------------------------------------------------------------------------------------------
 
 
-def _list_reliance(tracked: TrackResult, measures: Measures, angles: Angles | None) -> list[Item]:
-    """Return what the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
+def _describe_reliance(tracked: TrackResult, measures: Measures, angles: Angles | None) -> str:
+    """What the motion is good for: the usual ± of hinges, hands and rotations, and the least certain angle."""
     after_start, table = find_samples_after_start(tracked), tracked.model.table
-    stds = _find_angle_stds(angles, after_start) if angles is not None else {}
+    stds: dict[str, float] = {}  # median [deg] where an angle is determined, of the side where that is larger
+    for joint, each in angles.joints.items() if angles is not None else ():
+        for k, angle in enumerate(each.names if each.std is not None else ()):
+            assert each.std is not None
+            name = f"{plain(table.shared_name(joint))} {plain(angle)}"
+            std = float(np.degrees(finite_median(each.std[after_start & ~each.hidden(k), k])))
+            if np.isfinite(std):
+                stds[name] = max(std, stds.get(name, 0.0))
     tips = [finite_median(tip.std[after_start]) for tip in measures.tips.values() if tip.std is not None]
-    hinges = {plain(table.shared_name(hinge)) for hinge in table.hinges}
-    best = min(stds, key=stds.__getitem__, default=None)
-    best = next((name for name in stds if name.removesuffix(" flexion") in hinges), best)
+    hinges = [f"{plain(table.shared_name(hinge))} flexion" for hinge in table.hinges]
+    best = next((name for name in stds if name in hinges), min(stds, key=stds.__getitem__, default=None))
     worst = max(stds, key=stds.__getitem__, default=None)
     known = [f"{best} to ± {stds[best]:.0f}°"] if best is not None else []
     if tips and np.isfinite(tips).any():
-        known.append(f"{_name_tips(table)} to ± {1e3 * np.nanmax(tips):.0f} mm from {_name_root(table)}")
+        root = "the root" if table.is_mechanism else "the middle of the hips"
+        known.append(f"{_name_tips(table)} to ± {1e3 * np.nanmax(tips):.0f} mm from {root}")
     known += [f"{name} to ± {std:.0f}°" for name, std in stds.items() if name.endswith("rotation") and name != worst]
     if not known:
-        return [_explain_no_covariance(tracked)]
+        return _explain_no_covariance(tracked)
     least = f" Least certain: {worst}, ± {stds[worst]:.0f}°." if worst not in (best, None) else ""
-    return [f"**Good for** {listed(known)}.{least}"]
-
-
-def _find_angle_stds(angles: Angles, samples: np.ndarray) -> dict[str, float]:
-    """Angle, as "elbow flexion" → its median ± [deg] where it is determined, of the side where that is larger."""
-    stds = {}
-    for group, members in group_sides(angles.joints).items():
-        for k, name in enumerate(angles[next(iter(members.values()))].names):
-            each = [
-                float(np.degrees(finite_median(joint.std[samples & ~joint.hidden(k), k])))
-                for joint in (angles[member] for member in members.values())
-                if joint.std is not None
-            ]
-            if np.isfinite(each).any():
-                stds[f"{plain(group)} {plain(name)}"] = float(np.nanmax(each))
-    return stds
+    return f"**Good for** {listed(known)}.{least}"
 
 
 def _explain_no_covariance(tracked: TrackResult) -> str:
@@ -130,8 +136,8 @@ def _explain_no_covariance(tracked: TrackResult) -> str:
     )
 
 
-def _list_facts(tracked: TrackResult, measures: Measures) -> list[Item]:
-    recording = tracked.recording
+def _describe_recording(tracked: TrackResult, measures: Measures) -> str:
+    recording, time = tracked.recording, tracked.time
     text = (
         f"{_format_duration(float(recording.time[-1] - recording.time[0]))} at {measures.rate_hz:g} Hz from "
         f"{len(measures.signals)} sensors. Lengths: {plain(tracked.subject.note or tracked.subject.name)}. ± is one "
@@ -144,39 +150,33 @@ def _list_facts(tracked: TrackResult, measures: Measures) -> list[Item]:
             f" Angles and positions are shown for {len(recording)} samples, one in "
             f"{measures.samples / len(recording):.0f}; extremes, static phases and losses include all samples."
         )
-    before = float(tracked.time[np.argmax(find_samples_after_start(tracked))] - tracked.time[0])
+    before = float(time[np.argmax(find_samples_after_start(tracked))] - time[0])
     if before >= 1.0:
         text += (
             f" Each ± is of the time after the start pose; the {_format_duration(before)} before its end are left out."
         )
-    return [text]
+    return text
 
 
 def _list_recorded(tracked: TrackResult, measures: Measures) -> list[Item]:
-    recording, rate_hz = tracked.recording, tracked.recording.rate_hz
-    low, high = (f"{step:.2f}" for step in measures.steps_ms)
-    phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in recording.phases.items())
-    rows = []
+    rate_hz, rows = tracked.recording.rate_hz, []
+    phases = "; ".join(f"{name} {intervals(spans)}" for name, spans in tracked.recording.phases.items())
     for name, signal in measures.signals.items():
-        static = signal.static
-        cells = [
-            f"{np.degrees(signal.rate.max()):.0f} °/s",
-            *(f"{np.count_nonzero(mask) / rate_hz:.2f} s" for mask in (signal.cut, signal.gap)),
-            f"{100 * float(static.mean()):.0f} %" if static is not None else "",
-            f"{longest_run_s(~static, rate_hz):.0f} s" if static is not None else "",
-        ]
+        lost = [f"{np.count_nonzero(mask) / rate_hz:.2f} s" for mask in (signal.cut, signal.gap)]
+        static, biases = ["", ""], ["", "", ""]
+        if signal.static is not None:
+            static = [f"{100 * signal.static.mean():.0f} %", f"{longest_run_s(~signal.static, rate_hz):.0f} s"]
         if signal.bias is not None:
-            cells += [f"{np.degrees(np.linalg.norm(bias)):.2f} °/s" for bias in signal.bias]
-            cells.append(f"{signal.gravity:.3f} m/s²")
-        rows.append([plain(name), *cells])
+            biases = [f"{np.degrees(np.linalg.norm(bias)):.2f} °/s" for bias in signal.bias]
+            biases.append(f"{signal.gravity:.3f} m/s²")
+        rows.append([plain(name), f"{np.degrees(signal.rate.max()):.0f} °/s", *lost, *static, *biases])
     header = ["sensor", "fastest rotation", "saturated", "lost", "static", "longest motion"]
-    if any(signal.bias is not None for signal in measures.signals.values()):
-        header += ["bias at first", "bias at the end", "gravity"]
+    low, high = (f"{step:.2f}" for step in measures.steps_ms)
     return [
         f"{measures.samples} samples at {measures.rate_hz:g} Hz, one every {low if low == high else f'{low} to {high}'}"
         f" ms.{f' Phases: {phases}.' if phases else ''}",
         draw_timeline(tracked, measures.signals),
-        Table(header, [row + [""] * (len(header) - len(row)) for row in rows]),
+        Table("", [*header, "bias at first", "bias at the end", "gravity"], rows),
         "Saturated: an axis was at the end of its range, and the orientation lacks the rotation beyond it. While a "
         "sensor is static its gyroscope measures its bias, and the heading does not drift. An error of 0.1 °/s in the "
         f"bias rotates the heading by 6° in a minute. Gravity should measure 9.81 m/s², to {100 * GRAVITY_OFF:.0f} %.",
@@ -186,7 +186,7 @@ def _list_recorded(tracked: TrackResult, measures: Measures) -> list[Item]:
 def _list_drift(tracked: TrackResult, budgets: Mapping[str, Budget]) -> list[Item]:
     if not budgets:
         return [_explain_no_covariance(tracked)]
-    recording, correction = tracked.recording, tracked.correction
+    correction, table = tracked.correction, tracked.model.table
     after_start = find_samples_after_start(tracked)
     text = (
         "Gravity corrects the tilt. No sensor measures the heading, the rotation about the vertical: it is set in the "
@@ -199,19 +199,12 @@ def _list_drift(tracked: TrackResult, budgets: Mapping[str, Budget]) -> list[Ite
             f" By drift alone its uncertainty grows by up to {np.degrees(growth[fastest]):.1f}° in a minute of motion "
             f"(the {plain(fastest)}). {describe_heading_remedy(tracked)}"
         )
-    has_clasp = correction is not None and (correction.gap_rms_mm is not None or bool(correction.found_clasps))
     if correction is not None:
-        table = tracked.model.table
-        sources = ["accelerations of the joints"] * bool(correction.joint_accelerations)
-        sources += [f"{name}' hinges" for name in kinds(table, table.hinges)] + ["the joined hands"] * has_clasp
-        if sources:
-            text += (
-                f" The {listed(sources)} corrected the headings, by up to "
-                f"{max(correction.max_correction_deg.values(), default=0.0):.1f}°. This does not correct errors that "
-                "all segments share, such as the heading of the whole person."
-            )
-    unknown = [plain(name) for name in recording.sensors if name not in budgets]
-    text += f" The filter states no uncertainty: {listed(unknown)}." if unknown else ""
+        most = max(correction.max_correction_deg.values(), default=0.0)
+        text += (
+            f" What the joints and joined hands show corrected the headings by up to {most:.1f}°. This does not "
+            "correct errors that all segments share, such as the heading of the whole person."
+        )
     if has_stated_mounts(tracked):
         text += " A mount that is stated and not calibrated is as uncertain as people are off the start pose."
     stds = {name: budget.std for name, budget in budgets.items()}
@@ -220,100 +213,84 @@ def _list_drift(tracked: TrackResult, budgets: Mapping[str, Budget]) -> list[Ite
         ends = finite_median(std[after_start]), finite_max(std[after_start]), std[-1]
         rate = ""
         if name in budgets:
-            rate = f"{np.degrees(growth[name]):.2f} °/min" if name in growth else "never in motion"
-        rows.append([plain(name), *(degrees(float(np.degrees(each))) for each in ends), rate])
-    header = ["segment or joint", "median ±", "largest ±", "± at the end", "growth in motion, filter alone"]
+            rate = number(float(np.degrees(growth.get(name, np.nan))), 2, " °/min", unknown="never in motion")
+        rows.append([plain(name), *(number(float(np.degrees(each)), 1, "°") for each in ends), rate])
     figure = draw_over_time(
         tracked.time,
         {"heading, ± [°]": {name: np.degrees(std) for name, std in stds.items()}},
         "Uncertainty of each heading: one standard deviation, with mounts, start pose and soft tissue.",
-        _style_segments(budgets, tracked.model.table),
-        spans=("hands joined", recording.phases.get("clasp", ()) if has_clasp else ()),
+        _style_segments(budgets, table),
+        spans=("clasp", tracked.recording.phases.get("clasp", ())),
     )
-    text += " A joint has the errors of both its segments, here taken as independent."
-    return [text, figure, Table(header, rows)]
+    header = ["segment or joint", "median ±", "largest ±", "± at the end", "growth in motion, filter alone"]
+    return [text, figure, Table("", header, rows)]
 
 
 def _list_tips(tracked: TrackResult, measures: Measures) -> list[Item]:
-    table, after_start = tracked.model.table, find_samples_after_start(tracked)
-    groups = group_tips(measures.tips, table, tracked.subject.lengths)
+    after_start = find_samples_after_start(tracked)
+    groups = group_tips(measures.tips, tracked.model.table)
     if not groups:
         return []
-    items: list[Item] = list(draw_tips(tracked.time, groups, table).values())
+    items: list[Item] = list(draw_tips(tracked.time, groups, tracked.model.table).values())
     for group in groups:
         rows = []
         for name, tip in group.tips.items():
             low, high = np.nanpercentile(100 * tip.reach, [1.0, 99.0], axis=0)
-            stds = [
-                pick(tip.std[after_start]) if tip.std is not None else np.nan for pick in (finite_median, finite_max)
-            ]
-            ranges = [f"{whole(a)} to {whole(b)}" for a, b in zip(low, high, strict=True)]
-            known = [f"± {whole(1e3 * std)} mm" if np.isfinite(std) else "not known" for std in stds]
+            stds = (
+                [1e3 * pick(tip.std[after_start]) for pick in (finite_median, finite_max)]
+                if tip.std is not None
+                else ()
+            )
+            ranges = [f"{number(a, 0)} to {number(b, 0)}" for a, b in zip(low, high, strict=True)]
+            known = [f"± {std:.0f} mm" if np.isfinite(std) else "not known" for std in stds or (np.nan, np.nan)]
             rows.append([plain(name), *ranges, f"{tip.peak_speed:.1f} m/s", *known])
-        points = capital(listed([plain(name) for name in group.tips]))
-        items.append(f"{points}, from {group.start} along {group.frame}:")
-        header = ["", "forwards [cm]", "to the left [cm]", f"above {group.origin} [cm]"]
-        items.append(Table([*header, "highest speed", "median ±", "largest ±"], rows))
+        title = f"The {group.nouns}, from {group.start} along {group.frame}"
+        items.append(Table(title, ["", *AXES, "highest speed", "median ±", "largest ±"], rows))
     items.append(
         "Ranges hold 98 % of the time; the highest speed is the mean of a tenth of a second. The ± is of one axis, "
-        f"relative to {_name_root(table)}, and includes the lean and the lengths of all that lies between."
+        "relative to the root, and includes the lean and the lengths of all that lies between."
     )
-    sources = {point: group_by_source(parts) for point, parts in measures.error_budget.items()}
-    if sources:
-        header = ["", *(f"{source} [mm]" for source in next(iter(sources.values())))]
-        rows = [[plain(point), *(whole(1e3 * std) for std in each.values())] for point, each in sources.items()]
-        items += [
-            "What it is made of, root mean square over the recording; the parts add up in squares. Soft tissue, start "
-            "poses and the shoulder girdle are as in the literature, not measured on this person.",
-            Table(header, rows),
-        ]
+    items += tabulate_error_budget(measures.error_budget)
     return items
 
 
-def _list_angles(tracked: TrackResult, angles: Angles | None) -> list[Item]:
-    if angles is None:
-        return []
+def tabulate_error_budget(budget: Mapping[str, Mapping[str, float]]) -> list[Table]:
+    """The share of each source of error in the ± of each point; none where no ± is known."""
+    sources = {point: group_by_source(parts) for point, parts in budget.items()}
+    rows = [[plain(point), *(number(1e3 * std, 0) for std in each.values())] for point, each in sources.items()]
+    title = "What the ± is made of: root mean square of an axis; the parts add up in squares"
+    return [Table(title, ["", *(f"{source} [mm]" for source in next(iter(sources.values())))], rows)] if rows else []
+
+
+def _list_angles(tracked: TrackResult, angles: Angles) -> list[Item]:
     rows = []
     for joint, ranges in summary(angles).items():
         stds = angles[joint].std
         for k, name in enumerate(angles[joint].names):
             std = np.degrees(finite_median(stds[:, k])) if stds is not None else np.nan
-            ends = [f"{whole(np.degrees(value))}°" for value in (ranges.lowest[k], ranges.highest[k], ranges.range[k])]
-            if not np.isfinite(ranges.range[k]):
-                ends = ["", "", ""]  # every sample is in a gap or near the lock, as of an arm that hangs
-            elif ranges.range[k] >= FULL_TURN and ranges.near_lock:
+            ends = [
+                number(np.degrees(each[k]), 0, "°", unknown="")
+                for each in (ranges.lowest, ranges.highest, ranges.range)
+            ]
+            if np.isfinite(ranges.range[k]) and ranges.range[k] >= FULL_TURN and ranges.near_lock:
                 ends = ["", "", "all round"]
-            rows.append(
-                [
-                    f"{plain(joint)}, {plain(name)}",
-                    *ends,
-                    f"{np.degrees(ranges.peak_rate[k]):.0f} °/s" if np.isfinite(ranges.peak_rate[k]) else "",
-                    f"± {std:.1f}°" if np.isfinite(std) else "not known",
-                    f"{100 * ranges.near_lock:.0f} %" if k != 1 else "",
-                ]
-            )
-    stated = (
-        " The start pose counts as the exact N-pose: elbows that were bent by 10° in it read 10° too little."
-        if has_stated_mounts(tracked)
-        else ""
-    )
+            rate = number(np.degrees(ranges.peak_rate[k]), 0, " °/s", unknown="")
+            near_lock = f"{100 * ranges.near_lock:.0f} %" if k != 1 else ""
+            known = f"± {std:.1f}°" if np.isfinite(std) else "not known"
+            rows.append([f"{plain(joint)}, {plain(name)}", *ends, rate, known, near_lock])
+    stated = " The start pose counts as the exact N-pose: elbows that were bent by 10° in it read 10° too little."
     return [
         "After the International Society of Biomechanics (Wu 2005), left and right with the same signs. Elevation "
-        f"is negative where the arm is raised, and pronation is 90° with the palms at the thighs.{stated}",
+        "is negative where the arm is raised, and pronation is 90° with the palms at the thighs."
+        f"{stated if has_stated_mounts(tracked) else ''}",
         draw_joint_angles(angles),
-        Table(["angle", "lowest", "highest", "range", "peak rate", "median ±", "near gimbal lock"], rows),
+        Table("", ["angle", "lowest", "highest", "range", "peak rate", "median ±", "near gimbal lock"], rows),
         "Near gimbal lock (10°) the first and the third angle of a joint are not separable and are left out; the "
         "quaternions in pose.parquet have no such singularity.",
     ]
 
 
-def _list_view(tracked: TrackResult, view: str | None) -> list[Item]:
-    if view is not None and len(view) <= LARGEST_VIEW:
-        return [Frame(view)]
-    return [show_motion(tracked.model, tracked.pose, tracked.recording.phases, tracked.recording.name)]
-
-
-def _list_run(tracked: TrackResult) -> list[Item]:
+def _tabulate_run(tracked: TrackResult) -> Table:
     recording, subject = tracked.recording, tracked.subject
     rows = [
         ("recording", recording.name + (f", {recording.source.name}" if recording.source else "")),
@@ -325,10 +302,21 @@ def _list_run(tracked: TrackResult) -> list[Item]:
         ("mounts", "as the session states them" if has_stated_mounts(tracked) else "as calibrated"),
         ("body model", tracked.model.robot.name),
     ]
-    return [Facts(rows)]
+    return Table("", (), rows)
 
 
 # Figures --------------------------------------------------------------------------------------------------------------
+
+
+def draw_figures(result: TrackResult) -> Figures:
+    """Draw the paths of the hands and their reach, and the joint angles, of what is known; as `TrackResult.plot`."""
+    figures, table = Figures(), result.model.table
+    tips = measure_tips(result.pose, result.rate_hz, table) if len(result.time) > 1 else {}
+    if tips:
+        figures |= draw_tips(result.time, group_tips(tips, table), table)
+    with contextlib.suppress(BadData):  # no joint has both of its segments
+        figures["angles"] = draw_joint_angles(joint_angles(result.pose, AUTO))
+    return figures
 
 
 @styled
@@ -374,42 +362,25 @@ class TipGroup(NamedTuple):
     ----------
     tips : point → its motion
     nouns : what the points are on, as "hands"
-    origin, start : what the limbs hang at, as "shoulders", and where a reach begins, as "the middle of the shoulders"
+    start : where a reach begins, as "the middle of the shoulders"
     frame : whose axes its coordinates are along, in words
-    width, trunk : [m] between the points at which they hang, and from the root to their middle; None: no such length
     """
 
     tips: Mapping[str, TipMotion]
     nouns: str
-    origin: str
     start: str
     frame: str
-    width: float | None
-    trunk: float | None
 
 
-def group_tips(tips: Mapping[str, TipMotion], table: BodyTable, lengths: Mapping[str, float]) -> list[TipGroup]:
-    """The tips by the points at which their limbs hang; `lengths` [m] are the person's."""
+def group_tips(tips: Mapping[str, TipMotion], table: BodyTable) -> list[TipGroup]:
+    """The tips by the points at which their limbs hang."""
     limbs, groups = table.drawn_limbs, []
     for origin in dict.fromkeys(limbs[name].origin for name in tips):
-        names = [name for name in tips if limbs[name].origin == origin]
-        width, trunk = (lengths.get(table.find_length(*points) or "") for points in (origin, (ROOT, *origin)))
-        nouns = listed(kinds(table, [(limbs[name].segments or (name,))[-1] for name in names]))
-        hangs_at, start = plain(table.shared_name(origin[0])), "the "
-        if len(origin) > 1:
-            hangs_at, start = plural(hangs_at), "the middle of the "
-        base = limbs[names[0]].base
-        groups.append(
-            TipGroup(
-                {name: tips[name] for name in names},
-                nouns,
-                hangs_at,
-                start + hangs_at,
-                f"the {plain(base)}'s own axes" if base else "the axes of W",
-                width,
-                trunk,
-            )
-        )
+        own = {name: tip for name, tip in tips.items() if limbs[name].origin == origin}
+        nouns = listed(kinds(table, [(limbs[name].segments or (name,))[-1] for name in own]))
+        start, base = plain(table.shared_name(origin[0])), limbs[next(iter(own))].base
+        start = f"the middle of the {plural(start)}" if len(origin) > 1 else f"the {start}"
+        groups.append(TipGroup(own, nouns, start, f"the {plain(base)}'s own axes" if base else "the axes of W"))
     return groups
 
 
@@ -422,12 +393,19 @@ def draw_tips(time: np.ndarray, groups: Sequence[TipGroup], table: BodyTable) ->
     panels: dict[str, dict[str, np.ndarray]] = {}
     for axes, group in zip(paths.grid(len(groups), 3), groups, strict=True):
         styles |= {name: line_style(name, table.side(name)) for name in group.tips}
-        for ax, across, up in set_up_views(axes, group.width, group.trunk, group.origin):
+        for ax, (view, across, up) in zip(axes, VIEWS, strict=True):
+            ax.set_title(view)
+            ax.set_xlabel(AXES[across])
+            ax.set_ylabel(AXES[up], labelpad=1)
+            ax.set_aspect("equal", adjustable="datalim")
+            ax.margins(0.05)
+            ax.invert_xaxis() if view == "from above" else None
+            ax.plot(0.0, 0.0, "+", color=SOFT, markersize=10, label=group.start)
             for name, tip in group.tips.items():
                 at = 100.0 * tip.reach[:: max(1, len(tip.reach) // PATH_POINTS)][:, [across, up]]
                 ax.plot(at[:, 0], at[:, 1], **{**styles[name], "linewidth": 0.7})
                 ax.plot(at[:1, 0], at[:1, 1], "s" if table.side(name) == "right" else "o", color=styles[name]["color"])
-        for k, label in enumerate(("forwards [cm]", "to the left [cm]", f"above the {group.origin} [cm]")):
+        for k, label in enumerate(AXES):
             title = label if len(groups) == 1 else f"{group.nouns}: {label}"
             panels[title] = {name: 100.0 * tip.reach[:, k] for name, tip in group.tips.items()}
     paths.add_legend()
@@ -443,25 +421,9 @@ def _style_segments(names: Iterable[str], table: BodyTable) -> dict[str, dict[st
     return {name: line_style(name, table.side(name), rank) for name, rank in ranks.items()}
 
 
-def _find_joint_angles(tracked: TrackResult) -> Angles | None:
-    """The joint angles; None where no joint has both of its segments."""
-    try:
-        return joint_angles(tracked.pose, AUTO)
-    except BadData:
-        return None
-
-
-# Words ----------------------------------------------------------------------------------------------------------------
-
-
 def _name_tips(table: BodyTable) -> str:
-    """Return what the points whose path is drawn are on, as "hands"."""
+    """What the points whose path is drawn are on, as "hands"."""
     return listed(kinds(table, [(limb.segments or (name,))[-1] for name, limb in table.drawn_limbs.items()]))
-
-
-def _name_root(table: BodyTable) -> str:
-    """Return what the origin of W is."""
-    return "the root" if table.is_mechanism else "the middle of the hips"
 
 
 def _format_duration(seconds: float) -> str:

@@ -8,7 +8,6 @@ as keyframes, minutes would be tens of megabytes.
 from __future__ import annotations
 
 import base64
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import distribution
 from itertools import product
@@ -19,10 +18,12 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
+from ..angles import AUTO, joint_angles
 from ..body import BodyModel, Visual
 from ..body.configuration import solve_configuration
 from ..body.kinematics import Pose
 from ..body.links import compute_link_placements, find_known_links
+from ..errors import BadData
 from .page import Frame, load_template
 
 if TYPE_CHECKING:
@@ -30,12 +31,9 @@ if TYPE_CHECKING:
 
 FLOOR_Z = -0.93  # [m] the ground in W, whose origin is between the hips, of a body without feet
 FEET_Z = -0.6  # [m] below which a point of a person is at a foot
-GRID_CELL = 0.25  # [m]
-GRID_RADIUS = 3.0  # [m] where the grid has faded away
 CAMERA_FROM = (2.1, 1.25, 0.55)  # direction from the person to the camera in W: front-left, slightly above
 FRAMES_A_SECOND, MOST_FRAMES = 20.0, 5000  # of a motion inside a report
-_SPARSE = 30  # frames a sample, on average, from which on all samples are frames
-MOST_POSES = 150  # by which the camera is placed
+MOST_POSES, DIRECTIONS = 150, 100  # by which the camera is placed
 FIELD_OF_VIEW_DEG = 28.0  # a long lens: near hands do not look larger than they are
 LIGHTS = (  # meshcat's own; positions in W [m]
     ("AmbientLight", 0.66, None),
@@ -90,20 +88,30 @@ def pose_html(
     """
     frames = frame_indices(pose.time, fps)
     visuals, placed = _place_body(model, pose, frames)
+    paths = [name for name in model.table.paths if name in pose.points]
     return view_html(
         visuals,
         pose.time[frames],
         placed,
-        trails={
-            name: Trail(pose.points[name][frames], choose_trail_colour(name, model))
-            for name in model.table.paths
-            if name in pose.points
-        },
+        trails={name: Trail(pose.points[name][frames], choose_trail_colour(name, model)) for name in paths},
+        angles=_compute_angles(pose.cut(frames)),
         phases=phases,
         title=title,
-        fps=fps,
         floor_z=find_floor(model),
     )
+
+
+def _compute_angles(pose: Pose) -> dict[str, np.ndarray]:
+    """Joint and angle in words → values (n,) [deg], NaN where an angle is not determined."""
+    try:
+        joints = joint_angles(pose, AUTO).joints
+    except BadData:  # no joint has both of its segments
+        return {}
+    return {
+        f"{joint} {name}".replace("_", " "): np.degrees(np.where(each.hidden(k), np.nan, each.values[:, k]))
+        for joint, each in joints.items()
+        for k, name in enumerate(each.names)
+    }
 
 
 def _place_body(
@@ -179,7 +187,6 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
         trails=trails,
         phases={"approach": [(0.0, float(trajectory.time[trajectory.approach_samples]))]},
         title=title,
-        fps=fps,
         floor_z=floor_z,
     )
 
@@ -191,9 +198,9 @@ def view_html(
     *,
     meshes: Sequence[Mesh] = (),
     trails: Mapping[str, Trail] | None = None,
+    angles: Mapping[str, np.ndarray] | None = None,
     phases: Mapping[str, Sequence[tuple[float, float]]] | None = None,
     title: str = "",
-    fps: float = 30.0,
     floor_z: float = FLOOR_Z,
 ) -> str:
     """The page that plays a motion, to open in any browser; equal arguments give equal text.
@@ -207,38 +214,34 @@ def view_html(
     placements : link → (quat_WL (n, 4) xyzw, p_WL (n, 3) [m]); a link is hidden while its placement is NaN
     meshes : more shapes of links
     trails : point → its way
+    angles : name → (n,) [deg], shown beside the body
     phases : name → spans (begin, end) [s]
     title : plain text; shown, and the name of the window
-    fps : frames a second in the page: the nearest samples, none made up; a slower recording stays as it is
     floor_z : height [m] of the ground grid in W
-
     """
     time = np.asarray(time, dtype=float)
-    frames = frame_indices(time, fps)
-    ways = {name: np.asarray(trail.points, dtype=float)[frames] for name, trail in (trails or {}).items()}
+    trails = trails or {}
     drawn = visible(v for v in visuals if v.link in placements)
     meshes = [mesh for mesh in meshes if mesh.link in placements]
     links = list(dict.fromkeys([*(v.link for v in drawn), *(mesh.link for mesh in meshes)]))
-    motion = np.empty((len(links), len(frames), 7), dtype="<f4")  # quat_WL xyzw, p_WL
+    motion = np.empty((len(links), len(time), 7), dtype="<f4")  # quat_WL xyzw, p_WL
     for k, link in enumerate(links):
-        quat_WL, p_WL = placements[link]
-        motion[k, :, :4], motion[k, :, 4:] = np.asarray(quat_WL)[frames], np.asarray(p_WL)[frames]
-
+        motion[k, :, :4], motion[k, :, 4:] = placements[link]
     data = {
         "begin": float(time[0]),
         "end": float(time[-1]),
-        "offsets": _base64(time[frames] - time[0]),  # float32 holds an offset, not seconds since 1970
+        "offsets": _base64(time - time[0]),  # float32 holds an offset, not seconds since 1970
         "links": links,
         "motion": _base64(motion),
         "trails": [
-            {"name": name, "colour": trail.colour, "points": _base64(ways[name])}
-            for name, trail in (trails or {}).items()
+            {"name": name, "colour": trail.colour, "points": _base64(trail.points)} for name, trail in trails.items()
         ],
+        "angles": [{"name": name, "values": _base64(values)} for name, values in (angles or {}).items()],
         "phases": [
             {"name": name, "spans": [[float(begin), float(end)] for begin, end in spans]}
             for name, spans in (phases or {}).items()
         ],
-        "view": view([*drawn, *map(_box_of, meshes)], links, motion, list(ways.values())),
+        "view": view([*drawn, *map(_box_of, meshes)], links, motion, [trail.points for trail in trails.values()]),
         "scene": scene(drawn, links, meshes),
         "backdrop": backdrop(LIGHT, floor_z),
     }
@@ -255,19 +258,13 @@ def visible(visuals: Iterable[Visual]) -> list[Visual]:
     drawn = [v for v in visuals if v.kind != "mesh"]
     if drawn and max(max(v.rgba[:3]) for v in drawn) < 0.3:
         # A body without colours of its own (human-gazebo: 0.1 grey) would be a silhouette.
-        drawn = [_lighten(v) for v in drawn]
+        rgba = [(0.4 + 0.6 * r, 0.4 + 0.6 * g, 0.4 + 0.6 * b, opacity) for r, g, b, opacity in (v.rgba for v in drawn)]
+        drawn = [v._replace(rgba=own) for v, own in zip(drawn, rgba, strict=True)]
     return drawn
-
-
-def _lighten(visual: Visual) -> Visual:
-    red, green, blue, alpha = visual.rgba
-    return visual._replace(rgba=(0.4 + 0.6 * red, 0.4 + 0.6 * green, 0.4 + 0.6 * blue, alpha))
 
 
 def frame_indices(time: np.ndarray, fps: float) -> np.ndarray:
     """(m,) int, rising: the samples nearest to a clock of `fps` a second, with the first and the last."""
-    if (time[-1] - time[0]) * fps > _SPARSE * len(time):  # a jump in time would give too many frames
-        return np.arange(len(time))
     clock = np.append(np.arange(time[0], time[-1], 1.0 / fps), time[-1])
     nearest_changes = 0.5 * (time[:-1] + time[1:])
     return np.unique(np.searchsorted(nearest_changes, clock))
@@ -303,13 +300,7 @@ def scene(drawn: Sequence[Visual], links: Sequence[str], meshes: Sequence[Mesh] 
 
 def backdrop(colours: Backdrop, floor_z: float = FLOOR_Z) -> dict[str, Any]:
     """Background and ground grid as static/viewer.js builds them."""
-    points, vertex_colours = _grid(colours, floor_z)
-    return {
-        "top": colours.top,
-        "bottom": colours.bottom,
-        "points": _base64(points),
-        "colours": _base64(vertex_colours),
-    }
+    return {**colours._asdict(), "floor": floor_z}
 
 
 def _box_of(mesh: Mesh) -> Visual:
@@ -319,49 +310,28 @@ def _box_of(mesh: Mesh) -> Visual:
     return Visual(mesh.link, "box", size, np.array([0.0, 0.0, 0.0, 1.0]), 0.5 * (low + high), mesh.rgba)
 
 
-def _grid(colours: Backdrop, floor_z: float) -> tuple[np.ndarray, np.ndarray]:
-    """The ends of the ground's line pieces and their colours, each (m, 3); it fades into the background."""
-    ticks = np.arange(-GRID_RADIUS, GRID_RADIUS + GRID_CELL / 2, GRID_CELL)
-    x, y = np.meshgrid(ticks, ticks[:-1], indexing="ij")
-    start, end = np.stack([x, y]).reshape(2, -1), np.stack([x, y + GRID_CELL]).reshape(2, -1)
-    along_y = np.stack([start, end], axis=2).reshape(2, -1)  # start, end, start, end, …
-    xy = np.concatenate([along_y, along_y[::-1]], axis=1)
-    points = np.vstack([xy, np.full(xy.shape[1], floor_z)])
-    fade = np.clip(np.hypot(*xy) / GRID_RADIUS, 0.0, 1.0)
-    near, far = np.array(colours.grid)[:, None], np.array(colours.bottom)[:, None]
-    return points.T, (near + fade * (far - near)).T
-
-
 def view(
     visuals: Sequence[Visual], links: Sequence[str], motion: np.ndarray, trails: Sequence[np.ndarray]
 ) -> dict[str, Any]:
-    """The camera's axes in W (right, up, toward it) and, along them, the motion's outermost points [m]."""
-    toward = np.array(CAMERA_FROM) / np.linalg.norm(CAMERA_FROM)
-    right = np.cross([0.0, 0.0, 1.0], toward)
-    right /= np.linalg.norm(right)
-    R_WC = np.stack([right, np.cross(toward, right), toward], axis=1)
-    motion = motion[:, :: max(1, motion.shape[1] // MOST_POSES)].astype(float)
-    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
-    fan = np.column_stack([np.cos(angle), np.sin(angle)])
+    """What the camera shows: the direction from which it looks at first, and the motion's outermost points [m] in W."""
+    k = np.arange(DIRECTIONS) + 0.5  # evenly over the sphere
+    height, angle = 1.0 - 2.0 * k / DIRECTIONS, k * np.pi * (1.0 + 5.0**0.5)
+    directions = np.stack([np.cos(angle), np.sin(angle)]) * np.sqrt(1.0 - height**2)
+    directions = np.vstack([directions, height])
 
-    def outermost(points_C: np.ndarray) -> np.ndarray:
-        """The points (n, 3) that lie outermost, seen along the view or from above."""
-        points_C = points_C[np.isfinite(points_C).all(axis=1)]
-        if not len(points_C):
-            return points_C
-        planes = points_C[:, [0, 2]], points_C[:, [1, 2]]
-        return points_C[np.unique([int(np.argmax(plane @ direction)) for plane in planes for direction in fan])]
+    def find_outermost(points_W: np.ndarray) -> np.ndarray:
+        points_W = points_W[np.isfinite(points_W).all(axis=1)]
+        return points_W[np.unique(np.argmax(points_W @ directions, axis=0))] if len(points_W) else points_W
 
-    seen_W = [np.zeros((1, 3)), *(trail[:: max(1, len(trail) // (4 * MOST_POSES))] for trail in trails)]
-    seen_C = [outermost(points_W @ R_WC) for points_W in seen_W]
-    for link, placed in zip(links, motion, strict=True):
+    points_W = [np.zeros((1, 3)), *(trail[:: max(1, len(trail) // (4 * MOST_POSES))] for trail in trails)]
+    for link, placed in zip(links, motion[:, :: max(1, motion.shape[1] // MOST_POSES)].astype(float), strict=True):
         placed = placed[np.isfinite(placed).all(axis=1)]
         corners_L = [_corners(visual) for visual in visuals if visual.link == link]
         if len(placed):
             R_WL = Rotation.from_quat(placed[:, :4]).as_matrix()
             corners_W = np.concatenate(corners_L) @ R_WL.swapaxes(1, 2) + placed[:, None, 4:]
-            seen_C.append(outermost(corners_W.reshape(-1, 3) @ R_WC))
-    return {"axes": R_WC.T.tolist(), "points": np.round(outermost(np.concatenate(seen_C)), 4).tolist()}
+            points_W.append(find_outermost(corners_W.reshape(-1, 3)))
+    return {"toward": CAMERA_FROM, "points": np.round(find_outermost(np.concatenate(points_W)), 4).tolist()}
 
 
 def _corners(visual: Visual) -> np.ndarray:
@@ -375,24 +345,8 @@ def _corners(visual: Visual) -> np.ndarray:
 
 
 def choose_trail_colour(point: str, model: BodyModel) -> str:
-    """The colour of most visuals of a point's limb, its tip left out, where the other side has another; else ours."""
-    other = model.table.counterpart(point)
-    if other is None:
-        return OTHER_COLOUR
-    own, others = (_find_limb_colour(name, model) for name in (point, other))
-    if own and own != others:
-        return "#" + "".join(f"{round(255 * c):02x}" for c in own[:3])
-    return LEFT_COLOUR if model.table.side(point) == "left" else RIGHT_COLOUR
-
-
-def _find_limb_colour(point: str, model: BodyModel) -> tuple[float, ...]:
-    """The colour that most visuals of a point's limb have; empty where there is none."""
-    limb = model.table.find_limb(point)
-    chains = [model.chains[segment] for segment in limb.segments[:-1]] if limb is not None else []
-    joints = {joint for chain in chains for joint in chain.joints}
-    m = model.pin
-    colours = (v.rgba[:3] for v in visible(model.visuals) if m.frames[m.getFrameId(v.link)].parentJoint in joints)
-    return next((colour for colour, _ in Counter(colours).most_common(1)), ())
+    """The colour of a point's side."""
+    return {"left": LEFT_COLOUR, "right": RIGHT_COLOUR}.get(model.table.side(point) or "", OTHER_COLOUR)
 
 
 def _meshcat_source() -> Markup:

@@ -1,24 +1,31 @@
-"""Words of the reports: names, numbers with their units, lists."""
+"""Words of the reports: names, numbers with their units, lists; and tables, which commands print as pages show them."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ..body import BodyTable
 from ..recording import format_span
-from ..writers.result import versions as package_versions
+
+
+class Table(NamedTuple):
+    """A table; a cell may hold `code` and **bold**."""
+
+    title: str
+    header: Sequence[str]  # empty: names and values
+    rows: Sequence[Sequence[str]]
+
+    @property
+    def longest(self) -> int:
+        """Letters of its longest cell: where those are sentences, columns are set to the left and may break."""
+        return max((len(cell) for row in self.rows for cell in row), default=0)
 
 
 def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
-
-
-def slug(text: str) -> str:
-    """A name as a file's or an anchor's: "upper body, realistic" → "upper-body-realistic"."""
-    return re.sub(r"[^a-z0-9]+", "-", text.lower().replace("'", "")).strip("-") or "experiment"
 
 
 def plain(name: str) -> str:
@@ -41,36 +48,20 @@ def listed(parts: Sequence[str]) -> str:
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 
 
-def degrees(value: float) -> str:
-    """An angle in degrees, to a tenth."""
-    return f"{value:.1f}°" if np.isfinite(value) else "not known"
-
-
 def intervals(spans: Sequence[tuple[float, float]]) -> str:
     """Intervals [s]."""
     return ", ".join(map(format_span, spans))
 
 
-def plus_minus(value: float, std: float, unit: str, digits: int = 1) -> str:
-    """A number with its standard deviation and its unit."""
+def number(value: float, digits: int = 1, unit: str = "", sign: str = "", unknown: str = "not known") -> str:
+    """A number with its unit, its minus a minus; `sign` "+": with its sign."""
     if not np.isfinite(value):
-        return "not known"
-    text = f"{value:.{digits}f}"
-    return f"{text} ± {std:.{digits}f} {unit}" if np.isfinite(std) else f"{text} {unit}, ± not known"
+        return unknown
+    rounded = round(float(value), digits) + 0.0  # no minus zero
+    return f"{rounded:{sign if rounded else ''}.{digits}f}".replace("-", "−") + unit
 
 
-def signed(value: float) -> str:
-    """A number with its sign, to a tenth."""
-    if not np.isfinite(value):
-        return "not known"
-    return f"{value:+.1f}".replace("-", "−") if abs(value) >= 0.05 else "0.0"
-
-
-def whole(value: float) -> str:
-    """A number without decimals, its minus a minus."""
-    return f"{round(float(value)):d}".replace("-", "−") if np.isfinite(value) else "not known"
-
-
-def versions() -> str:
-    """What a report was made with."""
-    return ", ".join(f"{name} {number}" for name, number in package_versions().items())
+def plus_minus(value: float, std: float, unit: str = "", digits: int = 1) -> str:
+    """A number with its standard deviation, where it is known, and its unit."""
+    known = f" ± {std:.{digits}f}" if np.isfinite(value) and np.isfinite(std) else ""
+    return number(value, digits, f"{known}{unit}")

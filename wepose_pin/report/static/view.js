@@ -69,7 +69,9 @@ class Trail {
 const trails = data.trails.map((trail) => new Trail(trail));
 
 // ---- the camera
-const fit = () => fitCamera(viewer, stage, data.view, 80);
+const VIEWS = { Front: [1, 0, 0.05], Side: [0, -1, 0.05], Top: [-0.001, 0, 1] };   // from where, in W
+let from = data.view.toward;
+const fit = () => fitCamera(viewer, stage, data.view, 80, from);
 let moved = false;                                                       // by the user: then a resize leaves it alone
 viewer.controls.addEventListener("start", () => { moved = true; });
 new ResizeObserver(() => { viewer.set_3d_pane_size(); if (!moved) fit(); }).observe(stage);
@@ -103,9 +105,23 @@ SPEEDS.forEach((value) => {
   $("speeds").append(button);
 });
 $("trails").hidden = trails.length === 0;
+Object.entries(VIEWS).forEach(([name, direction]) => {
+  const button = document.createElement("button");
+  button.textContent = name;
+  button.addEventListener("click", () => { from = direction; moved = false; fit(); });
+  $("views").append(button);
+});
+const angles = data.angles.map(({ name, values }) => {
+  const row = $("angles").insertRow();
+  row.insertCell().textContent = name;
+  return { values: floats(values), cell: row.insertCell() };
+});
+$("anglesShown").hidden = angles.length === 0;
 
 function show() {
   pose(now);
+  const k = frameAt(now);
+  angles.forEach(({ values, cell }) => { cell.textContent = isFinite(values[k]) ? `${Math.round(values[k])}°` : "–"; });
   slider.value = now;
   slider.setAttribute("aria-valuetext", `${(data.begin + now).toFixed(digits)} s`);
   $("past").style.width = share(now);
@@ -129,7 +145,11 @@ function step(seconds) { api.pause(); api.seek(api.time() + seconds); }
 const frame = n > 1 ? span / (n - 1) : 0;
 $("play").addEventListener("click", () => (playing ? api.pause() : api.play()));
 $("trails").addEventListener("click", () => { trailsShown = !trailsShown; show(); });
-$("reset").addEventListener("click", () => { moved = false; fit(); });
+$("anglesShown").addEventListener("click", () => {
+  $("angles").hidden = !$("angles").hidden;
+  $("anglesShown").setAttribute("aria-pressed", !$("angles").hidden);
+});
+$("reset").addEventListener("click", () => { from = data.view.toward; moved = false; fit(); });
 slider.addEventListener("input", () => { now = Number(slider.value); show(); });
 addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey) return;

@@ -63,13 +63,25 @@ function buildScene(viewer, scene, links) {
   return links.map((_, k) => viewer.scene_tree.find(["meshcat", "body", String(k)]).object);
 }
 
-// Background and ground grid, in place of those before.
-function setBackdrop(viewer, { top, bottom, points, colours }) {
+// Background and ground grid, which fades into it, in place of those before.
+const GRID_CELL = 0.25, GRID_RADIUS = 3;                                 // [m]
+function setBackdrop(viewer, { top, bottom, grid, floor }) {
   viewer.set_property(["Background"], "top_color", top);
   viewer.set_property(["Background"], "bottom_color", bottom);
+  const points = [], colours = [];
+  const add = (x, y) => {
+    const share = Math.min(Math.hypot(x, y) / GRID_RADIUS, 1);
+    points.push(x, y, floor);
+    colours.push(...grid.map((near, k) => near + share * (bottom[k] - near)));
+  };
+  for (let a = -GRID_RADIUS; a <= GRID_RADIUS; a += GRID_CELL) {
+    for (let b = -GRID_RADIUS; b < GRID_RADIUS; b += GRID_CELL) {
+      add(a, b); add(a, b + GRID_CELL); add(b, a); add(b + GRID_CELL, a);
+    }
+  }
   const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(floats(points), 3));
-  geometry.setAttribute("color", new THREE.BufferAttribute(floats(colours), 3));
+  geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
+  geometry.setAttribute("color", new THREE.Float32BufferAttribute(colours, 3));
   viewer.set_object(["meshcat", "ground"], new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ vertexColors: true })));
   viewer.set_dirty();
 }
@@ -117,14 +129,17 @@ class Ribbon {
   }
 }
 
-// The camera as near as it can be with every point of the motion in the picture; headroom [px] for a title.
-function fitCamera(viewer, stage, view, headroom) {
-  const axes = view.axes.map((axis) => new THREE.Vector3(...axis));      // right, up, toward the camera, in W
+// The camera as near as it can be with every point of the motion in the picture, seen from a direction in W; headroom
+// [px] for a title.
+function fitCamera(viewer, stage, view, headroom, from = view.toward) {
+  const toward = new THREE.Vector3(...from).normalize(), across = new THREE.Vector3(0, 0, 1).cross(toward).normalize();
+  const axes = [across, toward.clone().cross(across), toward];            // right, up, toward the camera, in W
+  const points = view.points.map((point) => axes.map((axis) => axis.dot(new THREE.Vector3(...point))));
   const tall = 0.96 * Math.tan(THREE.MathUtils.degToRad(viewer.camera.fov / 2));
   const wide = tall * stage.clientWidth / stage.clientHeight;
   const tallUp = tall * (1 - Math.min(headroom / stage.clientHeight, 0.5));
   // A point (x, y, z) shows when |x - x0| <= wide (d - z), and so on: the camera stands at (x0, y0, d).
-  const most = (f) => Math.max(...view.points.map(f)), least = (f) => Math.min(...view.points.map(f));
+  const most = (f) => Math.max(...points.map(f)), least = (f) => Math.min(...points.map(f));
   const right = most(([x, , z]) => x + wide * z), left = least(([x, , z]) => x - wide * z);
   const top = most(([, y, z]) => y + tallUp * z), bottom = least(([, y, z]) => y - tall * z);
   const d = Math.max((right - left) / (2 * wide), (top - bottom) / (tall + tallUp));
