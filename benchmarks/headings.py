@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from wepose_pin.recording import Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MILD_PRESET, PEOPLE_PRESET, Imperfections, Simulation, simulate, simulate_person
-from wepose_pin.simulation.sequence import TASKS
+from wepose_pin.simulation.motion import TASKS
 from wepose_pin.tracking import TrackResult, track
 
 from .free_motion import FreeMotion
@@ -78,10 +78,10 @@ def measure_headings(name: str, preset: Imperfections, persons: int, seconds: fl
 
 def simulate_free_motion(seed: int, preset: Imperfections, seconds: float) -> Simulation:
     """Simulate a person whose hands move at random, each by itself."""
-    TASKS.setdefault(FreeMotion.phase, FreeMotion)
+    TASKS.setdefault(FreeMotion.name, FreeMotion)
     person = simulate_person(seed)
     return simulate(
-        person.lengths, seed=seed, imperfections=preset, clasp_s=seconds, circles=0, protocol=FreeMotion.phase
+        person.lengths, seed=seed, imperfections=preset, clasp_s=seconds, circles=0, protocol=FreeMotion.name
     )
 
 

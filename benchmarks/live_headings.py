@@ -15,7 +15,7 @@ from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.recording import Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import PEOPLE_PRESET, Person, Simulation, simulate, simulate_person
-from wepose_pin.simulation.sequence import TASKS
+from wepose_pin.simulation.motion import TASKS
 from wepose_pin.simulation.signals import make_pulse
 from wepose_pin.tracking import TrackOptions, track_chunks
 
@@ -38,7 +38,7 @@ PRESET = replace(PEOPLE_PRESET, start_heading_deg=0.0)  # the torso's turn again
 class ClaspedFreeMotion(FreeMotion):
     """Hands that move at random and clasp for two seconds every ten minutes."""
 
-    phase = "free_clasped"
+    name = "free_clasped"
 
     @property
     def clasps(self) -> list[tuple[float, float]]:
@@ -46,8 +46,9 @@ class ClaspedFreeMotion(FreeMotion):
         begins = np.arange(self.clasp[0] + EVERY_S / 2.0, self.clasp[1] - CLASP_S - 2.0 * APPROACH_S, EVERY_S)
         return [(float(begin), float(begin) + CLASP_S) for begin in begins]
 
-    def protocol_phases(self) -> dict[str, list[tuple[float, float]]]:
-        return {"clasp": self.clasps}
+    def prepare(self, rng: np.random.Generator) -> None:
+        super().prepare(rng)
+        self.phases["clasp"] = self.clasps
 
     def _palms(self, t: np.ndarray, motion_share: np.ndarray, clasp_T: np.ndarray) -> dict[str, np.ndarray]:
         joined = np.zeros_like(t)
@@ -135,9 +136,9 @@ def _describe_clasps(simulation: Simulation, recording: Recording, errors: Error
 
 def simulate_clasped_motion(person: Person, seconds: float) -> Simulation:
     """Simulate the person's hands moving at random, with clasps."""
-    TASKS.setdefault(ClaspedFreeMotion.phase, ClaspedFreeMotion)
+    TASKS.setdefault(ClaspedFreeMotion.name, ClaspedFreeMotion)
     return simulate(
-        person.lengths, seed=PERSON, imperfections=PRESET, clasp_s=seconds, circles=0, protocol=ClaspedFreeMotion.phase
+        person.lengths, seed=PERSON, imperfections=PRESET, clasp_s=seconds, circles=0, protocol=ClaspedFreeMotion.name
     )
 
 

@@ -15,7 +15,8 @@ from wepose_pin.calibration import Calibration, calibrate
 from wepose_pin.calibration.quality import assess
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Person, Simulation, simulate, simulate_person
-from wepose_pin.simulation.motion import Motion, Wander
+from wepose_pin.simulation.motion import Motion
+from wepose_pin.simulation.signals import Wander
 
 
 def codes(calibration: Calibration) -> set[str]:

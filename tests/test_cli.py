@@ -27,7 +27,7 @@ from wepose_pin.commands.options import Formulation, LiveMethod, Method
 from wepose_pin.filters import METHODS, OFFLINE
 from wepose_pin.recording import Recording
 from wepose_pin.simulation import Simulation, simulate
-from wepose_pin.simulation.sequence import TASKS
+from wepose_pin.simulation.motion import TASKS
 from wepose_pin.writers import write_session
 
 

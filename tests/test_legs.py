@@ -24,7 +24,7 @@ from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import evaluate
 from wepose_pin.simulation import IDEAL_PRESET, NOISE_FREE, Imperfections, Simulation, simulate_activity
 from wepose_pin.simulation.activities import ACTIVITIES
-from wepose_pin.simulation.motion import Flaws
+from wepose_pin.simulation.people import Flaws
 from wepose_pin.simulation.subject import spawn_streams
 
 URDF = Path(__file__).resolve().parent.parent / "urdf"
@@ -110,18 +110,18 @@ def test_the_true_pose_has_the_angles_of_the_activity(activity: str) -> None:
     R_WL = motion(t).R_WL
     angles = joint_angles(Pose(t, {segment: R.as_quat() for segment, R in R_WL.items()}, {}))
     for side in SIDES:
-        for joint, values in motion.leg(side, t)._asdict().items():
+        for joint, values in zip(("hip", "knee", "ankle"), motion.leg(side, t), strict=True):
             np.testing.assert_allclose(angles[f"{side}_{joint}"].values, values, atol=1e-12)
         elbow = angles[f"{side}_elbow"]
         np.testing.assert_allclose(elbow.values[:, 0], motion.arm(side, t)[:, 1], atol=1e-12)
     most = {name: np.degrees(angle.values.max(axis=0)) for name, angle in angles.joints.items()}
     if activity == "walk":
         assert 50.0 < most["left_knee"][0] < 72.0
-        hip, shoulder = motion.leg("left", t).hip[:, 0], motion.arm("left", t)[:, 0]
+        hip, shoulder = motion.leg("left", t)[0, :, 0], motion.arm("left", t)[:, 0]
         assert np.corrcoef(hip, shoulder)[0, 1] < -0.8  # arms swing against the legs
         half = round(0.5 * motion.stride_s / 0.013)
         between = slice(700, 900)
-        left, right = (motion.leg(side, t).knee[:, 0] for side in SIDES)
+        left, right = (motion.leg(side, t)[1, :, 0] for side in SIDES)
         assert np.corrcoef(left[between], right[700 + half : 900 + half])[0, 1] > 0.99
     elif activity == "sit":
         assert 90.0 < most["left_knee"][0] < 95.0

@@ -19,19 +19,19 @@ from wepose_pin.simulation import (
     PEOPLE_PRESET,
     Person,
     Simulation,
-    sequence,
     simulate,
     simulate_person,
 )
+from wepose_pin.simulation import motion as motions
 from wepose_pin.simulation.people import Offset
 
 SEED = 5301
-BOW = sequence.make_bow
+BOW = motions.make_bow
 WRONG = {
     "a bow to the side": ("clasp+bow", "make_bow", lambda share, _axis: BOW(share, np.pi / 2.0)),
     "a bow 30 deg off": ("clasp+bow", "make_bow", lambda share, _axis: BOW(share, np.deg2rad(30.0))),
-    "arms forwards": ("clasp+t_pose", "T_POSE", {**sequence.T_POSE, "plane": Offset(45.0, 6.0)}),
-    "arms that hang": ("clasp+t_pose", "T_POSE", {**sequence.T_POSE, "elevation": Offset(-75.0, 5.0)}),
+    "arms forwards": ("clasp+t_pose", "T_POSE", {**motions.T_POSE, "plane": Offset(45.0, 6.0)}),
+    "arms that hang": ("clasp+t_pose", "T_POSE", {**motions.T_POSE, "elevation": Offset(-75.0, 5.0)}),
 }
 
 
@@ -91,7 +91,7 @@ SLOW = ("a bow to the side", "arms forwards", "arms that hang")
 @pytest.mark.parametrize("what", [pytest.param(what, marks=[pytest.mark.slow] * (what in SLOW)) for what in WRONG])
 def test_another_pose_than_the_protocols_is_said_and_left_out(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     protocol, name, value = WRONG[what]
-    monkeypatch.setattr(sequence, name, value)
+    monkeypatch.setattr(motions, name, value)
     person, simulation = perform(protocol)
     monkeypatch.undo()
     recording = simulation.recording()

@@ -30,7 +30,7 @@ from wepose_pin.simulation import (
     simulate_person,
 )
 from wepose_pin.simulation import motion as motions
-from wepose_pin.simulation.sequence import TASKS
+from wepose_pin.simulation.motion import TASKS
 from wepose_pin.writers import write_session
 
 ANY = replace(MILD_PRESET, mount="any")

@@ -69,7 +69,7 @@ def test_a_lag_beyond_all_people_is_no_skin(shown: float, used: float) -> None:
 @pytest.mark.parametrize("size", [0.0, 1.0])
 def test_a_hinge_shows_how_far_skin_lags_behind_a_twist(size: float) -> None:
     person = simulate_person(3)
-    sizes = replace(IDEAL_PRESET, tissue_gain=size, upper_arm_place=0.6, forearm_place=0.85)
+    sizes = replace(IDEAL_PRESET, tissue_gain=size, sensor_place=1.0)
     made = simulate(person.lengths, seed=3, imperfections=sizes, clasp_s=40.0, circles=2)
     recording = made.recording()
     subject = calibrate(recording, measured=person.measured, prior=person.prior).subject

@@ -219,7 +219,7 @@ def test_every_wrong_call_is_refused_and_says_what_is_wrong(function: str) -> No
         *((lambda value=value: wp.StaticTest(window_s=value), "window_s") for value in POSITIVE),
         (lambda: wp.StaticTest(alpha=-1.0), "alpha"),
         (lambda: AmekfParams(block_s="100"), "block_s"),
-        (lambda: Imperfections(soft_tissue_deg=-1.0), "soft_tissue_deg"),
+        (lambda: Imperfections(tissue_gain=-1.0), "tissue_gain"),
         (lambda: Imperfections(mount="nonsense"), "mount"),
         (lambda: wp.retarget(**right()["retarget"], params=ControllerParams(position=-1.0)), "position"),
         (lambda: wp.simulate(**right()["simulate"], noise=ImuNoise(gyro_density=NAN)), "gyro_density"),

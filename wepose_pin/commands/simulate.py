@@ -56,31 +56,25 @@ def simulate(
     activity
         Simulate an activity in place of a protocol. Of the whole body, with sensors on pelvis, head, hands and legs
         too: walking on the spot (walk), sitting down and standing up (sit), running (run), or throwing overhand
-        (throw). Of the upper body: reaches, rests and typing of both arms, hands apart (tasks). Of the imperfections of
-        the body in --preset mild, an activity has only the soft-tissue artefacts.
+        (throw). Of the upper body: reaches, rests and typing of both arms, hands apart (tasks).
     preset
-        Simulate only the sensors' noise and bias (ideal), or also small soft-tissue artefacts, slip, sway and sensor
-        errors (mild), or all of these and more at the sizes of people in the literature (people): soft tissue that
-        follows the joints, shoulders that move with the arms, start poses as people hold them, wrists that bend. Sizes
-        and sources are in wepose_pin/simulation/imperfections.py.
+        Simulate only the sensors' noise and bias (ideal), or a person at the sizes of the literature (people): soft
+        tissue, shoulders that move with the arms, start poses as people hold them, wrists that bend, errors of sensors
+        and clocks; or a careful one at 0.3 of them (mild). Sizes and sources are in
+        wepose_pin/simulation/imperfections.py.
     rate_hz
         Sample the sensors at this rate, 20 to 2000 Hz.
     imperfection
         Simulate one imperfection at this size; may be given several times. mount=any: arbitrary sensor mounting, which
-        the session does not state. All others are numbers; 0 is off, inf for the two full scales. Of the body, rms:
-        soft_tissue_deg, palm_slip [m] in the clasp, sway_deg_s, start_segment_deg (arm segments off the start pose);
-        mean: start_elbow_deg (flexion in the start pose), shoulder_wander [m] (translation at 90 deg of elevation). Of
-        the sensors, standard deviation: gyro_scale, accel_scale (of the scale factors, 0.01 is 1 %), misalignment_deg,
-        g_sensitivity_deg_s (per g), clock_jitter [s], clock_offset [s]; full scale: gyro_range_deg_s, accel_range_g;
-        bits: of a sample over the full scale; dropped: fraction of samples lost, at most 0.2. Of people, as a multiple
-        of the size in the literature: tissue_gain (soft tissue that follows the joints), tissue_random (its random
-        part), girdle (shoulders that follow the arms), girdle_person (how people differ in that), girdle_wander
-        (shrugs and reaching), girdle_rest (place of the shoulders at rest), carrying_angle (of the elbow), start_pose
-        (offsets of the start pose); others: breath_deg (pitch of the torso's sensor), creep_deg (a strap in 10 min),
-        strap_slip_deg, wobble_deg (per g), upper_arm_place and forearm_place (of the sensor, share of the length),
-        girdle_hysteresis (share of elevation), elbow_abduction_deg, start_heading_deg (torso against W), sway_tilt_deg,
-        wrist_flexion_deg, wrist_deviation_deg, gyro_warm_up_deg_s (of the bias, in 15 min), clock_drift_ppm,
-        accel_average (share of the sample interval over which the accelerometer averages).
+        the session does not state. All others are numbers; 0 is off, inf for the two full scales. Of the body, as a
+        multiple of the size in the literature: tissue_gain (soft tissue that follows the joints), tissue_random (its
+        random part), girdle (shoulders), elbow (carrying angle), wrists, start_pose, sway (with breath); others:
+        palm_slip [m] in the clasp, start_heading_deg (torso against W), sensor_place (0 half-way along a segment, 1 as
+        people wear them). Of the sensors, standard deviation: gyro_scale, accel_scale (of the scale factors, 0.01 is
+        1 %), misalignment_deg, g_sensitivity_deg_s (per g), clock_jitter [s], clock_offset [s], clock_drift_ppm; full
+        scale: gyro_range_deg_s, accel_range_g; bits: of a sample over the full scale; dropped: fraction of samples
+        lost, at most 0.2; gyro_warm_up_deg_s (of the bias, in 15 min); accel_average (share of the sample interval over
+        which the accelerometer averages).
     """
     options = dict(locals())
     from dataclasses import replace
@@ -91,7 +85,7 @@ def simulate(
     from ..body import DEFAULT_BODY
     from ..body.subject import mount_rows, subject_toml
     from ..documents import whole_folder
-    from ..simulation.sequence import find_task
+    from ..simulation.motion import find_task
     from ..writers import write_session
     from ..writers.provenance import collect_provenance, write_provenance
 

@@ -13,7 +13,8 @@ the table, and sensors with noise and bias only. `Imperfections` add those of re
 from .activities import ACTIVITIES, simulate_activity
 from .imperfections import IDEAL_PRESET, MILD_PRESET, PEOPLE_PRESET, PRESETS, Imperfections
 from .imu import MTI_3, NOISE_FREE, ImuNoise
-from .motion import CIRCLING_POINT, SEGMENTS, SIDES
+from .motion import CIRCLING_POINT, SEGMENTS
+from .people import SIDES
 from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
 from .subject import (
     MEASURED_LENGTHS,

@@ -1,4 +1,4 @@
-"""Activities with known truth: walking on the spot, sitting down, running, throwing; `arm_tasks` has that of the arms.
+"""Activities with known truth: walking on the spot, sitting down, running, throwing; `arm_tasks` has those of the arms.
 
 One of the whole body is a set of joint angles as closed forms of time, of the hips and ankles after Wu et al. 2002, of
 the knees after Grood and Suntay 1983; segment orientations are put together from them here, without the code of the
@@ -10,9 +10,8 @@ the accelerometers measure.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -25,28 +24,17 @@ from ..body.girdle import PARAMETERS
 from ..body.links import compute_link_poses
 from ..errors import BadOption, one_of
 from ..rotations import compose, turn_about
-from .arm_tasks import ArmTasks
+from .arm_tasks import Activity, ArmTasks
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
-from .motion import ARM, E_Z, RAMP_S, SIDES, STAND_S, Activity, BodyPose, Flaws, place_arm, place_shoulder
-from .signals import integrate_pulse, make_pulse, make_step
+from .motion import ARM, E_Z, STAND_S, BodyPose, place_arm, place_shoulder
+from .people import SIDES, Flaws
+from .signals import make_pulse, make_step
 from .subject import Simulation, measure_motion, spawn_streams
 
-
-class LegAngles(NamedTuple):
-    """The three angles of each joint of a leg (n, 3) [rad], with the names and signs of `angles.JOINTS`."""
-
-    hip: np.ndarray  # flexion, adduction, internal rotation
-    knee: np.ndarray  # flexion, adduction, external rotation
-    ankle: np.ndarray  # dorsiflexion, inversion, internal rotation
-
-
-class TrunkAngles(NamedTuple):
-    """Rotation vectors (n, 3) [rad] about x (right side down), y (forward) and z (to the left) of W."""
-
-    torso: np.ndarray
-    pelvis: np.ndarray
-    head: np.ndarray
+# Signs by which angles of a right leg, with the names and signs of `angles.JOINTS`, are turns about y, x, z; those of a
+# left one about x and z are of opposite sign.
+_LEG_SIGNS = {"thigh": (-1.0, 1.0, 1.0), "shank": (1.0, 1.0, -1.0), "foot": (-1.0, 1.0, 1.0)}
 
 
 class WholeBodyActivity(Activity):
@@ -66,12 +54,12 @@ class WholeBodyActivity(Activity):
             self.p_LS[f"{side}_foot"] = np.array((0.4 * lengths[f"{side}_foot"], 0.0, 0.0))
 
     @abstractmethod
-    def leg(self, side: str, t: np.ndarray) -> LegAngles:
-        """Compute the angles of a leg at the times `t` (n,) [s]."""
+    def leg(self, side: str, t: np.ndarray) -> np.ndarray:
+        """Compute the angles of hip, knee and ankle (3, n, 3) [rad] at the times `t` (n,) [s], as `angles.JOINTS`."""
 
     @abstractmethod
-    def trunk(self, t: np.ndarray) -> TrunkAngles:
-        """Compute the rotations of torso, pelvis and head at the times `t` (n,) [s]."""
+    def trunk(self, t: np.ndarray) -> np.ndarray:
+        """Compute the rotation vectors of torso, pelvis and head (3, n, 3) [rad] in W at the times `t` (n,) [s]."""
 
     @abstractmethod
     def arm(self, side: str, t: np.ndarray) -> np.ndarray:
@@ -85,59 +73,42 @@ class WholeBodyActivity(Activity):
         """Compute where the root is at times (n,) [s]: (n, 3) [m] in a world at rest; None: it does not move."""
         return None
 
-    def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
-        return integrate_pulse(t, STAND_S, self.stop, RAMP_S)
-
     def __call__(self, t: np.ndarray, segments: Collection[str] = tuple(SIDES)) -> BodyPose:
-        """Return the exact pose of the trunk and of the segments' sides at the times `t` (n,) [s]."""
         sides = [side for side in SIDES if any(segment.startswith(side) for segment in segments)]
         R_WL = self._orientations(t, sides)
         p_W: dict[str, np.ndarray] = {}
         for link, (carrier, place) in self._carriers.items():
-            if link.startswith(tuple(SIDES)) and not link.startswith(tuple(sides)):
-                continue
-            p_W[link] = p_W[carrier] + R_WL[carrier].apply(place) if carrier else np.tile(place, (len(t), 1))
+            if not link.startswith(tuple(SIDES)) or link.startswith(tuple(sides)):
+                p_W[link] = p_W[carrier] + R_WL[carrier].apply(place) if carrier else np.tile(place, (len(t), 1))
         origins = {segment: p_W[segment] for segment in R_WL}
         points = {point: p_W[link] for point, link in self.model.point_frames.items() if link in p_W}
-        pose = BodyPose(R_WL, points, origins)
-        if self.flaws.girdle.moves:
-            self._move_shoulders(pose, t, sides)
+        pose, girdle, R_WT = BodyPose(R_WL, points, origins), self.flaws.girdle, R_WL["torso"]
+        for side in sides if girdle.size else ():  # on shoulders that move
+            R_arm = tuple(R_WL[f"{side}_{part}"] for part in ARM)
+            along_T = compose(R_WT.inv(), R_arm[0]).apply(-E_Z)
+            shoulder_T = place_shoulder(side, self.lengths) + girdle.place(SIDES[side], self.moving_time(t))
+            shoulder_T = shoulder_T + girdle.displace(along_T, SIDES[side])
+            place_arm(pose, side, origins["torso"] + R_WT.apply(shoulder_T), R_arm, self.lengths)
         root = self.root(t)
         if root is not None:
             pose = pose._replace(origins={segment: origin + root for segment, origin in origins.items()})
         return pose
 
-    def _move_shoulders(self, pose: BodyPose, t: np.ndarray, sides: Sequence[str]) -> None:
-        """Place the arms of a pose on shoulders that move."""
-        girdle, R_WT = self.flaws.girdle, pose.R_WL["torso"]
-        for side in sides:
-            y = SIDES[side]
-            R_arm = tuple(pose.R_WL[f"{side}_{part}"] for part in ARM)
-            along_T = compose(R_WT.inv(), R_arm[0]).apply(-E_Z)
-            shoulder_T = place_shoulder(side, self.lengths) + girdle.place(y, self.moving_time(t))
-            shoulder_T = shoulder_T + girdle.displace(along_T, y, np.zeros_like(t))
-            place_arm(pose, side, pose.origins["torso"] + R_WT.apply(shoulder_T), R_arm, self.lengths)
-
-    def _orientations(self, t: np.ndarray, sides: Sequence[str]) -> dict[str, Rotation]:
-        R_WL = {name: Rotation.from_rotvec(turn) for name, turn in self.trunk(t)._asdict().items()}
+    def _orientations(self, t: np.ndarray, sides: Collection[str]) -> dict[str, Rotation]:
         start = self.flaws.start_pose
-        if start.torso.any() or start.head.any():
-            R_WL["torso"] = R_WL["torso"] * Rotation.from_rotvec(start.torso)
-            R_WL["head"] = R_WL["head"] * Rotation.from_rotvec(start.head)
+        R_WT, R_WP, R_WH = (Rotation.from_rotvec(turn) for turn in self.trunk(t))
+        R_WT, R_WH = R_WT * Rotation.from_rotvec(start.torso), R_WH * Rotation.from_rotvec(start.head)
+        R_WL = {"torso": R_WT, "pelvis": R_WP, "head": R_WH}
         for side in sides:
             y = SIDES[side]
-            R_WU = compose(R_WL["torso"], self.shoulder(side, t))
-            if start.upper_arm[side].any():
-                R_WU = R_WU * Rotation.from_rotvec(start.upper_arm[side])
+            R_WU = compose(R_WT, self.shoulder(side, t)) * Rotation.from_rotvec(start.upper_arm[side])
             flexion = self.arm(side, t)[:, 1] + start.flexion[side]
             R_WF = R_WU * self.flaws.elbow_joint.rotate(y, flexion, np.full_like(t, start.pronation[side]))
-            leg = self.leg(side, t)
-            # A right leg, y = −1: flexion about −y, adduction about x, internal rotation about z. Its knee: y, x, −z.
-            R_WT = compose(R_WL["pelvis"], turn_about("YXZ", leg.hip * (-1.0, -y, -y)))
-            R_WS = compose(R_WT, turn_about("YXZ", leg.knee * (1.0, -y, y)))
-            R_WA = compose(R_WS, turn_about("YXZ", leg.ankle * (-1.0, -y, -y)))
-            parts = {"upper_arm": R_WU, "forearm": R_WF, "hand": R_WF, "thigh": R_WT, "shank": R_WS, "foot": R_WA}
-            R_WL |= {f"{side}_{part}": R for part, R in parts.items()}
+            R_WL |= {f"{side}_upper_arm": R_WU, f"{side}_forearm": R_WF, f"{side}_hand": R_WF}
+            R = R_WP
+            for (part, signs), angles in zip(_LEG_SIGNS.items(), self.leg(side, t), strict=True):
+                R = compose(R, turn_about("YXZ", angles * signs * np.array((1.0, -y, -y))))
+                R_WL[f"{side}_{part}"] = R
         return R_WL
 
 
@@ -201,18 +172,15 @@ class Walk(WholeBodyActivity):
         """Share of the stride (n,), from the first contact of this side's foot."""
         return (t - STAND_S) / self.stride_s + (0.5 if side == "left" else 0.0)
 
-    def leg(self, side: str, t: np.ndarray) -> LegAngles:
+    def leg(self, side: str, t: np.ndarray) -> np.ndarray:
         share = self._cycle(t, side)
         wave, quadrature = np.sin(2.0 * np.pi * share), np.cos(2.0 * np.pi * share)
         sagittal = self.activity(t)[:, None] * self.size * self.curves(share % 1.0)
         small = np.radians(self.activity(t))
-        return LegAngles(
-            np.column_stack((sagittal[:, 0], small * 6.0 * wave, small * 4.0 * quadrature)),
-            np.column_stack((sagittal[:, 1], small * 2.0 * wave, small * 4.0 * quadrature)),
-            np.column_stack((sagittal[:, 2], small * -4.0 * wave, small * 3.0 * quadrature)),
-        )
+        frontal, transverse = np.outer((6.0, 2.0, -4.0), small * wave), np.outer((4.0, 4.0, 3.0), small * quadrature)
+        return np.stack((sagittal.T, frontal, transverse), axis=2)
 
-    def trunk(self, t: np.ndarray) -> TrunkAngles:
+    def trunk(self, t: np.ndarray) -> np.ndarray:
         angle = 2.0 * np.pi * self._cycle(t, "right")
         size = np.radians(self.activity(t))[:, None]
 
@@ -221,7 +189,7 @@ class Walk(WholeBodyActivity):
             return np.column_stack((side * np.sin(angle), pitch, turn * np.cos(angle)))
 
         torso, pelvis = sway(*self._TORSO_DEG), sway(*self._PELVIS_DEG)
-        return TrunkAngles(size * torso, size * pelvis, size * self._HEAD_SHARE * torso)
+        return np.stack((size * torso, size * pelvis, size * self._HEAD_SHARE * torso))
 
     def arm(self, side: str, t: np.ndarray) -> np.ndarray:
         forward = 0.5 - 0.5 * np.cos(2.0 * np.pi * self._cycle(t, side))  # 0 at the first contact of its own foot
@@ -300,13 +268,13 @@ class Throw(WholeBodyActivity):
                 angles += np.outer(make_step(t, at, duration), size * change)
         return angles
 
-    def leg(self, _side: str, t: np.ndarray) -> LegAngles:
-        return LegAngles(*np.zeros((3, len(t), 3)))
+    def leg(self, _side: str, t: np.ndarray) -> np.ndarray:
+        return np.zeros((3, len(t), 3))
 
-    def trunk(self, t: np.ndarray) -> TrunkAngles:
+    def trunk(self, t: np.ndarray) -> np.ndarray:
         turn, lean = self._angles(t)[:, 4:].T
         torso = np.column_stack((np.zeros_like(t), lean, SIDES[self.side] * -turn))
-        return TrunkAngles(torso, 0.4 * torso, 0.2 * torso)
+        return np.stack((torso, 0.4 * torso, 0.2 * torso))
 
     def arm(self, side: str, t: np.ndarray) -> np.ndarray:
         """Compute no flexion of the shoulder, which `shoulder` turns, and that of the elbow."""
@@ -355,40 +323,26 @@ class Sit(WholeBodyActivity):
         move = self._MOVE_S
         return sum((make_pulse(t, at, at + move, 0.5 * move) for way in self.ways for at in way), np.zeros_like(t))
 
-    def leg(self, side: str, t: np.ndarray) -> LegAngles:
+    def leg(self, side: str, t: np.ndarray) -> np.ndarray:
         seated, moving = self._seated(t), self._moving(t)
-        thigh, shank_forward = np.radians(90.0) * seated, np.radians(12.0) * moving
-        pelvis_forward = self.tilt * moving
+        shank_forward, none = np.radians(12.0) * moving, np.zeros_like(t)
         spread = self.spread[list(SIDES).index(side)] * seated
-        none = np.zeros_like(t)
-        return LegAngles(
-            np.column_stack((thigh + pelvis_forward, -spread, 0.3 * spread)),
-            np.column_stack((thigh + shank_forward, none, np.radians(5.0) * seated)),
-            np.column_stack((shank_forward, none, none)),
-        )
+        hip = (np.radians(90.0) * seated + self.tilt * moving, -spread, 0.3 * spread)
+        knee = (np.radians(90.0) * seated + shank_forward, none, np.radians(5.0) * seated)
+        return np.moveaxis(np.array((hip, knee, (shank_forward, none, none))), 1, 2)
 
-    def trunk(self, t: np.ndarray) -> TrunkAngles:
+    def trunk(self, t: np.ndarray) -> np.ndarray:
         forward = self.lean * self._moving(t) + np.radians(3.0) * self._seated(t)
-        none = np.zeros_like(t)
-        turn = np.radians(4.0) * self._moving(t)
-        return TrunkAngles(
-            np.column_stack((none, forward, turn)),
-            np.column_stack((none, self.tilt * self._moving(t), none)),
-            np.column_stack((none, 0.4 * forward, 2.0 * turn)),
-        )
+        turn, none = np.radians(4.0) * self._moving(t), np.zeros_like(t)
+        pelvis = (none, self.tilt * self._moving(t), none)
+        return np.moveaxis(np.array(((none, forward, turn), pelvis, (none, 0.4 * forward, 2.0 * turn))), 1, 2)
 
     def arm(self, _side: str, t: np.ndarray) -> np.ndarray:
         reach, rest = np.radians((30.0, 20.0)), np.radians((15.0, 75.0))
         return self._moving(t)[:, None] * reach + self._seated(t)[:, None] * rest
 
 
-ACTIVITIES: dict[str, type[Activity]] = {
-    "walk": Walk,
-    "sit": Sit,
-    "tasks": ArmTasks,
-    "run": Run,
-    "throw": Throw,
-}
+ACTIVITIES: dict[str, type[Activity]] = {each.phase: each for each in (Walk, Sit, ArmTasks, Run, Throw)}
 
 
 def simulate_activity(
@@ -408,9 +362,8 @@ def simulate_activity(
     Parameters
     ----------
     activity : one of `ACTIVITIES`
-    imperfections : as in `simulate`. Of the mild preset's body only soft tissue counts. Activities of the whole body
-        leave sway, wrists and the hysteresis of the girdle out; of the people preset's soft tissue the legs have creep,
-        slips and wobble only, and what people hold in the start pose they hold throughout
+    imperfections : as in `simulate`. Activities of the whole body leave sway and wrists out; of soft tissue the legs
+        have the random part only, and what people hold in the start pose they hold throughout
     lengths : of the body [m]; those not named, or None: a person of 1.75 m
     seed, rate_hz, noise : as in `simulate`
 
@@ -424,9 +377,8 @@ def simulate_activity(
         raise BadOption(f"activity {activity!r} is not known; {one_of(ACTIVITIES, activity)}")
     rngs = spawn_streams(seed)
     model = load_model(ACTIVITIES[activity].body, lengths)
-    # Shoulders that do not move: those of people that do are placed by `girdle`, not by the law that is tracked with.
+    # Shoulders that do not move: those of people that do are placed by their own girdle, not by the one tracked with.
     rigid = -np.eye(len(PARAMETERS))[PARAMETERS.index("law")]
     model = replace(model, girdles=dict.fromkeys(model.table.girdles, rigid))
     flaws = Flaws(imperfections, rngs, model.lengths["shoulder_width"])
-    motion = ACTIVITIES[activity](model, rngs["motion"], seconds, flaws)
-    return measure_motion(motion, rngs, rate_hz, noise, imperfections)
+    return measure_motion(ACTIVITIES[activity](model, rngs["motion"], seconds, flaws), rngs, rate_hz, noise)

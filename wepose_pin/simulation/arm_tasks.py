@@ -8,18 +8,20 @@ to 23 deg of lean, 32 of turn and 59 of bend (Gates 2016, Am J Occup Ther 70); s
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body import DEFAULT_BODY
+from ..body import DEFAULT_BODY, BodyModel
 from ..rotations import compose, turn_about
-from .motion import E_Z, END_S, RAMP_S, SEGMENTS, SIDES, STAND_S, Activity, BodyPose, place_arm, place_shoulder
+from .motion import E_Z, MARGIN_S, RAMP_S, SEGMENTS, STAND_S, BodyMotion, BodyPose, place_arm, place_shoulder
+from .people import SIDES, Flaws
 from .signals import Process, make_pulse, make_step
 
-_RATE_STEP_S = 0.02  # for the rate of elevation
+END_S = 2.0  # after an activity the person stands still
 _TYPING_S = (2.0, 8.0)
 _TYPING = np.deg2rad((0.0, 0.0, 1.0, 0.7, 1.5))  # [rad] rms of each angle of the arm
 _TYPING_CORRELATION_S = 0.05
@@ -91,6 +93,26 @@ class _Path:
         return values[:, :-1], values[:, -1]
 
 
+class Activity(BodyMotion):
+    """An activity of some seconds, after standing in the N-pose and before standing still."""
+
+    phase: str
+    body: str  # the model's name
+
+    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws) -> None:
+        super().__init__(model.lengths, flaws)
+        self.model, self.seconds, self.stop = model, seconds, STAND_S + seconds
+        self.end = self.stop + END_S
+        self.pulses = [(STAND_S, self.stop, RAMP_S)]
+        self.phases[self.phase] = [(STAND_S + MARGIN_S, self.stop - MARGIN_S)]
+        self.phases["rest"] = [(self.stop + MARGIN_S, self.end - MARGIN_S)]
+        self.prepare(rng)
+
+    @abstractmethod
+    def prepare(self, rng: np.random.Generator) -> None:
+        """Draw what is this person's own."""
+
+
 class ArmTasks(Activity):
     """Random reaches, rests and typing of both arms, while the trunk leans and turns."""
 
@@ -101,10 +123,9 @@ class ArmTasks(Activity):
         self.trunk = _Path(self.flaws.start_pose.torso, self.stop, lambda _: self._draw_trunk(rng))
         self.arms = {side: self._draw_arm(rng, side) for side in SIDES}
         self.tremble = {side: Process(rng, _TYPING_CORRELATION_S, 5) for side in SIDES}
-        if self.flaws.wrists.bend:
-            grid = np.arange(*self.span, 0.1)
-            distance = np.column_stack([self._distance(grid, side) for side in SIDES])
-            self.flaws.wrists.fit(grid, self.activity(grid), distance)
+        grid = np.arange(STAND_S, self.end, 0.1)
+        distance = np.column_stack([self._distance(grid, side) for side in SIDES])
+        self.flaws.wrists.fit(grid, self.activity(grid), distance)
 
     def moving_time(self, t: np.ndarray, segment: str = "", /) -> np.ndarray:
         return self.arms.get(segment.partition("_")[0], self.trunk)(t)[1]
@@ -135,52 +156,31 @@ class ArmTasks(Activity):
 
         return _Path(np.array((*pose.upper_arm[side], pose.flexion[side], pose.pronation[side])), self.stop, draw)
 
-    def _angles(self, t: np.ndarray, side: str) -> np.ndarray:
-        """Return the arm's values (n, 5) [rad], as `_draw_arm` has them."""
-        values, _ = self.arms[side](t)
-        typing = sum((make_pulse(t, a, b, 0.5) for a, b in self.arms[side].typing), np.zeros_like(t))
-        return values + _TYPING * typing[:, None] * self.tremble[side](t)
-
     def _distance(self, t: np.ndarray, side: str) -> np.ndarray:
         """Return the distance (n,) [m] of the hand from the middle of the shoulders, by the elbow's angle."""
-        values, _ = self.arms[side](t)
         upper = self.lengths[f"{side}_upper_arm"]
         lower = self.lengths[f"{side}_forearm"] + self.lengths[f"{side}_hand"]
-        return np.sqrt(upper**2 + lower**2 + 2.0 * upper * lower * np.cos(values[:, 3]))
-
-    def _raising(self, t: np.ndarray, side: str) -> np.ndarray:
-        """Compute the rate (n,) [deg/s] at which the arm is raised."""
-        before, after = (
-            np.linalg.norm(self._angles(t + step, side)[:, :2], axis=1) for step in (-_RATE_STEP_S, _RATE_STEP_S)
-        )
-        return np.rad2deg(after - before) / (2.0 * _RATE_STEP_S)
+        return np.sqrt(upper**2 + lower**2 + 2.0 * upper * lower * np.cos(self.arms[side](t)[0][:, 3]))
 
     def __call__(self, t: np.ndarray, segments: Collection[str] = SEGMENTS) -> BodyPose:
-        """Return the exact pose of the torso and of the arms of the segments' sides at the times `t` (n,) [s]."""
-        flaws, sizes = self.flaws, self.flaws.sizes
-        sway, tilt = np.deg2rad(sizes.sway_deg_s), np.deg2rad(sizes.sway_tilt_deg) / np.sqrt(2.0)
+        flaws = self.flaws
         lean = self.trunk(t)[0]
-        lean[:, :2] += sway * flaws.sway["torso"](t) + tilt * flaws.tilt(t)
+        lean[:, :2] += flaws.sway_torso(t)
         R_WT = Rotation.from_rotvec(lean)
         pose = BodyPose({"torso": R_WT}, {}, {"torso": np.zeros(3)})
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
-            y, angles = SIDES[side], self._angles(t, side)
+            y = SIDES[side]
+            typing = sum((make_pulse(t, a, b, 0.5) for a, b in self.arms[side].typing), np.zeros_like(t))
+            angles = self.arms[side](t)[0] + _TYPING * typing[:, None] * self.tremble[side](t)
             swing = np.pad(angles[:, :2], ((0, 0), (0, 1)))
-            R_TU = compose(Rotation.from_rotvec(swing), turn_about("Z", angles[:, 2:3]))
-            hanging = make_pulse(t, -10.0, STAND_S + 0.5, 0.5) + make_step(t, self.span[1] - END_S - 0.5, 0.5)
-            swaying = sway * hanging[:, None] * np.pad(flaws.sway[side](t), ((0, 0), (0, 1)))
-            R_TU = compose(R_TU, Rotation.from_rotvec(swaying))
-            along_T = R_TU.apply(-E_Z)
-            shoulder_T = place_shoulder(side, self.lengths) + flaws.girdle.place(
-                y, self.moving_time(t, f"{side}_upper_arm")
-            )
-            raising = self._raising(t, side) if sizes.girdle_hysteresis else np.zeros_like(t)
-            shoulder_T = shoulder_T + flaws.girdle.displace(along_T, y, raising)
+            hanging = make_pulse(t, -10.0, STAND_S + 0.5, 0.5) + make_step(t, self.stop - 0.5, 0.5)
+            swaying = Rotation.from_rotvec(hanging[:, None] * flaws.sway_arm(t, side))
+            R_TU = compose(Rotation.from_rotvec(swing), turn_about("Z", angles[:, 2:3]), swaying)
             R_WU = compose(R_WT, R_TU)
             R_WF = compose(R_WU, flaws.elbow_joint.rotate(y, angles[:, 3], angles[:, 4]))
-            R_WH = R_WF
-            if flaws.wrists.bend:
-                none = np.zeros_like(t)
-                R_WH = compose(R_WF, flaws.wrists.rotate(y, t, self.activity(t), none, self._distance(t, side)))
-            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, R_WH), self.lengths)
+            R_FH = flaws.wrists.rotate(y, t, self.activity(t), np.zeros_like(t), self._distance(t, side))
+            shoulder_T = place_shoulder(side, self.lengths)
+            shoulder_T = shoulder_T + flaws.girdle.place(y, self.moving_time(t, f"{side}_upper_arm"))
+            shoulder_T = shoulder_T + flaws.girdle.displace(R_TU.apply(-E_Z), y)
+            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, compose(R_WF, R_FH)), self.lengths)
         return pose

@@ -1,4 +1,4 @@
-"""The motion of a protocol: a closed form of continuous time.
+"""The motion of protocols: a closed form of continuous time.
 
 It is exact between the samples as well, and shares no code with the model room, since tests compare the two. The torso
 frame T has the origin of W: the torso rotates about it.
@@ -7,34 +7,30 @@ frame T has the origin of W: the torso rotates about it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping
-from copy import deepcopy
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body import BodyModel
-from ..errors import BadOption
+from ..errors import BadOption, one_of
 from ..rotations import compose, log, quat_from_matrix, turn_about
-from .girdle import SimulatedGirdle
 from .imperfections import IDEAL_PRESET, Imperfections
-from .people import Elbow, StartPoseOffsets, Wrists
-from .signals import Process, Sway, Wander, integrate_pulse, make_pulse, make_step
+from .people import SIDES, Flaws, Offset
+from .signals import Wander, integrate_pulse, make_pulse, make_step
 
-SIDES = {"left": 1.0, "right": -1.0}  # y of the side in W
 CIRCLING_POINT = "right_palm"  # draws the circles after the protocol
 SEGMENTS = ("torso", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm")
 ARM = ("upper_arm", "forearm", "hand")
 
 E_Z = np.array((0.0, 0.0, 1.0))
 STAND_S = 5.0  # N-pose at the start
-_BLEND_S = 2.5  # N-pose to clasp, clasp to table
+_LEAD_S = 2.5  # N-pose to clasp, clasp to table
 RAMP_S = 2.0  # a motion grows and dies away over this time
-END_S = 2.0  # after an activity the person stands still
 _REST_S = (2.5, 2.0)  # first rest on the table, each later one
-LIFT_S = 1.5  # table to circle, circle to table
+_LIFT_S = 1.5  # table to circle, circle to table
 MARGIN_S = 0.1  # the stated phases keep this distance from the motion beside them
 _FLEXION = np.deg2rad((8.0, 140.0))  # of the elbow while the hand is led to a point
 _LEAST_FLEXION = np.deg2rad(3.0)  # at which a hand is out of reach
@@ -43,13 +39,27 @@ _PERSON_LEAST_FLEXION = np.deg2rad(15.0)  # the same where shoulders move: below
 # arms are long.
 _REACHES = [
     (rounds, slack)
-    for rounds, most in ((10, 0.05), (20, 0.05), (40, 0.2))
+    for rounds, most in ((5, 0.025), (10, 0.05), (20, 0.05), (40, 0.2))
     for slack in np.arange(0.02, most, 0.01).tolist()
 ]
 _RELAXATION = 0.75
 _MOST_MISSING = 5e-6  # [m] from a hand to its aim after these rounds
-_RATE_STEP_S = 0.02  # for the rate of elevation
-_TILT_S = 1.5  # correlation time of the slow part of the sway, assumption
+
+PARTS = ("bow", "clasp", "t_pose")
+_LONG_S = 45.0  # [s] of a session, from which on parts have their full length
+_PART_S = {"bow": (5.0, 6.0), "t_pose": (4.0, 5.0)}  # short, full; what leads the hands takes the time that is left
+_LEAST_CLASP_S = 5.0
+_BLEND_S = 1.5  # between hanging arms and hands that are led, or arms held sideways
+_POSE_RAMP_S = 1.0  # in which the motion of a T-pose grows and dies away
+BOW = np.deg2rad(45.0)
+BOW_AXIS_STD = np.deg2rad(3.5)  # from the torso's y: such axes repeat within 2 to 5 deg (Luinge 2007, de Vries 2010)
+# How people hold the T-pose, each their own: assumptions, held to N- and T-poses in Robert-Lachaine 2017.
+T_POSE = {
+    "elevation": Offset(-3.0, 5.0),
+    "plane": Offset(10.0, 6.0),
+    "elbow": Offset(5.0, 4.0),
+    "forearm_twist": Offset(0.0, 15.0),
+}
 
 
 class BodyPose(NamedTuple):
@@ -61,104 +71,36 @@ class BodyPose(NamedTuple):
 
 
 class BodyMotion(ABC):
-    """A body's motion as a function of continuous time, and where its sensors sit.
+    """A body's motion as a function of continuous time, after standing in the N-pose.
 
     Attributes
     ----------
     lengths : of the body [m]
     p_LS : segment → (3,) [m] in L, of its sensor
+    pulses : begin, end and ramp [s] of each time of motion
+    phases : of the recording: phase → intervals [s]
+    end : of the recording [s]
     """
 
-    lengths: Mapping[str, float]
-    p_LS: dict[str, np.ndarray]
+    end: float
 
-    @property
-    @abstractmethod
-    def span(self) -> tuple[float, float]:
-        """The times [s] at which the free motion begins and the recording ends."""
-
-    @abstractmethod
-    def __call__(self, t: np.ndarray, segments: Collection[str]) -> BodyPose:
-        """Return the exact pose at the times `t` (n,) [s], of these segments at least."""
+    def __init__(self, lengths: Mapping[str, float], flaws: Flaws) -> None:
+        self.lengths, self.flaws = lengths, flaws
+        self.p_LS = place_sensors(lengths, flaws.sizes)
+        self.pulses: list[tuple[float, float, float]] = []
+        self.phases: dict[str, list[tuple[float, float]]] = {"start": [(0.5, STAND_S - 0.5)]}
 
     @abstractmethod
+    def __call__(self, t: np.ndarray, segments: Collection[str] = SEGMENTS) -> BodyPose:
+        """Return the exact pose at the times `t` (n,) [s], of the trunk and of the sides of these segments."""
+
     def activity(self, t: np.ndarray) -> np.ndarray:
         """Return the activity (n,): 1 in free motion, 0 where the segments are static."""
+        return sum((make_pulse(t, *pulse) for pulse in self.pulses), np.zeros_like(t))
 
-    @abstractmethod
-    def moving_time(self, t: np.ndarray, segment: str = "", /) -> np.ndarray:
+    def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
         """Return the time (n,) [s] that a segment has moved up to `t`: the integral of its activity."""
-
-    @abstractmethod
-    def phases(self) -> dict[str, list[tuple[float, float]]]:
-        """Return the phases of the recording: phase → intervals [s]."""
-
-
-class Flaws:
-    """Random imperfections of the subject's motion; the sizes scale draws that do not depend on them."""
-
-    def __init__(
-        self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], shoulder_width: float = 0.34
-    ) -> None:
-        self.sizes = sizes
-        self.girdle = SimulatedGirdle(sizes, rngs, shoulder_width)
-        self.elbow_joint = Elbow(sizes, rngs)
-        self.wrists = Wrists(sizes, rngs)
-        self.start_pose = StartPoseOffsets(sizes, rngs, SIDES)
-        self.tilt = Process(rngs["sway_tilt"], _TILT_S, 2)
-        self.slip = [Wander(rngs["palm_slip"]) for _ in range(3)]
-        self.shoulder = {}  # side -> (3,) [m] in T at 90 deg of elevation
-        for side, y in SIDES.items():
-            direction = np.array((-0.3, -0.4 * y, 1.0)) + 0.3 * rngs["shoulder_wander"].standard_normal(3)
-            self.shoulder[side] = sizes.shoulder_wander * direction / np.linalg.norm(direction)
-        bend = 1.0 + 0.2 * np.clip(rngs["start_elbow"].standard_normal(2), -2.5, 2.5)
-        self.elbow = dict(zip(SIDES, np.deg2rad(sizes.start_elbow_deg) * bend, strict=True))  # [rad]
-        turn = np.deg2rad(sizes.start_segment_deg) / np.sqrt(3.0)
-        self.start = {name: turn * rngs["start_segment"].standard_normal(3) for name in SEGMENTS[1:]}  # (3,) [rad]
-        self.sway = {name: Sway(rngs["sway"]) for name in ("torso", *SIDES)}
-        # The arms need slack for palm slip and shoulder motion.
-        wander = sizes.palm_slip + sizes.shoulder_wander
-        self.slack = max(0.012, wander) if wander else 0.0
-
-    @property
-    def iterates(self) -> bool:
-        """True where the place of a hand follows from the arm's angles in steps only."""
-        return self.girdle.moves or self.wrists.bend or not self.elbow_joint.is_ideal
-
-
-class Activity(BodyMotion):
-    """An activity of some seconds, after standing in the N-pose and before standing still."""
-
-    phase: str
-    body: str  # the model's name
-
-    def __init__(self, model: BodyModel, rng: np.random.Generator, seconds: float, flaws: Flaws) -> None:
-        self.model, self.lengths, self.flaws, self.seconds = model, model.lengths, flaws, seconds
-        self.p_LS = place_sensors(self.lengths, flaws.sizes)
-        self.prepare(rng)
-
-    @abstractmethod
-    def prepare(self, rng: np.random.Generator) -> None:
-        """Draw what is this person's own."""
-
-    @property
-    def stop(self) -> float:
-        """Time [s] at which the activity ends."""
-        return STAND_S + self.seconds
-
-    @property
-    def span(self) -> tuple[float, float]:
-        return STAND_S, self.stop + END_S
-
-    def activity(self, t: np.ndarray) -> np.ndarray:
-        return make_pulse(t, STAND_S, self.stop, RAMP_S)
-
-    def phases(self) -> dict[str, list[tuple[float, float]]]:
-        return {
-            "start": [(0.5, STAND_S - 0.5)],
-            self.phase: [(STAND_S + MARGIN_S, self.stop - MARGIN_S)],
-            "rest": [(self.stop + MARGIN_S, self.stop + END_S - MARGIN_S)],
-        }
+        return sum((integrate_pulse(t, *pulse) for pulse in self.pulses), np.zeros_like(t))
 
 
 @dataclass(frozen=True)
@@ -172,87 +114,77 @@ class _Circle:
     sense: float  # +1 or -1
 
     @property
-    def stop(self) -> float:
-        """Time [s] at which the hand is back on the table."""
-        return self.start + self.duration + 2.0 * LIFT_S - 1.0  # turn, lift and return overlap by 0.5 s each
+    def pulse(self) -> tuple[float, float, float]:
+        """Begin, end and ramp [s]: turn, lift and return overlap by 0.5 s each."""
+        return self.start, self.start + self.duration + 2.0 * _LIFT_S - 1.0, _LIFT_S
 
     def offset_W(self, t: np.ndarray, table_W: np.ndarray) -> np.ndarray:
         """Return the vector from the table point to the hand (n, 3) [m]."""
-        angle = 2.0 * np.pi * self.sense * make_step(t, self.start + LIFT_S - 0.5, self.duration)
+        angle = 2.0 * np.pi * self.sense * make_step(t, self.start + _LIFT_S - 0.5, self.duration)
         circle_W = self.centre_W + np.cos(angle)[:, None] * self.axes_W[0] + np.sin(angle)[:, None] * self.axes_W[1]
-        return make_pulse(t, self.start, self.stop, LIFT_S)[:, None] * (circle_W - table_W)
+        return make_pulse(t, *self.pulse)[:, None] * (circle_W - table_W)
 
 
-class _Aim(NamedTuple):
-    """What torso and hands do at n times, whatever the shoulders do; by side but for the torso."""
+class _Part(NamedTuple):
+    """A piece of the session [s]."""
 
-    R_WT: Rotation
-    palm_T: dict[str, np.ndarray]  # (n, 3) [m]
-    lead: dict[str, np.ndarray]  # (n,) share by which the palm leads its arm; 0: the arm hangs
-    swivel: dict[str, np.ndarray]  # (n,) [rad]
-    pronation: dict[str, np.ndarray]  # (n,) [rad] about z of the forearm
-    hand_F: dict[str, Rotation]  # hand in the forearm; empty: straight
+    kind: str  # the protocol, whose phase has its name
+    start: float
+    stop: float
+
+    @property
+    def leads(self) -> bool:
+        """True where palms are led to a point."""
+        return self.kind not in _PART_S
+
+    @property
+    def pulse(self) -> tuple[float, float, float]:
+        """Begin, end and ramp [s] of its motion."""
+        return self.start, self.stop, _POSE_RAMP_S if self.kind == "t_pose" else RAMP_S
 
 
-class FreeArm(NamedTuple):
-    """What an arm does beside hanging while its palm is led nowhere, at n times."""
+class _Hand(NamedTuple):
+    """What one hand does at n times, wherever its shoulder is."""
 
-    turn: np.ndarray  # (n, 3) [rad] rotation vector of the upper arm in T
-    bend: np.ndarray  # (n, 2) [rad] of the elbow: less its flexion, and pronation about z of the forearm
-    start: np.ndarray  # (n,) share of the offsets of the start pose
-
-
-def _turn_to(vectors: np.ndarray, directions: np.ndarray) -> Rotation:
-    """Return the least rotations (n) of vectors (n, 3) to the directions (n, 3), below a half turn."""
-    a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (vectors, directions))
-    return Rotation.from_quat(np.column_stack((np.cross(a, b), 1.0 + np.sum(a * b, axis=1))))
+    lead: np.ndarray  # (n,) share by which the palm leads its arm; 0: the arm hangs
+    palm_T: np.ndarray  # (n, 3) [m]
+    palm_F: np.ndarray  # (n, 3) [m] from the elbow
+    swivel: np.ndarray  # (n,) [rad]
+    pronation: np.ndarray  # (n,) [rad] about z of the forearm
 
 
 class Motion(BodyMotion):
-    """The motion of a protocol, with torso and arms; `sequence` has those of other protocols than the clasp."""
+    """Torso and arms in the motions of protocols, one after the other, then circles of the right hand."""
 
-    phase = "clasp"
     lean_deg: float | np.ndarray = 15.0  # yaw, pitch, roll of the torso in the clasp
-
-    def prepare(self, rng: np.random.Generator) -> None:
-        """Draw what a protocol needs beyond the clasp."""
-
-    def protocol_phases(self) -> dict[str, list[tuple[float, float]]]:
-        """Return the phases between start and circles: phase → intervals [s]."""
-        return {self.phase: [(self.clasp[0] + MARGIN_S, self.clasp[1] - MARGIN_S)]}
-
-    def phases(self) -> dict[str, list[tuple[float, float]]]:
-        return {
-            "start": [(0.5, STAND_S - 0.5)],
-            **self.protocol_phases(),
-            "circles": [(self.circles[0].start, self.circles[-1].stop)] if self.circles else [],
-            "rest": [(a + MARGIN_S, b - MARGIN_S) for a, b in self.rest],
-        }
-
-    @property
-    def span(self) -> tuple[float, float]:
-        return self.clasp[0], self.rest[-1][1]
+    closes = True  # palms must reach each other to some micrometres
 
     def __init__(
-        self, lengths: Mapping[str, float], rng: np.random.Generator, clasp_s: float, circles: int, flaws: Flaws
+        self,
+        lengths: Mapping[str, float],
+        rng: np.random.Generator,
+        parts: Sequence[str],
+        clasp_s: float,
+        circles: int,
+        flaws: Flaws,
     ) -> None:
-        self.flaws = flaws
-        self.lengths = lengths
-        self.p_LS = place_sensors(lengths, flaws.sizes)
+        super().__init__(lengths, flaws)
         self.least_flexion, self.most_missing, self.rounds = _LEAST_FLEXION, np.inf, 1
+        self.slack = max(0.012, flaws.sizes.palm_slip) if flaws.sizes.palm_slip else 0.0  # arms need it for the slip
         self.half_width = 0.5 * lengths["shoulder_width"]
         self.arm = {s: (lengths[f"{s}_upper_arm"], lengths[f"{s}_forearm"] + lengths[f"{s}_hand"]) for s in SIDES}
         self.reach = min(sum(arm) for arm in self.arm.values())
-        self.clasp = (STAND_S + _BLEND_S, STAND_S + _BLEND_S + clasp_s)
+        self.clasp = (STAND_S + _LEAD_S, STAND_S + _LEAD_S + clasp_s)
+        self.schedule = _schedule(parts, *self.clasp)
         names = ("azimuth", "elevation", "radius", "roll", "pitch", "yaw")
         arm_names = (f"{side}_{angle}" for side in SIDES for angle in ("swivel", "pronation"))
         self.wander = {name: Wander(rng) for name in (*names, *arm_names)}
         # In units of the reach, from the right shoulder: table above the hips, circles before the chest.
-        shoulder_W = np.array((0.0, -self.half_width, lengths["trunk"]))
+        shoulder_W = place_shoulder("right", lengths)
         self.table_W = shoulder_W + self.reach * np.array((0.52, 0.03, -0.6))
-        t = self.clasp[1] + _BLEND_S
-        self.rest = [(t, t + _REST_S[0])]
         self.circles: list[_Circle] = []
+        at = self.clasp[1] + _LEAD_S
+        rests = [(at, at + _REST_S[0])]
         for _ in range(circles):
             centre_W = shoulder_W + self.reach * (
                 np.array((0.62, 0.03, 0.0)) + rng.uniform(-1, 1, 3) * (0.03, 0.1, 0.12)
@@ -261,14 +193,32 @@ class Motion(BodyMotion):
             tilt, turn, first = rng.uniform(-1.0, 1.0, 3) * np.array((0.5, 0.5, np.pi))  # mostly frontal
             plane = Rotation.from_euler("ZYX", [turn, tilt, first])
             axes_W = radius * plane.apply([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-            circle = _Circle(self.rest[-1][1], rng.uniform(3.0, 4.0), centre_W, axes_W, rng.choice((-1.0, 1.0)))
+            circle = _Circle(rests[-1][1], rng.uniform(3.0, 4.0), centre_W, axes_W, rng.choice((-1.0, 1.0)))
             self.circles.append(circle)
-            self.rest.append((circle.stop, circle.stop + _REST_S[1]))
+            rests.append((circle.pulse[1], circle.pulse[1] + _REST_S[1]))
+        self.end = rests[-1][1]
+        self.pulses = [*(part.pulse for part in self.schedule), *(circle.pulse for circle in self.circles)]
+        self.phases |= {part.kind: [(part.start + MARGIN_S, part.stop - MARGIN_S)] for part in self.schedule}
+        if self.circles:
+            self.phases["circles"] = [(self.circles[0].start, self.circles[-1].pulse[1])]
+        self.phases["rest"] = [(a + MARGIN_S, b - MARGIN_S) for a, b in rests]
         # The slip's gains [m]: the stated rms on each axis over the clasp, whatever the sampling rate.
         grid = np.arange(*self.clasp, 0.05)
         gate = make_pulse(grid, *self.clasp, RAMP_S)
         rms = np.array([np.sqrt(np.mean((gate * wander(grid)) ** 2)) for wander in flaws.slip])
         self.slip_gain = flaws.sizes.palm_slip / np.sqrt(3.0) / rms
+
+    def prepare(self, rng: np.random.Generator) -> None:
+        """Draw how this person does the parts."""
+        size = self.flaws.sizes.start_pose
+        self.pose = {}
+        for side in SIDES:
+            rng.standard_normal(9), rng.uniform(size=5)  # of parts that there were: a seed keeps its person
+            self.pose[side] = {
+                name: np.deg2rad(offset.mean + size * offset.std * np.clip(rng.standard_normal(), -2.3, 2.3))
+                for name, offset in T_POSE.items()
+            }
+        self.bow_axis = size * BOW_AXIS_STD * np.clip(rng.standard_normal(), -2.3, 2.3)
 
     def fit_to_person(self, rng: np.random.Generator) -> None:
         """Prepare the motion; where shoulders and wrists move, hands stay as near as the arms then need.
@@ -278,53 +228,36 @@ class Motion(BodyMotion):
         BadOption
             The arms do not reach at all.
         """
-        flaws = self.flaws
-        if not flaws.iterates:
-            self.prepare(rng)
+        self.prepare(rng)
+        if not self.flaws.iterates:
             return
+        grid, clasp_t = np.arange(self.clasp[0], self.end, 0.05), np.arange(*self.clasp, 0.05)
+        moving = self._motion_share(clasp_t)
+        reaches = _REACHES if self.closes else [(1, self.slack)]
         self.least_flexion, self.most_missing = _PERSON_LEAST_FLEXION, _MOST_MISSING
-        for self.rounds, flaws.slack in _REACHES:
-            self.prepare(deepcopy(rng))
-            grid, clasp_t = np.arange(*self.span, 0.05), np.arange(*self.clasp, 0.05)
-            moving = self._motion_share(clasp_t)
+        for self.rounds, self.slack in reaches:
             distance = np.linalg.norm(self._clasp_point(clasp_t, moving), axis=1)
-            flaws.wrists.fit(clasp_t, moving, np.column_stack((distance, distance)))
+            self.flaws.wrists.fit(clasp_t, moving, np.column_stack((distance, distance)))
             try:
-                self(grid)
-            except BadOption:
-                if (self.rounds, flaws.slack) == _REACHES[-1]:
-                    raise
-            else:
+                if self.closes:
+                    self(grid)
                 break
+            except BadOption:
+                if (self.rounds, self.slack) == reaches[-1]:
+                    raise
         self.least_flexion, self.most_missing = _LEAST_FLEXION, np.inf
-
-    def protocol_pulses(self) -> list[tuple[float, float, float]]:
-        """Return where the protocol moves the person: begin, end and ramp [s] of each pulse of motion."""
-        return [(*self.clasp, RAMP_S)]
-
-    def activity(self, t: np.ndarray) -> np.ndarray:
-        return self._sum_pulses(make_pulse, t)
-
-    def moving_time(self, t: np.ndarray, _segment: str = "", /) -> np.ndarray:
-        return self._sum_pulses(integrate_pulse, t)
-
-    def _sum_pulses(self, pulse: Callable[[np.ndarray, float, float, float], np.ndarray], t: np.ndarray) -> np.ndarray:
-        protocol = sum((pulse(t, *each) for each in self.protocol_pulses()), np.zeros_like(t))
-        return protocol + sum((pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
 
     def _clasp_point(self, t: np.ndarray, moving: np.ndarray) -> np.ndarray:
         """Return the point where the palms meet (n, 3) [m] in T, from midway between the shoulders, in reach."""
         azimuth = np.deg2rad(38.0) * moving * self.wander["azimuth"](t)
         elevation = np.deg2rad(-4.0 + 46.0 * moving * self.wander["elevation"](t))
         fraction = 0.5 + 0.5 * moving * self.wander["radius"](t)
-        ray = np.column_stack(
-            (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
-        )
+        ray = aim_ray(azimuth, elevation)
         # Shoulder to palm at the limits of the elbow, for the arm that is nearer to them.
         span = np.array(
             [[np.sqrt(a * a + b * b + 2 * a * b * np.cos(f)) for f in _FLEXION] for a, b in self.arm.values()]
         )
-        longest, shortest = span[:, 0].min() - self.flaws.slack, span[:, 1].max()
+        longest, shortest = span[:, 0].min() - self.slack, span[:, 1].max()
         # The far shoulder limits the radius from above, the near one from below; the smooth |y| is safe.
         side = self.half_width * np.sqrt(ray[:, 1] ** 2 + 0.01)
         upper = np.sqrt(side**2 + longest**2 - self.half_width**2) - side
@@ -334,23 +267,23 @@ class Motion(BodyMotion):
         return (lower + fraction * (upper - lower))[:, None] * ray
 
     def _motion_share(self, t: np.ndarray) -> np.ndarray:
-        return make_pulse(t, *self.clasp, RAMP_S)  # 0 at both ends of the clasp
-
-    def _torso(self, _t: np.ndarray, lean: np.ndarray) -> Rotation:
-        """Return R_WT from `lean` (n, 3) [rad]: yaw, pitch, roll."""
-        return turn_about("ZYX", lean)
+        """Return the share (n,) of the hands' motion, 0 at both ends of a clasp."""
+        return sum((make_pulse(t, *part.pulse) for part in self.schedule if part.leads), np.zeros_like(t))
 
     def _palms(self, _t: np.ndarray, _motion_share: np.ndarray, clasp_T: np.ndarray) -> dict[str, np.ndarray]:
         """Return the position (n, 3) [m] in T of each palm before the right one moves to the table."""
         return {"left": clasp_T, "right": clasp_T}
 
-    def _lead_share(self, _t: np.ndarray, led: np.ndarray, table: np.ndarray) -> dict[str, np.ndarray]:
+    def _lead_shares(self, t: np.ndarray, table: np.ndarray) -> dict[str, np.ndarray]:
         """Return the share (n,) by which each palm leads its arm; 0: the arm hangs."""
-        return {"left": led * (1.0 - table), "right": led}  # the left arm returns to hanging
-
-    def _free(self, t: np.ndarray, _side: str) -> FreeArm:
-        """Return what an arm does while its palm is led nowhere: it hangs."""
-        return FreeArm(np.zeros((len(t), 3)), np.zeros((len(t), 2)), np.ones_like(t))
+        share, last = np.zeros_like(t), self.schedule[-1]
+        for part in (part for part in self.schedule if part.leads):
+            first = part is self.schedule[0]  # from the N-pose
+            rise = make_step(t, STAND_S, _LEAD_S) if first else make_step(t, part.start - _BLEND_S, _BLEND_S)
+            share = share + rise * (1.0 - (0.0 if part is last else make_step(t, part.stop, _BLEND_S)))
+        if last.leads:
+            return {"left": share * (1.0 - table), "right": share}  # the left arm returns to hanging
+        return {"left": share, "right": share + table}
 
     def _arm(self, side: str, palm_T: np.ndarray, swivel: np.ndarray) -> tuple[Rotation, np.ndarray]:
         """Upper arm in T and elbow flexion [rad] to bring the palm to `palm_T` (n, 3) [m], from the shoulder.
@@ -377,55 +310,7 @@ class Motion(BodyMotion):
         x = sin_alpha[:, None] * n - cos_alpha[:, None] * m  # into which the forearm flexes
         return Rotation.from_quat(quat_from_matrix(np.stack((x, np.cross(n, m), -u), axis=2))), flexion
 
-    def _aim(self, t: np.ndarray, *, wrists: bool = True) -> _Aim:
-        """Compute what torso and hands do at the times `t` (n,) [s]; without `wrists` they are straight."""
-        moving = self._motion_share(t)
-        circling = sum((make_pulse(t, c.start, c.stop, LIFT_S) for c in self.circles), np.zeros_like(t))
-        led = make_step(t, STAND_S, _BLEND_S)  # from the N-pose to the clasp
-        table = make_step(t, self.clasp[1], _BLEND_S)  # from the clasp to the table
-
-        lean = np.column_stack([self.wander[name](t) for name in ("yaw", "pitch", "roll")])
-        lean *= np.deg2rad(self.lean_deg * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
-        flaws = self.flaws
-        lean[:, 1:] += np.deg2rad(flaws.sizes.sway_deg_s) * flaws.sway["torso"](t)
-        lean[:, 1:] += np.deg2rad(flaws.sizes.sway_tilt_deg) / np.sqrt(2.0) * flaws.tilt(t)
-        R_WT = self._torso(t, lean)
-        if flaws.start_pose.torso.any():
-            R_WT = compose(R_WT, Rotation.from_rotvec((1.0 - led)[:, None] * flaws.start_pose.torso))
-        centred_T = self._clasp_point(t, moving)
-        clasp_T = centred_T + self.lengths["trunk"] * E_Z
-        hand_W = self.table_W + sum((c.offset_W(t, self.table_W) for c in self.circles), np.zeros((len(t), 3)))
-        palm_T = self._palms(t, moving, clasp_T)
-        palm_T["right"] = palm_T["right"] + table[:, None] * (R_WT.inv().apply(hand_W) - palm_T["right"])
-        slips = [gain * wander(t) for gain, wander in zip(self.slip_gain, flaws.slip, strict=True)]
-        slip_T = moving[:, None] * np.column_stack(slips)
-        palm_T = {"left": palm_T["left"] + 0.5 * slip_T, "right": palm_T["right"] - 0.5 * slip_T}
-        swivel, pronation = {}, {}
-        for side in SIDES:
-            wander = self.wander[f"{side}_swivel"](t)
-            swivel[side] = np.deg2rad(35.0 + 30.0 * (moving + 0.3 * circling) * wander)
-            palm_down = np.deg2rad(40.0) * table if side == "right" else 0.0 * t
-            wander = np.deg2rad(55.0 * moving + 15.0 * circling) * self.wander[f"{side}_pronation"](t)
-            pronation[side] = wander + palm_down
-        hand_F: dict[str, Rotation] = {}
-        if flaws.wrists.bend and wrists:
-            distance = np.linalg.norm(centred_T, axis=1)
-            hand_F = {side: flaws.wrists.rotate(y, t, moving, circling, distance) for side, y in SIDES.items()}
-        return _Aim(R_WT, palm_T, self._lead_share(t, led, table), swivel, pronation, hand_F)
-
-    def _raising(self, t: np.ndarray, side: str) -> np.ndarray:
-        """Compute the rate (n,) [deg/s] at which the arm is raised, the shoulder at rest."""
-        elevation = []
-        for step in (-_RATE_STEP_S, _RATE_STEP_S):
-            aim = self._aim(t + step, wrists=False)
-            R_TU, _ = self._arm(side, aim.palm_T[side] - place_shoulder(side, self.lengths), aim.swivel[side])
-            free, lead = self._free(t + step, side), aim.lead[side][:, None]
-            down = Rotation.from_rotvec((1.0 - lead) * free.turn).apply(-E_Z)
-            along_T = Rotation.from_rotvec(lead * log(R_TU.as_quat())).apply(down)
-            elevation.append(np.rad2deg(np.arctan2(np.hypot(along_T[:, 0], along_T[:, 1]), -along_T[:, 2])))
-        return (elevation[1] - elevation[0]) / (2.0 * _RATE_STEP_S)
-
-    def _reach(self, t: np.ndarray, side: str, aim: _Aim, hang: Rotation) -> tuple[np.ndarray, Rotation, np.ndarray]:
+    def _reach(self, t: np.ndarray, side: str, hand: _Hand, hang: Rotation) -> tuple[np.ndarray, Rotation, np.ndarray]:
         """Shoulder (n, 3) [m] in T, upper arm in T and elbow flexion (n,) [rad] that bring the palm to its aim.
 
         The shoulder follows the arm, elbow and wrist are not straight. Each round bends the elbow towards the distance
@@ -433,86 +318,169 @@ class Motion(BodyMotion):
         function of time.
         """
         flaws, y = self.flaws, SIDES[side]
-        upper, blend = self.lengths[f"{side}_upper_arm"], aim.lead[side][:, None]
-        palm_F = self._palm_F(side, aim)
-        lower = np.linalg.norm(palm_F, axis=1)
-        hysteresis = flaws.sizes.girdle and flaws.sizes.girdle_hysteresis
-        raising = self._raising(t, side) if hysteresis else np.zeros_like(t)
-        centre_T = place_shoulder(side, self.lengths) + flaws.girdle.place(y, self.moving_time(t))
+        upper, lower = self.lengths[f"{side}_upper_arm"], np.linalg.norm(hand.palm_F, axis=1)
+        shoulder_T = np.tile(place_shoulder(side, self.lengths), (len(t), 1))
+        if not flaws.iterates:
+            return shoulder_T, *self._arm(side, hand.palm_T - shoulder_T, hand.swivel)
+        centre_T = shoulder_T = shoulder_T + flaws.girdle.place(y, self.moving_time(t))
         down_U = hang.apply(-E_Z)
 
         def bend(flexion: np.ndarray) -> np.ndarray:
             """Palm (n, 3) [m] in the upper arm, from the shoulder."""
-            return flaws.elbow_joint.rotate_vectors(y, flexion, aim.pronation[side], palm_F) - upper * E_Z
+            return flaws.elbow_joint.rotate_vectors(y, flexion, hand.pronation, hand.palm_F) - upper * E_Z
 
         def opening(palm: np.ndarray) -> np.ndarray:
             """Angle (n,) [rad] at the elbow, 0 where the arm is straight, from the palm seen from the shoulder."""
             cos = (np.sum(palm**2, axis=1) - upper**2 - lower**2) / (2.0 * upper * lower)
             return np.arccos(np.clip(cos, -1.0, 1.0))
 
-        shoulder_T, flexion = centre_T, np.empty(0)
-        for _ in range(self.rounds):
-            palm_T = aim.palm_T[side] - shoulder_T
-            R_TU, straight = self._arm(side, palm_T, aim.swivel[side])
-            flexion = flexion if flexion.size else straight
-            flexion = flexion + opening(palm_T) - opening(bend(flexion))
-            R_TU = compose(_turn_to(R_TU.apply(bend(flexion)), palm_T), R_TU)
-            along_T = Rotation.from_rotvec(blend * log(R_TU.as_quat())).apply(down_U)
+        for k in range(self.rounds):
+            palm_T = hand.palm_T - shoulder_T
+            R_TU, straight = self._arm(side, palm_T, hand.swivel)
+            if k == 0:
+                flexion, palm_U = straight, bend(straight)
+            flexion = flexion + opening(palm_T) - opening(palm_U)
+            palm_U = bend(flexion)
+            R_TU = compose(_turn_to(R_TU.apply(palm_U), palm_T), R_TU)
+            along_T = _scale(R_TU, hand.lead).apply(down_U)
             # A shoulder that rises lowers the arm, which lowers the shoulder: a part of the way settles sooner.
-            displaced_T = centre_T + flaws.girdle.displace(along_T, y, raising)
-            shoulder_T = shoulder_T + _RELAXATION * (displaced_T - shoulder_T)
-        missing = np.linalg.norm(aim.palm_T[side] - shoulder_T - R_TU.apply(bend(flexion)), axis=1)
-        worst = float(np.max(missing * (aim.lead[side] == 1.0), initial=0.0))
+            shoulder_T = shoulder_T + _RELAXATION * (centre_T + flaws.girdle.displace(along_T, y) - shoulder_T)
+        missing = np.linalg.norm(hand.palm_T - shoulder_T - R_TU.apply(palm_U), axis=1)
+        worst = float(np.max(missing * (hand.lead == 1.0), initial=0.0))
         if worst > self.most_missing:
             raise BadOption(f"lengths: the {side} arm does not reach through the motion, by {1e3 * worst:.2g} mm")
         return shoulder_T, R_TU, flexion
 
-    def _palm_F(self, side: str, aim: _Aim) -> np.ndarray:
-        """Palm (n, 3) [m] in the forearm, from the elbow."""
-        hand = np.array((0.0, 0.0, -self.lengths[f"{side}_hand"]))
-        bent = aim.hand_F[side].apply(hand) if aim.hand_F else np.tile(hand, (len(aim.lead[side]), 1))
-        return bent - self.lengths[f"{side}_forearm"] * E_Z
-
     def __call__(self, t: np.ndarray, segments: Collection[str] = SEGMENTS) -> BodyPose:
-        """Return the exact pose of the torso and of the arms of the segments' sides at the times `t` (n,) [s]."""
-        aim, flaws = self._aim(t), self.flaws
-        sway = np.deg2rad(flaws.sizes.sway_deg_s)
-        R_WT = aim.R_WT
+        flaws, start_pose = self.flaws, self.flaws.start_pose
+        moving = self._motion_share(t)
+        circling = sum((make_pulse(t, *circle.pulse) for circle in self.circles), np.zeros_like(t))
+        table = make_step(t, self.clasp[1], _LEAD_S)  # from the clasp to the table
+
+        lean = np.column_stack([self.wander[name](t) for name in ("yaw", "pitch", "roll")])
+        lean *= np.deg2rad(self.lean_deg * moving[:, None] + circling[:, None] * np.array((5.0, 3.0, 3.0)))
+        lean[:, 1:] += flaws.sway_torso(t)
+        R_WT = turn_about("ZYX", lean)
+        for part in self.schedule:
+            if part.kind == "bow":
+                R_WT = compose(make_bow(make_pulse(t, *part.pulse), self.bow_axis), R_WT)
+        starting = 1.0 - make_step(t, STAND_S, _LEAD_S)
+        R_WT = compose(R_WT, Rotation.from_rotvec(starting[:, None] * start_pose.torso))
+
+        centred_T = self._clasp_point(t, moving)
+        distance = np.linalg.norm(centred_T, axis=1)
+        palms_T = self._palms(t, moving, centred_T + self.lengths["trunk"] * E_Z)
+        hand_W = self.table_W + sum((c.offset_W(t, self.table_W) for c in self.circles), np.zeros((len(t), 3)))
+        palms_T["right"] = palms_T["right"] + table[:, None] * (R_WT.inv().apply(hand_W) - palms_T["right"])
+        slips = [gain * wander(t) for gain, wander in zip(self.slip_gain, flaws.slip, strict=True)]
+        slip_T = 0.5 * moving[:, None] * np.column_stack(slips)
+        leads = self._lead_shares(t, table)
+
         pose = BodyPose({"torso": R_WT}, {}, {"torso": np.zeros(3)})
         for side in [side for side in SIDES if any(segment.startswith(side) for segment in segments)]:
-            y, blend = SIDES[side], aim.lead[side]
-            y, blend = SIDES[side], aim.lead[side]
-            hanging, free = (1.0 - blend)[:, None], self._free(t, side)
-            starting = hanging * free.start[:, None]
-            turns = (  # of a hanging arm
-                hanging * free.turn,
-                hanging * sway * np.pad(flaws.sway[side](t), ((0, 0), (0, 1))),
-                hanging * flaws.start[f"{side}_upper_arm"],
-                starting * flaws.start_pose.upper_arm[side],
+            y, lead = SIDES[side], leads[side]
+            hand_F = Rotation.identity(len(t))
+            if flaws.sizes.wrists:
+                hand_F = flaws.wrists.rotate(y, t, moving, circling, distance)
+            palm_F = hand_F.apply((0.0, 0.0, -self.lengths[f"{side}_hand"])) - self.lengths[f"{side}_forearm"] * E_Z
+            turning = np.deg2rad(55.0 * moving + 15.0 * circling) * self.wander[f"{side}_pronation"](t)
+            hand = _Hand(
+                lead,
+                palms_T[side] + y * slip_T,
+                palm_F,
+                np.deg2rad(35.0 + 30.0 * (moving + 0.3 * circling) * self.wander[f"{side}_swivel"](t)),
+                turning + (np.deg2rad(40.0) * table if side == "right" else 0.0),  # palm down on the table
             )
-            if flaws.iterates:
-                hang = compose(Rotation.identity(len(t)), *(Rotation.from_rotvec(turn) for turn in turns))
-                shoulder_T, R_TU, flexion = self._reach(t, side, aim, hang)
-            else:
-                shoulder_T = place_shoulder(side, self.lengths)
-                R_TU, flexion = self._arm(side, aim.palm_T[side] - shoulder_T, aim.swivel[side])
-            if flaws.sizes.shoulder_wander:
-                # The elevation is that of the arm from the mean centre: the same to within a degree.
-                along_T = Rotation.from_rotvec(blend[:, None] * log(R_TU.as_quat())).apply(-E_Z)
-                shoulder_T = shoulder_T + (1.0 + along_T[:, 2:]) * flaws.shoulder[side]
-                R_TU, flexion = self._arm(side, aim.palm_T[side] - shoulder_T, aim.swivel[side])
-            bend = np.column_stack((-blend * flexion, blend * aim.pronation[side]))
-            bend[:, 0] -= (1.0 - blend) * flaws.elbow[side]
-            bend -= starting * np.array((flaws.start_pose.flexion[side], -flaws.start_pose.pronation[side]))
-            bend += hanging * free.bend
-            R_TU = Rotation.from_rotvec(blend[:, None] * log(R_TU.as_quat()))
-            R_WU = compose(R_WT, R_TU, *(Rotation.from_rotvec(turn) for turn in turns))
-            R_WF = compose(R_WU, flaws.elbow_joint.rotate(y, -bend[:, 0], bend[:, 1]))
-            if flaws.sizes.start_segment_deg:
-                R_WF = compose(R_WF, Rotation.from_rotvec(hanging * flaws.start[f"{side}_forearm"]))
-            R_WH = compose(R_WF, aim.hand_F[side]) if aim.hand_F else R_WF
-            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, R_WH), self.lengths)
+            hanging = (1.0 - lead)[:, None]
+            turn, bend, start = self._hold_poses(t, side)
+            offsets = hanging * start[:, None]
+            turns = (hanging * turn, hanging * flaws.sway_arm(t, side), offsets * start_pose.upper_arm[side])
+            hang = compose(*(Rotation.from_rotvec(each) for each in turns))
+            shoulder_T, R_TU, flexion = self._reach(t, side, hand, hang)
+            elbow = hanging * bend + offsets * (start_pose.flexion[side], start_pose.pronation[side])
+            elbow += lead[:, None] * np.column_stack((flexion, hand.pronation))
+            R_WU = compose(R_WT, _scale(R_TU, lead), hang)
+            R_WF = compose(R_WU, flaws.elbow_joint.rotate(y, *elbow.T))
+            place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, compose(R_WF, hand_F)), self.lengths)
         return pose
+
+    def _hold_poses(self, t: np.ndarray, side: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what an arm does that hangs or is held in a pose.
+
+        The rotation vector (n, 3) [rad] of the upper arm in T, flexion and pronation about z (n, 2) [rad] of the
+        forearm, and the share (n,) of the offsets of the start pose.
+        """
+        turn, bend, start = np.zeros((len(t), 3)), np.zeros((len(t), 2)), np.ones_like(t)
+        for part in (part for part in self.schedule if part.kind == "t_pose"):
+            held, pose = make_pulse(t, part.start - _BLEND_S, part.stop + _BLEND_S, _BLEND_S), self.pose[side]
+            raised = Rotation.from_euler("x", SIDES[side] * (0.5 * np.pi + pose["elevation"]))
+            raised = Rotation.from_euler("z", -SIDES[side] * pose["plane"]) * raised
+            turn += held[:, None] * raised.as_rotvec()
+            bend += held[:, None] * np.array((pose["elbow"], pose["forearm_twist"]))
+            start = start * (1.0 - held)
+        return turn, bend, start
+
+
+TASKS: dict[str, type[Motion]] = dict.fromkeys(PARTS, Motion)  # protocol, by itself -> its motion
+
+
+def find_task(protocol: str) -> type[Motion]:
+    """Find the motion of a protocol, or of several that are joined by "+".
+
+    Raises
+    ------
+    BadOption
+        There is none.
+    """
+    parts = protocol.split("+")
+    if protocol not in TASKS and (not set(parts) <= set(PARTS) or len(set(parts)) < len(parts)):
+        raise BadOption(f"protocol {protocol!r} is not simulated; {one_of(TASKS, protocol)}; or several joined by +")
+    return TASKS.get(protocol, Motion)
+
+
+def _schedule(parts: Sequence[str], begin: float, end: float) -> list[_Part]:
+    """Arrange the parts from `begin` to `end` [s]; the clasp, where there is one, takes the time that is left."""
+    seconds = [_PART_S[kind][end - begin >= _LONG_S] if kind in _PART_S else 0.0 for kind in parts]
+    # Time passes before and after a part but a bow: hands are led there, or arms are raised.
+    changes = [_BLEND_S * ((a != "bow") + (b != "bow")) for a, b in pairwise(parts)]
+    first, last = _BLEND_S * (parts[0] == "t_pose"), _BLEND_S * (parts[-1] == "t_pose")
+    left = end - begin - sum(seconds) - sum(changes) - first - last
+    leads = any(kind not in _PART_S for kind in parts)
+    least = _LEAST_CLASP_S if leads else 0.0
+    if left < least:
+        needed = end - begin + least - left
+        raise BadOption(f"protocol '{'+'.join(parts)}' needs {needed:.0f} s, {end - begin:g} are given")
+    schedule, at = [], begin + first
+    for kind, fixed, change in zip(parts, seconds, [*changes, last], strict=True):
+        # Without a clasp the parts last longer.
+        own = left if kind not in _PART_S else fixed + (0.0 if leads else left / len(parts))
+        schedule.append(_Part(kind, at, at + own))
+        at += own + change
+    return schedule
+
+
+def make_bow(share: np.ndarray, axis_angle: float) -> Rotation:
+    """Make a bow by shares (n,) of `BOW` about an axis that is so far [rad] from y."""
+    axis = np.array((-np.sin(axis_angle), np.cos(axis_angle), 0.0))
+    return Rotation.from_rotvec(BOW * share[:, None] * axis)
+
+
+def aim_ray(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+    """Return the unit vectors (n, 3) at these angles (n,) [rad] from x: azimuth to the left, elevation up."""
+    return np.column_stack(
+        (np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation))
+    )
+
+
+def _turn_to(vectors: np.ndarray, directions: np.ndarray) -> Rotation:
+    """Return the least rotations (n) of vectors (n, 3) to the directions (n, 3), below a half turn."""
+    a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (vectors, directions))
+    return Rotation.from_quat(np.column_stack((np.cross(a, b), 1.0 + np.sum(a * b, axis=1))))
+
+
+def _scale(R: Rotation, share: np.ndarray) -> Rotation:
+    """Return shares (n,) of rotations (n), about the same axes."""
+    return Rotation.from_rotvec(share[:, None] * log(R.as_quat()))
 
 
 def place_shoulder(side: str, lengths: Mapping[str, float]) -> np.ndarray:
@@ -537,9 +505,9 @@ def place_arm(
 
 
 def place_sensors(lengths: Mapping[str, float], sizes: Imperfections = IDEAL_PRESET) -> dict[str, np.ndarray]:
-    """Place each sensor in L [m]: on the sternum, and on the outer side of the arm segments, half-way if not told."""
+    """Place each sensor in L [m]: on the sternum, and on the outer side of the arm segments."""
     places = {"torso": np.array((0.11, 0.0, 0.8 * lengths["trunk"]))}
-    upper_arm, forearm = sizes.upper_arm_place or 0.5, sizes.forearm_place or 0.5
+    upper_arm, forearm = 0.5 + sizes.sensor_place * np.array((0.1, 0.35))
     for side, y in SIDES.items():
         places[f"{side}_upper_arm"] = np.array((0.0, 0.045 * y, -upper_arm * lengths[f"{side}_upper_arm"]))
         places[f"{side}_forearm"] = np.array((0.01, 0.03 * y, -forearm * lengths[f"{side}_forearm"]))

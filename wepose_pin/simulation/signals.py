@@ -99,6 +99,7 @@ def rotate_about(axis: int, angle: np.ndarray | float, vectors: np.ndarray) -> n
     i, j = (axis + 1) % 3, (axis + 2) % 3
     cos, sin = np.cos(angle), np.sin(angle)
     a, b = vectors[..., i], vectors[..., j]
-    turned = [vectors[..., axis]] * 3
-    turned[i], turned[j] = cos * a - sin * b, sin * a + cos * b
-    return np.stack(np.broadcast_arrays(*turned), axis=-1)
+    first = cos * a - sin * b
+    rotated = np.empty((*first.shape, 3))
+    rotated[..., axis], rotated[..., i], rotated[..., j] = vectors[..., axis], first, sin * a + cos * b
+    return rotated

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from ..rotations import compose, log
 from .imperfections import Imperfections
 from .imu import GRAVITY
-from .motion import E_Z, SIDES, STAND_S, BodyPose
-from .people import Offset
-from .signals import Process, RandomWalk, integrate_step, make_step
+from .motion import E_Z, BodyPose
+from .people import SIDES, Offset
+from .signals import Process, RandomWalk, integrate_step
 
 # Rotation of a sensor on its segment, degree per degree of a joint's, and its spread between people and strappings.
 GAINS = {
@@ -40,20 +40,9 @@ RANDOM_DEG = {
 }
 _ONSET = np.deg2rad((20.0, 20.0))  # elevation is read too small from 30 deg on: this far below, and so softly
 _ROUND = np.deg2rad(3.0)  # an angle from hanging has a kink there: rounded off
-_BREATH_HZ = (0.22, 0.28)
-_CREEP_S = 600.0
-_SLIPS_PER_S = 0.05 / 600.0
-_SLIP_S = 0.5
-
-
-def lost_twist(part: str, place: float) -> float:
-    """Return the share of a segment's twist that its sensor does not follow, 0 at the upper and 1 at the lower joint.
-
-    Upper arm: a line through the 35 to 48 % of Cutti 2005 (Gait Posture 21, 341), the cluster gains of 0.64 to 0.74 of
-    PubMed 40222145 and the ranges of Warner & Heller 2025. Forearm: an assumption, of which only the direction is known
-    (Charles group 2022, J Biomech Eng 144, 071007).
-    """
-    return 0.55 - 0.40 * place if part == "upper_arm" else 0.95 - 0.90 * place
+_BREATH_DEG, _BREATH_HZ = 0.7, (0.22, 0.28)
+_CREEP_DEG, _CREEP_S = 1.0, 600.0
+_WOBBLE_DEG = 0.5  # per g
 
 
 class ArmRotations(NamedTuple):
@@ -66,13 +55,6 @@ class ArmRotations(NamedTuple):
     pronation: np.ndarray  # (n,) [rad] of the forearm against the upper arm, about its long axis
 
 
-class JointRotations(NamedTuple):
-    """What the joints of trunk and arms do at n times."""
-
-    trunk_flexion: np.ndarray  # (n,) [rad] of the torso against W, forward
-    arms: dict[str, ArmRotations]  # by side
-
-
 def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
     """Split R into swing @ twist about z: the swing's rotation vector (n, 3) after the twist, the twist (n,) [rad]."""
     z, w = R.as_quat()[:, 2:].T
@@ -81,22 +63,16 @@ def _split(R: Rotation) -> tuple[np.ndarray, np.ndarray]:
     return about_z.inv().apply(log(compose(R, about_z.inv()).as_quat())), twist
 
 
-def read_joints(pose: BodyPose) -> JointRotations:
-    """Read the rotations of the joints that soft tissue follows, from a pose of trunk and at least one arm."""
-    tilt, _ = _split(pose.R_WL["torso"])
-    arms = {}
-    for side in SIDES:
-        if f"{side}_upper_arm" in pose.R_WL:
-            R_WU = pose.R_WL[f"{side}_upper_arm"]
-            swing, twist = _split(compose(pose.R_WL["torso"].inv(), R_WU))
-            bend, pronation = _split(compose(R_WU.inv(), pose.R_WL[f"{side}_forearm"]))
-            elevation, flexion = (np.hypot(np.linalg.norm(v, axis=1), _ROUND) - _ROUND for v in (swing, bend))
-            arms[side] = ArmRotations(elevation, swing, twist, flexion, pronation)
-    return JointRotations(tilt[:, 1], arms)
+def _read_arm(pose: BodyPose, side: str) -> ArmRotations:
+    R_WU = pose.R_WL[f"{side}_upper_arm"]
+    swing, twist = _split(compose(pose.R_WL["torso"].inv(), R_WU))
+    bend, pronation = _split(compose(R_WU.inv(), pose.R_WL[f"{side}_forearm"]))
+    elevation, flexion = (np.hypot(np.linalg.norm(v, axis=1), _ROUND) - _ROUND for v in (swing, bend))
+    return ArmRotations(elevation, swing, twist, flexion, pronation)
 
 
 class SoftTissue:
-    """The rotation of one sensor on its segment: by the joints, at random, by breath, creep, slips and acceleration."""
+    """The rotation of one sensor on its segment: by the joints, at random, by breath, creep and acceleration."""
 
     def __init__(
         self,
@@ -105,49 +81,47 @@ class SoftTissue:
         sizes: Imperfections,
         rngs: Mapping[str, np.random.Generator],
         duration: float,
+        start: BodyPose,
     ) -> None:
+        """`place`: of the sensor, as a share of the segment's length; `start`: trunk and arms in the start pose."""
         side, _, part = segment.partition("_")
         self.side, self.part = (side, part) if part else ("", segment)
-        self.sizes = sizes
-        draw = np.clip(rngs["tissue_gain"].standard_normal(4), -2.5, 2.5)
-        sign = rngs["tissue_gain"].choice((-1.0, 1.0), 2)
+        self.sizes, self.start = sizes, start
+        self.draw = np.clip(rngs["tissue_gain"].standard_normal(4), -2.5, 2.5)
+        self.sign = rngs["tissue_gain"].choice((-1.0, 1.0), 2)
         heading = rngs["tissue_gain"].uniform(0.0, 2.0 * np.pi)
-        self.draw, self.sign = sizes.tissue_gain * draw, sign
         self.across = np.array((np.cos(heading), np.sin(heading), 0.0))
-        self.lost = lost_twist(self.part, place)
+        # Share of the twist that the sensor does not follow. Upper arm: a line through the 35 to 48 % of Cutti 2005
+        # (Gait Posture 21, 341), the cluster gains of 0.64 to 0.74 of PubMed 40222145 and the ranges of Warner & Heller
+        # 2025. Forearm: an assumption, of which only the direction is known (Charles 2022, J Biomech Eng 144, 071007).
+        self.lost = 0.55 - 0.40 * place if self.part == "upper_arm" else 0.95 - 0.90 * place
         across_deg, twist_deg, correlation_s = RANDOM_DEG.get(self.part, (0.0, 0.0, 1.0))
-        self.random_rms = sizes.tissue_random * np.deg2rad((across_deg, across_deg, twist_deg))
+        self.random_rms = np.deg2rad((across_deg, across_deg, twist_deg))
         self.random = Process(rngs["tissue_random"], correlation_s, 3)
         self.breath = 2.0 * np.pi * rngs["breath"].uniform(*_BREATH_HZ), rngs["breath"].uniform(0.0, 2.0 * np.pi)
         self.creep = RandomWalk(rngs["creep"], duration, 3)
-        self.creep_rms = np.deg2rad(sizes.creep_deg) * np.sqrt(duration / _CREEP_S)
-        self.slips: list[tuple[float, float]] = []  # time [s] and direction
-        at = STAND_S + rngs["strap_slip"].exponential(1.0 / _SLIPS_PER_S)
-        while at <= duration:
-            self.slips.append((at, rngs["strap_slip"].choice((-1.0, 1.0))))
-            at += rngs["strap_slip"].exponential(1.0 / _SLIPS_PER_S)
+        self.creep_rms = np.deg2rad(_CREEP_DEG) * np.sqrt(duration / _CREEP_S)
 
     def _gain(self, name: str, k: int, sign: float = 1.0) -> float:
         """Return this person's gain, with the draw k."""
-        return sign * (self.sizes.tissue_gain * GAINS[name].mean + self.draw[k] * GAINS[name].std)
+        return sign * (GAINS[name].mean + self.draw[k] * GAINS[name].std)
 
-    def follow(self, now: JointRotations, start: JointRotations) -> np.ndarray:
-        """Rotation vectors (n, 3) [rad] in L by the joints' rotation since the start pose."""
-        turn = np.zeros((len(now.trunk_flexion), 3))
-        flexion = now.trunk_flexion - start.trunk_flexion
+    def follow(self, pose: BodyPose) -> np.ndarray:
+        """Rotation vectors (n, 3) [rad] in L by the joints' rotation since the start pose, at the size of people."""
+        turn = np.zeros((len(pose.R_WL["torso"]), 3))
+        if self.part in ("torso", "pelvis"):
+            flexion, first = (_split(each.R_WL["torso"])[0][:, 1] for each in (pose, self.start))
+            turn[:, 1] = self._gain(f"{self.part}_flexion", 0) * (flexion - first)
         if self.part == "torso":
-            left, right = (now.arms[side].elevation - start.arms[side].elevation for side in SIDES)
-            turn[:, 1] = self._gain("torso_flexion", 0) * flexion
+            left, right = (_read_arm(pose, side).elevation - _read_arm(self.start, side).elevation for side in SIDES)
             turn[:, 1] += self._gain("torso_elevation", 1) * 0.5 * (left + right)
             turn[:, 0] = self._gain("torso_sides", 2) * (right - left)
             turn[:, 2] = self._gain("torso_sides", 3) * (right - left)
-        elif self.part == "pelvis":
-            turn[:, 1] = self._gain("pelvis_flexion", 0) * flexion
         elif self.part in ("upper_arm", "forearm"):
-            arm, first = now.arms[self.side], start.arms[self.side]
-            bend = arm.flexion - first.flexion
-            twist = arm.twist - first.twist if self.part == "upper_arm" else arm.pronation - first.pronation
-            turn[:, 2] = -(self.sizes.tissue_gain * self.lost + self.draw[0] * _TWIST_STD) * twist
+            arm, first_arm = _read_arm(pose, self.side), _read_arm(self.start, self.side)
+            bend = arm.flexion - first_arm.flexion
+            twist = arm.twist - first_arm.twist if self.part == "upper_arm" else arm.pronation - first_arm.pronation
+            turn[:, 2] = -(self.lost + self.draw[0] * _TWIST_STD) * twist
             if self.part == "upper_arm":
                 # The angle above 30 deg, about the axis of elevation; none below 20 deg, where it has no meaning.
                 angle = np.linalg.norm(arm.swing, axis=1)
@@ -159,37 +133,25 @@ class SoftTissue:
                 turn += self._gain("forearm_flexion", 1, self.sign[0]) * bend[:, None] * self.across
         return turn
 
-    def __call__(
-        self,
-        t: np.ndarray,
-        moving_time: np.ndarray,
-        joints: tuple[JointRotations, JointRotations],
-        accel_L: np.ndarray,
-    ) -> np.ndarray:
+    def __call__(self, t: np.ndarray, moving_time: np.ndarray, pose: BodyPose, accel_L: np.ndarray) -> np.ndarray:
         """Return rotation vectors (n, 3) [rad] in L.
 
         Parameters
         ----------
         t : (n,) [s]
         moving_time : (n,) [s] that the segment has moved; the random part stands where the segment does
-        joints : at `t`, and in the start pose (n = 1)
+        pose : at `t`, of the torso and what carries the sensor, of the torso's sensor of both arms
         accel_L : (n, 3) [m/s^2] of the sensor, in L. Limbs move below 5 Hz: the low-pass of a strap at 15 Hz, which
             the literature gives, would change nothing
         """
-        turn = self.random_rms * self.random(moving_time)
-        if self.sizes.tissue_gain:
-            turn = turn + self.follow(*joints)
-        if self.sizes.breath_deg and self.part == "torso":
+        sizes, turn = self.sizes, np.zeros((len(t), 3))
+        if sizes.tissue_random:
+            across = np.cross(E_Z, accel_L)  # the free side of the strap lags
+            turn = self.random_rms * self.random(moving_time) + self.creep_rms * self.creep(t)
+            turn = sizes.tissue_random * (turn - np.deg2rad(_WOBBLE_DEG) / GRAVITY * across)
+        if sizes.tissue_gain:
+            turn = turn + sizes.tissue_gain * self.follow(pose)
+        if sizes.sway and self.part == "torso":
             rate, phase = self.breath
-            turn[:, 1] += np.sqrt(2.0) * np.deg2rad(self.sizes.breath_deg) * np.sin(rate * t + phase)
-        turn = turn + self.creep_rms * self.creep(t)
-        for at, direction in self.slips:
-            turn[:, 2] += direction * np.deg2rad(self.sizes.strap_slip_deg) * make_step(t, at, _SLIP_S)
-        across = np.cross(E_Z, accel_L)  # the free side of the strap lags
-        return turn - np.deg2rad(self.sizes.wobble_deg) / GRAVITY * across
-
-
-def is_on(sizes: Imperfections) -> bool:
-    """Return whether sensors turn on their segments in a way of this module."""
-    names = ("tissue_gain", "tissue_random", "breath_deg", "creep_deg", "strap_slip_deg", "wobble_deg")
-    return any(getattr(sizes, name) for name in names)
+            turn[:, 1] += sizes.sway * np.sqrt(2.0) * np.deg2rad(_BREATH_DEG) * np.sin(rate * t + phase)
+        return turn

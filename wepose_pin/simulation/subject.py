@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -23,10 +22,9 @@ from ..recording.gaps import bridge, mark_lost_samples
 from ..rotations import compose, heading, log
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import GRAVITY, MTI_3, Device, ImuNoise, draw_lost, jitter_time
-from .motion import E_Z, SEGMENTS, STAND_S, BodyMotion, BodyPose, Flaws
-from .sequence import find_task
-from .signals import Wander
-from .soft_tissue import JointRotations, SoftTissue, is_on, read_joints
+from .motion import E_Z, SEGMENTS, STAND_S, BodyMotion, BodyPose, find_task
+from .people import Flaws
+from .soft_tissue import SoftTissue
 
 _MOUNT = ("+x", "-z")  # sensor axes that point up and forward, apart from the tilt of the strap
 
@@ -36,51 +34,16 @@ MEASURED_STD = 0.003  # [m] of each
 # 400 mm.
 PEOPLE_MEASURED_STD = 0.012
 _STENCIL_S = 1e-3  # for p_ddot: truncation and rounding together stay below 1e-6 m/s^2
+_STEPS = (0, -2, -1, 1, 2)  # of the poses that an acceleration follows from
 _MIDPOINTS = (np.arange(4) + 0.5) / 4.0  # of an interval's quarters, for its mean
-_GAIN_RATE_HZ = 20.0  # at which soft-tissue motion is scaled to its rms
-# Streams of random numbers: new ones go to the end.
+# Streams of random numbers; "-" are those of what there was: a seed keeps its person.
 _STREAMS = (
-    "motion",
-    "strap",
-    "noise",
-    "palm_slip",
-    "shoulder_wander",
-    "start_elbow",
-    "start_segment",
-    "sway",
-    "soft_tissue",
-    "device",
-    "clock_jitter",
-    "clock_offset",
-    "dropped",
-    "mount",
-    "task",
-    "tissue_gain",
-    "tissue_random",
-    "breath",
-    "creep",
-    "strap_slip",
-    "girdle_person",
-    "girdle_wander",
-    "girdle_rest",
-    "carrying_angle",
-    "elbow_abduction",
-    "start_pose",
-    "start_heading",
-    "sway_tilt",
-    "wrist",
-    "gyro_warm_up",
-    "clock_drift",
-)
+    "motion strap noise palm_slip - - - sway - device clock_jitter clock_offset dropped mount task tissue_gain "
+    "tissue_random breath creep - girdle_person girdle_wander girdle_rest carrying_angle elbow_abduction start_pose "
+    "start_heading sway_tilt wrist gyro_warm_up clock_drift"
+).split()
 # What stays with a person from session to session.
-_PERSON_STREAMS = (
-    "shoulder_wander",
-    "tissue_gain",
-    "girdle_person",
-    "girdle_rest",
-    "carrying_angle",
-    "elbow_abduction",
-)
+_PERSON_STREAMS = ("tissue_gain", "girdle_person", "girdle_rest", "carrying_angle", "elbow_abduction")
 
 
 @dataclass(frozen=True)
@@ -166,103 +129,43 @@ class Simulation:
         )
 
 
-class _Moved(NamedTuple):
-    """The motion of a segment and of its sensor's position at n times."""
+class _Samples(NamedTuple):
+    """What one sensor measures without errors of its own, at n times."""
 
-    time: np.ndarray  # (n,) [s]
-    R_WL: Rotation
-    p_ddot: np.ndarray  # (n, 3) [m/s^2] in W, of the sensor's position
-    rate_L: np.ndarray  # (n, 3) [rad/s] of the segment
+    quat_WS: np.ndarray  # (n, 4) xyzw
+    force_S: np.ndarray  # (n, 3) [m/s^2], specific force
+    soft_L: np.ndarray  # (n, 3) [rad], rotation vector of the soft tissue
 
 
-class _Sampled:
-    """The motion at n times, and at neighbouring times for numerical derivatives."""
+@dataclass(frozen=True)
+class _Strapped:
+    """A sensor on a segment of a motion."""
 
-    def __init__(self, motion: BodyMotion, t: np.ndarray, segment: str = "", *, joints: bool = False) -> None:
-        """Sample all segments, or one segment and those that carry it; `joints`: with the rotations of the joints."""
-        segments = [segment] if segment else list(motion.p_LS)
-        all_arms = joints and segment in ("", "torso")  # the sensor on the chest follows both
-        self.time, self._motion, self._segments = t, motion, segments
-        self.pose: BodyPose = motion(t, [*segments, *SEGMENTS] if all_arms else segments)
-        self.joints: JointRotations | None = read_joints(self.pose) if joints else None
+    motion: BodyMotion
+    segment: str
+    R_LS: Rotation
+    tissue: SoftTissue
 
-    @cached_property
-    def neighbours(self) -> list[BodyPose]:
-        """The poses two steps and one step before, one and two after."""
-        return [self._motion(self.time + step * _STENCIL_S, self._segments) for step in (-2, -1, 1, 2)]
-
-    def segment(self, segment: str) -> _Moved:
-        p_LS = self._motion.p_LS[segment]
-        poses = [self.pose, *self.neighbours]
-        p_W, *others_W = (pose.R_WL[segment].apply(p_LS) + pose.origins[segment] for pose in poses)
+    def sample(self, t: np.ndarray, poses: Sequence[BodyPose] = ()) -> _Samples:
+        """Sample the sensor at the times `t` (n,) [s]; `poses`: of `_sample_poses` at these, where there are some."""
+        p_LS = self.motion.p_LS[self.segment]
+        pose, *around = poses or _sample_poses(self.motion, t, [self.segment])
+        p_W, *others_W = (each.R_WL[self.segment].apply(p_LS) + each.origins[self.segment] for each in (pose, *around))
         # Differences to the middle first: for a static segment they are exactly zero.
         far, near, near_after, far_after = (other_W - p_W for other_W in others_W)
-        p_ddot = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
-        turn = compose(self.neighbours[1].R_WL[segment].inv(), self.neighbours[2].R_WL[segment])
-        return _Moved(self.time, self.pose.R_WL[segment], p_ddot, log(turn.as_quat()) / (2.0 * _STENCIL_S))
+        accel_W = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
+        R_WL = pose.R_WL[self.segment]
+        moving_time = self.motion.moving_time(t, self.segment)
+        soft_L = self.tissue(t, moving_time, pose, R_WL.inv().apply(accel_W))
+        R_WS = compose(R_WL, Rotation.from_rotvec(soft_L), self.R_LS)
+        return _Samples(R_WS.as_quat(), R_WS.inv().apply(accel_W + GRAVITY * E_Z), soft_L)
 
 
-class _MildTissue:
-    """Soft-tissue rotation of a sensor of the mild preset: a mixture of specific force and rate, a slow wandering."""
-
-    def __init__(self, rng: np.random.Generator, rms_deg: float, moved: _Moved, activity: np.ndarray) -> None:
-        """The rotation has its rms over these samples."""
-        self.mixture = rng.standard_normal((6, 3))
-        self.wander = [Wander(rng) for _ in range(3)]
-        follows, wanders = self._parts(moved, activity)
-        each = np.array([1.0 / np.sqrt(np.mean(part**2, axis=0)) for part in (follows, wanders)])
-        total = each[0] * follows + each[1] * wanders
-        rms = np.deg2rad(rms_deg) / np.sqrt(3.0)  # [rad] of an axis
-        self.gains = each * rms / np.sqrt(np.mean(total**2, axis=0))  # (2, 3) of the two parts, of each axis
-
-    def _parts(self, moved: _Moved, activity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # In units of g and of 3 rad/s, typical of free arm motion; zero in a static N-pose.
-        force_L = moved.R_WL.inv().apply(moved.p_ddot / GRAVITY + E_Z) - E_Z
-        follows = np.column_stack((force_L, moved.rate_L / 3.0)) @ self.mixture
-        return follows, activity[:, None] * np.column_stack([wander(moved.time) for wander in self.wander])
-
-    def __call__(self, moved: _Moved, activity: np.ndarray) -> np.ndarray:
-        """Return rotation vectors (n, 3) [rad] in L."""
-        follows, wanders = self._parts(moved, activity)
-        return self.gains[0] * follows + self.gains[1] * wanders
-
-
-class _Skin:
-    """What turns one sensor on its segment."""
-
-    def __init__(
-        self,
-        motion: BodyMotion,
-        segment: str,
-        sizes: Imperfections,
-        rngs: Mapping[str, np.random.Generator],
-        start: JointRotations | None,
-        coarse: _Sampled | None,
-    ) -> None:
-        """`start`: the joints in the start pose; `coarse`: the motion that the mild tissue is scaled by; None: off."""
-        self.motion, self.segment, self.start = motion, segment, start
-        self.mild: _MildTissue | None = None
-        if coarse is not None:
-            moved, activity = coarse.segment(segment), motion.activity(coarse.time)
-            self.mild = _MildTissue(rngs["soft_tissue"], sizes.soft_tissue_deg, moved, activity)
-        place = -motion.p_LS[segment][2] / motion.lengths.get(segment, 1.0)
-        self.tissue = SoftTissue(segment, place, sizes, rngs, motion.span[1])
-
-    def sample(self, t: np.ndarray) -> _Sampled:
-        """Sample the motion at the times `t` (n,) [s], for this sensor alone."""
-        return _Sampled(self.motion, t, self.segment, joints=self.start is not None)
-
-    def turn(self, sampled: _Sampled) -> tuple[_Moved, np.ndarray]:
-        """Return the segment's motion and the sensor's rotation vectors (n, 3) [rad] in L."""
-        moved = sampled.segment(self.segment)
-        soft_L = np.zeros((len(sampled.time), 3))
-        if self.mild is not None:
-            soft_L = self.mild(moved, self.motion.activity(sampled.time))
-        if self.start is not None and sampled.joints is not None:
-            accel_L = moved.R_WL.inv().apply(moved.p_ddot)
-            moving_time = self.motion.moving_time(sampled.time, self.segment)
-            soft_L = soft_L + self.tissue(sampled.time, moving_time, (sampled.joints, self.start), accel_L)
-        return moved, soft_L
+def _sample_poses(motion: BodyMotion, t: np.ndarray, segments: Sequence[str]) -> list[BodyPose]:
+    """Sample a motion at the times `t` (n,) [s], then two steps and one before, one and two after."""
+    # The sensor on the chest follows both arms.
+    first = SEGMENTS if "torso" in segments and motion.flaws.sizes.tissue_gain else ()
+    return [motion(t + step * _STENCIL_S, [*segments, *(first if step == 0 else ())]) for step in _STEPS]
 
 
 def simulate(
@@ -343,9 +246,10 @@ def simulate(
     task = find_task(protocol)
     lengths = {name: float(lengths[name]) for name in names}
     rngs = spawn_streams(seed, session)
-    motion = task(lengths, rngs["motion"], clasp_s, circles, Flaws(imperfections, rngs, lengths["shoulder_width"]))
+    flaws = Flaws(imperfections, rngs, lengths["shoulder_width"])
+    motion = task(lengths, rngs["motion"], protocol.split("+"), clasp_s, circles, flaws)
     motion.fit_to_person(rngs["task"])
-    return measure_motion(motion, rngs, rate_hz, noise, imperfections)
+    return measure_motion(motion, rngs, rate_hz, noise)
 
 
 def spawn_streams(seed: int, session: int = 0) -> dict[str, np.random.Generator]:
@@ -358,23 +262,19 @@ def spawn_streams(seed: int, session: int = 0) -> dict[str, np.random.Generator]
 
 
 def measure_motion(
-    motion: BodyMotion,
-    rngs: Mapping[str, np.random.Generator],
-    rate_hz: float,
-    noise: ImuNoise,
-    imperfections: Imperfections,
+    motion: BodyMotion, rngs: Mapping[str, np.random.Generator], rate_hz: float, noise: ImuNoise
 ) -> Simulation:
     """Measure a motion with a sensor on each segment of its `p_LS`, by the streams of `spawn_streams`."""
-    n = int(np.floor(motion.span[1] * rate_hz)) + 1
+    sizes = motion.flaws.sizes
+    n = int(np.floor(motion.end * rate_hz)) + 1
     time = np.arange(n) / rate_hz
     N = Rotation.from_matrix([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])  # x_S to z_L, -z_S to x_L
 
-    sizes = imperfections
     own_clocks = any((sizes.clock_jitter, sizes.clock_offset, sizes.clock_drift_ppm))
-    never_still = own_clocks or any((sizes.sway_deg_s, sizes.sway_tilt_deg, sizes.breath_deg, sizes.creep_deg))
-    start = read_joints(motion(np.array([0.5 * STAND_S]), SEGMENTS)) if is_on(sizes) else None
-    stated_time = _Sampled(motion, time, joints=start is not None)
-    coarse = _Sampled(motion, np.arange(*motion.span, 1.0 / _GAIN_RATE_HZ)) if sizes.soft_tissue_deg else None
+    start = motion(np.array([0.5 * STAND_S]), SEGMENTS)
+    # One sample more, before the first one, for the rate that ends there.
+    poses = [] if own_clocks else _sample_poses(motion, _add_first(time, rate_hz), list(motion.p_LS))
+    true = motion(time, list(motion.p_LS))
 
     sensors: defaultdict[str, dict] = defaultdict(dict)
     for segment in motion.p_LS:
@@ -387,46 +287,42 @@ def measure_motion(
         own_time = own_time + sizes.clock_offset * rngs["clock_offset"].standard_normal()
         own_time = own_time + 1e-6 * sizes.clock_drift_ppm * rngs["clock_drift"].standard_normal() * time
 
-        skin = _Skin(motion, segment, sizes, rngs, start, coarse)
-        moved, soft_L = skin.turn(skin.sample(own_time) if own_clocks else stated_time)
-        R_WS = compose(moved.R_WL, Rotation.from_rotvec(soft_L), R_LS)
-        rotvec = log(compose(R_WS[:-1].inv(), R_WS[1:]).as_quat())
-        rate_S = np.vstack((np.zeros(3), rotvec * rate_hz))  # static before the first sample
-        if own_clocks:
-            rate_S[1:] = rotvec / np.diff(own_time)[:, None]
-        if never_still:  # a sample before the first one, for the rate that ends there
-            before, soft_before = skin.turn(skin.sample(own_time[:1] - 1.0 / rate_hz))
-            R_before = before.R_WL * Rotation.from_rotvec(soft_before) * R_LS
-            rate_S[0] = (R_before[0].inv() * R_WS[0]).as_rotvec() * rate_hz
-        force_S = R_WS.inv().apply(moved.p_ddot + GRAVITY * E_Z)
+        place = -motion.p_LS[segment][2] / motion.lengths.get(segment, 1.0)
+        strapped = _Strapped(motion, segment, R_LS, SoftTissue(segment, place, sizes, rngs, motion.end, start))
+        t = _add_first(own_time, rate_hz)
+        samples = strapped.sample(t, poses)
+        R_WS = Rotation.from_quat(samples.quat_WS)
+        rate_S = log(compose(R_WS[:-1].inv(), R_WS[1:]).as_quat()) / np.diff(t)[:, None]
+        force_S = samples.force_S[1:]
         if sizes.accel_average:
-            parts = []
-            for age in sizes.accel_average / rate_hz * _MIDPOINTS:
-                then, soft_then = skin.turn(skin.sample(own_time - age))
-                R_then = then.R_WL * Rotation.from_rotvec(soft_then) * R_LS
-                parts.append(R_then.inv().apply(then.p_ddot + GRAVITY * E_Z))
-            force_S = np.mean(parts, axis=0)
+            ages = sizes.accel_average / rate_hz * _MIDPOINTS
+            force_S = np.mean([strapped.sample(own_time - age).force_S for age in ages], axis=0)
 
         device = Device.sample(rngs["device"], sizes, rngs["gyro_warm_up"])
         readings = device.measure(rate_S, force_S, rate_hz, noise, sizes, rngs["noise"])
         dropped = draw_lost(rngs["dropped"], n, rate_hz, sizes.dropped)
         readings.gyro_S[dropped] = readings.accel_S[dropped] = np.nan
-        own = {"quat_LS": R_LS.as_quat(), "quat_WS": R_WS.as_quat(), "soft_tissue": soft_L, "sample_time": own_time}
-        for name, value in {**own, **readings._asdict(), "device": device}.items():
+        own = {"quat_LS": R_LS.as_quat(), "quat_WS": samples.quat_WS[1:], "soft_tissue": samples.soft_L[1:]}
+        for name, value in {**own, **readings._asdict(), "device": device, "sample_time": own_time}.items():
             sensors[name][segment] = value
 
     return Simulation(
         time=time,
         rate_hz=rate_hz,
-        quat_WL={segment: stated_time.pose.R_WL[segment].as_quat() for segment in motion.p_LS},
-        points=stated_time.pose.points,
+        quat_WL={segment: true.R_WL[segment].as_quat() for segment in motion.p_LS},
+        points=true.points,
         p_LS=dict(motion.p_LS),
         stated_mount=dict.fromkeys(motion.p_LS, _MOUNT if sizes.mount == "stated" else None),
         lengths=dict(motion.lengths),
-        phases=motion.phases(),
-        imperfections=imperfections,
+        phases=motion.phases,
+        imperfections=sizes,
         **sensors,
     )
+
+
+def _add_first(t: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Add the time of a sample before the times (n,) [s]."""
+    return np.concatenate((t[:1] - 1.0 / rate_hz, t))
 
 
 class Person(NamedTuple):
