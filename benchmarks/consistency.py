@@ -108,7 +108,7 @@ def compare_lengths(subject: Subject, person: Person) -> dict[str, Any]:
 
 
 def _compare_pose(tracked: TrackResult, simulation: Simulation) -> dict[str, Any]:
-    truth = simulation.truth_facing_torso()
+    truth = simulation.truth()
     quat_WL, true_points = truth.quat_WL, truth.points
     begin, end = simulation.phases["tasks" if "tasks" in simulation.phases else "circles"][0]
     rows = np.flatnonzero((tracked.time >= begin) & (tracked.time <= end))[::10]

@@ -64,9 +64,9 @@ def test_the_error_of_a_joint_is_that_of_its_angles() -> None:
     truth.quat_WL["right_forearm"][:20] = np.nan
     errors = evaluate(arm(3.0, 2.0), truth).joints
     assert set(errors) == {"right_elbow"}
-    assert errors["right_elbow"]["flexion"] == pytest.approx((3.0, 3.0, 3.0), abs=1e-9)
-    assert errors["right_elbow"]["carrying_angle"] == pytest.approx((-2.0, 2.0, 2.0), abs=1e-9)
-    assert errors["right_elbow"]["pronation"] == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    assert errors["right_elbow"]["flexion"][:3] == pytest.approx((3.0, 3.0, 3.0), abs=1e-9)
+    assert errors["right_elbow"]["carrying_angle"][:3] == pytest.approx((-2.0, 2.0, 2.0), abs=1e-9)
+    assert errors["right_elbow"]["pronation"][:3] == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 
 
 def test_near_the_lock_there_is_no_error_of_an_angle() -> None:

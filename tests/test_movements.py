@@ -23,7 +23,6 @@ from wepose_pin.angles.movement import (
     MovementOptions,
     Statistics,
     analyze_movement,
-    compare_curves,
     compare_statistics,
     compute_statistics,
     smooth_pose,
@@ -177,18 +176,6 @@ def test_the_interval_of_a_difference_is_welchs() -> None:
     few = compare_statistics(one, Statistics(1, 5.0, float("nan"), float("nan")))
     assert few.value == pytest.approx(5.0 - first.mean())
     assert np.isnan([few.low, few.high, few.std]).all()
-
-
-def test_curves_are_compared_after_the_full_turns_between_them() -> None:
-    pose = pose_of(1)
-    curve = analyze_movement("a", pose, {}, MovementOptions()).curves["right_elbow"][0]
-    higher = curve._replace(mean=curve.mean + 2.0 * np.pi + 0.1 * np.sin(np.linspace(0.0, np.pi, 101)))
-    difference = compare_curves(curve, higher)
-    assert difference.largest == pytest.approx(0.1)
-    assert difference.percent == 50.0
-    assert difference.rms == pytest.approx(0.1 / np.sqrt(2.0), rel=0.01)
-    lost = curve._replace(mean=np.full(101, np.nan))
-    assert np.isnan(compare_curves(curve, lost)).all()
 
 
 def test_sessions_are_compared_after_the_full_turns_between_them() -> None:

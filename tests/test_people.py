@@ -202,7 +202,7 @@ def test_people_reach_in_every_protocol(protocol: str) -> None:
 
 
 def test_mild_people_are_smaller_ones() -> None:
-    """The same draws: elbows bent by 0.3 of it at the start, sensors turned by as much less."""
+    """The same draws: arms turned by 0.3 of it at the start, sensors by as much less on other motions."""
     options = {"seed": 3, "noise": NOISE_FREE, "rate_hz": 20.0, "clasp_s": 20.0, "circles": 0}
     mild, people = (simulate(SUBJECT, imperfections=each, **options) for each in (MILD_PRESET, PEOPLE_PRESET))
     for side in SIDES:
@@ -210,7 +210,7 @@ def test_mild_people_are_smaller_ones() -> None:
         R_TU = Rotation.from_quat(people.quat_WL["torso"][40]).inv() * full
         assert arm.magnitude() / R_TU.magnitude() == pytest.approx(0.3, abs=0.1)
     turns = [rms(each.soft_tissue["left_upper_arm"][within(each, "clasp")]) for each in (mild, people)]
-    assert turns[0] / turns[1] == pytest.approx(0.3, abs=0.05)
+    assert 0.2 < turns[0] / turns[1] < 0.45
 
 
 @pytest.mark.monte_carlo

@@ -145,7 +145,7 @@ CASES: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, st
         "fail",
         [("sensors-exchanged", "torso and right_upper_arm", "")],
     ),
-    "eight seconds of motion": (
+    "six seconds of motion": (
         lambda r: replace(r, phases={**r.phases, "clasp": ((20.0, 28.0),)}),
         "fail",
         [("motion-too-small", "", "coincide")],
@@ -153,7 +153,7 @@ CASES: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, st
 }
 
 
-QUICK = ("as it should be", "the forearms exchanged", "eight seconds of motion")
+QUICK = ("as it should be", "the forearms exchanged", "six seconds of motion")
 
 
 def codes(quality: CalibrationQuality) -> list[str]:

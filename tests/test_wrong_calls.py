@@ -104,7 +104,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
         "formulation": NAME,
     },
     "evaluate": {"pose": ("result",), "truth": (None,), "interval": (*INTERVAL, (1e6, 2e6))},
-    "joint_angles": {"pose": ("result",), "sequence": NAME, "near_lock": (*POSITIVE, 10.0)},
+    "joint_angles": {"pose": ("result",), "sequence": NAME},
     "export": {
         "result": (*PATH, "nowhere"),
         "file": (*PATH, "out.nonsense"),

@@ -14,7 +14,6 @@ and one of three axes is a proper one turned by a right angle: ``R_k(c) = T R_i(
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -105,82 +104,69 @@ def follow(angles: Angles3, name: str, near_lock: float) -> np.ndarray:
     A motion that goes straight through the lock keeps its first and third angle, and the second goes on beyond its
     principal range. What the motion does within `near_lock` [rad] of the lock does not count, only how it came and how
     it left: on the plane of the first angle on which it came (within 45°), to either side, it is continued. Where it
-    left on another there is nothing to continue, and what follows is read anew; the jump lies at the sample nearest
-    to the lock. A stretch between two such jumps has the solution that is more, and further from the lock, in the
-    principal range, and the multiples of 2π with which its sample furthest from the lock is there.
+    left on another there is nothing to continue, and what follows is read anew, in the principal range for the most
+    part. Near the lock the first angle is within a right angle of that with which the motion came, and from the sample
+    nearest to the lock on of that with which it left (else of zero); no full turns add up there, and the sum or
+    difference with the third, which is determined, goes on.
     """
     principal, gimbal = angles
-    n = len(gimbal)
-    if n == 0:
-        return principal
-    turned = principal + np.pi
-    turned[:, 1] = 2.0 * sequence(name).offset - principal[:, 1]
-    same = np.square(wrap(np.diff(principal, axis=0))).sum(axis=1)
-    swap = np.square(wrap(turned[1:] - principal[:-1])).sum(axis=1) < same
-
-    before, after, nearest = _find_passages(gimbal < near_lock, gimbal)
-    change = np.abs(wrap(principal[after, 0] - principal[before, 0]))
-    passed, anew = change > 0.75 * np.pi, (change >= 0.25 * np.pi) & (change <= 0.75 * np.pi)
-    swap[nearest - 1] ^= _sum_steps(swap, before, after) % 2 != passed
-    swapped = np.concatenate([[False], np.cumsum(swap) % 2 == 1])
-    stretch = np.zeros(n, dtype=int)
-    stretch[nearest[anew]] = 1
-    stretch = np.cumsum(stretch)
-    swapped ^= (np.bincount(stretch, np.where(swapped, -gimbal, gimbal)) < 0.0)[stretch]
-
-    values = np.where(swapped[:, None], turned, principal)
-    turns = np.zeros((n, 3), dtype=int)
-    turns[1:] = -_count_turns(np.diff(values, axis=0))
-    astray = _sum_steps(turns[1:], before, after) + _count_turns(values[after] - values[before])
-    turns[nearest] -= astray
-    values += 2.0 * np.pi * np.cumsum(turns, axis=0)
-    ends = np.append(np.searchsorted(stretch, np.arange(stretch[-1] + 1)), n)
-    furthest = [first + int(np.argmax(gimbal[first:end])) for first, end in pairwise(ends)]
-    return values - 2.0 * np.pi * _count_turns(values[furthest])[stretch]
-
-
-def _find_passages(near: np.ndarray, gimbal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Last sample before, first after, and nearest to the lock, of each stay near it that has both."""
-    whole = [(a, b) for a, b in find_runs(near) if a > 0 and b < len(gimbal)]
-    passages = [(a - 1, b, a + int(np.argmin(gimbal[a:b]))) for a, b in whole]
-    before, after, nearest = np.array(passages, dtype=int).reshape(-1, 3).T
-    return before, after, nearest
-
-
-def drop_turns(values: np.ndarray, gimbal: np.ndarray, name: str, near_lock: float) -> np.ndarray:
-    """`values` (n, 3) of `follow` without the full turns that the first and third angle add up in a stay near the lock.
-
-    There they are within half a turn of those with which the motion came, and from the sample nearest to the lock on of
-    those with which it left. The sum or difference of the two that is determined goes on. A motion that is never
-    further from the lock has the first within half a turn of zero, and begins with that sum or difference so.
-    """
-    s, n = sequence(name), len(values)
-    first, near = values[:, 0], gimbal < near_lock
-    expected = first.copy()
-    for a, b in find_runs(near):
-        nearest = a + int(np.argmin(gimbal[a:b]))
-        edges = [first[k] for k in (a - 1, b) if 0 <= k < n] or [0.0]
-        expected[a:nearest], expected[nearest:b] = edges[0], edges[-1]
-    turns = 2.0 * np.pi * _count_turns(first - expected)
-    sign = np.where(
-        np.cos(values[:, 1] - s.offset) > 0.0, 1.0, -1.0
-    )  # the sum of both is determined, or the difference
-    values = values.copy()
-    values[:, 0] -= turns
-    values[:, 2] += sign * turns
-    if n and near.all():
-        values[:, 2] -= 2.0 * np.pi * _count_turns(values[0, 2] + sign[0] * values[0, 0])
+    values, s = principal.copy(), sequence(name)
+    if not len(values):
+        return values
+    groups: list[list[tuple[int, int]]] = []  # of stretches that continue each other
+    for a, b in find_runs(gimbal >= near_lock):
+        part, continues = _continue(principal[a:b], s), False
+        if groups:
+            last = values[groups[-1][-1][1] - 1]
+            change = abs(float(wrap(part[0, 0] - last[0])))
+            continues = not 0.25 * np.pi <= change <= 0.75 * np.pi
+            part = _solve_otherwise(part, s) if change > 0.75 * np.pi else part
+            part = part - round_to_turns(part[0] - last) if continues else part
+        values[a:b] = part
+        groups = [*groups[:-1], [*groups[-1], (a, b)]] if continues else [*groups, [(a, b)]]
+    for group in groups:
+        index = np.concatenate([np.arange(a, b) for a, b in group])
+        part, weights = values[index], gimbal[index]
+        beyond = np.cos(part[:, 1] - principal[index, 1]) < 1.0 - 1e-9
+        if weights[beyond].sum() > weights[~beyond].sum():
+            part = _solve_otherwise(part, s)
+        values[index] = part - round_to_turns(part[np.argmax(weights)])
+    for a, b in find_runs(gimbal < near_lock):
+        middle = a + int(np.argmin(gimbal[a:b]))
+        middle = b if b == len(values) else a if a == 0 else middle
+        values[middle:b] = _stay_near(principal[middle:b][::-1], values[b : b + 1], s)[::-1]
+        values[a:middle] = _stay_near(principal[a:middle], values[max(a - 1, 0) : a], s)
     return values
 
 
-def _sum_steps(steps: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Sums of `steps` (n − 1, …), the k-th from sample k to k + 1, between samples `before` and `after`."""
-    summed = np.concatenate([np.zeros((1, *steps.shape[1:]), dtype=int), np.cumsum(steps, axis=0)])
-    return summed[after] - summed[before]
+def _solve_otherwise(values: np.ndarray, s: Sequence) -> np.ndarray:
+    """The other solution (n, 3) for the same rotations."""
+    return np.column_stack([values[:, 0] + np.pi, 2.0 * s.offset - values[:, 1], values[:, 2] + np.pi])
 
 
-def _count_turns(angle: np.ndarray) -> np.ndarray:
-    return np.round(angle / (2.0 * np.pi)).astype(int)
+def _continue(principal: np.ndarray, s: Sequence) -> np.ndarray:
+    """The angles (n, 3) from the first sample on, away from the lock."""
+    other = _solve_otherwise(principal, s)
+    same = np.square(wrap(np.diff(principal, axis=0))).sum(axis=1)
+    swap = np.square(wrap(other[1:] - principal[:-1])).sum(axis=1) < same
+    swapped = np.concatenate([[False], np.cumsum(swap) % 2 == 1])
+    return np.unwrap(np.where(swapped[:, None], other, principal), axis=0)
+
+
+def _stay_near(principal: np.ndarray, edge: np.ndarray, s: Sequence) -> np.ndarray:
+    """The angles (n, 3) near the lock, next to those of the sample before, (1, 3); (0, 3): there is none."""
+    known, edge = bool(len(edge)), edge if len(edge) else np.zeros((1, 3))
+    other = _solve_otherwise(principal, s)
+    nearer = np.cos(principal[:, :1] - edge[:, :1]) >= 0.0
+    values = np.where(nearer, principal, other)
+    values[:, :2] -= round_to_turns(values[:, :2] - (edge[:, :2] if known else (0.0, s.offset)))
+    sign = np.where(
+        np.cos(values[:, 1] - s.offset) > 0.0, 1.0, -1.0
+    )  # the sum of both is determined, or the difference
+    total = values[:, 2] + sign * values[:, 0]
+    before = edge[:, 2] + sign[:1] * edge[:, 0] if known else total[:1] - round_to_turns(total[:1])
+    values[:, 2] = np.unwrap(np.concatenate([before, total]))[1:] - sign * values[:, 0]
+    return values
 
 
 def gradients(values: np.ndarray, name: str) -> np.ndarray:

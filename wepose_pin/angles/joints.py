@@ -46,8 +46,6 @@ _MIRRORED_TURN = np.array([-1.0, 1.0, -1.0])
 # first and third angle, or more.
 NEAR_LOCK = float(np.radians(10.0))
 MAX_NEAR_LOCK = 0.01  # of the samples: of an angle that is read as a whole
-# Nearer than this [rad] the first and third angle follow from noise, whatever the sensors.
-LEAST_NEAR_LOCK = np.radians(2.0)
 
 # The names say where an angle is positive. Elevation alone is negative where the arm is raised in the plane of
 # elevation, as the ISB has it.
@@ -117,7 +115,7 @@ class JointAngles:
     names : of the three angles
     values : (n, 3) [rad], continuous but for what is near the lock; NaN where the pose has none
     gimbal : (n,) [rad], how far from gimbal lock, at most π/2
-    near_lock : (n,) bool, nearer than asked: first and third angle say little there, and jump by full turns
+    near_lock : (n,) bool, within 10° of the lock: first and third angle say little there, and jump by full turns
     gap : (n,) bool, one of the segments was bridged over a gap of its sensor, or is not known
     std : (n, 3) [rad], one standard deviation, at most that of an angle even over the circle (104°); None where the
         pose has no covariances
@@ -210,12 +208,12 @@ def group_sides(joints: Iterable[str]) -> dict[str, dict[str, str]]:
     return groups
 
 
-def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY", near_lock: float = NEAR_LOCK) -> Angles:
+def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY") -> Angles:
     """Joint angles after the ISB: thorax and pelvis in W, shoulders, elbows, wrists, hips, knees, ankles, as measured.
 
     Left joints are mirrored on the sagittal plane first, so that an angle has the same sign and meaning on both sides.
-    Angles are continuous over time; full turns near gimbal lock are not added up. Standard deviations are to first
-    order, with the errors of two segments taken as independent.
+    Angles are continuous over time; samples within 10° of gimbal lock are flagged, and full turns are not added up
+    there. Standard deviations are to first order, with the errors of two segments taken as independent.
 
     Parameters
     ----------
@@ -225,8 +223,6 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY", near_lock: flo
         Intrinsic axes of the shoulder's angles: "YXY", "XZY" or "ZXY"; all other joints have ZXY. "auto": the first,
         or where it is near gimbal lock for more than 1 % of the time, the one that is so for the least time;
         ``angles["right_shoulder"].sequence`` names it.
-    near_lock : float
-        [rad], 10° by default. Samples nearer to gimbal lock are flagged; after them angles go on as before.
 
     Returns
     -------
@@ -237,7 +233,7 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY", near_lock: flo
     Raises
     ------
     BadOption
-        An unknown sequence; `near_lock` below 2° or above 45°.
+        An unknown sequence.
     BadData
         No joint has both of its segments in the pose, or all of their orientations are NaN.
 
@@ -258,14 +254,12 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY", near_lock: flo
         sequence = choose_shoulder_sequence(pose)
     if sequence not in SHOULDER_SEQUENCES:
         raise BadOption(f"shoulder sequence '{sequence}' is not known; {one_of((*SHOULDER_SEQUENCES, AUTO), sequence)}")
-    if not LEAST_NEAR_LOCK <= near_lock <= np.pi / 4.0:
-        raise BadOption(f"near_lock of {np.degrees(near_lock):g} degrees; between 2 and 45 degrees are needed")
     joints = {}
     for name, joint in JOINTS.items():
         if joint.distal in pose.quat_WL and (joint.proximal == "world" or joint.proximal in pose.quat_WL):
             if not joint.sequence:
                 joint = joint._replace(sequence=sequence, names=SHOULDER_SEQUENCES[sequence])
-            joints[name] = _angles(pose, joint, name.startswith("left_"), near_lock)
+            joints[name] = _angles(pose, joint, name.startswith("left_"))
     if not joints:
         raise BadData(
             f"no joint has its segments in the pose: torso, or two segments that one joint connects, are needed; "
@@ -287,20 +281,18 @@ def choose_shoulder_sequence(pose: Pose) -> str:
         for side in ("left", "right"):
             joint = JOINTS[f"{side}_shoulder"]._replace(sequence=sequence, names=names)
             if {joint.proximal, joint.distal} <= set(pose.quat_WL):
-                near_lock = _angles(pose, joint, side == "left", NEAR_LOCK).near_lock
+                near_lock = _angles(pose, joint, side == "left").near_lock
                 shares[sequence] = max(shares[sequence], float(np.mean(near_lock)))
     return "YXY" if shares["YXY"] <= MAX_NEAR_LOCK else min(shares, key=lambda sequence: shares[sequence])
 
 
-def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngles:
-    n = len(pose.time)
+def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
     members = [segment for segment in (joint.proximal, joint.distal) if segment != "world"]
     known = np.all([np.isfinite(pose.quat_WL[segment]).all(axis=1) for segment in members], axis=0)
     quat_WP, quat_WD = (_joint_frame(pose, joint, segment, left, known) for segment in (joint.proximal, joint.distal))
     quat = multiply(conjugate(quat_WP), quat_WD)
     angles = euler.decompose(quat, joint.sequence)
-    values = euler.follow(angles, joint.sequence, near_lock)
-    values = euler.drop_turns(values, angles.gimbal, joint.sequence, near_lock)
+    values = euler.follow(angles, joint.sequence, NEAR_LOCK)
     std = None
     if all(segment in pose.segment_cov for segment in members):
         cov_W = np.sum([pose.segment_cov[segment][known] for segment in members], axis=0)
@@ -308,16 +300,16 @@ def _angles(pose: Pose, joint: Joint, left: bool, near_lock: float) -> JointAngl
         variance = np.einsum("nai,nij,naj->na", rows, cov_W, rows, optimize=True)
         std = np.minimum(np.sqrt(np.maximum(variance, 0.0)), euler.UNKNOWN)
     gap = np.any([~known, *(pose.gap[segment] for segment in members if segment in pose.gap)], axis=0)
-    gimbal = _expand(known, angles.gimbal, n)
+    gimbal = _expand(known, angles.gimbal)
     return JointAngles(
         joint.sequence,
         joint.names,
-        _expand(known, values, n),
+        _expand(known, values),
         gimbal,
-        gimbal < near_lock,
+        gimbal < NEAR_LOCK,
         gap,
-        None if std is None else _expand(known, std, n),
-        _expand(known, rotations.unwrap_signs(quat), n),
+        None if std is None else _expand(known, std),
+        _expand(known, rotations.unwrap_signs(quat)),
     )
 
 
@@ -326,11 +318,8 @@ def compute_gradients(pose: Pose, name: str, joint: JointAngles, samples: np.nda
 
     Those by the proximal segment are of opposite sign. The samples are known ones.
     """
-    left, proximal = name.startswith("left_"), JOINTS[name].proximal
-    quat_WL = {segment: quat[samples] for segment, quat in pose.quat_WL.items() if segment == proximal}
-    part = Pose(pose.time[samples], quat_WL, {})
-    quat_WP = _joint_frame(part, JOINTS[name], proximal, left, np.ones(len(samples), dtype=bool))
-    return _gradients(joint.values[samples], joint.sequence, quat_WP, left)
+    quat_WP = _joint_frame(pose, JOINTS[name], JOINTS[name].proximal, name.startswith("left_"), samples)
+    return _gradients(joint.values[samples], joint.sequence, quat_WP, name.startswith("left_"))
 
 
 def _gradients(values: np.ndarray, sequence: str, quat_WP: np.ndarray, left: bool) -> np.ndarray:
@@ -342,21 +331,21 @@ def _gradients(values: np.ndarray, sequence: str, quat_WP: np.ndarray, left: boo
     return rows * _MIRRORED_TURN if left else rows
 
 
-def _joint_frame(pose: Pose, joint: Joint, segment: str, left: bool, known: np.ndarray) -> np.ndarray:
-    """The axes in which a joint's angles are taken, of one of its segments, in W; (n, 4) where it is `known`.
+def _joint_frame(pose: Pose, joint: Joint, segment: str, left: bool, samples: np.ndarray) -> np.ndarray:
+    """The axes in W in which a joint's angles are taken, of one of its segments, at m samples: (m, 4).
 
     Of a left joint mirrored.
     """
     axes = joint.axes or ISB_AXES[segment.removeprefix("left_").removeprefix("right_")]
     quat_LI = Rotation.from_matrix(np.column_stack([AXES[axis] for axis in axes])).as_quat()
     if segment == "world":
-        return np.tile(quat_LI, (int(np.count_nonzero(known)), 1))
-    quat_WL = pose.quat_WL[segment][known]
+        return np.tile(quat_LI, (len(pose.time[samples]), 1))
+    quat_WL = pose.quat_WL[segment][samples]
     return multiply(quat_WL * _MIRRORED_QUAT if left else quat_WL, quat_LI)
 
 
-def _expand(known: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
-    """`values` of the known samples among n, NaN elsewhere."""
-    out = np.full((n, *values.shape[1:]), np.nan)
+def _expand(known: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """`values` of the known samples among all of them, NaN elsewhere."""
+    out = np.full((len(known), *values.shape[1:]), np.nan)
     out[known] = values
     return out

@@ -18,7 +18,7 @@ from ..recording.gaps import find_runs
 from ..rotations import unwrap_signs
 from .curves import MeanCurve, compute_mean_curves
 from .euler import round_to_turns, wrap
-from .joints import AUTO, JOINTS, Angles, JointAngles, joint_angles
+from .joints import AUTO, JOINTS, Angles, joint_angles
 from .repetitions import Repetitions, find_repetitions
 from .tables import compute_summary_std, summarize_joint
 
@@ -194,31 +194,15 @@ def measure_spans(
     parts = [find_samples(pose.time, (float(begin), float(end))) for begin, end in spans]
     measures = {}
     for name, joint in angles.joints.items():
-        summaries = [summarize_joint(pose.time[part], _cut(joint, part)) for part in parts]
-        values, samples = np.empty((len(parts), 3, len(MEASURES))), np.empty((len(parts), 3, len(MEASURES)), dtype=int)
-        for row, (part, each) in enumerate(zip(parts, summaries, strict=True)):
-            values[row] = np.column_stack([each.lowest, each.highest, each.range, each.peak_rate])
-            samples[row] = np.where(each.samples < 0, -1, each.samples + part.start)
+        summaries = [summarize_joint(pose.time, joint, part) for part in parts]
+        rows = [np.column_stack([each.lowest, each.highest, each.range, each.peak_rate]) for each in summaries]
+        values = np.array(rows).reshape(-1, 3, len(MEASURES))
         values[:, :, :2] -= _count_turns(values)[:, :, None]
-        measures[name] = JointMeasures(
-            values,
-            compute_summary_std(pose, name, joint, samples),
-            np.array([each.near_lock for each in summaries]),
-            np.array([each.gap for each in summaries]),
-        )
+        samples = np.array([each.samples for each in summaries], dtype=int).reshape(values.shape)
+        std = compute_summary_std(pose, name, joint, samples)
+        near_lock, gap = np.array([(each.near_lock, each.gap) for each in summaries]).reshape(-1, 2).T
+        measures[name] = JointMeasures(values, std, near_lock, gap)
     return measures
-
-
-def _cut(joint: JointAngles, part: slice) -> JointAngles:
-    return replace(
-        joint,
-        values=joint.values[part],
-        gimbal=joint.gimbal[part],
-        near_lock=joint.near_lock[part],
-        gap=joint.gap[part],
-        std=None if joint.std is None else joint.std[part],
-        quat=joint.quat[part],
-    )
 
 
 def _count_turns(values: np.ndarray) -> np.ndarray:
@@ -288,22 +272,3 @@ def compare_measures(
     turns = np.nan_to_num(round_to_turns(0.5 * (two[0].mean + two[1].mean - one[0].mean - one[1].mean)))
     two[:2] = [each._replace(mean=float(each.mean - turns)) for each in two[:2]]  # lowest and highest
     return [(a, b, compare_statistics(a, b)) for a, b in zip(one, two, strict=True)]
-
-
-class CurveDifference(NamedTuple):
-    """Of two mean curves, the second less the first; NaN where they have no point in common."""
-
-    rms: float  # [rad]
-    largest: float  # [rad], with its sign
-    percent: float  # where it is
-
-
-def compare_curves(first: MeanCurve, second: MeanCurve) -> CurveDifference:
-    """The difference of two mean curves, after the full turns between them."""
-    difference = second.mean - first.mean
-    known = np.isfinite(difference)
-    if not known.any():
-        return CurveDifference(*[float("nan")] * 3)
-    difference = difference - round_to_turns(difference[known].mean())
-    worst = int(np.nanargmax(np.abs(difference)))
-    return CurveDifference(float(np.sqrt(np.mean(difference[known] ** 2))), float(difference[worst]), float(worst))

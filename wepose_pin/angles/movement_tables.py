@@ -10,7 +10,7 @@ import polars as pl
 
 from .curves import PERCENT
 from .joints import Angles, group_sides
-from .movement import MEASURES, JointMeasures, Movement, compare_curves, compare_measures, measure_spans
+from .movement import MEASURES, JointMeasures, Movement, compare_measures, measure_spans
 from .tables import angle_table
 
 SOURCE = (
@@ -204,7 +204,4 @@ def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
                     numbers |= {"ci95_high": difference.high, "difference_std": difference.std}
                     about_n = {"measure": measure, "unit": unit.replace("_", "/"), "first_n": one.n, "n": two.n}
                     rows.append({**about, **about_n, **{key: float(np.degrees(v)) for key, v in numbers.items()}})
-                curve = compare_curves(first.curves[name][k], movement.curves[name][k])
-                for measure, value in (("curve_rms", curve.rms), ("curve_largest", curve.largest)):
-                    rows.append({**about, "measure": measure, "unit": "deg", "difference": float(np.degrees(value))})
-    return pl.DataFrame(rows, infer_schema_length=None)
+    return pl.DataFrame(rows)

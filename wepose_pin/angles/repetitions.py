@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import find_peaks
 
 from ..errors import WrongOption, one_of
 from ..filters.butterworth import low_pass
+from ..recording.gaps import find_runs
 from .curves import compute_cmc, normalize_time
 from .joints import JOINTS, MAX_NEAR_LOCK, Angles
 
@@ -124,32 +125,33 @@ def find_repetitions(
         return Repetitions(_NO_SPANS, "", reason=f"each angle is near gimbal lock for over {limits}")
     joint, k = known[source]
     values, hidden = angles[joint].values[:, k], angles[joint].hidden(k)
+    none = Repetitions(_NO_SPANS, source)
     if np.count_nonzero(~hidden) < 10:
-        return Repetitions(_NO_SPANS, source, reason="the angle is not determined for even 10 samples")
+        return none._replace(reason="the angle is not determined for even 10 samples")
     signal = _smooth(angles.time, np.interp(angles.time, angles.time[~hidden], values[~hidden]))
     low, high = np.percentile(signal, [2.0, 98.0])
     if high - low < MIN_RANGE:
         reason = f"the angle has a range of {np.degrees(high - low):.1f}°, and {np.degrees(MIN_RANGE):.0f}° are needed"
-        return Repetitions(_NO_SPANS, source, reason=reason)
+        return none._replace(reason=reason)
     if rising is None:
         rising = _rests_low(signal, low, high)
     spans = _find_spans(angles.time, signal if rising else -signal, float(high - low))
     if cycles:
         spans = _close_cycles(spans)
+    none = none._replace(rising=rising)
     if len(spans) < MIN_REPETITIONS:
-        times = {0: "no time", 1: "once", 2: "twice"}[len(spans)]
-        reason = f"the angle goes out and back {times}, and {MIN_REPETITIONS} times are needed"
-        return Repetitions(_NO_SPANS, source, rising, reason=reason)
+        times = ("no time", "once", "twice")[len(spans)]
+        return none._replace(reason=f"the angle goes out and back {times}, and {MIN_REPETITIONS} times are needed")
     curves = normalize_time(angles.time, signal[:, None], spans)[:, :, 0]
     alike = _are_alike(curves) & (_share_within(angles.time, hidden, spans) <= MAX_HIDDEN)
     left_out, cmc = int(np.count_nonzero(~alike)), compute_cmc(curves[alike])
+    none = none._replace(cmc=cmc, left_out=left_out)
     if left_out > MAX_LEFT_OUT * len(spans) or np.count_nonzero(alike) < MIN_REPETITIONS:
-        reason = f"{left_out} of its {len(spans)} excursions are unlike the others"
-        return Repetitions(_NO_SPANS, source, rising, cmc, left_out, reason)
+        return none._replace(reason=f"{left_out} of its {len(spans)} excursions are unlike the others")
     if cmc < MIN_CMC:
         reason = f"its {len(spans)} excursions are not alike: their CMC is {cmc:.2f}, and {MIN_CMC} is needed"
-        return Repetitions(_NO_SPANS, source, rising, cmc, left_out, reason)
-    return Repetitions(spans[alike], source, rising, cmc, left_out)
+        return none._replace(reason=reason)
+    return none._replace(spans=spans[alike])
 
 
 def _are_alike(curves: np.ndarray) -> np.ndarray:
@@ -184,16 +186,11 @@ def find_movements(time: np.ndarray, *points: np.ndarray) -> np.ndarray:
     for point in points:
         smoothed = np.column_stack([_smooth(time, axis) for axis in np.nan_to_num(point).T])
         moving |= np.linalg.norm(np.gradient(smoothed, axis=0), axis=1) * rate_hz > MOVE_SPEED
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], moving, [False])).astype(int))).reshape(-1, 2)
-    spans: list[list[int]] = []
-    for begin, end in edges:
-        if spans and begin - spans[-1][1] < REST_S * rate_hz:
-            spans[-1][1] = end
-        else:
-            spans.append([begin, end])
-    movements = np.array([(time[a], time[b - 1]) for a, b in spans if time[b - 1] - time[a] >= MIN_MOVE_S]).reshape(
-        -1, 2
-    )
+    rests = [(a, b) for a, b in find_runs(~moving) if b - a < REST_S * rate_hz and a > 0 and b < len(time)]
+    for a, b in rests:
+        moving[a:b] = True
+    spans = np.array([(time[a], time[b - 1]) for a, b in find_runs(moving)]).reshape(-1, 2)
+    movements = spans[spans[:, 1] - spans[:, 0] >= MIN_MOVE_S]
     seconds = movements[:, 1] - movements[:, 0]
     usual = np.median(seconds) if len(seconds) else 0.0
     movements = movements[(seconds >= LEAST_SHARE * usual) & (seconds <= usual / LEAST_SHARE)]
@@ -216,9 +213,9 @@ def _rests_low(signal: np.ndarray, low: float, high: float) -> bool:
 
 def _find_spans(time: np.ndarray, signal: np.ndarray, full_range: float) -> np.ndarray:
     """Spans (r, 2) [s] of the excursions upwards of a signal."""
-    excursions = list(_find_excursions(signal, FIRST_SHARE * full_range))
+    excursions = _find_excursions(signal, FIRST_SHARE * full_range)
     if not excursions:
-        return np.empty((0, 2))
+        return _NO_SPANS
     usual = float(np.median([_size(signal, *each) for each in excursions]))
     rate = np.gradient(signal, time)
     spans = []
@@ -257,31 +254,11 @@ def _size(signal: np.ndarray, before: int, peak: int, after: int) -> float:
     return float(signal[peak] - 0.5 * (signal[before] + signal[after]))
 
 
-def _find_excursions(signal: np.ndarray, least: float) -> Iterator[tuple[int, int, int]]:
+def _find_excursions(signal: np.ndarray, least: float) -> list[tuple[int, int, int]]:
     """Valley, peak and valley of each excursion that rises and falls by at least `least`."""
-    peaks = _find_peaks(signal, least)
-    for k, peak in enumerate(peaks):
-        first = 0 if k == 0 else peaks[k - 1]
-        last = len(signal) - 1 if k == len(peaks) - 1 else peaks[k + 1]
-        before = first + int(np.argmin(signal[first : peak + 1]))
-        after = peak + int(np.argmin(signal[peak : last + 1]))
-        if signal[peak] - signal[before] >= least:
-            yield before, peak, after
-
-
-def _find_peaks(signal: np.ndarray, least: float) -> list[int]:
-    """Peaks after which the signal falls by at least `least`, between each two of them a valley as deep."""
-    peaks: list[int] = []
-    top = bottom = 0
-    seeks_peak = True
-    for i, value in enumerate(signal.tolist()):
-        if seeks_peak:
-            top = i if value > signal[top] else top
-            if value <= signal[top] - least:
-                peaks.append(top)
-                seeks_peak, bottom = False, i
-        else:
-            bottom = i if value < signal[bottom] else bottom
-            if value >= signal[bottom] + least:
-                seeks_peak, top = True, i
-    return peaks
+    peaks, _ = find_peaks(signal, prominence=least)
+    ends = [0, *peaks.tolist(), len(signal) - 1]
+    return [
+        (first + int(np.argmin(signal[first : peak + 1])), peak, peak + int(np.argmin(signal[peak : last + 1])))
+        for first, peak, last in zip(ends, ends[1:], ends[2:], strict=False)
+    ]

@@ -42,31 +42,32 @@ def summary(angles: Angles) -> dict[str, JointSummary]:
     return {name: summarize_joint(angles.time, joint) for name, joint in angles.joints.items()}
 
 
-def summarize_joint(time: np.ndarray, joint: JointAngles) -> JointSummary:
-    """Range of motion and peak rates of one joint; `time` (n,) [s]."""
+def summarize_joint(time: np.ndarray, joint: JointAngles, part: slice = slice(None)) -> JointSummary:
+    """Range of motion and peak rates of one joint in a part of the samples; `time` (n,) [s]."""
+    time, values, quat, gap = time[part], joint.values[part], joint.quat[part], joint.gap[part]
+    near_lock, start = joint.near_lock[part], part.start or 0
     m = _window(time)
     span = time[m:] - time[:-m]
     lowest, highest, peak_rate = (np.full(3, np.nan) for _ in range(3))
     samples = np.full((3, 4), -1)
-    sound = np.flatnonzero(_without_bad(joint.gap | joint.near_lock, m))
+    sound = np.flatnonzero(_without_bad(gap | near_lock, m))
     for k in range(3):
-        values, usable = joint.values[:, k], np.flatnonzero(~joint.hidden(k))
+        usable = np.flatnonzero(~joint.hidden(k)[part])
         if len(usable):
-            samples[k, :2] = usable[[values[usable].argmin(), values[usable].argmax()]]
-            lowest[k], highest[k] = values[samples[k, :2]]
+            ends = usable[[values[usable, k].argmin(), values[usable, k].argmax()]]
+            lowest[k], highest[k] = values[ends, k]
+            samples[k, :2] = start + ends
         if len(sound):
-            rates = np.abs(values[m:] - values[:-m])[sound] / span[sound]
-            first = sound[rates.argmax()]
+            rates = np.abs(values[m:, k] - values[:-m, k])[sound] / span[sound]
+            first = start + sound[rates.argmax()]
             samples[k, 2:] = first, first + m
             peak_rate[k] = rates.max()
-    whole = _without_bad(joint.gap, m)
-    turn = multiply(conjugate(joint.quat[:-m][whole]), joint.quat[m:][whole])
+    whole = _without_bad(gap, m)
+    turn = multiply(conjugate(quat[:-m][whole]), quat[m:][whole])
     speed = 2.0 * np.arctan2(np.linalg.norm(turn[:, :3], axis=1), np.abs(turn[:, 3])) / span[whole]
-    return JointSummary(
-        *(lowest, highest, peak_rate, float(speed.max()) if len(speed) else float("nan")),
-        *(float(np.mean(joint.near_lock)), float(np.mean(joint.gap))),
-        samples,
-    )
+    peak_speed = float(speed.max()) if len(speed) else float("nan")
+    shares = float(np.mean(near_lock)), float(np.mean(gap))
+    return JointSummary(lowest, highest, peak_rate, peak_speed, *shares, samples)
 
 
 def _window(time: np.ndarray) -> int:
@@ -101,34 +102,31 @@ def compute_summary_std(pose: Pose, name: str, joint: JointAngles, samples: np.n
     if joint.std is None:
         return stds
     for k in range(3):
-        low, high, begin, end = samples[:, k].T
-        known = np.flatnonzero(low >= 0)
-        stds[known, k, 0], stds[known, k, 1] = joint.std[low[known], k], joint.std[high[known], k]
-        stds[known, k, 2] = _difference_std(pose, name, joint, k, np.column_stack([low, high])[known])
-        known = np.flatnonzero(begin >= 0)
-        spans = pose.time[end[known]] - pose.time[begin[known]]
-        stds[known, k, 3] = _difference_std(pose, name, joint, k, np.column_stack([begin, end])[known]) / spans
+        for column, ends in ((2, [0, 1]), (3, [2, 3])):
+            known = np.flatnonzero(samples[:, k, ends[0]] >= 0)
+            pairs = samples[known, k][:, ends]
+            stds[known, k, column] = _difference_std(pose, name, joint, k, pairs)
+            if column == 2:
+                stds[known, k, :2] = joint.std[pairs, k]
+            else:
+                stds[known, k, 3] /= pose.time[pairs[:, 1]] - pose.time[pairs[:, 0]]
     return stds
 
 
 def _difference_std(pose: Pose, name: str, joint: JointAngles, k: int, pairs: np.ndarray) -> np.ndarray:
     """Standard deviations (m,) [rad] of the k-th angle at the second sample of each pair (m, 2) less the first."""
     rows = compute_gradients(pose, name, joint, pairs.ravel())[:, k].reshape(-1, 2, 1, 3)
-    constant_W, constant_L = np.zeros(len(pairs)), np.zeros(len(pairs))
+    variances = np.zeros((2, len(pairs)))  # constant in W, in L
     for segment in (JOINTS[name].proximal, JOINTS[name].distal):
         if segment == "world" or not len(pairs):
             continue
         cov_W = pose.segment_cov[segment][pairs]
         R_WL = Rotation.from_quat(pose.quat_WL[segment][pairs.ravel()]).as_matrix().reshape(-1, 2, 3, 3)
-        constant_W += _compute_variance(rows, cov_W)
-        constant_L += _compute_variance(rows @ R_WL, np.swapaxes(R_WL, 2, 3) @ cov_W @ R_WL)
-    return np.asarray(np.sqrt(np.maximum(np.maximum(constant_W, constant_L), 0.0)))
-
-
-def _compute_variance(rows: np.ndarray, cov: np.ndarray) -> np.ndarray:
-    """Variance (m,) of the second value less the first: derivatives (m, 2, 1, 3), covariances (m, 2, 3, 3)."""
-    difference = rows[:, 1] - rows[:, 0]
-    return np.asarray((difference @ cov.mean(axis=1) @ np.swapaxes(difference, 1, 2))[:, 0, 0])
+        frames = (rows, cov_W), (rows @ R_WL, np.swapaxes(R_WL, 2, 3) @ cov_W @ R_WL)
+        for variance, (gradient, cov) in zip(variances, frames, strict=True):
+            difference = gradient[:, 1] - gradient[:, 0]
+            variance += (difference @ cov.mean(axis=1) @ np.swapaxes(difference, 1, 2))[:, 0, 0]
+    return np.asarray(np.sqrt(np.maximum(variances.max(axis=0), 0.0)))
 
 
 def summary_table(angles: Angles) -> pl.DataFrame:

@@ -23,6 +23,7 @@ from ..tracking import TrackResult
 
 CUTOFF_HZ = 6.0  # usual for the motion of limbs
 _LEAST_MASS = 1e-6  # [kg]
+_LEAST_SAMPLES = 11
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Torques:
     ----------
     time : (n,) [s]
     torque : joint → (n, k) [Nm], of a prismatic joint [N]; k = 1, of a spherical joint 3: along the axes of its frame
-    q, v, a : (n, nq), (n, nv), (n, nv) smoothed configuration and its derivatives, what the torques were made from
+    q, v : (n, nq), (n, nv) smoothed configuration and its derivative, what the torques were made from
     cutoff_hz : of the smoothing
     mass : [kg] of all that moves
     """
@@ -42,7 +43,6 @@ class Torques:
     torque: Mapping[str, np.ndarray]
     q: np.ndarray
     v: np.ndarray
-    a: np.ndarray
     cutoff_hz: float
     mass: float
 
@@ -88,26 +88,28 @@ def joint_torques(
     mass = sum(inertia.mass for inertia in model.inertias[1:])
     if mass < _LEAST_MASS:
         raise BadModel(f"{model.name}: no moving link has a mass; torques need a URDF with <inertial>")
-    rate_hz = (len(time) - 1) / float(time[-1] - time[0]) if len(time) > 1 else 0.0
+    if len(time) < _LEAST_SAMPLES:
+        raise BadData(f"{len(time)} samples are too few for torques; at least {_LEAST_SAMPLES} are needed")
+    rate_hz = (len(time) - 1) / float(time[-1] - time[0])
     if not 0.0 < cutoff_hz < 0.5 * rate_hz:
         raise BadOption(f"a cut-off of {cutoff_hz:g} Hz; above 0 and below half the rate, {0.5 * rate_hz:g} Hz")
     # The motion is mirrored for a second beyond each end, where the filter's transient decays.
-    pad = min(len(time) - 1, max(10, round(rate_hz)))
-    if pad < 10:
-        raise BadData(f"{len(time)} samples are too few for torques; at least 11 are needed")
+    pad = min(len(time) - 1, max(_LEAST_SAMPLES - 1, round(rate_hz)))
     smooth = low_pass(_unwrap(model, q), cutoff_hz, rate_hz, pad)
     q = np.array([pin.normalize(model, row) for row in smooth])
-    v, a = derivatives(model, q, rate_hz)
+    # Central differences; the ends repeat.
+    half = np.array([pin.difference(model, a, b) for a, b in pairwise(q)]) * rate_hz
+    v = np.concatenate((half[:1], 0.5 * (half[1:] + half[:-1]), half[-1:]))
+    a = np.pad(np.diff(half, axis=0) * rate_hz, ((1, 1), (0, 0)), mode="edge")
     data = model.createData()
     tau = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
     torque = {}
-    for joint in range(1, model.njoints):
+    for joint in range(1, model.njoints) if joints is None else sorted(joints):
         bears = sum(model.inertias[k].mass for k in model.subtrees[joint])
-        included = joints is None or joint in joints
-        if included and bears > _LEAST_MASS and "Mimic" not in model.joints[joint].shortname():
+        if bears > _LEAST_MASS and "Mimic" not in model.joints[joint].shortname():
             first = model.idx_vs[joint]
             torque[model.names[joint]] = tau[:, first : first + model.nvs[joint]]
-    return Torques(time, torque, q, v, a, cutoff_hz, mass)
+    return Torques(time, torque, q, v, cutoff_hz, mass)
 
 
 def pose_torques(tracked: TrackResult, cutoff_hz: float = CUTOFF_HZ) -> Torques:
@@ -119,16 +121,6 @@ def pose_torques(tracked: TrackResult, cutoff_hz: float = CUTOFF_HZ) -> Torques:
     moved = {joint for name, chain in model.chains.items() if name in tracked.quat_WL for joint in chain.joints}
     joints = None if model.table.is_mechanism else moved
     return joint_torques(model.pin, tracked.time, tracked.q, cutoff_hz, joints)
-
-
-def derivatives(model: pin.Model, q: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities and accelerations (n, nv) of configurations (n, nq): central differences, the ends repeat."""
-    half = np.array([pin.difference(model, a, b) for a, b in pairwise(q)]) * rate_hz
-    v, a = np.empty((len(q), model.nv)), np.empty((len(q), model.nv))
-    v[1:-1] = 0.5 * (half[1:] + half[:-1])
-    a[1:-1] = (half[1:] - half[:-1]) * rate_hz
-    v[0], v[-1], a[0], a[-1] = half[0], half[-1], a[1], a[-2]
-    return v, a
 
 
 def _unwrap(model: pin.Model, q: np.ndarray) -> np.ndarray:

@@ -151,7 +151,7 @@ def _print_errors(errors: Evaluation) -> None:
                 for angle, error in angles.items()
             ],
         )
-    if errors.registration is not None and errors.agreement:
+    if errors.registration is not None and errors.joints:
         print_table(
             "Agreement of joint angles [deg]: Bland-Altman bias and 95 % limits; root mean square; ICC(A,1); range",
             ("joint", "angle", "bias", "limits of agreement", "rms", "ICC", "range"),
@@ -159,13 +159,13 @@ def _print_errors(errors: Evaluation) -> None:
                 (
                     joint,
                     angle,
-                    f"{each.bias:+.2f}",
+                    f"{each.mean:+.2f}",
                     f"{each.lower:+.2f} to {each.upper:+.2f}",
                     f"{each.rmse:.2f}",
                     f"{each.icc:.3f}",
                     f"{each.range:.0f}",
                 )
-                for joint, angles in errors.agreement.items()
+                for joint, angles in errors.joints.items()
                 for angle, each in angles.items()
             ],
         )

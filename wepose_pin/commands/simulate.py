@@ -123,9 +123,7 @@ def simulate(
                 protocol=protocol or (PROTOCOL if clasp_s >= LEAST_S else SHORT_PROTOCOL),
                 circles=CIRCLES,
             )
-        turned = sizes.start_heading_deg > 0.0  # tracking's W faces where the torso does
-        truth = simulation.truth_facing_torso() if turned else simulation.truth()
-        write_session(folder, simulation.recording(f"simulated-{seed}"), truth)
+        write_session(folder, simulation.recording(f"simulated-{seed}"), simulation.truth())
         order = (*simulation.lengths, *(row for segment in simulation.quat_LS for row in mount_rows(segment)))
         true = replace(
             person.prior,

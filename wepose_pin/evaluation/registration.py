@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from ..body.kinematics import Pose
 from ..errors import BadData
 from ..recording import AXES, format_span
-from ..rotations import multiply
+from ..rotations import conjugate, multiply
 from .sampling import sample_orientations, sample_points
 
 FITTED = 1.0 / 3.0  # share of the time that is not scored
@@ -84,16 +84,17 @@ def register(
     begin, end = float(pose.time[0]), float(pose.time[-1])
     fit_end = begin + FITTED * (end - begin)
     correlation = float("nan")
+    needed = f"a third of them aligns the reference and is not scored: {3.0 * SHORTEST_S:g} s are needed, or --no-align"
+    if fit_end - begin < SHORTEST_S:
+        raise BadData(f"the pose lasts {end - begin:.1f} s; {needed}")
     if offset_s is None:
         offset_s, correlation = _find_offset(pose, common, (begin, fit_end))
     truth, common = (replace(each, time=truth.time + offset_s) for each in (truth, common))
     first, last = max(begin, float(truth.time[0])), min(end, float(truth.time[-1]))
     fit_end = max(fit_end, first + FITTED * (last - first))
     if fit_end - first < SHORTEST_S or last - fit_end < SHORTEST_S:
-        raise BadData(
-            f"pose ({format_span((begin, end))}) and reference share {max(0.0, last - first):.1f} s; a third of them "
-            f"aligns the reference and is not scored: {3.0 * SHORTEST_S:g} s are needed, or --no-align"
-        )
+        shared = max(0.0, last - first)
+        raise BadData(f"pose ({format_span((begin, end))}) and reference share {shared:.1f} s; {needed}")
     time = pose.time[(pose.time >= first) & (pose.time <= fit_end)]
     R_WV, axis, heading = _find_world(pose, common, time, up, frames)
     quat_WT = {name: multiply(R_WV.as_quat(), quat_VT) for name, quat_VT in truth.quat_WL.items()}
@@ -140,11 +141,6 @@ def _find_offset(pose: Pose, truth: Pose, fitted: tuple[float, float]) -> tuple[
     ours = _compute_speeds(pose, *fitted)
     theirs = _compute_speeds(truth, float(truth.time[0]), float(truth.time[-1]))
     least = max(SHORTEST_S / STEP_S, 0.5 * ours.shape[1])
-    if ours.shape[1] * STEP_S < SHORTEST_S:
-        raise BadData(
-            f"the pose lasts {pose.time[-1] - pose.time[0]:.1f} s; a third of it aligns the reference and is not "
-            f"scored: {3.0 * SHORTEST_S:g} s are needed, or --no-align"
-        )
     scores = np.array([_correlate(a, b, least) for a, b in zip(ours, theirs, strict=True)])
     weights = np.isfinite(scores)
     score = np.where(weights, scores, 0.0).sum(axis=0) / np.maximum(weights.sum(axis=0), 1)
@@ -175,13 +171,10 @@ def _compute_speeds(pose: Pose, begin: float, end: float) -> np.ndarray:
     ends = grid - 0.5 * TURN_S, grid + 0.5 * TURN_S
     speeds = []
     for quat in pose.quat_WL.values():
-        quats = [sample_orientations(pose.time, quat, time) for time in ends]
-        good = np.isfinite(quats).all(axis=(0, 2))
-        speed = np.full(len(grid), np.nan)
-        if good.any():
-            turn = Rotation.from_quat(quats[0][good]).inv() * Rotation.from_quat(quats[1][good])
-            speed[good] = turn.magnitude() / TURN_S
-        speeds.append(speed)
+        before, after = (sample_orientations(pose.time, quat, time) for time in ends)
+        cos = np.abs(np.sum(before * after, axis=1))
+        sin = np.linalg.norm(multiply(conjugate(before), after)[:, :3], axis=1)
+        speeds.append(2.0 * np.arctan2(sin, cos) / TURN_S)
     if not speeds:
         first, *others = pose.points.values()
         for point in others:
@@ -193,17 +186,13 @@ def _compute_speeds(pose: Pose, begin: float, end: float) -> np.ndarray:
 def _correlate(a: np.ndarray, b: np.ndarray, least: float) -> np.ndarray:
     """Correlate a (n,) with b (m,) at all lags (n + m − 1,), over what both know; NaN where that is too little."""
     masks = [np.isfinite(x).astype(float) for x in (a, b)]
-    centred = [
-        np.where(mask > 0.0, x - np.nanmean(x) if mask.any() else 0.0, 0.0)
-        for x, mask in zip((a, b), masks, strict=True)
-    ]
+    centred = [np.nan_to_num(x - np.sum(np.nan_to_num(x)) / max(np.isfinite(x).sum(), 1)) for x in (a, b)]
 
     def at_lags(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return np.asarray(correlate(y, x, mode="full", method="fft"))
 
-    count = at_lags(masks[0], masks[1])
     power = np.sqrt(np.maximum(at_lags(centred[0] ** 2, masks[1]) * at_lags(masks[0], centred[1] ** 2), 0.0))
-    known = (count >= least - 0.5) & (power > 1e-9 * max(float(power.max()), 1e-300))
+    known = (at_lags(*masks) >= least - 0.5) & (power > max(1e-9 * float(power.max()), 1e-6))
     return np.where(known, at_lags(*centred) / np.where(known, power, 1.0), np.nan)
 
 
@@ -251,16 +240,10 @@ def _find_world(pose: Pose, truth: Pose, time: np.ndarray, up: str | None, frame
                 f"no axis of the reference's world is up: {up} is nearest, {off:.0f} deg off; where its segments' "
                 f"frames are not ours, --fit segments fits them too"
             )
-    R_UV = _raise_axis(np.asarray(AXES[up]))
+    axis_V = np.asarray(AXES[up])
+    across = np.cross(axis_V, AXES["+z"])
+    upside_down = np.array([np.pi, 0.0, 0.0]) if axis_V[2] < 0.0 else np.zeros(3)
+    R_UV = Rotation.from_rotvec(0.5 * np.pi * across if across.any() else upside_down)
     level = cross @ R_UV.as_matrix().T
     heading = float(np.arctan2(level[1, 0] - level[0, 1], level[0, 0] + level[1, 1]))
     return Rotation.from_euler("z", heading) * R_UV, up, float(np.degrees(heading))
-
-
-def _raise_axis(up: np.ndarray) -> Rotation:
-    """Return the rotation that brings an axis (3,) to z by the shortest way."""
-    z = np.array([0.0, 0.0, 1.0])
-    across = np.cross(up, z)
-    if not across.any():
-        return Rotation.from_rotvec([0.0 if up[2] > 0.0 else np.pi, 0.0, 0.0])
-    return Rotation.from_rotvec(0.5 * np.pi * across)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 from typing import NamedTuple
 
@@ -42,25 +42,18 @@ class AttitudeError(NamedTuple):
 
 
 class AngleError(NamedTuple):
-    """Error of one angle of a joint [deg], where neither pose nor reference is near gimbal lock or in a gap."""
+    """Error of one angle of a joint [deg], where neither pose nor reference is near gimbal lock or in a gap.
+
+    Samples follow each other closely: limits of agreement (Bland and Altman 1986) and correlation describe this
+    recording, and are no statistics of as many independent draws.
+    """
 
     mean: float  # with its sign: estimated less true
     rmse: float
     worst: float
-
-
-class Agreement(NamedTuple):
-    """Agreement of an angle with the reference's [deg], sample by sample (Bland and Altman 1986).
-
-    The samples of a recording follow each other closely: limits and correlation describe this recording, and are no
-    statistics of as many independent draws.
-    """
-
-    bias: float  # mean difference, estimated less true
     std: float  # of the differences
-    lower: float  # limits of agreement, bias ± 1.96 std
+    lower: float  # limits of agreement, mean ± 1.96 std
     upper: float
-    rmse: float
     icc: float  # ICC(A,1): two-way, absolute agreement, single measurement
     range: float  # of the reference, largest less smallest
 
@@ -93,14 +86,13 @@ class Evaluation:
     ----------
     attitude : segment → `AttitudeError` [deg]: `roll`, `pitch`, `yaw` (mean, standard deviation), `inclination_rmse`,
         `heading_rmse`, `total_rmse`, `drift_deg_min` [deg/min]
-    joints : joint → angle → `AngleError` [deg]: `mean`, `rmse`, `worst`
+    joints : joint → angle → `AngleError` [deg]: `mean`, `rmse`, `worst`, limits of agreement, `icc`, `range`
     position : point → `PositionError` [mm], relative to the root: `mean`, `std`, `rmse`, `worst`
     position_on_limb : the same relative to where its limb begins, such as the middle of the shoulders
     attitude_uncertainty, position_uncertainty : segment or point → `Uncertainty`, how far the stated covariance agrees
         with the error: `nees` (3 is right), `within_1`, `within_2` (shares within one and two standard deviations)
     interval : from, to [s], that is compared
     samples : number of samples that are compared
-    agreement : joint → angle → `Agreement` of both measurements
     registration : how the reference was brought to the pose; None: it is taken as it is
     """
 
@@ -112,7 +104,6 @@ class Evaluation:
     position_uncertainty: dict[str, Uncertainty]
     interval: tuple[float, float]
     samples: int
-    agreement: dict[str, dict[str, Agreement]] = field(default_factory=dict)
     registration: Registration | None = None
 
     def __repr__(self) -> str:
@@ -218,67 +209,40 @@ def evaluate(
             known = np.isfinite(on_limb).all(axis=1)
             if known.any():
                 position_on_limb[point] = position_error(on_limb[known])
-    for kind, common, errors in (
-        ("orientation of a segment", pose.quat_WL.keys() & truth.quat_WL.keys(), attitude),
-        ("position of a point", pose.points.keys() & truth.points.keys(), position),
-    ):
-        if common and not errors:
-            raise BadData(
-                f"pose and reference have no {kind} at the same time: of {', '.join(sorted(common))} one of the two is "
-                f"NaN; leave out what was not measured"
-            )
     if not attitude and not position:
         raise BadData(
-            "pose and reference have no segment and no point in common; columns as in pose.parquet are needed"
+            "pose and reference have no segment and no point in common at the same time; columns as in pose.parquet "
+            "are needed, with numbers"
         )
-    joints, agreement = _joint_errors(pose, inside, true_WL)
-    return Evaluation(
-        attitude,
-        joints,
-        position,
-        position_on_limb,
-        attitude_uncertainty,
-        position_uncertainty,
-        (float(time[0]), float(time[-1])),
-        int(inside.sum()),
-        agreement,
-    )
+    joints = _joint_errors(pose, inside, true_WL)
+    uncertainties = attitude_uncertainty, position_uncertainty
+    span = float(time[0]), float(time[-1])
+    return Evaluation(attitude, joints, position, position_on_limb, *uncertainties, span, int(inside.sum()))
 
 
-def _joint_errors(
-    pose: Pose, inside: np.ndarray, true_WL: dict[str, np.ndarray]
-) -> tuple[dict[str, dict[str, AngleError]], dict[str, dict[str, Agreement]]]:
-    """Joint → angle → its error, and its agreement, over the samples `inside`.
+def _joint_errors(pose: Pose, inside: np.ndarray, true_WL: dict[str, np.ndarray]) -> dict[str, dict[str, AngleError]]:
+    """Joint → angle → its error over the samples `inside`.
 
     `true_WL`: segment → (m, 4) xyzw on these samples
     """
-    if not true_WL:
-        return {}, {}
     time = pose.time[inside]
     gap = {segment: gap[inside] for segment, gap in pose.gap.items() if segment in true_WL}
     estimated = Pose(time, {segment: pose.quat_WL[segment][inside] for segment in true_WL}, {}, gap=gap)
     try:
         angles, true = joint_angles(estimated), joint_angles(Pose(time, true_WL, {}))
     except BadData:  # no joint has both of its segments
-        return {}, {}
-    errors, agreement = {}, {}
+        return {}
+    errors = {}
     for name, joint in angles.joints.items():
         sound = ~(joint.gap | joint.near_lock | true[name].gap | true[name].near_lock)
-        if not sound.any():
-            continue
-        # Principal values: two sets of angles that differ by half turns are the same pose.
-        values = [euler.decompose(each.quat[sound], joint.sequence).values for each in (joint, true[name])]
-        error = np.degrees(euler.wrap(values[0] - values[1]))
-        errors[name] = {
-            angle: AngleError(float(error[:, k].mean()), _rms(error[:, k]), float(np.abs(error[:, k]).max()))
-            for k, angle in enumerate(joint.names)
-        }
-        measured = np.degrees(values[1])
-        agreement[name] = {
-            angle: compute_agreement(measured[:, k] + error[:, k], measured[:, k])
-            for k, angle in enumerate(joint.names)
-        }
-    return errors, agreement
+        if sound.any():
+            # Principal values: two sets of angles that differ by half turns are the same pose.
+            values = [euler.decompose(each.quat[sound], joint.sequence).values for each in (joint, true[name])]
+            error, measured = np.degrees(euler.wrap(values[0] - values[1])), np.degrees(values[1])
+            errors[name] = {
+                angle: angle_error(measured[:, k] + error[:, k], measured[:, k]) for k, angle in enumerate(joint.names)
+            }
+    return errors
 
 
 def _find_middle(pose: Pose, points: tuple[str, ...]) -> np.ndarray:
@@ -325,13 +289,13 @@ def uncertainty(error: np.ndarray, cov: np.ndarray) -> Uncertainty:
     )
 
 
-def compute_agreement(estimated: np.ndarray, true: np.ndarray) -> Agreement:
-    """Compute the agreement of n values (n,) [deg] with a reference's (n,)."""
-    difference = estimated - true
-    bias, std = float(difference.mean()), float(difference.std(ddof=1)) if len(difference) > 1 else np.nan
-    rmse = float(np.sqrt(np.mean(difference**2)))
+def angle_error(estimated: np.ndarray, true: np.ndarray) -> AngleError:
+    """Error of n values (n,) [deg] against a reference's (n,)."""
+    error = estimated - true
+    mean, std = float(error.mean()), float(error.std(ddof=1)) if len(error) > 1 else np.nan
+    limits = mean - LIMITS * std, mean + LIMITS * std
     icc = compute_icc(np.column_stack([estimated, true]))
-    return Agreement(bias, std, bias - LIMITS * std, bias + LIMITS * std, rmse, icc, float(np.ptp(true)))
+    return AngleError(mean, _rms(error), float(np.abs(error).max()), std, *limits, icc, float(np.ptp(true)))
 
 
 def compute_icc(ratings: np.ndarray) -> float:
@@ -354,9 +318,4 @@ def compute_icc(ratings: np.ndarray) -> float:
 def position_error(difference: np.ndarray) -> PositionError:
     """Position error of differences (n, 3) [m]."""
     distance = 1e3 * np.linalg.norm(difference, axis=1)
-    return PositionError(
-        mean=float(distance.mean()),
-        std=float(distance.std()),
-        rmse=_rms(distance),
-        worst=float(distance.max()),
-    )
+    return PositionError(float(distance.mean()), float(distance.std()), _rms(distance), float(distance.max()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,6 +17,20 @@ from .signals import make_pulse
 _DURATION_S = 60.0  # of a trial
 _STENCIL_S = 1e-3
 _GRID_HZ = 200.0  # sampling rate for the scaling of the motion to its peaks
+
+
+class _Trial(NamedTuple):
+    """An experiment of the paper."""
+
+    stream: int  # of random numbers
+    moving: tuple[float, float]  # [s]
+    ramp: float  # [s]
+    waves_hz: tuple[tuple[float, ...], tuple[float, ...]]  # of turns, of shakes
+    peaks: tuple[tuple[float, float], tuple[float, float]]  # of rate [rad/s] and acceleration [m/s^2], drawn between
+
+
+_DYNAMIC = _Trial(11, (5.0, 55.0), 1.5, ((0.15, 0.4, 0.8, 1.5), (0.6, 1.0, 1.5, 2.2)), ((6.0, 8.0), (15.0, 20.0)))
+_DRIFT = _Trial(12, (25.0, 35.0), 1.0, ((0.5, 1.2, 2.2, 3.5), (2.0, 3.2, 4.5)), ((13.0, 15.0), (40.0, 50.0)))
 
 
 @dataclass(frozen=True)
@@ -40,29 +55,23 @@ class SingleSensor:
 class _HandMotion:
     """A static phase, a burst of rotation and translation, and a static phase in the first pose."""
 
-    def __init__(
-        self,
-        rng: np.random.Generator,
-        span: tuple[float, float],
-        ramp: float,
-        turn_hz: tuple[float, ...],
-        shake_hz: tuple[float, ...],
-        peaks: tuple[float, ...],
-    ) -> None:
-        self.span, self.ramp = span, ramp
+    def __init__(self, rng: np.random.Generator, trial: _Trial) -> None:
+        self.trial = trial
+        peaks = tuple(rng.uniform(*peak) for peak in trial.peaks)
         self.R_W0 = Rotation.random(random_state=rng)
         # One frequency near each of these; slower waves are larger, so that all contribute to the rate.
-        self.omega = [2.0 * np.pi * np.array(hz) * rng.uniform(0.85, 1.15, (3, len(hz))) for hz in (turn_hz, shake_hz)]
+        self.omega = [2.0 * np.pi * np.array(hz) * rng.uniform(0.85, 1.15, (3, len(hz))) for hz in trial.waves_hz]
         self.phase = [rng.uniform(0.0, 2.0 * np.pi, omega.shape) for omega in self.omega]
         # A hand's motion is uneven: its amplitude varies between a third and one.
         self.vigour = 2.0 * np.pi * rng.uniform(0.04, 0.12, 2), rng.uniform(0.0, 2.0 * np.pi, 2)
         self.gain = [1.0, 1.0]
         # Peaks of rate [rad/s] and acceleration [m/s^2]. The rate is not linear in the angles: a few rounds.
-        t = np.arange(span[0], span[1], 1.0 / _GRID_HZ)
+        t = np.arange(*trial.moving, 1.0 / _GRID_HZ)
+        h = _STENCIL_S
         for _ in range(6):
-            rate, acceleration = self.rates(t)
-            self.gain[0] *= peaks[0] / float(np.linalg.norm(rate, axis=1).max())
-            self.gain[1] *= peaks[1] / float(np.linalg.norm(acceleration, axis=1).max())
+            turn = log(compose(self.orientation(t - h).inv(), self.orientation(t + h)).as_quat())
+            self.gain[0] *= peaks[0] / float(np.linalg.norm(turn / (2.0 * h), axis=1).max())
+            self.gain[1] *= peaks[1] / float(np.linalg.norm(self.acceleration(t), axis=1).max())
 
     def _waves(self, which: int, t: np.ndarray) -> np.ndarray:
         omega, phase = self.omega[which], self.phase[which]
@@ -70,7 +79,7 @@ class _HandMotion:
         waves = np.sum(np.sin(omega * t[:, None, None] + phase) / omega**power, axis=2)
         swell, start = self.vigour
         vigour = 0.66 + 0.17 * np.sum(np.sin(swell * t[:, None] + start), axis=1)
-        return self.gain[which] * (make_pulse(t, *self.span, self.ramp) * vigour)[:, None] * waves
+        return self.gain[which] * (make_pulse(t, *self.trial.moving, self.trial.ramp) * vigour)[:, None] * waves
 
     def orientation(self, t: np.ndarray) -> Rotation:
         return compose(self.R_W0, turn_about("ZYX", self._waves(0, t)))
@@ -83,48 +92,6 @@ class _HandMotion:
         far, near, near_after, far_after = (self.position(t + k * _STENCIL_S) - middle for k in (-2, -1, 1, 2))
         return (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
 
-    def rates(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the angular rate in S (n, 3) [rad/s] and the acceleration in W (n, 3) [m/s^2]."""
-        h = _STENCIL_S
-        turn = log(compose(self.orientation(t - h).inv(), self.orientation(t + h)).as_quat())
-        return turn / (2.0 * h), self.acceleration(t)
-
-
-def _simulate_trial(
-    experiment: int,
-    seed: int,
-    span: tuple[float, float],
-    ramp: float,
-    waves_hz: tuple[tuple[float, ...], tuple[float, ...]],
-    peaks: tuple[tuple[float, float], tuple[float, float]],
-    rate_hz: float,
-    noise: ImuNoise,
-    imperfections: Imperfections = IDEAL_PRESET,
-) -> SingleSensor:
-    """Simulate 60 s with motion in the `span`; turns and shakes have these waves, and peaks in these ranges."""
-    motion_rng, sensor_rng = np.random.default_rng([seed, experiment]).spawn(2)
-    motion = _HandMotion(motion_rng, span, ramp, *waves_hz, tuple(motion_rng.uniform(*peak) for peak in peaks))
-    noise_rng, device_rng, jitter_rng, warm_up_rng = sensor_rng.spawn(4)
-    time = np.arange(int(np.floor(_DURATION_S * rate_hz)) + 1) / rate_hz
-    own_time = jitter_time(jitter_rng, time, rate_hz, imperfections.clock_jitter)
-    R_WS = motion.orientation(own_time)
-    turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(own_time)[:, None]
-    rate_S = np.vstack((np.zeros(3), turned))
-    force_S = R_WS.inv().apply(motion.acceleration(own_time) + GRAVITY * E_Z)
-    device = Device.sample(device_rng, imperfections, warm_up_rng)
-    readings = device.measure(rate_S, force_S, rate_hz, noise, imperfections, noise_rng)
-    return SingleSensor(
-        time=time,
-        rate_hz=rate_hz,
-        quat_WS=motion.orientation(time).as_quat(),
-        p_WS=motion.position(time),
-        gyro_S=readings.gyro_S,
-        accel_S=readings.accel_S,
-        gyro_bias=readings.gyro_bias,
-        static=[(0.0, span[0]), (span[1], _DURATION_S)],
-        moving=span,
-    )
-
 
 def simulate_paper_dynamic(
     seed: int,
@@ -132,14 +99,27 @@ def simulate_paper_dynamic(
     *,
     noise: ImuNoise = MTI_3,
     imperfections: Imperfections = IDEAL_PRESET,
+    trial: _Trial = _DYNAMIC,
 ) -> SingleSensor:
     """Simulate a trial of the paper's dynamic experiment: 5 s static, 50 s of free motion in the hand, 5 s static.
 
     Turns of 0.15 to 1.5 Hz with a peak of 6 to 8 rad/s, translation with a peak of 15 to 20 m/s^2, without pauses. Of
     `imperfections` those of a single sensor count: scale, misalignment, g-sensitivity, range, bits and jitter.
     """
-    waves_hz, peaks = ((0.15, 0.4, 0.8, 1.5), (0.6, 1.0, 1.5, 2.2)), ((6.0, 8.0), (15.0, 20.0))
-    return _simulate_trial(11, seed, (5.0, 55.0), 1.5, waves_hz, peaks, rate_hz, noise, imperfections)
+    motion_rng, sensor_rng = np.random.default_rng([seed, trial.stream]).spawn(2)
+    motion = _HandMotion(motion_rng, trial)
+    noise_rng, device_rng, jitter_rng, warm_up_rng = sensor_rng.spawn(4)
+    time = np.arange(int(np.floor(_DURATION_S * rate_hz)) + 1) / rate_hz
+    own_time = jitter_time(jitter_rng, time, rate_hz, imperfections.clock_jitter)
+    R_WS = motion.orientation(own_time)
+    turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(own_time)[:, None]
+    force_S = R_WS.inv().apply(motion.acceleration(own_time) + GRAVITY * E_Z)
+    device = Device.sample(device_rng, imperfections, warm_up_rng)
+    readings = device.measure(np.vstack((np.zeros(3), turned)), force_S, rate_hz, noise, imperfections, noise_rng)
+    quat_WS, p_WS = motion.orientation(time).as_quat(), motion.position(time)
+    static = [(0.0, trial.moving[0]), (trial.moving[1], _DURATION_S)]
+    measured = readings.gyro_S, readings.accel_S, readings.gyro_bias
+    return SingleSensor(time, rate_hz, quat_WS, p_WS, *measured, static, trial.moving)
 
 
 def simulate_paper_drift(seed: int, rate_hz: float = 1000.0, *, noise: ImuNoise = MTI_3) -> SingleSensor:
@@ -147,5 +127,4 @@ def simulate_paper_drift(seed: int, rate_hz: float = 1000.0, *, noise: ImuNoise 
 
     Turns of 0.5 to 4 Hz with a peak of 13 to 15 rad/s, shaking of 2 to 5 Hz with a peak of 40 to 50 m/s^2.
     """
-    waves_hz, peaks = ((0.5, 1.2, 2.2, 3.5), (2.0, 3.2, 4.5)), ((13.0, 15.0), (40.0, 50.0))
-    return _simulate_trial(12, seed, (25.0, 35.0), 1.0, waves_hz, peaks, rate_hz, noise)
+    return simulate_paper_dynamic(seed, rate_hz, noise=noise, trial=_DRIFT)

@@ -113,11 +113,7 @@ class Simulation:
         return dict.fromkeys(load_table().girdles, own)
 
     def truth(self) -> Pose:
-        """Return the exact pose."""
-        return Pose(self.time, self.quat_WL, self.points)
-
-    def truth_facing_torso(self) -> Pose:
-        """Return the exact pose in the W of tracking, whose x is where the torso faces in the first start phase."""
+        """Return the exact pose, in the W of tracking, whose x is where the torso faces in the start phase."""
         begin, end = self.phases["start"][0]
         start = (self.time >= begin) & (self.time <= end)
         facing = float(heading(Rotation.from_quat(self.quat_WL["torso"][start]).mean().as_quat()))
