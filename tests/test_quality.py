@@ -146,7 +146,7 @@ CASES: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, st
         [("sensors-exchanged", "torso and right_upper_arm", "")],
     ),
     "six seconds of motion": (
-        lambda r: replace(r, phases={**r.phases, "clasp": ((20.0, 28.0),)}),
+        lambda r: replace(r, phases={**r.phases, "clasp": ((20.0, 26.0),)}),
         "fail",
         [("motion-too-small", "", "coincide")],
     ),
