@@ -35,12 +35,10 @@ def mvnx(
     index: list[int] | None = None,
     before: str = "",
     end: str = "</frames></subject></mvnx>",
-    arm: tuple[float, float, float] | None = None,
     t_pose: str | None = "1 0 0 0 " * len(SEGMENTS),
 ) -> Path:
     """A file with these orientations (n, 6, 4) and, with `raw`, two sensors that rest with gravity on z.
 
-    `arm`: from joint to joint in the frames of the left arm's segments; its positions are in the file then.
     `t_pose`: the orientations in its frame of type tpose; None: it has no such frame.
     """
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', before, HEAD.format(version=version, rate=rate), "<segments>"]
@@ -54,14 +52,9 @@ def mvnx(
         number = k if index is None else index[k]
         lines.append(f'<frame time="{round(20 * number)}" index="{number}" type="normal">')
         lines.append(f"<orientation>{' '.join(f'{value:.9f}' for value in quats.ravel())}</orientation>")
-        if arm is not None:
-            p_W = np.zeros((len(SEGMENTS), 3))
-            for part in (2, 3):
-                p_W[part + 1] = p_W[part] + 0.3 * Rotation.from_quat(quats[part][[1, 2, 3, 0]]).apply(arm)
-            lines.append(f"<position>{' '.join(f'{value:.6f}' for value in p_W.ravel())}</position>")
         if raw:
             lines.append("<sensorAcceleration>0 0 9.81 0 9.81 0</sensorAcceleration>")
-            lines.append(f"<sensorAngularVelocity>0.1 0 0 0 0 {0.001 * k}</sensorAngularVelocity>")
+            lines.append(f"<sensorAngularVelocity>{0.1 + 1e-4 * (k % 2)} 0 0 0 0 {0.001 * k}</sensorAngularVelocity>")
         lines.append("</frame>")
     (folder / "trial.mvnx").write_text("\n".join([*lines, end]), encoding="utf-8")
     return folder / "trial.mvnx"
@@ -248,37 +241,21 @@ def test_poses_are_no_motion_and_segment_frames_are_those_of_the_n_pose(version:
 ISB = "1 0 0 0  1 0 0 0  0.70711 0.70711 0 0  0.48970 0.51009 0.48970 -0.51009  0.5 0.5 0.5 -0.5  0.70711 -0.70711 0 0"
 
 
-@pytest.mark.parametrize("t_pose", [ISB, None], ids=["tpose", "none"])
-def test_arms_in_the_frames_of_the_isb(t_pose: str | None, tmp_path: Path) -> None:
-    """Told by the T-pose or, without one, by the positions. A hanging palm is at the thigh in our frames."""
+def test_arms_in_the_frames_of_the_isb(tmp_path: Path) -> None:
+    """Told by the T-pose. A hanging palm is at the thigh in our frames."""
     quat = turning()
-    device = read_mvnx(mvnx(tmp_path, quat, arm=(0.0, 0.0, -1.0), t_pose=t_pose))
+    device = read_mvnx(mvnx(tmp_path, quat, t_pose=ISB))
     for k, label, palm in ((2, "LeftUpperArm", -90.0), (3, "LeftForeArm", 0.0), (4, "LeftHand", 0.0)):
         ours = Rotation.from_quat(device.sensors[label].signals["orientation"])
         theirs = Rotation.from_quat(quat[:, k][:, [1, 2, 3, 0]])
         np.testing.assert_allclose(ours.apply([0.0, 0.0, -1.0]), theirs.apply([0.0, 0.0, -1.0]), atol=1e-6)
         inward = [np.cos(np.radians(palm)), np.sin(np.radians(palm)), 0.0]  # what is -y, inward, of our frame
         np.testing.assert_allclose(ours.apply([0.0, -1.0, 0.0]), theirs.apply(inward), atol=1e-6)
-    assert [each.code for each in device.diagnostics] == ["file-assumption"] * (t_pose is None)
+    assert device.diagnostics == ()
+    assumed = read_mvnx(mvnx(tmp_path, quat, t_pose=None))
+    assert [each.code for each in assumed.diagnostics] == ["file-assumption"]
     torso = device.sensors["T8"].signals["orientation"]
     np.testing.assert_allclose(torso, quat[:, 1][:, [1, 2, 3, 0]], atol=1e-8)
-
-
-@pytest.mark.parametrize("t_pose", ["1 0 0 0 " * len(SEGMENTS), None], ids=["tpose", "none"])
-@pytest.mark.parametrize("arm", [(1.0, 0.0, 0.0), (0.0, 0.7, -0.7), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)])
-def test_arms_that_do_not_lie_along_their_frames_are_refused(
-    arm: tuple[float, float, float], t_pose: str | None, tmp_path: Path
-) -> None:
-    with pytest.raises(BadData, match=r"Left(Upper|Fore)Arm lies \d+ deg off the axis of its frame") as error:
-        read_mvnx(mvnx(tmp_path, turning(), arm=arm, t_pose=t_pose))
-    assert "\n" not in str(error.value)
-    assert read_mvnx(mvnx(tmp_path, turning(), arm=arm, raw=True)).kind == "raw"  # raw data do not need them
-
-
-def test_a_t_pose_of_another_pose_is_refused(tmp_path: Path) -> None:
-    path = mvnx(tmp_path, turning(), t_pose=f"{'1 0 0 0 ' * 3} 0.9239 0.3827 0 0 {'1 0 0 0 ' * 2}")
-    with pytest.raises(BadData, match="frame of type tpose is no T-pose: LeftForeArm is 45 deg off a quarter turn"):
-        read_mvnx(path)
 
 
 @pytest.mark.parametrize("name", ["Meri-020.mvnx", "test_mocap.mvnx"])
@@ -302,7 +279,7 @@ def test_raw_data_come_first_and_orientations_when_asked_for(tmp_path: Path) -> 
     raw = wp.load_session(session(tmp_path, path.name, ("torso", "left_forearm")))
     np.testing.assert_allclose(raw.sensors["left_forearm"].accel_S[0], [0.0, 9.81, 0.0])
     np.testing.assert_allclose(raw.sensors["left_forearm"].gyro_S[:, 2], 0.001 * np.arange(200))
-    np.testing.assert_allclose(raw.sensors["torso"].gyro_S[:, 0], 0.1)
+    np.testing.assert_allclose(raw.sensors["torso"].gyro_S[:, 0], 0.1, atol=2e-4)
     assert not raw.sensors["torso"].aligned
     ready = wp.load_session(session(tmp_path, path.name, ("torso", "left_forearm"), 'use = "orientation"'))
     assert ready.sensors["torso"].aligned
@@ -325,7 +302,7 @@ def test_lost_frames_are_gaps(tmp_path: Path) -> None:
 def test_a_mount_beside_aligned_orientations_is_an_error(tmp_path: Path) -> None:
     path = mvnx(tmp_path, turning())
     mount = 'mount = { up = "+x", forward = "-z" }'
-    with pytest.raises(BadSession, match=r"sensors\.torso\.mount stands beside aligned"):
+    with pytest.raises(BadSession, match=r"sensors\.torso: aligned orientations .* need no mount"):
         wp.load_session(session(tmp_path, path.name, ("torso",), each=mount))
     assert (
         not wp.load_session(session(tmp_path, path.name, ("torso",), each=f"aligned = false\n{mount}"))
@@ -343,8 +320,7 @@ def test_a_document_type_without_entities_is_what_mvn_writes(tmp_path: Path) -> 
     ("change", "says"),
     [
         ({"end": ""}, r"cannot be read as an MVNX; it is damaged, cut off .* line \d+"),
-        ({"rate": "fast"}, "subject frameRate='fast' is no rate"),
-        ({"rate": "0"}, "subject frameRate='0' is no rate"),
+        ({"rate": "fast"}, "cannot be read as an MVNX; .*fast"),
     ],
 )
 def test_a_damaged_file_is_one_line(change: dict[str, str], says: str, tmp_path: Path) -> None:
@@ -382,7 +358,7 @@ def test_a_missing_file_and_a_wrong_label(tmp_path: Path) -> None:
     with pytest.raises(MissingFile, match=r"none\.mvnx: no such file"):
         wp.load_session(session(tmp_path, "none.mvnx", ("torso",)))
     path = mvnx(tmp_path, turning())
-    with pytest.raises(BadSession, match=r"sensors\.torso\.label = 'T9' is not in trial\.mvnx; there is: Pelvis, T8"):
+    with pytest.raises(BadSession, match=r"sensors\.torso\.label = 'T9' is not known; there is: Pelvis, T8"):
         wp.load_session(session(tmp_path, path.name, ("torso",), each='label = "T9"'))
     with pytest.raises(BadSession, match=r"sensors\.right_hand\.label is missing; which of trial\.mvnx is it"):
         wp.load_session(session(tmp_path, path.name, ("right_hand",)))
