@@ -40,12 +40,10 @@ PROFILE = "wepose-live"
 HEADER, SENSORS, EVENTS, POSES = "wepose", "/sensors/", "/events", "/pose"  # name of the metadata, and topics
 FORMAT = 3  # of the header
 LONGEST_RECORD = 1 << 28  # [bytes] longer than any that we write
-SAMPLE_BYTES = 57  # of a sample in the file, at least
-# Ticks without a sample: with more than in eight hours at 100 Hz, times of samples are wrong.
-MOST_SILENT = 3_000_000
-MOST_RATE, MOST_WAIT_S = 10_000.0, 10.0
+MOST_RATE = 10_000.0
 LONGEST_TEXT = 200  # letters of a phase's name, or of a marked text
 KIND = "a recording of wepose live"
+_BROKE_OFF = "{}: broke off before the start pose was held; there is nothing to track in it"
 _VECTOR = {"type": "array", "items": {"type": "number"}}
 SCHEMAS: dict[str, dict[str, Any]] = {
     name: {"type": "object", "properties": properties}
@@ -134,29 +132,26 @@ def read_live_log(path: Path) -> LiveRecording:
         start: tuple[int, int] | None = None
         resets = []
         for event in events:
-            kind = event["kind"]
-            if kind == "clock":
-                if not (0.1 <= event["rate_hz"] <= MOST_RATE and 0.0 <= event["wait_s"] <= MOST_WAIT_S):
+            if event["kind"] == "clock":
+                if not 0.1 <= event["rate_hz"] <= MOST_RATE:
                     raise BadData(f"{path}: ticks at {event['rate_hz']:g} Hz; the file is damaged")
                 clock = event["rate_hz"], event["begin"], event["wait_s"]
                 synchronizer = StreamSynchronizer(header["sensors"], *clock, header["orientations"])
-            elif kind == "start":
+            elif event["kind"] == "start":
                 start = int(event["begin"]), int(event["end"])
-            elif kind == "reset":
+            elif event["kind"] == "reset":
                 resets.append(int(event["tick"]))
             else:
-                markers.add(kind, event)
-        ticks = [] if synchronizer is None else [_make_ticks(path, synchronizer, arrivals)]
-        if synchronizer is None or synchronizer.next_tick < 2:
-            raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
+                markers.add(event["kind"], event)
+        ticks = [] if synchronizer is None else [synchronizer.push(arrivals)]
+        if synchronizer is None or synchronizer.next_tick < 2 or (start and synchronizer.next_tick <= start[1] + 1):
+            raise BadData(_BROKE_OFF.format(path))
         resets = [tick for tick in resets if tick < synchronizer.next_tick]
-        if start is not None and synchronizer.next_tick <= start[1] + 1:
-            raise BadData(f"{path}: broke off in the start pose; there is nothing to track in it")
         header["sensors"] = [markers.segments.get(name, name) for name in header["sensors"]]
         ends = synchronizer.begin, synchronizer.begin + (synchronizer.next_tick - 1) / synchronizer.rate_hz
         header["phases"] = {**header["phases"], **markers.phases(*ends)}
         if start is None and not any(end <= ends[1] for _, end in header["phases"].get("start", ())):
-            raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
+            raise BadData(_BROKE_OFF.format(path))
         recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets))
     recording = replace(check_recording(recording), marks=tuple(markers.texts))
     if not is_complete:
@@ -164,15 +159,6 @@ def read_live_log(path: Path) -> LiveRecording:
         recording = replace(recording, diagnostics=(killed,))
     first = int(poses[0, 0]) if len(poses) else start[1] + 1 if start is not None else 0
     return LiveRecording(recording, header, first, poses[:, 1:].reshape(len(poses), len(header["sensors"]), 4).copy())
-
-
-def _make_ticks(path: Path, synchronizer: StreamSynchronizer, arrivals: Arrivals) -> Ticks:
-    """The ticks of all arrivals, without those whose time is far beyond what the file can hold."""
-    end_s = synchronizer.begin + (MOST_SILENT + path.stat().st_size / SAMPLE_BYTES) / synchronizer.rate_hz
-    far = arrivals.time > end_s
-    if np.count_nonzero(far) > 3:  # as many are a clock that jumped
-        raise BadData(f"{path}: samples at {arrivals.time[far][0]:g} s, where the file holds no as long recording")
-    return synchronizer.push(Arrivals(*(column[~far] for column in arrivals)) if far.any() else arrivals)
 
 
 def read_live_device(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
@@ -186,22 +172,18 @@ def read_live_device(path: Path, use: str | None = None, rate_hz: float | None =
     if rate_hz is not None:
         raise BadData(f"{path}: rate_hz = {rate_hz:g}: a live recording has times of its own; leave it out")
     recording = read_live_log(path).recording
-    kinds = {"orientation" if isinstance(sensor, OrientationSensor) else "raw" for sensor in recording.sensors.values()}
-    kind = kinds.pop()
-    if kinds or use not in (None, kind):
-        held = "raw data of some sensors and orientations of others" if kinds else f"'{kind}' of its sensors"
-        remedy = "track it as it is" if kinds else "leave it out"
-        raise BadData(f"{path}: use = {use!r}: the live recording holds {held}; {remedy}")
-    sensors = {}
+    sensors, kinds = {}, set()
     for name, sensor in recording.sensors.items():
-        signals = (
-            {"orientation": sensor.quat_VS}
-            if isinstance(sensor, OrientationSensor)
-            else {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
-        )
+        if isinstance(sensor, OrientationSensor):
+            kind, signals = "orientation", {"orientation": sensor.quat_VS}
+        else:
+            kind, signals = "raw", {"gyro": sensor.gyro_S, "accel": sensor.accel_S}
+        kinds.add(kind)
         if sensor.gap is not None:
             signals = {key: np.where(sensor.gap[:, None], np.nan, values) for key, values in signals.items()}
         sensors[name] = DeviceSensor(recording.time, signals, name, sensor.stated_quat_LS)
+    if len(kinds) > 1 or use not in (None, kind):
+        raise BadData(f"{path}: use = {use!r}: it holds {' and '.join(sorted(kinds))} data; track it as it is")
     diagnostics = recording.diagnostics
     if recording.resets:
         diagnostics += (Diagnostic("heading-resets-not-repeated", INFO, path.name, len(recording.resets)),)
@@ -259,19 +241,11 @@ def _read_content(path: Path) -> tuple[dict[str, Any], Arrivals, list[dict[str, 
             packed = [*message["orientation"], 0.0, 0.0] if "orientation" in message else None
             samples.extend(packed or [*message["gyro"], *message["accel"]])
     if not header:
-        raise BadData(f"{path}: broke off before the start pose was held; there is nothing to track in it")
+        raise BadData(_BROKE_OFF.format(path))
     which, time, gyro, accel = np.split(np.array(samples).reshape(-1, 8), [1, 2, 5], axis=1)
     arrivals = Arrivals(which[:, 0].astype(np.uint8), time[:, 0].copy(), gyro.copy(), accel.copy())
     rows = np.array(poses).reshape(-1, 1 + 4 * len(header["sensors"]))
     return header, arrivals, events, rows, is_complete
-
-
-def _cut_spans(phase: str, spans: Sequence[Sequence[float]], time: np.ndarray) -> Intervals:
-    """The intervals [s] of a phase within the times (n,) [s]; one that goes on ends there, if it need not be whole."""
-    inside = [(float(a), float(b)) for a, b in spans if time[0] <= a < time[-1]]
-    if phase in ("start", "static"):
-        return tuple((a, b) for a, b in inside if b <= time[-1])
-    return tuple((a, min(b, float(time[-1]))) for a, b in inside)
 
 
 def build_recording(
@@ -308,22 +282,19 @@ def build_recording(
         if lost.all():
             raise BadData(f"{source or header['name']}: sensors.{name} never sent a sample")
         marks = np.where(lost, LONG, GOOD).astype(np.int8)  # the live session bridged short gaps
-        stated = header["mounts"].get(name)
+        stated, gap = header["mounts"].get(name), lost if lost.any() else None
+        mount = None if stated is None else np.array(stated)
         if name in header["orientations"]:
-            sensors[name] = OrientationSensor(
-                bridge_quat(unpack_orientations(gyro[:, i], accel[:, i]), marks, clock),
-                None if stated is None else np.array(stated),
-                lost if lost.any() else None,
-                header["orientations"][name],
-            )
-            continue
-        sensors[name] = ImuSensor(
-            gyro_S=bridge(np.ascontiguousarray(gyro[:, i]), marks, clock, rate=True),
-            accel_S=bridge(np.ascontiguousarray(accel[:, i]), marks, clock),
-            stated_quat_LS=None if stated is None else np.array(stated),
-            gap=lost if lost.any() else None,
-        )
-    phases = {name: _cut_spans(name, spans, time) for name, spans in header["phases"].items()}
+            quat = bridge_quat(unpack_orientations(gyro[:, i], accel[:, i]), marks, clock)
+            sensors[name] = OrientationSensor(quat, mount, gap, header["orientations"][name])
+        else:
+            gyro_S = bridge(np.ascontiguousarray(gyro[:, i]), marks, clock, rate=True)
+            sensors[name] = ImuSensor(gyro_S, bridge(np.ascontiguousarray(accel[:, i]), marks, clock), mount, gap)
+    phases = {}
+    for name, spans in header["phases"].items():
+        inside = [(float(a), float(b)) for a, b in spans if time[0] <= a < time[-1]]
+        whole = name in ("start", "static")  # others may end with the recording
+        phases[name] = tuple((a, min(b, float(time[-1]))) for a, b in inside if not whole or b <= time[-1])
     if start is not None:
         phases["start"] = ((float(time[start[0] - first]), float(time[start[1] - first])),)
     return Recording(
