@@ -424,13 +424,6 @@ def test_xdf_with_rates_and_forces_in_streams_of_their_own(tmp_path: Path) -> No
     assert assumed == {"rad/s", "g"}
 
 
-def test_an_xdf_that_was_cut_off_is_said(tmp_path: Path) -> None:
-    two_streams(tmp_path / "a.xdf", cut=3000)
-    recording = load(tmp_path, '[data]\nfile = "a.xdf"\n[sensors.torso]')
-    assert "file-incomplete" in {each.code for each in recording.diagnostics}
-    assert len(recording) == N - 100
-
-
 def test_an_unknown_unit_is_named(tmp_path: Path) -> None:
     values = np.column_stack([ACCEL, GYRO])
     xdf(tmp_path / "a.xdf", {"torso": (LABELS, ["furlong"] * 3 + ["rad/s"] * 3, values)})

@@ -98,10 +98,10 @@ def _table(path: Path) -> object:
 
 
 def _description(path: Path) -> object:
-    from wepose_pin.readers.table_format import load_format, read_table_format
+    from wepose_pin.readers.table_format import load_format
 
     (path.parent / "a.csv").write_bytes(seeds.dot()[1])
-    return read_table_format(load_format(path), path.parent / "a.csv")
+    return load_format(path).read(path.parent / "a.csv")
 
 
 def _robot_map(path: Path) -> object:

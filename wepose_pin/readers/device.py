@@ -112,8 +112,7 @@ def make_device(
     for label, signals in chosen.items():
         for signal in NEEDED[kind]:
             check_measured(path, signals[signal].values, f"{signal} of {label}")
-        place = path.name if len(found) == 1 else f"{path.name} {label}"
-        time, values = join_signals(place, {name: signals[name] for name in NEEDED[kind]})
+        time, values = join_signals(f"{path.name} {label}", {name: signals[name] for name in NEEDED[kind]})
         if len(time) < FEWEST:
             raise BadData(f"{path}: holds {len(time)} samples of {label}; the export is empty or cut off")
         texts = [label, *([hints[label]] if hints else []), *([path.absolute().stem] if len(chosen) == 1 else [])]

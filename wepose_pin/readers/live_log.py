@@ -155,8 +155,7 @@ def read_live_log(path: Path) -> LiveRecording:
         recording = build_recording(header, synchronizer.rate_hz, ticks, start, path, tuple(resets))
     recording = replace(check_recording(recording), marks=tuple(markers.texts))
     if not is_complete:
-        killed = Diagnostic("file-incomplete", WARNING, path.name, facts={"variant": "killed"})
-        recording = replace(recording, diagnostics=(killed,))
+        recording = replace(recording, diagnostics=(Diagnostic("file-incomplete", WARNING, path.name),))
     first = int(poses[0, 0]) if len(poses) else start[1] + 1 if start is not None else 0
     return LiveRecording(recording, header, first, poses[:, 1:].reshape(len(poses), len(header["sensors"]), 4).copy())
 

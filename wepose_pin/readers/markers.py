@@ -82,28 +82,28 @@ def _write_side(value: Any, side: Mapping[str, str]) -> Any:
     return {key: _write_side(each, side) for key, each in value.items()} if isinstance(value, dict) else value
 
 
-def _are_names(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and all(isinstance(name, str) for name in value)
+def _are_ways(value: Any) -> bool:
+    """Return whether a value is a list of lists of names."""
+    return isinstance(value, list) and all(
+        isinstance(way, list) and way and all(isinstance(name, str) for name in way) for way in value
+    )
 
 
-def _are_directions(value: Any) -> bool:
-    """Whether a value is a way to orient a segment: two directions of different axes, each from markers to markers."""
-    if not isinstance(value, dict) or len(value) != 2 or len({DIRECTIONS.get(each) for each in value} - {None}) != 2:
-        return False
-    return all(isinstance(ends, list) and len(ends) == 2 and all(map(_are_names, ends)) for ends in value.values())
-
-
-def _are_all(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and all(map(test, value))
+def _are_frames(value: Any) -> bool:
+    """Return whether a value is a list of two directions of different axes each, from markers to markers."""
+    return isinstance(value, list) and all(
+        isinstance(frame, dict)
+        and len(frame) == 2
+        and len({DIRECTIONS.get(each) for each in frame} - {None}) == 2
+        and all(_are_ways(ends) and len(ends) == 2 for ends in frame.values())
+        for frame in value
+    )
 
 
 # Table → what its entries look like, and the test of one.
 _FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "points": ('[["A", "B"], ["C"]], ways, each of markers', _are_all(_are_names)),
-    "segments": (
-        '[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions from markers to markers',
-        _are_all(_are_directions),
-    ),
+    "points": ('[["A", "B"], ["C"]], ways, each of markers', _are_ways),
+    "segments": ('[{ up = [["A"], ["B"]], left = [["C"], ["D"]] }], ways, each of two directions', _are_frames),
     "rotations": ("the name of a rotation", lambda value: isinstance(value, str)),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -18,10 +19,8 @@ from .opensim import read_opensim
 from .rosbag import SUFFIXES as ROSBAGS
 from .rosbag import is_rosbag, read_rosbag
 from .sensor_logger import is_sensor_logger, read_sensor_logger
-from .table_format import detects, load_format, load_formats, read_table_format
+from .table_format import TableFormat, load_format, load_formats
 from .xdf import is_xdf, read_xdf
-
-USES = ("raw", "orientation")
 
 
 class Format(NamedTuple):
@@ -71,19 +70,11 @@ def _has_suffix(path: Path, *suffixes: str) -> bool:
     return path.suffix.lower() in suffixes
 
 
-def look_up_format(name: str) -> Format:
+def look_up_format(name: str) -> Format | TableFormat:
     """Look up a format by its name, or the path of a description."""
     if name in find_plugins("readers"):
         return load_plugin("readers", name)
-    described = load_format(Path(name)) if name.endswith(".toml") else load_formats()[name]
-
-    def read(path: Path, use: str | None, rate_hz: float | None) -> Device:
-        return read_table_format(described, path, use, rate_hz)
-
-    def is_one(path: Path, start: str) -> bool:
-        return detects(described, path, start)
-
-    return Format(described.title, is_one, read, described.whole, bool(described.files))
+    return load_format(Path(name)) if name.endswith(".toml") else load_formats()[name]
 
 
 def find_format(name: str, folder: Path, place: str) -> str:
@@ -115,21 +106,16 @@ def detect_format(path: Path) -> str | None:
     """
     if not (path.is_file() or path.is_dir()) and path.exists():
         return None
-    start = "\n".join(read_first_lines(path, 40)) if not path.is_dir() and _has_suffix(path, *TEXTS) else ""
+    is_table = path.is_dir() or _has_suffix(path, ".zip", *TEXTS)
+    start = "\n".join(read_first_lines(path, 40)) if path.is_file() and _has_suffix(path, *TEXTS) else ""
     for name in find_plugins("readers"):
         if look_up_format(name).detects(path, start):
             return name
-    return _detect_table(path, start) if path.is_dir() or _has_suffix(path, ".zip", *TEXTS) else None
-
-
-def _detect_table(path: Path, start: str) -> str | None:
-    for file in sorted((path if path.is_dir() else path.parent).glob("*.toml")):
-        try:
-            if detects(load_format(file), path, start):
+    for file in sorted((path if path.is_dir() else path.parent).glob("*.toml")) if is_table else ():
+        with contextlib.suppress(WeposeError):  # another TOML, such as a session
+            if load_format(file).detects(path, start):
                 return str(file)
-        except WeposeError:  # another TOML, such as a session
-            continue
-    return next((name for name, format in load_formats().items() if detects(format, path, start)), None)
+    return next((name for name, format in load_formats().items() if is_table and format.detects(path, start)), None)
 
 
 def read_device(path: Path, name: str, use: str | None = None, rate_hz: float | None = None) -> Device:

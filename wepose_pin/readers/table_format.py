@@ -121,6 +121,61 @@ class TableFormat(NamedTuple):
     clocks: Annotated[tuple[ClockColumn, ...], None] = ()
     signals: Annotated[Mapping[str, tuple[Columns, ...]], None] = MappingProxyType({})
 
+    @property
+    def folder(self) -> bool:
+        """Whether a recording may be a folder."""
+        return bool(self.files)
+
+    def detects(self, path: Path, start: str) -> bool:
+        """Return whether a file that starts with this text, a folder, or a zip is of the format."""
+        if path.is_file() and path.suffix.lower() != ".zip":
+            if self.suffixes and path.suffix.lower() not in self.suffixes:
+                return False
+            matches = [bool(re.search(pattern, start, re.S | re.M)) for pattern in self.detect]
+            # A table with all signals is one that needs no folder.
+            return any(matches) and (len(matches) == 1 or (not all(matches) and self.detects(path.parent, "")))
+        if not self.files:
+            return False
+        with open_folder(path) as files:
+            named = {file for pattern in self.files.values() for file in _select(files, pattern)}
+            starts = ["\n".join(read_first_lines(file, 3)) for file in named]
+        matches = [any(re.search(pattern, text, re.S | re.M) for text in starts) for pattern in self.detect]
+        return bool(matches) and all(matches)
+
+    def read(self, path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
+        """Read the sensors' raw data where they are there, else their orientations; `use` selects one of the two.
+
+        `rate_hz` replaces the file's own times, or is the rate of its counter.
+
+        Raises
+        ------
+        BadData
+            No such table; no times; an unknown unit; not what `use` asks for.
+        """
+        tables = _open_tables(self, path, use)
+        sensors = _find_sensors(self, tables)
+        kind = use or next((kind for kind in NEEDED if _has(sensors, kind)), "raw")
+        joins = self.times_before or len(tables) > 1  # a rate is that of the joined signals
+        alone = tables[0].about.get(self.label_line) or _name_alone(self, path)
+        found: dict[str, dict[str, Signal]] = {}
+        wraps_s = None
+        for sensor, signals in sensors.items():
+            own = found.setdefault(sensor or alone, {})
+            for name in NEEDED[kind] if set(NEEDED[kind]) <= set(signals) else ():
+                first, *others = signals[name]
+                time, wraps_s = _read_time(self, first, sensor, None if joins else rate_hz)
+                values = _read_values(name, first, time)
+                if others and (np.abs(values) > first.format.limit).any():
+                    values = _read_values(name, others[0], time)
+                own[name] = Signal(time, values)
+        diagnostics = []
+        # Clocks of devices that were not synchronized start at power-on.
+        if self.sync_line and not tables[0].about.get(self.sync_line, "synced").lower().startswith("synced"):
+            diagnostics.append(Diagnostic("device-not-synchronized", WARNING, path.name))
+        needs = f"{self.needs}; it has: {', '.join(filter(None, tables[0].names[:12]))}"
+        device = make_device(path, found, needs, use, rate_hz if joins else None, diagnostics)
+        return replace(device, wraps_s=None if joins else wraps_s)
+
     def is_time(self, name: str) -> bool:
         """Return whether a column of this name gives the time."""
         return any(_match(clock.column, name) for clock in self.clocks)
@@ -171,23 +226,6 @@ def load_format(path: Path) -> TableFormat:
 def load_formats() -> Mapping[str, TableFormat]:
     """Load the descriptions in the package: name → description."""
     return {path.stem: load_format(path) for path in sorted(FOLDER.glob("*.toml"))}
-
-
-def detects(format: TableFormat, path: Path, start: str) -> bool:
-    """Return whether a file that starts with this text, a folder, or a zip is of the format."""
-    if path.is_file() and path.suffix.lower() != ".zip":
-        if format.suffixes and path.suffix.lower() not in format.suffixes:
-            return False
-        matches = [bool(re.search(pattern, start, re.S | re.M)) for pattern in format.detect]
-        # A table with all signals is one that needs no folder.
-        return any(matches) and (len(matches) == 1 or (not all(matches) and detects(format, path.parent, "")))
-    if not format.files:
-        return False
-    with open_folder(path) as files:
-        named = {file for pattern in format.files.values() for file in _select(files, pattern)}
-        starts = ["\n".join(read_first_lines(file, 3)) for file in named]
-    matches = [any(re.search(pattern, text, re.S | re.M) for text in starts) for pattern in format.detect]
-    return bool(matches) and all(matches)
 
 
 def _select(files: Mapping[str, Path], pattern: str) -> list[Path]:
@@ -332,41 +370,6 @@ class _Source(NamedTuple):
 
 
 _Sensors = dict[str, dict[str, list[_Source]]]  # sensor → signal → its complete columns, those to prefer first
-
-
-def read_table_format(format: TableFormat, path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """Read the sensors' raw data where they are there, else their orientations; `use` selects one of the two.
-
-    `rate_hz` replaces the file's own times, or is the rate of its counter.
-
-    Raises
-    ------
-    MissingFile, BadData
-        Not there; no such table; no times; an unknown unit; not what `use` asks for.
-    """
-    tables = _open_tables(format, path, use)
-    sensors = _find_sensors(format, tables)
-    kind = use or next((kind for kind in NEEDED if _has(sensors, kind)), "raw")
-    joins = format.times_before or len(tables) > 1  # a rate is that of the joined signals
-    alone = tables[0].about.get(format.label_line) or _name_alone(format, path)
-    found: dict[str, dict[str, Signal]] = {}
-    wraps_s = None
-    for sensor, signals in sensors.items():
-        own = found.setdefault(sensor or alone, {})
-        for name in NEEDED[kind] if set(NEEDED[kind]) <= set(signals) else ():
-            first, *others = signals[name]
-            time, wraps_s = _read_time(format, first, sensor, None if joins else rate_hz)
-            values = _read_values(name, first, time)
-            if others and (np.abs(values) > first.format.limit).any():
-                values = _read_values(name, others[0], time)
-            own[name] = Signal(time, values)
-    diagnostics = []
-    # Clocks of devices that were not synchronized start at power-on.
-    if format.sync_line and not tables[0].about.get(format.sync_line, "synced").lower().startswith("synced"):
-        diagnostics.append(Diagnostic("device-not-synchronized", WARNING, path.name))
-    needs = f"{format.needs}; it has: {', '.join(filter(None, tables[0].names[:12]))}"
-    device = make_device(path, found, needs, use, rate_hz if joins else None, diagnostics)
-    return replace(device, wraps_s=None if joins else wraps_s)
 
 
 def _open_tables(format: TableFormat, path: Path, use: str | None) -> list[DeviceTable]:

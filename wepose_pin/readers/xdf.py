@@ -57,7 +57,6 @@ def read_xdf(path: Path, use: str | None = None, rate_hz: float | None = None) -
         values = stream["time_series"]
         if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or len(values) < 2:
             continue
-        diagnostics += _check_complete(path, stream, len(values))
         name = stream["info"]["name"][0] or "stream"
         columns = [f"{name} {label}" for label in _read_channels(stream, "label", values.shape[1])]
         units = dict(zip(columns, _read_channels(stream, "unit", values.shape[1]), strict=True))
@@ -84,15 +83,6 @@ def _read_channels(stream: Mapping[str, Any], key: str, count: int) -> list[str]
     except (KeyError, IndexError, TypeError, AttributeError):
         texts = []
     return [*texts, *[""] * count][:count]
-
-
-def _check_complete(path: Path, stream: Mapping[str, Any], count: int) -> list[Diagnostic]:
-    """Compare the number of samples with that of the footer; a file that was cut off has none."""
-    try:
-        stated = int(stream["footer"]["info"]["sample_count"][0])
-    except (KeyError, IndexError, TypeError, ValueError):
-        stated = count + 1
-    return [Diagnostic("file-incomplete", WARNING, path.name, count, stated)] if stated > count else []
 
 
 def _guess_unit(signal: str, values: np.ndarray) -> str:
