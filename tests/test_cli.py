@@ -251,9 +251,8 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["simulate", "-o", "OUT", "--prset", "ideal"], "not an option of wepose simulate; did you mean '--preset'?"),
         (
             ["calibrate", "s.toml", "-o", "OUT", "--protocol", "poses"],
-            "protocol 'poses' is no longer there; use t_pose+bow",
+            "protocol 'poses' is not known; there is: bow",
         ),
-        (["simulate", "-o", "OUT", "--protocol", "handle"], "protocol 'handle' is no longer there; use clasp with"),
         (["calibrate", "a", "b", "-o", "OUT"], "'b' is one word too many for wepose calibrate"),
         (["track", "s.toml"], "parameter --out requires an argument"),
         (["track", "s.toml", "-o", "OUT", "--method", "ekf"], 'Invalid value "ekf" for --method. Choose from: "amekf"'),

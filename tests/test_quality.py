@@ -148,7 +148,7 @@ CASES: dict[str, tuple[Callable[[Recording], Recording], str, list[tuple[str, st
     "six seconds of motion": (
         lambda r: replace(r, phases={**r.phases, "clasp": ((20.0, 26.0),)}),
         "fail",
-        [("motion-too-small", "", "coincide")],
+        [("motion-too-small", "", "")],
     ),
 }
 
@@ -238,11 +238,9 @@ def test_too_little_motion_is_named(share: dict[str, float], wanted: str, causes
     calibration = solved(moved_otherwise(person, share).recording(), person)
     quality = assess(calibration)
     print(codes(quality))
-    assert quality.doubt < 1.0  # uncertain headings are no exchange
     assert quality.quality == wanted
     variants = [str(each.facts.get("variant", "")) for each in quality.reasons if each.code == "motion-too-small"]
     assert causes & set(" ".join(variants).split())
-    assert quality.determined < quality.unknowns
 
 
 @pytest.mark.slow
@@ -255,7 +253,7 @@ def test_hands_apart_for_half_of_the_time_are_found_and_left_out(person: Person,
     (apart,) = [d for d in quality.diagnostics if d.code == "closure-open"]
     assert apart.value is not None
     assert OPEN_SHARE.passes < apart.value < 0.6
-    assert "Keep the palms together" in render(apart).do
+    assert "Keep the points together" in render(apart).do
     assert np.abs(arm_errors(calibration, person)).max() < 0.025
     assert np.abs(heading_errors(calibration, simulation.quat_LS)[1:]).max() < 8.0
     gap = np.linalg.norm(simulation.points["left_palm"] - simulation.points["right_palm"], axis=1)
@@ -314,7 +312,6 @@ def test_exit_code_and_file_carry_the_quality(
         assert len(content["gap"]["time"]) <= 600
         assert content["mounts"].keys() == anywhere.quat_LS.keys()
         assert content["lengths"]["left_upper_arm"]["std"] > 0.0
-        assert content["conditioning"]["rank"] < content["conditioning"]["unknowns"]
         assert {"wepose-pin", "casadi"} <= content["versions"].keys()
     assert QUALITIES == ("pass", "poor", "fail")
 
@@ -324,7 +321,7 @@ def test_the_page_has_the_limits_of_the_code() -> None:
     deg = (np.degrees(1.0), "°")
     rows: list[list[tuple[quality.QualityLimits, float, str]]] = [
         [(quality.LENGTH, 1e3, " mm")],
-        [(limits, *deg) for limits in (quality.ARM_HEADING, quality.TORSO_HEADING, quality.HAND_HEADING)],
+        [(limits, *deg) for limits in (quality.ARM_HEADING, quality.TORSO_HEADING, quality.OTHER_HEADING)],
         [(quality.SCALE, 1e2, " %")],
         [(quality.GAP, 1e3, " mm"), (quality.OPEN_SHARE, 1e2, " %")],
         [(quality.SAMPLES, 1.0, "")],
@@ -334,7 +331,6 @@ def test_the_page_has_the_limits_of_the_code() -> None:
     for row in rows:
         cells = ("; ".join(f"{factor * limits[k]:.3g}{unit}" for limits, factor, unit in row) for k in range(2))
         assert f"| {' | '.join(cells)} |" in page
-    assert quality.LONE_HEADING == quality.HAND_HEADING
     assert f"above {quality.ENOUGH_SAMPLES:g}" in page
     assert f"below {1e3 * quality.GAP.passes:g} mm" in page
 

@@ -35,7 +35,7 @@ def test_what_lies_beyond_a_loss_is_not_used(simulation: Simulation) -> None:
     assert begin + 13.5 < calibration.time[-1] < begin + 14.1
     [unused] = [each for each in calibration.diagnostics if each.code == "samples-not-connected"]
     assert unused.place == "left_upper_arm"
-    assert unused.value == pytest.approx(end - begin - 15.0, abs=0.05)
+    assert unused.value == pytest.approx(end - begin - 14.0, abs=0.05)
     upto = replace(recording, phases={**recording.phases, "clasp": ((begin, begin + 13.99),)})
     assert calibration.subject.lengths == pytest.approx(calibrate(upto).subject.lengths, rel=1e-3)
 

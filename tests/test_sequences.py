@@ -13,7 +13,7 @@ from simulated import SUBJECT, within
 from wepose_pin.assets import asset
 from wepose_pin.calibration import assess, calibrate, load_protocol
 from wepose_pin.calibration.protocols import choose_protocol
-from wepose_pin.errors import BadOption, BadPhase
+from wepose_pin.errors import BadOption
 from wepose_pin.simulation import (
     IDEAL_PRESET,
     MILD_PRESET,
@@ -74,9 +74,7 @@ def test_free_motion_shows_headings_and_keeps_lengths() -> None:
     assert "lengths-not-observed" in {diagnostic.code for diagnostic in calibration.diagnostics}
     assert assess(calibration).quality != "pass"
     still = replace(recording, phases={"start": ((0.5, 1.5),)}).cut(recording.span((0.0, 4.9)))
-    with pytest.raises(BadPhase, match=r"the motion does not show how sensors\.left_upper_arm") as caught:
-        calibrate(still, prior=person.prior, protocol="free")
-    assert "\n" not in str(caught.value)
+    assert calibrate(still, prior=person.prior, protocol="free").quality.quality == "fail"
 
 
 def test_an_earlier_calibration_adds_what_it_knows() -> None:

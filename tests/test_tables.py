@@ -186,7 +186,7 @@ PROTOCOLS: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "an origin that is the point": (
         PROTOCOL.replace("fixed_point", "recorded") + 'origin = "tip"\n',
-        ("closure 1.origin", "'tip'", "another one"),
+        ("no sensor moves tip",),
     ),
     "recorded places without a truth": (
         PROTOCOL.replace("fixed_point", "recorded"),

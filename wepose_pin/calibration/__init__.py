@@ -3,11 +3,10 @@
 `procedure` is the calibration from a recording to a subject, step by step. `protocols` describes what a person does,
 `conditions` what follows for a body, `problem` collects inputs and samples. `equations` has the unknowns and residuals
 in CasADi, `priors` what is known before, `least_squares` the problem and its solution by `nlpsol`. `initial_headings`
-searches headings without an initial guess, and `couplings` has what accelerations observe of them. `sample_losses`
-finds the samples connected with the start pose, `weights` weighs the samples, `ambiguity` compares other minima.
-`solution` makes of it a `result`. `alternatives` tries other labels, and leaves out mounts and poses. `anatomy`,
-`observability` and `quality` assess the result. `paper` is the published calibration of the lengths alone. `fusion`
-adds an earlier calibration of the person.
+searches headings without an initial guess, and `couplings` has what accelerations observe of them. `samples` finds the
+samples connected with the start pose, `weights` weighs them, `ambiguity` compares other minima. `solution` makes of it
+a `result`. `alternatives` tries other labels, and leaves out mounts and poses. `anatomy` and `quality` assess the
+result. `paper` is the published calibration of the lengths alone. `fusion` adds an earlier calibration of the person.
 """
 
 from .paper import Formulation

@@ -5,16 +5,11 @@ Each function takes the solution of a problem. It returns that of a better probl
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from itertools import permutations
+from itertools import combinations
 
-import numpy as np
-
-from ..body.mounts import MOUNT_WARNING_DEG
 from ..diagnostics import WARNING, Diagnostic
-from .anatomy import LEAST_ROTATION, OPEN, LimbMotion, measure_limbs, measure_rotation
-from .priors import combine_lengths
+from .anatomy import LEAST_ROTATION, measure_limbs, measure_rotation
 from .result import Calibration
 from .solution import solve_problem
 from .weights import CONTRADICTED, SUSPECT
@@ -25,38 +20,33 @@ BETTER = 0.6  # times the doubt of the stated labels, below which another labell
 def leave_out_mounts(stated: Calibration) -> Calibration:
     """Return the quick solution without the mounts that the motion contradicts."""
     problem = stated.problem
-    if measure_limbs(stated).doubt <= 1.0 and not problem.mounts_against_motion(stated.subject.mounts):
-        return stated
+    if measure_limbs(stated).doubt <= 1.0:
+        stated_mounts = problem.leave_out_mounts(stated.subject.mounts).unused_mounts
+        if stated_mounts == problem.unused_mounts:
+            return stated
     free = solve_problem(problem.remove_mounts(problem.filtered.R_VS), quick=True)
-    wrong = problem.mounts_against_motion(free.subject.mounts)
-    if not wrong or measure_limbs(free).doubt >= 1.0:
+    without = problem.leave_out_mounts(free.subject.mounts)
+    if without.unused_mounts == problem.unused_mounts or measure_limbs(free).doubt >= 1.0:
         return stated
-    return solve_problem(problem.leave_out_mounts(wrong, MOUNT_WARNING_DEG, "motion"), quick=True)
+    return solve_problem(without, quick=True)
 
 
 def exchange_labels(stated: Calibration) -> Calibration:
-    """Return the quick solution with the labels by which the limbs move as a person's; its lengths are the prior's.
-
-    First one labelling of those that close the same chain shows whether it closes, then those that do are compared.
-    """
+    """Return the quick solution with two sensors, or both sides, exchanged if the limbs move as a person's then."""
     problem, doubt, table = stated.problem, measure_limbs(stated).doubt, stated.problem.model.table
     if doubt <= 1.0 or table.is_mechanism or not measure_rotation(stated) >= LEAST_ROTATION:
         return stated
-
-    def measure(labels: Mapping[str, str]) -> LimbMotion:
-        return measure_limbs(solve_problem(problem.relabel(labels), quick=True))
-
     places = [name for name in problem.sensors if name in table.needed]
-    alike: dict[frozenset, list[dict[str, str]]] = {}
-    for order in permutations(places):
-        labels = dict(zip(places, order, strict=True))
-        sides = frozenset(frozenset(labels[p] for p in places if table.side(p) == side) for side in ("left", "right"))
-        alike.setdefault(sides, []).append({place: label for place, label in labels.items() if place != label})
-    gaps = {sides: measure(min(labellings, key=len)).gap for sides, labellings in alike.items()}
-    closing = [sides for sides, gap in gaps.items() if gap < OPEN and gap < 2.0 * min(gaps.values())]
-    doubts = [(measure(labels).doubt, labels) for sides in closing for labels in sorted(alike[sides], key=len)]
-    least, exchanged = min(doubts, key=lambda pair: pair[0], default=(np.inf, {}))
-    return _keep_prior(replace(stated, exchanged=exchanged)) if least < min(1.0, BETTER * doubt) else stated
+    sides = [(a, b) for a, b in table.pairs.items() if {a, b} <= set(places)]
+    exchanges = [dict((pair, pair[::-1])) for pair in combinations(places, 2)]
+    exchanges.append({a: b for pair in sides for a, b in (pair, pair[::-1])})
+    doubts = [measure_limbs(solve_problem(problem.relabel(labels), quick=True)).doubt for labels in exchanges]
+    least = min(doubts)
+    if least >= min(1.0, BETTER * doubt):
+        return stated
+    note = "sensors sit elsewhere than labelled"
+    subject = replace(stated.subject, note=note)
+    return replace(stated, subject=subject, remarks=(), exchanged=exchanges[doubts.index(least)])
 
 
 def leave_out_poses(best: Calibration) -> Calibration:
@@ -73,20 +63,3 @@ def leave_out_poses(best: Calibration) -> Calibration:
         return best
     unused = Diagnostic("pose-contradicted", WARNING, phase, deviation, CONTRADICTED, {"variant": "unused"})
     return leave_out_poses(replace(loose, remarks=(unused, *loose.remarks)))
-
-
-def _keep_prior(calibration: Calibration) -> Calibration:
-    """Return the calibration with the lengths and covariance from before the motion."""
-    problem, names = calibration.problem, tuple(calibration.subject.lengths)
-    lengths, information = combine_lengths(problem.prior, problem.measured, names)
-    subject = replace(
-        calibration.subject,
-        lengths=dict(zip(names, lengths.tolist(), strict=True)),
-        covariance=calibration.prior_covariance,
-        hinges={},
-        start_pose_offset={},
-        heading_drift={},
-        note="sensors sit elsewhere than labelled: nothing of the motion is used",
-    )
-    scale_std = float(np.sqrt(lengths @ information @ lengths) ** -1)
-    return replace(calibration, subject=subject, scale_std=scale_std, hinge_rms={}, remarks=())

@@ -8,12 +8,10 @@ how much worse it explains all that is known.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
 from ..diagnostics import WARNING, Diagnostic
-from .equations import Layout
 from .initial_headings import wrap_angle
 from .least_squares import Estimate, Gaussian, LeastSquares, solve
 from .priors import place_points
@@ -21,32 +19,25 @@ from .weights import WeightedFit
 
 COMPARED_SAMPLES = 120  # on which solutions are compared
 STEPS = 25
-LEAST_WEIGHT = 1e-4  # of a solution that counts
+LEAST_WEIGHT = 1e-4  # of a solution that counts: its probability over that of the best one
 NEAR = 3.0  # standard deviations within which two solutions are the same
-CIRCLE_STD = np.pi / np.sqrt(3.0)  # [rad] of a heading that may be anywhere
 
 
-class OtherMinimum(NamedTuple):
-    """Another solution."""
-
-    offset: np.ndarray  # (m,) from the best solution, headings within half a turn
-    weight: float  # its probability over that of the best solution, at most 1
-
-
-def find_other_minima(
-    result: WeightedFit, headings: np.ndarray, prior_at: Callable[[np.ndarray], Gaussian]
-) -> list[OtherMinimum]:
-    """Return solutions from other headings (k, sensors) [rad], the likeliest first, down to `LEAST_WEIGHT`.
+def include_other_minima(
+    result: WeightedFit, covariance: np.ndarray, headings: np.ndarray, prior_at: Callable[[np.ndarray], Gaussian]
+) -> tuple[np.ndarray, list[Diagnostic]]:
+    """Return the covariance (m, m) about the solution with other minima included, and what to say of them.
 
     Parameters
     ----------
-    result : the best solution
+    result, covariance : the best solution
+    headings : (k, sensors) [rad] of the other minima, the lowest first
     prior_at : headings (sensors,) → what is known without the closure; those without a stated mount are its mean
     """
     fit, (observations, _, weights) = result.fit, result.fit.problem
     rows = observations.layout.heading
-    if not observations.closed.any() or not len(headings):
-        return []
+    if not observations.closed.any():
+        return covariance, []
     stride = max(1, len(observations) // COMPARED_SAMPLES)
     few = np.concatenate([np.arange(len(observations))[span][::stride] for _, span in observations.spans()])
     some, weights = observations.take(few), stride * weights[few]
@@ -57,41 +48,21 @@ def find_other_minima(
         start = place_points(start, some)
         return solve(LeastSquares(some, prior_at(start[rows]), weights), start, STEPS, strict=False)
 
-    best = solve_from(fit.x[rows])
-    std = np.sqrt(np.diag(fit.covariance)[rows])
-    minima: list[OtherMinimum] = []
-    for psi in headings:
-        other = solve_from(psi)
+    best, std = solve_from(fit.x[rows]), np.sqrt(np.diag(fit.covariance)[rows])
+    # The residuals' variance is estimated from the effective samples: Student's t, not a Gaussian.
+    degrees = max(3.0 * result.effective_sample_size, 1.0)
+    offsets, likelihoods = [np.zeros_like(fit.x)], [1.0]
+    for other in map(solve_from, headings):
         offset = other.x - best.x
         offset[rows] = wrap_angle(offset[rows])
-        # The residuals' variance is estimated from the effective samples: Student's t, not a Gaussian.
-        degrees = max(3.0 * result.effective_sample_size, 1.0)
-        new = OtherMinimum(offset, float((1.0 + max(other.cost - best.cost, 0.0) / degrees) ** (-0.5 * degrees)))
-        if np.abs(offset[rows] / std).max() < NEAR or new.weight < LEAST_WEIGHT:
-            continue
-        if all(np.abs((offset - each.offset)[rows] / std).max() > NEAR for each in minima):
-            minima.append(new)
-    return sorted(minima, key=lambda each: -each.weight)
-
-
-def widen_covariance(covariance: np.ndarray, others: list[OtherMinimum], layout: Layout) -> np.ndarray:
-    """The covariance (m, m) about the solution with the minima included; no heading beyond the circle's."""
-    if not others:
-        return covariance
-    total = 1.0 + sum(each.weight for each in others)
-    outer = sum((each.weight / total * np.outer(each.offset, each.offset) for each in others), 0.0 * covariance)
-    widened = covariance + outer
-    rows = layout.heading
-    std = np.sqrt(np.diag(widened))
-    shrink = np.ones(layout.size)
-    shrink[rows] = np.minimum(1.0, CIRCLE_STD / std[rows])
-    return widened * np.outer(shrink, shrink)
-
-
-def diagnose_ambiguity(others: list[OtherMinimum], layout: Layout) -> list[Diagnostic]:
-    """The sensor whose heading differs most in the likeliest minimum, where there is one."""
-    if not others:
-        return []
-    turned = np.abs(others[0].offset[layout.heading])
+        likelihood = float((1.0 + max(other.cost - best.cost, 0.0) / degrees) ** (-0.5 * degrees))
+        if likelihood > LEAST_WEIGHT and all(np.abs((offset - o)[rows] / std).max() > NEAR for o in offsets):
+            offsets.append(offset)
+            likelihoods.append(likelihood)
+    if len(offsets) == 1:
+        return covariance, []
+    shares = np.array(likelihoods) / sum(likelihoods)
+    turned = np.abs(offsets[1 + int(np.argmax(shares[1:]))][rows])
     worst = int(np.argmax(turned))
-    return [Diagnostic("headings-ambiguous", WARNING, layout.sensors[worst], float(turned[worst]))]
+    ambiguous = Diagnostic("headings-ambiguous", WARNING, observations.layout.sensors[worst], float(turned[worst]))
+    return covariance + np.einsum("k,ki,kj->ij", shares, offsets, offsets), [ambiguous]

@@ -7,13 +7,12 @@ Ranges of hinges are those of the body's table.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body import HingeJoint
 from ..diagnostics import ERROR, Diagnostic
 from ..errors import BadSession
 from ..observations.paths import find_path
@@ -34,25 +33,9 @@ LEAST_ROTATION = np.deg2rad(8.0)
 class LimbMotion(NamedTuple):
     """How the limbs moved."""
 
-    flexion: dict[str, np.ndarray]  # hinge → (n,) [deg] 0 straight, positive where it bends further
-    doubts: tuple[Diagnostic, ...]  # what shows whether a person can move so, each with its limit
-    gap: float  # [m] rms
-
-    @property
-    def contradiction(self) -> Diagnostic:
-        """The value that is furthest beyond its limit."""
-        return max(self.doubts, key=lambda each: float(each.value or 0.0))
-
-    @property
-    def doubt(self) -> float:
-        """The largest ratio of a value to its limit; above 1 a person cannot move so."""
-        return float(self.contradiction.value or 0.0)
-
-
-def _diagnose_motion(variant: str, size: float, most: float, joint: str = "") -> Diagnostic:
-    """Return the diagnostic of a value, [SI], of which a person has at most `most`; its own value is their ratio."""
-    facts: dict[str, float | str] = {"variant": variant, "size": size, "most": most}
-    return Diagnostic("limb-motion-implausible", ERROR, joint, size / most, 1.0, facts)
+    flexion: dict[str, np.ndarray]  # hinge → (n,) [rad] 0 straight, positive where it bends further
+    contradiction: Diagnostic  # the value that is furthest beyond the limit of a person
+    doubt: float  # its ratio to the limit; above 1 a person cannot move so
 
 
 def measure_rotation(calibration: Calibration) -> float:
@@ -74,27 +57,23 @@ def measure_limbs(calibration: Calibration) -> LimbMotion:
     gap = 0.0
     if closed.any():
         gap = float(np.sqrt(np.average(calibration.gap[closed] ** 2, weights=calibration.contact[closed])))
-    behind = _share_behind(calibration, R)
-    doubts = [_diagnose_motion("behind", behind, BEHIND), _diagnose_motion("open", gap, OPEN)]
+    # Variant of the text, the value, its limit and the joint.
+    values = [("behind", _share_behind(calibration, R), BEHIND, ""), ("open", gap, OPEN, "")]
     flexion = {}
     for joint, hinge in table.hinges.items():
-        if hinge.on not in R or hinge.moves not in R:
-            continue
-        along = (R[hinge.on].inv() * R[hinge.moves]).apply(table.segments[hinge.moves].along)
-        angle = compute_hinge_angles(hinge, table.segments[hinge.on].along, along)
-        low, high = hinge.range
-        backward = float(np.mean((angle < low) | (angle > high)))
-        sideways = float(np.linalg.svd(along, compute_uv=False)[-1] / np.sqrt(len(along)))
-        doubts.append(_diagnose_motion("backwards", backward, BACKWARD, joint))
-        doubts.append(_diagnose_motion("sideways", sideways, SIDEWAYS, joint))
-        flexion[joint] = np.degrees(angle if high > -low else -angle)
-    return LimbMotion(flexion, tuple(doubts), gap)
-
-
-def compute_hinge_angles(hinge: HingeJoint, along_on: Sequence[float], along: np.ndarray) -> np.ndarray:
-    """Return angles (n,) [rad] about a hinge's axis from the long axis of `on` to `along` (n, 3) in its frame."""
-    straight, axis = np.array(along_on), np.array(hinge.axis)
-    return np.arctan2(np.cross(straight, along) @ axis, along @ straight)
+        if hinge.on in R and hinge.moves in R:
+            straight, axis = np.array(table.segments[hinge.on].along), np.array(hinge.axis)
+            along = (R[hinge.on].inv() * R[hinge.moves]).apply(table.segments[hinge.moves].along)
+            angle = np.arctan2(np.cross(straight, along) @ axis, along @ straight)
+            low, high = hinge.range
+            values.append(("backwards", float(np.mean((angle < low) | (angle > high))), BACKWARD, joint))
+            off_plane = float(np.linalg.svd(along, compute_uv=False)[-1] / np.sqrt(len(along)))
+            values.append(("sideways", off_plane, SIDEWAYS, joint))
+            flexion[joint] = angle if high > -low else -angle
+    variant, size, most, joint = max(values, key=lambda each: each[1] / each[2])
+    facts: dict[str, float | str] = {"variant": variant, "size": size, "most": most}
+    contradiction = Diagnostic("limb-motion-implausible", ERROR, joint, size / most, 1.0, facts)
+    return LimbMotion(flexion, contradiction, size / most)
 
 
 def reach_limbs(calibration: Calibration, R: Mapping[str, Rotation]) -> dict[str, np.ndarray]:
@@ -129,16 +108,10 @@ def _share_behind(calibration: Calibration, R: Mapping[str, Rotation]) -> float:
 
 def diagnose_labels(calibration: Calibration, contradiction: Diagnostic) -> Diagnostic:
     """Return the sensors that sit on other segments, or else the contradiction to a person's limbs."""
-    problem, moved = calibration.problem, calibration.exchanged
+    moved, order = calibration.exchanged, list(calibration.problem.model.table.segments)
     if not moved:
         return contradiction
-    place = ", ".join(f"{label} sits on the {place}" for place, label in sorted(moved.items()))
-    variant, table = {"variant": "mixed"}, problem.model.table
-    if all(moved[b] == a for a, b in moved.items()):  # pairs of sensors, exchanged
-        order = list(table.segments)
-        pairs = {tuple(sorted(pair, key=order.index)) for pair in moved.items()}
-        place = ", ".join(f"{a} and {b}" for a, b in sorted(pairs))
-        places = set(problem.sensors) & set(table.needed)
-        sides = {(left, right) for left, right in table.pairs.items() if {left, right} <= places}
-        variant = {"variant": "sides"} if pairs == sides else {}
-    return Diagnostic("sensors-exchanged", ERROR, place, contradiction.value, 1.0, variant)
+    pairs = {tuple(sorted(pair, key=order.index)) for pair in moved.items()}
+    place = ", ".join(f"{a} and {b}" for a, b in sorted(pairs))
+    facts = {"variant": "sides"} if len(pairs) > 1 else {}
+    return Diagnostic("sensors-exchanged", ERROR, place, contradiction.value, 1.0, facts)

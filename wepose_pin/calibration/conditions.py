@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from ..body import BodyModel, BodyTable
+from ..body import BodyModel
 from ..body.reaches import UNIVERSE
 from ..body.start_pose import StartPose
 from ..body.table_file import check_segments
@@ -46,12 +46,6 @@ class Loop:
         return tuple(part for path in self.paths for part in path.vectors)
 
 
-def choose_variant(closure: Closure, table: BodyTable) -> str:
-    """The variant of texts about a closure: its kind, "general" where it is not one of a protocol for hands."""
-    of_hands = closure.kind == "recorded" or set(closure.points) <= set(table.paths)
-    return closure.kind if of_hands and closure.kind != "fixed_point" and not table.is_mechanism else "general"
-
-
 @dataclass(frozen=True)
 class Moving:
     """Limbs with sensors on these segments move freely: only hinges hold."""
@@ -76,71 +70,39 @@ def resolve_conditions(
         A closure between points that no sensor determines, or a pose of a segment without a sensor.
     """
     table, constraints = model.table, list[Constraint]()
+    where = f"protocol '{protocol.name}': "
     for condition in protocol.conditions:
+        if isinstance(condition, Direction | Axis):
+            posed = (condition.segment, table.reference) if isinstance(condition, Direction) else (condition.segment,)
+            check_segments(table, posed, where, BadOption)
+            for segment in posed:
+                if segment not in sensors:
+                    raise BadSession(
+                        f"{where}no sensor on {segment}, which a pose or an axis is about; add it, or leave out that "
+                        f"condition"
+                    )
         if isinstance(condition, Closure):
-            loop = _resolve_closure(condition, protocol, model, start, sensors)
-            unknown = sum(isinstance(other, Loop) and other.kind == loop.kind for other in constraints)
-            constraints.append(replace(loop, unknown=unknown))
-        elif isinstance(condition, Direction):
-            _check_posed((condition.segment, table.reference), protocol, model, sensors)
-            constraints.append(
-                Pointing(
-                    condition.segment,
-                    table.reference,
-                    start.turn(condition.segment, table.segments[condition.segment].along),
-                    start.turn(table.reference, condition.direction),
-                    condition.std,
+            paths = tuple(find_path(model, start, sensors, points) for points in condition.ways)
+            between = {part.segment for path in paths for part in path.vectors} - {UNIVERSE}
+            if len(between) < (2 if condition.kind == "coincide" else 1):
+                points = " and ".join(condition.points)
+                moves = f"{points} both move with the sensor on {', '.join(between)}"
+                raise BadSession(
+                    f"{where}{moves if between else f'no sensor moves {points}'}; points that move against each other "
+                    f"are needed"
                 )
-            )
+            unknown = sum(isinstance(other, Loop) and other.kind == condition.kind for other in constraints)
+            constraints.append(Loop(condition, paths, unknown))
+        elif isinstance(condition, Direction):
+            along = start.turn(condition.segment, table.segments[condition.segment].along)
+            direction = start.turn(table.reference, condition.direction)
+            constraints.append(Pointing(condition.segment, table.reference, along, direction, condition.std))
         elif isinstance(condition, Axis):
-            _check_posed((condition.segment,), protocol, model, sensors)
             axis = start.turn(condition.segment, (0.0, 1.0, 0.0))
             constraints.append(Level(condition.segment, axis, condition.std))
         else:
             constraints.append(Moving(tuple(segment for segment in table.segments if segment in sensors)))
     return tuple(constraints)
-
-
-def _check_posed(segments: tuple[str, ...], protocol: Protocol, model: BodyModel, sensors: Collection[str]) -> None:
-    """Raise `BadOption` where the body lacks a segment of a pose, `BadSession` where it has no sensor."""
-    check_segments(model.table, segments, f"protocol '{protocol.name}': ", BadOption)
-    lacking = [segment for segment in segments if segment not in sensors]
-    if lacking:
-        raise BadSession(
-            f"protocol '{protocol.name}': no sensor on {lacking[0]}, which a pose or an axis is about; add it, or "
-            f"leave out that condition"
-        )
-
-
-def _resolve_closure(
-    closure: Closure, protocol: Protocol, model: BodyModel, start: StartPose, sensors: Collection[str]
-) -> Loop:
-    loop = Loop(closure, tuple(find_path(model, start, sensors, points) for points in closure.ways))
-    between = {part.segment for part in loop.parts}
-    if not between - {UNIVERSE}:
-        raise BadSession(
-            f"protocol '{protocol.name}': no sensor moves {' and '.join(closure.points)}; a point that moves is needed"
-        )
-    if closure.kind == "coincide" and len(between) == 1:
-        raise BadSession(
-            f"protocol '{protocol.name}': {' and '.join(closure.points)} both move with the sensor on {between.pop()}, "
-            f"so that their distance cannot change; points on two segments with sensors are needed"
-        )
-    return loop
-
-
-def find_segments(protocol: Protocol, model: BodyModel) -> frozenset[str]:
-    """The segments whose orientation some condition of a protocol uses where all of them have sensors."""
-    used = {condition.segment for condition in protocol.conditions if isinstance(condition, Direction | Axis)}
-    if protocol.free_motions:
-        used |= set(model.table.needed)
-    if any(isinstance(condition, Direction) for condition in protocol.conditions):
-        used.add(model.table.reference)
-    for closure in protocol.closures:
-        points = {point for way in closure.ways for point, _ in way}
-        for link in {link for point in points for link in model.reaches.get(point, {})}:
-            used |= {link} & set(model.table.segments)
-    return frozenset(used & set(model.table.segments))
 
 
 def is_scale_observed(constraints: Collection[Constraint]) -> bool:

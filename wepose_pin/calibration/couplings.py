@@ -19,7 +19,7 @@ from ..observations.joint_accelerations import BAND_HZ, LEAST_RATE_HZ, compute_s
 from ..recording import Recording
 from .equations import Layout
 from .least_squares import Gaussian
-from .sample_losses import find_sample_losses, find_samples, mask_connected, mask_measured
+from .samples import find_connected, find_samples, mask_measured
 
 SAMPLES_HZ = 10.0
 # Errors of orientations are slow: two samples closer than this [s] are never independent, however white the residual
@@ -60,13 +60,10 @@ def estimate_couplings(
     """
     pairs = [pair for pair in pairs if set(pair) <= set(recording.imus)]
     names = list(dict.fromkeys(name for pair in pairs for name in pair))
-    if recording.rate_hz < LEAST_RATE_HZ or not pairs:
-        return []
     samples = find_samples(recording, spans)
-    # Beyond a loss the headings are others.
-    connected = mask_connected(find_sample_losses(recording, filtered.start, names), samples)
+    connected = find_connected(recording, filtered.start, names).include(samples)
     samples = samples[mask_measured(recording, names, samples) & connected]
-    if len(samples) < LEAST_S * recording.rate_hz:
+    if not pairs or recording.rate_hz < LEAST_RATE_HZ or len(samples) < LEAST_S * recording.rate_hz:
         return []
     samples = samples[:: max(1, round(recording.rate_hz / SAMPLES_HZ))]
     sides = {name: compute_joint_sides(recording, filtered, name)[samples] for name in names}
@@ -96,19 +93,13 @@ def add_couplings(prior: Gaussian, layout: Layout, couplings: Sequence[Coupling]
 
 def compute_joint_sides(recording: Recording, filtered: FilteredRecording, name: str) -> np.ndarray:
     """(n, 3, 4) in V, band-passed: specific force, and what a lever of 1 m along each axis adds to the joint's."""
-    accel_S = _interpolate_missing(recording.imus[name].accel_S)
+    accel_S, at = recording.imus[name].accel_S, np.arange(len(recording))
+    finite = np.isfinite(accel_S).all(axis=1)
+    if not finite.all():
+        accel_S = np.column_stack([np.interp(at, at[finite], axis[finite]) for axis in accel_S.T])
     R_VS = filtered.R_VS[name].as_matrix()
     sides = compute_sides(R_VS[:, None], accel_S[:, None], recording.rate_hz)[:, 0, :, :4]
     return band_pass(np.concatenate([sides[:1], sides, sides[-1:]]), BAND_HZ, recording.rate_hz)
-
-
-def _interpolate_missing(values: np.ndarray) -> np.ndarray:
-    """Samples (n, 3) with the missing ones interpolated linearly."""
-    finite = np.isfinite(values).all(axis=1)
-    if finite.all():
-        return values
-    at = np.arange(len(values))
-    return np.column_stack([np.interp(at, at[finite], column[finite]) for column in values.T])
 
 
 def estimate_heading(near: np.ndarray, far: np.ndarray) -> tuple[float, float]:

@@ -13,7 +13,6 @@ apart for half of the phase, and a pose may be wrong.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,13 +34,6 @@ MOST_DISTINCT = 12
 _FIFTHS = 2.0 * np.pi / 5.0 * np.arange(5)
 
 
-class _Terms(NamedTuple):
-    """c and F of n samples, in units of their standard deviations."""
-
-    constant: np.ndarray  # (n, 3)
-    harmonics: np.ndarray  # (sensors, 5, n, 3)
-
-
 def search_headings(
     observations: Observations, x: np.ndarray, stated: Mapping[str, float], couplings: Sequence[Coupling] = ()
 ) -> np.ndarray:
@@ -58,13 +50,13 @@ def search_headings(
     sensors = observations.layout.sensors
     is_known = np.array([name in stated for name in sensors])
     center = np.array([stated.get(name, 0.0) for name in sensors])
-    terms = _collect_terms(observations, x, couplings)
+    constant, F = _collect_terms(observations, x, couplings)
     # A Latin hypercube: each angle of each sensor once, in any order.
     order = np.random.default_rng(0).permuted(np.tile(np.arange(STARTS), (len(sensors), 1)), axis=1).T
     psi, information = np.where(is_known, center, 2.0 * np.pi / STARTS * order), is_known / KNOWN_STD**2
-    psi = _descend(psi, terms, center, information, FIRST_ROUNDS)[:NEARER]
+    psi = _descend(psi, constant, F, center, information, FIRST_ROUNDS)[:NEARER]
     distinct: list[np.ndarray] = []
-    for each in _descend(psi, terms, center, information, MORE_ROUNDS):
+    for each in _descend(psi, constant, F, center, information, MORE_ROUNDS):
         if all(np.abs(wrap_angle(each - other)).max() > DISTINCT for other in distinct):
             distinct.append(each)
     headings = wrap_angle(np.array(distinct[:MOST_DISTINCT]))
@@ -78,19 +70,23 @@ def wrap_angle(angle: np.ndarray) -> np.ndarray:
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def _collect_terms(observations: Observations, x: np.ndarray, couplings: Sequence[Coupling]) -> _Terms:
-    """Return the terms of closures, at some of their samples, of poses and bows on average, and of couplings."""
-    layout, sensors = observations.layout, observations.layout.sensors
-    terms = [_Terms(np.zeros((0, 3)), np.zeros((len(sensors), 5, 0, 3)))]
+def _collect_terms(
+    observations: Observations, x: np.ndarray, couplings: Sequence[Coupling]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return c (n, 3) and F (sensors, 5, n, 3) in units of their standard deviations.
 
-    def add(std: float, constant: np.ndarray, parts: Mapping[str, np.ndarray], *, free: bool = False) -> None:
-        """Add n samples with the constant (n, 3) and the harmonics (5, n, 3) of sensors; `free`: of any mean."""
+    They are those of closures, at some of their samples, of poses and bows on average, and of couplings.
+    """
+    layout, sensors = observations.layout, observations.layout.sensors
+    constants, harmonics = [np.zeros((0, 3))], [np.zeros((len(sensors), 5, 0, 3))]
+
+    def add(std: float, constant: np.ndarray, parts: Mapping[str, np.ndarray]) -> None:
+        """Add n samples with the constant (n, 3) and the harmonics (5, n, 3) of sensors."""
         F = np.zeros((len(sensors), 5, *constant.shape))
-        for name, harmonics in parts.items():
-            F[sensors.index(name)] = harmonics
-        if free:
-            constant, F = constant - constant.mean(axis=0), F - F.mean(axis=2, keepdims=True)
-        terms.append(_Terms(constant / std, F / std))
+        for name, part in parts.items():
+            F[sensors.index(name)] = part
+        constants.append(constant / std)
+        harmonics.append(F / std)
 
     loops = sum(isinstance(condition, Loop) for condition in observations.conditions)
     count = max(SEARCH_SAMPLES // max(loops, 1), LEAST_SEARCH_SAMPLES)
@@ -111,28 +107,26 @@ def _collect_terms(observations: Observations, x: np.ndarray, couplings: Sequenc
                         parts[part.segment] = axes * _expand(Q[part.segment], vector)
                 if condition.kind == "recorded":
                     constant = constant - observations.data[layout.place][:, some].T
-                known = condition.closure.at
-                if known is not None:
-                    constant = constant - known
-                add(GAP_STD, constant, parts, free=condition.kind in ("fixed_point", "plane") and known is None)
+                elif condition.closure.at is not None:
+                    constant = constant - condition.closure.at
+                elif condition.kind in ("fixed_point", "plane"):  # of any mean
+                    constant = constant - constant.mean(axis=0)
+                    parts = {name: F - F.mean(axis=1, keepdims=True) for name, F in parts.items()}
+                add(GAP_STD, constant, parts)
         elif isinstance(condition, Pointing):
             parts = {condition.segment: _expand(Q[condition.segment], condition.along)}
             if condition.reference != condition.segment:
                 parts[condition.reference] = -_expand(Q[condition.reference], condition.direction)
-            means = {name: each.mean(axis=1, keepdims=True) for name, each in parts.items()}
-            add(condition.std, np.zeros((1, 3)), means)
+            add(condition.std, np.zeros((1, 3)), {k: F.mean(axis=1, keepdims=True) for k, F in parts.items()})
         elif isinstance(condition, Level):
             turn = Q[condition.segment].as_rotvec().sum(axis=0) * [1.0, 1.0, 0.0]  # forwards: about the axis
             turn = turn / max(float(np.linalg.norm(turn)), 1e-9)
             add(condition.std, -np.array([condition.axis]), {condition.segment: _turn_about_z(turn)})
     for coupling in couplings:
         ahead = np.array([np.cos(coupling.heading), np.sin(coupling.heading), 0.0])
-        add(
-            coupling.std,
-            np.zeros((1, 3)),
-            {coupling.near: _turn_about_z(np.array([1.0, 0.0, 0.0])), coupling.far: -_turn_about_z(ahead)},
-        )
-    return _Terms(np.concatenate([t.constant for t in terms]), np.concatenate([t.harmonics for t in terms], axis=2))
+        parts = {coupling.near: _turn_about_z(np.array([1.0, 0.0, 0.0])), coupling.far: -_turn_about_z(ahead)}
+        add(coupling.std, np.zeros((1, 3)), parts)
+    return np.concatenate(constants), np.concatenate(harmonics, axis=2)
 
 
 def _harmonics(psi: np.ndarray) -> np.ndarray:
@@ -154,22 +148,25 @@ def _turn_about_z(v: np.ndarray) -> np.ndarray:
     return F
 
 
-def _descend(psi: np.ndarray, terms: _Terms, center: np.ndarray, information: np.ndarray, rounds: int) -> np.ndarray:
+def _descend(
+    psi: np.ndarray, constant: np.ndarray, F: np.ndarray, center: np.ndarray, information: np.ndarray, rounds: int
+) -> np.ndarray:
     """Return headings (b, sensors) after some rounds of damped Gauss-Newton, the lowest cost first.
 
     Parameters
     ----------
     psi : (b, sensors) to start from
+    constant, F : c (n, 3) and F (sensors, 5, n, 3)
     center, information : (sensors,) of what is known of them
     """
-    m, n = len(center), len(terms.constant)
-    F = terms.harmonics.reshape(m, 5, 3 * n)
+    m, n = len(center), len(constant)
+    F = F.reshape(m, 5, 3 * n)
 
     def linearize(psi: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return cost (b,), gradient (b, m) and Hessian (b, m, m)."""
         h = _harmonics(psi)
         slope = np.stack([0.0 * psi, -h[..., 2], h[..., 1], -2.0 * h[..., 4], 2.0 * h[..., 3]], axis=-1)
-        r = terms.constant.ravel() + h.reshape(len(psi), -1) @ F.reshape(5 * m, -1)
+        r = constant.ravel() + h.reshape(len(psi), -1) @ F.reshape(5 * m, -1)
         J = (slope.swapaxes(0, 1) @ F).swapaxes(0, 1)
         size = 1.0 + np.sum(r.reshape(len(psi), n, 3) ** 2, axis=2) / OUTLIER**2
         weighted = J * np.repeat(size**-2, 3, axis=1)[:, None]

@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from ..errors import NoSolution
-from .conditions import Constraint, Loop, Moving
+from .conditions import Constraint, Loop
 from .equations import GAP_ROWS, Layout, sample_functions
 
 MIN_LENGTH = 0.01  # [m] below which a length has not converged
@@ -22,7 +22,7 @@ STEPS = 60
 TOLERANCE = 1e-4  # of the gradient, by standard deviations of the prior
 LOOSE_TOLERANCE = 0.05  # standard deviations of the result that may be left to go after the last step
 _QUIET = dict.fromkeys(("print_header", "print_time", "error_on_fail"), False)
-QUIET_QP = _QUIET | dict.fromkeys(("print_iter", "print_info"), False)
+_QUIET_QP = _QUIET | dict.fromkeys(("print_iter", "print_info"), False)
 _QUIET_NLP = _QUIET | dict.fromkeys(("print_iteration", "print_status", "show_eval_warnings"), False)
 _BLAS = "classic" if ca.has_blas("classic") else "reference"
 
@@ -59,11 +59,6 @@ class Observations:
     def closed(self) -> np.ndarray:
         """(n,) bool: samples of a closure."""
         return np.array([isinstance(c, Loop) for c in self.conditions], dtype=bool)[self.condition_index]
-
-    @property
-    def bending(self) -> np.ndarray:
-        """(n,) bool: samples of a closure or of free motion, which have the residuals of hinges."""
-        return np.array([isinstance(c, Loop | Moving) for c in self.conditions], dtype=bool)[self.condition_index]
 
     def residuals(self, x: ca.MX | np.ndarray) -> tuple[ca.MX, ca.MX]:
         """Return the residuals (k, n) and the gaps (3, n) [m], zero without a closure, in CasADi."""
@@ -127,11 +122,6 @@ class Estimate:
     def closure(self) -> np.ndarray:
         """(n, 3) whitened residuals of the gap, or those of another condition."""
         return self.residuals[:, :GAP_ROWS]
-
-    @property
-    def hinge(self) -> np.ndarray:
-        """(n, k − 3) residuals of the hinges, in units of `HINGE_STD`."""
-        return self.residuals[:, GAP_ROWS:]
 
     @property
     def gaps(self) -> np.ndarray:
@@ -212,7 +202,7 @@ def solve(problem: LeastSquares, start: np.ndarray, steps: int = STEPS, *, stric
         "beta": 0.5,
         "merit_memory": 1,  # every step lowers the cost
         "qpsol": "qrqp",
-        "qpsol_options": QUIET_QP,
+        "qpsol_options": _QUIET_QP,
     }
     program: dict[str, Any] = {"x": z, "f": cost}
     solver = ca.nlpsol("calibration", "sqpmethod", program, options)

@@ -3,9 +3,9 @@
 Segment orientations are those of tracking: of the filter, from the start pose, with the mounts as stated. With them the
 gap is linear in the lengths ℓ, g = A ℓ at each sample, and the lengths are the minimiser of
 
-    ½ Σ ‖A ℓ‖²   with   E ℓ = d   and   ℓ ≥ `MIN_LENGTH`,
+    ½ Σ ‖A ℓ‖²   with   E ℓ = d,
 
-a quadratic program, which CasADi's `qpsol` solves. There is no prior, so E and d state what the gap does not show:
+and not shorter than `MIN_LENGTH`. There is no prior, so E and d state what the gap does not show:
 
 - Measured lengths. At least one fixes the scale: ℓ = 0 closes the chain perfectly.
 - Lengths that always rotate together, as a forearm and a hand without a sensor: the gap shows their sum. Their
@@ -15,7 +15,7 @@ a quadratic program, which CasADi's `qpsol` solves. There is no prior, so E and 
 The shoulders are fixed on the trunk: no girdle moves them, in the subject neither.
 
 The covariance follows from the scatter of the gap and from the errors of d. It does not contain the errors of what is
-not estimated: mounts, headings and their drift, soft tissue. `full` (see `lengths`) estimates these.
+not estimated: mounts, headings and their drift, soft tissue. `full` estimates these.
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-import casadi as ca
 import numpy as np
 from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import Rotation
@@ -33,13 +32,10 @@ from scipy.spatial.transform import Rotation
 from ..body import BodyModel
 from ..body.mounts import PALM_SLIP_STD, align_sensors
 from ..body.start_pose import StartPose
-from ..body.subject import Subject
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, NoSolution, one_of
 from .conditions import Loop, group_lengths, resolve_conditions
-from .least_squares import MIN_LENGTH, QUIET_QP, Observations
-from .observability import diagnose_lengths
-from .priors import combine_lengths
+from .least_squares import MIN_LENGTH, Observations
 from .problem import CalibrationProblem
 from .protocols import Closure, Protocol
 from .result import Calibration, MeasuredLength
@@ -110,24 +106,25 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     correlated = count_correlated_samples(gaps, min_correlation(observations))
     covariance = _estimate_covariance(A, gaps, constraints, correlated)
     gap, prior_gap = (np.linalg.norm(vectors, axis=1) for vectors in (gaps, prior_gaps))
-    measured_covariance = np.linalg.inv(combine_lengths(prior, problem.measured, tuple(problem.model.lengths))[1])
-    note = f"{protocol.title}, lengths alone as in the paper; scale measured: {', '.join(problem.scale_lengths)}"
-    subject = _replace_lengths(prior, lengths, covariance, name=recording.name, note=note)
+    others = [k for k, name in enumerate(prior.order) if name not in prior.lengths]
+    subject = replace(  # what the prior knows of mounts stays
+        prior,
+        name=recording.name,
+        lengths=dict(zip(prior.lengths, lengths.tolist(), strict=True)),
+        order=(*prior.lengths, *(prior.order[k] for k in others)),
+        covariance=block_diag(covariance, prior.covariance[np.ix_(others, others)]),
+        note=f"{protocol.title}, lengths alone as in the paper; scale measured: {', '.join(problem.scale_lengths)}",
+    )
     return Calibration(
         problem=problem,
         subject=subject.fix_girdles(problem.model.table),
         effective_sample_size=len(gap) / correlated,
         scale_std=float(np.sqrt(lengths @ np.linalg.solve(covariance, lengths)) ** -1),
-        remarks=(
-            *filtered.diagnostics,
-            *mount_diagnostics,
-            *diagnose_lengths(problem, lengths, covariance, measured_covariance, None),
-        ),
+        remarks=(*filtered.diagnostics, *mount_diagnostics),
         time=recording.time[samples],
         gap=gap,
         prior_gap=prior_gap,
         contact=np.ones(len(gap)),
-        prior_covariance=_replace_lengths(prior, lengths, measured_covariance).covariance,
         quat_WL=quat_WL,
         measured_lengths={  # beside the prior alone: the gap is least without any length
             name: MeasuredLength(metres, prior.lengths[name], prior.std(name), std)
@@ -154,81 +151,58 @@ class _Constraints(NamedTuple):
     d: np.ndarray  # (m,)
     covariance: np.ndarray  # (m, m) of d
 
-    def find_free(self) -> np.ndarray:
-        """Directions (8, k) in which the lengths are free, orthonormal: ℓ = E⁺ d + free @ z."""
-        return null_space(self.E)
-
 
 def _state_constraints(problem: CalibrationProblem) -> _Constraints:
     """Return measured lengths, and the population's proportions and lengths where the gap shows none."""
     groups = group_lengths(problem.conditions, problem.model.lengths).values()
     names, prior, measured = tuple(problem.model.lengths), problem.prior, problem.measured
-    K, unit = len(names), dict(zip(names, np.eye(len(names)), strict=True))
+    unit = dict(zip(names, np.eye(len(names)), strict=True))
     assumed = []
     for group in groups:
         shares = [unit[name] / prior.lengths[name] for name in group if name not in measured]
         assumed += [a - b for a, b in pairwise(shares)]
-    outside = set(names).difference(measured, *groups)
-    assumed += [unit[name] for name in names if name in outside]
-    E_measured = np.array([unit[name] for name in measured if name in unit])
-    E_assumed = np.array(assumed).reshape(-1, K)
-    stated = [measured[name] for name in measured if name in unit]
-    prior_lengths = np.array([prior.lengths[name] for name in names])
+    assumed += [unit[name] for name in names if name not in {*measured, *(n for group in groups for n in group)}]
+    E_assumed = np.array(assumed).reshape(-1, len(names))
     return _Constraints(
-        np.vstack([E_measured, E_assumed]),
-        np.concatenate([[metres for metres, _ in stated], E_assumed @ prior_lengths]),
-        block_diag(np.diag([std**2 for _, std in stated]), E_assumed @ prior.lengths_covariance(names) @ E_assumed.T),
+        np.vstack([[unit[name] for name in measured], E_assumed]),
+        np.concatenate([[metres for metres, _ in measured.values()], E_assumed @ [prior.lengths[n] for n in names]]),
+        block_diag(
+            np.diag([std**2 for _, std in measured.values()]),
+            E_assumed @ prior.lengths_covariance(names) @ E_assumed.T,
+        ),
     )
 
 
 def _minimise(A: np.ndarray, constraints: _Constraints, names: tuple[str, ...]) -> np.ndarray:
-    """The lengths (8,) [m] that make the gaps least under the constraints, by CasADi's `qpsol`.
+    """The lengths ℓ = E⁺ d + Z z (8,) [m] that make the gaps least, where Z spans what E leaves free.
 
     Raises
     ------
     NoSolution
-        The gaps do not determine the lengths, or determine one that is at its bound.
+        The gaps do not determine the lengths, or are least with one that nobody has.
     """
-    effects = np.linalg.svd(A.reshape(-1, A.shape[-1]) @ constraints.find_free(), compute_uv=False)
-    if np.min(effects, initial=1.0) < LEAST_EFFECT * np.max(effects, initial=1.0):
+    rows, Z = A.reshape(-1, A.shape[-1]), null_space(constraints.E)
+    stated = np.linalg.pinv(constraints.E) @ constraints.d
+    z, _, rank, _ = np.linalg.lstsq(rows @ Z, -rows @ stated, rcond=LEAST_EFFECT)
+    if rank < Z.shape[1]:
         raise NoSolution("the motion does not determine the lengths: the gap does not change with some of them")
-    x = ca.MX.sym("lengths", A.shape[-1])
-    gaps = ca.mtimes(ca.DM(A.reshape(-1, A.shape[-1])), x)
-    program = {"x": x, "f": 0.5 * ca.sumsqr(gaps), "g": ca.mtimes(ca.DM(constraints.E), x)}
-    solver = ca.qpsol("lengths", "qrqp", program, QUIET_QP)
-    solution = solver(lbx=MIN_LENGTH, lbg=constraints.d, ubg=constraints.d)
-    if not solver.stats()["success"]:
-        raise NoSolution("the quadratic program of the lengths has no solution")
-    lengths = np.asarray(solution["x"]).ravel()
-    if np.min(lengths) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
+    lengths = stated + Z @ z
+    if np.min(lengths) < MIN_LENGTH:
         shortest = int(np.argmin(lengths))
         raise NoSolution(f"the gap is least with {names[shortest]} = {1e3 * lengths[shortest]:.0f} mm")
-    return lengths
+    return np.asarray(lengths)
 
 
 def _estimate_covariance(A: np.ndarray, gaps: np.ndarray, constraints: _Constraints, correlated: float) -> np.ndarray:
-    """Covariance (8, 8) [m²] of the lengths from the gaps' scatter and the constraints' errors; no bound is active.
+    """Covariance (8, 8) [m²] of the lengths from the gaps' scatter and the constraints' errors.
 
     Parameters
     ----------
     correlated : samples that make one independent one
     """
-    rows, free = A.reshape(-1, A.shape[-1]), constraints.find_free()
-    information = free.T @ rows.T @ rows @ free
-    variance = max(np.sum(gaps**2) / (gaps.size - free.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
-    by_z = free @ np.linalg.solve(information, free.T)
+    rows, Z = A.reshape(-1, A.shape[-1]), null_space(constraints.E)
+    variance = max(np.sum(gaps**2) / (gaps.size - Z.shape[1]), LEAST_VARIANCE * PALM_SLIP_STD**2)  # [m²]
+    by_z = Z @ np.linalg.solve(Z.T @ rows.T @ rows @ Z, Z.T)
     by_d = (np.eye(len(by_z)) - by_z @ rows.T @ rows) @ np.linalg.pinv(constraints.E)
     covariance = correlated * variance * by_z + by_d @ constraints.covariance @ by_d.T
     return 0.5 * (covariance + covariance.T)
-
-
-def _replace_lengths(subject: Subject, lengths: np.ndarray, covariance: np.ndarray, **fields: Any) -> Subject:
-    """The subject with other lengths (8,) [m], their covariance, and other `fields`; what it knows of mounts stays."""
-    others = [k for k, name in enumerate(subject.order) if name not in subject.lengths]
-    return replace(
-        subject,
-        lengths=dict(zip(subject.lengths, lengths.tolist(), strict=True)),
-        order=(*subject.lengths, *(subject.order[k] for k in others)),
-        covariance=block_diag(covariance, subject.covariance[np.ix_(others, others)]),
-        **fields,
-    )

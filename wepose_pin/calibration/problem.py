@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body import BodyModel, Segment, list_breadths
+from ..body import BodyModel, list_breadths
 from ..body.mounts import MAX_MOUNT_ERROR_DEG, MOUNT_WARNING_DEG, compute_heading_offset, find_nominal_mount
 from ..body.start_pose import StartPose, find_start_pose
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadPhase, BadSession
 from ..filters.sensors import FilteredRecording
-from ..observations.directions import Level, Pointing
+from ..observations.directions import Pointing
 from ..observations.hinges import find_hinges
 from ..observations.joint_accelerations import find_neighbours
 from ..observations.paths import find_girdles
@@ -27,8 +27,7 @@ from .couplings import Coupling, estimate_couplings
 from .equations import Layout, find_twists
 from .least_squares import Observations
 from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
-from .recorded import read_recorded_places
-from .sample_losses import SampleLoss, find_sample_losses, find_samples, mask_connected, mask_measured
+from .samples import ConnectedSamples, find_connected, find_samples, mask_measured, read_recorded_places
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
@@ -38,8 +37,6 @@ LOOSE = 100.0  # times the standard deviation of a pose that is not used
 FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phase states it: headings drift
 USUAL_ELEVATION = np.deg2rad(60.0)  # [rad] of the arms off hanging, hands joined before the chest
 RIGID_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a link's orientation where nothing is soft; only ratios matter
-
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -141,7 +138,7 @@ class CalibrationProblem:
         example = self.protocol.measured_example
         breadth = list_breadths(self.model.table).get(example.partition("=")[0])
         names = [name for name in self.lengths_in_closures if name not in self.measured]
-        if (example and not (breadth and breadth.length in self.measured)) or not names:
+        if not names or (example and not (breadth and breadth.length in self.measured)):
             return example
         longest = max(names, key=lambda name: self.model.lengths[name])
         return f"{longest}={self.model.lengths[longest]:.3f}"
@@ -190,17 +187,30 @@ class CalibrationProblem:
         recording, prior = replace(self.recording, sensors=sensors), replace(self.prior, mounts=mounts)
         return replace(self, recording=recording, prior=prior)
 
-    def leave_out_mounts(
-        self, angles_deg: Mapping[str, float], limit_deg: float, variant: str = ""
-    ) -> CalibrationProblem:
-        """Return the same problem without mounts that are off by these angles, which it states."""
-        facts: dict[str, float | str] = {"variant": f"unused {variant}".strip()}
-        limit = float(np.deg2rad(limit_deg))
-        unused = [
-            Diagnostic("mount-contradicted", WARNING, name, float(np.deg2rad(angle)), limit, facts)
-            for name, angle in angles_deg.items()
-        ]
-        return replace(self.remove_mounts(angles_deg), unused_mounts=(*self.unused_mounts, *unused))
+    def leave_out_mounts(self, estimated: Mapping[str, np.ndarray] | None = None) -> CalibrationProblem:
+        """Return the same problem without the mounts that gravity contradicts in the start pose, which it states.
+
+        Parameters
+        ----------
+        estimated : segment → `quat_LS` by the motion, which contradicts them instead
+        """
+        limit, variant = (MAX_MOUNT_ERROR_DEG, "unused") if estimated is None else (MOUNT_WARNING_DEG, "unused motion")
+        facts: dict[str, float | str] = {"variant": variant}
+        unused = []
+        for name in self.recording.imus:
+            mount = self.mount(name)
+            if mount is None or (estimated is not None and name not in estimated):
+                continue
+            if estimated is None:
+                up_V = (self.filtered.R_VS_start[name] * Rotation.from_quat(mount).inv()).apply([0.0, 0.0, 1.0])
+                angle = float(np.arccos(np.clip(up_V[2], -1.0, 1.0)))
+            else:
+                R_estimated = self.start_rotation(name) * Rotation.from_quat(estimated[name])
+                angle = float((R_estimated * Rotation.from_quat(mount).inv()).magnitude())
+            if angle > np.deg2rad(limit):
+                unused.append(Diagnostic("mount-contradicted", WARNING, name, angle, float(np.deg2rad(limit)), facts))
+        problem = self.remove_mounts([each.place for each in unused])
+        return replace(problem, unused_mounts=(*self.unused_mounts, *unused))
 
     def loosen_phase(self, phase: str) -> CalibrationProblem:
         """Return the same problem with poses of this phase that tell next to nothing."""
@@ -220,35 +230,12 @@ class CalibrationProblem:
         moved : segment → label of the sensor on it, where they differ
         """
 
-        def exchange(values: Mapping[str, _T]) -> dict[str, _T]:
+        def exchange(values: Mapping[str, Any]) -> dict[str, Any]:
             return {segment: values[moved.get(segment, segment)] for segment in values}
 
-        filtered = self.filtered
-        return replace(
-            self,
-            recording=replace(self.recording, sensors=exchange(self.recording.sensors)),
-            filtered=filtered._replace(R_VS=exchange(filtered.R_VS), R_VS_start=exchange(filtered.R_VS_start)),
-        )
-
-    def mounts_against_gravity(self) -> dict[str, float]:
-        """Return segment → angle [deg] between its mount and gravity in the start pose, above `MAX_MOUNT_ERROR_DEG`."""
-        angles = {}
-        for segment, R_VS_start in self.filtered.R_VS_start.items():
-            mount = self.mount(segment)
-            if mount is not None and segment in self.recording.imus:
-                up_V = (R_VS_start * Rotation.from_quat(mount).inv()).apply([0.0, 0.0, 1.0])
-                angles[segment] = float(np.degrees(np.arccos(np.clip(up_V[2], -1.0, 1.0))))
-        return {segment: angle for segment, angle in angles.items() if angle > MAX_MOUNT_ERROR_DEG}
-
-    def mounts_against_motion(self, estimated: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return segment → angle [deg] between its mount and the estimated `quat_LS`, above `MOUNT_WARNING_DEG`."""
-        angles = {}
-        for segment, quat_LS in estimated.items():
-            mount = self.mount(segment)
-            if mount is not None and segment in self.recording.imus:
-                R_estimated = self.start_rotation(segment) * Rotation.from_quat(quat_LS)
-                angles[segment] = float(np.degrees((R_estimated * Rotation.from_quat(mount).inv()).magnitude()))
-        return {segment: angle for segment, angle in angles.items() if angle > MOUNT_WARNING_DEG}
+        recording = replace(self.recording, sensors=exchange(self.recording.sensors))
+        R_VS, R_VS_start = exchange(self.filtered.R_VS), exchange(self.filtered.R_VS_start)
+        return replace(self, recording=recording, filtered=self.filtered._replace(R_VS=R_VS, R_VS_start=R_VS_start))
 
     def orient_segments(self, mounts: Mapping[str, np.ndarray], samples: np.ndarray) -> dict[str, np.ndarray]:
         """Return segment → `quat_WL` (n, 4) xyzw at samples (n,), with mounts `quat_LS`; headings not corrected."""
@@ -260,6 +247,11 @@ class CalibrationProblem:
             quat_WL[name] = (R_WV * filtered.R_VS[name][samples] * R_WS_start.inv() * R_start).as_quat()
         return quat_WL
 
+    @cached_property
+    def connected(self) -> ConnectedSamples:
+        """The samples at which no sensor has lost its heading since the start pose."""
+        return find_connected(self.recording, self.filtered.start, self.sensors)
+
     def observe(self, rate_hz: float = SAMPLE_RATE_HZ) -> tuple[Observations, np.ndarray]:
         """Return the observations of all conditions, and the numbers (n,) of their samples in the recording.
 
@@ -268,98 +260,81 @@ class CalibrationProblem:
         BadPhase
             A condition has too few samples at which all sensors measure, connected with the start pose.
         """
-        recording, filtered, protocol = self.recording, self.filtered, self.protocol
-        total = sum(len(self._find_samples(condition)) for condition in protocol.conditions)
-        stride = max(1, round(recording.rate_hz / rate_hz), total // MOST_SAMPLES)
-        start, sensors = self.start_pose, self.sensors
-        hinges = find_hinges(self.model, start, sensors)
-        layout = Layout(
-            tuple(self.model.lengths),
-            sensors,
-            hinges,
-            find_girdles(self.model, start, sensors),
-            find_twists(self.model.table, hinges, sensors),
-            sum(closure.kind == "fixed_point" for closure in protocol.closures),
-            sum(closure.kind == "plane" for closure in protocol.closures),
-            recorded=any(closure.kind == "recorded" for closure in protocol.closures),
-            soft=tuple(name for name in sensors if any(self.model.table.segments[name].foam_std)),
-            attitude_std=tuple(_estimate_attitude_std(self.model.table.segments[name]) for name in sensors),
-        )
-        parts, places = [], []
-        for condition, constraint in zip(protocol.conditions, self.conditions, strict=True):
-            phase = self._find_samples(condition)[::stride]
-            measured = phase[mask_measured(recording, recording.sensors, phase) & mask_connected(self._losses, phase)]
-            place = np.zeros((len(measured), 3))
-            unseen = ""
+        recording, filtered = self.recording, self.filtered
+        phases = [find_samples(recording, self.intervals(condition)) for condition in self.protocol.conditions]
+        stride = max(1, round(recording.rate_hz / rate_hz), sum(map(len, phases)) // MOST_SAMPLES)
+        layout, parts, places = self._lay_out(), [], []
+        for condition, constraint, phase in zip(self.protocol.conditions, self.conditions, phases, strict=True):
+            samples = phase[::stride]
+            samples = samples[mask_measured(recording, recording.sensors, samples) & self.connected.include(samples)]
+            place = np.zeros((len(samples), 3))
             if isinstance(constraint, Loop) and constraint.kind == "recorded":
-                place = read_recorded_places(recording, constraint.closure, recording.time[measured])
+                place = read_recorded_places(recording, constraint.closure, recording.time[samples])
                 known = np.isfinite(place).all(axis=1)
-                if not known.all():
-                    unseen = f"; {np.sum(~known) * stride / recording.rate_hz:.1f} s more are without a recorded place"
-                measured, place = measured[known], place[known]
-            parts.append(measured)
+                samples, place = samples[known], place[known]
+            parts.append(samples)
             places.append(place)
-            seconds = len(measured) * stride / recording.rate_hz
+            seconds = len(samples) * stride / recording.rate_hz
             if seconds < LEAST_S:
-                better = "five seconds" if isinstance(constraint, Pointing | Level) else "a minute"
+                lost = ""
+                if not self.connected.include(phase).all():
+                    lost = (
+                        f"; sensors.{self.connected.lost} is lost from {format_span(self.connected.loss)}, and its "
+                        f"heading with it: name a start pose and a motion with nothing lost between them, or record "
+                        f"again"
+                    )
                 raise BadPhase(
                     f"{recording.where()}: {_name_phase(condition)} has {seconds:.1f} s in which all sensors measure; "
-                    f"at least {LEAST_S:g} s are needed, better {better}{unseen}{self._describe_losses(phase)}"
+                    f"at least {LEAST_S:g} s are needed, better a minute{lost}"
                 )
         samples = np.concatenate(parts)
         rotations_since_start = [
             (filtered.R_VS[name][samples] * filtered.R_VS_start[name].inv()).as_quat().T for name in layout.sensors
         ]
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        recorded = np.concatenate(places).T if layout.recorded else np.empty((0, len(samples)))
+        recorded = np.concatenate(places).T[: 3 * layout.recorded]
         data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - filtered.start[1]])
         return Observations(layout, data, self.conditions, condition_index), samples
 
-    @cached_property
-    def _losses(self) -> list[SampleLoss]:
-        return find_sample_losses(self.recording, self.filtered.start, self.sensors)
-
-    def _find_samples(self, condition: Condition) -> np.ndarray:
-        """Return the numbers (n,) of the samples in which a condition holds."""
-        return find_samples(self.recording, self.intervals(condition))
-
-    def _describe_losses(self, phase: np.ndarray) -> str:
-        """Return what a refusal says of losses between the start pose and the samples (n,) of a phase."""
-        between = [loss for loss in self._losses if loss.beyond(phase).any()]
-        if not between:
-            return ""
-        worst = max(between, key=lambda loss: np.count_nonzero(loss.beyond(phase)))
-        span = format_span(self.recording.time[[worst.first, worst.last]])
-        return (
-            f"; sensors.{worst.sensor} is lost from {span}, and its heading with it: name a start pose and a motion "
-            f"with nothing lost between them, or record again"
+    def _lay_out(self) -> Layout:
+        segments, start, sensors = self.model.table.segments, self.start_pose, self.sensors
+        hinges, kinds = find_hinges(self.model, start, sensors), [each.kind for each in self.protocol.closures]
+        attitude_std = []
+        for name in sensors:  # of a sensor's orientation about an axis across its segment, arms raised
+            tissue = segments[name].soft_tissue
+            growth = USUAL_ELEVATION * np.hypot(tissue.per_tilt, tissue.per_raised)
+            std = float(np.sqrt(np.mean(np.square(tissue.std) + growth**2)))
+            attitude_std.append(std or RIGID_ATTITUDE_STD)
+        return Layout(
+            tuple(self.model.lengths),
+            sensors,
+            hinges,
+            find_girdles(self.model, start, sensors),
+            find_twists(self.model.table, hinges, sensors),
+            fixed=kinds.count("fixed_point"),
+            planes=kinds.count("plane"),
+            recorded="recorded" in kinds,
+            soft=tuple(name for name in sensors if any(segments[name].foam_std)),
+            attitude_std=tuple(attitude_std),
         )
 
     def diagnose_losses(self) -> list[Diagnostic]:
         """Return what is not used of each phase, as a sensor was lost between it and the start pose."""
-        diagnostics, rate_hz = [], self.recording.rate_hz
+        diagnostics = []
         for condition in self.protocol.conditions:
-            phase = self._find_samples(condition)
-            unused = ~mask_connected(self._losses, phase)
-            if unused.any():
-                worst = max(self._losses, key=lambda loss: np.count_nonzero(loss.beyond(phase)))
+            phase = find_samples(self.recording, self.intervals(condition))
+            unused = float(np.sum(~self.connected.include(phase))) / self.recording.rate_hz
+            if unused:
                 facts: dict[str, float | str] = {
                     "phase": _name_phase(condition),
-                    "seconds": len(phase) / rate_hz,
-                    "start": float(self.recording.time[worst.first]),
-                    "end": float(self.recording.time[worst.last]),
+                    "seconds": len(phase) / self.recording.rate_hz,
+                    "start": self.connected.loss[0],
+                    "end": self.connected.loss[1],
                 }
-                value = float(unused.sum() / rate_hz)
-                diagnostics.append(Diagnostic("samples-not-connected", WARNING, worst.sensor, value, facts=facts))
+                lost = self.connected.lost
+                diagnostics.append(Diagnostic("samples-not-connected", WARNING, lost, unused, facts=facts))
         return diagnostics
 
 
 def _name_phase(condition: Condition) -> str:
     return f"phases.{condition.phase}" if condition.phase else "the motion"
-
-
-def _estimate_attitude_std(segment: Segment) -> float:
-    """Return [rad], one standard deviation about an axis across its segment of a sensor's orientation, arms raised."""
-    tissue = segment.soft_tissue
-    growth = USUAL_ELEVATION * np.hypot(tissue.per_tilt, tissue.per_raised)
-    return float(np.sqrt(np.mean(np.square(tissue.std) + growth**2))) or RIGID_ATTITUDE_STD

@@ -28,21 +28,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from ..arguments import Positive, check_arguments
 from ..body import BodyModel, convert_breadths, list_breadths
 from ..body.body import load_sensed_model
-from ..body.mounts import MAX_MOUNT_ERROR_DEG
 from ..body.subject import Subject, population_subject
 from ..body.table_file import check_segments
-from ..errors import BadModel, BadOption, BadPhase, BadSession, NoSolution, one_of
+from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
-from ..observations.directions import Level, Pointing
 from ..recording import Recording
 from .alternatives import exchange_labels, leave_out_mounts, leave_out_poses
-from .anatomy import LEAST_ROTATION, measure_rotation
 from .fusion import fuse_calibrations, separate_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .problem import CalibrationProblem
@@ -134,9 +129,7 @@ def calibrate(
         protocol = load_protocol(choose_protocol(recording.phases, formulation) if protocol is None else protocol)
     if not isinstance(model, BodyModel):
         model = load_sensed_model(model or recording.model or None, recording.sensors, recording.where())
-    _check_body(recording, protocol, model)
-    _check_measured(measured or {}, model)
-    _check_sensors(recording, protocol)
+    _check_inputs(recording, protocol, model, measured or {})
     if prior is not None and (stature is not None or sex is not None):
         raise BadOption("prior has the lengths of a person; stature and sex narrow those of the population")
     prior = prior or population_subject(stature, sex, model)
@@ -144,24 +137,21 @@ def calibrate(
     lengths = convert_breadths(measured or {}, model.table, measured_std)
     if formulation == "paper":
         check_paper_formulation(protocol, model, lengths, recording.sensors, recording.start_pose)
-    for condition in protocol.conditions:
-        if condition.phase:
-            recording.phase(condition.phase)
     filtered = filter_recording(recording, method=method, sways=not model.table.is_mechanism)
     earlier = prior if prior.start_pose_offset and formulation == "full" else None
     if earlier is not None:  # the two calibrations are fused, each on the population prior
         prior = separate_mounts(earlier, population_subject(body=model))
     problem = CalibrationProblem(recording, filtered, protocol, prior, lengths, model)
     calibration = solve_paper_calibration(problem) if formulation == "paper" else solve_plausible(problem)
-    if earlier is not None and not calibration.exchanged:
-        fused = fuse_calibrations(earlier, calibration.subject, prior, lengths, model.table)
+    if earlier is not None:
+        fused = fuse_calibrations(earlier, calibration.subject, model.table)
         calibration = replace(calibration, subject=fused, problem=replace(calibration.problem, prior=earlier))
     quality = assess(calibration)
     return replace(calibration, quality=quality, subject=replace(calibration.subject, quality=quality.quality))
 
 
-def _check_body(recording: Recording, protocol: Protocol, model: BodyModel) -> None:
-    """Raises where the body lacks a segment of the recording, lengths, or what the protocol names."""
+def _check_inputs(recording: Recording, protocol: Protocol, model: BodyModel, measured: Mapping[str, float]) -> None:
+    """Raise where body, protocol, sensors and measured lengths do not fit each other."""
     check_segments(model.table, recording.sensors, f"{recording.where()}: sensors.", BadSession)
     if not model.table.lengths:
         raise BadModel(
@@ -169,20 +159,12 @@ def _check_body(recording: Recording, protocol: Protocol, model: BodyModel) -> N
             f"as docs/models.md shows"
         )
     protocol.check_body(model.table)
-
-
-def _check_measured(measured: Mapping[str, float], model: BodyModel) -> None:
-    """Raises `BadOption` where what is measured is no length or breadth, or not plausible."""
     names, (low, high) = (*model.lengths, *list_breadths(model.table)), MEASURED_RANGE
     for name, metres in measured.items():
         if name not in names:
             raise BadOption(f"measured {name}: not a length; {one_of(names, name)}")
         if not low < metres < high:
             raise BadOption(f"measured {name}={metres:g}: a length in metres is needed, between {low} and {high}")
-
-
-def _check_sensors(recording: Recording, protocol: Protocol) -> None:
-    """Raises `BadSession` where a segment has no sensor that the protocol needs."""
     for segment in protocol.needs:
         if segment not in recording.sensors:
             raise BadSession(
@@ -193,37 +175,10 @@ def _check_sensors(recording: Recording, protocol: Protocol) -> None:
 
 def solve_plausible(problem: CalibrationProblem) -> Calibration:
     """Return the solution without the mounts and poses that gravity or the motion contradicts, its labels checked."""
-    problem = problem.leave_out_mounts(problem.mounts_against_gravity(), MAX_MOUNT_ERROR_DEG)
+    problem = problem.leave_out_mounts()
     problem.observe()  # raises where a phase is too short, before anything is estimated
-    _check_free_motion(problem)
-    quick = solve_problem(problem, quick=True)
-    for revise in (leave_out_mounts, exchange_labels):
-        quick = revise(quick)
-    if quick.exchanged:
-        return quick
+    quick = exchange_labels(leave_out_mounts(solve_problem(problem, quick=True)))
     try:
-        return leave_out_poses(solve_problem(quick.problem))
+        return quick if quick.exchanged else leave_out_poses(solve_problem(quick.problem))
     except NoSolution as error:
-        hint, rotation = "", measure_rotation(quick)
-        if rotation < LEAST_ROTATION:
-            turned_deg = np.degrees(rotation)
-            hint = f"; the segments turned by {turned_deg:.1f} deg only: move for a minute through the whole reach"
-        raise NoSolution(f"{problem.recording.where()}: {error}{hint}") from error
-
-
-def _check_free_motion(problem: CalibrationProblem) -> None:
-    """Raises `BadPhase` where no closure holds and joints do not show the heading of a sensor without a mount."""
-    if not problem.is_free_motion:
-        return
-    stated = set(problem.stated_headings(problem.sensors))
-    shown = {c.segment for c in problem.conditions if isinstance(c, Pointing | Level)}
-    known = stated | shown or {problem.model.table.reference}
-    for _ in problem.couplings:
-        known |= {name for c in problem.couplings for name in (c.near, c.far) if {c.near, c.far} & known}
-    unknown = [name for name in problem.sensors if name not in known]
-    if unknown:
-        raise BadPhase(
-            f"{problem.recording.where()}: the motion does not show how {', '.join(f'sensors.{n}' for n in unknown)} "
-            f"turned against {'its neighbour' if len(unknown) == 1 else 'their neighbours'}: too little of it, or no "
-            f"accelerometer; state the mount, move both arms for a minute, or use a protocol with a closure"
-        )
+        raise NoSolution(f"{problem.recording.where()}: {error}") from error

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -34,20 +33,6 @@ from ..documents import Key, TomlTable, is_number, read_record, read_toml
 from ..errors import BadOption, one_of
 
 PROTOCOLS = ("bow", "clasp", "free", "t_pose", "table", "tip")
-_OF_CLASP = "clasp with a measured length, as in --measured biacromial=0.41"
-_OWN = "a protocol of your own whose point stays at a fixed place (docs/protocols.md)"
-# Protocols of earlier versions → what to do instead.
-REMOVED = {
-    "clasp_measured": _OF_CLASP,
-    "elbows": "clasp+t_pose",
-    "feet": _OWN,
-    "handle": _OF_CLASP,
-    "poses": "t_pose+bow",
-    "swing": "clasp+t_pose",
-    "touch_body": "clasp+t_pose",
-    "touch_left": _OWN,
-    "touch_right": _OWN,
-}
 DEFAULT = "clasp"
 GUIDED, BOW = "clasp+t_pose", "bow"  # the best of docs/validation.md in a minute; for whom hands alone are not enough
 ALSO = ("t_pose", BOW)  # what makes it better within the same minute, by phases of their names
@@ -173,11 +158,6 @@ class Protocol:
     def check_body(self, table: BodyTable) -> None:
         """Raise `BadOption` where the body lacks a point or a segment of the protocol."""
         where = f"protocol '{self.name}': "
-        if self.closures and not table.points:
-            raise BadOption(
-                f"{where}{table.where} has no points and no lengths; a table beside the URDF names them, as "
-                f"docs/models.md shows"
-            )
         for closure in self.closures:
             for point in (*closure.points, *filter(None, [closure.origin])):
                 if point not in table.points:
@@ -207,20 +187,23 @@ def load_protocol(name: str | Path) -> Protocol:
         There is no such protocol, or its file has a key or value that is none.
     """
     names = split_protocol(name)
-    if len(names) > 1:
-        return _join_protocols(str(name), [load_protocol(each) for each in names])
-    own = str(name).endswith(".toml")
-    if name in REMOVED:
-        raise BadOption(f"protocol '{name}' is no longer there; use {REMOVED[str(name)]}")
-    if not own and name not in PROTOCOLS:
+    if len(names) > 1:  # one after another; the start pose is held once
+        parts = [load_protocol(each) for each in names]
+        steps = [parts[0].steps, *([step for step in each.steps if step.phase != "start"] for each in parts[1:])]
+        return Protocol(
+            str(name),
+            ", ".join(each.title for each in parts),
+            tuple(dict.fromkeys(segment for each in parts for segment in each.needs)),
+            tuple(step for each in steps for step in each),
+            tuple(condition for each in parts for condition in each.conditions),
+            next((each.measured_example for each in parts if each.measured_example), ""),
+        )
+    if str(name).endswith(".toml"):
+        return _read_protocol(Path(name))
+    if name not in PROTOCOLS:
         raise BadOption(
             f"protocol '{name}' is not known; {one_of(PROTOCOLS, str(name))}; or the path of a .toml of one's own"
         )
-    return _read_protocol(Path(name)) if own else _load_packaged(str(name))
-
-
-@lru_cache
-def _load_packaged(name: str) -> Protocol:
     return _read_protocol(asset("calibration", f"{name}.toml"))
 
 
@@ -261,24 +244,9 @@ def _read_closure(entry: TomlTable) -> Closure:
     for key, kinds in _KINDS_OF_KEYS.items():
         if key in entry and kind not in kinds:
             raise BadOption(f"{entry.at(key)} is no key of kind '{kind}'; it is of {' and '.join(kinds)}")
-    if closure.origin in points:
-        raise BadOption(f"{entry.at('origin')} = {closure.origin!r} is the point itself; another one is needed")
     return closure
 
 
 def split_protocol(name: str | Path) -> list[str]:
     """The names of protocols that are joined by "+"; a path may have a +."""
     return [str(name)] if Path(name).is_file() else str(name).split("+")
-
-
-def _join_protocols(name: str, protocols: list[Protocol]) -> Protocol:
-    """One protocol after another; the start pose is held once."""
-    steps = [protocols[0].steps, *([s for s in p.steps if s.phase != "start"] for p in protocols[1:])]
-    return Protocol(
-        name,
-        ", ".join(protocol.title for protocol in protocols),
-        tuple(dict.fromkeys(segment for protocol in protocols for segment in protocol.needs)),
-        tuple(step for each in steps for step in each),
-        tuple(condition for protocol in protocols for condition in protocol.conditions),
-        next((protocol.measured_example for protocol in protocols if protocol.measured_example), ""),
-    )

@@ -13,7 +13,6 @@ from ..diagnostics import Diagnostic, notebook_html, render
 from .problem import CalibrationProblem
 
 MIN_CONTACT = 0.1  # weight of a sample's gap below which the palms are apart
-MIN_INFORMATION = 1e-2  # of a combination, in units of the prior's, below which the motion does not show it
 
 
 class MeasuredLength(NamedTuple):
@@ -64,30 +63,9 @@ class Check(NamedTuple):
         return value / max(limit, 1e-9)
 
 
-class AngleRange(NamedTuple):
-    """From the 2nd to the 98th percentile [deg]."""
-
-    low: float
-    high: float
-
-    @property
-    def size(self) -> float:
-        return self.high - self.low
-
-
-class MotionRange(NamedTuple):
-    """How far the body moved while the chain was closed; keys are limbs, by side or by their last point."""
-
-    elevation: dict[str, AngleRange]  # of the limb's first segment in the one above, 0 hanging, 90 level
-    sideways: dict[str, AngleRange]  # azimuth of the limb's end from its beginning in the segment above, positive left
-    bend: dict[str, AngleRange]  # flexion of its hinge, 0 straight
-    lean: float  # [deg] of the first segment's axis from its mean, 98th percentile
-    twist: AngleRange | None  # heading of the first segment
-
-
 @dataclass(frozen=True)
 class CalibrationQuality:
-    """The quality of a calibration, and how the motion determined it.
+    """The quality of a calibration: its checks, and what the user should know.
 
     Parameters
     ----------
@@ -95,19 +73,12 @@ class CalibrationQuality:
     checks : all of them, in the order of the results
     reasons : why it does not pass, the worst first, each followed by its cause
     further : what else the user should know
-    motion : how far the body moved
-    information : of the motion on independent combinations of lengths and mounts, in units of the prior's: 0 none, 1 as
-        much again
-    doubt : of the labels, above 1 where a person cannot move so
     """
 
     quality: Quality = "fail"
     checks: tuple[Check, ...] = ()
     reasons: tuple[Diagnostic, ...] = ()
     further: tuple[Diagnostic, ...] = ()
-    motion: MotionRange = field(default_factory=lambda: MotionRange({}, {}, {}, np.nan, None))
-    information: tuple[float, ...] = ()
-    doubt: float = 0.0
 
     def __repr__(self) -> str:
         failing = sum(check.quality != "pass" for check in self.checks)
@@ -117,27 +88,6 @@ class CalibrationQuality:
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """All that a user should know of the calibration."""
         return (*self.reasons, *self.further)
-
-    @property
-    def unknowns(self) -> int:
-        """Number of lengths and mounts' angles that are not known exactly."""
-        return len(self.information)
-
-    @property
-    def rank(self) -> int:
-        """How many combinations the motion shows."""
-        return sum(each > MIN_INFORMATION for each in self.information)
-
-    @property
-    def determined(self) -> int:
-        """How many combinations the motion determines better than the prior."""
-        return sum(each > 1.0 for each in self.information)
-
-    @property
-    def condition(self) -> float:
-        """Largest over smallest standard deviation after the motion, each in units of that before."""
-        least, most = min(self.information, default=np.nan), max(self.information, default=np.nan)
-        return float(np.sqrt((1.0 + most) / (1.0 + least)))
 
 
 @dataclass(frozen=True)
@@ -158,7 +108,6 @@ class Calibration:
     time : (n,) [s] of the samples
     gap, prior_gap : (n,) [m] length of the gap, as estimated and with the prior's lengths; NaN outside of closures
     contact : (n,) weight of each sample's gap, near 0 where the palms are apart
-    prior_covariance : (k, k) before the motion, rows as `subject.order`
     quat_WL : segment → (n, 4) xyzw at each sample, as tracking gives it
     measured_lengths : name → measured length beside the estimate without it
     hinge_rms : joint → [rad] rms angle of the segment below to the plane across its axis
@@ -177,7 +126,6 @@ class Calibration:
     gap: np.ndarray
     prior_gap: np.ndarray
     contact: np.ndarray
-    prior_covariance: np.ndarray
     quat_WL: Mapping[str, np.ndarray]
     measured_lengths: Mapping[str, MeasuredLength]
     hinge_rms: Mapping[str, float] = field(default_factory=dict)
@@ -204,12 +152,12 @@ class Calibration:
     @property
     def rms_gap(self) -> float:
         """[m] root mean square of the gap's length, where the hands are joined; NaN without a closure."""
-        return _rms(self.gap[self.touching])
+        return float(np.sqrt(np.mean(self.gap[self.touching] ** 2))) if self.touching.any() else np.nan
 
     @property
     def prior_rms_gap(self) -> float:
         """[m] the same with the prior's lengths."""
-        return _rms(self.prior_gap[self.touching])
+        return float(np.sqrt(np.mean(self.prior_gap[self.touching] ** 2))) if self.touching.any() else np.nan
 
     def __repr__(self) -> str:
         stds = [1e3 * std for name in self.subject.lengths if np.isfinite(std := self.subject.std(name))]
@@ -220,7 +168,3 @@ class Calibration:
 
     def _repr_html_(self) -> str:
         return notebook_html(self, self.diagnostics, [self.subject.lengths_html()])
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.girdle import PARAMETERS
 from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject, mount_rows
+from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import NoSolution
-from ..observations.hinges import find_hinges
-from .ambiguity import OtherMinimum, diagnose_ambiguity, find_other_minima, widen_covariance
-from .conditions import is_scale_observed
+from .ambiguity import include_other_minima
+from .conditions import Loop, Moving, is_scale_observed
 from .couplings import add_couplings
-from .equations import HINGE_STD, Layout
+from .equations import GAP_ROWS, HINGE_STD, Layout
 from .initial_headings import search_headings
-from .least_squares import MIN_LENGTH, Gaussian
-from .observability import diagnose_closures, diagnose_lengths, diagnose_mounts
+from .least_squares import MIN_LENGTH, Estimate, Gaussian
 from .priors import build_prior, place_points
 from .problem import LOOSE, SAMPLE_RATE_HZ, CalibrationProblem
 from .result import Calibration
@@ -35,16 +33,6 @@ from .weights import (
 WIDE = 0.15  # [m] a gap that neither the prior's lengths nor headings some degrees off explain
 MOST_LAG_STD = 0.15  # [rad/rad] from which on the motion does not show how far a sensor lags behind a twist
 QUICK_RATE_HZ = 1.0  # of samples that decide whether labels and mounts can be as stated
-
-
-class _Solution(NamedTuple):
-    """The solved least squares."""
-
-    samples: np.ndarray  # (n,) of the recording
-    prior: Gaussian  # without what accelerations show
-    result: WeightedFit
-    covariance: np.ndarray  # (m, m) of x
-    minima: list[OtherMinimum]
 
 
 def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibration:
@@ -77,7 +65,7 @@ def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibr
     contact = (1.0 + np.sum(observations.gaps(start) ** 2, axis=1) / WIDE**2) ** -2
     result = solve_reweighted(observations, prior_at(headings[0]), start, contact, quick)
     if quick:
-        return _describe(problem, _Solution(samples, prior, result, result.fit.covariance, []))
+        return _describe(problem, samples, result, result.fit.covariance)
     lengths = result.fit.x[layout.length]
     if np.min(lengths, initial=np.inf) < 1.01 * MIN_LENGTH:  # it lies at its bound, to the solver's accuracy
         raise NoSolution(
@@ -85,14 +73,13 @@ def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibr
             f"mm); check that the points do in the phase what the protocol says, and that every sensor sits where the "
             f"session says"
         )
-    minima = find_other_minima(result, headings[1:], prior_at)
-    covariance = widen_covariance(estimate_covariance(result), minima, layout)
-    return _describe(problem, _Solution(samples, prior, result, covariance, minima))
+    covariance, ambiguous = include_other_minima(result, estimate_covariance(result), headings[1:], prior_at)
+    calibration = _describe(problem, samples, result, covariance)
+    return replace(calibration, remarks=(*calibration.remarks, *ambiguous))
 
 
-def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
-    """The calibration that a solution makes."""
-    samples, prior, result, x_cov, minima = solution
+def _describe(problem: CalibrationProblem, samples: np.ndarray, result: WeightedFit, x_cov: np.ndarray) -> Calibration:
+    """Return the calibration that a solution at samples (n,) makes, with the covariance (m, m) of x."""
     fit, observations = result.fit, result.fit.problem.observations
     layout = observations.layout
     lengths, covariance = fit.x[layout.length], x_cov[np.ix_(layout.length, layout.length)]
@@ -101,7 +88,8 @@ def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
     scale = "of the population prior" if problem.prior.is_population else f"of {problem.prior.name}"
     if problem.scale_lengths or scale_observed:
         scale = f"measured: {', '.join(problem.scale_lengths)}" if problem.scale_lengths else "of the closure"
-    subject, hinge_rms = _make_subject(problem, solution)
+    hinges = _estimate_hinges(problem, fit, x_cov)
+    subject = _make_subject(problem, fit, x_cov)
 
     prior_x = fit.x.copy()
     prior_x[layout.length] = [problem.prior.lengths[name] for name in layout.lengths]
@@ -109,59 +97,56 @@ def _describe(problem: CalibrationProblem, solution: _Solution) -> Calibration:
         np.where(observations.closed, np.linalg.norm(gaps, axis=1), np.nan)
         for gaps in (fit.gaps, observations.gaps(place_points(prior_x, observations)))
     )
-    prior_cov = np.linalg.inv(prior.information)
     diagnostics = [*problem.filtered.diagnostics, *problem.diagnose_losses()]
-    if not scale_observed:
-        length_cov = np.linalg.inv(prior.information[np.ix_(layout.length, layout.length)])
-        free_scale_std = None if problem.scale_lengths else scale_std
-        diagnostics += diagnose_lengths(problem, lengths, covariance, length_cov, free_scale_std)
-    diagnostics += diagnose_ambiguity(minima, layout)
-    diagnostics += diagnose_mounts([name for name in problem.filtered.R_VS if name not in subject.mounts], problem)
-    time = problem.recording.time[samples]
-    diagnostics += diagnose_closures(time, result.contact, observations, problem.model)
+    if not problem.protocol.closures:
+        facts = {"protocol": problem.protocol.title, "prior": problem.prior.note or problem.prior.name}
+        diagnostics.append(Diagnostic("lengths-not-observed", INFO, facts=facts))
+    for name in problem.filtered.R_VS:
+        if name not in subject.mounts:
+            facts = {"protocol": problem.protocol.name}
+            diagnostics.append(Diagnostic("mount-unknown", WARNING, name, facts=facts))
     least_std = 0.0 if problem.model.table.is_mechanism else LEAST_LENGTH_STD
     phases, loose = [condition.phase for condition in problem.protocol.conditions], dict.fromkeys(problem.loose, LOOSE)
     return Calibration(
         problem=problem,
-        subject=replace(subject, note=f"{problem.protocol.title}; scale {scale}"),
+        subject=replace(
+            subject,
+            hinges={joint: hinge for joint, (hinge, _) in hinges.items()},
+            note=f"{problem.protocol.title}; scale {scale}",
+        ),
         effective_sample_size=result.effective_sample_size,
         scale_std=scale_std,
         remarks=tuple(diagnostics),
-        time=time,
+        time=problem.recording.time[samples],
         gap=gap,
         prior_gap=prior_gap,
         contact=result.contact,
-        prior_covariance=_project_to_subject(problem, layout, prior_cov)[1],
         quat_WL=problem.orient_segments(subject.mounts, samples),
         measured_lengths=compare_measured(fit, layout, problem.measured, least_std),
-        hinge_rms=hinge_rms,
+        hinge_rms={joint: rms for joint, (_, rms) in hinges.items()},
         posed=compare_posed(fit, phases, loose),
     )
 
 
-def _make_subject(problem: CalibrationProblem, solution: _Solution) -> tuple[Subject, dict[str, float]]:
-    """The subject of a solution, and joint → the rms [rad] by which its segment leaves the plane across its hinge."""
-    fit, filtered = solution.result.fit, problem.filtered
-    layout, x = fit.problem.observations.layout, fit.x
+def _make_subject(problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray) -> Subject:
+    """Return the subject of a solution, without hinges."""
+    filtered, layout, x = problem.filtered, fit.problem.observations.layout, fit.x
     mounts, offsets, drifts = {}, {}, {}
-    std = np.sqrt(np.diag(solution.covariance))
+    std = np.sqrt(np.diag(x_cov))
     for name, tilt, heading, drift in zip(layout.sensors, layout.tilt, layout.heading, layout.drift, strict=True):
         start_W = Rotation.from_rotvec(-np.append(x[tilt], 0.0)) * Rotation.from_rotvec([0.0, 0.0, x[heading]])
         mounts[name] = (problem.start_rotation(name).inv() * start_W * filtered.R_VS_start[name]).as_quat()
-        offset = Rotation.from_rotvec(np.append(x[tilt], 0.0)).as_rotvec()[:2]
         offset_std = np.minimum(std[tilt], np.pi)  # no angle is more uncertain than half a turn
-        offsets[name] = StartPoseOffset(offset, float(np.sqrt(np.mean(offset_std**2))))
+        offsets[name] = StartPoseOffset(x[tilt], float(np.sqrt(np.mean(offset_std**2))))
         drifts[name] = HeadingDrift(float(x[drift]), float(std[drift]))
     # The mounts of sensors outside the chain are those of the start pose.
     for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
         start_W = Rotation.from_rotvec([0.0, 0.0, psi]) * filtered.R_VS_start[name]
         mounts[name] = (problem.start_rotation(name).inv() * start_W).as_quat()
-    hinges = _estimate_hinges(problem, solution)
-    order, covariance = _project_to_subject(problem, layout, solution.covariance)
-    subject = replace(
+    order, covariance = _project_to_subject(problem, layout, x_cov)
+    return replace(
         problem.prior,
         name=problem.recording.name,
-        hinges={joint: hinge for joint, (hinge, _) in hinges.items()},
         start_pose_offset=offsets,
         heading_drift=drifts,
         lengths=dict(zip(layout.lengths, x[layout.length].tolist(), strict=True)),
@@ -171,29 +156,28 @@ def _make_subject(problem: CalibrationProblem, solution: _Solution) -> tuple[Sub
         covariance=covariance,
         mounts=mounts,
     )
-    return subject, {joint: rms for joint, (_, rms) in hinges.items()}
 
 
-def _estimate_hinges(problem: CalibrationProblem, solution: _Solution) -> Mapping[str, tuple[Hinge, float]]:
+def _estimate_hinges(
+    problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray
+) -> Mapping[str, tuple[Hinge, float]]:
     """Joint → its hinge, and the root mean square [rad] by which its segment leaves the plane across it."""
-    fit, hinges = solution.result.fit, {}
-    observations = fit.problem.observations
-    bending = fit.hinge[observations.bending]
-    if not len(bending):
-        return {}
-    terms = find_hinges(problem.model, problem.start_pose, problem.sensors)
+    hinges, observations = {}, fit.problem.observations
     layout = observations.layout
+    moving = [fit.residuals[span, GAP_ROWS:] for c, span in observations.spans() if isinstance(c, Loop | Moving)]
+    bending = np.concatenate([fit.residuals[:0, GAP_ROWS:], *moving])
     lags = {
         twist.segment: float(fit.x[row])
         for twist, row in zip(layout.twists, layout.twist, strict=True)
-        if solution.covariance[row, row] < MOST_LAG_STD**2
+        if x_cov[row, row] < MOST_LAG_STD**2
     }
-    for term, (across, tilted), residuals in zip(terms, fit.x[layout.hinge], bending.T, strict=True):
-        axis = np.array(term.axis) + across * np.array(term.across) + tilted * np.array(term.tilted)
-        axis_L = problem.start_rotation(term.on).inv().apply(axis / np.linalg.norm(axis))
-        rms = float(HINGE_STD * np.sqrt(np.mean(residuals**2)))
-        std = max(rms, problem.model.table.hinges[term.name].softness)
-        hinges[term.name] = Hinge(axis_L, std, lags.get(term.on)), rms
+    for k, (term, (across, tilted)) in enumerate(zip(layout.hinges, fit.x[layout.hinge], strict=True)):
+        if len(bending):
+            axis = np.array(term.axis) + across * np.array(term.across) + tilted * np.array(term.tilted)
+            axis_L = problem.start_rotation(term.on).inv().apply(axis / np.linalg.norm(axis))
+            rms = float(HINGE_STD * np.sqrt(np.mean(bending[:, k] ** 2)))
+            std = max(rms, problem.model.table.hinges[term.name].softness)
+            hinges[term.name] = Hinge(axis_L, std, lags.get(term.on)), rms
     return hinges
 
 

@@ -27,15 +27,15 @@ ROUND_STEPS = 2  # of the rounds after the first: the next one goes on
 FINAL_STEPS = 300  # of the last solve, which must converge: hands that hardly move take a hundred
 QUICK_ROUNDS, QUICK_STEPS = 1, 15
 OUTLIER = 5.0  # times the usual gap, at which the palms are apart
-MIN_LATE_CONTACT = 0.4  # the same in the last rounds, when the fit is about right
+MIN_LATE_CONTACT = 0.4  # weight below which the palms are apart in the last rounds, when the fit is about right
 # [rad] by which people's elbows leave a hinge (docs/people.md): an oblique axis, and one that wanders.
 ELBOW_STD = np.deg2rad(4.0)
 LEAST_BEND = 0.2  # sine of the angle by which a segment must bend to show its axis
 CONTRADICTED = 3.0  # standard deviations between a measured length, or a pose, and what is known without it
+SUSPECT = 1.5  # the same of a pose from which on it is compared with a solution without it
 # [m] rms error of the lengths of simulated people after a minute (docs/validation.md), from soft tissue and shoulders,
 # which the residuals show in part.
 LEAST_LENGTH_STD = 0.010
-SUSPECT = 1.5  # the same of a pose from which on it is compared with a solution without it
 
 
 class WeightedFit(NamedTuple):
@@ -60,12 +60,12 @@ class _Block(NamedTuple):
         return max(variance, LEAST_VARIANCE), count_correlated_samples(r * self.contact[:, None], least)
 
 
-def _list_blocks(observations: Observations, contact: np.ndarray) -> list[_Block]:
+def _list_blocks(observations: Observations, contact: np.ndarray, hinges: bool = True) -> list[_Block]:
     blocks = []
     for condition, span in observations.spans():
         if isinstance(condition, Loop):
             blocks.append(_Block(span, slice(condition.rows), contact[span]))
-            if observations.layout.hinges:
+            if observations.layout.hinges and hinges:
                 blocks.append(_Block(span, slice(GAP_ROWS, None), np.ones(span.stop - span.start)))
     return [block for block in blocks if block.contact.sum() > 0.0]
 
@@ -80,25 +80,27 @@ def solve_reweighted(
     start, contact : x (m,) to begin with, and the weight (n,) of each sample's gap in it
     quick : one round with few steps and without hinges
     """
-    closures = [(condition, span) for condition, span in observations.spans() if isinstance(condition, Loop)]
     rounds, steps = (QUICK_ROUNDS, QUICK_STEPS) if quick else (ROUNDS, STEPS)
     x, contact, correlation = start, contact.copy(), min_correlation(observations)
     weights = _state_weights(observations, contact, correlation)
     if quick:
         weights[:, GAP_ROWS:] = 0.0
-    for k in range(rounds if closures else 0):
+    for k in range(rounds if observations.closed.any() else 0):
         fit = solve(LeastSquares(observations, prior, weights), x, steps if k == 0 else ROUND_STEPS, strict=False)
-        x = fit.x
-        for closure, span in closures:
-            r = fit.closure[span, : closure.rows]
-            contact[span] = _estimate_contact(r, MIN_LATE_CONTACT if k > 1 else MIN_CONTACT)
-        weights = weights.copy()
-        for block in _list_blocks(observations, contact):
-            if block.columns.start is None or not quick:
-                variance, correlated = block.measure(fit.residuals, correlation)
-                weights[block.span, block.columns] = block.contact[:, None] / (correlated * variance)
+        x, weights = fit.x, weights.copy()
+        for closure, span in observations.spans():
+            if isinstance(closure, Loop):
+                r, least = fit.closure[span, : closure.rows], MIN_LATE_CONTACT if k > 1 else MIN_CONTACT
+                # The lower third: the palms may be apart for half of the phase and more.
+                size = np.sum(r**2, axis=1)
+                usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[closure.rows], LEAST_VARIANCE)
+                weight = (1.0 + size / (usual * OUTLIER**2 * closure.rows)) ** -2
+                contact[span] = np.where(weight > least, weight, 0.0)
+        for block in _list_blocks(observations, contact, hinges=not quick):
+            variance, correlated = block.measure(fit.residuals, correlation)
+            weights[block.span, block.columns] = block.contact[:, None] / (correlated * variance)
     fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, strict=not quick)
-    gaps = [block for block in _list_blocks(observations, contact) if block.columns.start is None]
+    gaps = _list_blocks(observations, contact, hinges=False)
     sizes = [float(block.contact.sum()) / block.measure(fit.residuals, correlation)[1] for block in gaps]
     return WeightedFit(fit, contact, sum(sizes))
 
@@ -109,29 +111,14 @@ def _state_weights(observations: Observations, contact: np.ndarray, correlation:
     weights[:, :GAP_ROWS] *= contact[:, None]
     for condition, span in observations.spans():
         # The error of a pose is constant, and how an elbow leaves its hinge follows its angles: one effective sample.
+        size = ELBOW_STD / HINGE_STD if isinstance(condition, Moving) else 1.0
+        if isinstance(condition, Level):  # by the sine of its bend an axis leaves the horizontal if it is off
+            first = 4 * observations.layout.sensors.index(condition.segment)
+            x, y, _, _ = observations.data[first : first + 4, span]
+            size = max(float(np.sqrt(np.mean(1.0 - (1.0 - 2.0 * (x**2 + y**2)) ** 2))), LEAST_BEND)
         if not isinstance(condition, Loop):
-            size = ELBOW_STD / HINGE_STD if isinstance(condition, Moving) else 1.0
-            if isinstance(condition, Level):
-                size = _measure_bend(observations, span, condition)
             weights[span] = size**-2 / (span.stop - span.start)
     return weights
-
-
-def _measure_bend(observations: Observations, span: slice, level: Level) -> float:
-    """The rms sine of the angle by which a segment bends: by so much its axis leaves the horizontal if it is off."""
-    first = 4 * observations.layout.sensors.index(level.segment)
-    x, y, _, _ = observations.data[first : first + 4, span]
-    cosine = 1.0 - 2.0 * (x**2 + y**2)
-    return max(float(np.sqrt(np.mean(1.0 - cosine**2))), LEAST_BEND)
-
-
-def _estimate_contact(r: np.ndarray, least: float) -> np.ndarray:
-    """The weight (n,) of the gaps with whitened residuals `r` (n, k); zero below `least`."""
-    size, k = np.sum(r**2, axis=1), r.shape[1]
-    # The lower third: the palms may be apart for half of the phase and more.
-    usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[k], LEAST_VARIANCE)
-    weight = (1.0 + size / (usual * OUTLIER**2 * k)) ** -2
-    return np.where(weight > least, weight, 0.0)
 
 
 def min_correlation(observations: Observations) -> float:
@@ -142,15 +129,12 @@ def min_correlation(observations: Observations) -> float:
 def count_correlated_samples(r: np.ndarray, least: float) -> float:
     """How many samples of `r` (n, k) make one independent one, at least `least`: 1 + 2 Σ ρ up to the first zero."""
     n = len(r)
-    centred = r - r.mean(axis=0)
-    size = 1 << (2 * n - 1).bit_length()
-    spectrum = np.abs(np.fft.rfft(centred, size, axis=0)) ** 2
-    rho = np.fft.irfft(spectrum, size, axis=0)[:n].sum(axis=1)
+    spectrum = np.abs(np.fft.rfft(r - r.mean(axis=0), 2 * n, axis=0)) ** 2
+    rho = np.fft.irfft(spectrum, 2 * n, axis=0)[:n].sum(axis=1)
     if not rho[0] > 0.0:
         return max(1.0, least)
-    rho = rho / rho[0]
     crossing = int(np.argmax(rho <= 0.0)) if np.any(rho <= 0.0) else n
-    return max(float(1.0 + 2.0 * rho[1:crossing].sum()), least)
+    return max(float(1.0 + 2.0 * rho[1:crossing].sum() / rho[0]), least)
 
 
 def estimate_covariance(result: WeightedFit) -> np.ndarray:
@@ -189,12 +173,12 @@ def compare_measured(
 
     `least_std` [m] is that of any estimate of a length.
     """
-    C, compared = fit.covariance, {}
-    rows = {name: row for row, name in enumerate(layout.lengths)}
+    compared = {}
     for name, (metres, std) in measured.items():
-        variance = C[rows[name], rows[name]]
+        row = layout.lengths.index(name)
+        variance = fit.covariance[row, row]
         rest = 1.0 / variance - 1.0 / std**2  # information without that of the measured length
-        expected = metres + (fit.x[rows[name]] - metres) / (variance * rest)
+        expected = metres + (fit.x[row] - metres) / (variance * rest)
         compared[name] = MeasuredLength(metres, float(expected), max(float(rest**-0.5), least_std), std)
     return compared
 
@@ -210,15 +194,14 @@ def compare_posed(fit: Estimate, phases: Sequence[str], loose: Mapping[str, floa
     loose : phases that are not used → factor by which the standard deviations of their poses are too large
     """
     (observations, _, weights), deviations = fit.problem, {}
-    spans = [
+    posed = [
         (phase, condition, span)
         for (condition, span), phase in zip(observations.spans(), phases, strict=True)
         if isinstance(condition, Pointing | Level)
     ]
-    for phase in dict.fromkeys(phase for phase, _, _ in spans):
-        own = [(condition, span) for name, condition, span in spans if name == phase]
+    for phase in dict.fromkeys(phase for phase, _, _ in posed):
         information, pull, mean_r, mean_J, degrees = 0.0, 0.0, [], [], 0
-        for condition, span in own:
+        for condition, span in ((condition, span) for name, condition, span in posed if name == phase):
             r, J, w = fit.closure[span], fit.jacobian[span, :GAP_ROWS], weights[span, :GAP_ROWS]
             information = information + np.einsum("nk,nki,nkj->ij", w, J, J)
             pull = pull + np.einsum("nk,nki,nk->i", w, J, r)
@@ -229,11 +212,7 @@ def compare_posed(fit: Estimate, phases: Sequence[str], loose: Mapping[str, floa
         rest, H = np.linalg.inv(fit.information - information), np.concatenate(mean_J)
         z = np.concatenate(mean_r) + H @ rest @ pull  # at the solution without this phase
         chi2 = float(z @ np.linalg.solve(np.eye(len(z)) + H @ rest @ H.T, z))
-        deviations[phase] = _find_normal_deviate(chi2, degrees)
+        # The deviate of a normal variable that is as rare as chi² (Wilson and Hilferty 1931).
+        spread = 2.0 / (9.0 * degrees)
+        deviations[phase] = float((np.cbrt(chi2 / degrees) - (1.0 - spread)) / np.sqrt(spread))
     return deviations
-
-
-def _find_normal_deviate(chi2: float, degrees: int) -> float:
-    """The standard deviations of a normal variable that are as rare as chi², by Wilson and Hilferty 1931."""
-    spread = 2.0 / (9.0 * degrees)
-    return float((np.cbrt(chi2 / degrees) - (1.0 - spread)) / np.sqrt(spread))

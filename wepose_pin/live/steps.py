@@ -12,9 +12,8 @@ from typing import TypeVar
 import numpy as np
 
 from ..calibration import Calibration, Protocol
-from ..calibration.observability import format_longest
 from ..calibration.protocols import Step as ProtocolStep
-from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals
+from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals, format_longest
 from ..diagnostics import Diagnostic, render, render_all
 from ..errors import BadData, WeposeError
 from .assignment import ShakeDetector

@@ -176,14 +176,11 @@ def _list_sensors(calibration: Calibration) -> list[Item]:
 
 
 def describe_gap(calibration: Calibration) -> str:
-    """The gap before and after, and what the motion determined."""
-    quality = calibration.quality
+    """The gap before and after, and how much the motion tells."""
     return (
         f"{capital(_name_gap(calibration))}, root mean square while touching: {1e3 * calibration.prior_rms_gap:.1f} mm "
         f"before, {1e3 * calibration.rms_gap:.1f} mm after. The effective sample size is "
-        f"{calibration.effective_sample_size:.0f}: neighbouring samples repeat the same information. The motion showed "
-        f"{quality.rank} of {quality.unknowns} independent combinations of lengths and mounts, and determined "
-        f"{quality.determined} of them better than the prior."
+        f"{calibration.effective_sample_size:.0f}: neighbouring samples repeat the same information."
     )
 
 

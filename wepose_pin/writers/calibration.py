@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration import Calibration, CalibrationQuality
+from ..calibration import Calibration
 from ..calibration.quality import find_open_intervals
 from ..diagnostics import as_json as diagnostic_as_json
 from .result import as_json, versions, write_subject
@@ -20,15 +20,15 @@ MOST_POINTS = 600  # of the residual over time
 def write_calibration(folder: Path, calibration: Calibration, provenance: Mapping[str, Any]) -> None:
     """Write the subject and ``calibration.json``, with the provenance, into an existing folder."""
     write_subject(folder, calibration.subject, calibration.subject.shape(calibration.problem.model))
-    content = as_json(_document(calibration, calibration.quality)) | {"versions": versions()}
+    content = as_json(_document(calibration)) | {"versions": versions()}
     content["provenance"] = dict(provenance)
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
     (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
 
 
-def _document(calibration: Calibration, quality: CalibrationQuality) -> dict[str, Any]:
+def _document(calibration: Calibration) -> dict[str, Any]:
     """The content of ``calibration.json``; lengths [m], times [s], angles as named, checks and diagnostics SI."""
-    subject = calibration.subject
+    subject, quality = calibration.subject, calibration.quality
     stride = -(-len(calibration.time) // MOST_POINTS)
     some = slice(None, None, stride)
     return {
@@ -71,14 +71,7 @@ def _document(calibration: Calibration, quality: CalibrationQuality) -> dict[str
         },
         "open_intervals": find_open_intervals(calibration),
         "effective_sample_size": calibration.effective_sample_size,
-        "conditioning": {
-            "unknowns": quality.unknowns,
-            "rank": quality.rank,
-            "determined": quality.determined,
-            "condition": _number(quality.condition),
-        },
-        "motion_deg": {**quality.motion._asdict(), "lean": _number(quality.motion.lean)},
-        "labels": {"doubt": _number(quality.doubt), "moved": dict(calibration.exchanged)},
+        "moved": dict(calibration.exchanged),
     }
 
 
