@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..body.kinematics import Pose
 from ..body.subject import Subject, mount_rows
 from ..calibration import Calibration
-from ..calibration.observability import find_intervals
+from ..calibration.quality import find_intervals
 from ..calibration.result import MIN_CONTACT
 from ..diagnostics import Diagnostic, lines
 from ..errors import WeposeError
