@@ -5,7 +5,7 @@ READY := $(VENV)/.ready
 DOCS_READY := $(VENV)/.docs_ready
 PEERS_READY := $(VENV)/.peers_ready
 
-.PHONY: demo test test-all check lint types docs picture package oldest workflows wheel fuzz recordings bench validation clean
+.PHONY: demo test test-all check lint types docs picture package oldest workflows wheel recordings bench validation clean
 
 demo: $(READY)            ## simulate, calibrate, track, evaluate, view
 	$(BIN)/wepose demo -o demo --force
@@ -28,10 +28,6 @@ lint: $(READY)
 
 types: $(READY)
 	$(BIN)/mypy
-
-SECONDS ?= 60
-fuzz: $(PEERS_READY)      ## fuzz all that is parsed, SECONDS=60 a target; TARGETS="csv body" for some
-	$(BIN)/python tests/fuzz/run.py $(TARGETS) --seconds $(SECONDS)
 
 SEEDS ?= 0:1000
 recordings: $(READY)      ## random recordings of ordinary behaviour, SEEDS=0:1000; goes on where it was stopped
@@ -88,4 +84,4 @@ $(PEERS_READY): $(READY)
 	@touch $(PEERS_READY)
 
 clean:
-	rm -rf $(VENV) .venv-oldest build dist demo docs/_build docs/generated .fuzz .random_recordings *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) .venv-oldest build dist demo docs/_build docs/generated .random_recordings *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -16,7 +16,6 @@ from scipy.io import savemat
 import wepose_pin
 from wepose_pin.assets import asset
 from wepose_pin.body.subject import population_subject, subject_toml
-from wepose_pin.live.sources import mti
 from wepose_pin.live.sources.udp import CRC, HEADER, MAGIC, SAMPLE
 
 N = 12
@@ -259,17 +258,6 @@ def datagrams() -> list[bytes]:
     return [json.dumps(one).encode(), lines, body + CRC.pack(zlib.crc32(body))]
 
 
-def serial() -> bytes:
-    """Bytes of an MTi: two packets of data, an acknowledgement and noise."""
-    stream = b"\x00\xfa"
-    for k in range(2):
-        data = struct.pack(">HBI", mti.SAMPLE_TIME, 4, 100 * k)
-        for kind in mti.OUTPUTS[0][1:]:
-            data += struct.pack(">HB3f", kind, 12, 0.1, 0.2, 9.8)
-        stream += mti.build_frame(mti.DATA, data)
-    return stream + mti.build_frame(mti.SET_OUTPUT + 1, struct.pack(">4H", 0x8020, 100, 0x4020, 100))
-
-
 def pose() -> bytes:
     names = [f"torso_q{axis}" for axis in "xyzw"] + [
         "torso_std",
@@ -298,32 +286,6 @@ def shipped(*names: str) -> list[bytes]:
 
 # What wepose wrote --------------------------------------------------------------------------------------------------
 
-PLAN = b"""[sessions]
-files = ["*/session.toml"]
-[subjects.anna]
-file = "anna.toml"
-stature = 1.7
-sex = "f"
-measured = { shoulder_width = 0.385 }
-[steps.calibrate]
-protocol = "clasp"
-method = "amekf"
-[steps.track]
-covariance = true
-[steps.retarget]
-robot = "arm.urdf"
-rate_hz = 50.0
-arm = "right"
-[steps.export]
-formats = ["trc", "mot"]
-[steps.evaluate]
-interval = [1.0, 2.0]
-"""
-PLAN_TABLE = b"""session,name,subject,stature,sex,measured.shoulder_width
-one,first,anna,1.7,f,0.385
-two,second,,,,
-"""
-
 
 def pose_csv() -> bytes:
     """A whole body's pose: both arms, as `wepose track` writes it."""
@@ -336,34 +298,3 @@ def pose_csv() -> bytes:
     for point in points:
         columns |= {f"{point}_{axis}": TIME for axis in "xyz"} | {f"{point}_std": np.full(N, 0.01)}
     return pl.DataFrame(columns).head(4).write_csv().encode()
-
-
-# What comes over a line --------------------------------------------------------------------------------------------
-
-
-def wild() -> bytes:
-    """Samples of two sensors that go on where the still ones end."""
-    from .streams import SAMPLE as ROW
-
-    rows = np.zeros(8, ROW)
-    rows["which"], rows["time"] = np.arange(8) % 2, 1.51 + 0.01 * (np.arange(8) // 2)
-    rows["accel"][:, 2] = 9.8
-    return rows.tobytes()
-
-
-def requests() -> list[bytes]:
-    """A browser's: the page, and the stream with a key pressed."""
-    get = b"GET / HTTP/1.1\r\nHost: localhost:80\r\nAccept: text/html\r\nConnection: close\r\n\r\n"
-    upgrade = (
-        b"GET /stream HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://127.0.0.1\r\nUpgrade: websocket\r\n"
-        b"Connection: Upgrade\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-    )
-    return [
-        get,
-        upgrade + b"".join(_masked(word) for word in (b'{"action": "reset"}', b"taken", b'{"action": "quit"}')),
-    ]
-
-
-def _masked(text: bytes) -> bytes:
-    """A WebSocket frame of text from a client, whose mask is zero."""
-    return b"\x81" + bytes([0x80 | len(text)]) + bytes(4) + text

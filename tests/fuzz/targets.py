@@ -7,13 +7,63 @@ Parquet, MATLAB, HDF5 and C3D are not here: libraries parse them, and some of th
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
-from . import records, seeds, streams
-from .target import NotOneLine, Target, file, try_one
+from wepose_pin.errors import WeposeError
 
-__all__ = ["NUMBERS", "TARGETS", "NotOneLine", "Target", "try_one"]
+from . import seeds
+
+
+class Target(NamedTuple):
+    """One reader.
+
+    Parameters
+    ----------
+    seeds : well-formed inputs
+    run : takes a folder and an input; raises `WeposeError` on what it does not take
+    words : what inputs are made of, for a fuzzer that knows nothing of the format
+    """
+
+    name: str
+    seeds: Callable[[], list[bytes]]
+    run: Callable[[Path, bytes], object]
+    words: tuple[bytes, ...] = ()
+
+
+def try_one(target: Target, folder: Path, data: bytes) -> WeposeError | None:
+    """Give the input to the target: what it was refused for, None if it was taken; all else is a finding and raised."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", category=DeprecationWarning, module="meshcat|zmq")  # as they are imported
+        try:
+            target.run(folder, data)
+        except WeposeError as error:
+            text = str(error)
+            assert text.isprintable() and 0 < len(text) <= 4000, repr(text)[:400]  # noqa: PT018
+            return error
+    return None
+
+
+def file(name: str, read: Callable[[Path], object]) -> Callable[[Path, bytes], object]:
+    """The target that reads the input as a file of this name."""
+
+    def run(folder: Path, data: bytes) -> object:
+        path = folder / name
+        path.write_bytes(data)
+        return read(path)
+
+    return run
+
+
+def _datagram(_folder: Path, data: bytes) -> object:
+    from wepose_pin.live.sources.udp import decode
+
+    batches, problems = decode(data)
+    assert all(problem.isprintable() for problem in problems), problems
+    return batches
 
 
 KINDS = (".csv", ".txt", ".sto", ".mvnx", ".xml", ".toml", ".mcap")
@@ -206,13 +256,6 @@ XML = (
 )  # fmt: skip
 JSON = (*NUMBERS, b"NaN", b"-Infinity", b"[" * 2000, b"null", b'"\\ud800"', b"{", b"}", b"[", b"]", b":", b"true")
 
-HTTP = (
-    b"Host: ", b"Origin: ", b"Upgrade: websocket", b"Content-Length: ", b"Transfer-Encoding: chunked", b"\r\n", b"\0",
-    b"GET /stream", b"POST /", b"HEAD /", b"OPTIONS *", b"HTTP/1.0", b"%00", b"[::1]", b"evil.example", b"\x81\xfe",
-    b"\x88\x80", b"\x89\x80", b"\xc1\x80", b'{"kind": "reset"}', b"taken",
-    b"Sec-WebSocket-Extensions: permessage-deflate",
-)  # fmt: skip
-
 SMALL_TABLE = b"""urdf = "upper_body.urdf"
 up = "+z"
 forward = "+x"
@@ -226,7 +269,6 @@ left_hand = "left_hand"
 [points]
 right_wrist = { link = "right_hand", at = [0.0, 0.0, 0.0] }
 """
-LSL = b"imu-torso\n" + b"".join(b"gyr_%s\nrad/s\n" % a for a in (b"x", b"y", b"z")) + b"acc_x\ng\nacc_y\ng\nacc_z\ng"
 SUMMARY = b'{"recording": "a", "sensors": {"torso": {}}, "points": ["left_palm"], "warnings": ["b"]}'
 _PROTOCOLS = ("calibration/clasp.toml", "calibration/t_pose.toml", "calibration/tip.toml")
 
@@ -236,37 +278,29 @@ def _device(name: str, format: str) -> Callable[[Path, bytes], object]:
 
 
 TARGETS = (
-    Target("csv", lambda: [seeds.csv(), seeds.wild_csv()], _session("arm.csv", TABLE), LINES, "data_tables"),
-    Target("mvnx", lambda: [seeds.mvnx(True), seeds.mvnx(False)], _device("a.mvnx", "mvnx"), XML, "readers.mvnx"),
-    Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES, "readers.table_format"),
-    Target("dot", seeds.dot, _device("a.csv", "dot"), LINES, "readers.table_format"),
-    Target("description", seeds.descriptions, file("lab.toml", _description), TOML, "readers.table_format"),
-    Target("phone", lambda: [seeds.sensor_logger()], _device("a.json", "sensor_logger"), JSON, "readers.sensor_logger"),
-    Target("xdf", lambda: [seeds.xdf()], _device("a.xdf", "xdf"), (), "readers.xdf"),
-    Target("trc", lambda: [seeds.trc()], file("a.trc", _reference), LINES, "readers.trc"),
-    Target("markers", lambda: [seeds.MARKERS], file("m.toml", _markers), TOML, "readers.markers"),
-    Target("opensim", lambda: [seeds.opensim()], _device("a.sto", "opensim"), LINES, "readers.opensim"),
-    Target("info", _described_seeds, _described, LINES, "readers.describe"),
-    Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML, "readers.session"),
-    Target("setup", lambda: [seeds.SESSION.encode()], file("session.toml", _setup), TOML, "live.setup"),
-    Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML, "body.subject"),
-    Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML, "body.table_file"),
-    Target("robot_map", lambda: [seeds.ARM_MAP], file("map.toml", _robot_map), TOML, "retargeting.maps"),
-    Target("protocol", lambda: seeds.shipped(*_PROTOCOLS), file("own.toml", _protocol), TOML, "calibration.protocols"),
-    Target("plan", lambda: [seeds.PLAN], records.plan, TOML, "batch.plan"),
-    Target("plan_table", lambda: [seeds.PLAN_TABLE], records.plan_table, LINES, "batch.plan"),
-    Target("body", lambda: seeds.shipped("urdf/upper_body.urdf"), file("body.urdf", _body), XML, "body.tree"),
-    Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML, "body.body"),
-    Target("retarget", lambda: [seeds.ARM.encode()], file("arm.urdf", _retargeted), XML, "retargeting.robot"),
-    Target("srdf", lambda: [seeds.SRDF], file("arm.srdf", _srdf), XML, "retargeting.collision"),
-    Target("datagram", seeds.datagrams, streams.datagram, JSON, "live.sources.udp"),
-    Target("udp", lambda: [streams.APART.join(seeds.datagrams())], streams.udp, JSON, "live.sources.udp"),
-    Target("mti", lambda: [seeds.serial()], streams.serial, (), "live.sources.mti"),
-    Target("lsl", lambda: [LSL], streams.lsl, (), "live.sources.lsl"),
-    Target("live_loop", lambda: [seeds.wild()], streams.loop, (), "live.loop"),
-    Target("live_page", seeds.requests, streams.page, HTTP, "live.server"),
-    Target("live_log", lambda: [seeds.live_log()], file("a.mcap", _live), JSON, "readers.live_log"),
-    Target("pose", lambda: [seeds.pose_csv()], file("pose.csv", _pose), (), "body.kinematics"),
-    Target("result", lambda: [seeds.pose_csv()], records.result, LINES, "writers.motion"),
-    Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON, "writers.result"),
+    Target("csv", lambda: [seeds.csv(), seeds.wild_csv()], _session("arm.csv", TABLE), LINES),
+    Target("mvnx", lambda: [seeds.mvnx(True), seeds.mvnx(False)], _device("a.mvnx", "mvnx"), XML),
+    Target("mt_manager", seeds.mt_manager, _device("a.txt", "mt_manager"), LINES),
+    Target("dot", seeds.dot, _device("a.csv", "dot"), LINES),
+    Target("description", seeds.descriptions, file("lab.toml", _description), TOML),
+    Target("phone", lambda: [seeds.sensor_logger()], _device("a.json", "sensor_logger"), JSON),
+    Target("xdf", lambda: [seeds.xdf()], _device("a.xdf", "xdf"), ()),
+    Target("trc", lambda: [seeds.trc()], file("a.trc", _reference), LINES),
+    Target("markers", lambda: [seeds.MARKERS], file("m.toml", _markers), TOML),
+    Target("opensim", lambda: [seeds.opensim()], _device("a.sto", "opensim"), LINES),
+    Target("info", _described_seeds, _described, LINES),
+    Target("session", lambda: [seeds.SESSION.encode()], _session_text, TOML),
+    Target("setup", lambda: [seeds.SESSION.encode()], file("session.toml", _setup), TOML),
+    Target("subject", lambda: [seeds.subject()], file("subject.toml", _subject), TOML),
+    Target("table", lambda: [SMALL_TABLE], file("model.toml", _table), TOML),
+    Target("robot_map", lambda: [seeds.ARM_MAP], file("map.toml", _robot_map), TOML),
+    Target("protocol", lambda: seeds.shipped(*_PROTOCOLS), file("own.toml", _protocol), TOML),
+    Target("body", lambda: seeds.shipped("urdf/upper_body.urdf"), file("body.urdf", _body), XML),
+    Target("robot", lambda: [seeds.URDF.encode()], file("arm.urdf", _robot), XML),
+    Target("retarget", lambda: [seeds.ARM.encode()], file("arm.urdf", _retargeted), XML),
+    Target("srdf", lambda: [seeds.SRDF], file("arm.srdf", _srdf), XML),
+    Target("datagram", seeds.datagrams, _datagram, JSON),
+    Target("live_log", lambda: [seeds.live_log()], file("a.mcap", _live), JSON),
+    Target("pose", lambda: [seeds.pose_csv()], file("pose.csv", _pose), ()),
+    Target("summary", lambda: [SUMMARY], file("summary.json", _summary), JSON),
 )
