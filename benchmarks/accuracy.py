@@ -13,7 +13,7 @@ from benchmarks.trials import read_authors_trial, read_broad
 from wepose_pin import rotations
 from wepose_pin.errors import MissingFile
 from wepose_pin.evaluation import attitude_error
-from wepose_pin.filters import METHODS, FilterSettings, run_filter
+from wepose_pin.filters import METHODS, run_filter
 from wepose_pin.filters.noise import estimate_noise
 
 from .filters import STANDARD_GRAVITY, Sample, imufusion_filter, simulated_trial
@@ -95,10 +95,7 @@ def _accuracy(title: str, truths: Sequence[Truth]) -> Table:
 def _orientations(data: Sample) -> dict[str, np.ndarray]:
     """Method or peer → its quaternions (n, 4) xyzw."""
     gyro, accel, rate_hz, noise = data
-    found = {
-        name: run_filter(gyro, accel, rate_hz, noise, FilterSettings(name, measured_start=True)).quat_VS
-        for name in METHODS
-    }
+    found = {name: run_filter(gyro, accel, rate_hz, noise, name).quat_VS for name in METHODS}
     unbiased = np.ascontiguousarray(gyro - noise.gyro_bias)
     if is_installed("vqf"):
         import vqf

@@ -22,9 +22,8 @@ import numpy as np
 
 import wepose_pin as wp
 from wepose_pin.errors import how_to_install
-from wepose_pin.filters import METHODS, OFFLINE, FilterSettings, run_filter
+from wepose_pin.filters import METHODS, OFFLINE, SensorFilters, run_filter
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
-from wepose_pin.filters.sensors import SensorFilters
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import simulate, simulate_paper_dynamic, simulate_person
 
@@ -187,7 +186,7 @@ def filters(effort: Effort, paths: Sequence[Path] = ()) -> Table:
         cases = _batch_peers(data)
         for name in METHODS:
             call = partial(wp.estimate_orientation, *data[:3], method=name, static=STATIC_S)
-            cases |= {name: call, f"{name}, inner run": partial(run_filter, *data, FilterSettings(name))}
+            cases |= {name: call, f"{name}, inner run": partial(run_filter, *data, name)}
         timings = time_in_turn(cases, effort.rounds, "VQF")
         offline = timings["offline VQF"].median if "offline VQF" in timings else float("nan")
         for name, timing in timings.items():
@@ -236,7 +235,7 @@ def live(effort: Effort) -> Table:
 def bank(effort: Effort) -> Table:
     """One live update of several sensors in one call."""
     table = Table(
-        "Live: one step of all sensors, detector and smekf in one call (SensorFilters)",
+        "Live: one step of all sensors, detector and smekf (SensorFilters)",
         (
             Column("median_us", "median [µs]", 2),
             Column("worst_us", "99.9 % within [µs]", 2),
@@ -272,9 +271,8 @@ def _start_filters(data: Sample, count: int, method: str = "smekf") -> SensorFil
     sensor = ImuSensor(data.gyro_S[:n], data.accel_S[:n])
     sensors = {f"sensor_{i}": sensor for i in range(count)}
     time = np.arange(n) / data.rate_hz
-    start = Recording("trial", time, data.rate_hz, sensors, {"start": (STATIC_S,)})
-    filters = SensorFilters(start, method=method)
-    filters.push(start)
+    filters = SensorFilters(dict.fromkeys(sensors, data.noise), method=method, start=slice(0, n))
+    filters.push(Recording("trial", time, data.rate_hz, sensors))
     return filters
 
 
@@ -292,9 +290,8 @@ _FIRST_USE = """
 import sys, time
 begin = time.perf_counter()
 import numpy as np
-from wepose_pin.filters import METHODS, FilterSettings, run_filter
+from wepose_pin.filters import METHODS, SensorFilters, run_filter
 from wepose_pin.filters.noise import estimate_noise
-from wepose_pin.filters.sensors import SensorFilters
 from wepose_pin.recording import ImuSensor, Recording
 rng = np.random.default_rng(0)
 gyro = rng.normal(scale=1e-3, size=(1000, 3))
@@ -303,12 +300,11 @@ noise = estimate_noise(gyro, accel, 100.0)
 print("imports", time.perf_counter() - begin)
 for name in METHODS:
     begin = time.perf_counter()
-    run_filter(gyro, accel, 100.0, noise, FilterSettings(name))
+    run_filter(gyro, accel, 100.0, noise, name)
     print(name, time.perf_counter() - begin)
 begin = time.perf_counter()
-start = Recording("start", np.arange(1000) / 100.0, 100.0, {"a": ImuSensor(gyro, accel)}, {"start": ((0.0, 9.0),)})
-filters = SensorFilters(start, method="smekf")
-filters.push(start)
+filters = SensorFilters({"a": noise}, method="smekf", start=slice(0, 900))
+filters.push(Recording("start", np.arange(1000) / 100.0, 100.0, {"a": ImuSensor(gyro, accel)}))
 filters.step(gyro[:1], accel[:1])
 print("SensorFilters", time.perf_counter() - begin)
 """

@@ -19,7 +19,6 @@ from wepose_pin.filters import (
     Amekf,
     AmekfParams,
     FilterRun,
-    FilterSettings,
     Smoother,
     estimate_orientation,
     run_filter,
@@ -420,7 +419,7 @@ def test_broad_against_vqf(data: Path) -> None:
         scored = np.flatnonzero(trial.scored)[::3]
         true = Rotation.from_quat(np.where(seen[:, None], trial.quat_true, [0, 0, 0, 1]))
         for method in table:
-            out = run_filter(trial.gyro_S, trial.accel_S, trial.rate_hz, noise, FilterSettings(method))
+            out = run_filter(trial.gyro_S, trial.accel_S, trial.rate_hz, noise, method)
             R_VS = Rotation.from_quat(out.quat_VS)
             psi = float(rotations.heading((true[rest] * R_VS[rest].inv()).mean().as_quat()))
             error = (Rotation.from_rotvec([0, 0, psi]) * R_VS[scored]) * true[scored].inv()

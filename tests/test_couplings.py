@@ -21,7 +21,7 @@ from wepose_pin.calibration.couplings import (
     estimate_couplings,
     estimate_heading,
 )
-from wepose_pin.filters import FilterSettings, run_filter
+from wepose_pin.filters import run_filter
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
@@ -126,7 +126,7 @@ def test_headings_of_a_real_chain_agree_with_the_optical_system(data: Path) -> N
             sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
             noise = assume_noise(sensor.rate_hz, registration.gyro_bias)
             R_VS[segment] = Rotation.from_quat(
-                run_filter(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise, FilterSettings("amekf")).quat_VS
+                run_filter(sensor.gyro_S, sensor.accel_S, sensor.rate_hz, noise, "amekf").quat_VS
             )
             clock = np.arange(len(sensor.gyro_S)) / sensor.rate_hz
             time = sensor.time + registration.offset_s

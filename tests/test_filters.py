@@ -15,19 +15,16 @@ from wepose_pin.filters import (
     METHODS,
     OFFLINE,
     AmekfParams,
-    FilterSettings,
     Gdc,
     GdcParams,
     Ncf,
-    PublishedSmekf,
-    SensorRun,
+    SensorFilters,
     Smekf,
     SmekfParams,
     estimate_orientation,
     run_filter,
 )
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
-from wepose_pin.filters.sensors import SensorFilters
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import quat_from_gravity
 from wepose_pin.simulation import simulate_paper_dynamic
@@ -162,19 +159,13 @@ def test_F_is_the_derivative_of_the_prediction(omega: tuple[float, float, float]
             for e in np.eye(6)
         ]
     )
-    P0 = np.diag([1e-3, 2e-3, 3e-3, 1e-5, 2e-5, 3e-5])
-    # With Q = 0, P becomes F P Fᵀ; in the paper's form with F to first order in δt.
-    first_order = np.eye(6) + dt * np.block([[-cross_matrix(gyro - bias), -np.eye(3)], [np.zeros((3, 6))]])
-    for expected, kind in ((F, Smekf), (first_order, PublishedSmekf)):
-        filter_ = kind(without_noise(), 1 / dt, quat, SmekfParams(P0[:3, :3], P0[3:, 3:]))
-        filter_.state.gyro_bias[:] = bias
-        filter_.run(gyro[None], np.zeros((1, 3)), np.array([False]))
-        np.testing.assert_allclose(filter_.state.P, expected @ P0 @ expected.T, rtol=1e-7, atol=1e-12)
-
-
-def without_noise() -> SensorNoise:
+    # With Q = 0, P becomes F P Fᵀ.
     zero = np.zeros((3, 3))
-    return SensorNoise(np.zeros(3), zero, zero, zero, zero, GRAVITY)
+    noise = SensorNoise(bias, np.diag([1e-5, 2e-5, 3e-5]), zero, zero, zero, GRAVITY)
+    filter_ = Smekf(noise, 1 / dt, quat, SmekfParams(tilt_std=0.03))
+    P0 = filter_.state.P
+    filter_.run(gyro[None], np.zeros((1, 3)), np.array([False]))
+    np.testing.assert_allclose(filter_.state.P, F @ P0 @ F.T, rtol=1e-7, atol=1e-12)
 
 
 def test_the_exact_covariance_keeps_the_heading_through_wild_motion() -> None:
@@ -184,7 +175,7 @@ def test_the_exact_covariance_keeps_the_heading_through_wild_motion() -> None:
         gyro, accel, true, _ = measured(np.random.default_rng(seed), 120.0, tilt=1.2)
         noise = estimate_noise(gyro[:180], accel[:180], RATE)
         for method, errors in worst.items():
-            out = run_filter(gyro, accel, RATE, noise, FilterSettings(method))
+            out = run_filter(gyro, accel, RATE, noise, method)
             error = heading_error_deg(out.quat_VS, true)
             errors.append(float(np.abs(error - error[100]).max()))
     mean = {method: float(np.mean(errors)) for method, errors in worst.items()}
@@ -201,9 +192,7 @@ def test_the_heading_of_a_sensor_that_turns_round_and_round_is_as_uncertain_as_i
     accel = np.tile([0.0, 0.0, GRAVITY], (len(gyro), 1)) + np.random.default_rng(5).normal(
         scale=0.01, size=(500 + n, 3)
     )
-    out = run_filter(
-        gyro, accel, RATE, estimate_noise(gyro[:500], accel[:500], RATE), FilterSettings("smekf", measured_start=True)
-    )
+    out = run_filter(gyro, accel, RATE, estimate_noise(gyro[:500], accel[:500], RATE), "smekf")
     assert out.attitude_cov is not None
     turned = Rotation.from_quat(out.quat_VS[-1]).as_rotvec()[2] - rate * n / RATE
     off = float(np.angle(np.exp(1j * turned)))
@@ -237,9 +226,7 @@ def test_how_the_sensors_axes_lie_changes_nothing(method: str) -> None:
     for R in (Rotation.identity(), turn):
         own_gyro, own_accel = R.apply(gyro), R.apply(accel)
         noise = estimate_noise(own_gyro[:180], own_accel[:180], RATE)
-        quat = run_filter(
-            own_gyro, own_accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 180))
-        ).quat_VS
+        quat = run_filter(own_gyro, own_accel, RATE, noise, method, start=slice(0, 180)).quat_VS
         R_VS = Rotation.from_quat(quat) * R
         runs.append(R_VS[0].inv() * R_VS)  # each world has a heading of its own
     # amekf doubts each axis of a measurement by itself (three standard deviations), the others none
@@ -274,9 +261,10 @@ def test_a_recording_may_begin_in_motion(method: str) -> None:
 def test_what_is_before_the_start_phase_comes_with_the_first_chunk(method: str) -> None:
     gyro, accel, _, _ = measured(np.random.default_rng(3), 60.0)
     noise = estimate_noise(gyro[1000:1180], accel[1000:1180], RATE)
-    run = SensorRun(RATE, noise, FilterSettings(method, measured_start=True, start=slice(1003, 1180)))
-    chunks = [run.push(gyro[a:b], accel[a:b]) for a, b in ((0, 2000), (2000, 4000), (4000, 6000))]
-    whole = run_filter(gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(1003, 1180)))
+    filters = SensorFilters({"a": noise}, method=method, start=slice(1003, 1180))
+    recording = Recording("a", np.arange(len(gyro)) / RATE, RATE, {"a": ImuSensor(gyro, accel)})
+    chunks = [filters.push(recording.cut(slice(a, a + 2000)))["a"] for a in (0, 2000, 4000)]
+    whole = run_filter(gyro, accel, RATE, noise, method, start=slice(1003, 1180))
     quat = np.concatenate([chunk.quat_VS for chunk in chunks])
     assert quat.shape == whole.quat_VS.shape
     turned = np.degrees((Rotation.from_quat(quat).inv() * Rotation.from_quat(whole.quat_VS)).magnitude())
@@ -301,9 +289,7 @@ def test_the_rate_changes_little(method: str) -> None:
         accel = R[1:].inv().apply([0.0, 0.0, GRAVITY]) + rng.normal(scale=1e-3 * np.sqrt(rate), size=(n, 3))
         k = round(4.5 * rate)
         noise = estimate_noise(gyro[:k], accel[:k], rate)
-        orientation = run_filter(
-            gyro, accel, rate, noise, FilterSettings(method, measured_start=True, start=slice(0, k))
-        )
+        orientation = run_filter(gyro, accel, rate, noise, method, start=slice(0, k))
         assert orientation.attitude_cov is not None
         std.append(np.sqrt(np.trace(orientation.attitude_cov[round(50.0 * rate)])))
         every = round(rate / 100.0)
@@ -380,9 +366,8 @@ def test_wrong_input_is_named() -> None:
     with pytest.raises(BadData, match=r"must both be \(n, 3\)"):
         estimate_orientation(gyro, gyro[:50], RATE, static=(0, 0.5))
     noise = estimate_noise(*measured(np.random.default_rng(0), 2.0)[:2], RATE)
-    for wrong in (-1.0, np.nan, np.diag([1.0, 1.0, -1.0])):
-        with pytest.raises(BadOption, match="positive semidefinite"):
-            Smekf(noise, RATE, np.array([0.0, 0.0, 0.0, 1.0]), SmekfParams(attitude_cov0=wrong))
+    with pytest.raises(BadOption, match="tilt_std"):
+        SmekfParams(tilt_std=-1.0)
     with pytest.raises(BadData, match="as many"):
         Smekf(noise, RATE, np.array([0.0, 0.0, 0.0, 1.0])).run(np.zeros((5, 3)), np.zeros((5, 3)), True)
     with pytest.raises(BadData, match="finite"):
@@ -407,13 +392,13 @@ def test_steps_of_many_sensors_give_the_bits_of_chunks(method: str) -> None:
         np.arange(len(gyro)) / RATE,
         RATE,
         {f"sensor_{i}": ImuSensor(gyro[:, i], accel[:, i], gap=gap[:, i]) for i in range(5)},
-        {"start": ((0.0, 179 / RATE),)},
     )
-    whole = SensorFilters(recording, method=method).push(recording)
+    noises = {name: estimate_noise(s.gyro_S[:180], s.accel_S[:180], RATE) for name, s in recording.imus.items()}
+    whole = SensorFilters(noises, method=method, start=slice(0, 180)).push(recording)
     alone = list(whole.values())
     assert 0.1 < np.mean([orientation.static for orientation in alone]) < 0.9
     gyro[gap], accel[gap] = np.nan, np.nan
-    filters = SensorFilters(recording, method=method)
+    filters = SensorFilters(noises, method=method, start=slice(0, 180))
     filters.push(recording.cut(slice(0, 200)))
     for k in range(200, 1000):
         quat = filters.step(gyro[k], accel[k])
@@ -455,7 +440,7 @@ def test_what_is_unseen_is_in_the_covariance(gap: int) -> None:
     for seed in range(40):
         gyro, accel, _, rest = measured(np.random.default_rng(100 + seed), 10.0)
         noise = estimate_noise(gyro[:180], accel[:180], RATE)
-        params = SmekfParams(1e-8, 1e-10)
+        params = SmekfParams(tilt_std=1e-4)
         clean = Smekf(noise, RATE, quat_from_gravity(accel[:50].mean(axis=0)), params).run(gyro, accel, rest)
         first = 350 + 5 * seed
         gyro[first : first + gap] = np.nan

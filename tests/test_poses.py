@@ -11,7 +11,7 @@ import pytest
 from benchmarks.validation.simulated import compute_mount_errors
 from wepose_pin.calibration import Calibration, calibrate
 from wepose_pin.errors import BadSession
-from wepose_pin.filters import FilterSettings, run_filter
+from wepose_pin.filters import run_filter
 from wepose_pin.filters.noise import estimate_noise
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.simulation import (
@@ -60,7 +60,7 @@ def as_trackers(recording: Recording) -> Recording:
     rest, sensors = recording.span(recording.phases["start"][0]), {}
     for name, sensor in recording.imus.items():
         noise = estimate_noise(sensor.gyro_S[rest], sensor.accel_S[rest], recording.rate_hz)
-        settings = FilterSettings("amekf", measured_start=True)
+        settings = "amekf"
         quat_VS = run_filter(sensor.gyro_S, sensor.accel_S, recording.rate_hz, noise, settings).quat_VS
         sensors[name] = OrientationSensor(quat_VS)
     return replace(recording, sensors=sensors, remounted=True)

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.errors import BadOption
-from wepose_pin.filters import FilterSettings, run_filter
+from wepose_pin.filters import run_filter
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
 from wepose_pin.simulation import simulate_paper_dynamic
@@ -134,7 +134,7 @@ def test_an_office_chair_is_no_bias(method: str, rate: float) -> None:
     noise = estimate_noise(gyro[:500], accel[:500], RATE)
     paper = StaticDetector(noise, RATE, PaperTest()).run(gyro, accel)
     assert paper[600:1600].mean() > 0.8  # the paper's conditions see nothing in it
-    orientation = run_filter(gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 500)))
+    orientation = run_filter(gyro, accel, RATE, noise, method, start=slice(0, 500))
     assert not orientation.static[650:1690].any()
     assert orientation.static[1900:].mean() > 0.8
     error = Rotation.from_quat(orientation.quat_VS) * R.inv()
@@ -149,9 +149,7 @@ def test_a_rotation_too_slow_to_tell_from_the_bias_is_in_the_standard_deviation(
     for rate in (0.0, 0.02, 0.05, 0.1, 0.2, 0.3):
         gyro, accel, R = chair(rate, 1, sway)
         noise = estimate_noise(gyro[:500], accel[:500], RATE, worn=True)
-        orientation = run_filter(
-            gyro, accel, RATE, noise, FilterSettings(method, measured_start=True, start=slice(0, 500))
-        )
+        orientation = run_filter(gyro, accel, RATE, noise, method, start=slice(0, 500))
         assert orientation.attitude_cov is not None
         error = Rotation.from_quat(orientation.quat_VS) * R.inv()
         up = R[-1].inv().apply([0.0, 0.0, 1.0])

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wepose_pin import rotations
-from wepose_pin.filters import METHODS, FilterSettings, GdcParams, NcfParams, run_filter
+from wepose_pin.filters import METHODS, GdcParams, NcfParams, run_filter
 from wepose_pin.filters.noise import SensorNoise
 from wepose_pin.filters.static import StaticTest
 
@@ -62,14 +62,14 @@ def list_contenders(setting: str, trial: str = "") -> list[Contender]:
 
 def _make_ours(method: str) -> Contender:
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-        return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(method, measured_start=True)).quat_VS
+        return run_filter(gyro_S, accel_S, rate_hz, noise, method).quat_VS
 
     return Contender(method, orient, method)
 
 
 def _make_tuned(method: str, params: Any) -> Contender:
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
-        return run_filter(gyro_S, accel_S, rate_hz, noise, FilterSettings(method, params)).quat_VS
+        return run_filter(gyro_S, accel_S, rate_hz, noise, method, params).quat_VS
 
     return Contender(method, orient)
 
@@ -79,7 +79,7 @@ def _make_default(method: str, params: Any) -> Contender:
 
     def orient(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, noise: SensorNoise) -> np.ndarray:
         unknown = replace(noise, gyro_bias=np.zeros(3))
-        return run_filter(gyro_S, accel_S, rate_hz, unknown, FilterSettings(method, params)).quat_VS
+        return run_filter(gyro_S, accel_S, rate_hz, unknown, method, params).quat_VS
 
     return Contender(f"{method}, default gains", orient)
 

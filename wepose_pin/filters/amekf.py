@@ -43,7 +43,6 @@ from .base import (
     store_sample,
 )
 from .noise import SensorNoise
-from .static import static_step
 
 
 class ErrorStates(NamedTuple):
@@ -654,13 +653,3 @@ def _run(states, models, gyro_S, accel_S, static, blocks, out_quat, out_bias, ou
             blocks[row] = state.block
             row += 1
         store_sample(state, k, out_quat, out_bias, out_cov, out_vertical)
-
-
-@kernel
-def step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
-    """Detect and filter one sample of each of k sensors; the arrays of `SensorFilters` have one row per sensor."""
-    for i in range(len(states)):
-        gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]
-        ax, ay, az = accel_S[i, 0], accel_S[i, 1], accel_S[i, 2]
-        static[i] = static_step(detectors[i], block[i], tail[i], gx, gy, gz, ax, ay, az)
-        step(states[i], models[i], gx, gy, gz, ax, ay, az, static[i])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -10,10 +11,10 @@ from scipy.special import stdtr  # of Student; scipy.stats takes half a second t
 
 from .. import rotations
 from ..diagnostics import WARNING, Diagnostic
-from ..errors import BadPhase
-from ..recording import OrientationSensor, Recording, format_span, format_time
+from ..errors import BadPhase, WeposeError
+from ..recording import ImuSensor, OrientationSensor, Recording, format_span, format_time
 from ..recording.sensors import compute_rate
-from .noise import SensorNoise, find_static_window
+from .noise import SensorNoise, estimate_noise, find_static_window
 
 # Motion in the start pose: root mean square of the rate, and largest rotation from the mean. A standing person sways
 # below 3 deg/s and 3 deg. Above `MOVES` the mean pose is not the start pose; above `SWAYS` it is a warning.
@@ -34,8 +35,46 @@ LEAST_STATIC_S = 1.0  # of an interval with motion in it, that must be static
 FEWEST_AT_START, LEAST_SHARE_AT_START = 10, 0.5
 
 
-def find_reference_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[Diagnostic]]:
-    """Find the intervals [s] of the start pose and of noise and bias; with the recording's diagnostics and theirs."""
+class ReferencePhases(NamedTuple):
+    """From what filters and headings start."""
+
+    start: tuple[float, float]  # [s] of the start pose
+    static: tuple[float, float]  # [s] of noise and bias
+    noises: dict[str, SensorNoise]  # segment → noise of its sensor; none of measured orientations
+    diagnostics: list[Diagnostic]  # of the recording, and of these
+
+
+def find_reference_phases(recording: Recording, sways: bool = True) -> ReferencePhases:
+    """Find the start pose and each sensor's noise and bias, and check that nothing moves there.
+
+    Parameters
+    ----------
+    sways : whether a person stands in the start pose; a mechanism stands still
+
+    Raises
+    ------
+    WeposeError
+        A phase with too few samples, with motion, or without gravity.
+    """
+    start, static, diagnostics = _find_phases(recording)
+    noises: dict[str, SensorNoise] = {}
+    for segment, sensor in recording.sensors.items():
+        if not sensor.aligned:
+            diagnostics += check_motion(recording, segment, start, "start")
+            if static != start:
+                diagnostics += check_motion(recording, segment, static, "static")
+        if isinstance(sensor, ImuSensor):
+            rows = recording.find_measured(segment, static)
+            gyro_S, accel_S = sensor.gyro_S[rows], sensor.accel_S[rows]
+            try:
+                noises[segment] = estimate_noise(gyro_S, accel_S, recording.rate_hz, static == start and sways)
+            except WeposeError as error:
+                raise type(error)(f"{recording.where()}: sensors.{segment}: {error}") from error
+    diagnostics += check_common_rotation(recording, noises, static)
+    return ReferencePhases(start, static, noises, diagnostics)
+
+
+def _find_phases(recording: Recording) -> tuple[tuple[float, float], tuple[float, float], list[Diagnostic]]:
     diagnostics = list(recording.diagnostics)
     stated, static = recording.phases.get("start", ()), recording.phases.get("static", ())
     is_guessed = not stated or recording.start_is_guessed

@@ -1,24 +1,267 @@
-"""The filters of a recording's sensors, chunk by chunk or a sample of each at a time; each sensor has its own world."""
+"""The filters of sensors, whole or sample by sample: `SensorFilters`, and `filter_recording` for a whole recording."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..diagnostics import Diagnostic
-from ..errors import BadData, WeposeError
-from ..recording import OrientationSensor, Recording
-from . import BEST, OFFLINE, FilterSettings, Orientation, SensorRun, amekf, check_method, smekf
-from .base import FilterRun, run_in_parallel, symmetric
-from .noise import SensorNoise, estimate_noise
-from .phases import check_common_rotation, check_motion, find_reference_phases
-from .static import StaticState, StaticTest
+from .. import rotations
+from ..diagnostics import Diagnostic, notebook_html
+from ..errors import BadData, BadOption, one_of
+from ..recording import ImuSensor, OrientationSensor, Recording
+from .amekf import Amekf, AmekfParams
+from .base import FilterRun, make_run, run_in_parallel
+from .gdc import Gdc
+from .ncf import Ncf
+from .noise import MOVING_TILT_STD, SensorNoise, StartTilt, estimate_start_tilt
+from .phases import find_reference_phases
+from .published import PublishedSmekf
+from .smekf import Smekf, SmekfParams
+from .smoother import Smoother
+from .static import USUAL_TEST, StaticDetector, StaticTest
 
-# Kernels that take a sample of each sensor, static detector and filter together.
-STEPS = {"amekf": amekf.step_bank, "smekf": smekf.step_bank, "smekf_published": smekf.step_bank}
+METHODS: dict[str, type] = {
+    "amekf": Amekf,
+    "smoother": Smoother,
+    "smekf": Smekf,
+    "smekf_published": PublishedSmekf,
+    "ncf": Ncf,
+    "gdc": Gdc,
+}
+BEST = "amekf"  # of those that need no future (docs/validation.md)
+OFFLINE = frozenset({"smoother"})  # for whole recordings only: no live update, no run cut in two
+STATIC_ONLY = frozenset({"smekf", "smekf_published"})  # they correct while the sensor is static
+_PARAMS: dict[str, type] = {"amekf": AmekfParams, "smoother": AmekfParams, "smekf": SmekfParams}
+
+
+class Orientation(NamedTuple):
+    """Orientation of one sensor over time.
+
+    V is the sensor's own world: z up, zero heading at the first sample of the phase from which the filter starts.
+
+    Parameters
+    ----------
+    quat_VS : (n, 4) xyzw
+    gyro_bias : (n, 3) [rad/s]
+    static : (n,) bool, the sensor did not move
+    attitude_cov : (n, 3, 3) [rad²] of the error rotation vector in S, on the right of `quat_VS`; None where the filter
+        has none
+    noise : of gyroscope and accelerometer in the static phase
+    diagnostics : what the user should know
+    about_vertical : (n, 3), as `base.AboutVertical`; None where the filter has no covariance
+    """
+
+    quat_VS: np.ndarray
+    gyro_bias: np.ndarray
+    static: np.ndarray
+    attitude_cov: np.ndarray | None
+    noise: SensorNoise
+    diagnostics: tuple[Diagnostic, ...] = ()
+    about_vertical: np.ndarray | None = None
+
+    @property
+    def rows(self) -> FilterRun:
+        """What the filter gives of each sample."""
+        return FilterRun(self.quat_VS, self.gyro_bias, self.attitude_cov, self.about_vertical)
+
+    def take(self, rows: slice | np.ndarray) -> Orientation:
+        """Take the samples `rows`."""
+        values: dict[str, Any] = {name: getattr(self, name) for name in _OF_EACH_SAMPLE}
+        taken: dict[str, Any] = {name: None if each is None else each[rows] for name, each in values.items()}
+        return self._replace(**taken)
+
+    def __repr__(self) -> str:
+        bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
+        share = 100.0 * float(np.mean(self.static)) if len(self.static) else float("nan")
+        return f"Orientation({len(self.quat_VS)} samples, {share:.0f} % static, gyro bias {bias:.2f} deg/s)"
+
+    def _repr_html_(self) -> str:
+        return notebook_html(self, self.diagnostics)
+
+
+_OF_EACH_SAMPLE = ("quat_VS", "gyro_bias", "static", "attitude_cov", "about_vertical")
+
+
+def join_orientations(parts: Sequence[Orientation]) -> Orientation:
+    """Join the samples of one sensor's orientations; what is not of each sample is that of the last part."""
+    joined: dict[str, Any] = {}
+    for name in _OF_EACH_SAMPLE:
+        values = [getattr(part, name) for part in parts]
+        joined[name] = None if any(value is None for value in values) else np.concatenate(values)
+    return parts[-1]._replace(**joined)
+
+
+def check_method(method: str) -> str:
+    """Check that a method of that name exists, and return it.
+
+    Raises
+    ------
+    BadOption
+        It does not.
+    """
+    if method not in METHODS:
+        raise BadOption(f"method '{method}' is not known; {one_of(METHODS, method)}")
+    return method
+
+
+class SensorFilters:
+    """One filter for each sensor: `push` takes chunks, `step` a sample of each sensor, with bit-identical results.
+
+    A filter starts with the tilt of the start phase and runs forward from its first sample, and backward over earlier
+    samples, so that a recording may begin in motion. The smoother runs forward over all samples, from the end of the
+    backward run, and takes the whole recording as one chunk.
+
+    Parameters
+    ----------
+    noises : sensor → its noise, from its static phase; other sensors have no filter
+    method : a key of `METHODS`
+    params : the filter's own; None: its defaults, with the tilt of the start phase as it is known
+    static_test : when a sensor counts as static; "smekf_published" uses conditions (1) to (4) alone, the paper's
+    start : samples of the start phase, in the first chunk; None: the first window of `static_test`, static or not
+
+    Attributes
+    ----------
+    names : the k sensors
+    quat_VS, gyro_bias, attitude_cov, about_vertical : (k, …) after the last sample, as `FilterRun`; the next step
+        overwrites them
+    static : (k,) bool, of the last step
+
+    Raises
+    ------
+    BadOption
+        An unknown method.
+    """
+
+    def __init__(
+        self,
+        noises: Mapping[str, SensorNoise],
+        *,
+        method: str = BEST,
+        params: Any = None,
+        static_test: StaticTest | None = None,
+        start: slice | None = None,
+    ) -> None:
+        self._method, self._params, self._start = check_method(method), params, start
+        self._test = static_test or USUAL_TEST
+        if METHODS[method] is PublishedSmekf:
+            self._test = replace(self._test, rate_stds=np.inf)
+        self.names, self._noises = tuple(noises), dict(noises)
+        self._filters: dict[str, Any] = {}
+        self._detectors: dict[str, StaticDetector] = {}
+
+    def push(self, chunk: Recording) -> dict[str, Orientation]:
+        """Filter a chunk.
+
+        Raises
+        ------
+        BadData
+            The start phase has no gravity.
+        """
+        is_first = not self._filters
+        orientations = run_in_parallel(lambda name: self._filter(name, chunk.imus[name], chunk.rate_hz), self.names)
+        if is_first:
+            k = len(self.names)
+            self.static = np.zeros(k, dtype=np.bool_)
+            self._now = make_run(k, covariance=any(each.attitude_cov is not None for each in orientations))
+            self.quat_VS, self.gyro_bias, self.attitude_cov, self.about_vertical = self._now
+            self._rows = [slice(i, i + 1) for i in range(k)]
+        for i, each in enumerate(orientations):
+            for now, values in zip(self._now, each.rows, strict=True):
+                if now is not None and values is not None and len(values):
+                    now[i] = values[-1]
+        return dict(zip(self.names, orientations, strict=True))
+
+    def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+        """Take a sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²]; return `quat_VS` (k, 4).
+
+        A sensor whose sample did not come has NaN in its row: its rate is held and fades, its covariance grows.
+        """
+        if np.shape(gyro_S) != self.gyro_bias.shape or np.shape(accel_S) != self.gyro_bias.shape:
+            raise BadData(f"gyro_S {np.shape(gyro_S)} and accel_S {np.shape(accel_S)}: {len(self.names)} rows of three")
+        for name, one in zip(self.names, self._rows, strict=True):
+            self.static[one] = self._detectors[name].run(gyro_S[one], accel_S[one])
+            self._filters[name].run(gyro_S[one], accel_S[one], self.static[one], self._now.part(one))
+        return self.quat_VS
+
+    def _filter(self, name: str, sensor: ImuSensor, rate_hz: float) -> Orientation:
+        """Filter a chunk of one sensor."""
+        gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
+        if sensor.gap is not None:
+            # A long bridge is a guess and no measurement: filters get NaN, and their covariance grows over it.
+            gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
+        before = None if name in self._filters else self._begin(name, gyro_S, accel_S, rate_hz, sensor.gyro_range)
+        filter_, detector = self._filters[name], self._detectors[name]
+        if before is None or self._method in OFFLINE:
+            static = detector.run(gyro_S, accel_S)
+            run = filter_.run(gyro_S, accel_S, static)
+            if before is not None:
+                # The smoother's heading is exact where the recording begins; headings are aligned in the start phase.
+                run.attitude_cov[: len(before[1])] = before[0].attitude_cov
+        else:
+            backward, static_before = before
+            rest = slice(len(static_before), None)
+            static = np.concatenate([static_before, detector.run(gyro_S[rest], accel_S[rest])])
+            run = backward.extended(len(gyro_S))
+            filter_.run(gyro_S[rest], accel_S[rest], static[rest], run.part(rest))
+        quat_VS, gyro_bias, attitude_cov, about_vertical = run
+        noise = self._noises[name]
+        return Orientation(quat_VS, gyro_bias, static, attitude_cov, noise, about_vertical=about_vertical)
+
+    def _begin(
+        self, name: str, gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, gyro_range: float
+    ) -> tuple[FilterRun, np.ndarray] | None:
+        """Create the filter; return the samples before its first one filtered, and whether they are static."""
+        noise, phase = self._noises[name], self._start or slice(0, self._test.samples(rate_hz))
+        start = estimate_start_tilt(gyro_S[phase], accel_S[phase], noise, rate_hz)
+        if self._start is None:  # the sensor may move there
+            start = start._replace(tilt_std=MOVING_TILT_STD)
+        first, before = phase.start, None
+
+        def create(method: str, noise: SensorNoise, start: StartTilt) -> Any:
+            params = self._params
+            if method in _PARAMS:
+                params = params or _PARAMS[method](tilt_std=start.tilt_std)
+                params = replace(params, gyro_range=min(gyro_range, params.gyro_range))
+            return METHODS[method](noise, rate_hz, start.quat_VS, params)
+
+        if first > 0:  # rates and bias change their sign backward in time; specific forces do not
+            turn = np.nan_to_num(gyro_S[first] - noise.gyro_bias) / rate_hz
+            mirrored = replace(noise, gyro_bias=-noise.gyro_bias)
+            gyro, accel = -gyro_S[first:0:-1], accel_S[first - 1 :: -1]
+            static = StaticDetector(mirrored, rate_hz, self._test).run(gyro, accel)
+            turned_back = start._replace(quat_VS=rotations.turned(start.quat_VS, turn))
+            run = create(BEST if self._method in OFFLINE else self._method, mirrored, turned_back).run(
+                gyro, accel, static
+            )
+            cov = None if run.attitude_cov is None else run.attitude_cov[::-1]
+            # What the backward run has corrected is no correction of the forward run.
+            vertical = None if run.about_vertical is None else np.zeros_like(run.about_vertical)
+            before = FilterRun(run.quat_VS[::-1], -run.gyro_bias[::-1], cov, vertical), static[::-1]
+            if self._method in OFFLINE:  # forward over all samples, which it alone uses, from the end of that run
+                turn = np.nan_to_num(gyro_S[0] + run.gyro_bias[-1]) / rate_hz
+                start = StartTilt(rotations.turned(run.quat_VS[-1], -turn), MOVING_TILT_STD)
+        self._filters[name] = create(self._method, noise, start)
+        self._detectors[name] = StaticDetector(noise, rate_hz, self._test)
+        return before
+
+
+def run_filter(
+    gyro_S: np.ndarray,
+    accel_S: np.ndarray,
+    rate_hz: float,
+    noise: SensorNoise,
+    method: str = BEST,
+    params: Any = None,
+    *,
+    start: slice | None = None,
+) -> Orientation:
+    """Return the orientations of one sensor, of checked arrays and known noise; the rest as of `SensorFilters`."""
+    recording = Recording("", np.empty(len(gyro_S)), rate_hz, {"": ImuSensor(gyro_S, accel_S)})
+    return SensorFilters({"": noise}, method=method, params=params, start=start).push(recording)[""]
 
 
 class FilteredRecording(NamedTuple):
@@ -30,136 +273,6 @@ class FilteredRecording(NamedTuple):
     start: tuple[float, float]  # [s]
     static_phase: tuple[float, float]  # [s]
     diagnostics: list[Diagnostic]  # of the recording, and of its start pose
-
-
-class SensorFilters:
-    """The filters of a recording: `push` takes chunks, `step` a sample of each sensor, with bit-identical results.
-
-    After the first chunk the states of all sensors share memory, so that `step` of a method in `STEPS` is one compiled
-    call for all of them, which allocates nothing. The next `step` overwrites its result and the arrays named here.
-
-    Parameters
-    ----------
-    first : the recording's first chunk, with the phases `start` and `static`
-    method, static_test, sways : as in `filter_recording`
-
-    Attributes
-    ----------
-    start, static_phase, diagnostics : as in `FilteredRecording`
-    names : the k segments whose sensors have a filter
-    quat_VS, gyro_bias : (k, 4) xyzw, (k, 3) [rad/s] now
-    static : (k,) bool, of the last step
-
-    Raises
-    ------
-    WeposeError
-        A start phase with too few samples; an unknown method.
-    """
-
-    def __init__(
-        self, first: Recording, *, method: str = BEST, static_test: StaticTest | None = None, sways: bool = True
-    ) -> None:
-        check_method(method)
-        self.start, self.static_phase, self.diagnostics = find_reference_phases(first)
-        noises: dict[str, SensorNoise] = {}
-        for segment, sensor in first.sensors.items():
-            if not sensor.aligned:
-                self.diagnostics += check_motion(first, segment, self.start, "start")
-            if self.static_phase != self.start and not sensor.aligned:
-                self.diagnostics += check_motion(first, segment, self.static_phase, "static")
-            if isinstance(sensor, OrientationSensor):
-                continue
-            static = first.find_measured(segment, self.static_phase)
-            try:
-                worn = self.static_phase == self.start and sways
-                noise = estimate_noise(sensor.gyro_S[static], sensor.accel_S[static], first.rate_hz, worn)
-            except WeposeError as error:
-                raise type(error)(f"{first.where()}: sensors.{segment}: {error}") from error
-            noises[segment] = noise
-        self.diagnostics += check_common_rotation(first, noises, self.static_phase)
-        self.names = tuple(noises)
-        self._runs = [
-            SensorRun(
-                first.rate_hz,
-                noise,
-                FilterSettings(
-                    method,
-                    static_test=static_test or StaticTest(),
-                    measured_start=True,
-                    start=first.span(self.start),
-                    gyro_range=first.imus[segment].gyro_range,
-                ),
-            )
-            for segment, noise in noises.items()
-        ]
-        self._step: Any = STEPS.get(method) if self.names else None
-        self._method, self._is_begun = method, False
-
-    def push(self, chunk: Recording) -> dict[str, Orientation]:
-        """Filter a chunk; the smoother takes the whole recording as one."""
-        measured = []
-        for segment in self.names:
-            sensor = chunk.imus[segment]
-            gyro_S, accel_S = sensor.gyro_S, sensor.accel_S
-            if sensor.gap is not None:
-                # A long bridge is a guess and no measurement: filters get NaN, and their covariance grows over it.
-                gyro_S, accel_S = (np.where(sensor.gap[:, None], np.nan, values) for values in (gyro_S, accel_S))
-            measured.append((gyro_S, accel_S))
-        results = run_in_parallel(lambda run, signals: run.push(*signals), self._runs, measured)
-        if not self._is_begun and self._method not in OFFLINE:
-            self._share_memory()
-        self._is_begun = True
-        return dict(zip(self.names, results, strict=True))
-
-    def _share_memory(self) -> None:
-        """Put the states of all sensors side by side, for `step`."""
-        filters, detectors = [run.filter for run in self._runs], [run.detector for run in self._runs]
-        k = len(filters)
-        self.static = np.zeros(k, dtype=np.bool_)
-        self.quat_VS, self.gyro_bias = np.empty((k, 4)), np.empty((k, 3))
-        if self._step is not None:
-            self._states = np.concatenate([filter_.state.record for filter_ in filters])
-            self._models = np.concatenate([filter_.model for filter_ in filters])
-            self._detector_states = StaticState(
-                *map(np.concatenate, zip(*(detector.state for detector in detectors), strict=True))
-            )
-            self.quat_VS, self.gyro_bias = self._states["quat_VS"], self._states["gyro_bias"]
-        for i, (filter_, detector) in enumerate(zip(filters, detectors, strict=True)):
-            if self._step is not None:
-                filter_.state = type(filter_.state)(self._states[i : i + 1])
-                detector.state = StaticState(*(values[i : i + 1] for values in self._detector_states))
-            else:
-                self.quat_VS[i], self.gyro_bias[i] = filter_.state.quat_VS, filter_.state.gyro_bias
-                filter_.state = type(filter_.state)(self.quat_VS[i], self.gyro_bias[i])
-
-    def step(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """Take a sample of each sensor, `gyro_S` (k, 3) [rad/s], `accel_S` (k, 3) [m/s²]; return `quat_VS` (k, 4).
-
-        A sensor whose sample did not come has NaN in its row: its rate is held and fades, its covariance grows.
-        """
-        gyro, accel = np.ascontiguousarray(gyro_S, dtype=float), np.ascontiguousarray(accel_S, dtype=float)
-        shape = self.gyro_bias.shape
-        if gyro.shape != shape or accel.shape != shape:  # the compiled step would read beyond their ends
-            raise BadData(f"gyro_S {gyro.shape} and accel_S {accel.shape}: a row for each of {shape[0]} sensors")
-        if self._step is not None:
-            self._step(self._states, self._models, *self._detector_states, gyro, accel, self.static)
-            return self.quat_VS
-        for i, run in enumerate(self._runs):
-            one = slice(i, i + 1)
-            self.static[one] = run.detector.run(gyro[one], accel[one])
-            out = FilterRun(self.quat_VS[one], self.gyro_bias[one], None)
-            run.filter.run(gyro[one], accel[one], self.static[one], out)
-        return self.quat_VS
-
-    @property
-    def attitude_cov(self) -> np.ndarray | None:
-        """Covariance (k, 3, 3) [rad²] of the error on the right, in S; a copy. None: the filters have none."""
-        return None if self._step is None else symmetric(self._states["attitude_cov"])
-
-    @property
-    def about_vertical(self) -> np.ndarray | None:
-        """(k, 3) as `AboutVertical`; a view. None: the filters have no covariance."""
-        return None if self._step is None else np.asarray(self._states["about_vertical"])
 
 
 def filter_recording(
@@ -176,14 +289,15 @@ def filter_recording(
     WeposeError
         A start phase with too few samples; an unknown method.
     """
-    filters = SensorFilters(recording, method=method, static_test=static_test, sways=sways)
-    orientation = filters.push(recording)
+    phases = find_reference_phases(recording, sways)
+    start = recording.span(phases.start)
+    orientation = SensorFilters(phases.noises, method=method, static_test=static_test, start=start).push(recording)
     R_VS = {
         segment: Rotation.from_quat((sensor if isinstance(sensor, OrientationSensor) else orientation[segment]).quat_VS)
         for segment, sensor in recording.sensors.items()
     }
-    R_VS_start = find_start_orientations(recording, orientation, filters.start)
-    return FilteredRecording(R_VS, R_VS_start, orientation, filters.start, filters.static_phase, filters.diagnostics)
+    R_VS_start = find_start_orientations(recording, orientation, phases.start)
+    return FilteredRecording(R_VS, R_VS_start, orientation, phases.start, phases.static, phases.diagnostics)
 
 
 def find_start_orientations(

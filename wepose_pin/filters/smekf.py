@@ -1,17 +1,18 @@
 """sMEKF: the multiplicative Kalman filter that corrects in static phases alone (Lisini Baldi 2019, Algorithm 1).
 
-One thing differs from the paper, which works to first order. Its transition Φ = I − [ω δt]× lets the standard deviation
-grow by √(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz to 10⁶ deg in 20 s. Its corrections rotate the attitude and not
-the covariance, so that static phases seem to measure the heading. Here Φ = exp(−[ω δt]×), and a correction rotates the
-covariance too. `PublishedSmekf` is the paper's, to the first order.
+One thing differs from the paper, which works to first order (`published`). Its transition Φ = I − [ω δt]× lets the
+standard deviation grow by √(1 + (ω δt)²) a sample, at 720 deg/s and 100 Hz to 10⁶ deg in 20 s. Its corrections rotate
+the attitude and not the covariance, so that static phases seem to measure the heading. Over two minutes of simulated
+motion with static phases the rms heading error is 0.57 deg as published and 0.10 deg here.
 
-The state is x = [a; b]: the attitude error a [rad] and the gyroscope bias b [rad/s]. The paper's a is on the right of
-`quat_VS`, in S, as that of `attitude_cov`. Inside, a is on the left, in V, where it changes neither with the sensor's
-rotation nor with a correction of the attitude, so that Φ is the identity and P need not be rotated.
+The state is x = [a; b]: the attitude error a [rad] and the gyroscope bias b [rad/s] in S. The paper's a is on the
+right of `quat_VS`, in S, as that of `attitude_cov`. Inside, a is on the left, in V, where it changes neither with the
+sensor's rotation nor with a correction of the attitude: Φ is the identity and P need not be rotated.
 
 Measurement model: gyro = ω + b + w_ω, accel/g = R_VSᵀ e_z + w_g. In a static phase ω = 0, so gyro measures b. Σ_ω and
-Σ_g are the covariances of the white noises w_ω and w_g, Σ_b that of the bias's random walk, P₀ that of the state at the
-first sample.
+Σ_g are the covariances of the white noises w_ω and w_g, Σ_b that of the bias's random walk. A person's sway and the
+accelerometer's bias are correlated from sample to sample, so that the covariances of static samples are inflated: many
+samples of a static phase count as few.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ from math import factorial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..arguments import NonNegative, check_fields
 from ..compilation import fma, inlined, kernel
-from ..errors import BadOption
 from ..recording.limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED
-from ..rotations import C0, C1, C2, C3, S0, S1, S2, S3, fill_matrix, half_angle_terms, up_in_sensor
+from ..rotations import C0, C1, C2, C3, S0, S1, S2, S3, half_angle_terms, up_in_sensor
 from .base import (
     RATE_VAR,
     START_HEADING_STD,
@@ -39,54 +40,21 @@ from .base import (
     symmetric,
 )
 from .noise import ACCEL_BIAS_STD, SWAY_CORRELATION_S, SensorNoise
-from .static import static_step
-
-GYRO_SCALE_STD = 0.002  # of a calibrated MEMS gyroscope, as in `amekf.AmekfParams.gyro_matrix_std`
 
 
 @dataclass(frozen=True)
 class SmekfParams:
-    """Covariances of the filter; the defaults are those of the authors' published software.
+    """What the static phase does not say of a sensor; standard deviations."""
 
-    Their P₀ gives the heading, which nothing measures, a standard deviation of 1.8 deg; `starting_params` takes P₀ from
-    the start phase. Their Σ_b is some 2 Σ_ω, orders of magnitude above the drift of a real bias, so that each static
-    phase forgets the ones before and the covariance is too large.
-
-    Over two minutes of simulated motion with static phases the rms heading error is 0.57 deg with the paper's P₀, Σ_b
-    and first order, and 0.10 deg exact and with `starting_params`.
-    """
-
-    attitude_cov0: float | np.ndarray = 1e-3  # [rad²], a number or (3, 3) in S
-    bias_cov0: float | np.ndarray = 1e-3  # [rad²/s²], a number or (3, 3)
-    bias_step_cov: np.ndarray | None = None  # (3, 3) Σ_b [rad²/s²]; None: of the static phase's first differences
-    static_gyro_cov: np.ndarray | None = None  # (3, 3) [rad²/s²] of static gyro about the bias; None: Σ_ω
-    static_accel_cov: np.ndarray | None = None  # (3, 3) of static accel/g about the vertical; None: Σ_g
-    static_turn_noise: float = 0.0  # [rad/√s] of undetected rotation about the vertical in a static phase; the paper: 0
-    gyro_scale_std: float = 0.0  # of the gyroscope's scale, which no static phase shows; the paper: 0
+    tilt_std: NonNegative = ACCEL_BIAS_STD  # [rad] of roll and pitch at the start
+    static_turn_noise: NonNegative = (
+        STATIC_TURN_NOISE  # [rad/√s] of undetected rotation about the vertical in a static phase
+    )
+    gyro_scale_std: NonNegative = 0.002  # of the gyroscope's scale, which no static phase shows
     gyro_range: float = np.inf  # [rad/s]; a sample at it is used, and the covariance grows by what may be beyond
 
-
-def starting_params(noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, tilt_std: float) -> SmekfParams:
-    """Return the parameters with P₀ of the start phase: the tilt as it is known, the heading exact by definition.
-
-    A person's sway and the accelerometer's bias are correlated from sample to sample, while Σ_ω and Σ_g stand for white
-    noise. The covariances of static samples are therefore inflated: many samples of a static phase count as few.
-
-    Parameters
-    ----------
-    quat_VS : (4,) xyzw, the orientation from which the filter starts
-    tilt_std : [rad] one standard deviation of its roll and pitch
-    """
-    up_S = np.array(up_in_sensor(quat_VS))
-    across = np.eye(3) - np.outer(up_S, up_S)
-    return SmekfParams(
-        attitude_cov0=tilt_std**2 * across + START_HEADING_STD**2 * np.eye(3),
-        bias_cov0=noise.gyro_bias_cov,
-        static_gyro_cov=noise.gyro_cov + noise.sway_density(rate_hz) * rate_hz * np.eye(3),
-        static_accel_cov=noise.accel_cov + ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz * np.eye(3),
-        static_turn_noise=STATIC_TURN_NOISE,
-        gyro_scale_std=GYRO_SCALE_STD,
-    )
+    def __post_init__(self) -> None:
+        check_fields(self, "")
 
 
 # At a missing sample (NaN, or beyond `recording.limits`) the last rate is held and fades with the time constant HOLD_S,
@@ -100,7 +68,7 @@ STATE = np.dtype(
     [
         ("quat_VS", float, 4),  # xyzw
         ("gyro_bias", float, 3),  # [rad/s]
-        ("attitude_cov", float, 6),  # [rad²] upper triangle: P_aa, and what the gyroscope's scale adds to the heading
+        ("attitude_cov", float, 6),  # [rad²] upper triangle: P_aa in S, and what the gyroscope's scale adds
         ("turned", float),  # [rad] net rotation about the vertical since the start
         ("P_aa", float, 6),  # [rad²] upper triangle, of a in V
         ("P_ab", float, (3, 3)),  # [rad²/s] of a in V and b in S
@@ -120,7 +88,6 @@ MODEL = np.dtype(
         ("static_gyro_cov", float, 6),  # [rad²/s²]
         ("static_accel_cov", float, 6),  # of accel/g
         ("fade", float),  # factor on a held rate at each missing sample
-        ("first_order", np.bool_),
         ("static_turn", float),  # [rad²] variance of an undetected turn in a static sample
         ("scale_var", float),  # of the gyroscope's scale
         ("gyro_range", float),  # [rad/s]
@@ -156,25 +123,31 @@ class Smekf:
     missed (HOLD_S, LOST_RATE_STD). `run` is that of `base.OrientationFilter`.
     """
 
-    first_order = False  # the paper's transition I − [ω δt]× in place of exp(−[ω δt]×)
-
     def __init__(
         self, noise: SensorNoise, rate_hz: float, quat_VS: np.ndarray, params: SmekfParams | None = None
     ) -> None:
-        self.params = params or SmekfParams()
-        self.noise = noise
-        self.rate_hz = rate_hz
-        self.model = _model(noise, 1.0 / rate_hz, self.params, self.first_order)
-        record = np.zeros(1, STATE)
+        self.params = p = params or SmekfParams()
+        self.noise, self.rate_hz = noise, rate_hz
+        dt, model, record = 1.0 / rate_hz, np.zeros(1, MODEL), np.zeros(1, STATE)
+        sway_cov = noise.sway_density(rate_hz) * rate_hz * np.eye(3)
+        accel_bias_cov = ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz * np.eye(3)
+        model["dt"], model["inverse_gravity"] = dt, 1.0 / noise.gravity
+        for name, cov in (
+            ("attitude_step", dt * dt * noise.gyro_cov),
+            ("bias_step", dt * dt * noise.bias_step_cov),
+            ("static_gyro_cov", noise.gyro_cov + sway_cov),
+            ("static_accel_cov", noise.accel_cov + accel_bias_cov),
+        ):
+            model[name] = cov[_UPPER]
+        model["fade"], model["gyro_range"] = np.exp(-dt / HOLD_S), p.gyro_range
+        model["static_turn"], model["scale_var"] = p.static_turn_noise**2 * dt, p.gyro_scale_std**2
         record["quat_VS"], record["gyro_bias"] = quat_VS, noise.gyro_bias
-        R_VS, attitude_cov = np.empty((3, 3)), _matrix(self.params.attitude_cov0)
-        fill_matrix(record["quat_VS"][0], R_VS)
-        record["attitude_cov"] = attitude_cov[_UPPER]
-        record["P_aa"] = (R_VS @ attitude_cov @ R_VS.T)[_UPPER]
-        bias_cov = _matrix(self.params.bias_cov0)
-        record["P_bb"] = bias_cov[_UPPER]
-        record["about_vertical"][0, RATE_VAR] = float(np.trace(bias_cov)) / 3.0
-        self.state = SmekfState(record)
+        tilt_var, heading_var, up = p.tilt_std**2, START_HEADING_STD**2, np.array(up_in_sensor(record["quat_VS"][0]))
+        record["P_aa"] = tilt_var + heading_var, 0.0, 0.0, tilt_var + heading_var, 0.0, heading_var
+        record["attitude_cov"] = (tilt_var * (np.eye(3) - np.outer(up, up)) + heading_var * np.eye(3))[_UPPER]
+        record["P_bb"] = noise.gyro_bias_cov[_UPPER]
+        record["about_vertical"][0, RATE_VAR] = up @ noise.gyro_bias_cov @ up
+        self.model, self.state = model, SmekfState(record)
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
@@ -183,44 +156,6 @@ class Smekf:
         out = out or make_run(len(gyro))
         _run(self.state.record, self.model, gyro, accel, is_static, *out)
         return out
-
-
-class PublishedSmekf(Smekf):
-    """sMEKF as published: transition and corrections of the covariance to the first order.
-
-    `filters.SensorRun` gives it the paper's static test too.
-    """
-
-    first_order = True
-
-
-def _matrix(cov: float | np.ndarray) -> np.ndarray:
-    """A covariance (3, 3) that may be given as one variance."""
-    if isinstance(cov, float) and 0.0 <= cov < np.inf:
-        return cov * np.eye(3)
-    array = np.asarray(cov, dtype=float)
-    matrix = array if array.ndim == 2 else array * np.eye(3)
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.eigvalsh(matrix)[0] < -1e-15:
-        raise BadOption(f"covariance {cov!r}: a variance from 0 on is needed, or a positive semidefinite (3, 3)")
-    return matrix
-
-
-def _model(noise: SensorNoise, dt: float, params: SmekfParams, first_order: bool) -> np.ndarray:
-    """Return the constants of a sensor's filter, (1,) of `MODEL`."""
-
-    def upper(cov: np.ndarray | None, default: np.ndarray) -> np.ndarray:
-        return (default if cov is None else _matrix(cov))[_UPPER]
-
-    model = np.zeros(1, MODEL)
-    model["dt"], model["inverse_gravity"] = dt, 1.0 / noise.gravity
-    model["attitude_step"] = (dt * dt * noise.gyro_cov)[_UPPER]
-    model["bias_step"] = dt * dt * upper(params.bias_step_cov, noise.bias_step_cov)
-    model["static_gyro_cov"] = upper(params.static_gyro_cov, noise.gyro_cov)
-    model["static_accel_cov"] = upper(params.static_accel_cov, noise.accel_cov)
-    model["fade"], model["first_order"] = np.exp(-dt / HOLD_S), first_order
-    model["static_turn"], model["gyro_range"] = params.static_turn_noise**2 * dt, params.gyro_range
-    model["scale_var"] = params.gyro_scale_std**2
-    return model
 
 
 @inlined
@@ -301,13 +236,7 @@ def predict(state, model, wx, wy, wz, lost_var):  # type: ignore[no-untyped-def]
     half, cosine, d = rotation_terms(square)
     R = turn(state.quat_VS, load_quat(state.quat_VS), (half * wx, half * wy, half * wz, cosine))
     s, c = 2.0 * half * cosine, 2.0 * half * half  # sin θ/θ, (1 − cos θ)/θ²
-    if model.first_order:  # of errors in S, where F = [[I − [w]×, −δt I], [0, I]]: R (I − [w]×) exp([w]×) Rᵀ
-        whole = fma(-square, c, 1.0)  # cos θ
-        off = sum_of_three(fma(square, s, whole), s - whole, c - s, wx, wy, wz)
-        P = rotate_covariance(P, multiply(multiply(R, off), transpose(R)))
-        B = multiply(R, sum_of_three(-dt, 0.0, 0.0, wx, wy, wz))
-    else:
-        B = multiply(R, sum_of_three(-dt * s, dt * c, -dt * d, wx, wy, wz))
+    B = multiply(R, sum_of_three(-dt * s, dt * c, -dt * d, wx, wy, wz))
     aa, ab, bb = P
     b = (
         add_dot(ab[0], B[0], bb[0], B[1], bb[1], B[2], bb[2]),
@@ -360,27 +289,22 @@ def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-unty
         (b[2], b[5], b[8], c[2], c[4], c[5]),
     )
     P, d = fuse(P, (x, y, z), S, (gx - bias[0], gy - bias[1], gz - bias[2]))
-    # accel: H P = [−y; x; 0] of the rows x, y of P, S = H P Hᵀ + R_VS Σ_g R_VSᵀ; what gyro said is off the innovation.
-    # Its vertical part measures nothing of the state, only the noise that it shares with the others.
+    # accel: H P = [y; −x; 0] of the rows x, y of P, S = H P Hᵀ + R_VS Σ_g R_VSᵀ; what gyro said is off the innovation.
+    # Its vertical part comes first: it measures nothing of the state, only the noise that it shares with the others.
     Q, g = rotate_symmetric(R, model.static_accel_cov), model.inverse_gravity
     ax, ay, az = ax * g, ay * g, az * g
-    share = 1.0 / Q[5] if Q[5] > 0.0 else 0.0
-    lx, ly, off = share * Q[2], share * Q[4], add_dot(-1.0, R[6], ax, R[7], ay, R[8], az)
     a, b, _ = P
     x, y = (a[0], a[1], a[2], b[0], b[1], b[2]), (-a[1], -a[3], -a[4], -b[3], -b[4], -b[5])
-    horizontal = fma(-lx, Q[2], Q[0] + a[3]), fma(-lx, Q[4], Q[1] - a[1]), fma(-ly, Q[4], Q[3] + a[0])
-    P, e = fuse_two(
-        P,
-        (y, x),
-        horizontal,
-        add_dot(fma(-lx, off, d[1]), R[0], ax, R[1], ay, R[2], az),
-        add_dot(fma(-ly, off, -d[0]), R[3], ax, R[4], ay, R[5], az),
+    S = Q[5], Q[2], Q[4], Q[0] + a[3], Q[1] - a[1], Q[3] + a[0]
+    innovation = (
+        add_dot(-1.0, R[6], ax, R[7], ay, R[8], az),
+        add_dot(d[1], R[0], ax, R[1], ay, R[2], az),
+        add_dot(-d[0], R[3], ax, R[4], ay, R[5], az),
     )
+    P, e = fuse(P, ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), y, x), S, innovation)
     tx, ty, tz = d[0] + e[0], d[1] + e[1], d[2] + e[2]
     half, cosine, _ = rotation_terms(dot(tx, tx, ty, ty, tz, tz))
     after_R = turn(state.quat_VS, (half * tx, half * ty, half * tz, cosine), load_quat(state.quat_VS))
-    if model.first_order:  # the paper leaves the covariance in S as it is
-        P = rotate_covariance(P, multiply(after_R, transpose(R)))
     bx, by, bz = d[3] + e[3], d[4] + e[4], d[5] + e[5]
     bias[0] += bx
     bias[1] += by
@@ -395,30 +319,23 @@ def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-unty
 def fuse(P, rows, S, innovation):  # type: ignore[no-untyped-def]
     """Correct by three measurements: return P − (H P)ᵀ S⁻¹ (H P) and the error state (6,) (H P)ᵀ S⁻¹ (y − h).
 
-    `rows` are those of H P (3, 6), S is its upper triangle, `innovation` is y − h. A direction in which S is zero
-    corrects nothing. The first is taken by itself, the others with what is left of them.
+    `rows` are those of H P (3, 6), S is its upper triangle, `innovation` is y − h. One after the other, each freed from
+    what it shares with those before it. A direction in which S is zero corrects nothing.
     """
     x, y, z = rows
-    inverse = 1.0 / S[0] if S[0] > 0.0 else 0.0
-    k, m, e = inverse * S[1], inverse * S[2], innovation[0]
-    y, z = less(y, k, x), less(z, m, x)
-    rest = fma(-k, S[1], S[3]), fma(-k, S[2], S[4]), fma(-m, S[2], S[5])
-    P, error = fuse_two(
-        subtract_outer(P, inverse, x), (y, z), rest, fma(-k, e, innovation[1]), fma(-m, e, innovation[2])
-    )
-    return P, less(error, -inverse * e, x)
-
-
-@inlined
-def fuse_two(P, rows, S, first, second):  # type: ignore[no-untyped-def]
-    """Correct by two measurements, as `fuse`: `first` and `second` are their innovations."""
-    x, y = rows
-    inverse = 1.0 / S[0] if S[0] > 0.0 else 0.0
-    k = inverse * S[1]
-    var, y = fma(-k, S[1], S[2]), less(y, k, x)
-    other = 1.0 / var if var > 0.0 else 0.0
-    error = less(less((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), -inverse * first, x), -other * fma(-k, first, second), y)
-    return subtract_outer(subtract_outer(P, inverse, x), other, y), error
+    a = 1.0 / S[0] if S[0] > 0.0 else 0.0
+    k, m = a * S[1], a * S[2]
+    var, shared = fma(-k, S[1], S[3]), fma(-k, S[2], S[4])
+    b = 1.0 / var if var > 0.0 else 0.0
+    n = b * shared
+    var = fma(-n, shared, fma(-m, S[2], S[5]))
+    c = 1.0 / var if var > 0.0 else 0.0
+    y = less(y, k, x)
+    z = less(less(z, m, x), n, y)
+    first, second = innovation[0], fma(-k, innovation[0], innovation[1])
+    third = fma(-n, second, fma(-m, first, innovation[2]))
+    error = less(less(less((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), -a * first, x), -b * second, y), -c * third, z)
+    return subtract_outer(subtract_outer(subtract_outer(P, a, x), b, y), c, z), error
 
 
 @inlined
@@ -449,13 +366,6 @@ def subtract_outer(P, share, row):  # type: ignore[no-untyped-def]
             fma(t, v, bb[3]), fma(t, w, bb[4]), fma(-share * w, w, bb[5]),
         ),
     )  # fmt: skip
-
-
-@inlined
-def rotate_covariance(P, A):  # type: ignore[no-untyped-def]
-    """F P Fᵀ of F = [[A, 0], [0, I]]."""
-    aa, ab, bb = P
-    return rotate_symmetric(A, aa), multiply(A, ab), bb
 
 
 @inlined
@@ -573,13 +483,3 @@ def _run(states, models, gyro_S, accel_S, static, out_quat, out_bias, out_cov, o
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         step(state, model, gx, gy, gz, accel_S[k, 0], accel_S[k, 1], accel_S[k, 2], static[k])
         store_sample(state, k, out_quat, out_bias, out_cov, out_vertical)
-
-
-@kernel
-def step_bank(states, models, detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
-    """One sample of each of k sensors, detector and filter; arrays with a row a sensor, as `SensorFilters` has them."""
-    for i in range(len(states)):
-        gx, gy, gz = gyro_S[i, 0], gyro_S[i, 1], gyro_S[i, 2]
-        ax, ay, az = accel_S[i, 0], accel_S[i, 1], accel_S[i, 2]
-        static[i] = static_step(detectors[i], block[i], tail[i], gx, gy, gz, ax, ay, az)
-        step(states[i], models[i], gx, gy, gz, ax, ay, az, static[i])

@@ -14,7 +14,7 @@ means does not depend on the rate of sampling.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
 from scipy.special import gammainc, gammaincinv
@@ -129,16 +129,6 @@ class StaticTest:
 USUAL_TEST = StaticTest()
 
 
-class StaticState(NamedTuple):
-    """Memory of the detectors of k sensors, a row each; a window has N samples."""
-
-    detector: np.ndarray  # (k,) of `DETECTOR`
-    block: np.ndarray  # (k, N, 7) samples of the current block, then of the one before
-    # (k, N) of `SUMS`: of the block before, from each of its samples on which it does not move; where no window begins
-    # any more, `gyro` is that of the current block up to the sample
-    tail: np.ndarray
-
-
 class StaticDetector:
     """Decides for each sample whether the window that ends there is static.
 
@@ -155,7 +145,12 @@ class StaticDetector:
 
     def __init__(self, noise: SensorNoise, rate_hz: float, test: StaticTest | None = None) -> None:
         self.test = test or USUAL_TEST
-        self.state = _first_state(noise, rate_hz, self.test)
+        n = self.test.samples(rate_hz)
+        self._detector = _first_state(noise, rate_hz, self.test)
+        self._block = np.zeros((n, SIGNALS))  # samples of the current block, then of the one before
+        # Sums of the block before, from each of its samples on which it does not move; where no window begins any more,
+        # `gyro` is that of the current block up to the sample.
+        self._tail = np.zeros(n, SUMS)
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """`static` (n,) bool for `gyro_S` (n, 3) [rad/s] and `accel_S` (n, 3) [m/s²]."""
@@ -163,12 +158,12 @@ class StaticDetector:
             raise BadData(f"{len(gyro_S)} rows of gyro_S and {len(accel_S)} of accel_S: they must be as many")
         gyro, accel = np.ascontiguousarray(gyro_S, dtype=float), np.ascontiguousarray(accel_S, dtype=float)
         static = np.empty(len(gyro), dtype=np.bool_)
-        _run(*self.state, gyro, accel, static)
+        _run(self._detector, self._block, self._tail, gyro, accel, static)
         return static
 
 
-def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> StaticState:
-    """The state of one detector before its first sample."""
+def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> np.ndarray:
+    """Build the memory of a detector before its first sample, (1,) of `DETECTOR`."""
     n = test.samples(rate_hz)
     newest = max(1, round(test.newest_s * rate_hz))
     dt, window_s = 1.0 / rate_hz, n / rate_hz
@@ -198,7 +193,7 @@ def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> Static
     }
     for name, value in values.items():
         detector[name] = value
-    return StaticState(detector, np.zeros((1, n, SIGNALS)), np.zeros((1, n), SUMS))
+    return detector
 
 
 def _bound_rate_change(noise: SensorNoise, newest: int, n: int, rate_stds: float) -> np.ndarray:
@@ -348,8 +343,8 @@ def _bias_agrees(detector, window, gx, gy, gz, ax, ay, az):  # type: ignore[no-u
 
 
 @inlined
-def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
-    """One sample of one sensor, a row of a `StaticState`: is the window that it ends static?"""
+def _step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[no-untyped-def]
+    """One sample: is the window that it ends static?"""
     n, at, anchor, head = len(block), detector.samples, detector.anchor, detector.sums
     ax, ay, az = ax * detector.inverse_gravity, ay * detector.inverse_gravity, az * detector.inverse_gravity
     block[at, 0], block[at, 1], block[at, 2] = gx, gy, gz
@@ -411,9 +406,9 @@ def static_step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[
 
 
 @kernel
-def _run(detectors, blocks, tails, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
-    detector, block, tail = detectors[0], blocks[0], tails[0]
+def _run(detectors, block, tail, gyro_S, accel_S, static):  # type: ignore[no-untyped-def]
+    detector = detectors[0]
     for k in range(len(gyro_S)):
         gx, gy, gz = gyro_S[k, 0], gyro_S[k, 1], gyro_S[k, 2]
         ax, ay, az = accel_S[k, 0], accel_S[k, 1], accel_S[k, 2]
-        static[k] = static_step(detector, block, tail, gx, gy, gz, ax, ay, az)
+        static[k] = _step(detector, block, tail, gx, gy, gz, ax, ay, az)

@@ -217,9 +217,9 @@ def _contradict(time: np.ndarray, gyro_S: np.ndarray, accel_S: np.ndarray) -> bo
         return False
     force = rotations.unroll(gyro_S * np.diff(time, prepend=time[0])[:, None], accel_S)
     mean = np.add.reduceat(force, edges)[:-1]
-    up = mean / np.maximum(np.linalg.norm(mean, axis=1), 1e-9)[:, None]
-    apart = min(len(up) - 1, round(PARTED_S / MEAN_S))
-    return bool((np.sum(up[apart:] * up[:-apart], axis=1) < np.cos(PARTED)).any())
+    apart, size = min(len(mean) - 1, round(PARTED_S / MEAN_S)), np.linalg.norm(mean, axis=1)
+    along = np.sum(mean[apart:] * mean[:-apart], axis=1)
+    return bool((along < np.cos(PARTED) * size[apart:] * size[:-apart]).any())
 
 
 # Saturation -----------------------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from ..body.subject import Subject
 from ..compilation import kernel
 from ..diagnostics import drop_consequences
 from ..filters import AboutVertical, Orientation
+from ..filters.phases import find_reference_phases
 from ..filters.sensors import SensorFilters, find_start_orientations
 from ..recording import ImuSensor, OrientationSensor, Recording
 from ..recording.arrivals import unpack_orientations
@@ -99,16 +100,17 @@ class SegmentEstimator:
     def _begin(self, first: Recording) -> SegmentOrientations:
         """Filter and align the first chunk."""
         collect_nominal_mounts(first, self._subject, self._start_pose)  # an error before anything is filtered
-        self._filters = filters = SensorFilters(
-            first,
+        self._phases = phases = find_reference_phases(first, sways=not self._start_pose.table.is_mechanism)
+        self._filters = SensorFilters(
+            phases.noises,
             method=self._options.method,
             static_test=self._options.static_test,
-            sways=not self._start_pose.table.is_mechanism,
+            start=first.span(phases.start),
         )
-        orientation = filters.push(first)
-        R_VS_start = find_start_orientations(first, orientation, filters.start)
-        mounts, headings, diagnostics = align_sensors(first, self._subject, R_VS_start, filters.start, self._start_pose)
-        self.diagnostics = tuple(drop_consequences((*filters.diagnostics, *diagnostics)))
+        orientation = self._filters.push(first)
+        R_VS_start = find_start_orientations(first, orientation, phases.start)
+        mounts, headings, diagnostics = align_sensors(first, self._subject, R_VS_start, phases.start, self._start_pose)
+        self.diagnostics = tuple(drop_consequences((*phases.diagnostics, *diagnostics)))
         self.names, self.rate_hz, self._first = tuple(first.sensors), first.rate_hz, first.cut(slice(0, 1))
         self._measured = np.array([isinstance(each, OrientationSensor) for each in first.sensors.values()], dtype=bool)
         self._lost = np.zeros(len(self.names), dtype=int)  # samples since a measured orientation
@@ -220,8 +222,8 @@ class SegmentEstimator:
                 for i, name in enumerate(self.names)
                 if name in covs
             },
-            start=self._filters.start,
-            static_phase=self._filters.static_phase,
+            start=self._phases.start,
+            static_phase=self._phases.static,
             diagnostics=self.diagnostics,
         )
 
