@@ -74,7 +74,7 @@ TABLE: dict[str, dict[str, tuple[Any, ...]]] = {
     "load_session": {"path": PATH, "gaps": ("no", None)},
     "load_subject": {"path": PATH},
     "load_result": {"folder": (*PATH, "nowhere")},
-    "load_model": {"path": PATH, "lengths": LENGTHS, "segments": ("x", []), "up": ("z", "+w"), "root": (3,)},
+    "load_model": {"path": PATH, "lengths": LENGTHS},
     "population_subject": {"stature": (*POSITIVE, 175.0, 0.3), "sex": NAME},
     "estimate_orientation": {
         "gyro_S": SAMPLES,

@@ -21,7 +21,7 @@ from .anthropometry import SEXES, LengthPrior, compute_population_lengths, conve
 from .body import BodyModel, load_model
 from .chains import Chain
 from .girdle import Girdle, GirdleMotion
-from .reaches import LinkVector
+from .lengths import LinkVector
 from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, Segment
 from .table_file import find_table, load_table, read_table
 from .visuals import Visual

@@ -10,10 +10,8 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import numpy as np
 import pinocchio as pin
 
-from ..errors import BadModel
 from .table import BodyTable
 
 
@@ -31,58 +29,27 @@ class Chain(NamedTuple):
 
 
 def find_chains(model: pin.Model, table: BodyTable) -> dict[str, Chain]:
-    """Find segment → its chain, for segments that the model has, in the order of Pinocchio's joints.
-
-    Raises
-    ------
-    BadModel
-        A mimic joint lies between two segments.
-    """
+    """Find segment → its chain, for segments that the model has, in the order of Pinocchio's joints."""
     frames = {name: model.frames[model.getFrameId(name)] for name in table.segments if model.existFrame(name)}
     at: dict[int, str] = {}  # joint → the first of the segments that it carries; the others are rigid with that
     for segment, frame in frames.items():
         at.setdefault(frame.parentJoint, segment)
     paths = {segment: _find_path(model, joint, at) for joint, segment in at.items()}
-    for segment, (_, joints) in paths.items():
-        for joint in joints:
-            if "Mimic" in model.joints[joint].shortname():
-                raise BadModel(
-                    f"{model.name}: joint '{model.names[joint]}' mimics another and carries '{segment}'; it must be "
-                    f"free or fixed for the segment to be followed"
-                )
     # A joint that moves two segments at once rests.
     times = Counter(joint for _, joints in paths.values() for joint in joints)
     chains = {}
     for segment, frame in sorted(frames.items(), key=lambda item: item[1].parentJoint):
         above, joints = paths.get(segment, (at[frame.parentJoint], []))
         free = [j for j in joints if times[j] == 1 and "Prismatic" not in model.joints[j].shortname()]
-        if not table.segments[segment].spine:
-            free = _take_nearest_three(model, free)
+        while not table.segments[segment].spine and sum(model.nvs[joint] for joint in free[1:]) >= 3:
+            del free[0]
         spherical = [joint for joint in free if model.nvs[joint] == 3]
         chains[segment] = Chain(tuple(free), spherical[-1] if spherical else None, above)
     return chains
 
 
-def axis_in_joint(model: pin.Model, joint: int) -> np.ndarray:
-    """Return the axis (3,) of a joint of one axis in its own frame."""
-    moved = model.joints[joint]
-    data = moved.createData()  # of this joint alone: of the whole model it takes fifty times as long
-    moved.calc(data, pin.neutral(model))
-    return np.asarray(data.S)[3:].copy()
-
-
 def _find_path(model: pin.Model, joint: int, at: Mapping[int, str]) -> tuple[str | None, list[int]]:
     """Find the segment above that which `joint` carries, None: the root, and the joints from there down to `joint`."""
-    path = model.supports[joint].tolist()[1:]
+    path = model.supports[joint].tolist()
     above = [k for k, other in enumerate(path[:-1]) if other in at]
-    return (at[path[above[-1]]], path[above[-1] + 1 :]) if above else (at.get(0) if joint else None, path)
-
-
-def _take_nearest_three(model: pin.Model, joints: list[int]) -> list[int]:
-    """Return the joints nearest to the segment, as many as make three axes, or all."""
-    axes = 0
-    for k, joint in enumerate(reversed(joints)):
-        axes += model.nvs[joint]
-        if axes >= 3:
-            return joints[len(joints) - 1 - k :]
-    return joints
+    return (at[path[above[-1]]], path[above[-1] + 1 :]) if above else (None, path[1:])

@@ -5,13 +5,13 @@ In a spine of several joints each place takes an equal share of the tilt, and th
 takes what they leave, with it the turn about the vertical: a whole turn of the person does not twist the spine.
 
 All else is one least-squares fit within the limits of the joints (`_Fit`): a limb that has fewer axes somewhere, with
-all its segments; a segment of the spine without a spherical joint; all joints of a mechanism. Girdles follow the limbs.
+all its segments; a spine without a spherical joint, with all that hangs on it; all joints of a mechanism. Girdles
+follow the limbs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -21,7 +21,6 @@ from ..compilation import kernel
 from ..errors import BadData, BadModel
 from ..rotations import conjugate, exp, log, multiply, product, rotation_about
 from .body import BodyModel
-from .chains import axis_in_joint
 from .girdle import displace_one, find_girdle_scale
 from .links import compute_link_poses, find_columns
 from .table_file import check_segments
@@ -30,8 +29,6 @@ _MEET_TOLERANCE = 1e-6  # [m] between joints of one place
 _ROUNDS = 100  # of a fit; two to four are the rule from the frame before
 _STEP = 1e-6  # [rad] at which a frame is fitted
 _DAMPING, _MOST_DAMPING = 1e-7, 1e6  # the least; the greatest ends a search that finds nothing better
-_WORTH_ANOTHER_START = np.deg2rad(1.0) ** 2  # [rad²] left, from which another start is tried
-_GROWTH = 1.5  # of what is left, from which it is tried again
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -74,134 +71,105 @@ class ConfigurationSolver:
             raise BadData("no segment has an orientation: a pose needs one")
         check_segments(model.table, segments, f"{model.pin.name}: ", BadModel)
         m = model.pin
-        self._model, self._segments, self._neutral = model, tuple(segments), pin.neutral(m)
+        self._model, self.segments, self._neutral = model, tuple(segments), pin.neutral(m)
         self._last: np.ndarray | None = None  # (nq,) of the frame before
-        self._spherical: list[_SphericalJoint] = []
-        self._bent: list[_BentSpine] = []
-        self._spine_fits: list[_Fit] = []
-        self._fits: list[_Fit] = []
+        fitted = _find_fitted(model, segments)
+        joints = sorted({joint for name in fitted for joint in model.chains[name].joints})
         if model.table.is_mechanism:
-            self._last = self._neutral if start is None else start
-            joints = [joint for joint in range(1, m.njoints) if m.nvs[joint]]  # a mimic joint has none
-            self._fits.append(_Fit(m, self._segments, self._segments, joints, limits, restarts=False))
-        else:
-            self._plan(limits)
-        self._joined = tuple(np.array(column) for column in zip(*self._spherical, strict=True))
+            self._last, joints = self._neutral if start is None else start, list(range(1, m.njoints))
+        self._fit = _Fit(model, fitted, self.segments, joints, limits) if fitted else None
+        self._bent: list[_BentSpine] = []
+        spherical = []
+        for name in self.segments:
+            if model.table.is_mechanism or not model.chains[name].exact:
+                continue
+            above = model.parents[name]
+            while above is not None and not (above in segments and model.chains[above].joints):
+                above = model.parents[above]
+            if len(model.chains[name].joints) == 1:
+                spherical.append(_join_spherical(model, name, above, self.segments))
+            else:
+                self._bent.append(_BentSpine(model, name, above, self.segments, limits))
+        self._spherical = tuple(np.array(column) for column in zip(*spherical, strict=True))
         self._quaternions = np.array([m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4], dtype=int)
         self._girdles = [
-            _PlacedGirdle(model, name, self._segments)
+            _PlacedGirdle(model, name, self.segments)
             for name, girdle in model.table.girdles.items()
-            if girdle.on in self._segments
+            if girdle.on in self.segments
         ]
-
-    def _plan(self, limits: bool) -> None:
-        """Find how each measured segment of a person is followed."""
-        model, segments = self._model, self._model.table.segments
-        data = model.pin.createData()
-        pin.framesForwardKinematics(model.pin, data, self._neutral)
-        for names in _find_limbs(model, self._segments):
-            for name in names:
-                chain, above = model.chains[name], model.parents[name]
-                while above is not None and not (above in self._segments and model.chains[above].joints):
-                    above = model.parents[above]
-                if chain.exact and len(chain.joints) == 1:
-                    self._spherical.append(_join_spherical(model, data, name, above, self._segments))
-                elif chain.exact:
-                    self._bent.append(_BentSpine(model, data, name, above, self._segments, limits))
-            if _is_fitted(model, names):
-                joints = sorted({joint for name in names for joint in model.chains[name].joints})
-                fits = self._spine_fits if segments[names[0]].spine else self._fits
-                fits.append(_Fit(model.pin, names, self._segments, joints, limits, restarts=True))
 
     def solve(self, quat_WL: np.ndarray) -> np.ndarray:
         """Solve for `q` (n, nq) of orientations (n, k, 4) xyzw; they continue the motion of the last call."""
         last = self._last
         q = np.empty((len(quat_WL), len(self._neutral)))
         q[:] = self._neutral
-        self._follow_exactly(q, quat_WL)
-        if self._spine_fits:  # what hangs on them stands elsewhere then
-            stands = quat_WL.copy()
-            for fit in self._spine_fits:
-                fit.run(q, quat_WL, last)
-                R_WL, _ = compute_link_poses(self._model, q, fit.links)
-                for k, row in enumerate(fit.rows):
-                    stands[:, row] = Rotation.from_matrix(R_WL[:, k]).as_quat()
-                self._follow_exactly(q, stands)
-        for fit in self._fits:
-            fit.run(q, quat_WL, last)
+        if self._spherical:
+            _set_relative_rotations(quat_WL, *self._spherical, q)
+        for spine in self._bent:
+            spine.bend(q, quat_WL)
+        if self._fit is not None:
+            self._fit.run(q, quat_WL, last)
         for girdle in self._girdles:
             girdle.place(q, quat_WL)
         _unwrap_signs(q, self._quaternions, q[0] if last is None else last)
         self._last = q[-1].copy()
         return q
 
-    def _follow_exactly(self, q: np.ndarray, stands: np.ndarray) -> None:
-        """Write the joints of segments that follow exactly; `stands` (n, k, 4): the orientations of the segments."""
-        if self._joined:
-            _set_relative_rotations(stands, *self._joined, q)
-        for spine in self._bent:
-            spine.bend(q, stands)
 
-
-def _find_limbs(model: BodyModel, measured: Collection[str]) -> list[list[str]]:
-    """Find the measured segments of each limb, and each segment of the spine by itself, the spine first."""
-    parents, segments = model.parents, model.table.segments
-
-    def first_of_limb(segment: str) -> str:
-        above = parents[segment]
-        return segment if above is None or segments[segment].spine or segments[above].spine else first_of_limb(above)
-
-    limbs: dict[str, list[str]] = {}
-    for segment in model.chains:
-        if segment in measured:
-            limbs.setdefault(first_of_limb(segment), []).append(segment)
-    return sorted(limbs.values(), key=lambda names: not segments[names[0]].spine)
-
-
-def _is_fitted(model: BodyModel, limb: Collection[str]) -> bool:
-    """Return whether a segment of a limb has joints that cannot follow every orientation."""
-    return any(model.chains[name].joints and not model.chains[name].exact for name in limb)
+def _find_fitted(model: BodyModel, measured: Collection[str]) -> list[str]:
+    """Find the measured segments that are fitted: of a mechanism all, of a person all of a limb whose joints cannot
+    follow every orientation, and what hangs on such a spine.
+    """
+    if model.table.is_mechanism:
+        return list(measured)
+    limb: dict[str, str] = {}  # segment → the first of its limb; one of the spine is its own
+    for name, chain in model.chains.items():
+        spine = chain.above is None or any(model.table.segments[each].spine for each in (name, chain.above))
+        limb[name] = name if spine or chain.above is None else limb[chain.above]
+    inexact = {limb[name] for name in measured if model.chains[name].joints and not model.chains[name].exact}
+    fitted: list[str] = []
+    for name, chain in model.chains.items():
+        if name in measured and (limb[name] in inexact or chain.above in fitted):
+            fitted.append(name)
+    return fitted
 
 
 # Exactly ----------------------------------------------------------------------------------------------------------
 
 
-class _SphericalJoint(NamedTuple):
-    """A spherical joint that takes the rotation of its segment L against the measured segment A above, or W."""
-
-    row: int  # of its segment
-    above: int  # row of the segment above; -1: W
-    left: np.ndarray  # (4,) R_JA, all joints at zero
-    right: np.ndarray  # (4,) R_LJ
-    at: int  # its place in q
-
-
 def _join_spherical(
-    model: BodyModel, data: pin.Data, segment: str, above: str | None, segments: Sequence[str]
-) -> _SphericalJoint:
+    model: BodyModel, segment: str, above: str | None, segments: Sequence[str]
+) -> tuple[int, int, np.ndarray, np.ndarray, int]:
+    """Join a segment L to the measured segment A above, or W, by a spherical joint J, which takes its rotation.
+
+    Returns the rows of L and A (-1: W), R_JA and R_LJ (4,) with all joints at zero, and the joint's place in `q`.
+    """
     joint = model.chains[segment].spherical
-    R_AJ, R_AL = _stand_at_zero(model, data, segment, above, [joint])
+    R_AJ, R_AL = _compare_at_zero(model, segment, above, [joint])
     left, right = R_AJ[0].inv(), R_AL.inv() * R_AJ[0]
     row = -1 if above is None else segments.index(above)
-    return _SphericalJoint(segments.index(segment), row, left.as_quat(), right.as_quat(), model.pin.idx_qs[joint])
+    return segments.index(segment), row, left.as_quat(), right.as_quat(), model.pin.idx_qs[joint]
 
 
-def _stand_at_zero(
-    model: BodyModel, data: pin.Data, segment: str, above: str | None, joints: Sequence[int | None]
+def _compare_at_zero(
+    model: BodyModel, segment: str, above: str | None, joints: Sequence[int | None]
 ) -> tuple[Rotation, Rotation]:
-    """Find R_AJ of joints' moving frames and R_AL of a segment, A the segment above or W.
+    """Find R_AJ of joints' moving frames and R_AL of a segment with all joints at zero, A the segment above or W."""
+    R_AW = np.eye(3) if above is None else model.neutral_rotations[above].T
+    data = _stand_at_zero(model.pin)
+    R_AJ = [R_AW @ data.oMi[joint].rotation for joint in joints]
+    return Rotation.from_matrix(R_AJ), Rotation.from_matrix(R_AW @ model.neutral_rotations[segment])
 
-    `data` is Pinocchio's with all joints at zero.
-    """
-    m = model.pin
-    R_WA = np.eye(3) if above is None else data.oMf[m.getFrameId(above)].rotation
-    R_AJ = [R_WA.T @ data.oMi[joint].rotation for joint in joints]
-    return Rotation.from_matrix(R_AJ), Rotation.from_matrix(R_WA.T @ data.oMf[m.getFrameId(segment)].rotation)
+
+def _stand_at_zero(m: pin.Model) -> pin.Data:
+    data = m.createData()
+    pin.forwardKinematics(m, data, pin.neutral(m))
+    return data
 
 
 @kernel
 def _set_relative_rotations(quat, rows, above, left, right, at, q):  # type: ignore[no-untyped-def]
-    """Write R_JA R_AW R_WL R_LJ of each `_SphericalJoint` into `q` (n, nq), from `quat` (n, k, 4) xyzw."""
+    """Write R_JA R_AW R_WL R_LJ of each row of `_join_spherical` into `q` (n, nq), from `quat` (n, k, 4) xyzw."""
     for j in range(len(rows)):
         for i in range(len(quat)):
             x, y, z, w = left[j, 0], left[j, 1], left[j, 2], left[j, 3]
@@ -234,17 +202,11 @@ class _BentSpine:
     """
 
     def __init__(
-        self,
-        model: BodyModel,
-        data: pin.Data,
-        segment: str,
-        above: str | None,
-        segments: Sequence[str],
-        limits: bool,
+        self, model: BodyModel, segment: str, above: str | None, segments: Sequence[str], limits: bool
     ) -> None:
-        m, chain = model.pin, model.chains[segment]
+        m, chain, data = model.pin, model.chains[segment], _stand_at_zero(model.pin)
         self._row, self._above = segments.index(segment), -1 if above is None else segments.index(above)
-        R_AJ, R_AL = _stand_at_zero(model, data, segment, above, chain.joints)
+        R_AJ, R_AL = _compare_at_zero(model, segment, above, chain.joints)
         self._quat_LA, self._up_A = R_AL.inv().as_quat(), R_AL.apply([0.0, 0.0, 1.0])
         places: list[list[int]] = []  # joints that meet in one point
         for joint in chain.joints:
@@ -257,30 +219,27 @@ class _BentSpine:
         for place in places:
             spherical = [joint for joint in place if m.nvs[joint] == 3]
             for joint in spherical[-1:] or place:
-                R, at = R_AJ[chain.joints.index(joint)], m.idx_qs[joint]
-                axis = None if spherical else R.apply(axis_in_joint(m, joint))
-                bounded = limits and m.nqs[joint] == 1
-                ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if bounded else (-np.inf, np.inf)
-                self._joints.append((joint == chain.spherical, at, m.nqs[joint], R.as_quat(), axis, ends))
+                R, at, ends = R_AJ[chain.joints.index(joint)], m.idx_qs[joint], (-np.inf, np.inf)
+                if limits and m.nqs[joint] == 1:
+                    ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at])
+                axis = None if spherical else R.apply(m.joints[joint].extract().axis)
+                self._joints.append((joint == chain.spherical, at, R.as_quat(), axis, ends))
 
-    def bend(self, q: np.ndarray, stands: np.ndarray) -> None:
-        """Write the joints' values into `q` (n, nq); `stands` (n, k, 4) xyzw."""
-        R_WA = stands[:, self._above] if self._above >= 0 else _IDENTITY
-        turned = multiply(multiply(conjugate(R_WA), stands[:, self._row]), self._quat_LA)
+    def bend(self, q: np.ndarray, quat_WL: np.ndarray) -> None:
+        """Write the joints' values into `q` (n, nq); `quat_WL` (n, k, 4) xyzw."""
+        R_WA = quat_WL[:, self._above] if self._above >= 0 else _IDENTITY
+        turned = multiply(multiply(conjugate(R_WA), quat_WL[:, self._row]), self._quat_LA)
         share = self._share * log(_remove_turn(turned, self._up_A))  # (n, 3)
         before, after, free = _IDENTITY, _IDENTITY, (0, _IDENTITY)
-        for is_free, at, size, quat_AJ, axis, ends in self._joints:
+        for is_free, at, quat_AJ, axis, ends in self._joints:
             if is_free:
                 free, before, after = (at, quat_AJ), after, _IDENTITY
-                continue
-            if axis is None:
-                rotation = exp(share)
-                q[:, at : at + 4] = multiply(multiply(conjugate(quat_AJ), rotation), quat_AJ)
+            elif axis is None:
+                q[:, at : at + 4] = multiply(multiply(conjugate(quat_AJ), exp(share)), quat_AJ)
+                after = multiply(after, exp(share))
             else:
-                angle = np.clip(share @ axis, *ends)
-                q[:, at : at + size] = np.transpose([angle] if size == 1 else [np.cos(angle), np.sin(angle)])
-                rotation = rotation_about(axis, angle)
-            after = multiply(after, rotation)
+                q[:, at] = np.clip(share @ axis, *ends)
+                after = multiply(after, rotation_about(axis, q[:, at]))
         rotation = multiply(multiply(conjugate(before), turned), conjugate(after))
         at, quat_AJ = free
         q[:, at : at + 4] = multiply(multiply(conjugate(quat_AJ), rotation), quat_AJ)
@@ -300,7 +259,9 @@ def _remove_turn(quat: np.ndarray, up: np.ndarray) -> np.ndarray:
 class _Fit:
     """Configurations in which links come nearest to orientations: the sum over the links of angle² is least.
 
-    Gauss-Newton with Levenberg's damping on Pinocchio's Jacobian, each frame from the solution of the one before.
+    Gauss-Newton with Levenberg's damping on Pinocchio's Jacobian, each frame from the solution of the one before;
+    spherical joints of a person begin where they follow exactly.
+
     Limits are kept by projection: a joint at its limit that the gradient pushes outward takes no part in the step, and
     what a step carries over a limit ends on it (Bertsekas 1982, "Projected Newton methods for optimization problems
     with simple constraints", SIAM J. Control 20:221). Joints that the links do not determine move as little as possible
@@ -308,23 +269,16 @@ class _Fit:
 
     Parameters
     ----------
-    segments : the measured ones, `links` are some of them
+    links : the fitted ones of the measured `segments`
     joints : those that may move
     limits : keep the limits of joints with one axis
-    restarts : try a frame's own start too where the one from the frame before leaves much
     """
 
     def __init__(
-        self,
-        model: pin.Model,
-        links: Sequence[str],
-        segments: Sequence[str],
-        joints: Sequence[int],
-        limits: bool,
-        restarts: bool,
+        self, body: BodyModel, links: Sequence[str], segments: Sequence[str], joints: Sequence[int], limits: bool
     ) -> None:
-        self._restarts, self._least_left = restarts, np.inf  # [rad²] since another start was tried
-        self.links, self.rows = list(links), [segments.index(link) for link in links]
+        model, is_mechanism = body.pin, body.table.is_mechanism
+        self._rows = [segments.index(link) for link in links]
         self._model, self._data = model, model.createData()
         frames = [model.frames[model.getFrameId(link)] for link in links]
         # The joint's frame is compared in place of the link's, which is fixed to it: its rotation comes for nothing.
@@ -336,7 +290,8 @@ class _Fit:
             moves[k, find_columns(model, model.supports[frame.parentJoint].tolist()[1:])] = True
         self._pull = moves[:, self._columns].astype(float).T  # (f, m): which links a column turns
         self._both = self._pull @ self._pull.T  # (f, f): how many links two columns both turn
-        self._places = np.concatenate([model.idx_qs[j] + np.arange(model.nqs[j]) for j in joints])  # in q
+        begin = [j for j in joints if is_mechanism or model.nqs[j] == 1]  # where they were in the frame before
+        self._places = np.array([model.idx_qs[j] + k for j in begin for k in range(model.nqs[j])], dtype=int)
         bounded = [j for j in joints if model.nqs[j] == 1] if limits else []
         self._at = np.array([model.idx_qs[joint] for joint in bounded], dtype=int)
         self._lower, self._upper = model.lowerPositionLimit[self._at], model.upperPositionLimit[self._at]
@@ -347,25 +302,15 @@ class _Fit:
 
         Parameters
         ----------
-        q : with the joints that may move at each frame's own start
         quat_WL : (n, k, 4) xyzw of the segments
-        last : (nq,) the frame before the first; None: the first begins at its own start
+        last : (nq,) the frame before the first; None: there is none
         """
-        quat = quat_WL[:, self.rows].reshape(-1, 4)
+        quat = quat_WL[:, self._rows].reshape(-1, 4)
         targets = Rotation.from_quat(quat).as_matrix().reshape(len(q), -1, 3, 3) @ self._R_LJ
         for k, R in enumerate(targets):
-            start = self._keep_limits(q[k].copy())
             if last is not None:
                 q[k, self._places] = last[self._places]
-            last, left = self._solve(self._keep_limits(q[k].copy()), R)
-            if self._restarts and left > max(_WORTH_ANOTHER_START, _GROWTH * self._least_left):
-                # What was nearest before may have become the shallower of two valleys.
-                other, less = self._solve(start, R)
-                if less < left:
-                    last, left = other, less
-                self._least_left = left
-            self._least_left = min(self._least_left, left)
-            q[k] = last
+            last = q[k] = self._solve(self._keep_limits(q[k].copy()), R)
 
     def _keep_limits(self, q: np.ndarray) -> np.ndarray:
         q[self._at] = np.clip(q[self._at], self._lower, self._upper)
@@ -377,13 +322,13 @@ class _Fit:
         e = np.array([pin.log3(R @ view.T) for R, view in zip(R_target, self._views, strict=True)])
         return float(np.sum(e * e)), e
 
-    def _solve(self, q: np.ndarray, R_target: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return the configuration (nq,) that is nearest from the start `q`, and what is left [rad²]."""
+    def _solve(self, q: np.ndarray, R_target: np.ndarray) -> np.ndarray:
+        """Return the configuration (nq,) that is nearest from the start `q`."""
         left, e = self._compare(q, R_target)
         damping = _DAMPING
         step = np.zeros(self._model.nv)
         for _ in range(_ROUNDS):
-            J = self._data.J[3:, self._columns]
+            J = self._data.J.reshape(6, -1)[3:, self._columns]
             g = np.einsum("if,fi->f", J, self._pull @ e)  # downhill; exact, as log(R)ᵀ is its own under its Jacobian
             free = np.ones(len(g), dtype=bool)
             push, value = g[self._bounded], q[self._at]
@@ -404,7 +349,7 @@ class _Fit:
             damping = max(_DAMPING, 0.1 * damping)
             if np.abs(step).max() < _STEP:
                 break
-        return q, left
+        return q
 
 
 def compute_orientation_residuals(
@@ -414,12 +359,8 @@ def compute_orientation_residuals(
 
     Only for segments whose orientation the joints cannot reproduce exactly; for all of a mechanism.
     """
-    limited = list(quat_WL)
-    if not model.table.is_mechanism:
-        fitted = {name for names in _find_limbs(model, quat_WL) if _is_fitted(model, names) for name in names}
-        limited = [
-            name for name, chain in model.chains.items() if name in quat_WL and (name in fitted or not chain.exact)
-        ]
+    fitted = _find_fitted(model, quat_WL)
+    limited = [name for name, chain in model.chains.items() if name in quat_WL and (name in fitted or not chain.exact)]
     if not limited:
         return {}
     R_WL, _ = compute_link_poses(model, q, limited)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from .body import BodyModel
 from .girdle import PARAMETERS
+from .lengths import UNIVERSE, LinkVector
 from .links import find_carrier, find_known_points, move_girdles
-from .reaches import UNIVERSE, LinkVector
 
 
 def compute_point_covariances(

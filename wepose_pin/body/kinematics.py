@@ -138,7 +138,7 @@ def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.nd
     return KinematicsSolver(model, quat_WL, limits=limits).solve_chunk(time, quat_WL)
 
 
-class KinematicsSolver:
+class KinematicsSolver(ConfigurationSolver):
     """Poses from orientations, chunk by chunk or one after another: each continues the motion of the last.
 
     Parameters
@@ -162,27 +162,22 @@ class KinematicsSolver:
     def __init__(
         self, model: BodyModel, segments: Collection[str], *, limits: bool = True, start: np.ndarray | None = None
     ) -> None:
-        self._solver = ConfigurationSolver(model, segments, limits=limits, start=start)
-        self.segments, self.points = tuple(segments), tuple(find_known_points(model, segments))
-        self._model, self.data = model, model.pin.createData()
+        super().__init__(model, segments, limits=limits, start=start)
+        self.points, self.data = tuple(find_known_points(model, segments)), model.pin.createData()
         self._frames = [model.point_frames[point] for point in self.points]
         self._views = [self.data.oMf[model.pin.getFrameId(frame)].translation for frame in self._frames]
         self._last_quats: dict[str, np.ndarray] = {}
-        self._last_joints: dict[str, float] = {}
 
     def solve_chunk(self, time: np.ndarray, quat_WL: Mapping[str, np.ndarray]) -> Pose:
         """Compute the pose of the next chunk: `time` (n,) [s], segment → (n, 4) xyzw."""
-        q, joints = self._solver.solve(np.stack([quat_WL[name] for name in self.segments], axis=1)), {}
-        if self._model.table.is_mechanism:
-            R_WL, p_W = compute_link_poses(self._model, q, [*self._frames, *quat_WL])
-            quat_WL = {
-                name: Rotation.from_matrix(R_WL[:, k]).as_quat()
-                for k, name in enumerate(quat_WL, start=len(self._frames))
-            }
-            joints = compute_joint_values(self._model.pin, q, self._last_joints)
-            self._last_joints = {name: float(values[-1]) for name, values in joints.items()}
-        else:
-            _, p_W = compute_link_poses(self._model, q, self._frames, rotations=False)
+        q, joints = self.solve(np.stack([quat_WL[name] for name in self.segments], axis=1)), {}
+        is_mechanism = self._model.table.is_mechanism
+        links = [*self._frames, *(quat_WL if is_mechanism else ())]
+        R_WL, p_W = compute_link_poses(self._model, q, links, rotations=is_mechanism)
+        if is_mechanism:
+            fitted = enumerate(quat_WL, start=len(self._frames))
+            quat_WL = {name: Rotation.from_matrix(R_WL[:, k]).as_quat() for k, name in fitted}
+            joints = compute_joint_values(self._model.pin, q)
         points = {point: p_W[:, k] for k, point in enumerate(self.points)}
         quats = {name: unwrap_signs(quat, self._last_quats.get(name)) for name, quat in quat_WL.items()}
         self._last_quats = {name: quat[-1].copy() for name, quat in quats.items()}
@@ -190,7 +185,7 @@ class KinematicsSolver:
 
     def compute_points(self, quat_WL: np.ndarray) -> np.ndarray:
         """Compute the points (p, 3) [m] in W of the next pose, from `quat_WL` (k, 4) xyzw."""
-        pin.framesForwardKinematics(self._model.pin, self.data, self._solver.solve(quat_WL[None])[0])
+        pin.framesForwardKinematics(self._model.pin, self.data, self.solve(quat_WL[None])[0])
         return np.array(self._views)
 
     def orient_segments(self, quat_WL: np.ndarray) -> np.ndarray:

@@ -1,24 +1,31 @@
-"""The lengths of a body: measured between its points, and set by stretching its segments."""
+"""The lengths of a body: measured between its points, set by stretching its segments, and the ways to its points.
+
+A point is p_W = Σ R_WK (B l + c) over the links K between the root and the point, with l the lengths: each link
+contributes a vector that is affine in the lengths and constant in the link. The joints of a girdle stand at zero here:
+what they add is in `girdle`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from ..errors import BadModel
 from .table import ROOT, BodyTable, Stretch
-from .tree import Tree, copy_robot, parse_tree
+from .tree import Tree, copy_robot, joint_placement, parse_tree
 
-_TOLERANCE = 1e-13  # [m]
-_MOST_ROUNDS = 50  # one is enough where every point lies on its joint
+UNIVERSE = "universe"  # the link of what is rigid with the root
+_TOLERANCE = 1e-9  # [m] by which a length may miss what it is set to
 _LEAST = 1e-6  # [m] of a length
+_DECIMALS = 13  # of a vector [m] and of its change per metre of a length; what is beyond is rounding
 
 
 def measure_lengths(robot: Any, table: BodyTable) -> dict[str, float]:
     """The lengths [m] between the points of `robot` (yourdfpy), all joints at zero; the mean where parts share one."""
-    at = _points(parse_tree(robot, robot.name), table)
+    at = _find_points(parse_tree(robot, robot.name), table)
     return {
         name: float(np.mean([np.linalg.norm(_line(at, part)) for part in length.stretches]))
         for name, length in table.lengths.items()
@@ -29,119 +36,95 @@ def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> 
     """A copy of the robot with these lengths [m], each of which it has.
 
     A segment stretches along the line of its length, all joints at zero; one of several lengths along each of them.
+
+    Raises
+    ------
+    BadModel
+        Stretching the segments does not give the lengths.
     """
     robot = copy_robot(robot)
-    for _ in range(_MOST_ROUNDS):
-        own = measure_lengths(robot, table)
-        ratio = {name: value / own[name] for name, value in targets.items() if abs(own[name] - value) > _TOLERANCE}
-        if not ratio:
-            break
-        _stretch(robot, table, ratio)
+    tree = parse_tree(robot, robot.name)
+    own, projections = measure_lengths(robot, table), _find_projections(tree, table)
+    ratio = {name: value / own[name] for name, value in targets.items()}
+    of_link: dict[str, np.ndarray] = {}  # S_W (3, 3)
+    of_joint: dict[str, np.ndarray] = {}
+    for segment, parts in projections.items():
+        S_W = np.eye(3) + sum((ratio.get(name, 1.0) - 1.0) * P for name, P in parts.items())
+        links, joints = _find_stretched(tree, table, segment)
+        of_link |= dict.fromkeys(links, S_W)
+        of_joint |= dict.fromkeys(joints, S_W)
+    placed = {link.name: tree.neutral(link.name)[:3, :3] for link in robot.links}
+    for joint in robot.joints:
+        if joint.name in of_joint and joint.origin is not None:
+            R_WK = placed[joint.parent]
+            joint.origin[:3, 3] = R_WK.T @ of_joint[joint.name] @ R_WK @ joint.origin[:3, 3]
+    for link in robot.links:
+        if link.name in of_link:
+            _stretch_link(link, placed[link.name].T @ of_link[link.name] @ placed[link.name])
+    reached = measure_lengths(robot, table)
+    for name, value in targets.items():
+        if abs(reached[name] - value) > _TOLERANCE:
+            segments = " and ".join(part.segment for part in table.lengths[name].stretches)
+            raise BadModel(
+                f"{table.where}: lengths.{name}: stretching {segments} does not move its points apart by as much; name "
+                f"the segment between them"
+            )
     return robot
 
 
-def check_lengths_scale(robot: Any, table: BodyTable) -> None:
-    """Raise `BadModel` where a length's points lie in one place, or stretching its segment does not move them apart."""
-    own = measure_lengths(robot, table)
-    for name, value in own.items():
-        if value < _LEAST:
-            raise BadModel(f"{table.where}: lengths.{name}: its points lie in one place; it scales nothing")
-    for name, value in own.items():
-        changed = copy_robot(robot)
-        _stretch(changed, table, {name: 1.1})
-        if abs(measure_lengths(changed, table)[name] - 1.1 * value) > 0.05 * value:
-            segments = " and ".join(part.segment for part in table.lengths[name].stretches)
-            raise BadModel(
-                f"{table.where}: lengths.{name}: scales nothing: stretching {segments} does not move its points apart; "
-                f"name the segment between them"
-            )
-
-
-def _points(tree: Tree, table: BodyTable) -> dict[str, np.ndarray]:
+def _find_points(tree: Tree, table: BodyTable) -> dict[str, np.ndarray]:
     return {ROOT: np.zeros(3)} | {name: tree.neutral(point.link)[:3, 3] for name, point in table.points.items()}
 
 
 def _line(at: Mapping[str, np.ndarray], part: Stretch) -> np.ndarray:
     """The line (3,) [m] that a length measures."""
     first, last = (np.sum([at[point] for point in points], axis=0) / len(points) for points in (part.start, part.end))
-    return last - first
+    return np.asarray(last - first)
 
 
-def _stretch(robot: Any, table: BodyTable, ratio: Mapping[str, float]) -> None:
-    """Make the lengths longer by `ratio`.
-
-    To a segment belong all links from its own down to the next segments, to one of the spine also the spine below it,
-    down to the next segment or the root, which keep their shape.
-    """
-    tree = parse_tree(robot, robot.name)
-    at = _points(tree, table)
-    starts = {name: tree.body(segment.link) for name, segment in table.segments.items()}
-    of_link: dict[str, np.ndarray] = {}  # (3, 3) in W
-    of_joint: dict[str, np.ndarray] = {}
-    for segment, start in starts.items():
-        S_W = _segment_stretch(segment, table, at, ratio)
-        if S_W is None:
+def _find_projections(tree: Tree, table: BodyTable) -> dict[str, dict[str, np.ndarray]]:
+    """Segment → its lengths → P (3, 3): S_W = 1 + Σ (ratio − 1) P stretches the segment, all joints at zero."""
+    at = _find_points(tree, table)
+    projections: dict[str, dict[str, np.ndarray]] = {}
+    for segment in table.segments:
+        lines = {
+            name: _line(at, part)
+            for name, length in table.lengths.items()
+            for part in length.stretches
+            if part.segment == segment
+        }
+        if not lines:
             continue
-        links = _links_between(tree, start, set(starts.values()))
-        if table.segments[segment].spine:
-            below = [joint.parent for joint in tree.path(start)]
-            bases = [link for name, link in starts.items() if name != segment and link in below]
-            if bases:
-                below = below[max(below.index(link) for link in bases) :]
-            of_joint |= {joint.name: S_W for joint in tree.path(start) if joint.parent in below}
-            links += below[1:]
-        of_link |= dict.fromkeys(links, S_W)
-        of_joint |= {joint.name: S_W for link in links for joint in tree.below[link]}
-    for joint in robot.joints:
-        if joint.name in of_joint and joint.origin is not None:
-            joint.origin[:3, 3] = _rotate_to_link(tree, joint.parent, of_joint[joint.name]) @ joint.origin[:3, 3]
-    for link in robot.links:
-        if link.name in of_link:
-            _stretch_link(link, _rotate_to_link(tree, link.name, of_link[link.name]))
+        basis = np.array([line / max(np.linalg.norm(line), _LEAST) for line in lines.values()]).T  # (3, k)
+        if np.linalg.matrix_rank(basis, tol=1e-6) < len(lines):
+            raise BadModel(
+                f"{table.where}: lengths.{', lengths.'.join(lines)}: cannot stretch segment '{segment}' independently; "
+                f"up to three lengths in different directions are possible, between points in different places"
+            )
+        # Across the lines of one or two lengths nothing changes.
+        dual = np.linalg.pinv(basis)
+        projections[segment] = {name: np.outer(basis[:, k], dual[k]) for k, name in enumerate(lines)}
+    return projections
 
 
-def _segment_stretch(
-    segment: str, table: BodyTable, at: Mapping[str, np.ndarray], ratio: Mapping[str, float]
-) -> np.ndarray | None:
-    """The stretch (3, 3) in W of a segment by its lengths; None where none of them changes."""
-    lines = [
-        (_line(at, part), ratio.get(name, 1.0))
-        for name, length in table.lengths.items()
-        for part in length.stretches
-        if part.segment == segment
-    ]
-    if all(factor == 1.0 for _, factor in lines):
-        return None
-    if len(lines) == 1:
-        line, factor = lines[0]
-        along = line / np.linalg.norm(line)
-        return np.eye(3) + (factor - 1.0) * np.outer(along, along)
-    directions = np.array([line for line, _ in lines])  # (k, 3)
-    if len(lines) == 2:
-        directions = np.vstack([directions, np.cross(directions[1], directions[0])])
-    if len(lines) > 3 or abs(np.linalg.det(directions)) <= 1e-9 * np.prod(np.linalg.norm(directions, axis=1)):
-        names = [name for name, length in table.lengths.items() if any(p.segment == segment for p in length.stretches)]
-        raise BadModel(
-            f"{table.where}: lengths.{', lengths.'.join(names)}: all of segment '{segment}', which they cannot stretch "
-            f"independently; up to three lengths in different directions are possible"
-        )
-    basis = directions.T
-    factors = [factor for _, factor in lines] + [1.0] * (3 - len(lines))
-    return basis @ np.diag(factors) @ np.linalg.inv(basis)
+def _find_stretched(tree: Tree, table: BodyTable, segment: str) -> tuple[list[str], list[str]]:
+    """The links and joints of a segment, which stretch with it.
 
-
-def _links_between(tree: Tree, start: str, others: set[str]) -> list[str]:
-    """`start` and the links below it, without the links `others` and what is below them."""
-    links, to_do = [], [start]
-    while to_do:
-        links.append(link := to_do.pop())
-        to_do += [joint.child for joint in tree.below[link] if joint.child not in others]
-    return links
-
-
-def _rotate_to_link(tree: Tree, link: str, S_W: np.ndarray) -> np.ndarray:
-    R_WK = tree.neutral(link)[:3, :3]
-    return R_WK.T @ S_W @ R_WK
+    These are the links from its own down to the next segments, to one of the spine also the spine below it, down to the
+    next segment or the root, which keep their shape.
+    """
+    starts = {name: tree.body(each.link) for name, each in table.segments.items()}
+    start = starts[segment]
+    links = tree.hanging(start, set(starts.values()))
+    joints = [joint.name for link in links for joint in tree.below[link]]
+    if table.segments[segment].spine:
+        spine = tree.path(start)
+        bases = [k for k, joint in enumerate(spine) if joint.parent in set(starts.values())]
+        spine = spine[bases[-1] if bases else 0 :]
+        links += [joint.parent for joint in spine[1:]]
+        joints += [joint.name for link in (joint.parent for joint in spine[1:]) for joint in tree.below[link]]
+        joints += [spine[0].name] if spine else []
+    return links, joints
 
 
 def _stretch_link(link: Any, S: np.ndarray) -> None:
@@ -172,3 +155,60 @@ def _stretch_link(link: Any, S: np.ndarray) -> None:
         inertia = R @ inertial.inertia @ R.T
         second = volume * S @ (0.5 * np.trace(inertia) * np.eye(3) - inertia) @ S.T
         inertial.inertia = R.T @ (np.trace(second) * np.eye(3) - second) @ R
+
+
+class LinkVector(NamedTuple):
+    """A link's part of the way from the root to a point, in its frame [m]: ``by_length @ lengths + constant``."""
+
+    by_length: np.ndarray  # (3, k), lengths in the order of the table
+    constant: np.ndarray  # (3,) [m]
+
+
+def measure_reaches(
+    robot: Any, table: BodyTable, model: pin.Model, neutral: Mapping[str, np.ndarray]
+) -> dict[str, dict[str, LinkVector]]:
+    """Measure point → link → its part of the way from the root.
+
+    A link is a segment; what a joint between segments moves has the joint's name and frame, and what is rigid with the
+    root is `UNIVERSE`.
+
+    Parameters
+    ----------
+    robot, model : the body, in yourdfpy and in Pinocchio
+    neutral : link → its R_WK (3, 3) with all joints at zero
+
+    Raises
+    ------
+    BadModel
+        A joint that slides: orientations do not tell where the point is.
+    """
+    tree = parse_tree(robot, robot.name)
+    own = measure_lengths(robot, table)
+    names = {joint: model.names[joint] for joint in range(model.njoints)}
+    for segment in reversed(list(table.segments)):  # of segments that are rigid with one another the first
+        names[model.frames[model.getFrameId(segment)].parentJoint] = segment
+    stretches: dict[str, dict[str, np.ndarray]] = {}
+    for segment, parts in _find_projections(tree, table).items():
+        stretches |= dict.fromkeys(_find_stretched(tree, table, segment)[1], parts)
+    follow = {joint for girdle in table.girdles.values() for joint in girdle.joints}
+    reaches: dict[str, dict[str, LinkVector]] = {}
+    for point, place in table.points.items():
+        sums: dict[str, np.ndarray] = {}  # (3, k + 1) [m] in the link: by each length's ratio, and what is left
+        for joint in tree.path(place.link):
+            if joint.type == "prismatic" and joint.name not in follow:
+                raise BadModel(f"{robot.name}: joint '{joint.name}' slides: orientations do not tell where {point} is")
+            if not model.existFrame(joint.parent):
+                continue  # between the axes of a spherical joint
+            link = names[model.frames[model.getFrameId(joint.parent)].parentJoint]
+            step = tree.neutral(joint.parent)[:3, :3] @ joint_placement(joint)[:3, 3]
+            parts = stretches.get(joint.name, {})
+            columns = [parts[name] @ step if name in parts else np.zeros(3) for name in own]
+            vectors = np.column_stack([*columns, step - np.sum(columns, axis=0) if columns else step])
+            sums[link] = sums.get(link, 0.0) + neutral[link].T @ vectors
+        reaches[point] = {}
+        for link, vectors in sums.items():
+            by_length = np.round(vectors[:, :-1] / list(own.values()), _DECIMALS) + 0.0  # no negative zeros
+            constant = np.round(vectors[:, -1], _DECIMALS) + 0.0
+            if by_length.any() or constant.any():
+                reaches[point][link] = LinkVector(by_length, constant)
+    return reaches

@@ -93,13 +93,9 @@ def find_carrier(model: BodyModel, link: str, measured: Collection[str]) -> str 
 
 
 def find_known_points(model: BodyModel, segments: Iterable[str]) -> list[str]:
-    """Find the points that follow from the measured segments: those that no open motion moves.
-
-    Of a person a segment without a sensor is rigid with the one above where the table says so, else its joints are
-    open, and joints that set no segment rest.
-    """
+    """Find the points that follow from the measured segments: those that no open motion moves."""
     points = model.point_frames
-    moved = _move_frames(model, segments, list(points.values()))[:, :3]
+    moved = _find_open_motions(model, list(segments), list(points.values()))[1][:, :3]
     return [point for point, J in zip(points, moved, strict=True) if not np.any(np.abs(J) > _DETERMINED)]
 
 
@@ -111,7 +107,7 @@ def find_known_links(model: BodyModel, segments: Iterable[str]) -> list[str]:
         carriers = {m.frames[m.getFrameId(segment)].parentJoint for segment in segments}
         above = {0}.union(*(m.supports[carrier].tolist() for carrier in carriers))
         return [link for link in links if m.frames[m.getFrameId(link)].parentJoint in above]
-    moved = _move_frames(model, segments, links)
+    moved = _find_open_motions(model, segments, links)[1]
     return [link for link, J in zip(links, moved, strict=True) if not np.any(np.abs(J) > _DETERMINED)]
 
 
@@ -121,51 +117,42 @@ def find_undetermined_joints(model: BodyModel, segments: Iterable[str]) -> list[
     Joints that stand in line for a moment do not count.
     """
     m = model.pin
-    _, null = _find_open_motions(m, list(segments), np.arange(m.nv))
-    share = np.linalg.norm(null, axis=1)
+    share = np.linalg.norm(_find_open_motions(model, list(segments), [])[0], axis=1)
     return [m.names[j] for j in range(1, m.njoints) if np.any(share[m.idx_vs[j] : m.idx_vs[j] + m.nvs[j]] > _OPEN)]
 
 
-def _move_frames(model: BodyModel, segments: Iterable[str], frames: Sequence[str]) -> np.ndarray:
-    """Compute by how much open motions move frames and rotate them (m, 6, k)."""
-    m, segments, columns = model.pin, list(segments), np.arange(model.pin.nv)
+def _find_open_motions(
+    model: BodyModel, segments: Sequence[str], links: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the motions (nv, k) that rotate no measured segment, and by how much they move and rotate links (m, 6, k).
+
+    Of a person a segment without a sensor is rigid with the one above where the table says so, else its joints are
+    open, and joints that set no segment rest. In the configuration no joints stand in line by chance.
+    """
+    m, rng = model.pin, np.random.default_rng(0)
+    free = set(range(1, m.njoints))
     if not model.table.is_mechanism:
-        free: set[int] = set()
+        free = set()
         for segment, chain in model.chains.items():
             if segment in segments:
                 free.update(chain.joints if chain.spherical is None else (chain.spherical,))
             elif not model.table.segments[segment].rigid_without_sensor:
                 free.update(chain.joints)
-        columns = find_columns(m, sorted(free))
-    data, null = _find_open_motions(m, segments, columns)
-    J = [pin.getFrameJacobian(m, data, m.getFrameId(name), pin.LOCAL_WORLD_ALIGNED) for name in frames]
-    return np.reshape(J, (len(frames), 6, m.nv)) @ null
-
-
-def _find_open_motions(m: pin.Model, links: Sequence[str], columns: np.ndarray) -> tuple[pin.Data, np.ndarray]:
-    """Find the motions (nv, k) of the free `columns` that rotate none of `links`, in a generic configuration.
-
-    First: Pinocchio's data with the Jacobians of that configuration, which is within the limits, and in which no joints
-    stand in line by chance.
-    """
-    rng = np.random.default_rng(0)
+    columns = find_columns(m, sorted(free))
     q = pin.integrate(m, pin.neutral(m), rng.uniform(0.2, 0.9, m.nv) * rng.choice([-1.0, 1.0], m.nv))
-    for joint in range(1, m.njoints):
-        at = m.idx_qs[joint]
-        if m.nqs[joint] == 1:
-            low, high = m.lowerPositionLimit[at], m.upperPositionLimit[at]
-            if not low <= q[at] <= high:
-                low, high = max(low, -1.0), min(high, 1.0)
-                q[at] = low + rng.uniform(0.2, 0.8) * (high - low)
     data = m.createData()
     pin.computeJointJacobians(m, data, q)
     pin.updateFramePlacements(m, data)
-    J = [pin.getFrameJacobian(m, data, m.getFrameId(link), pin.LOCAL_WORLD_ALIGNED)[3:, columns] for link in links]
-    _, s, Vt = np.linalg.svd(np.concatenate([np.zeros((1, len(columns))), *J]))
-    open_motions = Vt[np.count_nonzero(s > _SINGULAR) :]
-    null = np.zeros((m.nv, len(open_motions)))
-    null[columns] = open_motions.T
-    return data, null
+
+    def compute_jacobians(names: Sequence[str]) -> np.ndarray:
+        frames = [m.getFrameId(name) for name in names]
+        J = [pin.getFrameJacobian(m, data, frame, pin.LOCAL_WORLD_ALIGNED) for frame in frames]
+        return np.reshape(J, (len(frames), 6, m.nv))[:, :, columns]
+
+    _, s, Vt = np.linalg.svd(compute_jacobians(segments)[:, 3:].reshape(3 * len(segments), -1))
+    open_motions = np.zeros((m.nv, len(columns) - np.count_nonzero(s > _SINGULAR)))
+    open_motions[columns] = Vt[np.count_nonzero(s > _SINGULAR) :].T
+    return open_motions, compute_jacobians(links) @ open_motions[columns]
 
 
 def find_columns(m: pin.Model, joints: Iterable[int]) -> np.ndarray:
@@ -173,20 +160,6 @@ def find_columns(m: pin.Model, joints: Iterable[int]) -> np.ndarray:
     return np.array([m.idx_vs[joint] + k for joint in joints for k in range(m.nvs[joint])], dtype=int)
 
 
-def compute_joint_values(
-    m: pin.Model, q: np.ndarray, before: Mapping[str, float] | None = None
-) -> dict[str, np.ndarray]:
-    """Compute joint → its value (n,) [rad or m] in configurations (n, nq); only joints of one axis.
-
-    Values of a joint without end go on beyond half a turn, from that in `before`.
-    """
-    values = {}
-    for joint in range(1, m.njoints):
-        name, first = m.names[joint], m.idx_qs[joint]
-        if m.nqs[joint] == 1:
-            values[name] = q[:, first].copy()
-        elif m.nvs[joint] == 1:
-            angle = np.arctan2(q[:, first + 1], q[:, first])
-            last = None if before is None else before.get(name)
-            values[name] = np.unwrap(angle) if last is None else np.unwrap(np.concatenate([[last], angle]))[1:]
-    return values
+def compute_joint_values(m: pin.Model, q: np.ndarray) -> dict[str, np.ndarray]:
+    """Compute joint → its value (n,) [rad or m] in configurations (n, nq); only joints of one axis."""
+    return {m.names[joint]: q[:, m.idx_qs[joint]].copy() for joint in range(1, m.njoints) if m.nqs[joint] == 1}

@@ -6,9 +6,8 @@ finds the segments by their names.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -41,12 +40,16 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
         A link that is not there; points in one place; a segment so far off that no rotation is the shortest.
     """
     tree = parse_tree(robot, table.where)
-    _check_links(table, tree)
+    places = [(f"segments.{name}", segment.link) for name, segment in table.segments.items()]
+    places += [(f"points.{name}", point.link) for name, point in table.points.items()]
+    for place, link in [*places, *(("root", link) for link in table.root)]:
+        if link not in tree.below:
+            raise BadModel(f"{table.where}: {place}: no link '{link}'; {one_of(tree.below, link, MOST_LINKS)}")
     R_WM = Rotation.from_quat(compute_mount(table.up, table.forward)).as_matrix()  # M: the root link
     M_WM = np.eye(4)
     M_WM[:3, :3] = R_WM
     M_WM[:3, 3] = -R_WM @ np.mean([tree.neutral(link)[:3, 3] for link in table.root or (tree.root,)], axis=0)
-    M_WK = {link: M_WM @ tree.neutral(link) for link in table.links}  # K: a link of theirs
+    M_WK = {link: M_WM @ tree.neutral(link) for link in tree.below}  # K: a link of theirs
     p_W = {name: M_WK[point.link][:3, :3] @ point.at + M_WK[point.link][:3, 3] for name, point in table.points.items()}
 
     segment_of = {segment.link: name for name, segment in reversed(list(table.segments.items()))}
@@ -64,14 +67,12 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
         if begins is not None and not any(point.at):
             points[name] = Point(begins)
             continue
-        if point.link == name and not any(point.at):  # the link is there already
-            points[name] = point
-            continue
+        points[name] = Point(name)
+        if point.link == name and not any(point.at):
+            continue  # the link is there already
         carrier = begins or _segment_above(tree, point.link, segment_of)
         link = point.link if carrier is None or table.is_mechanism else table.segments[carrier].link
         frames[name] = link, M_WK[link][:3, :3] if carrier is None else R_WL[carrier], p_W[name]
-        M_WK.setdefault(link, M_WM @ tree.neutral(link))
-        points[name] = Point(name)
     segments = {name: segment._replace(link=name, up=None, forward=None) for name, segment in table.segments.items()}
     named = replace(table, segments=segments, points=points, up="+z", forward="+x", root=())
     return _with_links(robot, tree.root, M_WM, M_WK, frames), named
@@ -79,45 +80,15 @@ def rename_links(robot: Any, table: BodyTable) -> tuple[Any, BodyTable]:
 
 def _segment_above(tree: Tree, link: str, segment_of: Mapping[str, str]) -> str | None:
     """The nearest segment between a link and the root."""
-    while link != tree.root:
-        link = tree.above[link].parent
-        if link in segment_of:
-            return segment_of[link]
-    return None
-
-
-def _check_links(table: BodyTable, tree: Tree) -> None:
-    where = table.where
-    lacking = [name for name, segment in table.segments.items() if segment.link not in tree.below]
-    if len(lacking) > 1:
-        raise BadModel(
-            f"{where}: segments: no link for {format_closest_links(lacking, tree.below, table)}; "
-            f"{one_of(tree.below, most=MOST_LINKS)}"
-        )
-    places = [(f"segments.{name}", segment.link) for name, segment in table.segments.items()]
-    places += [(f"points.{name}", point.link) for name, point in table.points.items()]
-    for place, link in [*places, *(("root", link) for link in table.root)]:
-        if link not in tree.below:
-            raise BadModel(f"{where}: {place}: no link '{link}'; {one_of(tree.below, link, MOST_LINKS)}")
-
-
-def format_closest_links(segments: Iterable[str], links: Iterable[str], table: BodyTable) -> str:
-    """Segments that have no link, each with the links whose names speak of it or come closest."""
-    links = list(links)
-    names = []
-    for segment in segments:
-        close = [link for link in links if table.guess_segment(link) == segment]
-        others = [link for link in links if table.guess_segment(link) is None]
-        close = close or get_close_matches(segment, others, n=3, cutoff=0.5)
-        names.append(f"'{segment}'" + (f" (maybe {' or '.join(close[:4])})" if close else ""))
-    return ", ".join(names)
+    above = [segment_of[joint.parent] for joint in tree.path(link) if joint.parent in segment_of]
+    return above[-1] if above else None
 
 
 def _neutral_orientation(
     table: BodyTable, name: str, M_WK: Mapping[str, np.ndarray], p_W: Mapping[str, np.ndarray], R_above: np.ndarray
 ) -> np.ndarray:
     """Orientation R_WL (3, 3) of a segment while all joints are at zero; `R_above`: of the segment above."""
-    segment, where = table.segments[name], table.where
+    segment = table.segments[name]
     R_WK = M_WK[segment.link][:3, :3]
     if segment.up is not None and segment.forward is not None:
         return R_WK @ Rotation.from_quat(compute_mount(segment.up, segment.forward)).as_matrix().T
@@ -131,15 +102,11 @@ def _neutral_orientation(
     first, last = (np.mean([p_W[point] for point in points], axis=0) for points in ends)
     along = last - first
     length = np.linalg.norm(along)
-    if length < 1e-6:
+    cosine = float(np.dot(segment.along, along) / max(length, 1e-6))
+    if length < 1e-6 or cosine < 1e-6 - 1.0:
         raise BadModel(
-            f"{where}: {' and '.join(ends[0] + ends[1])} lie in one place; name the links at both ends of {name}"
-        )
-    cosine = float(np.dot(segment.along, along) / length)
-    if cosine < 1e-6 - 1.0:
-        raise BadModel(
-            f"{where}: segments.{name}: points opposite to its direction in the N-pose; state its up and forward axes "
-            f"of the N-pose"
+            f"{table.where}: segments.{name}: {' and '.join(ends[0] + ends[1])} lie in one place, or opposite to its "
+            f"direction in the N-pose; name other links, or state its up and forward axes of the N-pose"
         )
     return Rotation.from_quat([*np.cross(segment.along, along / length), 1.0 + cosine]).as_matrix()
 
@@ -167,7 +134,7 @@ def _with_links(
     if not np.allclose(M_WM, np.eye(4), atol=1e-12):
         added["root"] = root, M_WM
     own = {link.name for link in robot.links}
-    renamed = {name: _make_unique(f"{name}_link", own) for name in added if name in own}
+    renamed = {name: f"{name}_link" for name in added if name in own}
     for link in robot.links:
         link.name = renamed.get(link.name, link.name)
     for joint in robot.joints:
@@ -175,14 +142,9 @@ def _with_links(
         joint.child = renamed.get(joint.child, joint.child)
     joints = {joint.name for joint in robot.joints}
     for name, (link, M) in added.items():
-        ends = (name, renamed.get(link, link)) if name == "root" else (renamed.get(link, link), name)
+        ends, joint_name = (renamed.get(link, link), name), f"{name}_fixed"
+        while joint_name in joints:
+            joint_name += "_"
         robot.links.append(yourdfpy.Link(name=name))
-        robot.joints.append(yourdfpy.Joint(_make_unique(f"{name}_fixed", joints), "fixed", *ends, origin=M))
+        robot.joints.append(yourdfpy.Joint(joint_name, "fixed", *(ends[::-1] if name == "root" else ends), origin=M))
     return robot
-
-
-def _make_unique(name: str, used: Iterable[str]) -> str:
-    """`name`, made longer until it is not among those `used`."""
-    while name in used:
-        name += "_"
-    return name

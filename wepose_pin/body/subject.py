@@ -231,7 +231,6 @@ class Subject:
         """Raise `BadSubject` where a name is not one of the body's, or a length of the body is missing."""
         where = f"subject '{self.name}': "
         try:
-            check_names(f"{where}lengths", self.lengths, (*table.lengths, *table.absent))
             missing = [name for name in table.lengths if name not in self.lengths]
             if missing:
                 raise BadOption(f"{where}lengths: {', '.join(missing)} of the body {table.name} is missing")

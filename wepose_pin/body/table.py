@@ -120,22 +120,25 @@ class Stretch(NamedTuple):
     # A point, or two in whose middle the line begins or ends, with all joints at zero.
     start: Annotated[tuple[str, ...], Key("from", of="points")]
     end: Annotated[tuple[str, ...], Key("to", of="points")]
+    # Its name among the ratios to stature in calibration/anthropometry.toml; empty: it has none, and the prior is the
+    # model's own value
+    share: str = ""
+    # One standard deviation of the model's own value [%].
+    std_percent: Annotated[float, Key(least=1e-3)] = 10.0
 
 
 class Length(NamedTuple):
-    """A length of a body.
-
-    Parameters
-    ----------
-    stretches : what it scales; more than one where parts of the body share it
-    share : its name among the ratios to stature in ``calibration/anthropometry.toml``; empty: it has none, and the
-        prior is the model's own value
-    relative_std : standard deviation of the model's own value, as a share of it
-    """
+    """A length of a body: what it scales, more than one where parts of the body share it."""
 
     stretches: tuple[Stretch, ...]
-    share: str = ""
-    relative_std: float = 0.1
+
+    @property
+    def share(self) -> str:
+        return next((part.share for part in self.stretches if part.share), "")
+
+    @property
+    def relative_std(self) -> float:
+        return 0.01 * self.stretches[0].std_percent
 
 
 class HingeJoint(NamedTuple):
@@ -184,14 +187,6 @@ class Limb(NamedTuple):
         return self.points[-1]
 
 
-class SensorPlace(NamedTuple):
-    """Where a sensor usually sits, and its axes that point up and forward in the N-pose; None: not stated."""
-
-    place: str = ""  # in words, for pages
-    up: str | None = None
-    forward: str | None = None
-
-
 @dataclass(frozen=True)
 class BodyTable:
     """The names and properties of what a body has.
@@ -206,14 +201,13 @@ class BodyTable:
     girdles : shoulder point → the law by which it moves on the trunk as the arm is raised
     poses : name → joint of the URDF → value [rad or m]
     pairs : name on the left → name on the right, of segments, points, lengths and hinges
-    sensors : segment → where its sensor usually sits
+    sensors : segment → where its sensor usually sits, in words
     limbs : the points of each line that is drawn
     paths : points whose path is drawn
     kind : "person": three revolute joints in a row are one spherical joint, segment frames equal W in the N-pose;
         "mechanism": joints and frames are those of the URDF
     up, forward : the root link's axes that point up and forward while all joints are at zero
     root : the link whose origin is that of W, or links midway between which it is; empty: the root link
-    absent : names of lengths that this body lacks, and the one after which it is modelled has
     where : the table's file, for messages
     """
 
@@ -225,14 +219,13 @@ class BodyTable:
     girdles: Mapping[str, Girdle] = field(default_factory=dict)
     poses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     pairs: Mapping[str, str] = field(default_factory=dict)
-    sensors: Mapping[str, SensorPlace] = field(default_factory=dict)
+    sensors: Mapping[str, str] = field(default_factory=dict)
     limbs: tuple[tuple[str, ...], ...] = ()
     paths: tuple[str, ...] = ()
     kind: Literal["person", "mechanism"] = "person"
     up: str = "+z"
     forward: str = "+x"
     root: tuple[str, ...] = ()
-    absent: tuple[str, ...] = ()
     where: str = "segments"
 
     @property
@@ -243,12 +236,6 @@ class BodyTable:
     def reference(self) -> str:
         """The segment that faces x of W in the start pose."""
         return next(iter(self.segments))
-
-    @property
-    def links(self) -> set[str]:
-        """The links of segments, points and root."""
-        segments = {segment.link for segment in self.segments.values()}
-        return segments | {point.link for point in self.points.values()} | set(self.root)
 
     @property
     def needed(self) -> tuple[str, ...]:
@@ -280,6 +267,10 @@ class BodyTable:
         beginning = ends[0] if ends else ()
         return self.segments[segment].joint or (beginning[0] if len(beginning) == 1 else segment)
 
+    @cached_property
+    def _stretches(self) -> tuple[Stretch, ...]:
+        return tuple(part for length in self.lengths.values() for part in length.stretches)
+
     def find_length(self, *points: str) -> str | None:
         """Return the name of the length between these points, or their middles; None: there is none."""
         for name, length in self.lengths.items():
@@ -292,20 +283,17 @@ class BodyTable:
 
         A line between a point and its counterpart, as between the shoulders, is no limb.
         """
-        for line in self.limbs:
-            if point in line[1:] and self.counterpart(line[0]) not in line:
-                points = line[: line.index(point) + 1]
-                break
-        else:
+        lines = (line for line in self.limbs if point in line[1:] and self.counterpart(line[0]) not in line)
+        line = next(lines, None)
+        if line is None:
             return None
-        stretches = [part for length in self.lengths.values() for part in length.stretches]
-        between = {(*part.start, *part.end): part.segment for part in stretches}
-        own = [between[ends] for ends in pairwise(points) if ends in between]
-        above = (part.segment for part in stretches if points[0] in part.start + part.end and part.segment not in own)
-        other = self.counterpart(points[0])
-        left_first = (points[0], other) if points[0] in self.pairs else (other, points[0])
-        origin = tuple(point for point in left_first if point is not None)
-        return Limb(points, tuple(dict.fromkeys(own)), next(above, None), origin)
+        points = line[: line.index(point) + 1]
+        between = {(*part.start, *part.end): part.segment for part in self._stretches}
+        own = dict.fromkeys(between[ends] for ends in pairwise(points) if ends in between)
+        above = (part.segment for part in self._stretches if points[0] in part.start + part.end)
+        base = next((segment for segment in above if segment not in own), None)
+        origin = [point for point in (points[0], self.counterpart(points[0])) if point is not None]
+        return Limb(points, tuple(own), base, tuple(sorted(origin, key=lambda point: point not in self.pairs)))
 
     @property
     def drawn_limbs(self) -> dict[str, Limb]:
@@ -314,7 +302,7 @@ class BodyTable:
 
     def ends(self, segment: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
         """Return the points at which the length of a segment begins and ends; None where not just one length is its."""
-        stretches = [part for length in self.lengths.values() for part in length.stretches if part.segment == segment]
+        stretches = [part for part in self._stretches if part.segment == segment]
         return (stretches[0].start, stretches[0].end) if len(stretches) == 1 else None
 
     def guess_segment(self, label: str) -> str | None:
@@ -342,29 +330,35 @@ class BodyTable:
 
 
 def prune_table(table: BodyTable) -> BodyTable:
-    """Return the table without lengths, hinges, girdles, pairs, sensors and lines whose segments or points it lacks."""
-    points = {*table.points, ROOT}
+    """Return the table without what needs segments or points that it lacks."""
+    segments, points = set(table.segments), {*table.points, ROOT}
     lengths = {
         name: length
         for name, length in table.lengths.items()
-        if all(part.segment in table.segments and points.issuperset(part.start + part.end) for part in length.stretches)
+        if all(part.segment in segments and points.issuperset(part.start + part.end) for part in length.stretches)
     }
-    hinges = {name: hinge for name, hinge in table.hinges.items() if {hinge.on, hinge.moves} <= set(table.segments)}
+    hinges = {name: hinge for name, hinge in table.hinges.items() if {hinge.on, hinge.moves} <= segments}
     girdles = {
         name: girdle
         for name, girdle in table.girdles.items()
-        if name in table.points and {girdle.on, girdle.moves} <= set(table.segments)
+        if name in points and {girdle.on, girdle.moves} <= segments
     }
-    names = {*table.segments, *table.points, *lengths, *hinges}
-    limbs = tuple(limb for limb in table.limbs if set(limb) <= set(table.points))
+    pruned = {}
+    for name, segment in table.segments.items():
+        tissue = segment.soft_tissue
+        tissue = tissue._replace(raised=tuple(other for other in tissue.raised if other in segments))
+        if tissue.relative_to and tissue.relative_to not in segments:
+            tissue = tissue._replace(relative_to="", per_tilt=ZERO, per_twist=0.0)
+        pruned[name] = segment._replace(soft_tissue=tissue)
+    names = {*segments, *points, *lengths, *hinges}
     return replace(
         table,
+        segments=pruned,
         lengths=lengths,
-        absent=tuple(name for name in (*table.absent, *table.lengths) if name not in lengths),
         hinges=hinges,
         girdles=girdles,
         pairs={left: right for left, right in table.pairs.items() if {left, right} <= names},
-        sensors={name: place for name, place in table.sensors.items() if name in table.segments},
-        limbs=limbs,
-        paths=tuple(point for point in table.paths if point in table.points),
+        sensors={name: place for name, place in table.sensors.items() if name in segments},
+        limbs=tuple(limb for limb in table.limbs if points.issuperset(limb)),
+        paths=tuple(point for point in table.paths if point in points),
     )

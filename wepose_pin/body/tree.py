@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,8 +12,6 @@ import pinocchio as pin
 
 from ..errors import BadModel, one_of
 
-_TURNS = ("revolute", "continuous")
-DEEPEST = 200  # joints in a row; a person has 20
 _FAR = 1e6  # [m]
 _PARALLEL_TOLERANCE = 1e-6
 _MEET_TOLERANCE = 1e-9  # [m]
@@ -50,6 +48,14 @@ class Tree(NamedTuple):
             M = M @ joint_placement(joint)
         return M
 
+    def hanging(self, start: str, others: Collection[str] = ()) -> list[str]:
+        """`start` and the links below it, without the links `others` and what is below them."""
+        links, to_do = [], [start]
+        while to_do:
+            links.append(link := to_do.pop())
+            to_do += [joint.child for joint in self.below[link] if joint.child not in others]
+        return links
+
 
 def copy_robot(robot: Any) -> Any:
     """A deep copy of `robot` (yourdfpy), by pickle: several times as fast as `copy.deepcopy`."""
@@ -64,65 +70,47 @@ def parse_tree(robot: Any, where: str) -> Tree:
     BadModel
         Names that occur twice, joints on links that are not there, two roots, a loop.
     """
-    for kind, items in (("link", robot.links), ("joint", robot.joints)):
+    for items in (robot.links, robot.joints):
         name, times = next(iter(Counter(item.name for item in items).most_common(1)), ("", 0))
         if times > 1:
-            raise BadModel(f"{where}: {kind} '{name}' occurs {times} times; a name stands for one {kind}")
+            raise BadModel(f"{where}: '{name}' occurs {times} times; a name stands for one link and one joint")
     below: dict[str, list[Any]] = {link.name: [] for link in robot.links}
     above: dict[str, Any] = {}
     for joint in robot.joints:
-        for link in (joint.parent, joint.child):
-            if link not in below:
-                raise BadModel(f"{where}: joint '{joint.name}' names a link '{link}' that is not there")
+        if joint.parent not in below or joint.child not in below:
+            raise BadModel(f"{where}: joint '{joint.name}' names a link that is not there; {one_of(below)}")
         if joint.child in above:
-            raise BadModel(
-                f"{where}: link '{joint.child}' hangs on two joints, '{above[joint.child].name}' and '{joint.name}'; "
-                f"a body is a tree"
-            )
+            raise BadModel(f"{where}: link '{joint.child}' hangs on two joints; a body is a tree")
         above[joint.child] = joint
         below[joint.parent].append(joint)
-        axis, place = joint.axis, joint_placement(joint)
-        numbers = np.concatenate([place.ravel(), np.ravel(axis) if axis is not None else ()]).astype(float)
-        if place.shape != (4, 4) or np.shape(axis) not in ((), (3,)) or not (np.abs(numbers) < _FAR).all():
-            raise BadModel(
-                f"{where}: joint '{joint.name}': origin or axis is not three numbers each, of metres and rad"
-            )
+        axis, place = () if joint.axis is None else joint.axis, joint_placement(joint)
+        numbers = np.concatenate([np.ravel(place), np.ravel(axis)]).astype(float)
+        if place.shape != (4, 4) or np.shape(axis) not in ((0,), (3,)) or not (np.abs(numbers) < _FAR).all():
+            raise BadModel(f"{where}: joint '{joint.name}': origin or axis is not three numbers each, of m and rad")
     roots = [name for name in below if name not in above]
     if len(roots) != 1:
         names = ", ".join(roots) if roots else "none"
         raise BadModel(f"{where}: {len(roots)} links without a joint above them ({names}); a body has one root")
-    reached, to_do = {roots[0]: 0}, [roots[0]]
-    while to_do:
-        link = to_do.pop()
-        for joint in below[link]:
-            reached[joint.child] = reached[link] + 1
-            to_do.append(joint.child)
-    deepest = max(reached, key=lambda link: reached[link])
-    if reached[deepest] > DEEPEST:
-        raise BadModel(f"{where}: {reached[deepest]} joints in a row down to '{deepest}'; {DEEPEST} at most are read")
-    lost = [name for name in below if name not in reached]
+    tree = Tree(roots[0], above, below)
+    lost = set(below).difference(tree.hanging(tree.root))
     if lost:
-        raise BadModel(f"{where}: link '{lost[0]}' hangs in a loop of joints, apart from the root; a body is a tree")
-    return Tree(roots[0], above, below)
+        raise BadModel(f"{where}: link '{min(lost)}' hangs in a loop of joints, apart from the root; a body is a tree")
+    return tree
 
 
-def build(robot: Any, where: str, *, spherical: bool = True) -> tuple[pin.Model, dict[str, int], dict[str, np.ndarray]]:
+def build(robot: Any, where: str, *, spherical: bool) -> tuple[pin.Model, dict[str, int], dict[str, np.ndarray]]:
     """The Pinocchio model, depth first as Pinocchio's algorithms need it; one frame a link.
 
-    Second and third: its spherical joints and their axes, as `BodyModel` has them.
-
-    A mimic joint follows the joint it mimics. The limits of joints that stay as they are are the URDF's. Without
-    `spherical` triples of revolute joints stay as they are too.
+    Second and third: its spherical joints and their axes, as `BodyModel` has them. Other joints have the URDF's limits.
+    Without `spherical` triples of revolute joints stay as they are.
 
     Raises
     ------
     BadModel
-        No tree; a type of joint that is not known; an axis of zero; a mimic joint that cannot follow.
+        No tree; a type of joint that is not known; an axis of zero.
     """
     tree = parse_tree(robot, where)
     links = {link.name: link for link in robot.links}
-    mimicked = {joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
-    coupled = mimicked | {joint.name for joint in robot.joints if joint.mimic is not None}
     model = pin.Model()
     model.name = robot.name or "body"
     joints: dict[str, int] = {}
@@ -131,7 +119,7 @@ def build(robot: Any, where: str, *, spherical: bool = True) -> tuple[pin.Model,
     def carry(link: str, parent: int, M_JL: pin.SE3) -> None:
         inertial = links[link].inertial
         if inertial is not None and inertial.mass:
-            model.appendBodyToJoint(parent, _inertia(inertial, f"{where}: link '{link}'"), M_JL)
+            model.appendBodyToJoint(parent, _inertia(inertial), M_JL)
 
     def grow(link: str, parent: int, M_JL: pin.SE3) -> None:
         """Add `link`, placed at `M_JL` on Pinocchio's joint `parent`, and what hangs on it."""
@@ -139,32 +127,26 @@ def build(robot: Any, where: str, *, spherical: bool = True) -> tuple[pin.Model,
         carry(link, parent, M_JL)
         for first in tree.below[link]:
             M_Jc = M_JL * pin.SE3(joint_placement(first))
+            triple = _triple(first, tree, links) if spherical else None
+            child = first.child if triple is None else triple[-1].child
             if first.type == "fixed":
-                grow(first.child, parent, M_Jc)
-                continue
-            triple = _triple(first, tree, links, mimicked) if spherical else None
-            if triple is None and first.type != "floating":
-                grow(first.child, *_add_single(model, parent, M_Jc, first, coupled, where))
-                continue
-            child = first.child
-            if triple is not None:
-                child = triple[-1].child
-                axes[child] = _axes(triple)
-                for joint in triple[1:]:
+                grow(child, parent, M_Jc)
+            elif triple is None and first.type != "floating":
+                grow(child, _add_single(model, parent, M_Jc, first, where), pin.SE3.Identity())
+            else:
+                for joint in (triple or [first])[1:]:
                     M_Jc = M_Jc * pin.SE3(joint_placement(joint))
-            joints[child] = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
-            if triple is not None:
-                # The links between the axes, as they stand at zero.
-                M_cK = pin.SE3.Identity()
-                for joint in triple[:0:-1]:
-                    M_cK = M_cK * pin.SE3(joint_placement(joint)).inverse()
-                    carry(joint.parent, joints[child], M_cK)
-            grow(child, joints[child], pin.SE3.Identity())
+                joints[child] = model.addJoint(parent, pin.JointModelSpherical(), M_Jc, child)
+                if triple is not None:
+                    axes[child] = _axes(triple)
+                    # The links between the axes, as they stand at zero.
+                    M_cK = pin.SE3.Identity()
+                    for joint in triple[:0:-1]:
+                        M_cK = M_cK * pin.SE3(joint_placement(joint)).inverse()
+                        carry(joint.parent, joints[child], M_cK)
+                grow(child, joints[child], pin.SE3.Identity())
 
     grow(tree.root, 0, pin.SE3.Identity())
-    for joint in robot.joints:
-        if joint.mimic is not None:
-            model = _mimicking(model, joint, where)
     return model, joints, axes
 
 
@@ -180,7 +162,7 @@ def joint_axis(joint: Any) -> np.ndarray:
     return axis / norm if norm > 1e-9 else np.zeros(3)
 
 
-def _triple(first: Any, tree: Tree, links: Mapping[str, Any], mimicked: set[str]) -> tuple[Any, Any, Any] | None:
+def _triple(first: Any, tree: Tree, links: Mapping[str, Any]) -> list[Any] | None:
     """The three revolute joints that begin with `first` and together are a spherical joint, if they are."""
     chain = [first]
     while len(chain) < 3:
@@ -189,17 +171,15 @@ def _triple(first: Any, tree: Tree, links: Mapping[str, Any], mimicked: set[str]
         if len(below) != 1 or link.visuals or link.collisions or heavy:
             return None
         chain.append(below[0])
-    if any(joint.type not in _TURNS or joint.mimic is not None or joint.name in mimicked for joint in chain):
+    if any(joint.type not in ("revolute", "continuous") for joint in chain):
         return None
     if any(np.linalg.norm(joint_placement(joint)[:3, 3]) > _MEET_TOLERANCE for joint in chain[1:]):
         return None
     axes = _axes(chain)
-    if np.abs(axes @ axes.T - np.eye(3)).max() > _PARALLEL_TOLERANCE:
-        return None
-    return chain[0], chain[1], chain[2]
+    return chain if np.abs(axes @ axes.T - np.eye(3)).max() <= _PARALLEL_TOLERANCE else None
 
 
-def _axes(chain: Any) -> np.ndarray:
+def _axes(chain: list[Any]) -> np.ndarray:
     """Axes (3, 3), a row each, in the frame of the last joint's child, all joints at zero."""
     rows = []
     for k, joint in enumerate(chain):
@@ -210,12 +190,12 @@ def _axes(chain: Any) -> np.ndarray:
     return np.array(rows)
 
 
-def find_bounds(joint: Any, unbounded: float) -> tuple[float, float]:
-    """Lower and upper limit of a joint [rad or m]."""
+def _find_bounds(joint: Any) -> tuple[float, float]:
+    """Lower and upper limit of a joint [rad or m]; a continuous one has none."""
     if joint.type == "continuous" or joint.limit is None:
-        return -unbounded, unbounded
+        return -np.inf, np.inf
     low, high = joint.limit.lower, joint.limit.upper
-    return (-unbounded if low is None else float(low)), (unbounded if high is None else float(high))
+    return (-np.inf if low is None else float(low)), (np.inf if high is None else float(high))
 
 
 def check_joint_values(robot: Any, values: Mapping[str, float], place: str, error: type[Exception]) -> None:
@@ -224,79 +204,33 @@ def check_joint_values(robot: Any, values: Mapping[str, float], place: str, erro
     for name, value in values.items():
         if name not in joints:
             raise error(f"{place}.{name} is no joint that moves; {one_of(joints, name)}")
-        low, high = find_bounds(joints[name], np.inf)
+        low, high = _find_bounds(joints[name])
         if not low - 1e-6 <= value <= high + 1e-6:
             raise error(f"{place}.{name} = {value:g} is outside its limits, {low:g} to {high:g}")
 
 
-def _add_single(
-    model: pin.Model, parent: int, M: pin.SE3, joint: Any, coupled: set[str], where: str
-) -> tuple[int, pin.SE3]:
-    """Add a joint of one axis with its limits; gives it, and the placement of the child link on it.
-
-    `coupled`: joints that mimic another or are mimicked; Pinocchio couples angles, not the unbounded joint's cosine.
-    """
-    if joint.type not in ("revolute", "continuous", "prismatic"):
-        raise BadModel(
-            f"{where}: joint '{joint.name}' is of type '{joint.type}'; known are fixed, revolute, continuous, "
-            f"prismatic, floating, and spherical as three revolute joints"
-        )
+def _add_single(model: pin.Model, parent: int, M: pin.SE3, joint: Any, where: str) -> int:
+    """Add a joint of one axis with its limits."""
+    kinds = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
+    kinds["continuous"] = kinds["revolute"]
     axis = joint_axis(joint)
-    if not axis.any():
-        raise BadModel(f"{where}: joint '{joint.name}' has an axis of zero length; three numbers as 0 0 1 are wanted")
+    if joint.type not in kinds or not axis.any():
+        raise BadModel(
+            f"{where}: joint '{joint.name}' is of type '{joint.type}', axis {axis.tolist()}; fixed, floating, or "
+            f"{', '.join(kinds)} about an axis are known"
+        )
     limit = joint.limit
     effort = np.inf if limit is None or limit.effort is None else float(limit.effort)
     velocity = np.inf if limit is None or limit.velocity is None else float(limit.velocity)
-    of_rate = np.array([effort]), np.array([velocity])
-    if joint.type == "continuous" and joint.name not in coupled:
-        # Python cannot give Pinocchio's unbounded joint an axis: its own z is turned onto ours. q: cosine and sine.
-        turn = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix(), np.zeros(3))
-        bounds = np.full(2, -1.01), np.full(2, 1.01)
-        return model.addJoint(parent, pin.JointModelRUBZ(), M * turn, joint.name, *of_rate, *bounds), turn.inverse()
-    kind = pin.JointModelRevoluteUnaligned if joint.type == "revolute" else pin.JointModelPrismaticUnaligned
-    low, high = find_bounds(joint, np.inf)
-    added = model.addJoint(parent, kind(axis), M, joint.name, *of_rate, np.array([low]), np.array([high]))
-    return added, pin.SE3.Identity()
+    limits = (np.array([number]) for number in (effort, velocity, *_find_bounds(joint)))
+    return int(model.addJoint(parent, kinds[joint.type](axis), M, joint.name, *limits))
 
 
-def _mimicking(model: pin.Model, joint: Any, where: str) -> pin.Model:
-    """The model in which `joint` follows the one it mimics."""
-    leader = joint.mimic.joint or ""
-    if not model.existJointName(joint.name) or not model.existJointName(leader) or leader == joint.name:
-        raise BadModel(f"{where}: joint '{joint.name}' mimics '{leader}', which is no joint that it could follow")
-    leader_id, to = model.getJointId(leader), model.getJointId(joint.name)
-    if to < leader_id or model.nvs[to] != 1 or model.nvs[leader_id] != 1:
-        raise BadModel(f"{where}: joint '{joint.name}' mimics '{leader}', which must be a joint before it, of one axis")
-    ratio = 1.0 if joint.mimic.multiplier is None else float(joint.mimic.multiplier)
-    offset = 0.0 if joint.mimic.offset is None else float(joint.mimic.offset)
-    try:
-        return pin.transformJointIntoMimic(model, leader_id, to, ratio, offset)
-    except Exception as error:  # what C++ throws
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BadModel(f"{where}: joint '{joint.name}' cannot mimic '{leader}': {reason}") from error
-
-
-def _inertia(inertial: Any, where: str) -> pin.Inertia:
+def _inertia(inertial: Any) -> pin.Inertia:
     placement = pin.SE3.Identity() if inertial.origin is None else pin.SE3(np.asarray(inertial.origin, dtype=float))
     inertia = np.asarray(inertial.inertia if inertial.inertia is not None else np.zeros((3, 3)), dtype=float)
-    if not 0.0 < inertial.mass < _FAR or not np.isfinite(placement.homogeneous).all() or not np.isfinite(inertia).all():
-        raise BadModel(f"{where}: mass {inertial.mass:g} kg, or its origin or inertia is NaN; a mass is above 0")
-    # The constructor refuses what no body can have, as some URDFs state it; Pinocchio's own reader does not, nor do we:
-    # `find_impossible_inertia` names it.
+    # The constructor refuses what no body can have, as some URDFs state it; Pinocchio's own reader does not.
     total = pin.Inertia.Zero()
     total.mass, total.lever = float(inertial.mass), placement.translation
     total.inertia = placement.rotation @ inertia @ placement.rotation.T
     return total
-
-
-def find_impossible_inertia(robot: Any) -> list[str]:
-    """Links whose moments of inertia no body can have: one is negative, or larger than the two others together."""
-    links = []
-    for link in robot.links:
-        inertial = link.inertial
-        if inertial is not None and inertial.mass and inertial.inertia is not None:
-            moments = np.linalg.eigvalsh(np.asarray(inertial.inertia, dtype=float))
-            slack = 1e-6 * max(np.abs(moments).max(), 1e-9)  # of numbers that were cut
-            if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
-                links.append(link.name)
-    return links

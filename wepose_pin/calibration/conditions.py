@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..body import BodyModel
-from ..body.reaches import UNIVERSE
+from ..body.lengths import UNIVERSE
 from ..body.start_pose import StartPose
 from ..body.table_file import check_segments
 from ..errors import BadOption, BadSession

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..body.reaches import UNIVERSE
+from ..body.lengths import UNIVERSE
 from ..observations.directions import Level, Pointing
 from .conditions import Loop
 from .couplings import Coupling

@@ -1,6 +1,6 @@
 """Paths between points of a body: vectors that rotate with segments, and girdles that move the points.
 
-A point is the sum of the vectors of the links between it and the root (`wepose_pin.body.reaches`). Each link rotates
+A point is the sum of the vectors of the links between it and the root (`wepose_pin.body.lengths`). Each link rotates
 with a segment that has a sensor, its own or the one above it with which it is rigid. Where points coincide, the path
 from one to the other is zero; its covariance weighs what is left of it.
 """
@@ -15,8 +15,8 @@ import numpy as np
 
 from ..body import BodyModel, Girdle
 from ..body.girdle import displace, find_girdle_scale
+from ..body.lengths import UNIVERSE
 from ..body.links import find_carrier
-from ..body.reaches import UNIVERSE
 from ..body.start_pose import StartPose
 from ..body.table import Vector
 from ..errors import BadSession

@@ -325,7 +325,7 @@ def format_session(proposal: Proposal, path: Path, folder: Path, wearer: Wearer,
     if lacking:
         lines += ["", f"# without a sensor here, and not known without one: {', '.join(lacking)}"]
     for segment in sorted(proposal.sensors, key=lambda name: segments.index(name) if name in segments else 99):
-        place = body.sensors[segment].place if segment in body.sensors else ""
+        place = body.sensors.get(segment, "")
         name = segment if segment in segments else "SEGMENT"
         table = [f"[sensors.{name}]{f'   # usually {place}' if place else ''}"]
         table += _format_keys(proposal, segment, proposal.sensors[segment])
