@@ -164,7 +164,7 @@ def wrong_recordings(recording: wp.Recording) -> Iterator[tuple[str, wp.Recordin
 
 def wrong_subjects(subject: wp.Subject) -> Iterator[tuple[str, wp.Subject]]:
     k, good = len(subject.order), subject.mounts["torso"]
-    for wrong in (length for length in LENGTHS if isinstance(length, dict)):
+    for wrong in (length for length in LENGTHS if isinstance(length, dict) and set(length) <= set(subject.lengths)):
         yield "lengths", replace(subject, lengths={**subject.lengths, **wrong})
     for covariance in (None, np.zeros((k, k - 1)), np.full((k, k), NAN)):
         yield "covariance", replace(subject, covariance=covariance)
