@@ -162,7 +162,7 @@ def _connect_robot(recording: Recording, folder: Path) -> RobotOutput:
     """The output for an arm of seven joints, that of the tests."""
     write_arm = importlib.import_module("tests.arms").write_arm
     options = RobotOptions(load_robot(find_map(str(write_arm(folder)))), to="9")
-    robot, _ = connect_robot(options, ReplaySource(recording), SensorSetup.from_recording(recording))
+    robot = connect_robot(options, tuple(recording.sensors))
     robot.open()
     return robot
 

@@ -105,7 +105,10 @@ def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest
         (["--source", replay, "--subject", str(tmp_path / "none")], "none: no such file"),
         (["--source", replay, "--udp", "somewhere"], "--udp somewhere: a port or HOST:PORT is needed"),
         (["--source", replay, "--output", "osc:9000"], "--output osc:9000: 'osc' is none; there is: lsl, udp"),
-        (["--source", replay, "--port", "70000"], "the live page: port 70000; a number from 1 to 65535"),
+        (
+            ["--source", replay, "--port", "70000"],
+            "127.0.0.1:70000: an address and a port from 1 to 65535",
+        ),
         (["--source", replay, "--method", "smoother"], "smoother"),
     ):
         run("live", *arguments, *([] if "--port" in arguments else ["--no-page"]), code=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import pty
@@ -32,7 +33,7 @@ def status(state: str = "ready", message: str = "Tracking.", sensors: tuple = ()
 
 def test_without_a_terminal_a_line_a_change() -> None:
     file, time_s = io.StringIO(), 0.0
-    with TerminalView(file, clock=lambda: time_s) as view:
+    with contextlib.closing(TerminalView(file, clock=lambda: time_s)) as view:
         time_s = 12.5
         for left in (3, 2, 1):
             view.status(status("start_pose", f"Stand still: {left} s more."))

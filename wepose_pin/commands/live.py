@@ -223,7 +223,7 @@ def live(
                 body = build_subject_model(worn, model, samples.sensors)
             if following is not None:
                 factor = float(speed.replace("max", "inf")) if replays else 1.0
-                driven, samples = connect_robot(following, samples, worn, factor, body.table)
+                driven = connect_robot(following, samples.sensors, worn.subject, factor, body.table)
                 if not driven.stream.checks_contact:
                     print_diagnostics([Diagnostic("robot-shapes-missing", WARNING, driven.robot.map.name)])
             if served is not None and (guide or driven is not None):

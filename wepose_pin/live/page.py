@@ -145,13 +145,11 @@ def _find_reach(model: BodyModel) -> np.ndarray:
     data = place_n_pose(model)
     known = find_known_points(model, model.chains)
     p_W = {point: data.oMf[model.pin.getFrameId(model.point_frames[point])].translation for point in known}
-    ends = [np.zeros(3)]
-    begins = {limb[-1]: limb[0] for limb in model.table.limbs}
-    for end in model.table.paths:
-        if end not in p_W or begins.get(end) not in p_W:
-            continue
-        p_begin, side = p_W[begins[end]], model.table.side(end)
-        for left in (1.0,) if side == "left" else (-1.0,) if side == "right" else (1.0, -1.0):
-            directions = np.array([[1.0, 0.0, 0.0], [0.7, 0.7 * left, 0.0], [0.0, left, 0.0], [0.0, 0.6 * left, 0.8]])
-            ends += list(p_begin + (np.linalg.norm(p_W[end] - p_begin) + FINGERS) * directions)
-    return np.array(ends)
+    points = [np.zeros(3)]
+    for first, *_, last in model.table.limbs:
+        if last in model.table.paths and first in p_W and last in p_W:
+            reach = np.linalg.norm(p_W[last] - p_W[first]) + FINGERS
+            sides = {"left": (1.0,), "right": (-1.0,)}.get(model.table.side(last), (1.0, -1.0))
+            ways = [[1.0, 0.0, 0.0], *([0.0, side, 0.0] for side in sides), *([0.0, 0.6 * side, 0.8] for side in sides)]
+            points += list(p_W[first] + reach * np.array(ways))
+    return np.array(points)

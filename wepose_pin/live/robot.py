@@ -7,7 +7,7 @@ import math
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..body import BodyModel, BodyTable, load_table
-from ..body.subject import population_subject
+from ..body.subject import Subject, population_subject
 from ..diagnostics import WARNING, Diagnostic
 from ..documents import TomlTable, read_toml
 from ..errors import BadOption, WrongOption
@@ -25,9 +25,6 @@ from ..retargeting.stream import STUCK_M, ArmObserver, Command, CommandStream, S
 from ..retargeting.targets import check_person_arms
 from .loop import MAX_LATENCIES
 from .outputs import UdpSender
-from .setup import SensorSetup
-from .sources.base import Source
-from .sources.replay import ReplaySource
 from .state import LivePose, Output, Status, StreamInfo, round_finite
 
 if TYPE_CHECKING:
@@ -74,14 +71,13 @@ class RobotOutput(Output):
     """Sends the robot's commands, each as JSON in a datagram of its own.
 
     A thread of its own makes them at the stream's rate, by this machine's clock: the loop never waits for the solver,
-    and the robot stops also when the loop hangs. In a replay as fast as possible time is that of the ticks instead:
-    `show` makes all commands that are due, without thread or clock, and equal poses give equal bits.
+    and the robot stops also when the loop hangs.
 
     Parameters
     ----------
     to : ``PORT`` of this machine, or ``HOST:PORT``
     lengths_cov : (k, k) [m²] of the person's lengths in the order of the table; None: exact
-    speed : of a replay; infinite: time is that of the ticks
+    speed : of a replay
     table : of the person's body; None: the upper body
 
     Raises
@@ -101,15 +97,13 @@ class RobotOutput(Output):
     ) -> None:
         self.stream, self.robot = stream, stream.robot
         self._sender = UdpSender(to, "to =", PORT)
-        self._lengths_cov, self._table, self._by_ticks = lengths_cov, table, math.isinf(speed)
-        self._speed = 1.0 if self._by_ticks else speed
+        self._lengths_cov, self._table, self._speed = lengths_cov, table, speed
         self._observer: ArmObserver | None = None
         self._newest: tuple[float, LivePose] | None = None  # with its time of arrival [s]
         self._taken: LivePose | None = None
         self._came = 0.0  # [s] when the newest sound pose came
         self._clock_offset = math.nan  # [s] from this machine's clock to the poses'
-        self._due = math.nan  # [s] on the ticks' clock
-        self._resume = self._closing = self._closed = False
+        self._resume = self._closing = False
         self._thread: threading.Thread | None = None
         self._failure: BaseException | None = None
         self.newest: Command | None = None
@@ -120,7 +114,7 @@ class RobotOutput(Output):
 
     def open(self) -> None:
         """Begin to send: the robot keeps its rest posture until tracking starts."""
-        if not self._by_ticks and self._thread is None:
+        if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
             self._thread.start()
 
@@ -130,15 +124,11 @@ class RobotOutput(Output):
         self.open()
 
     def show(self, pose: LivePose) -> None:
-        """Take the newest pose; waits only where time is that of the ticks."""
-        self._raise_failure()
-        if self._by_ticks:
-            self._process_tick(pose)
-        else:
-            self._newest = (time.monotonic(), pose)
+        self._newest = time.monotonic(), pose
 
     def status(self, status: Status) -> None:  # noqa: ARG002
-        self._raise_failure()
+        if self._failure is not None:
+            raise self._failure
 
     def describe(self) -> str:
         """The robot's state and why, as a sentence."""
@@ -155,13 +145,9 @@ class RobotOutput(Output):
 
     def close(self) -> None:
         """Brake within the limits, report that the robot is stopped, and end. May be called twice."""
-        if self._closed:
-            return
-        self._closing = self._closed = True
+        self._closing = True
         if self._thread is not None:
             self._thread.join(PATIENCE_S)
-        elif self._by_ticks and self._failure is None:
-            self._finish()
         self._sender.close()
 
     def figure(self, model: BodyModel) -> RobotFigure:
@@ -184,7 +170,7 @@ class RobotOutput(Output):
             {side: np.array(error) for side, error in self._error.items()},
         )
 
-    # By this machine's clock -----------------------------------------------------------------------------------------
+    # In the thread ---------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
         due, dt, reported = time.monotonic(), self.stream.dt, 0
@@ -194,83 +180,39 @@ class RobotOutput(Output):
                 late = int((time.monotonic() - due) / dt)
                 self._skipped += late if self._taken is not None else 0  # before, the sources warm up
                 due += (late + 1) * dt
-                command = self._send_command(*self._take_newest())
+                if self._closing:
+                    self.stream.end("the session has ended")
+                if self._resume:
+                    self._resume = False
+                    self.stream.resume()
+                command = self._send_command()
                 reported += self._closing and command.state == "stopped"
         except BaseException as error:  # the loop raises it
             self._failure = error
 
-    def _take_newest(self) -> tuple[float, float]:
-        """Take the newest pose; return now [s] on the poses' clock, and the age of the newest sound pose [s]."""
-        self._handle_requests()
-        newest, wall = self._newest, time.monotonic()
-        if newest is not None and newest[1] is not self._taken:
+    def _send_command(self) -> Command:
+        """Take the newest pose, and send the command that follows."""
+        newest, begin = self._newest, time.monotonic()
+        if newest is not None and newest[1] is not self._taken and self._observer is not None:
             came, self._taken = newest
-            offset = self._taken.time / self._speed - came
-            if self._push(self._taken):
+            pose = self._taken
+            observed = self._observer.observe(pose.quat_WL, pose.points, pose.std, pose.lost)
+            offset = pose.time / self._speed - came
+            if self.stream.push(pose.time / self._speed, observed):
                 self._came = came
                 if abs(offset - self._clock_offset) < CLOCK_JUMP_S:
                     offset = self._clock_offset + (offset - self._clock_offset) * self.stream.dt / CLOCK_S
                 self._clock_offset = offset
-        return wall + self._clock_offset, wall - self._came
-
-    # By the clock of the ticks ---------------------------------------------------------------------------------------
-
-    def _process_tick(self, pose: LivePose) -> None:
-        """Send the commands that are due by the tick of `pose`."""
-        self._handle_requests()
-        dt = self.stream.dt
-        if not abs(pose.time - self._due) < PATIENCE_S:  # the first, or another clock
-            self._due = self._came = pose.time
-        while self._due < pose.time - 1e-3 * dt:
-            self._send_command(self._due, self._due - self._came)
-            self._due += dt
-        if self._push(pose):
-            self._came = pose.time
-        if self._due < pose.time + 1e-3 * dt:
-            self._send_command(self._due, max(0.0, self._due - self._came))
-            self._due += dt
-
-    def _finish(self) -> None:
-        self._handle_requests()
-        reported = 0
-        for _ in range(int(PATIENCE_S / self.stream.dt)):
-            reported += self._send_command(self._due, 0.0).state == "stopped"
-            if reported == LAST_COMMANDS:
-                return
-
-    # By either clock -------------------------------------------------------------------------------------------------
-
-    def _handle_requests(self) -> None:
-        """Do what other threads asked for."""
-        if self._closing:
-            self.stream.end("the session has ended")
-        if self._resume:
-            self._resume = False
-            self.stream.resume()
-
-    def _push(self, pose: LivePose) -> bool:
-        """Hand a pose to the stream; False where it is not sound, or came before `start`."""
-        if self._observer is None:
-            return False
-        observed = self._observer.observe(pose.quat_WL, pose.points, pose.std, pose.lost)
-        return self.stream.push(pose.time / self._speed, observed)
-
-    def _send_command(self, now: float, age: float) -> Command:
-        begin = time.perf_counter()
-        command = self.stream.step(now, age)
+        command = self.stream.step(begin + self._clock_offset, begin - self._came)
         self._sender.send(command_json(self.robot, command, self._speed))
         self.newest = command
         if not math.isnan(command.time):
-            self._step.append(time.perf_counter() - begin)
+            self._step.append(time.monotonic() - begin)
             self._states[command.state] += 1
         if command.state in ("follow", "slow"):
             for arm, error in zip(self.robot.arms, command.error[:, 0].tolist(), strict=True):
                 self._error[arm.side].append(error)
         return command
-
-    def _raise_failure(self) -> None:
-        if self._failure is not None:
-            raise self._failure
 
 
 @dataclass(frozen=True)
@@ -316,13 +258,19 @@ def read_robot(name: str) -> RobotOptions:
 
 
 def connect_robot(
-    options: RobotOptions, source: Source, setup: SensorSetup, speed: float = 1.0, table: BodyTable | None = None
-) -> tuple[RobotOutput, Source]:
-    """The robot's output, and the source as it needs it; neither is opened.
+    options: RobotOptions,
+    sensors: Sequence[str],
+    subject: Subject | None = None,
+    speed: float = 1.0,
+    table: BodyTable | None = None,
+) -> RobotOutput:
+    """The robot's output, not opened.
 
     Parameters
     ----------
-    speed : of a replay; infinite: as fast as possible
+    sensors : of the source; empty: not known yet
+    subject : of the person; None: the population prior
+    speed : of a replay
     table : of the person's body; None: the upper body
 
     Raises
@@ -330,13 +278,13 @@ def connect_robot(
     WeposeError
         What is wrong with the options; an arm without sensors.
     """
-    if source.sensors:
-        check_person_arms(options.robot, source.sensors, table=table)
-    if isinstance(source, ReplaySource) and math.isinf(speed):
-        source = ReplaySource(source.recording, speed, block=1)  # the robot gets every pose
-    lengths_cov = (setup.subject or population_subject(body=table)).lengths_covariance((table or load_table()).lengths)
+    if math.isinf(speed):
+        raise BadOption("--speed max: a robot follows a replay at its own speed, or a multiple of it")
+    if sensors:
+        check_person_arms(options.robot, sensors, table=table)
+    lengths_cov = (subject or population_subject(body=table)).lengths_covariance((table or load_table()).lengths)
     stream = CommandStream(options.robot, options.stream)
-    return RobotOutput(stream, options.to, lengths_cov=lengths_cov, speed=speed, table=table), source
+    return RobotOutput(stream, options.to, lengths_cov=lengths_cov, speed=speed, table=table)
 
 
 def command_json(robot: Robot, command: Command, speed: float = 1.0) -> bytes:

@@ -12,9 +12,8 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from ipaddress import ip_address
-from typing import Any
+from typing import Any, NamedTuple
 
 from tornado.httpserver import HTTPServer
 from tornado.web import Application, HTTPError, RequestHandler
@@ -26,7 +25,6 @@ from .encoder import PoseEncoder
 from .state import QUIT, Request, Status, round_finite
 
 FRAME_S = 1.0 / 60.0
-MAX_CLIENTS = 16
 MAX_BYTES = 1024  # of a message from the page
 PING_S, PONG_S = 5.0, 4.0
 GOODBYE_S = 0.5  # that a browser has to answer when the page ends
@@ -41,20 +39,12 @@ HEADERS = {
 }
 
 
-@dataclass(frozen=True)
-class Content:
+class Content(NamedTuple):
     """What the server shows: a page, and what draws its frames."""
 
     page: str  # HTML
     identity: str  # of this page; a browser that reconnects with another one reloads
     encoder: PoseEncoder
-
-    @property
-    def scripts(self) -> str:
-        """The digests of the page's own scripts."""
-        scripts = re.findall(r"<script>(.*?)</script>", self.page, flags=re.DOTALL)
-        digests = [base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()) for script in scripts]
-        return " ".join(f"'sha256-{digest.decode('ascii')}'" for digest in digests)
 
 
 class Server:
@@ -81,17 +71,15 @@ class Server:
         self.status: Status | None = None
         self.clients: set[Stream] = set()
         self._encoded: tuple[Status | None, str] = None, ""  # the newest status that was sent, and as what
-        if not host:  # to the system that would be every interface
-            raise BadOption("the live page needs an address to listen on; 127.0.0.1 is this machine only")
-        if not 0 <= port < 65536:
-            raise BadOption(f"the live page: port {port}; a number from 1 to 65535, or 0 for any that is free")
+        if not host or not 0 <= port < 65536:  # without a host the system would take every interface
+            raise BadOption(f"the live page at {host}:{port}: an address and a port from 1 to 65535, or 0, are needed")
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             self._socket = socket.create_server((host, port), family=family, backlog=16)
         except OSError as error:
             raise BadOption(
-                f"the live page cannot listen on {host}:{port}: {error.strerror}; "
-                f"another port, or 0 for any that is free"
+                f"the live page cannot listen on {host}:{port}: {error.strerror}; another port, or 0 for any that is "
+                f"free"
             ) from None
         self._socket.setblocking(False)
         port = int(self._socket.getsockname()[1])
@@ -115,20 +103,17 @@ class Server:
         )
         server = HTTPServer(application, max_header_size=16384)
         server.add_socket(self._socket)
-        time = asyncio.get_running_loop().time
-        due = time()
         while not self._closing.is_set():
             self._send_newest()
-            due = max(due + FRAME_S, time())
-            await asyncio.sleep(max(due - time(), 0.001))
+            await asyncio.sleep(FRAME_S)
         server.stop()
         for client in list(self.clients):
             if self.status is not None:
                 client.send(self._encode_status(self.status))
             client.close(1001, "ended")
-        until = time() + GOODBYE_S
-        while self.clients and time() < until:
-            await asyncio.sleep(0.01)
+        for _ in range(int(GOODBYE_S / 0.01)):
+            if self.clients:
+                await asyncio.sleep(0.01)
         await server.close_all_connections()
 
     def _send_newest(self) -> None:
@@ -190,19 +175,19 @@ class Guarded(RequestHandler):  # type: ignore[misc]
 class Page(Guarded):
     """The page, which may run its own scripts and connect to its own server."""
 
-    def set_default_headers(self) -> None:
-        self.clear_header("Server")
-
     def get(self) -> None:
-        content = self.server.content
+        page = self.server.content.page
+        scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
+        digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+        own = " ".join(f"'sha256-{digest}'" for digest in digests)
         # meshcat's viewer creates style elements when it starts and fails without them.
         policy = (
-            f"default-src 'none'; script-src {content.scripts}; style-src 'unsafe-inline'; img-src data:; "
+            f"default-src 'none'; script-src {own}; style-src 'unsafe-inline'; img-src data:; "
             f"connect-src ws://{self.request.host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
         )
         for name, value in {**HEADERS, "Content-Security-Policy": policy}.items():
             self.set_header(name, value)
-        self.finish(content.page.encode("utf-8"))
+        self.finish(page)
 
 
 class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
@@ -222,9 +207,6 @@ class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
         self.drawn: object = self  # nothing
 
     def open(self, *_: str, **__: str) -> None:
-        if len(self.server.clients) >= MAX_CLIENTS:
-            self.close(1013, "too many pages are open")
-            return
         self.server.clients.add(self)
         self.greet()
 

@@ -10,7 +10,9 @@ import re
 import select
 import shutil
 import sys
+import termios
 import time
+import tty
 from collections.abc import Callable
 from typing import Any, TextIO
 
@@ -48,12 +50,9 @@ class TerminalView(Output):
         self._actions = status.actions
         if self._keyboard is not None:
             self._keyboard.open()
-        is_terminal = self._file.isatty()
-        if is_terminal and not select.select([], [self._file], [], 0.0)[1]:
-            return  # it is halted: the loop must not wait for it
         now = f"{self._clock() - self._begin:.1f} s  "
         text = "".join(f"{line}\n" for line in self._list_changes(status, now))
-        if is_terminal:
+        if self._file.isatty():
             last = "" if status.state == "ended" else now + self._describe_now(status)
             text = CLEAR + text + last[: shutil.get_terminal_size().columns - 1]
         self._file.write(text)
@@ -85,12 +84,6 @@ class TerminalView(Output):
         """Restore the terminal. May be called twice."""
         if self._keyboard is not None:
             self._keyboard.close()
-
-    def __enter__(self) -> TerminalView:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _list_changes(self, status: Status, time_s: str) -> list[str]:
         """A line for each state that differs from the last one reported; another number in a sentence is no change."""
@@ -141,10 +134,7 @@ class Keyboard:
         self._before: list[Any] = []
 
     def open(self) -> None:
-        try:
-            import termios
-            import tty
-
+        with contextlib.suppress(OSError, ValueError):  # no standard input, or none that is a terminal
             fd = sys.stdin.fileno()
             # The system stops a background job that changes the terminal.
             if self._fd is None and os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp():
@@ -152,17 +142,12 @@ class Keyboard:
                 tty.setcbreak(fd)  # Ctrl-C stays an interrupt
                 self._fd = fd
                 atexit.register(self.close)
-        except (ImportError, OSError, ValueError, AttributeError):
-            return  # no standard input, or none that is a terminal
 
     def take(self) -> list[str]:
         """Keys since the last call; never waits."""
         if self._fd is None or not select.select([self._fd], [], [], 0.0)[0]:
             return []
-        try:
-            pressed = os.read(self._fd, 64)
-        except OSError:
-            pressed = b""
+        pressed = os.read(self._fd, 64)
         if not pressed:
             self.close()  # the terminal is gone
         return list(pressed.decode("utf-8", "ignore"))
@@ -171,8 +156,6 @@ class Keyboard:
         """Restore the terminal."""
         fd, self._fd = self._fd, None
         if fd is not None:
-            import termios
-
             with contextlib.suppress(termios.error):
                 termios.tcsetattr(fd, termios.TCSADRAIN, self._before)
             atexit.unregister(self.close)
