@@ -223,31 +223,6 @@ def test_a_pose_that_is_no_number_stops_the_robot(arm: retargeting.Robot) -> Non
     keeps_its_limits(run.messages(), arm)
 
 
-@pytest.mark.slow
-def test_a_lost_sensor_slows_it_and_its_return_is_no_jump(arm: retargeting.Robot) -> None:
-    """The forearm stays as it was for two seconds and is elsewhere when its sensor comes back."""
-    pose = person(14.0, swing=45.0)
-    poses = live_poses(pose)
-    row = list(pose.quat_WL).index("right_forearm")
-    names = list(pose.points)
-    elbow, wrist, hand = (names.index(f"right_{name}") for name in ("elbow", "wrist", "palm"))
-    for k in range(500, 700):
-        last, points, quat = poses[499], poses[k].points.copy(), poses[k].quat_WL.copy()
-        for at in (wrist, hand):
-            points[at] = points[elbow] + last.points[at] - last.points[elbow]
-        quat[row] = last.quat_WL[row]
-        poses[k] = poses[k]._replace(points=points, quat_WL=quat, lost=np.arange(3) == row)
-    run = Session(arm, pose).run(poses)
-    usual = Session(arm, pose).run(live_poses(pose))
-    assert run.states(4.9, 5.3) == ["follow", "slow"]
-    assert run.commands[550].reason == "no samples from right forearm"
-    assert usual.hand_speed(5.0, 7.0) > 0.8
-    assert run.hand_speed(5.5, 7.0) < 0.5
-    assert run.hand_speed(7.0, 7.5) < 0.8 * usual.hand_speed(7.0, 7.5)
-    assert run.states(11.0) == ["follow"]
-    keeps_its_limits(run.messages(), arm)
-
-
 def test_an_uncertain_hand_is_slow(arm: retargeting.Robot) -> None:
     pose = person(10.0, swing=45.0)
     poses = live_poses(pose)

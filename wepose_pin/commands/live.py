@@ -180,15 +180,10 @@ def live(
     if subject is not None and not accept_failed:
         load_subject(subject).check_quality()
     replays = source.startswith("replay:")
-    stated = None if session is None else find_setup(None, subject, session)
-    if replays:
-        samples = open_source(source, speed=speed)
-        worn = stated or find_setup(samples, subject, None)
-        body = build_subject_model(worn, model, samples.sensors)
-    else:
-        worn = stated or find_setup(None, subject, None)
-        body = build_subject_model(worn, model)
-        samples = _open_stream(source, worn, body, setup, guide)
+    samples = open_source(source, speed=speed) if replays else None
+    worn = find_setup(samples, subject, session)
+    body = build_subject_model(worn, model, () if samples is None else samples.sensors)
+    samples = samples or _open_stream(source, worn, body, setup, guide)
     if not guide:
         check_mounts(samples, worn)  # before the page opens
     print_diagnostics(body.diagnostics)
@@ -254,18 +249,39 @@ def live(
 
 def _print_end(ended: Live, record: Path | None) -> None:
     """What was tracked, what the robot did, and what was recorded."""
-    session = ended.session
+    import numpy as np
+
+    session, robot = ended.session, ended.robot
     assert session is not None
     print_diagnostics(session.diagnostics)
-    _print_session(session)
-    if ended.robot is not None:
-        _print_robot(ended.robot)
+    title = "no poses: the start pose was not held"
+    if session.poses:
+        p50, p99 = (1e3 * np.quantile(session.latency, (0.5, 0.99))).tolist()
+        title = (
+            f"{session.poses} poses in {session.seconds:.1f} s; from the newest sample to its pose {p50:.2f} ms (p50), "
+            f"{p99:.2f} ms (p99)"
+        )
+    titles = ("sensor", "samples", "lost", "ticks without", "late", "twice", "unsound", "frozen", "cut off")
+    keys = ("taken", "lost", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
+    print_table(title, titles, [(name, *(str(each[key]) for key in keys)) for name, each in session.counts.items()])
+    if robot is not None:
+        title = f"{robot.robot}: {robot.commands} commands, none with a pose"
+        if robot.share:
+            shares = ", ".join(f"{100.0 * share:.1f} % {state}" for state, share in robot.share.items())
+            p50, p99 = (1e3 * np.quantile(robot.step, (0.5, 0.99))).tolist()
+            took = f"each took {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
+            title = f"{robot.robot}: {robot.commands} commands; with a pose {shares}; {took}"
+        rows = [
+            (side, *(f"{1e3 * np.quantile(error, share):.1f}" if len(error) else "–" for share in (0.5, 0.9)))
+            for side, error in robot.error.items()
+        ]
+        print_table(title, ("arm", "hand off its target [mm]", "in 90 % under"), rows)
+        print_diagnostics(robot.diagnostics)
     if session.problem:
         facts = {"variant": "disk", "reason": session.problem}
         print_diagnostics([Diagnostic("file-incomplete", WARNING, str(session.record), facts=facts)])
     elif session.record is not None:
-        again = f"  (wepose track {session.record} -o DIR gives these poses again)"
-        say(f"Recorded: {session.record}{again}")
+        say(f"Recorded: {session.record}  (wepose track {session.record} -o DIR gives these poses again)")
     elif record is not None:
         say(f"Nothing was recorded to {record}: without the start pose there is nothing to track.")
 
@@ -292,8 +308,7 @@ def _open_page(model: BodyModel, title: str, host: str | None, port: int, in_bro
     page = LivePage(model, host=host or LOOPBACK, port=port, title=title)
     page.open()
     if "token=" in page.url:
-        say(f"Page: {page.url}")
-        say("Whoever reaches this machine there and has this address can watch and press the page's buttons.")
+        say(f"Page: {page.url}  (whoever has this address can watch and press the page's buttons)")
     else:
         say(f"Page: {page.url}  (this machine only)")
     if in_browser:
@@ -319,49 +334,3 @@ def _name_recording(folder: Path) -> Path:
     """A file in the folder that is not there yet."""
     number = next(n for n in itertools.count(1) if not (folder / f"session-{n}.mcap").exists())
     return folder / f"session-{number}.mcap"
-
-
-def _print_session(session: SessionSummary) -> None:
-    import numpy as np
-
-    title = "no poses: the start pose was not held"
-    if session.poses:
-        p50, p99 = (1e3 * np.quantile(session.latency, (0.5, 0.99))).tolist()
-        title = (
-            f"{session.poses} poses in {session.seconds:.1f} s; from the newest sample to its pose {p50:.2f} ms (p50), "
-            f"{p99:.2f} ms (p99)"
-        )
-    print_table(
-        title,
-        ("sensor", "samples", "lost", "ticks without", "late", "twice", "unsound", "frozen", "cut off"),
-        [
-            (
-                name,
-                *(
-                    str(counts[key])
-                    for key in ("taken", "lost", "missing", "late", "duplicate", "bad", "frozen", "cut_off")
-                ),
-            )
-            for name, counts in session.counts.items()
-        ],
-    )
-
-
-def _print_robot(robot: RobotSummary) -> None:
-    import numpy as np
-
-    title = f"{robot.robot}: {robot.commands} commands, none with a pose"
-    if robot.share:
-        shares = ", ".join(f"{100.0 * share:.1f} % {state}" for state, share in robot.share.items())
-        p50, p99 = (1e3 * np.quantile(robot.step, (0.5, 0.99))).tolist()
-        took = f"each took {p50:.2f} ms (p50), {p99:.2f} ms (p99)"
-        title = f"{robot.robot}: {robot.commands} commands; with a pose {shares}; {took}"
-    print_table(
-        title,
-        ("arm", "hand off its target [mm]", "in 90 % under"),
-        [
-            (side, *(f"{1e3 * np.quantile(error, share):.1f}" if len(error) else "–" for share in (0.5, 0.9)))
-            for side, error in robot.error.items()
-        ],
-    )
-    print_diagnostics(robot.diagnostics)

@@ -167,12 +167,11 @@ class AngleCurves:
             joints = joint_angles(Pose(time, quat_WL, {})).joints
         except WeposeError:  # no two segments make a joint
             return None
-
-        def list_degrees(values: np.ndarray) -> list[float | None]:
-            return [round_finite(value, 1) for value in np.degrees(values)]
-
         curves = {
-            name: {angle: list_degrees(joint.values[:, k]) for k, angle in enumerate(joint.names)}
+            name: {
+                angle: [round_finite(value, 1) for value in np.degrees(joint.values[:, k])]
+                for k, angle in enumerate(joint.names)
+            }
             for name, joint in joints.items()
         }
         return {"time": np.round(time, 3).tolist(), "joints": curves}

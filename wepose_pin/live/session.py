@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from ..body import BodyModel, load_model, load_table
-from ..body.kinematics import KinematicsSolver
+from ..body import BodyModel, load_table
 from ..errors import ExistingOutput
 from ..filters import BEST
 from ..recording import ImuSensor, Recording
-from ..recording.arrivals import Samples, StreamSynchronizer, order_arrivals
-from ..recording.plausibility import check_signals, find_unseen_rate
-from ..tracking import Tracker, TrackOptions
+from ..recording.plausibility import find_unseen_rate
 from ..tracking.heading_problem import CAUSAL_KNOT_S
 from ..writers.live_log import LiveLog
 from ..writers.result import versions
@@ -105,30 +103,17 @@ def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[],
 
 
 def warm_up(method: str) -> None:
-    """Run a tracker once: compilation and reading of files must not delay the start pose, nor a heading correction."""
-    n, rng, sensors = 200, np.random.default_rng(0), tuple(load_table().segments)[:5]
-    recording = Recording(
-        "warm",
-        np.arange(n) / 100.0,
-        100.0,
-        {
-            name: ImuSensor(
-                gyro_S=1e-3 * rng.standard_normal((n, 3)),
-                accel_S=[0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3)),
-                stated_quat_LS=np.array([0.0, 0.0, 0.0, 1.0]),
-            )
-            for name in sensors
-        },
-        {"start": ((0.0, 1.9),)},
-    )
-    check_signals(recording)
-    find_unseen_rate(np.zeros((n, 3)), np.tile([0.0, 0.0, 9.81], (n, 1)), recording.rate_hz)
-    tracker = Tracker(options=TrackOptions(method, causal=True))
-    tracker.push(recording)
-    estimator = tracker.segment_estimator
-    for _ in range(round(2.0 * CAUSAL_KNOT_S * recording.rate_hz)):
-        estimator.step(np.zeros((len(sensors), 3)), np.tile([0.0, 0.0, 9.81], (len(sensors), 1)))
-    estimator.covariance()
-    KinematicsSolver(load_model(), sensors).compute_points(np.tile([0.0, 0.0, 0.0, 1.0], (len(sensors), 1)))
-    synchronizer = StreamSynchronizer(sensors, 100.0, 0.0)
-    synchronizer.push(order_arrivals([Samples(sensors[0], np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))], sensors))
+    """Track a person who stands: compilation and reading of files must not delay the start pose, nor a correction."""
+    n, rng, upright = 200 + round(200.0 * CAUSAL_KNOT_S), np.random.default_rng(0), np.array([0.0, 0.0, 0.0, 1.0])
+    sensors = {
+        name: ImuSensor(
+            gyro_S=1e-3 * rng.standard_normal((n, 3)),
+            accel_S=[0.0, 0.0, 9.81] + 1e-2 * rng.standard_normal((n, 3)),
+            stated_quat_LS=upright,
+        )
+        for name in tuple(load_table().segments)[:5]
+    }
+    recording = Recording("warm", np.arange(n) / 100.0, 100.0, sensors, {"start": ((0.0, 1.9),)})
+    find_unseen_rate(np.zeros((200, 3)), np.tile([0.0, 0.0, 9.81], (200, 1)), 100.0)
+    source = ReplaySource(recording, math.inf)
+    LiveLoop(source, SensorSetup.from_recording(recording), method=method).loop(lambda: False)

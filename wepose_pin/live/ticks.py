@@ -9,7 +9,7 @@ import numpy as np
 from ..body import BodyTable
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadData
-from ..recording.arrivals import JUMP_S, Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
+from ..recording.arrivals import Arrivals, Samples, StreamSynchronizer, Ticks, order_arrivals
 from ..tracking.start_pose import START_POSE_HOLD_S, StartPoseDetector
 from ..writers.live_log import LiveLog
 from .monitor import measure_step
@@ -17,7 +17,6 @@ from .setup import SensorSetup
 from .state import join_names
 
 RATE_MEASUREMENT_S = 1.0  # [s] over which the rate is measured if the source does not know it
-MAX_ABSENCE_S = 3.0  # [s] after which ticks begin without a sensor that has sent nothing
 DEFAULT_RATE_HZ = 100.0  # where none can be measured
 MAX_TICK_BLOCKS = 64  # blocks of ticks kept before those older than the start pose are dropped
 BEGUN_S = 0.5  # [s] of standing still after which a person who moves is told so
@@ -87,18 +86,16 @@ class TickStream:
     def _begin_ticks(self) -> None:
         which, time_s = (np.concatenate(parts) for parts in tuple(zip(*self._waiting, strict=True))[:2])
         times = [time_s[which == i] for i in np.unique(which)]
-        first, newest = np.array([float(own[0]) for own in times]), max(float(own[-1]) for own in times)
-        if len(first) < len(self.sensors) and newest - first.min() < MAX_ABSENCE_S:
+        if len(times) < len(self.sensors):
             return
-        rate = self._rate_hz
+        first, newest = max(float(own[0]) for own in times), max(float(own[-1]) for own in times)
+        rate, begin = self._rate_hz, first if self._begin is None else self._begin
         if rate is None:
-            if newest - first.max() < RATE_MEASUREMENT_S:
+            if newest - first < RATE_MEASUREMENT_S:
                 return
             # That of the slowest sensor.
             rates = [1.0 / step for step in map(measure_step, times) if step]
             rate = max(1.0, round(min(rates), 1)) if rates else DEFAULT_RATE_HZ
-        # A time-stamp outlier must not put all other sensors before the beginning.
-        begin = self._begin if self._begin is not None else float(first[first < np.median(first) + JUMP_S].max())
         self.synchronizer = clock = StreamSynchronizer(self.sensors, rate, begin, orientations=self._orientations)
         if self.log is not None:
             self.log.event("clock", rate_hz=clock.rate_hz, begin=clock.begin, wait_s=clock.wait_s)
