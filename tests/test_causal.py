@@ -224,11 +224,8 @@ def test_a_heading_is_stated_as_track_states_it(recording: Recording, simulation
     np.testing.assert_allclose(np.sqrt(tracker.covariance()[:, 2, 2]), stated, rtol=1e-9)
     moved = np.array([name != "torso" for name in tracker.names])
     assert (np.degrees(np.sqrt(tracker.covariance()[:, 2, 2]))[moved] > 1.0).all()
-    var = tracker.heading_var()
-    assert var is not None
     tracker.reset_headings()  # sets the heading of the start pose, and says nothing of how the mount turns a raised arm
-    after = np.degrees(np.sqrt(tracker.covariance()[:, 2, 2]))
-    assert (after[moved] > np.degrees(np.sqrt(np.maximum(np.square(stated) - var, 0.0)))[moved]).all()
+    assert (np.degrees(np.sqrt(tracker.covariance()[:, 2, 2]))[moved] > 1.0).all()
 
 
 def test_the_detector_finds_the_first_stillness_and_says_who_moves() -> None:

@@ -133,11 +133,13 @@ def test_a_code_or_a_fact_that_is_not_there_fails() -> None:
         render(Diagnostic("static-phase-missing", WARNING))
 
 
-def test_words_of_a_variant_replace_parts_one_after_the_other() -> None:
-    facts = {"variant": "position no-clasp"}
-    text = render(Diagnostic("heading-uncertain", WARNING, "left_palm", 0.12, 0.1, facts))
-    assert text.what.startswith("The position of the left palm may be off by ± 120 mm")
-    assert text.do == "Let the person rest for a second now and then, or hold the hands together (phase `clasp`)."
+def test_a_variant_replaces_parts_of_a_text() -> None:
+    usual, sides = (
+        render(Diagnostic("sensors-exchanged", WARNING, "torso", 3.0, 1.0, facts))
+        for facts in ({}, {"variant": "sides"})
+    )
+    assert usual.title == sides.title
+    assert sides.what == "The left and right sensors seem to be exchanged." != usual.what
 
 
 def test_what_follows_from_a_cause_is_not_shown_beside_it() -> None:
@@ -151,10 +153,12 @@ def test_what_follows_from_a_cause_is_not_shown_beside_it() -> None:
 
 
 def test_json_holds_data_and_text_and_comes_back() -> None:
-    facts = {"variant": "overflexed", "joint": "elbow", "above": "upper arm", "below": "forearm"}
+    facts = {"variant": "sideways", "joint": "elbow", "above": "upper arm", "below": "forearm"}
     diagnostic = Diagnostic("hinge-implausible", ERROR, "left_elbow", 2.967, float("nan"), facts)
     content = json.loads(json.dumps(as_json(diagnostic), allow_nan=False))
-    assert content["text"]["what"].startswith("The left elbow bends by up to 170°")
+    assert content["text"]["what"].startswith(
+        "The forearm leaves the plane in which the left elbow bends by up to 170°"
+    )
     assert content["limit"] is None
     assert from_json(content) == Diagnostic("hinge-implausible", ERROR, "left_elbow", 2.967, None, facts)
     content["text"] = {"title": "another"}

@@ -20,10 +20,11 @@ from wepose_pin.evaluation import evaluate
 from wepose_pin.recording import OrientationSensor, Recording
 from wepose_pin.rotations import heading
 from wepose_pin.simulation import MTI_3, NOISE_FREE, Simulation, simulate, simulate_person
-from wepose_pin.tracking import Tracker, summarize, track
+from wepose_pin.tracking import Tracker, TrackResult, summarize, track
 from wepose_pin.tracking.clasps import ClaspDetector
-from wepose_pin.tracking.heading_filter import HeadingFilter, estimate_headings
+from wepose_pin.tracking.heading_filter import LEARNED_VARIANCE_RATIO, HeadingFilter, estimate_headings
 from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, Knot
+from wepose_pin.tracking.measures import measure_hinge
 
 # The simulated person's shoulders stay in place, against the law of the table.
 RIGID = {name: np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]) for name in TABLE.girdles}
@@ -61,16 +62,17 @@ def test_a_forearm_that_drifts_is_brought_back(made: tuple[Simulation, Subject])
         )
     assert errors[False] < 0.7 * errors[True]
     assert pose.correction is not None
-    assert pose.correction.gap_rms_mm is not None
-    assert pose.correction.gap_rms_mm[1] < 0.6 * pose.correction.gap_rms_mm[0]
-    assert (
-        pose.correction.hinge_residual_rms_deg["right_elbow"][1]
-        < pose.correction.hinge_residual_rms_deg["right_elbow"][0]
-    )
     summary = summarize(pose).content["heading_correction"]
     assert (
         summary["largest_correction_deg"]["right_forearm"] > 4.0 > summary["largest_correction_deg"]["left_upper_arm"]
     )
+
+
+def elbow_rms(pose: TrackResult) -> float:
+    """By how much the right forearm leaves the plane of its hinge [rad]."""
+    elbow = measure_hinge(pose.pose, TABLE, "right_elbow")
+    assert elbow is not None
+    return float(np.sqrt(np.mean(elbow.aside**2)))
 
 
 def test_without_a_clasp_the_hinges_of_each_arm_correct_it(made: tuple[Simulation, Subject]) -> None:
@@ -81,11 +83,7 @@ def test_without_a_clasp_the_hinges_of_each_arm_correct_it(made: tuple[Simulatio
     fewer = replace(recording, sensors={n: s for n, s in recording.sensors.items() if n != "torso"})
     alone = replace(recording, sensors={n: s for n, s in recording.sensors.items() if "forearm" not in n})
     for of, person in ((recording, replace(subject, hinges={})), (fewer, subject)):
-        correction = track(of, person).correction
-        assert correction is not None
-        assert correction.gap_rms_mm is None
-        before, after = correction.hinge_residual_rms_deg["right_elbow"]
-        assert after < 0.7 * before
+        assert elbow_rms(track(of, person)) < 0.7 * elbow_rms(track(of, person, open_loop=True))
     assert track(alone, subject).correction is None
     assert track(recording, subject, open_loop=True).correction is None
 
@@ -102,8 +100,6 @@ def test_hands_that_are_apart_in_the_clasp_phase_turn_nothing(made: tuple[Simula
     assert only.correction is not None
     assert only.correction.max_correction_deg["right_forearm"] > 0.5
     assert longer.correction is not None
-    assert longer.correction.gap_rms_mm is not None
-    assert longer.correction.gap_rms_mm[0] > 300.0
     for name, quat in only.quat_WL.items():
         np.testing.assert_allclose(longer.quat_WL[name], quat, atol=1e-12)
     never = track(replace(recording, phases={"start": start}), replace(subject, hinges={}))
@@ -210,10 +206,11 @@ KNOWN_STD = 0.02 * BIAS_STD
 def make_filter() -> HeadingFilter:
     """Of a segment whose heading nothing observes but its orientation filter."""
     problem = HeadingProblem(
-        ("torso",), load_model(), wp.population_subject(), (), (), np.zeros((0, 3)), {}, PERSON_NOISE, KNOT_S, 16,
-        np.zeros(1), np.full(1, BIAS_STD), np.full(1, START_STD**2), np.full(1, np.deg2rad(6.0) ** 2), 0.0,
+        ("torso",), load_model(), wp.population_subject(), (), (), np.zeros((0, 3)), {}, PERSON_NOISE, 8.0, 1, 16,
+        np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros(1, dtype=bool), np.zeros(1), np.full(1, BIAS_STD),
+        np.full(1, START_STD**2), np.full(1, np.deg2rad(6.0) ** 2), 0.0,
     )  # fmt: skip
-    return HeadingFilter(problem)
+    return HeadingFilter(problem, say((0.0, 0.0, BIAS_STD**2)))
 
 
 def say(about_vertical: tuple[float, ...]) -> FilterHeadings:
@@ -226,7 +223,7 @@ def go_on(state: HeadingFilter, knots: int, about_vertical: tuple[float, ...]) -
     nothing = np.zeros(0), np.zeros((0, 1, 4)), np.zeros((0, 1, 3, 8))
     variance = []
     for _ in range(knots):
-        state.step(Knot(0.0, *nothing, say(about_vertical), np.zeros(1, dtype=bool)))
+        list(state.step(Knot(0.0, *nothing, say(about_vertical), np.zeros(1, dtype=bool), {})))
         variance.append(estimate_headings(state.problem, state.x, state.P, 0.0).segment_covariance[0, 0])
     return np.sqrt(variance)
 
@@ -240,10 +237,10 @@ def test_a_headings_variance_is_start_pose_and_drift_until_the_filter_has_found_
     growing = go_on(state, 10, (0.0, 0.0, BIAS_STD**2))
     assert growing[-1] == pytest.approx(np.hypot(START_STD, 20.0 * np.hypot(BIAS_STD, PERSON_NOISE.rate_std)), rel=0.05)
     standing = go_on(state, 20, (0.0, 0.0, KNOWN_STD**2))
-    assert standing[-1] - standing[-6] < 1.3 * 10.0 * PERSON_NOISE.rate_std
+    assert standing[-1] - standing[-6] < 1.1 * 10.0 * np.sqrt(LEARNED_VARIANCE_RATIO) * PERSON_NOISE.rate_std
 
 
-def test_what_a_filter_corrects_is_believed_as_far_as_nothing_else_has_observed_it() -> None:
+def test_a_bias_that_a_filter_has_found_corrects_the_heading_as_far_as_nothing_else_has_observed_it() -> None:
     """After 20 s a filter turns its heading by −t Δb and its bias by Δb."""
     bias, seconds = np.deg2rad(0.6), 20.0
     for observed, remaining in ((False, 0.0), (True, 1.0)):
@@ -251,24 +248,19 @@ def test_what_a_filter_corrects_is_believed_as_far_as_nothing_else_has_observed_
         go_on(state, round(seconds / KNOT_S), (0.0, 0.0, BIAS_STD**2))
         if observed:
             state.P *= 1e-4
-        std = go_on(state, 1, (-seconds * bias, bias, BIAS_STD**2))[-1]
-        np.testing.assert_allclose(state.x[:2], remaining * bias * np.array([seconds, 1.0]), atol=0.1 * bias)
-        assert (std > seconds * bias) != observed
+        go_on(state, 1, (-seconds * bias, bias, KNOWN_STD**2))
+        np.testing.assert_allclose(state.x[:2], remaining * bias * np.array([seconds, 1.0]), atol=0.1 * bias * seconds)
+        assert abs(state.x[1] - remaining * bias) < 0.1 * bias
 
 
-def test_a_rate_is_unknown_again_once_another_axis_is_vertical() -> None:
+def test_a_rate_is_unknown_again_once_an_axis_of_unknown_bias_is_vertical() -> None:
     state = make_filter()
-    go_on(state, 2, (0.0, 0.0, BIAS_STD**2))
-    state.P[1] *= 1e-2
-    state.P[:, 1] *= 1e-2
+    go_on(state, 2, (0.0, 0.0, KNOWN_STD**2))
     before = state.P[1, 1]
-    for angle, known in ((0.0, True), (0.7, True), (1.5, False)):
-        filters = say((0.0, 0.0, BIAS_STD**2))
-        quat_WL = Rotation.from_rotvec([angle, 0.0, 0.0]).as_quat()[None, None]
-        state.predict(
-            state.find_change(Knot(0.0, np.zeros(1), quat_WL, np.zeros((0, 1, 3, 8)), filters, np.zeros(1, dtype=bool)))
-        )
-        assert (state.P[1, 1] < 2.0 * before + 1e-6) == known
+    go_on(state, 1, (0.0, 0.0, KNOWN_STD**2))
+    assert state.P[1, 1] < 1.1 * before
+    go_on(state, 1, (0.0, 0.0, BIAS_STD**2))
+    assert state.P[1, 1] > 0.9 * BIAS_STD**2
 
 
 def test_a_chunk_may_end_with_the_last_sample_of_the_start_pose(made: tuple[Simulation, Subject]) -> None:
@@ -314,8 +306,6 @@ def test_hands_with_sensors_of_their_own_bend_at_the_wrist(made: tuple[Simulatio
         mounts[f"{side}_hand"] = np.array([0.0, 0.0, 0.0, 1.0])
     pose = track(replace(recording, sensors=sensors), replace(subject, lengths=lengths, mounts=mounts, hinges={}))
     assert pose.correction is not None
-    assert pose.correction.gap_rms_mm is not None
-    assert max(pose.correction.gap_rms_mm) < 2.0
     assert max(pose.correction.max_correction_deg.values()) < 0.1  # 1.3 mm over two arms, of people who stand ± 13 deg
     assert set(pose.correction.max_correction_deg) == set(sensors)
 

@@ -18,7 +18,7 @@ from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate,
 from wepose_pin.tracking import TrackResult, track
 from wepose_pin.tracking.heading_filter import HeadingFilter
 from wepose_pin.tracking.heading_problem import PERSON_NOISE, FilterHeadings, HeadingProblem, Knot
-from wepose_pin.tracking.knots import JointAccelerationFilter
+from wepose_pin.tracking.headings import JointAccelerationFilter
 
 LIMB = ("torso", "right_upper_arm", "right_forearm")
 
@@ -89,8 +89,9 @@ def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_jo
     zeros = np.zeros(2)
     filters = FilterHeadings(*np.zeros((4, 2)))
     problem = HeadingProblem(
-        names, load_model(), population_subject(), (pair,), (), np.zeros((0, 3)), {}, PERSON_NOISE, knot_s, samples,
-        zeros, np.full(2, 1e-4), np.deg2rad([0.1, 20.0]) ** 2, zeros, 0.0,
+        names, load_model(), population_subject(), (pair,), (), np.zeros((0, 3)), {}, PERSON_NOISE, rate_hz, 1, samples,
+        np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.zeros(2, dtype=bool), zeros, np.full(2, 1e-4),
+        np.deg2rad([0.1, 20.0]) ** 2, zeros, 0.0,
     )  # fmt: skip
     z = []
     for _ in range(20):
@@ -98,12 +99,12 @@ def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_jo
         off = rng.normal(scale=np.deg2rad(20.0))
         R_WS = np.stack([spin @ tilt[0], Rotation.from_rotvec([0.0, 0.0, -off]).as_matrix() @ spin @ tilt[1]], axis=1)
         accel_S = np.broadcast_to([0.0, 0.0, 9.81], (len(spin), 2, 3)) + rng.normal(scale=0.02, size=(len(spin), 2, 3))
-        accelerations, state = JointAccelerationFilter(2, rate_hz), HeadingFilter(problem)
+        accelerations, state = JointAccelerationFilter(2, rate_hz), HeadingFilter(problem, filters)
         for begin in range(0, len(spin), samples):
             rows = slice(begin, begin + samples)
             sides = accelerations.push(R_WS[rows], accel_S[rows])[::5]
             quats = np.tile([0.0, 0.0, 0.0, 1.0], (1, 2, 1))
-            state.step(Knot(0.0, np.zeros(1), quats, sides, filters, np.zeros(2, dtype=bool)))
+            list(state.step(Knot(0.0, np.zeros(1), quats, sides, filters, np.zeros(2, dtype=bool), {})))
         z.append((off - state.x[1] + state.x[0]) / np.sqrt(state.P[1, 1] + state.P[0, 0] - 2.0 * state.P[0, 1]))
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 
@@ -124,7 +125,6 @@ def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving
     assert set(correction.joint_accelerations) == {
         f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")
     }
-    assert correction.max_correction_deg["right_forearm"] > 5.0
     rows = tracked.time[tracked.time > 30.0][::20]
     for near, far in pairwise(LIMB):
         by_std = heading_errors(moving, tracked, 30.0)[near, far] / np.degrees(correction.relative_std(near, far, rows))

@@ -141,22 +141,6 @@ def test_a_page_that_fails_is_a_warning(
     assert run("evaluate", tmp_path / "out", tmp_path / "out" / "pose.parquet") == 0
 
 
-def test_a_motion_that_cannot_be_assessed_is_written_all_the_same(
-    session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("wepose_pin.tracking.summary.diagnose_pose", fails)
-    assert run("track", session, "-o", tmp_path / "assessed") == 0
-    assert names(tmp_path / "assessed") == RESULT | {"view.html", "report.html"}
-    assert "not checked for wrong mounts" in capsys.readouterr().err
-    monkeypatch.setattr("wepose_pin.tracking.summary.measure", fails)
-    assert run("track", session, "-o", tmp_path / "gathered") == 0
-    assert names(tmp_path / "gathered") == RESULT | {"view.html"}
-    summary = json.loads((tmp_path / "gathered" / "summary.json").read_text())
-    codes = {(each["code"], each["place"]) for each in summary["diagnostics"]}
-    failed = {("output-incomplete", ""), ("output-incomplete", "report.html")}
-    assert failed <= codes
-
-
 def test_the_result_is_there_when_the_page_is_stopped(
     session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,12 +26,7 @@ from wepose_pin.report.figures import COLUMNS, envelope
 from wepose_pin.report.track import render_track_report
 from wepose_pin.simulation import Simulation, simulate, simulate_person
 from wepose_pin.tracking import TrackOptions, TrackResult, summarize, track
-from wepose_pin.tracking.measures import (
-    compute_heading_uncertainties,
-    compute_joint_heading_stds,
-    measure_hinge,
-    measure_tips,
-)
+from wepose_pin.tracking.measures import measure_headings, measure_hinge, measure_tips
 from wepose_pin.writers import write_session
 
 POINTS = ("left_palm", "right_palm")
@@ -216,23 +210,11 @@ def test_gaps(simulation: Simulation) -> None:
     assert "Lines break where samples are lost" in text_of(page)
 
 
-def test_gravity_bias_and_stamps(simulation: Simulation) -> None:
+def test_a_large_bias(simulation: Simulation) -> None:
     recording = simulation.recording("off")
-    torso = recording.sensors["torso"]
-    rng = np.random.default_rng(1)
-    time = recording.time + rng.uniform(-0.004, 0.004, len(recording))
-    off = changed(recording, "torso", gyro_S=torso.gyro_S + np.deg2rad([2.0, 0.0, 0.0]), accel_S=1.04 * torso.accel_S)
-    pose = track(replace(off, time=time))
-    scale = the("accel-scale", pose)
-    assert (scale.place, scale.severity) == ("torso", INFO)
-    assert scale.value == pytest.approx(0.04, abs=0.01)
-    text = render(scale).what
-    assert re.search(r"measures 10\.\d m/s² while static from .* s to .* s, \+[34]\.\d % off gravity", text)
-    bias = the("gyro-bias-large", pose)
+    gyro_S = recording.sensors["torso"].gyro_S + np.deg2rad([2.0, 0.0, 0.0])
+    bias = the("gyro-bias-large", track(changed(recording, "torso", gyro_S=gyro_S)))
     assert (bias.place, bias.value) == ("torso", pytest.approx(np.deg2rad(2.0), abs=np.deg2rad(1.0)))
-    uneven = the("time-stamps-uneven", pose)
-    assert uneven.value is not None
-    assert uneven.value > 0.2
 
 
 def test_a_person_who_never_rests(pose: TrackResult) -> None:
@@ -256,12 +238,7 @@ def test_headings_that_may_be_far_off(pose: TrackResult) -> None:
     uncertain = [d for d in summarize(wide).diagnostics if d.code == "heading-uncertain"]
     assert {d.place for d in uncertain} == {"left_shoulder", "left_elbow", "right_shoulder", "right_elbow"}
     assert {d.severity for d in uncertain} == {WARNING}
-    assert "which correct the headings as the joints move" in render(uncertain[0]).do
     assert [d.value for d in uncertain] == sorted((d.value for d in uncertain), reverse=True)  # type: ignore[type-var]
-    assert len(compute_joint_heading_stds(compute_heading_uncertainties(wide), wide.model)) == 4
-    smekf = replace(wide, source=replace(wide.segments, options=TrackOptions("smekf")))
-    needs_static = next(d for d in summarize(smekf).diagnostics if d.code == "heading-uncertain")
-    assert "Use the method amekf" in render(needs_static).do
 
 
 def test_headings_that_were_turned_far(pose: TrackResult) -> None:
@@ -293,12 +270,8 @@ def test_elbows_that_cannot_be(pose: TrackResult) -> None:
     assert not any(code.startswith("hinge-") for code in usual)
     back = the("hinge-implausible", with_elbow(pose, np.full(n, -30.0)))
     assert (back.severity, back.place, back.value) == (WARNING, "left_elbow", pytest.approx(np.deg2rad(30.0)))
-    folded = the("hinge-implausible", with_elbow(pose, np.full(n, 170.0)))
-    assert (folded.severity, folded.place, folded.value) == (WARNING, "left_elbow", pytest.approx(np.deg2rad(170.0)))
     turned = the("hinge-implausible", with_elbow(pose, np.full(n, 90.0), 40.0))
     assert turned.value == pytest.approx(np.deg2rad(40.0))
-    drifting = the("hinge-implausible", with_elbow(pose, np.full(n, 90.0), np.linspace(0.0, 60.0, n)))
-    assert "by 15° in the first half of the recording and by 45° in the second" in render(drifting).what
 
 
 def test_a_late_start_pose(pose: TrackResult) -> None:
@@ -328,43 +301,17 @@ def test_an_elbow_in_closed_form() -> None:
     np.testing.assert_allclose(again.aside, 0.0, atol=1e-12)
 
 
-def test_the_elbows_uncertainty_against_draws() -> None:
-    rng = np.random.default_rng(5)
-    quats = {**bent(np.array([70.0])), "left_upper_arm": Rotation.from_euler("xyz", [[20, -30, 40]], True).as_quat()}
-    covs: Mapping[str, np.ndarray] = {}
-    for name in ("left_upper_arm", "left_forearm"):
-        root = np.deg2rad(1.5) * rng.normal(size=(3, 3))
-        covs = {**covs, name: (root @ root.T)[None]}
-    pose = Pose(np.zeros(1), quats, {}, segment_cov=covs)
-    elbow = measure_hinge(pose, TABLE, "left_elbow")
-    assert elbow is not None
-    assert elbow.std is not None
-    n = 20000
-    drawn = {
-        name: (
-            Rotation.from_rotvec(rng.multivariate_normal(np.zeros(3), covs[name][0], n))
-            * Rotation.from_quat(quats[name][0])
-        ).as_quat()
-        for name in covs
-    }
-    draws = measure_hinge(Pose(np.arange(float(n)), drawn, {}), TABLE, "left_elbow")
-    assert draws is not None
-    assert elbow.std[0] == pytest.approx(draws.bend.std(), rel=0.03)
-
-
-def test_heading_budgets_are_those_of_the_covariance(pose: TrackResult) -> None:
-    for name, budget in compute_heading_uncertainties(replace(pose, correction=None)).items():
+def test_heading_stds_are_those_of_the_covariance(pose: TrackResult) -> None:
+    for name, stated in measure_headings(replace(pose, correction=None)).items():
         of = pose.segments.orientation[name]
         assert of.attitude_cov is not None
         R = Rotation.from_quat(of.quat_VS).as_matrix()
         cov = R @ of.attitude_cov @ R.swapaxes(1, 2)
         std = np.sqrt(cov[:, 2, 2])
-        np.testing.assert_allclose(budget.drift, std, rtol=1e-6)
-        np.testing.assert_allclose(budget.std, np.sqrt(pose.pose.segment_cov[name][:, 2, 2]), rtol=1e-12)
-        held = compute_heading_uncertainties(pose)[name].drift  # by the other sensors
-        assert np.all(held <= budget.drift)
-        minutes = np.count_nonzero(~of.static) / pose.recording.rate_hz / 60.0
-        assert budget.growth * minutes == pytest.approx(std[-1] - std[0], rel=1e-6)
+        np.testing.assert_allclose(stated.drift, std, rtol=1e-6)
+        np.testing.assert_allclose(stated.std, np.sqrt(pose.pose.segment_cov[name][:, 2, 2]), rtol=1e-12)
+        held = measure_headings(pose)[name].drift  # by the other sensors
+        assert np.all(held <= stated.drift)
 
 
 def test_hands_are_seen_from_the_torso(pose: TrackResult) -> None:
@@ -447,19 +394,8 @@ def test_what_comes_before_the_start_pose_is_not_in_the_figures_and_said(pose: T
     assert rows_of_hands(render_track_report(summarize(peak), view="<p>")) == rows_of_hands(
         render_track_report(summarize(late), view="<p>")
     )
-    most = max(float(compute_axis_std(peak.pose.point_cov[name]).max()) for name in POINTS)
-    assert the("start-pose-late", peak).facts["position"] == pytest.approx(most)
-    assert not any(each.code == "start-pose-late" for each in summarize(late).diagnostics)
     text = text_of(render_track_report(summarize(peak), view="<p>"))
-    assert "No warnings" not in text
     assert "the 7 s before its end are left out" in text
-
-
-def test_hands_whose_place_is_hardly_known_stand_out(pose: TrackResult) -> None:
-    cov = {name: np.broadcast_to(0.12**2 * np.eye(3), cov.shape) for name, cov in pose.pose.point_cov.items()}
-    uncertain = the("heading-uncertain", with_pose(pose, point_cov=cov), "right_palm")
-    assert uncertain.severity == WARNING
-    assert "The position of the right palm may be off by ± 120 mm" in render(uncertain).what
 
 
 def rows_of_hands(page: str) -> list[list[str]]:

@@ -14,7 +14,7 @@ from ..errors import BadData
 from ..tracking import TrackResult, TrackSummary
 from ..tracking.error_budget import group_by_source
 from ..tracking.measures import (
-    Budget,
+    HeadingStd,
     Measures,
     Signal,
     TipMotion,
@@ -26,7 +26,6 @@ from ..tracking.measures import (
     longest_run_s,
     measure_tips,
 )
-from ..tracking.pose_diagnostics import GRAVITY_OFF, describe_heading_remedy
 from .angles import FULL_TURN, draw_joint_angles
 from .figures import (
     ALARM,
@@ -61,15 +60,8 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
     ----------
     summary : of `summarize`
     view : the page of `pose_html`, embedded up to `LARGEST_VIEW`; None: a view is made here
-
-    Raises
-    ------
-    BadData
-        The motion could not be measured.
     """
     tracked, measures = summary.tracked, summary.measures
-    if measures is None:
-        raise BadData("the motion could not be measured")
     recording, table = tracked.recording, tracked.model.table
     try:
         angles = joint_angles(tracked.pose, AUTO)
@@ -90,7 +82,7 @@ def render_track_report(summary: TrackSummary, *, view: str | None = None) -> st
         ],
         {
             "What was recorded": _list_recorded(tracked, measures),
-            "Drift of the headings": _list_drift(tracked, measures.budgets),
+            "Drift of the headings": _list_drift(tracked, measures.headings),
             f"The {_name_tips(table)}": _list_tips(tracked, measures),
             "Joint angles": _list_angles(tracked, angles) if angles is not None else [],
             "The motion in 3D": [frame],
@@ -179,12 +171,12 @@ def _list_recorded(tracked: TrackResult, measures: Measures) -> list[Item]:
         Table("", [*header, "bias at first", "bias at the end", "gravity"], rows),
         "Saturated: an axis was at the end of its range, and the orientation lacks the rotation beyond it. While a "
         "sensor is static its gyroscope measures its bias, and the heading does not drift. An error of 0.1 °/s in the "
-        f"bias rotates the heading by 6° in a minute. Gravity should measure 9.81 m/s², to {100 * GRAVITY_OFF:.0f} %.",
+        "bias rotates the heading by 6° in a minute. Gravity should measure 9.81 m/s², to 2 %.",
     ]
 
 
-def _list_drift(tracked: TrackResult, budgets: Mapping[str, Budget]) -> list[Item]:
-    if not budgets:
+def _list_drift(tracked: TrackResult, headings: Mapping[str, HeadingStd]) -> list[Item]:
+    if not headings:
         return [_explain_no_covariance(tracked)]
     correction, table = tracked.correction, tracked.model.table
     after_start = find_samples_after_start(tracked)
@@ -192,13 +184,6 @@ def _list_drift(tracked: TrackResult, budgets: Mapping[str, Budget]) -> list[Ite
         "Gravity corrects the tilt. No sensor measures the heading, the rotation about the vertical: it is set in the "
         "start pose and then drifts with the gyroscope's errors."
     )
-    growth = {name: budget.growth for name, budget in budgets.items() if np.isfinite(budget.growth)}
-    if growth:
-        fastest = max(growth, key=growth.__getitem__)
-        text += (
-            f" By drift alone its uncertainty grows by up to {np.degrees(growth[fastest]):.1f}° in a minute of motion "
-            f"(the {plain(fastest)}). {describe_heading_remedy(tracked)}"
-        )
     if correction is not None:
         most = max(correction.max_correction_deg.values(), default=0.0)
         text += (
@@ -207,22 +192,19 @@ def _list_drift(tracked: TrackResult, budgets: Mapping[str, Budget]) -> list[Ite
         )
     if has_stated_mounts(tracked):
         text += " A mount that is stated and not calibrated is as uncertain as people are off the start pose."
-    stds = {name: budget.std for name, budget in budgets.items()}
+    stds = {name: heading.std for name, heading in headings.items()}
     rows = []
-    for name, std in [*stds.items(), *compute_joint_heading_stds(budgets, tracked.model).items()]:
+    for name, std in [*stds.items(), *compute_joint_heading_stds(headings, tracked.model).items()]:
         ends = finite_median(std[after_start]), finite_max(std[after_start]), std[-1]
-        rate = ""
-        if name in budgets:
-            rate = number(float(np.degrees(growth.get(name, np.nan))), 2, " °/min", unknown="never in motion")
-        rows.append([plain(name), *(number(float(np.degrees(each)), 1, "°") for each in ends), rate])
+        rows.append([plain(name), *(number(float(np.degrees(each)), 1, "°") for each in ends)])
     figure = draw_over_time(
         tracked.time,
         {"heading, ± [°]": {name: np.degrees(std) for name, std in stds.items()}},
         "Uncertainty of each heading: one standard deviation, with mounts, start pose and soft tissue.",
-        _style_segments(budgets, table),
+        _style_segments(headings, table),
         spans=("clasp", tracked.recording.phases.get("clasp", ())),
     )
-    header = ["segment or joint", "median ±", "largest ±", "± at the end", "growth in motion, filter alone"]
+    header = ["segment or joint", "median ±", "largest ±", "± at the end"]
     return [text, figure, Table("", header, rows)]
 
 

@@ -1,8 +1,9 @@
-"""A Kalman filter of heading errors over knots of a recording, and what observes them.
+"""A Kalman filter of heading errors over knots of a recording: it owns the headings and the biases about the vertical.
 
-δ_i is the heading error of segment i, on the left in W: R_WL,true = Rz(δ_i) R_WL. It changes by a random walk, whose
-step variance is the growth of the orientation filter's heading variance, and by a rate that changes slowly: the bias
-that the orientation filter has not found. Differences of two or more δ are observed by:
+δ_i is the heading error of segment i, on the left in W: R_WL,true = Rz(δ_i) R_WL. It changes by a random walk and by a
+rate that changes slowly: the bias about the vertical. An orientation filter corrects both by what its own sensor shows,
+as in a static phase. The headings here are those without its corrections, and what it has learned of the bias is one
+more observation. Differences of two or more δ are observed by:
 
 - the acceleration of a joint, which two sensors measure (`observations.joint_accelerations`), with their levers as
   unknowns;
@@ -15,26 +16,25 @@ They are states, so that a long recording does not average them away.
 
 from __future__ import annotations
 
-import contextlib
-import tempfile
-import weakref
 from collections.abc import Iterator
-from typing import IO, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import expit, logit
 
 from ..observations.hinges import linearize_hinge
 from ..observations.joint_accelerations import JointResidual, linearize_joint
-from ..recording import Intervals
 from .clasps import OUTLIER_STDS, ClaspDetector, Rows, whiten_gap
-from .heading_problem import HeadingProblem, Knot
+from .heading_problem import FilterHeadings, HeadingProblem, Knot
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
 MIN_DRIFT_PSD = 1e-10  # [rad²/s]
 # The heading variance of an orientation filter leaps where a knot adds more than this many times the largest recent
 # growth; that is forgotten with a time constant [s].
 LEAP_RATIO, GROWTH_MEMORY_S = 10.0, 60.0
+# An orientation filter learns of a bias where its variance falls by at least this share, and is off by twice what it
+# states: its motions are not as random as it assumes. Found by simulated people who walk, run, throw and reach.
+LEAST_LEARNED, LEARNED_VARIANCE_RATIO = 1e-4, 4.0
 MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accelerations
 # People stand off the start pose as the population does, or by a share of it where they take care: the share, and how
 # likely that is before anything is observed; assumptions.
@@ -48,16 +48,6 @@ _HINGE_COLUMNS = [0, 1, 2, 2, 3]  # of `HingeRows.H`: soft tissue twists a senso
 # Jacobian of the angle and of the two sides of a joint by its columns (`HeadingProblem.pair_columns`).
 _JOINT_JACOBIAN = np.zeros((15, 17))
 _JOINT_JACOBIAN[0, :3], _JOINT_JACOBIAN[1:, 3:] = (1.0, -1.0, 1.0), np.eye(14)
-
-
-class KnotChange(NamedTuple):
-    """How headings and their rates change within a knot, beside what the rates themselves add; (k,) each."""
-
-    heading: np.ndarray  # [rad] by what the orientation filters have corrected
-    rate: np.ndarray  # [rad/s] the same
-    heading_var: np.ndarray  # [rad²] growth of a heading's variance
-    rate_var: np.ndarray  # [rad²/s²] growth of a rate's variance
-    rate_share: np.ndarray  # of a rate's error that is left, as its sensor's filter knows the bias better than that
 
 
 class JointMisfit(NamedTuple):
@@ -117,24 +107,33 @@ class Information:
         self.vector[columns] += weighted @ r
 
 
+class Process(NamedTuple):
+    """How the state changes within a knot, besides what it does by itself; (n,) each."""
+
+    change: np.ndarray
+    variance: np.ndarray
+
+
 class HeadingFilter:
     """The state and its covariance, knot by knot.
+
+    Parameters
+    ----------
+    start : what the orientation filters know at the end of the start pose
 
     Attributes
     ----------
     x, P : (n,), (n, n); the first k are δ [rad]
+    process : of the last knot
+    clasps : [s] when points were found to coincide
     """
 
-    def __init__(self, problem: HeadingProblem) -> None:
+    def __init__(self, problem: HeadingProblem, start: FilterHeadings) -> None:
         self.problem = problem
-        self.phases: dict[str, Intervals] = dict(problem.phases)  # of closures, as far as they are known
         noise, knot_s, c, k = problem.noise, problem.knot_s, problem.columns, len(problem.names)
         self.x, std, decay = np.zeros(c.size), np.zeros(c.size), np.ones(c.size)
-        bias_std = problem.rate_std
-        if problem.start is not None:
-            known = np.sqrt(problem.start.rate_var)
-            bias_std = np.where(np.isfinite(known), known, bias_std)
-        std[c.rate] = np.hypot(noise.rate_std, bias_std)
+        known = np.sqrt(start.rate_var)
+        std[c.rate] = np.hypot(noise.rate_std, np.where(np.isfinite(known), known, problem.rate_std))
         for i, pair in enumerate(problem.pairs):
             std[c.joint[i]] = noise.girdle_std if pair.travels else noise.joint_std
             self.x[c.lever[i]], std[c.lever[i]] = pair.levers, pair.lever_std
@@ -146,14 +145,14 @@ class HeadingFilter:
         self.P = np.diag(std**2)
         self._set_start_covariance()
         self._decay, self._process_var = decay, (1.0 - decay**2) * std**2
+        self._process_var[c.rate] = noise.rate_change_psd * knot_s
         self._misfits = [JointMisfit()] * len(problem.pairs)  # of each joint's accelerations
-        self._last = problem.start
-        self._last_up: np.ndarray | None = None  # (k, 3) the axis of each segment that was turned to the vertical
+        self._last = start
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
         self._recent_growth = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, the largest
         self._detector = ClaspDetector(problem)
         self._closed_before = set[str]()  # phases whose points coincided in the last knot
-        self.clasps: list[tuple[float, float]] = []  # [s] when points were found to coincide
+        self.clasps: list[tuple[float, float]] = []
 
     def reset(self, headings: np.ndarray) -> None:
         """Set δ (k,) [rad] as known to within the start pose."""
@@ -172,102 +171,60 @@ class HeadingFilter:
         self.P[c.start, c.start] = problem.start_var
         self.P[c.heading, c.start] = self.P[c.start, c.heading] = problem.start_var
 
-    def step(self, knot: Knot) -> KnotChange:
-        """Predict to the end of a knot and update by its observations; return the change of the prediction."""
-        change = self.find_change(knot)
-        self.predict(change)
-        for _ in self.update(knot):
-            pass
-        return change
-
-    def find_change(self, knot: Knot) -> KnotChange:
-        """Find how headings and their rates change within a knot.
-
-        The heading variance of an orientation filter grows by the bias too, which is a rate here. So its growth counts
-        up to `drift_psd`. As a whole it counts where it leaps: samples were lost, or the gyroscope was saturated.
-
-        What the filter has corrected of its heading and its bias is believed as far as nothing but the filter knows
-        them, and may be wrong by that much. The rest is taken back, in δ and in its rate. A rate is never less certain
-        than the filter's bias.
-        """
-        noise, knot_s, k = self.problem.noise, self.problem.knot_s, len(self.problem.names)
-        now, last = knot.filters, self._last or knot.filters
-        self._last = now
-        gained = np.maximum(now.var - last.var, MIN_DRIFT_PSD * knot_s)
-        known = np.isfinite(gained)
-        usual = np.maximum(self._recent_growth, self.problem.drift_psd * knot_s)
-        leaps = known & (knot.lost | (gained > LEAP_RATIO * usual))
-        remembered = self._recent_growth * np.exp(-knot_s / GROWTH_MEMORY_S)
-        self._recent_growth = np.maximum(remembered, np.where(known, gained, 0.0))
-        limited = np.where(leaps, gained, np.minimum(gained, self.problem.drift_psd * knot_s))
-        drift_var = np.where(known, limited, UNKNOWN_DRIFT_PSD * knot_s * np.ones(k))
-        heading = np.nan_to_num(now.heading - last.heading)
-        rate = np.nan_to_num(now.rate - last.rate)
-        headings, rates = np.diag(self.P)[:k], np.diag(self.P)[k : 2 * k]
-        alone = np.nan_to_num(last.var) + self.problem.start_var + self.problem.mount_var
-        believed = np.minimum(1.0, headings / alone)
-        rate_alone = np.nan_to_num(now.rate_var, nan=np.inf) + noise.rate_std**2
-        rate_before = np.nan_to_num(last.rate_var, nan=np.inf) + noise.rate_std**2
-        rate_believed = np.minimum(1.0, rates / rate_before)
-        unknown_again = self._find_new_axis_share(knot) * np.nan_to_num(np.maximum(rate_alone - rates, 0.0), posinf=0.0)
-        grown = noise.rate_change_psd * knot_s + (rate_believed * rate) ** 2 + unknown_again
-        share = np.sqrt(np.minimum(1.0, rate_alone / (rates + grown)))
-        return KnotChange(
-            heading=(believed - 1.0) * heading,
-            rate=(1.0 - rate_believed) * rate,
-            heading_var=drift_var + (believed * heading) ** 2,
-            rate_var=share**2 * grown,
-            rate_share=share,
-        )
-
-    def _find_new_axis_share(self, knot: Knot) -> np.ndarray:
-        """Find the share (k,) of the variance of the bias about the vertical that the bias about the last one leaves.
-
-        It is the squared sine of the angle by which a segment has turned since another of its axes was vertical; zero
-        up to 45°.
-        """
-        k = len(self.problem.names)
-        if not len(knot.quat_WL):
-            return np.zeros(k)
-        x, y, z, w = knot.quat_WL[-1].T
-        up = np.stack([2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)], axis=1)
-        last_up = up if self._last_up is None else self._last_up
-        cosine = np.einsum("ki,ki->k", up, last_up)
-        is_turned = np.abs(cosine) < np.sqrt(0.5)
-        self._last_up = np.where(is_turned[:, None], up, last_up)
-        return np.where(is_turned, 1.0 - cosine**2, 0.0)
-
-    def advance(self, values: np.ndarray, change: KnotChange) -> np.ndarray:
-        """Return F v of one knot for v (n,) or (n, m): correlated states decay, headings change by their rates."""
-        k = len(self.problem.names)
-        advanced = np.asarray((self._decay * values.T).T)
-        advanced[:k] += self.problem.knot_s * values[k : 2 * k]
-        advanced[k : 2 * k] = (change.rate_share * advanced[k : 2 * k].T).T
-        return advanced
-
-    def predict(self, change: KnotChange) -> None:
-        """Predict state and covariance at the end of the next knot."""
-        self.x = self.advance(self.x, change)
-        grown = self._process_var.copy()
-        k = len(self.problem.names)
-        self.x[:k] += change.heading
-        self.x[k : 2 * k] += change.rate
-        grown[:k] += change.heading_var
-        grown[k : 2 * k] += change.rate_var
-        self.P = self.advance(self.advance(self.P, change).T, change).T + np.diag(grown)
-
-    def update(self, knot: Knot) -> Iterator[None]:
-        """Update by a knot's observations, then by points that are found to coincide in it.
+    def step(self, knot: Knot) -> Iterator[None]:
+        """Predict to the end of a knot and update by its observations.
 
         It yields between parts of a millisecond or two; the state is valid after the last one.
         """
+        self.process = self._find_process(knot)
+        self.predict(self.process)
+        yield
+        yield from self._update(knot)
+        self._last, self._lost_before = knot.filters, knot.lost
+
+    def _find_process(self, knot: Knot) -> Process:
+        """Find how the state changes within a knot.
+
+        The heading variance of an orientation filter grows by the bias too, which is a rate here. So its growth counts
+        up to `drift_psd`. As a whole it counts where it leaps: samples were lost, or the gyroscope was saturated.
+        What the filter has corrected of its heading and its bias is taken back. A bias is less certain where another
+        axis of the sensor becomes vertical.
+        """
+        problem, now, last, c = self.problem, knot.filters, self._last, self.problem.columns
+        least = problem.drift_psd * problem.knot_s
+        gained = np.maximum(now.var - last.var, MIN_DRIFT_PSD * problem.knot_s)
+        known = np.isfinite(gained)
+        leaps = knot.lost | (gained > LEAP_RATIO * np.maximum(self._recent_growth, least))
+        remembered = self._recent_growth * np.exp(-problem.knot_s / GROWTH_MEMORY_S)
+        self._recent_growth = np.maximum(remembered, np.where(known, gained, 0.0))
+        process = Process(np.zeros(c.size), self._process_var.copy())
+        process.change[c.heading] = -np.nan_to_num(now.heading - last.heading)
+        process.change[c.rate] = np.nan_to_num(now.rate - last.rate)
+        drift = np.where(leaps, gained, np.minimum(gained, least))
+        process.variance[c.heading] += np.where(known, drift, UNKNOWN_DRIFT_PSD * problem.knot_s)
+        process.variance[c.rate] += np.nan_to_num(np.maximum(now.rate_var - last.rate_var, 0.0))
+        return process
+
+    def advance(self, values: np.ndarray) -> np.ndarray:
+        """Return F v of one knot for v (n,) or (n, m): correlated states decay, headings change by their rates."""
+        columns, advanced = self.problem.columns, np.asarray((self._decay * values.T).T)
+        advanced[columns.heading] += self.problem.knot_s * values[columns.rate]
+        return advanced
+
+    def predict(self, process: Process) -> None:
+        """Predict state and covariance at the end of the next knot."""
+        self.x = self.advance(self.x) + process.change
+        self.P = self.advance(self.advance(self.P).T).T + np.diag(process.variance)
+
+    def _update(self, knot: Knot) -> Iterator[None]:
+        """Update by a knot's observations, then by points that are found to coincide in it."""
         k, unreliable = len(self.problem.names), knot.lost | self._lost_before  # after a loss the tilt may be wrong
-        inside = {phase: mask_intervals(knot.time, self.phases.get(phase, ())) for phase in self.problem.closures}
-        inside = {phase: rows for phase, rows in inside.items() if rows.any()}
+        inside = {phase: rows for phase, rows in knot.inside.items() if rows.any()}
         x, information, misfits = self.x, Information(len(self.x)), self._misfits
         for _ in range(ITERATIONS):
             information = Information(len(x))
             misfits = self._add_joints(knot, x, information)
+            self._add_biases(knot, x, information)
             yield
             yield from self._add_hinges(knot, x, information, unreliable)
             for phase, rows in inside.items():
@@ -278,7 +235,7 @@ class HeadingFilter:
                     yield
             x = self._fuse(x, information)
             yield
-        self._misfits, self._lost_before = misfits, knot.lost
+        self._misfits = misfits
         self._apply(x, information)
         yield
         found = self._detector.find(knot, self.x[:k], self.P[:k, :k], inside)
@@ -295,6 +252,21 @@ class HeadingFilter:
             yield
         self._closed_before = {*inside, *found}
 
+    def _add_biases(self, knot: Knot, x: np.ndarray, information: Information) -> None:
+        """Add what the orientation filters have learned of the biases about the vertical.
+
+        A filter that corrects a bias by c while its variance falls from v to v (1 − K) has observed c/K with the
+        variance v (1 − K)/K. The rate here already has c; it is the bias and `rate_std`, which is no bias.
+        """
+        now, last, columns = knot.filters, self._last, self.problem.columns.rate
+        other_var = self.problem.noise.rate_std**2
+        learned = 1.0 - (now.rate_var + other_var) / (last.rate_var + other_var)
+        learns = learned > LEAST_LEARNED  # false for NaN
+        share = np.where(learns, learned, 1.0)
+        correction = np.where(learns, now.rate - last.rate, 0.0)
+        var = LEARNED_VARIANCE_RATIO * np.where(learns, now.rate_var + other_var, 1.0) / share
+        information.add(columns, np.eye(len(columns)), x[columns] + correction * (1.0 / share - 1.0), learns / var)
+
     def _fuse(self, x: np.ndarray, information: Information) -> np.ndarray:
         """Return the state (n,) that fits both the prediction and rows that were linearized at x (n,) best."""
         right = self.P @ (information.matrix @ (x - self.x) - information.vector)
@@ -303,7 +275,7 @@ class HeadingFilter:
     def _apply(self, x: np.ndarray, information: Information) -> None:
         """Set the state, and the covariance that the information leaves."""
         self.x = x
-        self.P = _symmetric(np.linalg.solve(np.eye(len(x)) + self.P @ information.matrix, self.P))
+        self.P = symmetric(np.linalg.solve(np.eye(len(x)) + self.P @ information.matrix, self.P))
 
     def _add_joints(self, knot: Knot, x: np.ndarray, information: Information) -> list[JointMisfit]:
         """Add the accelerations of joints; return the recent misfits with those of the knot."""
@@ -356,15 +328,7 @@ class HeadingFilter:
         information.add(problem.columns.heading, H, r, 1.0 / correlated)
 
 
-def mask_intervals(time: np.ndarray, intervals: Intervals) -> np.ndarray:
-    """Return (n,) bool: which times [s] lie in one of the intervals [s]."""
-    inside = np.zeros(len(time), dtype=bool)
-    for begin, end in intervals:
-        inside |= (time >= begin) & (time <= end)
-    return inside
-
-
-def _symmetric(P: np.ndarray) -> np.ndarray:
+def symmetric(P: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * (P + P.T))
 
 
@@ -405,7 +369,7 @@ def estimate_headings(problem: HeadingProblem, x: np.ndarray, P: np.ndarray, car
     spread = np.eye(k) + information[:, None] * by_start[columns.start]
     gain = by_start[rows] @ np.linalg.solve(spread, np.diag(information))
     change = -gain @ x[columns.start]
-    cov = _symmetric(P[np.ix_(rows, rows)] - care * gain @ by_start[rows].T)
+    cov = symmetric(P[np.ix_(rows, rows)] - care * gain @ by_start[rows].T)
     cov += care * (1.0 - care) * np.outer(change, change)
     of_headings, both = cov[:k, :k], cov[:k, k:]
     return HeadingEstimate((x[rows] + care * change)[:k], of_headings, of_headings + cov[k:, k:] + both + both.T)
@@ -414,58 +378,3 @@ def estimate_headings(problem: HeadingProblem, x: np.ndarray, P: np.ndarray, car
 def _information_by_care(problem: HeadingProblem) -> np.ndarray:
     """Return what care adds to the information (k,) [1/rad²] of the start pose."""
     return np.asarray((CAREFUL_SHARE**-2 - 1.0) / problem.start_var)
-
-
-def _close(file: IO[bytes]) -> None:
-    """Close a temporary file; what a full disk has not taken is of no use any more."""
-    with contextlib.suppress(OSError):
-        file.close()
-
-
-class HeadingSmoother:
-    """Filters knots one by one, and smooths them after the last (Rauch, Tung, Striebel 1965).
-
-    What the way back needs of each knot is in a temporary file: of a day it is gigabytes.
-    """
-
-    def __init__(self, problem: HeadingProblem) -> None:
-        self._problem, self._filter = problem, HeadingFilter(problem)
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115  it lasts as long as this object
-        weakref.finalize(self, _close, self._file)
-        self._times: list[float] = []  # [s] of the knots' middles
-
-    def add(self, knot: Knot) -> None:
-        """Filter the next knot."""
-        change = self._filter.step(knot)
-        self._file.write(np.concatenate([self._filter.x, self._filter.P.ravel(), *change]).tobytes())
-        self._times.append(0.5 * (knot.time[0] + knot.end))
-
-    def _read(self, i: int) -> tuple[np.ndarray, np.ndarray, KnotChange]:
-        """Read the state and its covariance after knot i, and the change that led to it."""
-        n, k = self._problem.columns.size, len(self._problem.names)
-        size = n + n**2 + k * len(KnotChange._fields)
-        self._file.seek(8 * size * i)
-        x, P, change = np.split(np.fromfile(self._file, count=size), [n, n + n**2])
-        return x, P.reshape(n, n), KnotChange(*change.reshape(-1, k))
-
-    def smooth(self) -> tuple[np.ndarray, HeadingEstimate, list[tuple[float, float]]]:
-        """Smooth all m knots.
-
-        Return the times (m,) [s] of their middles, the headings at them, and the intervals [s] in which points were
-        found to coincide.
-        """
-        problem, forward = self._problem, self._filter
-        x, P, change = self._read(len(self._times) - 1)
-        care = find_care(problem, x, P)
-        estimates = [estimate_headings(problem, x, P, care)]
-        for i in range(len(self._times) - 2, -1, -1):
-            before_x, before_P, change_before = self._read(i)
-            forward.x, forward.P = before_x, before_P
-            forward.predict(change)
-            gain = np.linalg.solve(forward.P, forward.advance(before_P, change)).T
-            x = before_x + gain @ (x - forward.x)
-            P = _symmetric(before_P + gain @ (P - forward.P) @ gain.T)
-            estimates.append(estimate_headings(problem, x, P, care))
-            change = change_before
-        headings = HeadingEstimate(*(np.array(each[::-1]) for each in zip(*estimates, strict=True)))
-        return np.array(self._times), headings, forward.clasps

@@ -8,11 +8,12 @@ equal length, the knots. Headings are observed by joints between two sensors, by
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..body import BodyModel
 from ..body.mounts import compute_start_heading_var, find_mount_covariance
@@ -20,11 +21,11 @@ from ..body.start_pose import StartPose
 from ..body.subject import Subject
 from ..calibration import PROTOCOLS, load_protocol
 from ..errors import BadSession
+from ..filters.noise import SensorNoise
 from ..observations.closures import PointPair
 from ..observations.hinges import HingePlane, find_hinges
 from ..observations.joint_accelerations import LEAST_RATE_HZ, JointPair, find_joint_pairs
-from ..recording import Intervals, Recording
-from .segment_orientations import SegmentOrientations
+from ..recording import Recording
 
 REFERENCE_START_STD = np.deg2rad(0.5)  # [rad] of the heading that defines x, at the end of the start pose; assumption
 MEASURED_RATE_STD = np.deg2rad(0.1)  # [rad/s] at which a measured orientation drifts about the vertical; assumption
@@ -99,6 +100,7 @@ class Knot(NamedTuple):
     sides: np.ndarray  # (m, k, 3, 8) of each sensor at its joints, as `compute_sides`, band-passed
     filters: FilterHeadings  # at the end
     lost: np.ndarray  # (k,) bool: the sensor has lost a sample
+    inside: Mapping[str, np.ndarray]  # phase → (m,) bool: its points coincide
 
 
 class StateColumns(NamedTuple):
@@ -143,16 +145,22 @@ class HeadingProblem:
     hinge_std: np.ndarray
     closures: Mapping[str, PointPair]  # phase → points that coincide in it
     noise: HeadingNoise
-    knot_s: float  # [s] length of a knot
+    sensor_rate_hz: float
+    stride: int  # sensors' samples from one sample of a knot to the next
     samples_per_knot: int
+    quat_SL: np.ndarray  # (k, 4) xyzw, from L' to the sensor
+    measured: np.ndarray  # (k,) bool: the sensor measures orientations
     drift_psd: np.ndarray  # (k,) [rad²/s] largest growth of a heading's variance apart from that by its rate
     rate_std: np.ndarray  # (k,) [rad/s] at the start: gyroscopes' biases, or drift of measured orientations
     start_var: np.ndarray  # (k,) [rad²] of the headings at the end of the start pose, by the pose
     mount_var: np.ndarray  # (k,) [rad²] the same by the mounts
     delay_std: float  # [s] by which an accelerometer is late against its gyroscope
-    phases: Mapping[str, Intervals] = field(default_factory=dict)  # phase → its intervals [s]; causally none yet
-    start: FilterHeadings | None = None  # at the end of the start pose; None: as at the end of the first knot
     causal: bool = False  # headings are corrected as samples come; a short clasp then counts as one observation
+
+    @property
+    def knot_s(self) -> float:
+        """Length of a knot [s]."""
+        return self.samples_per_knot * self.stride / self.sensor_rate_hz
 
     @property
     def rate_hz(self) -> float:
@@ -188,41 +196,40 @@ class HeadingProblem:
         ]
 
 
-def find_stride(rate_hz: float) -> int:
-    """Return the number of samples from one that the heading filter takes to the next, at `SAMPLE_RATE_HZ`."""
-    return max(1, round(rate_hz / SAMPLE_RATE_HZ))
-
-
 def make_heading_problem(
-    orientations: SegmentOrientations, subject: Subject, model: BodyModel
+    recording: Recording,
+    quat_LS: Mapping[str, np.ndarray],
+    noises: Mapping[str, SensorNoise],
+    subject: Subject,
+    model: BodyModel,
+    *,
+    causal: bool,
 ) -> HeadingProblem | None:
     """Return what observes the headings of these segments, and how well they are known at the start; None: nothing.
 
-    Causally, the phases of closures are not read but marked as they begin and end (`CausalHeadings.mark`).
-
     Parameters
     ----------
-    orientations : of the first chunk, or of the one that ends with the start pose
+    recording : the first chunk, or the one that ends with the start pose
+    quat_LS : segment → (4,) xyzw, the mounts used
+    noises : of the sensors that have a filter
     """
-    recording, names, causal = orientations.recording, tuple(orientations.quat_WL), orientations.options.causal
+    names, rate_hz = tuple(quat_LS), recording.rate_hz
     noise = MECHANISM_NOISE if model.table.is_mechanism else PERSON_NOISE
-    raw = {name: orientations.quat_LS[name] for name in names if name in recording.imus}
-    pairs = find_joint_pairs(model, raw) if recording.rate_hz >= LEAST_RATE_HZ else ()
+    raw = {name: quat for name, quat in quat_LS.items() if name in recording.imus}
+    pairs = find_joint_pairs(model, raw) if rate_hz >= LEAST_RATE_HZ else ()
     hinges, hinge_std = _find_hinges(recording, names, subject, model, noise)
     closures = _find_closures(names, model)
-    phases = {} if causal else {phase: recording.phases.get(phase, ()) for phase in closures}
-    closed = any(end >= orientations.start[1] for intervals in phases.values() for _, end in intervals)
-    if not (pairs or hinges or closed):
+    if not (pairs or hinges or any(recording.phases.get(phase) for phase in closures)):
         return None
-    stride = find_stride(recording.rate_hz)
-    samples = max(1, round((CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S) * recording.rate_hz / stride))
+    stride = max(1, round(rate_hz / SAMPLE_RATE_HZ))
     drift_psd, rate_std = np.full(len(names), noise.drift_psd), np.full(len(names), MEASURED_RATE_STD)
     for i, name in enumerate(names):
-        if name in orientations.orientation:  # a gyroscope's white noise may be more
-            of_sensor = orientations.orientation[name].noise
-            drift_psd[i] = max(noise.drift_psd, float(np.trace(of_sensor.gyro_cov)) / (3.0 * recording.rate_hz))
-            rate_std[i] = np.sqrt(float(np.trace(of_sensor.gyro_bias_cov)) / 3.0)
+        if name in noises:  # a gyroscope's white noise may be more
+            drift_psd[i] = max(noise.drift_psd, float(np.trace(noises[name].gyro_cov)) / (3.0 * rate_hz))
+            rate_std[i] = np.sqrt(float(np.trace(noises[name].gyro_bias_cov)) / 3.0)
     start_var, mount_var = np.array([find_start_variances(recording, name, subject, model) for name in names]).T
+    neutral = Rotation.from_matrix([model.neutral_rotations[name] for name in names])  # L to L'
+    mounts = Rotation.from_quat([quat_LS[name] for name in names])
     return HeadingProblem(
         names,
         model,
@@ -232,14 +239,16 @@ def make_heading_problem(
         hinge_std,
         closures,
         noise,
-        samples * stride / recording.rate_hz,
-        samples,
-        drift_psd,
-        rate_std,
-        start_var,
-        mount_var,
-        AVERAGED_SAMPLES / recording.rate_hz + CHIP_DELAY_STD,
-        phases,
+        sensor_rate_hz=rate_hz,
+        stride=stride,
+        samples_per_knot=max(1, round((CAUSAL_KNOT_S if causal else OFFLINE_KNOT_S) * rate_hz / stride)),
+        quat_SL=(neutral * mounts).inv().as_quat(),
+        measured=np.array([name not in raw for name in names]),
+        drift_psd=drift_psd,
+        rate_std=rate_std,
+        start_var=start_var,
+        mount_var=mount_var,
+        delay_std=AVERAGED_SAMPLES / rate_hz + CHIP_DELAY_STD,
         causal=causal,
     )
 

@@ -7,9 +7,13 @@ Rauch-Tung-Striebel pass backward follows. Causally what a knot shows is correct
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
+import weakref
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import IO, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,13 +21,14 @@ from scipy.spatial.transform import Rotation
 from .. import rotations
 from ..body.mounts import compute_start_heading_var
 from ..body.start_pose import StartPose
-from ..observations.hinges import linearize_hinge
-from ..recording import Intervals, OrientationSensor
-from .heading_filter import HeadingFilter, HeadingSmoother, estimate_headings, find_care, mask_intervals
-from .heading_problem import FilterHeadings, HeadingProblem
-from .knots import E_Z, KnotReader, Samples, read_filter_headings, stack_samples
-from .segment_orientations import SegmentOrientations
+from ..filters.butterworth import BandPass
+from ..observations.joint_accelerations import BAND_HZ, compute_sides
+from ..recording import Intervals
+from .heading_filter import HeadingEstimate, HeadingFilter, Process, estimate_headings, find_care, symmetric
+from .heading_problem import FilterHeadings, HeadingProblem, Knot
+from .segment_orientations import SegmentOrientations, correct_covariance
 
+E_Z = np.array([0.0, 0.0, 1.0])
 # Share of the next knot in which a knot is solved, in so many parts at even distances (a few more where it closes
 # several gaps); over the rest its correction fades in.
 SOLVE_SHARE, SOLVE_PARTS = 0.4, 20
@@ -39,10 +44,6 @@ class HeadingCorrection:
     covariance: np.ndarray  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
     segment_covariance: np.ndarray  # (m, k, k) [rad²] of the segments' headings
     found_clasps: Intervals = ()  # [s] when the hands were found joined outside of a phase
-    gap_rms_mm: tuple[float, float] | None = None  # between points that coincide, before and after; None: in no phase
-    # Hinge → the segment below to its plane, before and after.
-    hinge_residual_rms_deg: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    delay_s: float | None = None  # [s] after which a causal covariance is used; None: interpolated, offline
 
     @property
     def segments(self) -> tuple[str, ...]:
@@ -54,24 +55,27 @@ class HeadingCorrection:
         return tuple(pair.far for pair in self.problem.pairs)
 
     @property
-    def hinges(self) -> tuple[str, ...]:
-        """Joints that were observed as hinges."""
-        return tuple(hinge.name for hinge in self.problem.hinges)
-
-    @property
     def max_correction_deg(self) -> dict[str, float]:
         """Segment → largest rotation about the vertical."""
         largest = np.degrees(np.max(np.abs(self.errors), axis=0, initial=0.0))
         return dict(zip(self.segments, largest.tolist(), strict=True))
+
+    def summarize(self) -> dict[str, Any]:
+        """What was observed and the largest correction of each heading, as ``summary.json`` has it."""
+        return {
+            "joint_accelerations": list(self.joint_accelerations),
+            "hinges": [hinge.name for hinge in self.problem.hinges],
+            "found_clasps": [[round(value, 2) for value in span] for span in self.found_clasps],
+            "largest_correction_deg": {name: round(value, 3) for name, value in self.max_correction_deg.items()},
+        }
 
     def correct(self, orientations: SegmentOrientations) -> SegmentOrientations:
         """Return a chunk's orientations with corrected headings, of a correction that is interpolated between knots."""
         chunk, subject = orientations.recording, self.problem.subject
         start_pose = StartPose(table=self.problem.model.table)
         corrected, covariance = dict(orientations.quat_WL), dict(orientations.covariance_W)
-        errors = interpolate(chunk.time, self.time, self.errors)
         for i, name in enumerate(self.segments):
-            delta = errors[:, i]
+            delta = np.interp(chunk.time, self.time, self.errors[:, i])
             corrected[name] = rotations.multiply(rotations.rotation_about(E_Z, delta), corrected[name])
             filtered = orientations.orientation.get(name)
             if filtered is not None and filtered.attitude_cov is not None:
@@ -79,7 +83,7 @@ class HeadingCorrection:
                 covariance[name] = correct_covariance(
                     covariance[name],
                     (filtered.quat_VS, filtered.attitude_cov),
-                    orientations.heading_offset[name],
+                    np.array([orientations.heading_offset[name]]),
                     compute_start_heading_var(chunk, name, subject, start_pose),
                     np.stack([known, np.full(len(delta), np.inf), delta**2], axis=1),
                     chunk.sensors[name].gap,
@@ -100,285 +104,240 @@ class HeadingCorrection:
         Neighbours share what one tells of the other. Where `segment_cov` (n, 3, 3) [rad²] in W, given for each segment,
         states less than the heading filter knew, the correlation stays and the covariance shrinks.
         """
-        names = [name for name in self.segments if name in segment_cov]
-        rows = [self.segments.index(name) for name in names]
+        rows = {name: i for i, name in enumerate(self.segments) if name in segment_cov}
         if not len(self.time):
             return {}
-        scale = []
-        for name, i in zip(names, rows, strict=True):
-            variance = self._read(self.segment_covariance[:, i, i], time)
+        scale = {}
+        for name, i in rows.items():
             # As much as the heading is uncertain where the tilt is known may be shared with other segments.
             own = np.linalg.det(segment_cov[name]) / np.linalg.det(segment_cov[name][:, :2, :2])
             with np.errstate(divide="ignore"):
-                scale.append(np.sqrt(np.clip(own / variance, 0.0, 1.0)))
+                scale[name] = np.sqrt(np.clip(own / self._read(self.segment_covariance[:, i, i], time), 0.0, 1.0))
         return {
-            (names[a], names[b]): scale[a] * scale[b] * self._read(self.segment_covariance[:, rows[a], rows[b]], time)
-            for a, b in combinations(range(len(names)), 2)
+            (a, b): scale[a] * scale[b] * self._read(self.segment_covariance[:, rows[a], rows[b]], time)
+            for a, b in combinations(rows, 2)
         }
 
     def _read(self, values: np.ndarray, time: np.ndarray) -> np.ndarray:
-        """Return what is known (n,) at these times [s] of `values` (m,) at the knots; causally 0 before the first."""
-        if self.delay_s is None:
+        """Return what is known (n,) at these times [s] of `values` (m,) at the knots.
+
+        Causally a knot is used after the next one, and before the first nothing is known.
+        """
+        if not self.problem.causal:
             return np.asarray(np.interp(time, self.time, values))
-        return np.concatenate(([0.0], values))[np.searchsorted(self.time, time - self.delay_s, side="right")]
+        knots = np.searchsorted(self.time, time - self.problem.knot_s, side="right")
+        return np.concatenate(([0.0], values))[knots]
 
 
 class HeadingCorrector:
-    """Finds the correction of the headings of a recording in two passes over its chunks.
+    """Corrects headings as samples come, or by `smooth` after the last one.
 
-    First pass: `add_observations` of every chunk, then `solve`. Second pass: `HeadingCorrection.correct` of each. The
-    result does not depend on the chunks, because observations are summed knot by knot.
-
-    Parameters
-    ----------
-    orientations : of the first chunk
-    problem : from `make_heading_problem`
-    """
-
-    def __init__(self, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
-        self._problem, self._start_end = problem, orientations.start[1]
-        self._measured = find_measured_headings(orientations)
-        self._reader = KnotReader(orientations, problem)
-        self._smoother: HeadingSmoother | None = None  # from the first knot on
-        self._samples: list[tuple[np.ndarray, np.ndarray]] = []  # time and orientations of each knot
-
-    def add_observations(self, orientations: SegmentOrientations) -> None:
-        """Add the observations of a chunk, in the first pass."""
-        chunk, names = orientations.recording, self._problem.names
-        begin = int(np.searchsorted(chunk.time, self._start_end))
-        if begin == len(chunk):
-            return
-        samples = stack_samples(orientations, names)
-        if self._smoother is None:
-            start = read_filter_headings(orientations.orientation, names, begin)
-            self._problem = replace(self._problem, start=start)
-            self._smoother = HeadingSmoother(self._problem)
-        while begin < len(chunk):
-            end = min(len(chunk), begin + self._reader.remaining)
-            self._reader.push(*(values[begin:end] for values in samples))
-            self._last_filters = read_filter_headings(orientations.orientation, names, end - 1)
-            if not self._reader.remaining:
-                self._close_knot(self._smoother)
-            begin = end
-
-    def _close_knot(self, smoother: HeadingSmoother) -> None:
-        knot = self._reader.form(self._reader.take(), self._last_filters)
-        smoother.add(knot)
-        self._samples.append((knot.time, knot.quat_WL))
-
-    def solve(self) -> HeadingCorrection | None:
-        """Estimate the heading errors; return None where nothing observes them."""
-        problem, smoother = self._problem, self._smoother
-        if smoother is None:
-            return None
-        if self._reader.count:
-            self._close_knot(smoother)
-        knot_times, smoothed, clasps = smoother.smooth()
-        if self._measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
-            smoothed.errors[:, self._measured] = 0.0
-        # The errors are constant before the first and after the last.
-        time, quat_WL = (np.concatenate(values) for values in zip(*self._samples, strict=True))
-        self._samples, self._smoother = [], None
-        gap, hinges = measure_residuals(problem, time, quat_WL, np.zeros(quat_WL.shape[:2]))
-        corrections = interpolate(time, knot_times, smoothed.errors)
-        gap_after, hinges_after = measure_residuals(problem, time, quat_WL, corrections)
-        return HeadingCorrection(
-            problem,
-            knot_times,
-            *smoothed,
-            tuple(clasps),
-            None if gap is None or gap_after is None else (gap, gap_after),
-            {joint: (rms, hinges_after[joint]) for joint, rms in hinges.items()},
-        )
-
-
-def interpolate(time: np.ndarray, knot_times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return what is between the knots (n, k) of `values` (m, k) at them."""
-    return np.stack([np.interp(time, knot_times, column) for column in values.T], axis=1)
-
-
-def measure_residuals(
-    problem: HeadingProblem, time: np.ndarray, quat_WL: np.ndarray, headings: np.ndarray
-) -> tuple[float | None, dict[str, float]]:
-    """Return the rms gap [mm] between points that coincide, None in no phase, and hinge → rms deviation [deg].
+    Causally a complete knot is solved in parts, with samples between, so that no pose waits for long. From the sample
+    `lead` of the next knot on, by which all parts are done, the correction fades in. Offline nothing is corrected yet;
+    what the way back needs of each knot is in a temporary file: of a day it is gigabytes.
 
     Parameters
     ----------
-    time, quat_WL, headings : (n,) [s], (n, k, 4) xyzw of L', (n, k) [rad] by which they are corrected
-    """
-    squares = []
-    for phase, points in problem.closures.items():
-        inside = mask_intervals(time, problem.phases[phase])
-        if inside.any():
-            squares.append(np.sum(points.linearize(quat_WL[inside], headings[inside]).gap ** 2, axis=1))
-    gap = 1e3 * float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else None
-    rms = {}
-    for hinge in problem.hinges:
-        moves, on = (problem.names.index(name) for name in (hinge.moves, hinge.on))
-        r = linearize_hinge(hinge, quat_WL[:, on], quat_WL[:, moves], headings[:, [moves, on]]).r
-        rms[hinge.name] = float(np.degrees(np.sqrt(np.mean(r**2))))
-    return gap, rms
-
-
-class CausalHeadings:
-    """Corrects headings as samples come; what a knot observes is corrected by the end of the next one.
-
-    When a knot is complete it is solved in parts, with samples between, so that no pose waits for long. From the sample
-    `lead` of the next knot on, by which all parts are done, the correction fades in.
-
-    Parameters
-    ----------
-    orientations : up to the end of the start pose
+    offset : (k,) ψ [rad] to which corrections are added
+    start : what the orientation filters know at the end of the start pose
+    begin : [s] the time of the first sample
 
     Attributes
     ----------
-    offset : (k,) ψ [rad] to which corrections are added
-    variance : (k,) [rad²] each after the last knot: variances of each segment's heading and of its filter's alone, and
+    variance : (3, k) [rad²] after the last knot: variances of each segment's heading and of its filter's alone, and
         the squared correction of the headings since the start or the last reset
     """
 
-    def __init__(self, orientations: SegmentOrientations, problem: HeadingProblem) -> None:
-        recording = orientations.recording
-        start = read_filter_headings(orientations.orientation, problem.names, len(recording) - 1)
-        self._problem = problem = replace(problem, start=start)
-        self.offset = np.array([orientations.heading_offset[name] for name in problem.names])
-        self._reader = KnotReader(orientations, problem)
-        self._filter = HeadingFilter(problem)
-        self._care = find_care(problem, self._filter.x, self._filter.P)
-        self._rate_hz, self._samples = recording.rate_hz, 0
-        self._start_end = float(recording.time[-1])
-        self._lead = min(round(SOLVE_SHARE * self._reader.size), self._reader.size - 1)
-        self._solving: Iterator[None] | None = None  # the last knot, until its correction is applied
-        self._record = False
-        self._begin, self._end, self._at_reset = np.zeros((3, len(problem.names)))
-        self._measured = find_measured_headings(orientations)
+    def __init__(self, problem: HeadingProblem, offset: np.ndarray, start: FilterHeadings, begin: float) -> None:
+        k = len(problem.names)
+        self.problem, self.offset, self._begin_s = problem, offset, begin
+        self._quat_WV = rotations.rotation_about(E_Z, offset)
+        self._filter = HeadingFilter(problem, start)
+        self._accelerations = JointAccelerationFilter(k, problem.sensor_rate_hz) if problem.pairs else None
+        self._size = problem.stride * problem.samples_per_knot
+        self._lead = min(round(SOLVE_SHARE * self._size), self._size - 1) if problem.causal else 0
+        self._samples = np.zeros((self._size, k, 4)), np.zeros((self._size, k, 3))
+        self._inside = {phase: np.zeros(self._size, dtype=bool) for phase in problem.closures}
+        self._open = set[str]()  # phases that have begun
+        self._count = self._knots = 0  # samples in the open knot, knots before it
+        self._knot_end, self._records = (
+            0.0,
+            False,
+        )  # of the last knot: its end [s] after `begin`, whether it is recorded
+        self._solving: Iterator[None] | None = None  # the last knot, until it is done
+        self._from, self._to, self._at_reset = np.zeros((3, k))
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
-        self._var_at_knot = np.zeros(len(problem.names))  # [rad²] of the filters, at the last knot that is solved
-        self._knot_end = 0.0  # [s] of that knot
+        self._var_at_knot = np.zeros(k)  # [rad²] of the filters, at the last knot that is solved
+        self._times: list[float] = []  # [s] of the knots: their ends, offline their middles
+        self._history: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []  # of knots, as `HeadingCorrection` has it
+        self._file: IO[bytes] | None = None
+        if not problem.causal:
+            self._file = tempfile.TemporaryFile()  # noqa: SIM115  it lasts as long as this object
+            weakref.finalize(self, _close, self._file)
         self._update_estimate()
-        self.variance = self._find_variances()
-        self._marked: dict[str, list[tuple[int, int | None]]] = {}  # phase → first sample, and the one after the last
-        self._history: list[tuple[float, np.ndarray, np.ndarray, np.ndarray]] = []  # of knots, as the correction
-
-    @property
-    def phases(self) -> set[str]:
-        """The names of the phases in which points coincide."""
-        return set(self._problem.closures)
+        self._update_variance()
 
     @property
     def fade(self) -> tuple[np.ndarray, np.ndarray, int, int]:
         """How the correction fades in: from (k,) [rad], to (k,) [rad], number of the next sample, number of samples."""
-        count = self._reader.count
-        if count < self._lead:
-            return self._end, self._end, 0, 1
-        return self._begin, self._end, count - self._lead, self._reader.size - self._lead
+        if self._count < self._lead:
+            return self._to, self._to, 0, 1
+        return self._from, self._to, self._count - self._lead, self._size - self._lead
 
     @property
     def remaining(self) -> int:
         """Number of samples that can be pushed at once: after them `fade` changes, or the knot is complete."""
-        count = self._reader.count
-        return (self._lead if count < self._lead else self._reader.size) - count
+        return (self._lead if self._count < self._lead else self._size) - self._count
+
+    def mark(self, phase: str, *, begins: bool) -> None:
+        """Mark that a phase begins with the next sample, or has ended before it; its closures hold in between."""
+        (self._open.add if begins else self._open.discard)(phase)
 
     def push(self, quat_VS: np.ndarray, accel_S: np.ndarray) -> bool:
         """Add up to `remaining` samples: (n, k, 4) xyzw, (n, k, 3) [m/s²], NaN where lost; return whether the knot is
         complete.
         """
-        time = (self._samples + np.arange(len(quat_VS))) / self._rate_hz
-        self._reader.push(time, quat_VS, accel_S)
-        self._samples += len(quat_VS)
+        rows = slice(self._count, self._count + len(quat_VS))
+        self._samples[0][rows], self._samples[1][rows] = quat_VS, accel_S
+        for phase, inside in self._inside.items():
+            inside[rows] = phase in self._open
+        self._count += len(quat_VS)
         if self._solving is not None:
-            if self._reader.count >= self._lead:
+            if self._count >= self._lead:
                 self._apply()
-            elif self._reader.count % max(1, self._lead // SOLVE_PARTS) == 0:
+            elif self._count % max(1, self._lead // SOLVE_PARTS) == 0:
                 next(self._solving, None)
-        return not self._reader.remaining
+        return self._count == self._size
 
     def close(self, filters: FilterHeadings, *, record: bool = False) -> None:
-        """Close a complete knot; `filters` is after its last sample; `record`: keep the covariance for `summarize`."""
-        self._record = record
-        self._solving = self._solve(self._reader.take(), filters)
+        """Close the open knot; `filters` is after its last sample; `record`: keep its result for `collect`."""
+        quat_VS, accel_S = (values[: self._count].copy() for values in self._samples)
+        inside = {phase: rows[: self._count : self.problem.stride].copy() for phase, rows in self._inside.items()}
+        self._solving = self._solve(self._knots * self._size, quat_VS, accel_S, inside, filters)
+        self._count, self._knots, self._records = 0, self._knots + 1, record
         if not self._lead:
             self._apply()
 
-    def mark(self, phase: str, *, begins: bool) -> None:
-        """Mark that a phase begins with the next sample, or has ended before it; its closures hold in between."""
-        marked = self._marked.setdefault(phase, [])
-        is_open = bool(marked) and marked[-1][1] is None
-        if begins and not is_open:
-            marked.append((self._samples, None))
-        elif is_open and not begins:
-            marked[-1] = marked[-1][0], self._samples
-        else:
-            return
-        # Half a sample around the first and the last one.
-        self._filter.phases[phase] = tuple(
-            ((first - 0.5) / self._rate_hz, np.inf if last is None else (last - 0.5) / self._rate_hz)
-            for first, last in marked
-        )
-
-    def _solve(self, samples: Samples, filters: FilterHeadings) -> Iterator[None]:
+    def _solve(
+        self,
+        first: int,
+        quat_VS: np.ndarray,
+        accel_S: np.ndarray,
+        inside: Mapping[str, np.ndarray],
+        filters: FilterHeadings,
+    ) -> Iterator[None]:
         """Estimate the heading errors of a knot, a part at each step of the iterator."""
-        knot = self._reader.form(samples, filters)
+        problem, rows = self.problem, slice(None, None, self.problem.stride)
+        time = (first + np.arange(len(quat_VS))) / problem.sensor_rate_hz
+        quat_WS = rotations.multiply(self._quat_WV, quat_VS)
+        sides = np.zeros((0, len(problem.names), 3, 8))
+        if self._accelerations is not None:
+            R_WS = Rotation.from_quat(quat_WS.reshape(-1, 4)).as_matrix().reshape(*quat_WS.shape[:2], 3, 3)
+            sides = self._accelerations.push(R_WS, accel_S)[rows]
+        lost = np.asarray(~np.isfinite(accel_S).all(axis=(0, 2)))
+        quat_WL = rotations.multiply(quat_WS[rows], problem.quat_SL)
+        knot = Knot(float(time[-1]), time[rows], quat_WL, sides, filters, lost, inside)
         yield
-        self._filter.predict(self._filter.find_change(knot))
-        yield
-        yield from self._filter.update(knot)
-        self._care = find_care(self._problem, self._filter.x, self._filter.P)
+        yield from self._filter.step(knot)
+        if self._file is not None:
+            x, P, process = self._filter.x, self._filter.P, self._filter.process
+            self._file.write(np.concatenate([x, P.ravel(), *process]).tobytes())
+            self._times.append(self._begin_s + 0.5 * float(time[0] + time[-1]))
+            return
         self._update_estimate()
-        self._var_at_knot, self._knot_end = np.nan_to_num(filters.var), knot.end
-
-    def _update_estimate(self) -> None:
-        self._estimate = estimate_headings(self._problem, self._filter.x, self._filter.P, self._care)
+        self._var_at_knot, self._knot_end = np.nan_to_num(filters.var), float(time[-1])
 
     def _apply(self) -> None:
-        """Finish the last knot; its correction fades in from the next sample on."""
+        """Finish the last knot; causally its correction fades in from the next sample on."""
         if self._solving is None:
             return
         for _ in self._solving:
             pass
         self._solving = None
-        self._begin, self._end = self._end, self._estimate.errors.copy()
-        if self._measured.any() and not self._corrects_measured:
-            self._corrects_measured = exceed_uncertainty(self._end[None], self._estimate.covariance[None])
-            self._end[self._measured] *= self._corrects_measured
-        if self._record:
-            self._history.append((self._start_end + self._knot_end, self._end, *self._estimate[1:]))
-        self.variance = self._find_variances()
+        if self._file is not None:
+            return
+        self._from, self._to = self._to, self._estimate.errors.copy()
+        measured = self.problem.measured
+        if measured.any() and not self._corrects_measured:
+            self._corrects_measured = exceed_uncertainty(self._to[None], self._estimate.covariance[None])
+            self._to[measured] *= self._corrects_measured
+        if self._records:
+            self._times.append(self._begin_s + self._knot_end)
+            self._history.append((self._to, *self._estimate[1:]))
+        self._update_variance()
 
     def reset(self, heading_offset: np.ndarray) -> None:
         """Correct the headings to ψ (k,) [rad] at once, as the person shows them by standing in the start pose."""
         self._apply()
         error = heading_offset - self.offset
-        error = error + 2.0 * np.pi * np.round((self._end - error) / (2.0 * np.pi))
+        error = error + 2.0 * np.pi * np.round((self._to - error) / (2.0 * np.pi))
         self._filter.reset(error)
         self._update_estimate()
         self._corrects_measured = True
-        self._begin = self._end = error
-        self._at_reset = error
-        self.variance = self._find_variances()
+        self._from = self._to = self._at_reset = error
+        self._update_variance()
 
-    def _find_variances(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what `variance` is now."""
-        return np.diag(self._estimate.segment_covariance), self._var_at_knot, (self._end - self._at_reset) ** 2
+    def _update_estimate(self) -> None:
+        x, P = self._filter.x, self._filter.P
+        self._estimate = estimate_headings(self.problem, x, P, find_care(self.problem, x, P))
 
-    def summarize(self) -> HeadingCorrection:
-        """Return what was observed and corrected so far, without residuals: they are not computed causally."""
-        k, history = len(self._problem.names), self._history
+    def _update_variance(self) -> None:
+        var = np.diag(self._estimate.segment_covariance)
+        self.variance = np.array([var, self._var_at_knot, (self._to - self._at_reset) ** 2])
+
+    def collect(self) -> HeadingCorrection:
+        """Return what was observed and corrected causally so far."""
+        k, history = len(self.problem.names), self._history
         return HeadingCorrection(
-            self._problem,
-            np.array([time for time, *_ in history]),
-            np.array([errors for _, errors, _, _ in history]).reshape(-1, k),
-            np.array([cov for _, _, cov, _ in history]).reshape(-1, k, k),
-            np.array([cov for _, _, _, cov in history]).reshape(-1, k, k),
-            tuple((self._start_end + a, self._start_end + b) for a, b in self._filter.clasps),
-            delay_s=self._problem.knot_s,
+            self.problem,
+            np.array(self._times),
+            np.array([errors for errors, _, _ in history]).reshape(-1, k),
+            np.array([cov for _, cov, _ in history]).reshape(-1, k, k),
+            np.array([cov for _, _, cov in history]).reshape(-1, k, k),
+            self._find_clasps(),
         )
 
+    def smooth(self, filters: FilterHeadings) -> HeadingCorrection | None:
+        """Smooth all knots (Rauch, Tung, Striebel 1965), `filters` after the last sample; None: there is no knot."""
+        problem, forward = self.problem, self._filter
+        if self._count:
+            self.close(filters)
+        if not self._times:
+            return None
+        x, P, process = self._read(len(self._times) - 1)
+        care = find_care(problem, x, P)
+        estimates = [estimate_headings(problem, x, P, care)]
+        for i in range(len(self._times) - 2, -1, -1):
+            before_x, before_P, process_before = self._read(i)
+            forward.x, forward.P = before_x, before_P
+            forward.predict(process)
+            gain = np.linalg.solve(forward.P, forward.advance(before_P)).T
+            x = before_x + gain @ (x - forward.x)
+            P = symmetric(before_P + gain @ (P - forward.P) @ gain.T)
+            estimates.append(estimate_headings(problem, x, P, care))
+            process = process_before
+        smoothed = HeadingEstimate(*(np.array(each[::-1]) for each in zip(*estimates, strict=True)))
+        if problem.measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
+            smoothed.errors[:, problem.measured] = 0.0
+        return HeadingCorrection(problem, np.array(self._times), *smoothed, found_clasps=self._find_clasps())
 
-def find_measured_headings(orientations: SegmentOrientations) -> np.ndarray:
-    """Find (k,) bool the segments whose sensors measure orientations."""
-    sensors = orientations.recording.sensors
-    return np.array([isinstance(sensors[name], OrientationSensor) for name in orientations.quat_WL], dtype=bool)
+    def _read(self, i: int) -> tuple[np.ndarray, np.ndarray, Process]:
+        """Read the state and its covariance after knot i, and the process that led to it."""
+        assert self._file is not None
+        n = self.problem.columns.size
+        size = n * (n + 3)
+        self._file.seek(8 * size * i)
+        x, P, *process = np.split(np.fromfile(self._file, count=size), np.cumsum([n, n * n, n]))
+        return x, P.reshape(n, n), Process(*process)
+
+    def _find_clasps(self) -> Intervals:
+        return tuple((self._begin_s + a, self._begin_s + b) for a, b in self._filter.clasps)
+
+
+def _close(file: IO[bytes]) -> None:
+    """Close a temporary file; what a full disk has not taken is of no use any more."""
+    with contextlib.suppress(OSError):
+        file.close()
 
 
 def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:
@@ -394,37 +353,36 @@ def exceed_uncertainty(errors: np.ndarray, covariance: np.ndarray) -> bool:
     return bool((np.sum(errors * weighted, axis=1) > 1.0).any())
 
 
-def correct_covariance(
-    cov_W: np.ndarray,
-    filtered: tuple[np.ndarray, np.ndarray],
-    heading_offset: float,
-    start_var: float,
-    variance: np.ndarray,
-    lost: np.ndarray | None = None,
-) -> np.ndarray:
-    """Return the covariances (n, 3, 3) [rad²] of a segment in W, `cov_W`, with the variance of its corrected heading.
-
-    Variance from other sources, such as a mount's heading, is not observed by what neighbours share: it stays.
+class JointAccelerationFilter:
+    """The side B of each sensor at its joints, band-passed, from samples of all sensors; it runs on from call to call.
 
     Parameters
     ----------
-    filtered : of the sensor's filter, `quat_VS` (n, 4) xyzw and the covariance (n, 3, 3) [rad²] of its error, in S
-    heading_offset, start_var : ψ [rad], and its variance [rad²] by the start pose
-    variance : (n, 3) [rad²] as `CausalHeadings.variance`
-    lost : (n,) bool: the sensor is lost, and neighbours do not tell where its segment is
+    sensors : number of them
     """
-    R_VS, attitude_cov = Rotation.from_quat(filtered[0]), filtered[1]
-    with_heading_V = R_VS.apply(np.einsum("nab,nb->na", attitude_cov, R_VS.inv().apply(E_Z)))  # with each axis
-    alone = with_heading_V[:, 2] + start_var
-    known, at_knot, correction = variance.T
-    # The filter alone may know the heading better; to it a correction is an error of that size.
-    corrected = np.minimum(known + np.maximum(with_heading_V[:, 2] - at_knot, 0.0), alone + correction)
-    if lost is not None:
-        corrected = np.where(lost, np.maximum(corrected, alone), corrected)
-    with_heading_W = Rotation.from_rotvec([0.0, 0.0, heading_offset]).apply(with_heading_V)
-    removed = (1.0 - np.sqrt(corrected / alone))[:, None] * with_heading_W
-    replaced = cov_W.copy()
-    replaced[:, 2, :2] -= removed[:, :2]
-    replaced[:, :2, 2] -= removed[:, :2]
-    replaced[:, 2, 2] += corrected - alone
-    return replaced
+
+    def __init__(self, sensors: int, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self._band: BandPass | None = None
+        self._last_R_WS, self._last_accel_S = np.zeros((2, sensors, 3, 3)), np.zeros((2, sensors, 3))
+
+    def push(self, R_WS: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
+        """Return B (n, k, 3, 8), one sample late; where a sensor has lost samples it is of no use.
+
+        Parameters
+        ----------
+        R_WS : (n, k, 3, 3)
+        accel_S : (n, k, 3) [m/s²], NaN where lost
+        """
+        accel_S = np.concatenate([self._last_accel_S, accel_S])
+        lost = ~np.isfinite(accel_S).all(axis=2)
+        for i in np.flatnonzero(lost.any(axis=0)):
+            accel_S[:, i] = accel_S[np.maximum.accumulate(np.where(lost[:, i], 0, np.arange(len(accel_S)))), i]
+        if self._band is None:
+            self._last_R_WS, accel_S[:2] = np.repeat(R_WS[:1], 2, axis=0), accel_S[2]
+            steady = compute_sides(np.repeat(R_WS[:1], 3, axis=0), np.repeat(accel_S[2:3], 3, axis=0), self._rate_hz)
+            self._band = BandPass(BAND_HZ, self._rate_hz, steady.ravel())
+        R_WS = np.concatenate([self._last_R_WS, R_WS])
+        self._last_R_WS, self._last_accel_S = R_WS[-2:], accel_S[-2:]
+        B = compute_sides(R_WS, accel_S, self._rate_hz)
+        return self._band.push(B.reshape(len(B), -1)).reshape(B.shape)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -15,11 +15,11 @@ from ..body.start_pose import StartPose
 from ..body.subject import Subject
 from ..diagnostics import Diagnostic
 from ..errors import BadOption
-from ..filters import BEST, OFFLINE, Orientation, check_method, join_orientations
+from ..filters import BEST, OFFLINE, Orientation, check_method
 from ..filters.noise import ACCEL_BIAS_STD
 from ..filters.smekf import HOLD_S, LOST_RATE_STD
 from ..filters.static import StaticTest
-from ..recording import OrientationSensor, Recording
+from ..recording import Recording
 
 
 @dataclass(frozen=True)
@@ -76,26 +76,6 @@ class SegmentOrientations:
 
     def __repr__(self) -> str:
         return f"SegmentOrientations({self.recording!r}, {self.options.method})"
-
-
-def join_segments(recording: Recording, parts: Sequence[SegmentOrientations]) -> SegmentOrientations:
-    """Join the parts of a recording; fields that are not a value a sample are those of the last part."""
-    last = parts[-1]
-    return replace(
-        last,
-        recording=recording,
-        quat_WL={name: np.concatenate([part.quat_WL[name] for part in parts]) for name in last.quat_WL},
-        orientation={name: join_orientations([part.orientation[name] for part in parts]) for name in last.orientation},
-        covariance_W={name: np.concatenate([part.covariance_W[name] for part in parts]) for name in last.covariance_W},
-    )
-
-
-def count_lost_samples(sensor: OrientationSensor, before: int = 0) -> np.ndarray:
-    """Count (n,) the samples since the last that was measured; `before`: those before the first."""
-    samples = np.arange(len(sensor.quat_VS))
-    if sensor.gap is None:
-        return np.zeros_like(samples)
-    return samples - np.maximum.accumulate(np.where(sensor.gap, -1 - before, samples))
 
 
 def compute_measured_covariance(lost_s: np.ndarray) -> np.ndarray:
@@ -156,6 +136,43 @@ def compute_segment_covariance(
     cov_W += error_jacobian @ mount_cov @ error_jacobian.swapaxes(1, 2)
     cov_W[:, 2, 2] += compute_start_heading_var(recording, segment, subject, start_pose)
     return cov_W
+
+
+def correct_covariance(
+    cov_W: np.ndarray,
+    filtered: tuple[np.ndarray, np.ndarray],
+    heading_offset: np.ndarray,
+    start_var: float,
+    variance: np.ndarray,
+    lost: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the covariances (n, 3, 3) [rad²] of a segment in W, `cov_W`, with the variance of its corrected heading.
+
+    Variance from other sources, such as a mount's heading, is not observed by what neighbours share: it stays.
+
+    Parameters
+    ----------
+    filtered : of the sensor's filter, `quat_VS` (n, 4) xyzw and the covariance (n, 3, 3) [rad²] of its error, in S
+    heading_offset, start_var : ψ (n,) or (1,) [rad], and its variance [rad²] by the start pose
+    variance : (n, 3) [rad²] as `HeadingCorrector.variance`
+    lost : (n,) bool: the sensor is lost, and neighbours do not tell where its segment is
+    """
+    R_VS, attitude_cov = Rotation.from_quat(filtered[0]), filtered[1]
+    vertical = np.array([0.0, 0.0, 1.0])
+    with_heading_V = R_VS.apply(np.einsum("nab,nb->na", attitude_cov, R_VS.inv().apply(vertical)))  # with each axis
+    alone = with_heading_V[:, 2] + start_var
+    known, at_knot, correction = variance.T
+    # The filter alone may know the heading better; to it a correction is an error of that size.
+    corrected = np.minimum(known + np.maximum(with_heading_V[:, 2] - at_knot, 0.0), alone + correction)
+    if lost is not None:
+        corrected = np.where(lost, np.maximum(corrected, alone), corrected)
+    with_heading_W = Rotation.from_rotvec(heading_offset[:, None] * vertical).apply(with_heading_V)
+    removed = (1.0 - np.sqrt(corrected / alone))[:, None] * with_heading_W
+    replaced = cov_W.copy()
+    replaced[:, 2, :2] -= removed[:, :2]
+    replaced[:, :2, 2] -= removed[:, :2]
+    replaced[:, 2, 2] += corrected - alone
+    return replaced
 
 
 def compute_soft_tissue_covariances(table: BodyTable, quat_WL: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

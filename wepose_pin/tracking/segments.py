@@ -8,25 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from .. import rotations
+from ..body import BodyModel
 from ..body.mounts import align_sensors, collect_nominal_mounts, compute_heading_offset, compute_start_heading_var
 from ..body.start_pose import N_POSE, StartPose
 from ..body.subject import Subject
 from ..compilation import kernel
 from ..diagnostics import drop_consequences
-from ..filters import AboutVertical, Orientation
+from ..filters import Orientation
 from ..filters.phases import find_reference_phases
 from ..filters.sensors import SensorFilters, find_start_orientations
-from ..recording import ImuSensor, OrientationSensor, Recording
+from ..recording import ImuSensor, OrientationSensor, Recording, Sensor
 from ..recording.arrivals import unpack_orientations
 from ..rotations import product
-from .heading_problem import FilterHeadings, HeadingProblem
-from .headings import CausalHeadings, correct_covariance
-from .knots import find_specific_force, read_filter_headings
+from .heading_problem import FilterHeadings, make_heading_problem
+from .headings import E_Z, HeadingCorrection, HeadingCorrector
 from .segment_orientations import (
     SegmentOrientations,
     TrackOptions,
@@ -34,19 +35,30 @@ from .segment_orientations import (
     compute_measured_covariance,
     compute_segment_covariance,
     compute_soft_tissue_covariances,
-    count_lost_samples,
-    join_segments,
+    correct_covariance,
 )
 
 RESET_S = 0.5  # [s] over which the orientation is averaged when headings are reset
 
 
+class FilterOutput(NamedTuple):
+    """What the filters of k sensors state after n samples; NaN where there is no filter, or it has no covariance."""
+
+    quat_VS: np.ndarray  # (n, k, 4) xyzw, of measured orientations too
+    attitude_cov: np.ndarray  # (n, k, 3, 3) [rad²]
+    about_vertical: np.ndarray  # (n, k, 3) as `AboutVertical`
+
+    def at(self, row: int) -> FilterHeadings:
+        """What the filters know of their headings after a sample."""
+        variance = compute_heading_variance(self.quat_VS[row], self.attitude_cov[row])
+        return FilterHeadings(variance, *self.about_vertical[row].T)
+
+
 class SegmentEstimator:
     """Orientation of each segment of a recording, chunk by chunk (`push`) or sample by sample (`step`): the same bits.
 
-    The first chunk contains the phases `start` and `static`. Where it ends with the start pose, `correct_headings`
-    switches on the causal correction; phases in which points coincide, and resets, count from then on. A sensor with
-    measured orientations has no filter. The smoother takes the whole recording as one chunk.
+    The first chunk contains the phases `start` and `static`. A sensor with measured orientations has no filter. The
+    smoother takes the whole recording as one chunk.
 
     Parameters
     ----------
@@ -54,13 +66,15 @@ class SegmentEstimator:
     options : None: the default ones. While measured orientations are lost, the last one stands where `causal`; else
         they are interpolated, as the reader does
     start_pose : of the body; left out: the N-pose
+    heading_body : the person and the body by which headings are observed from the end of the start pose on; None:
+        they are not
 
     Attributes
     ----------
     names : the k segments; this and what follows from the first chunk on
     diagnostics : of the recording, its start pose and its mounts
     heading_offset : (k,) ψ [rad], heading of each sensor's world V in W at the start or the last reset
-    headings : what corrects the headings; None: nothing does
+    headings : what corrects the headings, causally at once; None: nothing does
     quat_WL : (k, 4) xyzw after the last sample; overwritten by the next one
     """
 
@@ -69,10 +83,12 @@ class SegmentEstimator:
         subject: Subject | None = None,
         options: TrackOptions | None = None,
         start_pose: StartPose = N_POSE,
+        heading_body: tuple[Subject, BodyModel] | None = None,
     ) -> None:
         self._subject, self._options, self._start_pose = subject, options or TrackOptions(), start_pose
+        self._heading_body = heading_body
         self.names: tuple[str, ...] = ()
-        self.headings: CausalHeadings | None = None
+        self.headings: HeadingCorrector | None = None
 
     def push(self, chunk: Recording) -> SegmentOrientations:
         """Return the segment orientations of a chunk, bit-identical with as many steps.
@@ -85,17 +101,7 @@ class SegmentEstimator:
         """
         if not self.names:
             return self._begin(chunk)
-        resets = {tick for tick in chunk.resets if 0 <= tick < len(chunk)}
-        marks = self._find_marks(chunk)
-        parts = []
-        for begin, end in pairwise(sorted({0, *resets, *marks, len(chunk)})):
-            if begin in resets:
-                self.reset_headings()
-            for phase, begins in marks.get(begin, ()):
-                self.mark_phase(phase, begins=begins)
-            part = chunk.cut(slice(begin, end))
-            parts.append(self._place_chunk(part, self._filters.push(part)))
-        return parts[0] if len(parts) == 1 else join_segments(chunk, parts)
+        return self._place(chunk, self._filters.push(chunk))
 
     def _begin(self, first: Recording) -> SegmentOrientations:
         """Filter and align the first chunk."""
@@ -109,26 +115,38 @@ class SegmentEstimator:
         )
         orientation = self._filters.push(first)
         R_VS_start = find_start_orientations(first, orientation, phases.start)
-        mounts, headings, diagnostics = align_sensors(first, self._subject, R_VS_start, phases.start, self._start_pose)
+        mounts, offsets, diagnostics = align_sensors(first, self._subject, R_VS_start, phases.start, self._start_pose)
         self.diagnostics = tuple(drop_consequences((*phases.diagnostics, *diagnostics)))
         self.names, self.rate_hz, self._first = tuple(first.sensors), first.rate_hz, first.cut(slice(0, 1))
+        k = len(self.names)
         self._measured = np.array([isinstance(each, OrientationSensor) for each in first.sensors.values()], dtype=bool)
-        self._lost = np.zeros(len(self.names), dtype=int)  # samples since a measured orientation
-        self._quat_LS = np.array([mounts[name].as_quat() for name in self.names])
-        self.heading_offset = np.array([headings[name] for name in self.names])
-        self._quat_WV = _quat_about_z(self.heading_offset)
-        self._recent = np.empty((0, len(self.names), 4))
+        self._lost = np.zeros(k, dtype=int)  # samples since a measured orientation
+        quat_LS = {name: mounts[name].as_quat() for name in self.names}
+        self._quat_LS = np.array(list(quat_LS.values()))
+        self.heading_offset = np.array([offsets[name] for name in self.names])
+        self._quat_WV = rotations.rotation_about(E_Z, self.heading_offset)
+        self._recent = np.empty((0, k, 4))  # orientations of the last `RESET_S`
         self._oldest = 0  # row of `_recent` with the oldest sample
-        self.quat_WL = np.zeros((len(self.names), 4))
-        self._uncorrected = np.zeros(len(self.names))
-        # [rad²] `CausalHeadings.variance` at the last step; NaN: the heading's variance is that of its filter
-        self._variance = (np.full(len(self.names), np.nan),) * 3
-        return self._place_chunk(first, orientation)
-
-    def correct_headings(self, problem: HeadingProblem, first: SegmentOrientations) -> None:
-        """Correct headings from now on; `first` is of the first chunk, which ended with the start pose."""
-        self.headings = CausalHeadings(first, problem)
-        self._variance = self.headings.variance
+        self._filter_headings: FilterHeadings  # after the last chunk
+        self.quat_WL = np.zeros((k, 4))
+        self._uncorrected = np.zeros(k)
+        # [rad²] `HeadingCorrector.variance` at the last step; NaN: the heading's variance is that of its filter
+        self._variance = np.full((3, k), np.nan)
+        problem = None
+        if self._heading_body is not None and not any(sensor.aligned for sensor in first.sensors.values()):
+            problem = make_heading_problem(
+                first, quat_LS, phases.noises, *self._heading_body, causal=self._options.causal
+            )
+        if problem is None:
+            return self._place(first, orientation)
+        # Headings are observed from the first sample after the start pose on.
+        begin = int(np.searchsorted(first.time, phases.start[1], side="right"))
+        start = self._stack(first.cut(slice(0, begin)), {n: o.take(slice(0, begin)) for n, o in orientation.items()})
+        time = float(first.time[0]) + begin / self.rate_hz
+        self.headings = HeadingCorrector(problem, self.heading_offset, start.at(-1), time)
+        if self._options.causal:
+            self._variance = self.headings.variance
+        return self._place(first, orientation, begin)
 
     @property
     def static(self) -> np.ndarray:
@@ -149,41 +167,113 @@ class SegmentEstimator:
 
         Of a sensor with measured orientations they hold what `pack_orientations` gives.
         """
+        row = self._recent[self._oldest]
         if self._measured.any():
-            accel_S = self._take_measured(gyro_S, accel_S)
+            quat_VS = unpack_orientations(gyro_S, accel_S)
+            lost = ~np.isfinite(quat_VS).all(axis=1)
+            self._lost = np.where(lost & self._measured, self._lost + 1, 0)
+            row[:] = np.where(lost[:, None], self._recent[self._oldest - 1], quat_VS)
+            if not self._measured.all():
+                row[~self._measured] = self._filters.step(gyro_S[~self._measured], accel_S[~self._measured])
+            accel_S = np.where((self._measured & ~lost)[:, None], 0.0, accel_S)
         else:
-            self._recent[self._oldest] = self._filters.step(gyro_S, accel_S)
-        newest = self._recent[self._oldest : self._oldest + 1]
-        _place_segments(self._quat_WV, self._correction(), newest, self._quat_LS, self.quat_WL, self.quat_WL[None])
+            row[:] = self._filters.step(gyro_S, accel_S)
+        _place_segments(self._quat_WV, self._fade(), row[None], self._quat_LS, self.quat_WL, self.quat_WL[None])
         self._oldest = (self._oldest + 1) % len(self._recent)
         if self.headings is not None:
             self._variance = self.headings.variance  # of this sample, as in `_place`
-            if self.headings.push(newest, accel_S[None]):
-                self.headings.close(self._read_filter_headings())
+            if self.headings.push(row[None], accel_S[None]):
+                self.headings.close(self._read_filters().at(0))
         return self.quat_WL
 
-    def _take_measured(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
-        """Add one sample of which some are measured; return `accel_S`, zero where there is none."""
-        row, before, measured = self._recent[self._oldest], self._recent[self._oldest - 1], self._measured
-        quat_VS = unpack_orientations(gyro_S, accel_S)
-        lost = ~np.isfinite(quat_VS).all(axis=1)
-        self._lost = np.where(lost & measured, self._lost + 1, 0)
-        orientations = np.where(lost[:, None], before, quat_VS)
-        if not measured.all():
-            orientations[~measured] = self._filters.step(gyro_S[~measured], accel_S[~measured])
-        row[:] = orientations
-        return np.where((measured & ~lost)[:, None], 0.0, accel_S)
-
-    def _correction(self) -> tuple[np.ndarray, np.ndarray, int, int]:
+    def _fade(self) -> tuple[np.ndarray, np.ndarray, int, int]:
         """Return what `_place_segments` fades in: from and to (k,) [rad], the next sample's number, their number."""
-        if self.headings is None:
-            return self._uncorrected, self._uncorrected, 0, 1
-        return self.headings.fade
+        return (self._uncorrected, self._uncorrected, 0, 1) if self.headings is None else self.headings.fade
+
+    def _read_filters(self) -> FilterOutput:
+        """Read what the filters state after the last step."""
+        k, filtered = len(self.names), ~self._measured
+        output = FilterOutput(
+            self._recent[self._oldest - 1][None].copy(), np.full((1, k, 3, 3), np.nan), np.full((1, k, 3), np.nan)
+        )
+        if self._filters.attitude_cov is not None:
+            output.attitude_cov[0, filtered], output.about_vertical[0, filtered] = (
+                self._filters.attitude_cov,
+                self._filters.about_vertical,
+            )
+        return output
+
+    def _stack(self, chunk: Recording, orientation: Mapping[str, Orientation]) -> FilterOutput:
+        """Stack what the filters state of a chunk."""
+        n, k = len(chunk), len(self.names)
+        output = FilterOutput(np.empty((n, k, 4)), np.full((n, k, 3, 3), np.nan), np.full((n, k, 3), np.nan))
+        for i, (name, sensor) in enumerate(chunk.sensors.items()):
+            if isinstance(sensor, ImuSensor):
+                each = orientation[name]
+                output.quat_VS[:, i] = each.quat_VS
+                if each.attitude_cov is not None and each.about_vertical is not None:
+                    output.attitude_cov[:, i], output.about_vertical[:, i] = each.attitude_cov, each.about_vertical
+                continue
+            output.quat_VS[:, i] = sensor.quat_VS
+            if self._options.causal and sensor.gap is not None and sensor.gap.any():
+                before = self._recent[self._oldest - 1, i] if len(self._recent) else sensor.quat_VS[0]
+                known = np.concatenate([[True], ~sensor.gap])
+                last = np.maximum.accumulate(np.where(known, np.arange(n + 1), 0))
+                output.quat_VS[:, i] = np.concatenate([before[None], sensor.quat_VS])[last][1:]
+        return output
+
+    def _place(self, chunk: Recording, orientation: Mapping[str, Orientation], begin: int = 0) -> SegmentOrientations:
+        """Return the segment orientations of a filtered chunk, whose headings are observed from sample `begin` on."""
+        n, output = len(chunk), self._stack(chunk, orientation)
+        quat_WL, variance = np.empty(output.quat_VS.shape), np.empty((n, *self._variance.shape))
+        offset = np.empty((n, len(self.names)))
+        size = max(1, round(RESET_S * self.rate_hz))
+        history = np.concatenate([self._order_recent(), output.quat_VS])
+        before = len(history) - n
+        accel_S = np.stack([_find_specific_force(sensor) for sensor in chunk.sensors.values()], axis=1)
+        marks, resets = self._find_marks(chunk), {tick for tick in chunk.resets if 0 <= tick < n}
+        for first, last in pairwise(sorted({0, *resets, *marks, min(begin, n), n})):
+            if first in resets:
+                recent = history[max(0, before + first - size) : before + first]
+                self._reset(recent, (output.at(first - 1) if first else self._filter_headings).var)
+            for phase, begins in marks.get(first, ()):
+                self.mark_phase(phase, begins=begins)
+            while first < last:
+                stop = last
+                if self.headings is not None and first >= begin:
+                    stop = min(last, first + self.headings.remaining)
+                rows = slice(first, stop)
+                placed = self._quat_WV, self._fade(), output.quat_VS[rows], self._quat_LS, self.quat_WL, quat_WL[rows]
+                _place_segments(*placed)
+                variance[rows], offset[rows] = self._variance, self.heading_offset
+                if self.headings is not None and first >= begin:
+                    if self.headings.push(output.quat_VS[rows], accel_S[rows]):
+                        self.headings.close(output.at(stop - 1), record=True)
+                    if self._options.causal:
+                        self._variance = self.headings.variance
+                first = stop
+        self._recent, self._oldest, self._filter_headings = history[-size:], 0, output.at(-1)
+        return SegmentOrientations(
+            recording=chunk,
+            options=self._options,
+            quat_WL={name: quat_WL[:, i] for i, name in enumerate(self.names)},
+            quat_LS=dict(zip(self.names, self._quat_LS, strict=True)),
+            heading_offset=dict(zip(self.names, self.heading_offset.tolist(), strict=True)),
+            orientation=orientation,
+            covariance_W=self._find_covariances(chunk, output, quat_WL, offset, variance),
+            start=self._phases.start,
+            static_phase=self._phases.static,
+            diagnostics=self.diagnostics,
+        )
+
+    def smooth_headings(self) -> HeadingCorrection | None:
+        """Return the correction of the headings after the last chunk; None: nothing observes them."""
+        return None if self.headings is None else self.headings.smooth(self._filter_headings)
 
     def _find_marks(self, chunk: Recording) -> dict[int, list[tuple[str, bool]]]:
         """Find sample → phases that begin (True) or have ended with it, of those that headings are corrected by."""
         marks: dict[int, list[tuple[str, bool]]] = {}
-        for phase in () if self.headings is None else sorted(self.headings.phases):
+        for phase in () if self.headings is None else self.headings.problem.closures:
             inside = np.zeros(len(chunk), dtype=bool)
             for interval in chunk.phases.get(phase, ()):
                 inside[chunk.span(interval)] = True
@@ -196,118 +286,31 @@ class SegmentEstimator:
         if self.headings is not None:
             self.headings.mark(phase, begins=begins)
 
-    def _place_chunk(self, chunk: Recording, orientation: Mapping[str, Orientation]) -> SegmentOrientations:
-        """Return the segment orientations of a filtered chunk without resets."""
-        quat_VS = self._stack_orientations(chunk, orientation)
-        quat_WL = np.empty(quat_VS.shape)
-        variance = self._place(chunk, orientation, quat_VS, quat_WL)
-        size = len(self._recent) or max(1, round(RESET_S * self.rate_hz))
-        self._recent, self._oldest = np.concatenate([self._order_recent(), quat_VS[-size:]])[-size:], 0
-        covs = {name: o.attitude_cov for name, o in orientation.items() if o.attitude_cov is not None}
-        for i, (name, sensor) in enumerate(chunk.sensors.items()):
-            if isinstance(sensor, OrientationSensor):
-                lost = count_lost_samples(sensor, self._lost[i])
-                covs[name], self._lost[i] = compute_measured_covariance(lost / self.rate_hz), lost[-1]
-        by_name = {name: quat_WL[:, i] for i, name in enumerate(self.names)}
-        soft = compute_soft_tissue_covariances(self._start_pose.table, by_name) if covs else {}
-        return SegmentOrientations(
-            recording=chunk,
-            options=self._options,
-            quat_WL=by_name,
-            quat_LS=dict(zip(self.names, self._quat_LS, strict=True)),
-            heading_offset=dict(zip(self.names, self.heading_offset.tolist(), strict=True)),
-            orientation=orientation,
-            covariance_W={
-                name: self._covariance_W(i, quat_VS[:, i], covs[name], variance[:, :, i]) + soft[name]
-                for i, name in enumerate(self.names)
-                if name in covs
-            },
-            start=self._phases.start,
-            static_phase=self._phases.static,
-            diagnostics=self.diagnostics,
-        )
-
-    def _stack_orientations(self, chunk: Recording, orientation: Mapping[str, Orientation]) -> np.ndarray:
-        """Stack `quat_VS` (n, k, 4) of all sensors."""
-        columns = []
-        for i, (name, sensor) in enumerate(chunk.sensors.items()):
-            if isinstance(sensor, ImuSensor):
-                columns.append(orientation[name].quat_VS)
-                continue
-            quat_VS = sensor.quat_VS
-            if self._options.causal and sensor.gap is not None and sensor.gap.any():
-                before = self._recent[self._oldest - 1, i] if len(self._recent) else quat_VS[0]
-                known = np.concatenate([[True], ~sensor.gap])
-                last = np.maximum.accumulate(np.where(known, np.arange(len(known)), 0))
-                quat_VS = np.concatenate([before[None], quat_VS])[last][1:]
-            columns.append(quat_VS)
-        return np.stack(columns, axis=1)
-
-    def _place(
-        self, chunk: Recording, orientation: Mapping[str, Orientation], quat_VS: np.ndarray, quat_WL: np.ndarray
-    ) -> np.ndarray:
-        """Fill `quat_WL` (n, k, 4), knot by knot; return `CausalHeadings.variance` (n, 3, k) [rad²] of each sample."""
-        n = len(chunk)
-        variance = np.tile(self._variance, (n, 1, 1))
-        if self.headings is None:
-            _place_segments(self._quat_WV, self._correction(), quat_VS, self._quat_LS, self.quat_WL, quat_WL)
-            return variance
-        accel_S = np.stack([find_specific_force(chunk, name) for name in self.names], axis=1)
-        begin = 0
-        while begin < n:
-            end = min(n, begin + self.headings.remaining)
-            rows = slice(begin, end)
-            _place_segments(
-                self._quat_WV, self._correction(), quat_VS[rows], self._quat_LS, self.quat_WL, quat_WL[rows]
-            )
-            variance[rows] = self.headings.variance
-            if self.headings.push(quat_VS[rows], accel_S[rows]):
-                self.headings.close(read_filter_headings(orientation, self.names, end - 1), record=True)
-            begin = end
-        return variance
-
     def reset_headings(self) -> None:
         """Reset the headings: the body has stood in the start pose again for `RESET_S`."""
-        recent = self._order_recent()
+        self._reset(self._order_recent(), self._read_filters().at(0).var)
+
+    def _reset(self, recent: np.ndarray, var: np.ndarray) -> None:
+        """Reset the headings by recent orientations (m, k, 4); `var` (k,) [rad²] is that of the filters' headings."""
         same_sign = recent * np.sign(np.einsum("nki,ki->nk", recent, recent[-1]))[:, :, None]
         mean = same_sign.sum(axis=0)
         mean /= np.linalg.norm(mean, axis=1)[:, None]
         offset = np.zeros(len(self.names))
-        for i in range(len(self.names)):
-            R_WS_start = self._start_pose.to_world(self.names[i], Rotation.from_quat(self._quat_LS[i]))
+        for i, name in enumerate(self.names):
+            R_WS_start = self._start_pose.to_world(name, Rotation.from_quat(self._quat_LS[i]))
             offset[i] = compute_heading_offset(Rotation.from_quat(mean[i]), R_WS_start)
         self.heading_offset = offset
         if self.headings is not None:
-            self._quat_WV = _quat_about_z(self.headings.offset)
             self.headings.reset(offset)
             self._variance = self.headings.variance
             return
-        self._quat_WV, var = _quat_about_z(offset), self.heading_var()
-        if var is not None:  # as after the start pose: what the filters have added since is gone
-            start_var = np.array([self._find_start_var(name) for name in self.names])
-            self._variance = start_var, var, np.full(len(var), np.inf)
+        self._quat_WV = rotations.rotation_about(E_Z, offset)
+        # As after the start pose: what the filters have added since is gone.
+        start_var = np.array([self._find_start_var(name) for name in self.names])
+        self._variance = np.array([start_var, var, np.full(len(var), np.inf)])
 
     def _find_start_var(self, name: str) -> float:
         return compute_start_heading_var(self._first, name, self._subject, self._start_pose)
-
-    def heading_var(self) -> np.ndarray | None:
-        """Return the variance (k,) [rad²] of each heading by its filter alone now, NaN without a filter.
-
-        None: no filter has a covariance.
-        """
-        cov = self._filters.attitude_cov
-        if cov is None:
-            return None
-        variance = np.full(len(self.names), np.nan)
-        variance[~self._measured] = compute_heading_variance(self._filters.quat_VS, cov)
-        return variance
-
-    def _read_filter_headings(self) -> FilterHeadings:
-        """Read what the filters say of their headings after a step."""
-        var, about_vertical = self.heading_var(), np.full((len(self.names), len(AboutVertical._fields)), np.nan)
-        if self._filters.about_vertical is not None:
-            about_vertical[~self._measured] = self._filters.about_vertical
-        return FilterHeadings(np.full(len(self.names), np.nan) if var is None else var, *about_vertical.T)
 
     def covariance(self) -> np.ndarray:
         """Return the covariances (k, 3, 3) [rad²] of the segments in W after the last step, mounts included.
@@ -321,48 +324,69 @@ class SegmentEstimator:
 
         There may be steps between the parts: the result is that of the step before the first one.
         """
-        cov = np.full((len(self.names), 3, 3), np.nan)
-        cov[self._measured] = compute_measured_covariance(self._lost[self._measured] / self.rate_hz)
-        attitude_cov = self._filters.attitude_cov
-        if attitude_cov is not None:
-            cov[~self._measured] = attitude_cov
-        if np.isfinite(cov).any():
-            newest = self._recent[self._oldest - 1].copy()
-            variance = np.array(self._variance)
-            soft = compute_soft_tissue_covariances(
-                self._start_pose.table, {name: self.quat_WL[i : i + 1] for i, name in enumerate(self.names)}
-            )
+        output, offset, variance = self._read_filters(), self.heading_offset.copy(), np.array(self._variance)
+        lost_s, covariance = self._lost / self.rate_hz, np.full((len(self.names), 3, 3), np.nan)
+        quat_WL = {name: self.quat_WL[i : i + 1].copy() for i, name in enumerate(self.names)}
+        soft = compute_soft_tissue_covariances(self._start_pose.table, quat_WL)
+        yield None
+        for i, name in enumerate(self.names):
+            cov = self._find_covariance(i, output, lost_s[i : i + 1], offset[None, i], variance[None, :, i])
+            if cov is not None:
+                covariance[i] = (cov + soft[name])[0]
             yield None
-            for i, name in enumerate(self.names):
-                parts = newest[i : i + 1], cov[i : i + 1], variance[None, :, i]
-                cov[i] = (self._covariance_W(i, *parts) + soft[name])[0]
-                yield None
-        yield cov
+        yield covariance
 
-    def _covariance_W(self, i: int, quat_VS: np.ndarray, attitude_cov: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """Return the covariance (n, 3, 3) [rad²] of sensor i's segment, error on the left of `quat_WL`, in W.
+    def _find_covariances(
+        self, chunk: Recording, output: FilterOutput, quat_WL: np.ndarray, offset: np.ndarray, variance: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Return segment → covariance (n, 3, 3) [rad²] in W of a chunk; none of filters without one."""
+        covariances: dict[str, np.ndarray] = {}
+        soft: dict[str, np.ndarray] = {}
+        samples = np.arange(len(chunk))
+        for i, (name, sensor) in enumerate(chunk.sensors.items()):
+            lost_s = np.zeros(len(chunk))
+            if isinstance(sensor, OrientationSensor) and sensor.gap is not None:
+                lost = samples - np.maximum.accumulate(np.where(sensor.gap, -1 - self._lost[i], samples))
+                self._lost[i], lost_s = lost[-1], lost / self.rate_hz
+            cov = self._find_covariance(i, output, lost_s, offset[:, i], variance[:, :, i])
+            if cov is not None:
+                by_name = {each: quat_WL[:, j] for j, each in enumerate(self.names)}
+                soft = soft or compute_soft_tissue_covariances(self._start_pose.table, by_name)
+                covariances[name] = cov + soft[name]
+        return covariances
 
-        It lacks soft tissue. `variance` (n, 3) [rad²] is `CausalHeadings.variance` of the sensor.
+    def _find_covariance(
+        self, i: int, output: FilterOutput, lost_s: np.ndarray, offset: np.ndarray, variance: np.ndarray
+    ) -> np.ndarray | None:
+        """Return the covariance (n, 3, 3) [rad²] of sensor i's segment in W, error on the left, without soft tissue.
+
+        None: its filter has none. `lost_s` (n,) [s] is how long a measured orientation has been lost, `offset` (n,)
+        [rad] its ψ, and `variance` (n, 3) [rad²] `HeadingCorrector.variance`.
         """
-        if self._first.sensors[self.names[i]].aligned:
+        name, quat_VS, attitude_cov = self.names[i], output.quat_VS[:, i], output.attitude_cov[:, i]
+        if self._measured[i]:
+            attitude_cov = compute_measured_covariance(lost_s)
+        if np.isnan(attitude_cov[0, 0, 0]):
+            return None
+        if self._first.sensors[name].aligned:
             return attitude_cov
-        quat_WS = rotations.multiply(_quat_about_z(self.heading_offset[i : i + 1]), quat_VS)
+        quat_WS = rotations.multiply(rotations.rotation_about(E_Z, offset), quat_VS)
         R_LS = Rotation.from_quat(self._quat_LS[i])
         cov = compute_segment_covariance(
-            self._first, self.names[i], self._subject, quat_WS, R_LS, attitude_cov, self._start_pose
+            self._first, name, self._subject, quat_WS, R_LS, attitude_cov, self._start_pose
         )
         if np.isnan(variance).any():
             return cov
-        start_var = self._find_start_var(self.names[i])
-        return correct_covariance(cov, (quat_VS, attitude_cov), self.heading_offset[i], start_var, variance)
+        return correct_covariance(cov, (quat_VS, attitude_cov), offset, self._find_start_var(name), variance)
 
     def _order_recent(self) -> np.ndarray:
         return np.concatenate([self._recent[self._oldest :], self._recent[: self._oldest]])
 
 
-def _quat_about_z(angle: np.ndarray) -> np.ndarray:
-    """Return rotations (k, 4) xyzw about z by angles (k,) [rad]."""
-    return rotations.exp(angle[:, None] * [0.0, 0.0, 1.0])
+def _find_specific_force(sensor: Sensor) -> np.ndarray:
+    """Return `accel_S` (n, 3) [m/s²] of a sensor, NaN where samples are lost; zeros of an `OrientationSensor`."""
+    accel_S = sensor.accel_S if isinstance(sensor, ImuSensor) else np.zeros((len(sensor.quat_VS), 3))
+    return accel_S if sensor.gap is None else np.where(sensor.gap[:, None], np.nan, accel_S)
 
 
 @kernel

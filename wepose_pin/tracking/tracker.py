@@ -20,8 +20,7 @@ from ..errors import BadOption, BadPhase, BadSession
 from ..filters import OFFLINE
 from ..filters.noise import BEGINNING_S
 from ..recording import Recording
-from .heading_problem import HeadingProblem, make_heading_problem
-from .headings import HeadingCorrection, HeadingCorrector
+from .headings import HeadingCorrection
 from .result import TrackResult
 from .segment_orientations import SegmentOrientations, TrackOptions
 from .segments import SegmentEstimator
@@ -65,14 +64,12 @@ class Tracker:
         self._person: Subject  # as used; it and the next two from the first chunk on
         self._body: BodyModel
         self._start_pose: StartPose
-        self._is_begun = False
+        self._is_begun = self._has_tracked = False
         self._start = StartPoseCutter()  # of a causal tracker
         self._estimator: SegmentEstimator | None = None  # after the start pose
-        self._headings: HeadingCorrector | None = None
         self._kinematics: KinematicsSolver | None = None
         self._chunks: list[Recording] = []  # that wait for the headings
         self._only: SegmentOrientations | None = None  # of the first chunk, while it is the only one
-        self._has_tracked = False
 
     @property
     def segment_estimator(self) -> SegmentEstimator:
@@ -97,43 +94,30 @@ class Tracker:
         WeposeError
             The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
         """
+        options, is_first = self.options, self._estimator is None
         if not self._is_begun:
             self._is_begun = True
             self._person, self._body, self._start_pose = _fit_body(self._subject, self._model, chunk)
-        if chunk.resets and (self.options.open_loop or not self.options.causal):
+        if chunk.resets and (options.open_loop or not options.causal):
             chunk = replace(chunk, resets=())
-        return self._push_causal(chunk) if self.options.causal else self._push_offline(chunk)
-
-    def _push_causal(self, chunk: Recording) -> TrackResult | None:
-        if self._estimator is None:
+        if options.causal and is_first:
             found = self._start.push(chunk)
             if found is None:
                 return None
             start, chunk = found
-            self._estimator = self._make_estimator()
-            segments = self._estimator.push(start)
-            problem = self._make_problem(segments)
-            if problem is not None:
-                self._estimator.correct_headings(problem, segments)
-        if not len(chunk):
-            return None
-        self._has_tracked = True
+            self._estimator = self._make_estimator(observes_headings=not options.open_loop)
+            self._estimator.push(start)
+            if not len(chunk):
+                return None
+        elif is_first:
+            self._estimator = self._make_estimator(observes_headings=not options.open_loop)
+        elif options.method in OFFLINE:
+            raise BadOption(f"method '{options.method}' takes the whole recording as one chunk")
+        assert self._estimator is not None
         segments, headings = self._estimator.push(chunk), self._estimator.headings
-        return self._solve_pose(segments, None if headings is None else headings.summarize())
-
-    def _push_offline(self, chunk: Recording) -> TrackResult | None:
-        is_first = self._estimator is None
-        if self._estimator is None:
-            self._estimator = self._make_estimator()
-        elif self.options.method in OFFLINE:
-            raise BadOption(f"method '{self.options.method}' takes the whole recording as one chunk")
-        segments = self._estimator.push(chunk)
-        if is_first:
-            problem = self._make_problem(segments)
-            self._headings = None if problem is None else HeadingCorrector(segments, problem)
-        if self._headings is None:
-            return self._solve_pose(segments)
-        self._headings.add_observations(segments)
+        if headings is None or options.causal:
+            self._has_tracked = True
+            return self._solve_pose(segments, None if headings is None else headings.collect())
         self._chunks.append(chunk)
         self._only = segments if is_first else None
         return None
@@ -148,29 +132,23 @@ class Tracker:
         """
         if self.options.causal and not self._has_tracked:
             raise BadPhase(self._start.explain_end())
-        if self._headings is None:
+        if not self._chunks or self._estimator is None:
             return
-        correction, estimator = self._headings.solve(), self._make_estimator()
+        correction, estimator = self._estimator.smooth_headings(), self._make_estimator(observes_headings=False)
         for chunk in self._chunks:
             segments = self._only or estimator.push(chunk)
             yield self._solve_pose(segments if correction is None else correction.correct(segments), correction)
 
-    def _make_estimator(self) -> SegmentEstimator:
-        return SegmentEstimator(self._subject, self.options, self._start_pose)
-
-    def _make_problem(self, first: SegmentOrientations) -> HeadingProblem | None:
-        """Return what observes the headings of a recording whose first chunk this is; None: nothing."""
-        if self.options.open_loop or any(sensor.aligned for sensor in first.recording.sensors.values()):
-            return None
-        return make_heading_problem(first, self._person, self._body)
+    def _make_estimator(self, *, observes_headings: bool) -> SegmentEstimator:
+        heading_body = (self._person, self._body) if observes_headings else None
+        return SegmentEstimator(self._subject, self.options, self._start_pose, heading_body)
 
     def _solve_pose(self, segments: SegmentOrientations, correction: HeadingCorrection | None = None) -> TrackResult:
         """Return a chunk with its pose; its headings have been corrected."""
         recording, person, body = segments.recording, self._person, self._body
         if self._kinematics is None:
-            self._kinematics = KinematicsSolver(
-                body, segments.quat_WL, limits=self.options.limits, start=self._start_pose.q
-            )
+            limits, start = self.options.limits, self._start_pose.q
+            self._kinematics = KinematicsSolver(body, segments.quat_WL, limits=limits, start=start)
         tissue = SoftTissueCorrection(body.table, body.tissue_means, tuple(segments.quat_WL))
         pose = self._kinematics.solve_chunk(recording.time, tissue.correct_segments(segments.quat_WL))
         point_cov: dict[str, np.ndarray] = {}
