@@ -23,9 +23,6 @@ from .libraries import library_errors
 
 FORMATS = (".csv", ".tsv", ".txt", ".parquet")
 NO_VALUE = ["", "nan", "NaN", "NAN", "-nan", "NA", "N/A", "null", "NULL", "None"]
-# Characters of a line without values.
-EMPTY = b",; \t\r\n"
-MOST_EMPTY_END = 1 << 16  # bytes of such lines at the end
 # The names of a CSV stand within its first lines, or bytes.
 MOST_PREAMBLE, PREAMBLE_BYTES = 100, 1 << 20
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?|[-+]?nan", re.IGNORECASE)
@@ -46,17 +43,18 @@ def read_table(path: Path) -> pl.DataFrame:
     BadData
         The file is damaged, or has rows of different lengths.
     """
-    _check_table(path)
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"):
             return pl.read_parquet(open_source(path))
     layout = read_layout(path)
-    body = _drop_empty_end(read_body(path, layout.head_lines))
+    body = read_body(path, layout.head_lines)
     names = [
         f"{name}_duplicated_{layout.names[:k].count(name) - 1}" if name in layout.names[:k] else name
         for k, name in enumerate(layout.names)
     ]
     table = parse_rows(path, body, names, layout.separator)
+    filled = table.select(pl.any_horizontal(pl.all().is_not_null())).to_series().arg_true()
+    table = table.head(int(filled[-1]) + 1 if len(filled) else 0)  # spreadsheets leave lines without values at the end
     # polars fills short rows silently.
     if table.width > 1 and table[table.columns[-1]].null_count():
         _find_ragged(path, body, len(names), layout.separator)
@@ -71,19 +69,8 @@ def read_body(path: Path, head_lines: int) -> bytes:
         return file.read()
 
 
-def _drop_empty_end(body: bytes) -> bytes:
-    """Drop lines without values at the end of a CSV, which editors and spreadsheets leave."""
-    end = body[-MOST_EMPTY_END:]
-    content = end.rstrip(EMPTY)
-    first = len(body) - len(end) + len(content)
-    if not content:
-        return body[:first]
-    return body[:first] + body[first:].partition(b"\n")[0] + b"\n" if body.count(b"\n", first) > 1 else body
-
-
 def read_names(path: Path) -> tuple[list[str], dict[str, str]]:
     """Read the names of a table's columns, and the units of those that have one in a line of a CSV."""
-    _check_table(path)
     if _is_parquet(path):
         with library_errors(path, "a Parquet file"):
             return list(pl.read_parquet_schema(open_source(path))), {}
@@ -199,10 +186,7 @@ def open_source(path: Path) -> Path | bytes:
 
 
 def _is_parquet(path: Path) -> bool:
-    return path.suffix.lower() == ".parquet"
-
-
-def _check_table(path: Path) -> None:
+    """Return whether a file is Parquet, else it is a CSV; raise `MissingFile` where it is no table."""
     if path.is_dir():
         raise MissingFile(f"{path}: is a folder; a table is wanted here, {', '.join(FORMATS)}")
     if path.suffix.lower() not in FORMATS:
@@ -210,6 +194,7 @@ def _check_table(path: Path) -> None:
     if not path.is_file():
         beside = [p.name for p in path.parent.iterdir() if p.suffix.lower() in FORMATS] if path.parent.is_dir() else []
         raise MissingFile(f"{path}: no such file; {one_of(sorted(beside), path.name)}")
+    return path.suffix.lower() == ".parquet"
 
 
 # Layout of a CSV ---------------------------------------------------------------------------------------------------
@@ -235,12 +220,9 @@ def read_layout(path: Path) -> CsvLayout:
     MissingFile, BadData
         The file is not readable; empty; not text.
     """
-    try:
-        with path.open("rb") as file:
-            start = file.read(PREAMBLE_BYTES)
-            raw = start.split(b"\n")[: -1 if file.read(1) else None] or [start]
-    except OSError as error:
-        raise MissingFile(f"{path}: cannot be read: {error.strerror}") from error
+    with library_errors(path, "a CSV"), path.open("rb") as file:
+        start = file.read(PREAMBLE_BYTES)
+        raw = start.split(b"\n")[: -1 if file.read(1) else None] or [start]
     lines = [(k, line) for k, line in enumerate(raw) if line.strip() and not line.startswith(b"#")][:MOST_PREAMBLE]
     if not lines:
         raise BadData(f"{path}: is empty; a line with the names of the columns and then numbers are needed")
@@ -267,34 +249,23 @@ def _find_separator(lines: Sequence[str]) -> str:
 
 def _find_names(rows: Sequence[Sequence[str]]) -> tuple[tuple[int, int], list[str]]:
     """Find the lines of names, from and to, and the cells of the line of units after them."""
-    numeric = next((k for k, cells in enumerate(rows) if k and _is_numeric(cells)), None)
+    filled = [[cell.strip() for cell in cells if cell.strip()] for cells in rows]
+
+    def share(k: int, pattern: re.Pattern[str]) -> float:
+        return sum(map(bool, map(pattern.fullmatch, filled[k]))) / max(len(filled[k]), 1)
+
+    numeric = next((k for k in range(1, len(rows)) if len(filled[k]) > 1 and share(k, _NUMBER) > 0.5), None)
     if numeric is None:
         return (0, 1), []
     width = len(rows[numeric])
-    units = list(rows[numeric - 1]) if numeric > 1 and _is_units(rows[numeric - 1], width) else []
+    units = numeric > 1 and len(rows[numeric - 1]) == width and share(numeric - 1, _UNITS) >= 0.5
     last = numeric - 1 if units else numeric
     first = last - 1
-    if first and len(rows[first]) == width == len(rows[first - 1]) and _repeats(rows[first]):
+    if first and len(rows[first]) == width == len(rows[first - 1]) and len(set(filled[first])) < len(filled[first]):
         first -= 1  # names in two lines: sensors above, their axes below
-    if first and not units and first + 1 == last and len(rows[0]) == width <= 2 * sum(map(bool, rows[0])):
+    elif first and not units and len(rows[0]) == width <= 2 * len(filled[0]):
         return (0, 1), []  # text in the first rows
-    return (first, last), units
-
-
-def _repeats(cells: Sequence[str]) -> bool:
-    """Whether names occur more than once: a line above says of which sensor they are."""
-    filled = [cell.strip() for cell in cells if cell.strip()]
-    return len(set(filled)) < len(filled)
-
-
-def _is_numeric(cells: Sequence[str]) -> bool:
-    filled = [cell.strip() for cell in cells if cell.strip()]
-    return len(filled) > 1 and 2 * sum(_NUMBER.fullmatch(cell) is not None for cell in filled) > len(filled)
-
-
-def _is_units(cells: Sequence[str], width: int) -> bool:
-    filled = [cell.strip() for cell in cells if cell.strip()]
-    return len(cells) == width and bool(filled) and 2 * sum(map(bool, map(_UNITS.fullmatch, filled))) >= len(filled)
+    return (first, last), list(rows[numeric - 1]) if units else []
 
 
 def _join_names(lines: Sequence[Sequence[str]]) -> list[str]:
