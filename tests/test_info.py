@@ -251,8 +251,7 @@ def test_what_can_be_done_with_the_session_is_said(
             }
     pl.DataFrame(columns).write_csv(tmp_path / "a.csv")
     text = info(capsys, tmp_path / "a.csv", "--write")
-    assert ("wepose calibrate" in text) == mounts
-    assert mounts or "state the mounts of torso, left_upper_arm" in text
+    assert "wepose calibrate" in text
     session = (tmp_path / "session.toml").read_text(encoding="utf-8")
     assert ("# clasp = [[" in session) == mounts
 
@@ -400,7 +399,7 @@ def test_a_sensor_without_a_segment_may_be_one_that_is_lacking(
         "in place of SEGMENT; then add the seconds of clasp .* wepose calibrate .*; or state the mounts", text
     )
     session = (tmp_path / "session.toml").read_text(encoding="utf-8")
-    assert ("# clasp = [[" in session, "without a sensor here" in session) == (True, False)
+    assert "# clasp = [[" in session
 
 
 # What is guessed ---------------------------------------------------------------------------------------------------

@@ -66,7 +66,19 @@ class ArrayFile:
         UnknownColumn, BadData
             An array or its column does not exist; arrays have different lengths.
         """
-        columns = {name: self._read_column(name, place) for name, place in wanted.items()}
+        columns = {}
+        for name, place in wanted.items():
+            part = re.fullmatch(r"(.*)\[(\d+)\]", name)
+            array = part[1] if part else name
+            values = self._read_array(self._find(array, place))
+            if values.ndim == 2 and (values.shape[1] > MOST_COLUMNS or values.shape[0] == 1):
+                values = values.T  # MATLAB's v7.3 transposes arrays
+            values = values.reshape(len(values), -1)
+            k = int(part[2]) if part else 0
+            if k >= values.shape[1] or (part is None and values.shape[1] > 1):
+                shape = f"one column of {self.path.name}, whose {array} has shape {values.shape}"
+                raise UnknownColumn(f"{place}: {name} is not {shape}; name one as {array}[0]")
+            columns[name] = np.ascontiguousarray(values[:, k])
         lengths = {name: len(values) for name, values in columns.items()}
         if len(set(lengths.values())) > 1:
             listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
@@ -79,20 +91,6 @@ class ArrayFile:
         if len(shape) != 2 or width not in shape:
             raise BadData(f"{place}: {name} in {self.path.name} has shape {shape}; (n, {width}) is needed")
         return [f"{name}[{k}]" for k in range(width)]
-
-    def _read_column(self, name: str, place: str) -> np.ndarray:
-        part = re.fullmatch(r"(.*)\[(\d+)\]", name)
-        values = self._read_array(self._find(part[1] if part else name, place))
-        if values.ndim == 2 and (values.shape[1] > MOST_COLUMNS or values.shape[0] == 1):
-            values = values.T  # MATLAB's v7.3 transposes arrays
-        if part is None:
-            if values.ndim == 2 and values.shape[1] > 1:
-                raise BadData(f"{place}: {name} in {self.path.name} has shape {values.shape}; name a column: {name}[0]")
-            return values.reshape(-1)
-        k = int(part[2])
-        if values.ndim != 2 or k >= values.shape[1]:
-            raise UnknownColumn(f"{place}: no column {k} in {part[1]} of {self.path.name}, its shape is {values.shape}")
-        return np.ascontiguousarray(values[:, k])
 
     def _find(self, name: str, place: str) -> str:
         path = "/" + name.replace(".", "/").strip("/")

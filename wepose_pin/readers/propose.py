@@ -322,8 +322,6 @@ def format_session(proposal: Proposal, path: Path, folder: Path, wearer: Wearer,
             lines.append(
                 f"# clasp = {example}   # for wepose calibrate: the seconds in which the palms are held together"
             )
-    if lacking:
-        lines += ["", f"# without a sensor here, and not known without one: {', '.join(lacking)}"]
     for segment in sorted(proposal.sensors, key=lambda name: segments.index(name) if name in segments else 99):
         place = body.sensors.get(segment, "")
         name = segment if segment in segments else "SEGMENT"
@@ -365,17 +363,11 @@ def _propose_mount(recording: Recording, segment: str, static: Sequence[tuple[fl
 
 def advise(recording: Recording, table: BodyTable) -> str:
     """Advise on the use of a session with these sensors, once its lines marked CHECK are right."""
-    name = "take the # off the lines of each sensor with ? and write its segment in place of SEGMENT"
-    then = (
+    advice = (
         "add the seconds of clasp to [phases] and wepose calibrate SESSION -o subject; "
         "or state the mounts and wepose track SESSION -o result"
     )
-    worn = {segment: sensor for segment, sensor in recording.sensors.items() if segment in table.segments}
-    if len(worn) < len(recording.sensors):
-        return f"{name}; then {then}" if worn else name
-    without = [segment for segment, sensor in worn.items() if not sensor.aligned and sensor.stated_quat_LS is None]
-    if not without:
-        return "wepose track SESSION -o result"
-    if set(worn) >= set(table.needed) >= set(without):
-        return then
-    return f"state the mounts of {', '.join(without)}, then wepose track SESSION -o result"
+    if all(sensor.aligned or sensor.stated_quat_LS is not None for sensor in recording.sensors.values()):
+        advice = "wepose track SESSION -o result"
+    name = "take the # off the lines of each sensor with ? and write its segment in place of SEGMENT; then "
+    return advice if set(recording.sensors) <= set(table.segments) else name + advice

@@ -312,31 +312,29 @@ class _Measured:
         frozen = np.zeros(len(clock.time), dtype=bool)
         for fault in faults:
             frozen |= (clock.time > fault.first) & (clock.time <= fault.last)
-        marks, signals = {}, {}
+        signals, lost = {}, frozen.copy()
         for name in self.values:
             place = f"{self.path}: {self.table.place}{name}"
             signals[name], good = self._place_on_clock(name, place)
             if not good.any():
                 listed = ", ".join(self.columns[name])
                 raise BadData(f"{place}: no numbers from {format_span(clock.time[[0, -1]])} in {listed}")
-            marks[name] = mark_lost_samples(clock, good)
-            if not gaps and (marks[name] == LONG).any():
-                first, last = find_runs(marks[name] == LONG)[0]
+            if not gaps and (long := find_runs(mark_lost_samples(clock, good) == LONG)):
+                first, last = long[0]
                 raise BadData(
                     f"{place}: {last - first} samples without numbers, {(last - first) * clock.step:.3f} s from "
                     f"{clock.time[first]:.3f} s; {GAP_LIMIT}"
                 )
-            if frozen.any():
-                marks[name] = mark_lost_samples(clock, good & ~frozen)
-        all_marks = np.max(list(marks.values()), axis=0)
-        gap = all_marks == LONG if gaps or faults else None
+            lost |= ~good
+        marks = mark_lost_samples(clock, ~lost)
+        gap = marks == LONG if gaps or faults else None
+        marks_reported = np.where(frozen, GOOD, marks)  # frozen samples have a diagnostic of their own
         if "orientation" in signals:
-            quat = bridge_quat(signals["orientation"], marks["orientation"], clock)
-            return OrientationSensor(quat, self.mount, gap, self.aligned), all_marks
-        gyro_S = bridge(signals["gyro"], marks["gyro"], clock, rate=True)
-        accel_S = bridge(signals["accel"], marks["accel"], clock)
-        gap_marks = np.where(frozen, GOOD, all_marks)  # frozen samples have a diagnostic of their own
-        return ImuSensor(gyro_S, accel_S, self.mount, gap, check.gyro_range[segment]), gap_marks
+            quat = bridge_quat(signals["orientation"], marks, clock)
+            return OrientationSensor(quat, self.mount, gap, self.aligned), marks_reported
+        gyro_S = bridge(signals["gyro"], marks, clock, rate=True)
+        accel_S = bridge(signals["accel"], marks, clock)
+        return ImuSensor(gyro_S, accel_S, self.mount, gap, check.gyro_range[segment]), marks_reported
 
     def _place_on_clock(self, name: str, place: str) -> tuple[np.ndarray, np.ndarray]:
         """Put the values (n, k) of a signal on the clock, with a mask (n,) of the samples that exist."""
