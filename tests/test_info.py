@@ -304,7 +304,7 @@ def test_what_cannot_be_read_is_said_and_a_session_still_proposed(
     text = info(capsys, tmp_path / "a.csv")
     unread = diagnosed(tmp_path / "a.csv")["session-unreadable"]
     assert (unread.severity, unread.place) == (ERROR, "a.csv")
-    assert "sensors.torso: accel stands still at 0, 0, 0 m/s^2" in str(unread.facts["reason"])
+    assert "sensors.torso" in str(unread.facts["reason"])
     assert "[sensors.torso]" in text
 
 
