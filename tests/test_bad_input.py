@@ -127,18 +127,18 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     "no sensors": (lambda f: setattr(f, "session", f.session.split("[sensors")[0]), "session.toml: no sensors; one"),
     "a sensor that is no table": (
         lambda f: setattr(f, "session", f.session.split("[sensors")[0] + "[sensors]\ntorso = 3"),
-        "sensors.torso = 3 is not a table; write [sensors.torso]",
+        "sensors.torso = 3 is not a table; a table [sensors.torso] is needed",
     ),
     "no data": (lambda f: f.say("[data]", "[sensors.head]"), "session.toml: data is missing; a table [data]"),
     "no file": (lambda f: f.say('file = "arm.csv"\n', ""), "session.toml: data.file is missing"),
     "gyro without accel": (lambda f: f.say('accel = ["ax", "ay", "az"]\n', ""), "sensors.torso.accel is missing"),
     "two columns for three": (
         lambda f: f.say('["gx", "gy", "gz"]', '["gx", "gy"]'),
-        "sensors.torso.gyro is ['gx', 'gy']; a list of 3 column names is needed",
+        "sensors.torso.gyro = ['gx', 'gy']; a list of 3 different column names is needed",
     ),
     "a column twice in a sensor": (
         lambda f: f.say('"gy", "gz"', '"gy", "gy"'),
-        "sensors.torso.gyro names a column twice",
+        "a list of 3 different column names is needed",
     ),
     "a boolean for a number": (
         lambda f: f.say('time = "time"', "rate_hz = true"),
@@ -363,7 +363,7 @@ def test_the_unspoilt_files_pass(tmp_path: Path, capsys: pytest.CaptureFixture[s
     [
         ("nothing.toml", None, "nothing.toml: no such file; a session file is wanted here"),
         ("data.csv", b"time,gx\n", "data.csv: is a table of data by its name; a session file is wanted here"),
-        ("bytes.toml", b"\xff\xfe\x00", "bytes.toml: is not UTF-8 text (byte 0)"),
+        ("bytes.toml", b"\xff\xfe\x00", "bytes.toml: not valid TOML"),
         ("empty.toml", b"", "empty.toml: data is missing; a table [data] is needed"),
     ],
 )

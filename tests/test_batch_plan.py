@@ -91,7 +91,7 @@ def test_items_keep_their_names_when_others_join(folder: Path) -> None:
     ("text", "said"),
     [
         (STEPS, "sessions is missing"),
-        (f'[[sessions]]\nfiles = "anna/*"\n{STEPS}', "write [sessions]"),
+        (f'[[sessions]]\nfiles = "anna/*"\n{STEPS}', "a table [sessions] is needed"),
         (f"[sessions]\n{STEPS}", "either files (globs) or table is needed"),
         (f'[sessions]\nfiles = ["nobody/*"]\n{STEPS}', "'nobody/*' finds nothing"),
         (f"[sessions]\nfiles = [3]\n{STEPS}", "a name is wanted, or a list of names"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,7 +13,7 @@ import pytest
 from test_bad_input import Files, good_table, refused
 
 from wepose_pin.commands import main
-from wepose_pin.documents import whole_folder, written
+from wepose_pin.documents import whole_folder
 from wepose_pin.errors import (
     BadData,
     BadModel,
@@ -268,32 +267,6 @@ def test_a_full_disk_under_stdout(tmp_path: Path, session: Path) -> None:
     assert run.returncode == 2
     assert run.stderr.splitlines()[-1].endswith("No space left on device; " + f"{tmp_path / 'out'} was written before")
     assert (tmp_path / "out" / "pose.parquet").is_file()
-
-
-def test_a_signal_while_files_move_waits_until_they_have(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ctrl-C between the first file and the last of an output folder that is there already."""
-    (tmp_path / "out").mkdir()
-    replace: Callable[[Path, Path], Path] = Path.replace
-
-    def and_stop(path: Path, target: Path) -> Path:
-        os.kill(os.getpid(), signal.SIGINT)
-        return replace(path, target)
-
-    def fill() -> None:
-        with whole_folder(tmp_path / "out") as folder:
-            for name in "abc":
-                (folder / name).write_text(name)
-            monkeypatch.setattr(Path, "replace", and_stop)
-
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            fill()
-    finally:
-        signal.signal(signal.SIGINT, before)
-    monkeypatch.undo()
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a", "b", "c"]
-    assert written[-1] == tmp_path / "out"
 
 
 def test_what_a_killed_run_left_is_in_nobodys_way(tmp_path: Path) -> None:

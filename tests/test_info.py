@@ -341,7 +341,7 @@ def test_sessions_subjects_and_results(capsys: pytest.CaptureFixture[str], simul
     ("name", "content", "says"),
     [
         ("a.toml", b"x = 1\n", "neither a session ([data], [sensors.…]) nor a subject"),
-        ("a.toml", b"\xff\xfe", "is not UTF-8 text"),
+        ("a.toml", b"\xff\xfe", "not valid TOML"),
         ("a.csv", b"", "is empty"),
         ("a.csv", b"a,b\rc,d\n1,2,3\n", "cannot be read as a CSV"),
         ("a.csv", b"\x00\x01\x02" * 90, "zero bytes"),

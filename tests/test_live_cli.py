@@ -116,7 +116,7 @@ def test_wrong_wishes_are_one_line(session: Path, tmp_path: Path, capsys: pytest
         assert said in err
         assert len(err.splitlines()) == 1
     run("live", "--source", replay, "--vmc", "39539", code=2)
-    assert "--vmc is no option any more: --udp sends each pose as JSON" in capsys.readouterr().err
+    assert "--vmc is not an option of wepose live" in capsys.readouterr().err
     assert file.read_bytes() == b"something"
     run("track", str(file), "-o", str(tmp_path / "r"), code=2)
 

@@ -506,7 +506,7 @@ def test_wrong_robots_are_one_line_before_the_source_opens(
         (["--robot", follow("rate = 5")], "follow.toml: rate is not a known key; did you mean 'rate_hz'?"),
         (["--robot", str(tmp_path / "no.toml")], "no.toml: no such file"),
         (["--robot", str(whole), "--speed", "max"], "--speed max: a robot follows a replay at its own speed"),
-        (["--arm", "left"], "--arm is no option any more: --robot takes a TOML file that has it"),
+        (["--arm", "left"], "--arm is not an option of wepose live"),
     ):
         with pytest.raises(SystemExit) as stop:
             main(["live", "--source", f"replay:{session}", "--no-page", *arguments])

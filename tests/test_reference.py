@@ -323,7 +323,7 @@ def test_wepose_evaluate_says_what_was_fitted(
     assert "s, which are not scored:" in aligned
     assert "its clock -3.217 s (speeds correlate by " in aligned
     assert "its world: +y is up, rotated by +" in aligned
-    assert "Agreement of joint angles [deg]: Bland-Altman" in aligned
+    assert "limits of agreement (Bland-Altman, 95 %)" in aligned
     plain = run_evaluate(capsys, result, tmp_path / "truth.parquet", "--interval", "20", "40")
     assert "aligned" not in plain
     assert "Agreement" not in plain

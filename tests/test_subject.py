@@ -146,7 +146,7 @@ GIRDLE = "law = 0\nrest_x = 0\nrest_y = 0\nrest_z = 0\nraised_x = 0\nraised_y = 
         ),
         (
             "ALL\n[start_pose_offset.torso]\nx_deg = 1",
-            "torso.y_deg is missing; a number [deg] from -180 to 180 is needed for each of x_deg, y_deg",
+            "torso.y_deg is missing; a number [deg] from -180 to 180 is needed",
         ),
         (
             "ALL\n[heading_drift.torso]\nrate_deg_min = 1\nstd_deg_min = -1",

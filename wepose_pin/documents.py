@@ -1,27 +1,21 @@
-"""Reading of TOML with checks, writing of TOML, and atomic output of folders and files.
-
-The checks are ours: an error of msgspec names the expected kind, but not the value, the choices or the table among
-several (`$.sensors[...]`); a user needs all three.
-"""
+"""Reading of TOML with checks, writing of TOML, and atomic output of folders and files."""
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import math
+import os
 import re
 import shutil
-import signal
 import tempfile
-import threading
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from types import FrameType, UnionType
+from types import UnionType
 from typing import Annotated, Any, Literal, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
 from .errors import BadSession, ExistingOutput, MissingFile, WeposeError, one_of
@@ -37,20 +31,17 @@ def read_toml(path: Path, what: str, error: type[WeposeError] = BadSession) -> d
     Raises
     ------
     MissingFile
-        The file is missing, or not readable as text.
+        The file is missing, or cannot be read.
     WeposeError
         It is not TOML; an error of the kind `error`.
     """
-    if path.exists() and not path.is_file():
-        raise MissingFile(f"{path}: is {'a folder' if path.is_dir() else 'no regular file'}; {what} is wanted here")
+    if not path.is_file():
+        found = "is a folder" if path.is_dir() else "is no regular file" if path.exists() else "no such file"
+        raise MissingFile(f"{path}: {found}; {what} is wanted here")
     try:
         return parse_toml(path.read_bytes().decode("utf-8-sig"))
-    except FileNotFoundError:
-        raise MissingFile(f"{path}: no such file; {what} is wanted here") from None
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read: {failure.strerror}") from failure
-    except UnicodeDecodeError as failure:
-        raise MissingFile(f"{path}: is not UTF-8 text (byte {failure.start}); {what} is wanted here") from failure
     except ValueError as failure:
         raise error(f"{path}: not valid TOML: {' '.join(str(failure).split())}") from failure
 
@@ -103,10 +94,9 @@ class TomlTable:
     def table(self, key: str, default: Mapping[str, Any] | None = None) -> TomlTable:
         """Return the table of that name; an error without it and without `default`."""
         value = self.values.get(key, default)
-        if value is None:
-            raise self.error(f"{self.at(key)} is missing; a table [{self.place}{key}] is needed{self._suggest(key)}")
         if not isinstance(value, Mapping):
-            raise self.error(f"{self.at(key)} = {value!r} is not a table; write [{self.place}{key}]")
+            found = "is missing" if value is None else f"= {value!r} is not a table"
+            raise self.error(f"{self.at(key)} {found}; a table [{self.place}{key}] is needed")
         return replace(self, values=value, place=f"{self.place}{key}.")
 
     def entries(self, key: str) -> list[TomlTable]:
@@ -140,12 +130,10 @@ class TomlTable:
 
     def choice(self, key: str, choices: Iterable[str], default: str | None = None) -> str:
         """Return one of the choices."""
-        choices = list(choices)
-        value = self.text(key, default)
-        if value is None:
-            raise self.error(f"{self.at(key)} is missing; {one_of(choices)}")
+        choices, value = list(choices), self.text(key, default)
         if value not in choices:
-            raise self.error(f"{self.at(key)} = '{value}' is not known; {one_of(choices, value)}")
+            found = "is missing" if value is None else f"= '{value}' is not known"
+            raise self.error(f"{self.at(key)} {found}; {one_of(choices, value)}")
         return value
 
     def flag(self, key: str) -> bool:
@@ -160,29 +148,19 @@ class TomlTable:
         value = self.values.get(key, default)
         if value is None:
             return None
-        if not is_number(value):
-            raise self.error(f"{self.at(key)} = {_format_value(value)} is not a number")
-        if positive and value <= 0:
-            raise self.error(f"{self.at(key)} = {value!r} must be greater than 0")
+        if not is_number(value) or (positive and value <= 0):
+            wanted = "must be greater than 0" if is_number(value) else "is not a number"
+            raise self.error(f"{self.at(key)} = {_format_value(value)} {wanted}")
         return float(value)
 
     def names(self, key: str, count: int) -> list[str]:
         """Return a list of `count` different names of columns."""
         value = self.values.get(key)
-        if not isinstance(value, list) or len(value) != count or not all(isinstance(v, str) for v in value):
-            entry = "missing" if value is None else _format_value(value)
-            closest = self._suggest(key) if value is None else ""
-            raise self.error(f"{self.at(key)} is {entry}; a list of {count} column names is needed{closest}")
-        if len(set(value)) < count:
-            raise self.error(
-                f"{self.at(key)} names a column twice: {_format_value(value)}; {count} different ones are needed"
-            )
-        return value
-
-    def _suggest(self, key: str) -> str:
-        """Suggest a similar key for a missing one; empty: there is none."""
-        suggestion = one_of(self.values, key)
-        return f"; {suggestion}" if suggestion.startswith("did") else ""
+        names = [name for name in value if isinstance(name, str)] if isinstance(value, list) else []
+        if names != value or len(names) != count or len(set(names)) < count:
+            found = "is missing" if value is None else f"= {_format_value(value)}"
+            raise self.error(f"{self.at(key)} {found}; a list of {count} different column names is needed")
+        return names
 
 
 def is_number(value: Any, below: float = 1e300) -> TypeGuard[float]:
@@ -314,18 +292,19 @@ def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]]) -
 
 
 def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str, Collection[str]], base: Any) -> Any:
+    value, parts = table.values.get(key.name), get_args(value_type)
     if hasattr(value_type, "_fields"):
         return read_record(value_type, table.table(key.name), known, base)
     if get_origin(value_type) is Mapping:
-        kind, entries = get_args(value_type)[1], table.table(key.name)
-        if kind is float:
+        entries = table.table(key.name)
+        if parts[1] is float:
             return {name: _read_number(entries, replace(key, name=name)) for name in entries.values}
         tables = {name: entries.table(name) for name in entries.values}
-        if hasattr(kind, "_fields"):
-            return {name: read_record(kind, entry, known) for name, entry in tables.items()}
+        if hasattr(parts[1], "_fields"):
+            return {name: read_record(parts[1], entry, known) for name, entry in tables.items()}
         for entry in tables.values():
             entry.allow(*key.each, *key.unread)
-        return {name: _read_value(kind, entry, key, known, None) for name, entry in tables.items()}
+        return {name: _read_value(parts[1], entry, key, known, None) for name, entry in tables.items()}
     if key.each:
         import numpy as np  # not for whoever reads none
 
@@ -333,14 +312,13 @@ def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str,
     if key.words:
         return key.words[table.choice(key.name, key.words)]
     if get_origin(value_type) is Literal:
-        return table.choice(key.name, filter(None, get_args(value_type)))
+        return table.choice(key.name, filter(None, parts))
     if value_type is bool:
         return table.flag(key.name)
     if value_type is str:
         return table.choice(key.name, known[key.of]) if key.of else table.text(key.name, None)
     if value_type is float:
         return _read_number(table, key)
-    value, parts = table.values[key.name], get_args(value_type)
     if str in parts:
         texts = table.texts(key.name)
         for text in texts if key.of else ():
@@ -348,10 +326,10 @@ def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str,
                 raise table.error(f"{table.at(key.name)}: '{text}' is not known; {one_of(known[key.of], text)}")
         if ... in parts or len(texts) == len(parts):
             return texts
-    else:
-        is_right = isinstance(value, list | tuple) and len(value) == len(parts)
-        if is_right and all(is_number(number) and key.least <= number <= key.most for number in value):
-            return tuple(_to_si(key, number) for number in value)
+    elif isinstance(value, list | tuple) and len(value) == len(parts):
+        each = [_to_si(key, number) for number in value if is_number(number) and key.least <= number <= key.most]
+        if len(each) == len(parts):
+            return tuple(each)
     raise table.error(f"{table.at(key.name)} = {_format_value(value)}; {_describe(value_type, key, known)} needed")
 
 
@@ -359,9 +337,8 @@ def _read_number(table: TomlTable, key: Key) -> float:
     value = table.values.get(key.name)
     if is_number(value) and key.least <= value <= key.most:
         return _to_si(key, value)
-    entry = f"= {_format_value(value)}" if key.name in table else "is missing"
-    others = f" for each of {', '.join(key.each)}" if key.each else ""
-    raise table.error(f"{table.at(key.name)} {entry}; {_describe(float, key, {})} needed{others}")
+    found = f"= {_format_value(value)}" if key.name in table else "is missing"
+    raise table.error(f"{table.at(key.name)} {found}; {_describe(float, key, {})} needed")
 
 
 def _to_si(key: Key, value: float) -> float:
@@ -431,28 +408,38 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
     ExistingOutput
         `out` is not empty and `force` is false, or it is no folder, or cannot be written.
     """
-    _check(out, force)
+    prefix = f".{out.absolute().name}.partial-"
+    _check_folder(out, force, prefix)
     # Inside an existing `out`: it may be a separate file system, or the only writable place.
     existing = next(folder for folder in (out.absolute(), *out.absolute().parents) if folder.exists())
-    if not existing.is_dir():
-        raise ExistingOutput(f"{out}: cannot be made: {existing} is a file")
-    own: Path | None = None
     try:
-        try:
-            with _defer_signals():
-                own = Path(tempfile.mkdtemp(prefix=_prefix(out), dir=existing))
-            partial = own / "whole"  # with the user's usual permissions
-            partial.mkdir()
-        except OSError as error:
-            raise ExistingOutput(f"{out}: cannot be written: {error.strerror}") from error
+        own = Path(tempfile.mkdtemp(prefix=prefix, dir=existing))
+    except OSError as error:
+        raise ExistingOutput(f"{out}: cannot be written: {error.strerror}") from error
+    try:
+        partial = own / "whole"  # with the user's usual permissions
+        partial.mkdir()
         with _report_full_disk(out):
             yield partial
-        with _defer_signals():
-            _move(partial, out, force)
-            written.append(out)
+        _check_folder(out, force, prefix)  # again: another run may have written there meanwhile
+        if out.exists():
+            for path in sorted(partial.rglob("*")):
+                target = out / path.relative_to(partial)
+                target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
+        else:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            partial.rename(out)
+        written.append(out)
     finally:
-        if own is not None:
-            shutil.rmtree(own, ignore_errors=True)
+        shutil.rmtree(own, ignore_errors=True)
+
+
+def _check_folder(out: Path, force: bool, prefix: str) -> None:
+    existing = next(path for path in (out.absolute(), *out.absolute().parents) if os.path.lexists(path))
+    if not existing.is_dir():
+        raise ExistingOutput(f"{out}: cannot be made: {existing} is a file; a folder is wanted for the output")
+    if not force and out.is_dir() and any(not path.name.startswith(prefix) for path in out.iterdir()):
+        raise ExistingOutput(f"{out}: exists and is not empty; --force replaces its files, -o names another folder")
 
 
 @contextmanager
@@ -490,63 +477,6 @@ def _report_full_disk(out: Path) -> Iterator[None]:
     except OSError as error:
         # An error of polars has the system's text but no number.
         if error.errno in _FULL or "No space left" in str(error):
-            reason = error.strerror or str(error)
-            raise ExistingOutput(f"{out}: cannot be written: {reason}; nothing was written") from error
+            why = error.strerror or str(error)
+            raise ExistingOutput(f"{out}: cannot be written: {why}; nothing was written") from error
         raise
-
-
-def _move(partial: Path, out: Path, force: bool) -> None:
-    paths = sorted(partial.rglob("*"))
-    _check(out, force)  # again: another run may have written there meanwhile
-    for path in paths:
-        target = out / path.relative_to(partial)
-        if target.exists() and target.is_dir() != path.is_dir():
-            raise ExistingOutput(f"{target}: is in the way; nothing was written, move it or name another folder")
-    if not out.exists():
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(OSError):  # another process has just created it
-            partial.rename(out)
-            return
-        _check(out, force)
-    for path in paths:
-        if path.is_dir():
-            (out / path.relative_to(partial)).mkdir(parents=True, exist_ok=True)
-    for path in paths:
-        if path.is_file():
-            path.replace(out / path.relative_to(partial))
-
-
-def _prefix(out: Path) -> str:
-    return f".{out.absolute().name}.partial-"
-
-
-def _check(out: Path, force: bool) -> None:
-    if out.is_symlink() and not out.exists():
-        raise ExistingOutput(f"{out}: is a link to nothing; name a folder")
-    if out.exists() and not out.is_dir():
-        raise ExistingOutput(f"{out}: is a file; a folder is wanted for the output")
-    if not force and out.is_dir() and any(not p.name.startswith(_prefix(out)) for p in out.absolute().iterdir()):
-        raise ExistingOutput(f"{out}: exists and is not empty; --force replaces its files, -o names another folder")
-
-
-@contextmanager
-def _defer_signals() -> Iterator[None]:
-    """Defer signals that stop a command until the block has ended; only the main thread receives them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    deferred: list[tuple[int, FrameType | None]] = []
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        for number in before:
-            if callable(before[number]):
-                signal.signal(number, lambda number, frame: deferred.append((number, frame)))
-        yield
-    finally:
-        for number, handler in before.items():
-            if callable(handler):
-                signal.signal(number, handler)
-        for signal_number, frame in deferred[:1]:
-            handler = before[signal.Signals(signal_number)]
-            if callable(handler):
-                handler(signal_number, frame)

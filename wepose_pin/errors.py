@@ -148,33 +148,25 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
 
 
-_muting = threading.Lock()
-_stderr: list[int] = []  # what it was, once for each thread that wants it quiet
+_muting = threading.RLock()
 
 
 @contextlib.contextmanager
 def native_stderr_muted() -> Iterator[None]:
     """What libraries in C++ and Rust print on stderr meanwhile is dropped: their errors are told in a line of ours."""
     with _muting:
-        if _stderr:
-            _stderr.append(_stderr[0])
-        else:
-            try:
-                _stderr.append(os.dup(2))
-            except OSError:  # there is none
-                _stderr.append(-1)
-            else:
-                nowhere = os.open(os.devnull, os.O_WRONLY)
-                os.dup2(nowhere, 2)
-                os.close(nowhere)
-    try:
-        yield
-    finally:
-        with _muting:
-            kept = _stderr.pop()
-            if not _stderr and kept >= 0:
-                os.dup2(kept, 2)
-                os.close(kept)
+        try:
+            kept = os.dup(2)
+        except OSError:  # there is none
+            yield
+            return
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
 
 
 def reason(error: Exception) -> str:

@@ -22,18 +22,6 @@ COMMANDS = {
     "live": "wepose_pin.commands.live:live",
     "batch": "wepose_pin.batch.command:batch",
 }
-# Commands and options of earlier versions → what to do instead.
-REMOVED = {
-    "reproduce": "run the command that `provenance` in the result's summary.json names again, with the same versions",
-    "validate": "in a clone of the project, run make validation DATA=DIR",
-}
-_ON_YOUR_OWN = "--udp sends each pose as JSON, from which examples/live_consumer.py shows how to go on"
-_IN_THE_FILE = "--robot takes a TOML file that has it (docs/live-outputs.md)"
-REMOVED_OPTIONS = {
-    "live": dict.fromkeys(("--mvn", "--vmc"), _ON_YOUR_OWN)
-    | dict.fromkeys(("--arm", "--to", "--robot-hz", "--hold-after", "--stop-after"), _IN_THE_FILE)
-    | dict.fromkeys(("--speed-scale", "--limit-margin"), _IN_THE_FILE),
-}
 WIDEST = 98  # columns of a help text
 _LABEL = 24  # columns of an option's name beside its text
 
@@ -47,16 +35,11 @@ def parse(words: Sequence[str]) -> tuple[Callable[..., Any], inspect.BoundArgume
         A command or an option that is not known, lacks its value or has one that is not possible, or is missing.
     """
     first = words[0] if words else ""
-    if first in REMOVED:
-        raise BadOption(f"'{first}' is no command any more: {REMOVED[first]}")
     if first and not first.startswith("-") and first not in COMMANDS:
         raise BadOption(f"'{first}' is not a command; {one_of(COMMANDS, first)}")
     if first in ("", "--help", "-h"):
         for name in COMMANDS:
             APP[name]  # imported, for its line in the help
-    for word in words[1:]:
-        if (switch := word.partition("=")[0]) in REMOVED_OPTIONS.get(first, {}):
-            raise BadOption(f"{switch} is no option any more: {REMOVED_OPTIONS[first][switch]}")
     try:
         command, bound, _ = APP.parse_args(words, print_error=False, exit_on_error=False)
     except CycloptsError as error:
@@ -81,10 +64,7 @@ class PlainHelp:
     """The help as paragraphs and two columns of text, without boxes; of a switch that is on, how to turn it off."""
 
     def __call__(self, console: Console, options: ConsoleOptions, panel: HelpPanel) -> None:  # noqa: ARG002
-        if not panel.entries:
-            return
-        console.out(f"{panel.title}:", highlight=False)
-        for entry in panel.entries:
+        for k, entry in enumerate(panel.entries):
             names, text = entry.display_labels_with_metavar, _plain(entry.description)
             if entry.negative_names:
                 turns_off = entry.default == "True"
@@ -95,14 +75,16 @@ class PlainHelp:
             label = f"  {', '.join(names)}"
             if entry.choices:
                 label = label.removesuffix("CHOICE") + "|".join(entry.choices)
-            first = label if len(label) < _LABEL else ""
-            if not first:
-                console.out(label, highlight=False)
-            indent = " " * _LABEL
-            width = min(console.width, WIDEST)
-            lines = textwrap.wrap(text, width, initial_indent=f"{first:<{_LABEL}}", subsequent_indent=indent)
-            console.out("\n".join(lines or [first]), highlight=False)
-        console.out("")
+            if len(label) >= _LABEL:
+                label += "\n"
+            columns = textwrap.fill(
+                text, min(console.width, WIDEST), initial_indent=" " * _LABEL, subsequent_indent=" " * _LABEL
+            )
+            below = columns if label.endswith("\n") else columns[len(label) :]
+            heading = f"{panel.title}:\n" if k == 0 else ""
+            console.out(f"{heading}{label}{below}".rstrip(), highlight=False)
+        if panel.entries:
+            console.out("")
 
     def render_usage(self, console: Console, options: ConsoleOptions, usage: RenderableType) -> None:  # noqa: ARG002
         console.out(_plain(usage), highlight=False, end="\n\n")
@@ -110,10 +92,9 @@ class PlainHelp:
     def render_description(self, console: Console, options: ConsoleOptions, text: RenderableType) -> None:  # noqa: ARG002
         for paragraph in _plain(text, paragraphs=True).split("\n\n"):
             line = " ".join(paragraph.split())
-            example = line.startswith("Example: ")
-            console.out(
-                line if example else textwrap.fill(line, min(console.width, WIDEST)), highlight=False, end="\n\n"
-            )
+            if not line.startswith("Example: "):
+                line = textwrap.fill(line, min(console.width, WIDEST))
+            console.out(line, highlight=False, end="\n\n")
 
 
 def _plain(text: RenderableType | None, paragraphs: bool = False) -> str:

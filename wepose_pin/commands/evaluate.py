@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -127,68 +128,53 @@ def _print_errors(errors: Evaluation) -> None:
     say(f"{errors.samples} samples from {format_span(errors.interval)}")
     if errors.registration is not None:
         _say_registration(errors.registration)
-    if errors.attitude:
-        print_table(
-            "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]",
-            ("segment", "roll", "pitch", "yaw", "inclination", "heading", "total", "drift"),
-            [
-                (
-                    name,
-                    *(f"{mean:.2f} ± {std:.2f}" for mean, std in (error.roll, error.pitch, error.yaw)),
-                    *(f"{rmse:.2f}" for rmse in (error.inclination_rmse, error.heading_rmse, error.total_rmse)),
-                    f"{error.drift_deg_min:+.2f}",
-                )
-                for name, error in errors.attitude.items()
-            ],
+    attitude = [
+        (
+            name,
+            *(f"{mean:.2f} ± {std:.2f}" for mean, std in (error.roll, error.pitch, error.yaw)),
+            *(f"{rmse:.2f}" for rmse in (error.inclination_rmse, error.heading_rmse, error.total_rmse)),
+            f"{error.drift_deg_min:+.2f}",
         )
-    if errors.joints:
-        print_table(
-            "Joint angle error [deg]: mean; root mean square; largest (near gimbal lock left out)",
-            ("joint", "angle", "mean", "rms", "largest"),
-            [
-                (joint, angle, f"{error.mean:+.2f}", f"{error.rmse:.2f}", f"{error.worst:.2f}")
-                for joint, angles in errors.joints.items()
-                for angle, error in angles.items()
-            ],
+        for name, error in errors.attitude.items()
+    ]
+    joints = [
+        (
+            joint,
+            angle,
+            *(f"{e.mean:+.2f}", f"{e.rmse:.2f}", f"{e.worst:.2f}"),
+            *(f"{e.lower:+.2f} to {e.upper:+.2f}", f"{e.icc:.3f}", f"{e.range:.0f}"),
         )
-    if errors.registration is not None and errors.joints:
-        print_table(
-            "Agreement of joint angles [deg]: Bland-Altman bias and 95 % limits; root mean square; ICC(A,1); range",
-            ("joint", "angle", "bias", "limits of agreement", "rms", "ICC", "range"),
-            [
-                (
-                    joint,
-                    angle,
-                    f"{each.mean:+.2f}",
-                    f"{each.lower:+.2f} to {each.upper:+.2f}",
-                    f"{each.rmse:.2f}",
-                    f"{each.icc:.3f}",
-                    f"{each.range:.0f}",
-                )
-                for joint, angles in errors.joints.items()
-                for angle, each in angles.items()
-            ],
-        )
-    if errors.position:
-        places = errors.position, errors.position_on_limb
-        print_table(
-            "Position error [mm], mean ± std",
-            ("point", "from the root", "from where its limb begins"),
-            [
-                (name, *(f"{each[name].mean:.1f} ± {each[name].std:.1f}" if name in each else "" for each in places))
-                for name in errors.position
-            ],
-        )
+        for joint, angles in errors.joints.items()
+        for angle, e in angles.items()
+    ]
+    places = errors.position, errors.position_on_limb
+    positions = [
+        (name, *(f"{each[name].mean:.1f} ± {each[name].std:.1f}" if name in each else "" for each in places))
+        for name in errors.position
+    ]
     points = {f"{name} (point)": stated for name, stated in errors.position_uncertainty.items()}
-    if stated := {**errors.attitude_uncertainty, **points}:
-        print_table(
-            "Stated uncertainty: right are a normalised squared error of 3, and 68 % and 95 % of the errors within",
+    uncertainty = [
+        (name, f"{u.nees:.2f}", f"{100 * u.within_1:.0f} %", f"{100 * u.within_2:.0f} %")
+        for name, u in {**errors.attitude_uncertainty, **points}.items()
+    ]
+    tables: dict[str, tuple[tuple[str, ...], Sequence[Sequence[str]]]] = {
+        "Attitude error [deg]: mean ± std of the absolute; root mean square; drift of the heading [deg/min]": (
+            ("segment", "roll", "pitch", "yaw", "inclination", "heading", "total", "drift"),
+            attitude,
+        ),
+        "Joint angle error [deg], near gimbal lock left out; limits of agreement (Bland-Altman, 95 %); ICC(A,1)": (
+            ("joint", "angle", "mean", "rms", "largest", "limits of agreement", "ICC", "range"),
+            joints,
+        ),
+        "Position error [mm], mean ± std": (("point", "from the root", "from where its limb begins"), positions),
+        "Stated uncertainty: right are a normalised squared error of 3, and 68 % and 95 % of the errors within": (
             ("of", "normalised", "within 1 std", "within 2 std"),
-            [
-                (name, f"{u.nees:.2f}", f"{100 * u.within_1:.0f} %", f"{100 * u.within_2:.0f} %")
-                for name, u in stated.items()
-            ],
-        )
+            uncertainty,
+        ),
+    }
+    for title, (header, rows) in tables.items():
+        if rows:
+            print_table(title, header, rows)
 
 
 def _say_registration(registration: Registration) -> None:

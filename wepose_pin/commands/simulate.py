@@ -165,17 +165,13 @@ def choose_imperfections(preset: str, changes: Mapping[str, float | str]) -> Imp
     sizes = PRESETS[preset]
     names = [each.name for each in fields(sizes)]
     for name, value in changes.items():
-        option = f"--imperfection {name}={value:g}" if isinstance(value, float) else f"--imperfection {name}={value}"
         if name not in names:
-            raise BadOption(f"{option}: '{name}' is not an imperfection; {one_of(names, name, len(names))}")
-        if name != "mount" and not isinstance(value, float):
-            raise BadOption(f"{option}: '{value}' is not a number, as in {name}=0")
-        if name == "bits" and not float(value).is_integer():
-            raise BadOption(f"{option}: '{value}' is not a whole number, as in {name}=0")
+            raise BadOption(f"--imperfection {name}: not an imperfection; {one_of(names, name, len(names))}")
+        whole = isinstance(value, float) and value.is_integer() and name == "bits"
         try:
-            sizes = replace(sizes, **dict[str, Any]({name: int(value) if name == "bits" else value}))
+            sizes = replace(sizes, **dict[str, Any]({name: int(value) if whole else value}))
         except BadOption as error:
-            raise BadOption(f"{option}: {error}") from None
+            raise BadOption(f"--imperfection {name}={value}: {error}") from None
     return sizes
 
 
