@@ -289,19 +289,22 @@ def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-unty
         (b[2], b[5], b[8], c[2], c[4], c[5]),
     )
     P, d = fuse(P, (x, y, z), S, (gx - bias[0], gy - bias[1], gz - bias[2]))
-    # accel: H P = [y; −x; 0] of the rows x, y of P, S = H P Hᵀ + R_VS Σ_g R_VSᵀ; what gyro said is off the innovation.
-    # Its vertical part comes first: it measures nothing of the state, only the noise that it shares with the others.
+    # accel: H P = [−y; x; 0] of the rows x, y of P, S = H P Hᵀ + R_VS Σ_g R_VSᵀ; what gyro said is off the innovation.
+    # Its vertical part measures nothing of the state, only the noise that it shares with the others.
     Q, g = rotate_symmetric(R, model.static_accel_cov), model.inverse_gravity
     ax, ay, az = ax * g, ay * g, az * g
+    share = 1.0 / Q[5] if Q[5] > 0.0 else 0.0
+    lx, ly, off = share * Q[2], share * Q[4], add_dot(-1.0, R[6], ax, R[7], ay, R[8], az)
     a, b, _ = P
     x, y = (a[0], a[1], a[2], b[0], b[1], b[2]), (-a[1], -a[3], -a[4], -b[3], -b[4], -b[5])
-    S = Q[5], Q[2], Q[4], Q[0] + a[3], Q[1] - a[1], Q[3] + a[0]
-    innovation = (
-        add_dot(-1.0, R[6], ax, R[7], ay, R[8], az),
-        add_dot(d[1], R[0], ax, R[1], ay, R[2], az),
-        add_dot(-d[0], R[3], ax, R[4], ay, R[5], az),
+    horizontal = fma(-lx, Q[2], Q[0] + a[3]), fma(-lx, Q[4], Q[1] - a[1]), fma(-ly, Q[4], Q[3] + a[0])
+    P, e = fuse_two(
+        P,
+        (y, x),
+        horizontal,
+        add_dot(fma(-lx, off, d[1]), R[0], ax, R[1], ay, R[2], az),
+        add_dot(fma(-ly, off, -d[0]), R[3], ax, R[4], ay, R[5], az),
     )
-    P, e = fuse(P, ((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), y, x), S, innovation)
     tx, ty, tz = d[0] + e[0], d[1] + e[1], d[2] + e[2]
     half, cosine, _ = rotation_terms(dot(tx, tx, ty, ty, tz, tz))
     after_R = turn(state.quat_VS, (half * tx, half * ty, half * tz, cosine), load_quat(state.quat_VS))
@@ -319,23 +322,30 @@ def correct(state, model, P, R, gx, gy, gz, ax, ay, az):  # type: ignore[no-unty
 def fuse(P, rows, S, innovation):  # type: ignore[no-untyped-def]
     """Correct by three measurements: return P − (H P)ᵀ S⁻¹ (H P) and the error state (6,) (H P)ᵀ S⁻¹ (y − h).
 
-    `rows` are those of H P (3, 6), S is its upper triangle, `innovation` is y − h. One after the other, each freed from
-    what it shares with those before it. A direction in which S is zero corrects nothing.
+    `rows` are those of H P (3, 6), S is its upper triangle, `innovation` is y − h. A direction in which S is zero
+    corrects nothing. The first is taken by itself, the others with what is left of them.
     """
     x, y, z = rows
-    a = 1.0 / S[0] if S[0] > 0.0 else 0.0
-    k, m = a * S[1], a * S[2]
-    var, shared = fma(-k, S[1], S[3]), fma(-k, S[2], S[4])
-    b = 1.0 / var if var > 0.0 else 0.0
-    n = b * shared
-    var = fma(-n, shared, fma(-m, S[2], S[5]))
-    c = 1.0 / var if var > 0.0 else 0.0
-    y = less(y, k, x)
-    z = less(less(z, m, x), n, y)
-    first, second = innovation[0], fma(-k, innovation[0], innovation[1])
-    third = fma(-n, second, fma(-m, first, innovation[2]))
-    error = less(less(less((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), -a * first, x), -b * second, y), -c * third, z)
-    return subtract_outer(subtract_outer(subtract_outer(P, a, x), b, y), c, z), error
+    inverse = 1.0 / S[0] if S[0] > 0.0 else 0.0
+    k, m, e = inverse * S[1], inverse * S[2], innovation[0]
+    y, z = less(y, k, x), less(z, m, x)
+    rest = fma(-k, S[1], S[3]), fma(-k, S[2], S[4]), fma(-m, S[2], S[5])
+    P, error = fuse_two(
+        subtract_outer(P, inverse, x), (y, z), rest, fma(-k, e, innovation[1]), fma(-m, e, innovation[2])
+    )
+    return P, less(error, -inverse * e, x)
+
+
+@inlined
+def fuse_two(P, rows, S, first, second):  # type: ignore[no-untyped-def]
+    """Correct by two measurements, as `fuse`: `first` and `second` are their innovations."""
+    x, y = rows
+    inverse = 1.0 / S[0] if S[0] > 0.0 else 0.0
+    k = inverse * S[1]
+    var, y = fma(-k, S[1], S[2]), less(y, k, x)
+    other = 1.0 / var if var > 0.0 else 0.0
+    error = less(less((0.0, 0.0, 0.0, 0.0, 0.0, 0.0), -inverse * first, x), -other * fma(-k, first, second), y)
+    return subtract_outer(subtract_outer(P, inverse, x), other, y), error
 
 
 @inlined

@@ -26,18 +26,8 @@ from .noise import BLOCK_S, SensorNoise
 
 # A sample is gyro [rad/s] (3), accel/g (3) and the norm of accel/g.
 SIGNALS = 7
-# Sums over samples, of their differences from an anchor; products are xx xy xz yy yz zz.
-SUMS = np.dtype(
-    [
-        ("gyro", float, 3),
-        ("accel", float, 3),
-        ("norm", float),
-        ("gyro_products", float, 6),
-        ("accel_products", float, 6),
-        ("norm_square", float),
-    ],
-    align=True,
-)
+# Sums over samples, of their differences from an anchor. Upper triangles are xx xy xz yy yz zz.
+SUMS = np.dtype([("signals", float, SIGNALS), ("products", float, (2, 6)), ("norm_square", float)], align=True)
 # Memory of the detector of one sensor, its windows aside.
 DETECTOR = np.dtype(
     [
@@ -45,14 +35,11 @@ DETECTOR = np.dtype(
         ("has_block", np.bool_),  # there is a block before it
         ("anchor", float, SIGNALS),  # the last sample of the block before
         ("sums", SUMS),  # of the current block so far, while it does not move
-        ("least", float, 3),  # [rad/s] gyro in the current block
-        ("most", float, 3),
-        ("moves", np.bool_),  # these differ by too much for any static window
-        ("moves_until", np.int64),  # so they do from this sample of the block before to its end; `tail` begins after it
+        ("moves", np.bool_),  # a sample of it is too far from the anchor for any static window
+        ("moves_until", np.int64),  # of the block before, the last sample that is; `tail` begins after it
         ("inverse_gravity", float),  # [s²/m]
-        # right-hand sides of conditions (1), (2), (4), each times N - 1, and of (3)
-        ("gyro_limit", float, 6),
-        ("accel_limit", float, 6),
+        # right-hand sides of conditions (1) and (2), of (4), each times N - 1, and of (3)
+        ("limits", float, (2, 6)),
         ("norm_variance", float),
         ("norm_error", float),
         # condition (6)
@@ -139,7 +126,6 @@ class StaticDetector:
     those of the rest of the block before, which are made backwards once a block. Nothing is ever subtracted from a sum,
     and the differences summed are from a sample within the window, so that (mean − anchor)² is at most N − 1 variances
     of the window itself: a static window is as precise after 1e8 samples of any motion as in the first second.
-    Nothing is summed up over samples of which two differ by more than condition (1) allows in any window that has both.
     Condition (5) alone has a longer memory, the known bias.
     """
 
@@ -148,8 +134,8 @@ class StaticDetector:
         n = self.test.samples(rate_hz)
         self._detector = _first_state(noise, rate_hz, self.test)
         self._block = np.zeros((n, SIGNALS))  # samples of the current block, then of the one before
-        # Sums of the block before, from each of its samples on which it does not move; where no window begins any more,
-        # `gyro` is that of the current block up to the sample.
+        # Sums of the block before from each of its samples to its end; where no window begins any more, `signals` are
+        # those of the current block up to the sample.
         self._tail = np.zeros(n, SUMS)
 
     def run(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
@@ -173,13 +159,10 @@ def _first_state(noise: SensorNoise, rate_hz: float, test: StaticTest) -> np.nda
     detector = np.zeros(1, DETECTOR)
     values = {
         "inverse_gravity": 1.0 / noise.gravity,
-        "gyro_limit": (n - 1) * test.alpha * noise.gyro_cov[_UPPER],
-        "accel_limit": (n - 1) * test.beta * noise.accel_cov[_UPPER],
+        "limits": (n - 1) * np.array([test.alpha * noise.gyro_cov[_UPPER], test.beta * noise.accel_cov[_UPPER]]),
         "norm_error": test.gamma1,
-        "norm_variance": (n - 1) * test.gamma2,
-        "least": np.inf,
-        "most": -np.inf,
         "moves_until": -1,
+        "norm_variance": (n - 1) * test.gamma2,
         "newest": min(newest, n),
         "rate_change": _bound_rate_change(noise, newest, n, test.rate_stds)[_UPPER],
         "bias": noise.gyro_bias,
@@ -208,85 +191,60 @@ def _bound_rate_change(noise: SensorNoise, newest: int, n: int, rate_stds: float
 @inlined
 def _add(sums, before, block, at, anchor):  # type: ignore[no-untyped-def]
     """Fill `sums` with `before` and sample `at` of the block; both may be one."""
-    gx, gy, gz = block[at, 0] - anchor[0], block[at, 1] - anchor[1], block[at, 2] - anchor[2]
-    ax, ay, az = block[at, 3] - anchor[3], block[at, 4] - anchor[4], block[at, 5] - anchor[5]
+    for part in range(2):
+        k = 3 * part
+        x, y, z = block[at, k] - anchor[k], block[at, k + 1] - anchor[k + 1], block[at, k + 2] - anchor[k + 2]
+        signals, products = sums.signals, sums.products[part]
+        signals[k] = before.signals[k] + x
+        signals[k + 1] = before.signals[k + 1] + y
+        signals[k + 2] = before.signals[k + 2] + z
+        products[0], products[1] = before.products[part, 0] + x * x, before.products[part, 1] + x * y
+        products[2], products[3] = before.products[part, 2] + x * z, before.products[part, 3] + y * y
+        products[4], products[5] = before.products[part, 4] + y * z, before.products[part, 5] + z * z
     norm = block[at, 6] - anchor[6]
-    _add_vector(sums.gyro, before.gyro, gx, gy, gz)
-    _add_vector(sums.accel, before.accel, ax, ay, az)
-    _add_products(sums.gyro_products, before.gyro_products, gx, gy, gz)
-    _add_products(sums.accel_products, before.accel_products, ax, ay, az)
-    sums.norm = before.norm + norm
+    sums.signals[6] = before.signals[6] + norm
     sums.norm_square = before.norm_square + norm * norm
 
 
 @inlined
-def _add_vector(sums, before, x, y, z):  # type: ignore[no-untyped-def]
-    sums[0], sums[1], sums[2] = before[0] + x, before[1] + y, before[2] + z
-
-
-@inlined
-def _add_products(sums, before, x, y, z):  # type: ignore[no-untyped-def]
-    sums[0], sums[1], sums[2] = before[0] + x * x, before[1] + x * y, before[2] + x * z
-    sums[3], sums[4], sums[5] = before[3] + y * y, before[4] + y * z, before[5] + z * z
-
-
-@inlined
 def _clear(sums):  # type: ignore[no-untyped-def]
-    sums.norm = sums.norm_square = 0.0
-    for i in range(3):
-        sums.gyro[i] = sums.accel[i] = 0.0
+    for i in range(SIGNALS):
+        sums.signals[i] = 0.0
     for i in range(6):
-        sums.gyro_products[i] = sums.accel_products[i] = 0.0
+        sums.products[0, i] = sums.products[1, i] = 0.0
+    sums.norm_square = 0.0
 
 
 @inlined
-def _widen(least, most, limit, gx, gy, gz):  # type: ignore[no-untyped-def]
-    """Take a sample of gyro into the range of others; return the range, and whether it is too wide for a static window.
+def _is_far(detector, block, at):  # type: ignore[no-untyped-def]
+    """Return whether gyro at a sample is too far from the anchor for any static window with both.
 
-    Two samples that differ by d make (N − 1) S ≥ d²/2; twice the `limit` is beyond rounding. NaN is no motion.
+    Two samples that differ by d make (N − 1) S ≥ d²/2; twice the limit is beyond rounding. NaN is not far.
     """
-    least = gx if gx < least[0] else least[0], gy if gy < least[1] else least[1], gz if gz < least[2] else least[2]
-    most = gx if gx > most[0] else most[0], gy if gy > most[1] else most[1], gz if gz > most[2] else most[2]
-    x, y, z = most[0] - least[0], most[1] - least[1], most[2] - least[2]
-    return least, most, x * x > 4.0 * limit[0] or y * y > 4.0 * limit[3] or z * z > 4.0 * limit[5]
+    limit, anchor = detector.limits[0], detector.anchor
+    x, y, z = block[at, 0] - anchor[0], block[at, 1] - anchor[1], block[at, 2] - anchor[2]
+    return x * x > 4.0 * limit[0] or y * y > 4.0 * limit[3] or z * z > 4.0 * limit[5]
 
 
 @inlined
-def _sum_up(detector, tail, block, anchor):  # type: ignore[no-untyped-def]
-    """Fill `tail` with the sums from each sample of the block to its end, back to the one before which it moved."""
-    last = len(block) - 1
-    least, most = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
-    detector.moves_until = -1
-    for at in range(last, -1, -1):
-        least, most, moves = _widen(least, most, detector.gyro_limit, block[at, 0], block[at, 1], block[at, 2])
-        if moves:
-            detector.moves_until = at
-            break
-        if at == last:
-            _clear(tail[last])
-            _add(tail[last], tail[last], block, last, anchor)
-        else:
-            _add(tail[at], tail[at + 1], block, at, anchor)
-    detector.moves = False
-    for i in range(3):
-        detector.least[i], detector.most[i] = np.inf, -np.inf
+def _is_within(detector, rest, part, share):  # type: ignore[no-untyped-def]
+    """Conditions (1), `part` 0, and (2): (N − 1)(limit − S) is positive semidefinite: no principal minor is negative.
 
-
-@inlined
-def _is_within(limit, sums, tail_sums, products, tail_products, share):  # type: ignore[no-untyped-def]
-    """Conditions (1) and (2): (N − 1)(limit − S) is positive semidefinite: no principal minor is negative.
-
-    `sums` and `products` are of three signals, of the current block and of the rest of the one before. NaN says no.
+    The window is the current block and `rest`, that of the one before. NaN says no.
     """
-    x, y, z = sums[0] + tail_sums[0], sums[1] + tail_sums[1], sums[2] + tail_sums[2]
-    xx = limit[0] - (products[0] + tail_products[0] - x * x * share)
-    yy = limit[3] - (products[3] + tail_products[3] - y * y * share)
-    zz = limit[5] - (products[5] + tail_products[5] - z * z * share)
+    head, limit, k = detector.sums, detector.limits[part], 3 * part
+    products, rest_products = head.products[part], rest.products[part]
+    x = head.signals[k] + rest.signals[k]
+    y = head.signals[k + 1] + rest.signals[k + 1]
+    z = head.signals[k + 2] + rest.signals[k + 2]
+    xx = limit[0] - (products[0] + rest_products[0] - x * x * share)
+    yy = limit[3] - (products[3] + rest_products[3] - y * y * share)
+    zz = limit[5] - (products[5] + rest_products[5] - z * z * share)
     if not (xx >= 0.0 and yy >= 0.0 and zz >= 0.0):
         return False
-    xy = limit[1] - (products[1] + tail_products[1] - x * y * share)
-    xz = limit[2] - (products[2] + tail_products[2] - x * z * share)
-    yz = limit[4] - (products[4] + tail_products[4] - y * z * share)
+    xy = limit[1] - (products[1] + rest_products[1] - x * y * share)
+    xz = limit[2] - (products[2] + rest_products[2] - x * z * share)
+    yz = limit[4] - (products[4] + rest_products[4] - y * z * share)
     if not (xx * yy - xy * xy >= 0.0 and xx * zz - xz * xz >= 0.0 and yy * zz - yz * yz >= 0.0):
         return False
     return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz) >= 0.0
@@ -295,14 +253,14 @@ def _is_within(limit, sums, tail_sums, products, tail_products, share):  # type:
 @inlined
 def _rate_is_steady(detector, tail, n, gx, gy, gz):  # type: ignore[no-untyped-def]
     """Condition (6) for a window of n samples whose mean rate is g; the rates are differences from the anchor."""
-    newest, head = detector.newest, detector.sums.gyro
+    newest, head = detector.newest, detector.sums.signals
     begin = detector.samples - newest  # first sample of the newest part in the current block
     x, y, z = head[0] - newest * gx, head[1] - newest * gy, head[2] - newest * gz
     if begin < 0:
-        part = tail[n + begin].gyro
+        part = tail[n + begin].signals
         x, y, z = x + part[0], y + part[1], z + part[2]
     elif begin > 0:
-        part = tail[begin - 1].gyro
+        part = tail[begin - 1].signals
         x, y, z = x - part[0], y - part[1], z - part[2]
     M = detector.rate_change
     across = M[1] * x * y + M[2] * x * z + M[4] * y * z
@@ -355,16 +313,11 @@ def _step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[no-unt
     if first < n:
         detector.samples = first
         if not detector.moves:
-            low, high = detector.least, detector.most
-            least, most, detector.moves = _widen(
-                (low[0], low[1], low[2]), (high[0], high[1], high[2]), detector.gyro_limit, gx, gy, gz
-            )
-            low[0], low[1], low[2] = least
-            high[0], high[1], high[2] = most
+            detector.moves = detector.has_block and _is_far(detector, block, at)
             _add(head, head, block, at, anchor)
             # No window needs the sums of the block before from here; those up to here serve condition (6).
-            gyro = tail[at].gyro
-            gyro[0], gyro[1], gyro[2] = head.gyro[0], head.gyro[1], head.gyro[2]
+            for i in range(3):
+                tail[at].signals[i] = head.signals[i]
         if not detector.has_block:
             detector.bias_var += detector.walk_var
             return False
@@ -372,37 +325,35 @@ def _step(detector, block, tail, gx, gy, gz, ax, ay, az):  # type: ignore[no-unt
         if (gx + gy + gz + norm) * 0.0 == 0.0:  # never anchor on NaN or infinity: it would outlast its window
             for m in range(SIGNALS):
                 anchor[m] = block[at, m]
-        _sum_up(detector, tail, block, anchor)
         _clear(head)
-        detector.samples = 0
-        detector.has_block = True
-        first = 0
+        _add(tail[at], head, block, at, anchor)
+        detector.moves, detector.moves_until = False, -1
+        for before in range(at - 1, -1, -1):
+            if _is_far(detector, block, before):
+                detector.moves_until = before
+                break
+            _add(tail[before], tail[before + 1], block, before, anchor)
+        detector.samples, detector.has_block, first = 0, True, 0
     if detector.moves or first <= detector.moves_until:
         return _bias_agrees(detector, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     rest, share = tail[first], 1.0 / n
-    norm = head.norm + rest.norm
+    norm = head.signals[6] + rest.signals[6]
     static = (
         abs(anchor[6] + norm * share - 1.0) <= detector.norm_error  # (3)
         and head.norm_square + rest.norm_square - norm * norm * share <= detector.norm_variance  # (4)
-        and _is_within(detector.gyro_limit, head.gyro, rest.gyro, head.gyro_products, rest.gyro_products, share)  # (1)
-        and _is_within(
-            detector.accel_limit, head.accel, rest.accel, head.accel_products, rest.accel_products, share
-        )  # (2)
+        and _is_within(detector, rest, 0, share)  # (1)
+        and _is_within(detector, rest, 1, share)  # (2)
     )
-    gx = (head.gyro[0] + rest.gyro[0]) * share
-    gy = (head.gyro[1] + rest.gyro[1]) * share
-    gz = (head.gyro[2] + rest.gyro[2]) * share
-    static = static and _rate_is_steady(detector, tail, n, gx, gy, gz)  # (6)
-    return _bias_agrees(
-        detector,
-        n if static else 0,
-        anchor[0] + gx,
-        anchor[1] + gy,
-        anchor[2] + gz,
-        anchor[3] + (head.accel[0] + rest.accel[0]) * share,
-        anchor[4] + (head.accel[1] + rest.accel[1]) * share,
-        anchor[5] + (head.accel[2] + rest.accel[2]) * share,
-    )
+    if not static:
+        return _bias_agrees(detector, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    gx = (head.signals[0] + rest.signals[0]) * share
+    gy = (head.signals[1] + rest.signals[1]) * share
+    gz = (head.signals[2] + rest.signals[2]) * share
+    ax = anchor[3] + (head.signals[3] + rest.signals[3]) * share
+    ay = anchor[4] + (head.signals[4] + rest.signals[4]) * share
+    az = anchor[5] + (head.signals[5] + rest.signals[5]) * share
+    window = n if _rate_is_steady(detector, tail, n, gx, gy, gz) else 0  # (6)
+    return _bias_agrees(detector, window, anchor[0] + gx, anchor[1] + gy, anchor[2] + gz, ax, ay, az)
 
 
 @kernel

@@ -84,7 +84,7 @@ def check_sensors(
     """
     imus = {name: _take_numbers(*each) for name, each in samples.items() if len(each) == 3}
     for (name, a), (other, b) in combinations(imus.items(), 2):
-        if all(map(np.array_equal, a[1:], b[1:])) and len(_find_runs_of_equal_rows(*a[1:])) > FROZEN_SAMPLES:
+        if all(map(np.array_equal, a[1:], b[1:])) and len(a[0]) - len(_find_repeats(*a[1:])) > FROZEN_SAMPLES:
             raise BadData(
                 f"{where}: sensors.{name} and sensors.{other} hold the same values in {len(a[0])} rows: "
                 f"one is a copy of the other; name the file and columns in which each was recorded"
@@ -141,14 +141,14 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
         others = [other for key, other in samples.items() if key != name]
         found: list[Fault] = []
         covered = np.zeros(len(time), dtype=bool)
-        for signals, columns, least_s in (
-            (BOTH, (gyro_S, accel_S), FROZEN_S),
-            (GYRO, (gyro_S,), STUCK_S),
-            (ACCEL, (accel_S,), STUCK_S),
+        of_gyro, of_accel = _find_repeats(gyro_S), _find_repeats(accel_S)
+        for signals, columns, repeats, least_s in (
+            (BOTH, (gyro_S, accel_S), np.intersect1d(of_gyro, of_accel, assume_unique=True), FROZEN_S),
+            (GYRO, (gyro_S,), of_gyro, STUCK_S),
+            (ACCEL, (accel_S,), of_accel, STUCK_S),
         ):
-            if not _may_repeat(*columns):
-                continue
-            first, last = _find_runs_of_equal_rows(*columns).T
+            begins = np.flatnonzero(np.diff(repeats, prepend=-1) > 1)
+            first, last = repeats[begins] - 1, np.append(repeats[begins[1:] - 1], repeats[-1:])
             long = (last - first + 1 >= FROZEN_SAMPLES) & (time[last] - time[first] >= (1.0 - 1e-6) * least_s)
             noisy = long.any() and _is_noisy(time, columns)
             for a, b in zip(first[long].tolist(), last[long].tolist(), strict=True):
@@ -171,18 +171,13 @@ def find_faults(samples: Mapping[str, tuple[np.ndarray, ...]]) -> dict[str, list
     return faults
 
 
-def _may_repeat(*signals: np.ndarray) -> bool:
-    """Return whether there may be a run of `FROZEN_SAMPLES` equal rows of the signals (n, 3): one holds such a pair."""
-    step = FROZEN_SAMPLES - 1
-    equal = [signal[step::step, k] == signal[step - 1 : -1 : step, k] for signal in signals for k in range(3)]
-    return bool(np.logical_and.reduce(equal).any())
-
-
-def _find_runs_of_equal_rows(*signals: np.ndarray) -> np.ndarray:
-    """Find the first and the last row of each run (m, 2) of equal rows of the signals (n, 3), those of one row too."""
-    equal = np.logical_and.reduce([signal[1:, k] == signal[:-1, k] for signal in signals for k in range(3)])
-    first = np.concatenate([[0], np.flatnonzero(~equal) + 1])
-    return np.column_stack([first, np.append(first[1:], len(signals[0])) - 1])
+def _find_repeats(*signals: np.ndarray) -> np.ndarray:
+    """Find the rows (m,) in which all signals (n, 3) repeat the row before."""
+    first, *others = (signal[:, k] for signal in signals for k in range(3))
+    rows = np.flatnonzero(first[1:] == first[:-1]) + 1
+    for column in others:  # few are left after the first
+        rows = rows[column[rows] == column[rows - 1]]
+    return rows
 
 
 def _is_noisy(time: np.ndarray, signals: tuple[np.ndarray, ...] | list[np.ndarray]) -> bool:
@@ -190,14 +185,15 @@ def _is_noisy(time: np.ndarray, signals: tuple[np.ndarray, ...] | list[np.ndarra
 
     All axes reverse as in noise in some seconds, which happens with little motion, and rows repeat briefly or for long.
     """
-    runs = _find_runs_of_equal_rows(*signals)
-    rows, lengths = runs[:ROWS, 0], runs[:, 1] - runs[:, 0] + 1
+    rows = np.delete(np.arange(len(time)), _find_repeats(*signals))
+    lengths = np.diff(rows, append=len(time))
     if len(rows) < 2 * FROZEN_SAMPLES:
         return False
     longer = lengths > 2.0 * np.median(lengths)
-    long = longer & (time[runs[:, 1]] - time[runs[:, 0]] >= (1.0 - 1e-6) * FROZEN_S)
+    long = longer & (time[rows + lengths - 1] - time[rows] >= (1.0 - 1e-6) * FROZEN_S)
     if np.count_nonzero(longer) > 3 * np.count_nonzero(long) + COARSE * len(lengths):
         return False
+    rows = rows[:ROWS]
     values = np.hstack([signal[rows] for signal in signals])
     steps = np.diff(values, axis=0)
     steps[np.abs(steps) < ROUNDING * np.abs(values).max(axis=0)] = 0.0
@@ -229,7 +225,7 @@ def find_gyro_range(gyro_S: np.ndarray, accel_S: np.ndarray) -> float:
     """Find the rate [rad/s] from which an axis of gyro counts as saturated, of samples (n, 3); infinite: none is."""
     if not find_saturation(gyro_S, NARROWEST_GYRO_RANGE).any():
         return np.inf
-    gyro_S = gyro_S[_find_runs_of_equal_rows(gyro_S, accel_S)[:, 0]]  # rows that hold a new sample
+    gyro_S = np.delete(gyro_S, _find_repeats(gyro_S, accel_S), axis=0)
     levels = np.abs(gyro_S[find_saturation(gyro_S, NARROWEST_GYRO_RANGE)])
     return float((1.0 - AT_RANGE) * levels.min(initial=np.inf))
 
