@@ -22,7 +22,6 @@ PERSONS, SECONDS = 5, 600.0
 FEW_PERSONS, FEW_SECONDS = 2, 120.0
 UNSCORED_S = 10.0  # [s] at the beginning, in which causal tracking knows little more than the start pose
 EVERY = 25  # samples from one that is scored to the next
-JOINED_M = 0.08  # [m] between palms, above which a clasp that is found is false
 LIMBS = (("torso", "left_upper_arm", "left_forearm"), ("torso", "right_upper_arm", "right_forearm"))
 # The torso's turn against W is none of the headings': W's x is where it faces.
 PRESETS = {"people": replace(PEOPLE_PRESET, start_heading_deg=0.0), "mild": MILD_PRESET}
@@ -57,22 +56,16 @@ def measure_headings(name: str, preset: Imperfections, persons: int, seconds: fl
         ],
     )
     squares: dict[str, dict[str, list[float]]] = {}
-    false, hours = dict.fromkeys(("offline", "causal"), 0), 0.0
     for seed in range(1, persons + 1):
         simulation = simulate_free_motion(seed, preset, seconds)
-        hours += seconds / 3600.0
         tracked = track_in_all_ways(simulation.recording())
         for kind, of in tracked.items():
             for row, figures in compare_headings(simulation, of).items():
                 for key, value in figures.items():
                     column = key.replace("sensor", kind).replace("segment", f"segment_{kind}")
                     squares.setdefault(row, {}).setdefault(column, []).append(value**2)
-            if kind in false and of.correction is not None:
-                false[kind] += count_false_clasps(simulation, of.correction.found_clasps)
     for row, columns in squares.items():
         table.rows[row] = {column: float(np.sqrt(np.mean(values))) for column, values in columns.items()}
-    counts = " and ".join(f"{count / hours:.2g} {kind}" for kind, count in false.items())
-    table.notes.append(f"False clasps per hour of these motions: {counts}, in {hours:.2g} h.")
     return table
 
 
@@ -120,15 +113,6 @@ def compare_headings(simulation: Simulation, tracked: TrackResult) -> dict[str, 
                 figures["segment_by_std"] = _rms(of_segment / np.sqrt(stated))
             result[f"{far} to {near}"] = figures
     return result
-
-
-def count_false_clasps(simulation: Simulation, clasps: tuple[tuple[float, float], ...]) -> int:
-    """Count the clasps [s] in which the palms were not joined at some time."""
-    gap = np.linalg.norm(simulation.points["left_palm"] - simulation.points["right_palm"], axis=1)
-    return sum(
-        bool(gap[(simulation.time >= begin) & (simulation.time <= end)].max(initial=0.0) > JOINED_M)
-        for begin, end in clasps
-    )
 
 
 def _rms(values: np.ndarray) -> float:

@@ -66,7 +66,6 @@ class Errors(NamedTuple):
     time: np.ndarray  # (n,) [s]
     by_joint: dict[str, np.ndarray]  # "far to near" → (n,) [rad]
     by_std: dict[str, float]  # rms of error over stated standard deviation; empty in open loop
-    found: tuple[tuple[float, float], ...]  # [s] clasps
 
 
 def sections(minutes: float) -> dict[str, Section]:
@@ -75,7 +74,7 @@ def sections(minutes: float) -> dict[str, Section]:
 
 
 def measure_live_headings(minutes: float) -> Table:
-    """One calibrated person of preset people; clasps are found, or marked."""
+    """One calibrated person of preset people; clasps are marked, or not."""
     person = simulate_person(PERSON)
     simulation = simulate_clasped_motion(person, 60.0 * minutes)
     subject = calibrate_person(person, simulation)
@@ -83,7 +82,7 @@ def measure_live_headings(minutes: float) -> Table:
     unmarked = replace(recording, phases={"start": recording.phases["start"]})
     errors = {
         "open": estimate_errors(simulation, unmarked, subject, TrackOptions(causal=True, open_loop=True)),
-        "found": estimate_errors(simulation, unmarked, subject, TrackOptions(causal=True)),
+        "live": estimate_errors(simulation, unmarked, subject, TrackOptions(causal=True)),
         "marked": estimate_errors(simulation, recording, subject, TrackOptions(causal=True)),
         "offline": estimate_errors(simulation, recording, subject, TrackOptions()),
     }
@@ -92,8 +91,8 @@ def measure_live_headings(minutes: float) -> Table:
         f"{EVERY_S / 60.0:g} min",
         (
             Column("open", "without correction [deg]", 2),
-            Column("found", "live [deg]", 2),
-            Column("found_by_std", "by its std", 2),
+            Column("live", "live [deg]", 2),
+            Column("live_by_std", "by its std", 2),
             Column("marked", "clasps marked [deg]", 2),
             Column("marked_by_std", "by its std", 2),
             Column("offline", "offline [deg]", 2),
@@ -113,25 +112,11 @@ def measure_live_headings(minutes: float) -> Table:
         if rows["open"].sum() > SCORED_HZ * CHUNK_S:
             name = f"all, {begin / 60.0:.0f} to {end / 60.0:.0f} min"
             table.rows[name] = {kind: _rms_deg(_stack(each)[:, rows[kind]]) for kind, each in errors.items()}
-    table.notes += _describe_clasps(simulation, recording, errors["found"])
     table.notes.append(
         "Rms of the heading of a sensor's world against its neighbour's, soft tissue left out. Lengths and mounts as a "
         "calibration leaves them; no static phase."
     )
     return table
-
-
-def _describe_clasps(simulation: Simulation, recording: Recording, errors: Errors) -> list[str]:
-    """Describe how many clasps there were, how many were found, and how far the palms were apart in them."""
-    gap = np.linalg.norm(simulation.points["left_palm"] - simulation.points["right_palm"], axis=1)
-    clasps = recording.phases["clasp"]
-    apart = [float(gap[recording.span(clasp)].max()) for clasp in clasps]
-    hits = sum(any(a < end and b > begin for a, b in errors.found) for begin, end in clasps)
-    false = sum(not any(a < end and b > begin for begin, end in clasps) for a, b in errors.found)
-    return [
-        f"{len(clasps)} clasps, palms up to {1e3 * max(apart, default=0.0):.0f} mm apart; {hits} found live by "
-        f"themselves, and {false} where there was none."
-    ]
 
 
 def simulate_clasped_motion(person: Person, seconds: float) -> Simulation:
@@ -181,7 +166,7 @@ def estimate_errors(simulation: Simulation, recording: Recording, subject: Subje
             if correction is not None:
                 std = correction.relative_std(near, far, time)
                 by_std[f"{far} to {near}"] = float(np.sqrt(np.mean((error / std) ** 2)))
-    return Errors(time, by_joint, by_std, () if correction is None else correction.found_clasps)
+    return Errors(time, by_joint, by_std)
 
 
 def _stack(errors: Errors) -> np.ndarray:

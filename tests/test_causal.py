@@ -43,7 +43,8 @@ def started(
     """A causal tracker whose start pose has just ended, and the sample that comes next."""
     begin = recording.span(recording.phases["start"][0]).stop
     tracker = Tracker(subject, options=TrackOptions(method, causal=True))
-    assert not tracker.push(recording.cut(slice(0, begin)))
+    assert tracker.push(recording.cut(slice(0, begin))) is None
+    assert tracker.segment_estimator is not None
     return tracker.segment_estimator, begin
 
 
@@ -52,7 +53,7 @@ def columns(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([s.gyro_S for s in sensors], axis=1), np.stack([s.accel_S for s in sensors], axis=1)
 
 
-@pytest.mark.parametrize("method", ["amekf", "smekf", "ncf", "gdc"])
+@pytest.mark.parametrize("method", ["amekf", "smekf", "ncf"])
 def test_sample_by_sample_gives_the_bits_of_a_run_through_resets_and_gaps(recording: Recording, method: str) -> None:
     gap = np.zeros(len(recording), dtype=bool)
     gap[2100:2300] = True
@@ -172,13 +173,6 @@ def test_chunks_and_samples_in_turn_give_the_bits_of_the_whole(recording: Record
         assert np.array_equal(np.concatenate(parts), whole.quat_WL[name]), name
 
 
-def test_what_comes_later_changes_nothing(recording: Recording, whole: TrackResult) -> None:
-    part = track(first(recording, 2500), causal=True)
-    for name, quat in part.quat_WL.items():
-        assert np.array_equal(quat, whole.quat_WL[name][: len(quat)])
-        assert np.array_equal(part.pose.segment_cov[name], whole.pose.segment_cov[name][: len(quat)])
-
-
 def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording, whole: TrackResult) -> None:
     begin = recording.span(recording.phases["start"][0]).start
     assert begin > 0
@@ -186,26 +180,18 @@ def test_what_lay_before_the_start_pose_changes_nothing(recording: Recording, wh
     assert all(np.array_equal(part.quat_WL[name], quat) for name, quat in whole.quat_WL.items())
 
 
-def test_it_is_close_to_tracking_the_whole_recording(recording: Recording) -> None:
-    """The filter begins half a second later and is else the same."""
-    causal, whole = (track(recording, causal=causal, open_loop=True) for causal in (True, False))
-    for name, quat in causal.quat_WL.items():
-        offline = Rotation.from_quat(whole.quat_WL[name][-len(quat) :])
-        assert np.degrees((offline.inv() * Rotation.from_quat(quat)).magnitude().max()) < 0.2
-
-
 def test_a_reset_turns_headings_to_where_the_person_stands(recording: Recording) -> None:
-    """Standing in the start pose with headings that are off by 30 degrees: a reset brings them back."""
+    """A forearm's gyroscope turns its heading by 30 degrees while the person stands in the start pose."""
     tracker, begin = started(recording)
-    before = tracker.heading_offset.copy()
-    tracker.heading_offset += np.deg2rad(30.0)
-    tracker._quat_WV = Rotation.from_rotvec(tracker.heading_offset[:, None] * [0.0, 0.0, 1.0]).as_quat()
-    std = np.sqrt(tracker.covariance()[:, 2, 2])
+    gyro, accel = (np.array(values[begin - 1]) for values in columns(recording))
+    column = tracker.names.index("left_forearm")
+    turning = gyro.copy()
+    turning[column] += np.deg2rad(30.0) * accel[column] / np.linalg.norm(accel[column])
+    for k in range(160):
+        tracker.step(turning if k < 100 else gyro, accel)
+    assert np.degrees(Rotation.from_quat(tracker.quat_WL[column]).magnitude()) > 20.0
     tracker.reset_headings()
-    np.testing.assert_allclose(tracker.heading_offset, before, atol=np.deg2rad(1.5))  # as the person sways
-    np.testing.assert_allclose(np.sqrt(tracker.covariance()[:, 2, 2]), std, atol=1e-9)  # that of a start pose
-    gyro, accel = columns(recording)
-    np.testing.assert_allclose(np.abs(tracker.step(gyro[begin], accel[begin])[:, 3]), 1.0, atol=0.01)
+    assert np.degrees(Rotation.from_quat(tracker.step(gyro, accel)).magnitude().max()) < 1.5  # as the person sways
 
 
 def test_a_heading_is_stated_as_track_states_it(recording: Recording, simulation: Simulation) -> None:
@@ -243,12 +229,8 @@ def test_the_detector_finds_the_first_stillness_and_says_who_moves() -> None:
     assert states[601] == "start_pose"
     assert states[-1] == "ready"
     assert (detector.begin, detector.end) == (601, 600 + round(START_POSE_HOLD_S * rate))
-
-
-def test_a_slow_steady_turn_is_no_stillness() -> None:
-    gyro = np.full((1000, 1, 3), np.deg2rad(6.0))
-    detector = StartPoseDetector(100.0, np.zeros(1, dtype=bool))
-    assert all(detector.push(tick, np.zeros((1, 3))) != "ready" for tick in gyro)
+    turns = StartPoseDetector(rate, np.zeros(1, dtype=bool))  # slowly and evenly
+    assert all(turns.push(np.full((1, 3), np.deg2rad(6.0)), np.zeros((1, 3))) != "ready" for _ in range(1000))
 
 
 def test_without_a_named_start_pose_it_is_found(recording: Recording, whole: TrackResult) -> None:

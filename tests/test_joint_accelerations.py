@@ -104,7 +104,7 @@ def test_in_an_even_spin_a_wrong_tilt_is_not_taken_for_an_acceleration_of_the_jo
             rows = slice(begin, begin + samples)
             sides = accelerations.push(R_WS[rows], accel_S[rows])[::5]
             quats = np.tile([0.0, 0.0, 0.0, 1.0], (1, 2, 1))
-            list(state.step(Knot(0.0, np.zeros(1), quats, sides, filters, np.zeros(2, dtype=bool), {})))
+            list(state.step(Knot(quats, sides, filters, np.zeros(2, dtype=bool), {})))
         z.append((off - state.x[1] + state.x[0]) / np.sqrt(state.P[1, 1] + state.P[0, 0] - 2.0 * state.P[0, 1]))
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -138,7 +139,15 @@ def track(
             progress("making the pages", 2 / 3)
             failures = write_track_pages(out, summary, view=view, report=report, fps=view_rate_hz or 30.0)
     content = summary.content
-    _print_summary(content, error_budget)
+    _print_summary(content)
+    if error_budget:
+        from ..report.track import tabulate_error_budget
+
+        tables = tabulate_error_budget(summary.measures.error_budget)
+        for table in tables:
+            print_table(*table)
+        if not tables:
+            say("Error budget: none, since the filter states no uncertainty, or no point of a person is known")
     print_diagnostics(failures)
     motion = "Motion" + (f", {view_rate_hz:.2g} frames a second" if view_rate_hz else "")
     say_pages(out, ({"Report": "report.html"} if report else {}) | ({motion: "view.html"} if view else {}))
@@ -150,57 +159,30 @@ def track(
     return Tracked(content, failures)
 
 
-def _print_summary(summary: Mapping[str, Any], error_budget: bool) -> None:
-    """Diagnostics, the sensors' static share, bias and gravity, joints, and the error budget where it is wanted."""
+def _print_summary(summary: Mapping[str, Any]) -> None:
+    """Print diagnostics, the sensors' static share, bias and gravity, and the joints of a mechanism."""
     print_diagnostics(from_json(each) for each in summary["diagnostics"])
+    rows: list[tuple[str, ...]] = []
+    for segment, about in summary["sensors"].items():
+        if "static_share" not in about:
+            rows.append((segment, "", "orientations from the recording", ""))
+            continue
+        begin, end = (math.hypot(*about[f"gyro_bias_{when}_deg_s"]) for when in ("start", "end"))
+        share, gravity = f"{100 * about['static_share']:.0f} %", f"{about['gravity_m_s2']:.3f}"
+        rows.append((segment, share, f"{begin:.3f} → {end:.3f}", gravity))
     print_table(
         f"{summary['recording']}: {summary['duration_s']:g} s at {summary['rate_hz']:g} Hz, {summary['method']}, "
         f"lengths: {summary['subject']['note'] or summary['subject']['name']}",
         ("sensor", "static", "gyro bias, start → end [deg/s]", "gravity [m/s²]"),
-        [(segment, *_sensor_cells(about)) for segment, about in summary["sensors"].items()],
+        rows,
     )
     if "joints" in summary:
-        _print_joints(summary)
-    if error_budget:
-        _print_error_budget(summary["error_budget_mm"])
-
-
-def _sensor_cells(about: Mapping[str, Any]) -> tuple[str, str, str]:
-    if "static_share" not in about:
-        return "", "orientations from the recording", ""
-    begin, end = (_norm(about[f"gyro_bias_{when}_deg_s"]) for when in ("start", "end"))
-    return f"{100 * about['static_share']:.0f} %", f"{begin:.3f} → {end:.3f}", f"{about['gravity_m_s2']:.3f}"
-
-
-def _norm(values: Sequence[float]) -> float:
-    return sum(value * value for value in values) ** 0.5
-
-
-def _print_joints(summary: Mapping[str, Any]) -> None:
-    print_table(
-        "Joints [rad or m]",
-        ("joint", "minimum", "maximum", ""),
-        [
-            (
-                name,
-                f"{values['min']:.3f}",
-                f"{values['max']:.3f}",
-                "undetermined" if name in summary["undetermined_joints"] else "",
-            )
-            for name, values in summary["joints"].items()
-        ],
-    )
-
-
-def _print_error_budget(budget: Mapping[str, Mapping[str, float]]) -> None:
-    from ..tracking.error_budget import group_by_source
-
-    rows = {point: group_by_source(parts) for point, parts in budget.items()}
-    if not rows:
-        say("Error budget: none, since the filter states no uncertainty, or no point of a person is known")
-        return
-    print_table(
-        "Error budget: one standard deviation of an axis [mm], root mean square; by segment in summary.json",
-        ("point", *next(iter(rows.values()))),
-        [(point, *(f"{value:.1f}" for value in row.values())) for point, row in rows.items()],
-    )
+        unknown = summary["undetermined_joints"]
+        print_table(
+            "Joints [rad or m]",
+            ("joint", "minimum", "maximum", ""),
+            [
+                (name, f"{values['min']:.3f}", f"{values['max']:.3f}", "undetermined" if name in unknown else "")
+                for name, values in summary["joints"].items()
+            ],
+        )

@@ -212,6 +212,7 @@ class LiveLoop(Stage):
         tracker = Tracker(self.setup.subject, model=self.model, options=TrackOptions(self.method, causal=True))
         tracker.push(recording)
         estimator = tracker.segment_estimator
+        assert estimator is not None
         search.ticks = []
         self._diagnostics = (*estimator.diagnostics, *diagnostics)
         self._first_pose = self._heading_reset_time = float(recording.time[-1])

@@ -13,7 +13,7 @@ from ..body.girdle import PARAMETERS
 from ..body.lengths import UNIVERSE
 from ..body.start_pose import StartPose
 from .paths import BodySymbols, express_covariance, express_path, find_girdles, find_path
-from .symbols import about_z, evaluate, product, rotate, rotate_back
+from .symbols import about_z, evaluate, product, rotate
 
 
 class GapRows(NamedTuple):
@@ -47,7 +47,6 @@ class PointPair:
 
     def __init__(self, model: BodyModel, start: StartPose, sensors: Sequence[str], points: tuple[str, str]) -> None:
         self.points = points
-        ends = [find_path(model, start, sensors, [(point, 1.0)]) for point in points]
         between = find_path(model, start, sensors, [(points[0], 1.0), (points[1], -1.0)])
         self.segments = tuple(part.segment for part in between.vectors if part.segment != UNIVERSE)
         table, k, lengths = model.table, len(sensors), len(model.lengths)
@@ -68,24 +67,10 @@ class PointPair:
                 off_law += off @ off.T
         by_attitude = express_covariance(vectors, 0.0, dict.fromkeys(vectors, 1.0))
         rows = [gap, ca.jacobian(gap, headings), ca.jacobian(gap, shape), by_attitude, off_law]
-        self._gap = _make_function([quat, headings, shape], rows)
-        reference = table.reference
-        self._ends = None
-        if reference in sensors:
-            places = [rotate_back(body.quat_WL[reference], express_path(end, body)[0]) for end in ends]
-            self._ends = _make_function([quat, headings, shape], places)
+        outputs = [ca.densify(each) for each in rows]
+        self._gap = ca.Function("rows", [quat, headings, shape], outputs, {"cse": True})
 
     def linearize(self, quat_WL: np.ndarray, headings: np.ndarray) -> GapRows:
         """Linearize the gap of orientations (n, k, 4) at heading errors (k,) [rad]."""
         gap, *others = evaluate(self._gap, quat_WL.reshape(len(quat_WL), -1), headings, self._shape)
         return GapRows(gap[:, :, 0], *others)
-
-    def locate_ends(self, quat_WL: np.ndarray, headings: np.ndarray) -> list[np.ndarray]:
-        """Return the paths (n, 3) [m] of both points in the frame of the reference segment, which has a sensor."""
-        assert self._ends is not None
-        places = evaluate(self._ends, quat_WL.reshape(len(quat_WL), -1), headings, self._shape)
-        return [place[:, :, 0] for place in places]
-
-
-def _make_function(inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
-    return ca.Function("rows", inputs, [ca.densify(output) for output in outputs], {"cse": True})

@@ -123,7 +123,11 @@ def find_path(
             continue
         carrier = UNIVERSE if link == UNIVERSE else find_carrier(model, link, sensors)
         if carrier is None:
-            raise BadSession(_describe_missing_sensor(model, link, [point for point, _ in points]))
+            places = " and ".join(point for point, _ in points)
+            raise BadSession(
+                f"sensors.{link} is missing: without it the place of {places} is not known; add it, or use a protocol "
+                f"without that point"
+            )
         R = start.rotation(link)
         B, c = sums.get(carrier, (np.zeros((3, lengths)), np.zeros(3)))
         sums[carrier] = B + R @ by_length, c + R @ constant
@@ -138,16 +142,6 @@ def find_path(
         for name in model.point_girdles[point]:
             signs[name] = signs.get(name, 0.0) + sign
     return PointPath(tuple(vectors), tuple((name, sign) for name, sign in signs.items() if sign))
-
-
-def _describe_missing_sensor(model: BodyModel, link: str, points: Collection[str]) -> str:
-    place = f"the place of {' and '.join(points)} is not known"
-    if link not in model.table.segments:
-        return (
-            f"no segment of {model.table.name} moves with '{link}', so that {place}; add its link to [segments], with "
-            f"a sensor, or use a protocol without that point"
-        )
-    return f"sensors.{link} is missing: without it {place}; add it, or use a protocol without that point"
 
 
 def find_girdles(model: BodyModel, start: StartPose, sensors: Collection[str]) -> tuple[GirdleTerm, ...]:

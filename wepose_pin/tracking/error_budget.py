@@ -17,14 +17,14 @@ from .segment_orientations import compute_soft_tissue_covariances
 
 PERIOD_S = 1.0  # [s] from one sample to the next
 SOFT_TISSUE, SENSOR, LENGTHS, GIRDLES = "soft tissue", "sensor, mount, start pose", "lengths", "shoulder girdle"
+CORRELATED = "what correlated headings add"
 
 
 class ErrorBudget:
     """Accumulates the error budget of a recording, chunk by chunk."""
 
     def __init__(self) -> None:
-        self._variances: dict[str, dict[str, float]] = {}  # point → part → sum over samples [m²], mean of the axes
-        self._correlated: dict[str, float] = {}  # point → what correlated headings add, summed likewise
+        self._sums: dict[str, dict[str, float]] = {}  # point → part → sum over samples [m²], mean of the axes
         self._samples = self._received = 0
 
     def add(self, tracked: TrackResult) -> None:
@@ -58,14 +58,14 @@ class ErrorBudget:
             both = variances({**zero, name: total[name]}, 0.0 * shape_cov)
             parts[f"{name}: {SOFT_TISSUE}"] = _subtract(own_soft, exact)
             parts[f"{name}: {SENSOR}"] = _subtract(both, own_soft)
+        parts[CORRELATED] = {
+            point: np.trace(pose.point_cov[point][rows], axis1=1, axis2=2) / 3.0 - independent
+            for point, independent in variances(total, shape_cov).items()
+        }
         for part, by_point in parts.items():
             for point, values in by_point.items():
-                sums = self._variances.setdefault(point, {})
-                for value in values.tolist():  # one by one: a sum of sums would depend on the chunks
-                    sums[part] = sums.get(part, 0.0) + value
-        for point, independent in variances(total, shape_cov).items():
-            correlated = np.trace(pose.point_cov[point][rows], axis1=1, axis2=2) / 3.0 - independent
-            self._correlated[point] = sum(correlated.tolist(), self._correlated.get(point, 0.0))
+                sums = self._sums.setdefault(point, {})
+                sums[part] = sum(values.tolist(), sums.get(part, 0.0))  # one by one, whatever the chunks
         self._samples += len(rows)
 
     def summarize(self) -> dict[str, dict[str, float]]:
@@ -74,13 +74,13 @@ class ErrorBudget:
         Parts below a tenth of a millimetre are left out.
         """
         budget = {}
-        for point, independent in self._variances.items():
-            sensors = sum(value for part, value in independent.items() if part.endswith(SENSOR))
-            ratio = 1.0 + self._correlated[point] / sensors if sensors else 1.0
-            parts = {p: value * ratio if p.endswith(SENSOR) else value for p, value in independent.items()}
-            std = {part: float(np.sqrt(max(value, 0.0) / self._samples)) for part, value in parts.items()}
+        for point, sums in self._sums.items():
+            sensors = sum(value for part, value in sums.items() if part.endswith(SENSOR))
+            ratio = 1.0 + sums[CORRELATED] / sensors if sensors else 1.0
+            shares = {part: value * (ratio if part.endswith(SENSOR) else 1.0) for part, value in sums.items()}
+            std = {part: float(np.sqrt(max(share, 0.0) / self._samples)) for part, share in shares.items()}
             ordered = sorted(std.items(), key=lambda item: -item[1])
-            budget[point] = {part: value for part, value in ordered if value >= 1e-4}
+            budget[point] = {part: value for part, value in ordered if value >= 1e-4 and part != CORRELATED}
         return budget
 
 

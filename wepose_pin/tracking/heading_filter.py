@@ -8,7 +8,7 @@ more observation. Differences of two or more δ are observed by:
 - the acceleration of a joint, which two sensors measure (`observations.joint_accelerations`), with their levers as
   unknowns;
 - a hinge: the long axis of the segment below stays in the plane across the hinge's axis, within its range;
-- two points that coincide: palms in a phase `clasp`, or in a clasp that was found.
+- two points that coincide: palms in a phase `clasp`.
 
 Errors by soft tissue, tilted hinge axes and travelling joints are correlated over seconds or over the whole recording.
 They are states, so that a long recording does not average them away.
@@ -22,9 +22,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit, logit
 
+from ..body.mounts import PALM_SLIP_STD, SEGMENT_ATTITUDE_STD
+from ..observations.closures import GapRows
 from ..observations.hinges import linearize_hinge
 from ..observations.joint_accelerations import JointResidual, linearize_joint
-from .clasps import OUTLIER_STDS, ClaspDetector, Rows, whiten_gap
 from .heading_problem import FilterHeadings, HeadingProblem, Knot
 
 UNKNOWN_DRIFT_PSD = np.deg2rad(3.0) ** 2 / 60.0  # [rad²/s] where a filter has no covariance: 3° in a minute; assumption
@@ -39,6 +40,7 @@ MISFIT_MEMORY_S = 30.0  # time constant of the recent misfit of a joint's accele
 # People stand off the start pose as the population does, or by a share of it where they take care: the share, and how
 # likely that is before anything is observed; assumptions.
 CAREFUL_SHARE, CAREFUL_PROBABILITY = 0.1, 0.2
+OUTLIER_STDS = 5.0  # standard deviations above which a row is an outlier
 HINGE_HEADING_MARGIN = np.deg2rad(10.0)  # [rad] that headings may have drifted before a hinge row is an outlier
 ITERATIONS = 2  # linearizations of an update
 # A heading may be feigned by this many times the rms of the coherent misfits that no heading explains, and by no more
@@ -125,7 +127,6 @@ class HeadingFilter:
     ----------
     x, P : (n,), (n, n); the first k are δ [rad]
     process : of the last knot
-    clasps : [s] when points were found to coincide
     """
 
     def __init__(self, problem: HeadingProblem, start: FilterHeadings) -> None:
@@ -150,9 +151,7 @@ class HeadingFilter:
         self._last = start
         self._lost_before = np.zeros(k, dtype=bool)  # whether a sensor has lost a sample in the last knot
         self._recent_growth = np.zeros(k)  # [rad²] of the orientation filter's variance in a knot, the largest
-        self._detector = ClaspDetector(problem)
         self._closed_before = set[str]()  # phases whose points coincided in the last knot
-        self.clasps: list[tuple[float, float]] = []
 
     def reset(self, headings: np.ndarray) -> None:
         """Set δ (k,) [rad] as known to within the start pose."""
@@ -217,7 +216,7 @@ class HeadingFilter:
         self.P = self.advance(self.advance(self.P).T).T + np.diag(process.variance)
 
     def _update(self, knot: Knot) -> Iterator[None]:
-        """Update by a knot's observations, then by points that are found to coincide in it."""
+        """Update by a knot's observations."""
         k, unreliable = len(self.problem.names), knot.lost | self._lost_before  # after a loss the tilt may be wrong
         inside = {phase: rows for phase, rows in knot.inside.items() if rows.any()}
         x, information, misfits = self.x, Information(len(self.x)), self._misfits
@@ -230,27 +229,13 @@ class HeadingFilter:
             for phase, rows in inside.items():
                 points = self.problem.closures[phase]
                 if not unreliable[[self.problem.names.index(name) for name in points.segments]].any():
-                    gap = whiten_gap(self.problem, points.linearize(knot.quat_WL[rows], x[:k]))
-                    self._add_gap(phase, gap, knot, information)
+                    self._add_gap(phase, points.linearize(knot.quat_WL[rows], x[:k]), knot, information)
                     yield
             x = self._fuse(x, information)
             yield
         self._misfits = misfits
         self._apply(x, information)
-        yield
-        found = self._detector.find(knot, self.x[:k], self.P[:k, :k], inside)
-        yield
-        found = {} if unreliable.any() else found
-        for phase, gap in found.items():
-            information = Information(len(x))
-            self._add_gap(phase, gap, knot, information)
-            self._apply(self._fuse(self.x, information), information)
-            begin = float(knot.time[0])
-            if self.clasps and begin - self.clasps[-1][1] < 1.5 * self.problem.knot_s:
-                begin = self.clasps.pop()[0]
-            self.clasps.append((begin, knot.end))
-            yield
-        self._closed_before = {*inside, *found}
+        self._closed_before = set(inside)
 
     def _add_biases(self, knot: Knot, x: np.ndarray, information: Information) -> None:
         """Add what the orientation filters have learned of the biases about the vertical.
@@ -316,15 +301,21 @@ class HeadingFilter:
             information.add(columns[:2], rows.slope[:, None] * [1.0, -1.0], rows.excess, beyond)
             yield
 
-    def _add_gap(self, phase: str, gap: Rows, knot: Knot, information: Information) -> None:
-        """Add the rows of a closure; as many samples as its residuals are correlated over are one observation.
+    def _add_gap(self, phase: str, rows: GapRows, knot: Knot, information: Information) -> None:
+        """Add a closure, without outliers; as many samples as its residuals are correlated over are one observation.
 
         Causally all of a clasp's first knot is one: a clasp may be shorter than its residuals are correlated.
         """
-        problem, (r, H) = self.problem, gap
+        problem = self.problem
+        covariance = PALM_SLIP_STD**2 * np.eye(3) + SEGMENT_ATTITUDE_STD**2 * rows.by_attitude + rows.off_law
+        covariance += rows.by_shape @ problem.shape_cov @ rows.by_shape.swapaxes(1, 2)
+        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+        r, H = (whiten @ rows.gap[:, :, None])[..., 0], whiten @ rows.H
+        is_inlier = np.sum(r**2, axis=1) < OUTLIER_STDS**2 * 3.0  # three axes
         correlated = max(1.0, problem.noise.closure_correlation_s * problem.rate_hz)
         if problem.causal and phase not in self._closed_before:
-            correlated = float(len(knot.time))
+            correlated = float(len(knot.quat_WL))
+        r, H = r[is_inlier].ravel(), H[is_inlier].reshape(-1, H.shape[2])
         information.add(problem.columns.heading, H, r, 1.0 / correlated)
 
 

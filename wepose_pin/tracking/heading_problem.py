@@ -62,7 +62,6 @@ class HeadingNoise:
     axis_std: float = float(np.deg2rad(5.0))
     tilt_std: float = float(np.deg2rad(2.0))
     range_std: float = float(np.deg2rad(10.0))  # [rad] of the limits of a hinge's range
-    slip_std: float = 0.03  # [m] of the gap between palms in a clasp that was found: a cup may be between them
     closure_correlation_s: float = 20.0
 
 
@@ -94,8 +93,6 @@ class FilterHeadings(NamedTuple):
 class Knot(NamedTuple):
     """The samples of a knot, with uncorrected headings."""
 
-    end: float  # [s]
-    time: np.ndarray  # (m,) [s] of the samples
     quat_WL: np.ndarray  # (m, k, 4) xyzw of L'
     sides: np.ndarray  # (m, k, 3, 8) of each sensor at its joints, as `compute_sides`, band-passed
     filters: FilterHeadings  # at the end

@@ -23,7 +23,6 @@ from ..body.mounts import compute_start_heading_var
 from ..body.start_pose import StartPose
 from ..filters.butterworth import BandPass
 from ..observations.joint_accelerations import BAND_HZ, compute_sides
-from ..recording import Intervals
 from .heading_filter import HeadingEstimate, HeadingFilter, Process, estimate_headings, find_care, symmetric
 from .heading_problem import FilterHeadings, HeadingProblem, Knot
 from .segment_orientations import SegmentOrientations, correct_covariance
@@ -43,7 +42,6 @@ class HeadingCorrection:
     errors: np.ndarray  # (m, k) [rad] that are corrected, on the left in W
     covariance: np.ndarray  # (m, k, k) [rad²] of the errors of the sensors' heading offsets
     segment_covariance: np.ndarray  # (m, k, k) [rad²] of the segments' headings
-    found_clasps: Intervals = ()  # [s] when the hands were found joined outside of a phase
 
     @property
     def segments(self) -> tuple[str, ...]:
@@ -65,7 +63,6 @@ class HeadingCorrection:
         return {
             "joint_accelerations": list(self.joint_accelerations),
             "hinges": [hinge.name for hinge in self.problem.hinges],
-            "found_clasps": [[round(value, 2) for value in span] for span in self.found_clasps],
             "largest_correction_deg": {name: round(value, 3) for name, value in self.max_correction_deg.items()},
         }
 
@@ -236,7 +233,7 @@ class HeadingCorrector:
             sides = self._accelerations.push(R_WS, accel_S)[rows]
         lost = np.asarray(~np.isfinite(accel_S).all(axis=(0, 2)))
         quat_WL = rotations.multiply(quat_WS[rows], problem.quat_SL)
-        knot = Knot(float(time[-1]), time[rows], quat_WL, sides, filters, lost, inside)
+        knot = Knot(quat_WL, sides, filters, lost, inside)
         yield
         yield from self._filter.step(knot)
         if self._file is not None:
@@ -294,7 +291,6 @@ class HeadingCorrector:
             np.array([errors for errors, _, _ in history]).reshape(-1, k),
             np.array([cov for _, cov, _ in history]).reshape(-1, k, k),
             np.array([cov for _, _, cov in history]).reshape(-1, k, k),
-            self._find_clasps(),
         )
 
     def smooth(self, filters: FilterHeadings) -> HeadingCorrection | None:
@@ -319,7 +315,7 @@ class HeadingCorrector:
         smoothed = HeadingEstimate(*(np.array(each[::-1]) for each in zip(*estimates, strict=True)))
         if problem.measured.any() and not exceed_uncertainty(smoothed.errors, smoothed.covariance):
             smoothed.errors[:, problem.measured] = 0.0
-        return HeadingCorrection(problem, np.array(self._times), *smoothed, found_clasps=self._find_clasps())
+        return HeadingCorrection(problem, np.array(self._times), *smoothed)
 
     def _read(self, i: int) -> tuple[np.ndarray, np.ndarray, Process]:
         """Read the state and its covariance after knot i, and the process that led to it."""
@@ -329,9 +325,6 @@ class HeadingCorrector:
         self._file.seek(8 * size * i)
         x, P, *process = np.split(np.fromfile(self._file, count=size), np.cumsum([n, n * n, n]))
         return x, P.reshape(n, n), Process(*process)
-
-    def _find_clasps(self) -> Intervals:
-        return tuple((self._begin_s + a, self._begin_s + b) for a, b in self._filter.clasps)
 
 
 def _close(file: IO[bytes]) -> None:

@@ -121,17 +121,13 @@ def compute_joint_heading_stds(
 ) -> dict[str, np.ndarray]:
     """Joint → (n,) [rad], one standard deviation of the heading between its segments, as if they were independent.
 
-    From the body outwards: all of a limb before the next. `part` "drift": without start pose and soft tissue.
+    `part` "drift": without start pose and soft tissue.
     """
-    stds = {}
-    segments = [segment for segment, above in model.parents.items() if above is None]
-    while segments:
-        segment = segments.pop(0)
-        segments = [*(each for each, above in model.parents.items() if above == segment), *segments]
-        above = model.parents[segment]
-        if above is not None and {above, segment} <= set(headings):
-            stds[model.table.joint_name(segment)] = np.hypot(*(getattr(headings[n], part) for n in (above, segment)))
-    return stds
+    return {
+        model.table.joint_name(segment): np.hypot(*(getattr(headings[name], part) for name in (above, segment)))
+        for segment, above in model.parents.items()
+        if above is not None and {above, segment} <= set(headings)
+    }
 
 
 def measure_hinge(pose: Pose, table: BodyTable, name: str, subject: Subject | None = None) -> HingeMotion | None:

@@ -73,7 +73,6 @@ class SegmentEstimator:
     ----------
     names : the k segments; this and what follows from the first chunk on
     diagnostics : of the recording, its start pose and its mounts
-    heading_offset : (k,) ψ [rad], heading of each sensor's world V in W at the start or the last reset
     headings : what corrects the headings, causally at once; None: nothing does
     quat_WL : (k, 4) xyzw after the last sample; overwritten by the next one
     """
@@ -123,8 +122,9 @@ class SegmentEstimator:
         self._lost = np.zeros(k, dtype=int)  # samples since a measured orientation
         quat_LS = {name: mounts[name].as_quat() for name in self.names}
         self._quat_LS = np.array(list(quat_LS.values()))
-        self.heading_offset = np.array([offsets[name] for name in self.names])
-        self._quat_WV = rotations.rotation_about(E_Z, self.heading_offset)
+        # (k,) ψ [rad], heading of each sensor's world V in W at the start or the last reset
+        self._heading_offset = np.array([offsets[name] for name in self.names])
+        self._quat_WV = rotations.rotation_about(E_Z, self._heading_offset)
         self._recent = np.empty((0, k, 4))  # orientations of the last `RESET_S`
         self._oldest = 0  # row of `_recent` with the oldest sample
         self._filter_headings: FilterHeadings  # after the last chunk
@@ -143,7 +143,7 @@ class SegmentEstimator:
         begin = int(np.searchsorted(first.time, phases.start[1], side="right"))
         start = self._stack(first.cut(slice(0, begin)), {n: o.take(slice(0, begin)) for n, o in orientation.items()})
         time = float(first.time[0]) + begin / self.rate_hz
-        self.headings = HeadingCorrector(problem, self.heading_offset, start.at(-1), time)
+        self.headings = HeadingCorrector(problem, self._heading_offset.copy(), start.at(-1), time)
         if self._options.causal:
             self._variance = self.headings.variance
         return self._place(first, orientation, begin)
@@ -234,8 +234,7 @@ class SegmentEstimator:
         marks, resets = self._find_marks(chunk), {tick for tick in chunk.resets if 0 <= tick < n}
         for first, last in pairwise(sorted({0, *resets, *marks, min(begin, n), n})):
             if first in resets:
-                recent = history[max(0, before + first - size) : before + first]
-                self._reset(recent, (output.at(first - 1) if first else self._filter_headings).var)
+                self._reset(history[max(0, before + first - size) : before + first])
             for phase, begins in marks.get(first, ()):
                 self.mark_phase(phase, begins=begins)
             while first < last:
@@ -245,7 +244,7 @@ class SegmentEstimator:
                 rows = slice(first, stop)
                 placed = self._quat_WV, self._fade(), output.quat_VS[rows], self._quat_LS, self.quat_WL, quat_WL[rows]
                 _place_segments(*placed)
-                variance[rows], offset[rows] = self._variance, self.heading_offset
+                variance[rows], offset[rows] = self._variance, self._heading_offset
                 if self.headings is not None and first >= begin:
                     if self.headings.push(output.quat_VS[rows], accel_S[rows]):
                         self.headings.close(output.at(stop - 1), record=True)
@@ -258,7 +257,7 @@ class SegmentEstimator:
             options=self._options,
             quat_WL={name: quat_WL[:, i] for i, name in enumerate(self.names)},
             quat_LS=dict(zip(self.names, self._quat_LS, strict=True)),
-            heading_offset=dict(zip(self.names, self.heading_offset.tolist(), strict=True)),
+            heading_offset=dict(zip(self.names, self._heading_offset.tolist(), strict=True)),
             orientation=orientation,
             covariance_W=self._find_covariances(chunk, output, quat_WL, offset, variance),
             start=self._phases.start,
@@ -288,26 +287,21 @@ class SegmentEstimator:
 
     def reset_headings(self) -> None:
         """Reset the headings: the body has stood in the start pose again for `RESET_S`."""
-        self._reset(self._order_recent(), self._read_filters().at(0).var)
+        self._reset(self._order_recent())
 
-    def _reset(self, recent: np.ndarray, var: np.ndarray) -> None:
-        """Reset the headings by recent orientations (m, k, 4); `var` (k,) [rad²] is that of the filters' headings."""
+    def _reset(self, recent: np.ndarray) -> None:
+        """Reset the headings by recent orientations (m, k, 4)."""
         same_sign = recent * np.sign(np.einsum("nki,ki->nk", recent, recent[-1]))[:, :, None]
         mean = same_sign.sum(axis=0)
         mean /= np.linalg.norm(mean, axis=1)[:, None]
-        offset = np.zeros(len(self.names))
         for i, name in enumerate(self.names):
             R_WS_start = self._start_pose.to_world(name, Rotation.from_quat(self._quat_LS[i]))
-            offset[i] = compute_heading_offset(Rotation.from_quat(mean[i]), R_WS_start)
-        self.heading_offset = offset
-        if self.headings is not None:
-            self.headings.reset(offset)
+            self._heading_offset[i] = compute_heading_offset(Rotation.from_quat(mean[i]), R_WS_start)
+        if self.headings is None:
+            self._quat_WV = rotations.rotation_about(E_Z, self._heading_offset)
+        else:
+            self.headings.reset(self._heading_offset)
             self._variance = self.headings.variance
-            return
-        self._quat_WV = rotations.rotation_about(E_Z, offset)
-        # As after the start pose: what the filters have added since is gone.
-        start_var = np.array([self._find_start_var(name) for name in self.names])
-        self._variance = np.array([start_var, var, np.full(len(var), np.inf)])
 
     def _find_start_var(self, name: str) -> float:
         return compute_start_heading_var(self._first, name, self._subject, self._start_pose)
@@ -324,7 +318,7 @@ class SegmentEstimator:
 
         There may be steps between the parts: the result is that of the step before the first one.
         """
-        output, offset, variance = self._read_filters(), self.heading_offset.copy(), np.array(self._variance)
+        output, offset, variance = self._read_filters(), self._heading_offset.copy(), np.array(self._variance)
         lost_s, covariance = self._lost / self.rate_hz, np.full((len(self.names), 3, 3), np.nan)
         quat_WL = {name: self.quat_WL[i : i + 1].copy() for i, name in enumerate(self.names)}
         soft = compute_soft_tissue_covariances(self._start_pose.table, quat_WL)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from .. import rotations
 from ..errors import BadPhase
 from ..filters.phases import SWAYS_DEG, SWAYS_DEG_S
-from ..recording import Intervals, OrientationSensor, Recording, Sensor, join_recordings
+from ..recording import Intervals, OrientationSensor, Recording, join_recordings
 from ..recording.arrivals import list_numbers, unpack_orientations
 from ..recording.clocks import Clock
 from ..recording.gaps import GOOD, LONG, bridge
@@ -73,12 +73,11 @@ class StartPoseDetector:
         if self._held % self._every == 0 or self._held == self._hold:
             held = self._gyro[: self._held]
             last = held[-self._window :]
-            rate = np.sqrt(np.mean(np.sum((last - last.mean(axis=0)) ** 2, axis=2), axis=0))
-            rotation = np.linalg.norm(np.cumsum(held - held.mean(axis=0), axis=0) / self._rate, axis=2).max(axis=0)
-            mean = np.linalg.norm(held.mean(axis=0), axis=1)
-            moves = (
-                (np.degrees(rate) > SWAYS_DEG_S) | (np.degrees(rotation) > SWAYS_DEG) | (np.degrees(mean) > SWAYS_DEG_S)
-            )
+            mean, degrees = held.mean(axis=0), np.degrees(1.0)
+            rate = degrees * np.sqrt(np.mean(np.sum((last - last.mean(axis=0)) ** 2, axis=2), axis=0))
+            turned = degrees * np.linalg.norm(np.cumsum(held - mean, axis=0) / self._rate, axis=2).max(axis=0)
+            steady = degrees * np.linalg.norm(mean, axis=1)
+            moves = (rate > SWAYS_DEG_S) | (turned > SWAYS_DEG) | (steady > SWAYS_DEG_S)
             if moves.any():
                 self.moving = tuple(np.flatnonzero(moves).tolist())
                 self._held, self._moved_at = 0, self._tick
@@ -91,12 +90,9 @@ class StartPoseDetector:
     def _find_measured_rates(self, gyro_S: np.ndarray, accel_S: np.ndarray) -> np.ndarray:
         """Return `gyro_S` with the rates of measured orientations since the last tick; zero at the first."""
         quat = unpack_orientations(gyro_S[self._measured], accel_S[self._measured])
-        last = quat if self._last_quat is None else self._last_quat
-        known = np.isfinite(quat).all(axis=1) & np.isfinite(last).all(axis=1)
-        turns = np.full((len(quat), 3), np.nan)
-        turns[known] = (Rotation.from_quat(last[known]).inv() * Rotation.from_quat(quat[known])).as_rotvec()
-        rates, self._last_quat = gyro_S.copy(), quat
-        rates[self._measured] = turns * self._rate
+        last, self._last_quat = quat if self._last_quat is None else self._last_quat, quat
+        rates = gyro_S.copy()
+        rates[self._measured] = rotations.log(rotations.multiply(rotations.conjugate(last), quat)) * self._rate
         return rates
 
 
@@ -112,8 +108,7 @@ class StartPoseCutter:
 
         None: the start pose has not ended.
         """
-        received = chunk if self._received is None else join_recordings(self._received, chunk)
-        self._received = received
+        received = self._received = chunk if self._received is None else join_recordings(self._received, chunk)
         if received.phases.get("start"):
             interval = received.phases["start"][0]
             if received.time[-1] < interval[1] - 1e-9:
@@ -123,13 +118,13 @@ class StartPoseCutter:
             if self._detector is None:
                 measured = [isinstance(sensor, OrientationSensor) for sensor in received.sensors.values()]
                 self._detector = StartPoseDetector(received.rate_hz, np.array(measured))
-            for gyro_S, accel_S in zip(*stack_ticks(chunk), strict=True):
-                if self._detector.push(gyro_S, accel_S) == "ready":
-                    break
-            else:
+            detector = self._detector
+            if all(
+                detector.push(gyro_S, accel_S) != "ready" for gyro_S, accel_S in zip(*stack_ticks(chunk), strict=True)
+            ):
                 return None
-            interval = float(received.time[self._detector.begin]), float(received.time[self._detector.end])
-            last = self._detector.end + 1
+            interval = float(received.time[detector.begin]), float(received.time[detector.end])
+            last = detector.end + 1
         start = replace(cut_start_pose(received, interval), start_is_guessed=not received.phases.get("start"))
         return start, received.cut(slice(last, len(received)))
 
@@ -162,27 +157,21 @@ def cut_start_pose(recording: Recording, interval: tuple[float, float]) -> Recor
         A sensor without samples in the start pose.
     """
     before: dict[str, Intervals] = {"start": (interval,)}
-    static = recording.phases.get("static", ())
-    span = recording.span(interval)
+    span, static = recording.span(interval), recording.phases.get("static", ())
     begin = span.start
     if static and static[0][1] <= interval[1]:
         before["static"] = static[:1]
         begin = min(begin, recording.span(static[0]).start)
     part = recording.cut(slice(begin, span.stop))
     clock = Clock(np.arange(len(part)) / part.rate_hz, np.arange(len(part)), 1.0 / part.rate_hz)
-    sensors = {name: _bridge_gaps(part, name, clock) for name in part.sensors}
+    sensors = dict(part.sensors)
+    for name, sensor in part.imus.items():
+        if sensor.gap is None or not sensor.gap.any():
+            continue
+        if sensor.gap.all():
+            where = f"{part.where()}: phases.start: sensors.{name}"
+            raise BadPhase(f"{where} sent nothing in it; state seconds in which all do")
+        marks = np.where(sensor.gap, LONG, GOOD).astype(np.int8)
+        gyro_S, accel_S = bridge(sensor.gyro_S, marks, clock, rate=True), bridge(sensor.accel_S, marks, clock)
+        sensors[name] = replace(sensor, gyro_S=gyro_S, accel_S=accel_S)
     return replace(part, phases=before, sensors=sensors)
-
-
-def _bridge_gaps(part: Recording, name: str, clock: Clock) -> Sensor:
-    """Return a sensor of `part` with its gaps bridged from this part alone."""
-    sensor = part.sensors[name]
-    if isinstance(sensor, OrientationSensor) or sensor.gap is None or not sensor.gap.any():
-        return sensor
-    if sensor.gap.all():
-        raise BadPhase(
-            f"{part.where()}: phases.start: sensors.{name} sent nothing in it; state seconds in which all do"
-        )
-    marks = np.where(sensor.gap, LONG, GOOD).astype(np.int8)
-    gyro_S, accel_S = bridge(sensor.gyro_S, marks, clock, rate=True), bridge(sensor.accel_S, marks, clock)
-    return replace(sensor, gyro_S=gyro_S, accel_S=accel_S)

@@ -48,6 +48,10 @@ class Tracker:
         the recording names, else the upper body. Without a subject a model that is given or named keeps its own lengths
     options : None: the default ones
     with_point_cov : compute the covariances of the points; a page that shows none does without
+
+    Attributes
+    ----------
+    segment_estimator : takes single samples, of a causal tracker after the start pose; None before it has ended
     """
 
     def __init__(
@@ -66,25 +70,10 @@ class Tracker:
         self._start_pose: StartPose
         self._is_begun = self._has_tracked = False
         self._start = StartPoseCutter()  # of a causal tracker
-        self._estimator: SegmentEstimator | None = None  # after the start pose
+        self.segment_estimator: SegmentEstimator | None = None
         self._kinematics: KinematicsSolver | None = None
         self._chunks: list[Recording] = []  # that wait for the headings
         self._only: SegmentOrientations | None = None  # of the first chunk, while it is the only one
-
-    @property
-    def segment_estimator(self) -> SegmentEstimator:
-        """The estimator of segment orientations for single samples, of a causal tracker after the start pose.
-
-        Raises
-        ------
-        BadOption, BadPhase
-            The tracker is not causal; the start pose has not ended.
-        """
-        if not self.options.causal:
-            raise BadOption("a tracker takes single samples where its options are causal")
-        if self._estimator is None:
-            raise BadPhase("the start pose has not ended: push a recording that includes it")
-        return self._estimator
 
     def push(self, chunk: Recording) -> TrackResult | None:
         """Add the next chunk; return it with its pose; None: `smooth` returns it, or the start pose has not ended.
@@ -94,7 +83,7 @@ class Tracker:
         WeposeError
             The recording, the subject or the model lacks something that is needed; a sensor is on no segment.
         """
-        options, is_first = self.options, self._estimator is None
+        options, is_first = self.options, self.segment_estimator is None
         if not self._is_begun:
             self._is_begun = True
             self._person, self._body, self._start_pose = _fit_body(self._subject, self._model, chunk)
@@ -105,16 +94,16 @@ class Tracker:
             if found is None:
                 return None
             start, chunk = found
-            self._estimator = self._make_estimator(observes_headings=not options.open_loop)
-            self._estimator.push(start)
+            self.segment_estimator = self._make_estimator(observes_headings=not options.open_loop)
+            self.segment_estimator.push(start)
             if not len(chunk):
                 return None
         elif is_first:
-            self._estimator = self._make_estimator(observes_headings=not options.open_loop)
+            self.segment_estimator = self._make_estimator(observes_headings=not options.open_loop)
         elif options.method in OFFLINE:
             raise BadOption(f"method '{options.method}' takes the whole recording as one chunk")
-        assert self._estimator is not None
-        segments, headings = self._estimator.push(chunk), self._estimator.headings
+        assert self.segment_estimator is not None
+        segments, headings = self.segment_estimator.push(chunk), self.segment_estimator.headings
         if headings is None or options.causal:
             self._has_tracked = True
             return self._solve_pose(segments, None if headings is None else headings.collect())
@@ -132,9 +121,9 @@ class Tracker:
         """
         if self.options.causal and not self._has_tracked:
             raise BadPhase(self._start.explain_end())
-        if not self._chunks or self._estimator is None:
+        if not self._chunks or self.segment_estimator is None:
             return
-        correction, estimator = self._estimator.smooth_headings(), self._make_estimator(observes_headings=False)
+        correction, estimator = self.segment_estimator.smooth_headings(), self._make_estimator(observes_headings=False)
         for chunk in self._chunks:
             segments = self._only or estimator.push(chunk)
             yield self._solve_pose(segments if correction is None else correction.correct(segments), correction)
