@@ -127,7 +127,6 @@ def is_sound(trajectory: retargeting.Trajectory) -> None:
     contacts = retargeting.find_self_collisions(robot, trajectory.time, trajectory.joint_position)
     assert contacts.samples == 0, contacts.first
     assert contacts.pairs > 1
-    assert contacts.excluded["in collision at rest"] == []
     assert np.isfinite(trajectory.joint_position).all()
 
 

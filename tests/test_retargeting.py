@@ -100,9 +100,7 @@ def test_the_robot_follows_hand_turn_and_elbow(swung: retargeting.Trajectory) ->
 
 
 def test_what_can_be_reached_is_reached(swung: retargeting.Trajectory) -> None:
-    frames, reached = retargeting.assess_reachability(swung)
-    assert len(frames) == len(reached) == 40
-    assert reached.max() < 5e-3
+    assert retargeting.find_missed_targets(swung) == []
     assert sum(retargeting.attribute_errors(swung, 0).values()) == pytest.approx(np.mean(error(swung) > 0.02), abs=1e-3)
 
 
@@ -302,8 +300,6 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     why = retargeting.attribute_errors(trajectory, 0)
     assert why["self-collision"] > 0.2
     assert why["self-collision"] > 0.9 * sum(why.values())
-    _, reached = retargeting.assess_reachability(trajectory)
-    assert reached[-1, 0] == pytest.approx(error(trajectory)[-1], abs=0.02)  # nor could it with all the time there is
 
 
 def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:

@@ -25,10 +25,8 @@ class Retargeted(NamedTuple):
 
     @property
     def exit_code(self) -> int:
-        """0 where a robot may run it: limits kept, no self-collision, no hand off a target that it can reach."""
-        summary = self.summary
-        wrong = not summary["within_limits"] or summary["self_collisions"]["samples"] or summary["missed_targets"]
-        return 3 if wrong else 0
+        """0 where a robot may run it: limits kept, no self-collision."""
+        return 3 if not self.summary["within_limits"] or self.summary["self_collisions"]["samples"] else 0
 
 
 def retarget(
@@ -57,9 +55,8 @@ def retarget(
     alex (from the package example-robot-data). Any other by its URDF with a robot map beside it, a TOML that says which
     links are shoulder, elbow and hand (docs/robot-maps.md).
 
-    Exit code: 0 the trajectory keeps the robot's limits, has no self-collision (checked on what is written), and no
-    hand stays off a target that it can reach; 3 one of these does not hold: the files are written, but no robot may run
-    them; 2 invalid input, nothing is written.
+    Exit code: 0 the trajectory keeps the robot's limits and has no self-collision (checked on what is written); 3 one
+    of these does not hold: the files are written, but no robot may run them; 2 invalid input, nothing is written.
 
     Example: wepose retarget result --robot panda_table -o panda
 

@@ -27,7 +27,7 @@ from .figures import (
 from .page import Frame, Item, render_page, show_diagnostics
 from .words import Table, number, plain
 
-CAUSE_COLOURS = (ALARM, *SESSION_COLOURS, SOFT, COLOURS["other"])  # of `CAUSES`
+CAUSE_COLOURS = (ALARM, *SESSION_COLOURS, SOFT)  # of `CAUSES`
 PAIRS = 8  # that are listed, the closest ones
 
 
@@ -88,16 +88,14 @@ def tabulate_hands(summary: Mapping[str, Any]) -> list[Table]:
     """Errors of the hands, and their causes."""
     arms, rows = summary["arms"], []
     for side, arm in arms.items():
-        near, swivel = arm["reachability"]["hand_error_where_reachable_mm"], arm["swivel_error_deg"]
-        errors = (arm["hand_error_everywhere_mm"], arm["hand_error_mm"], near)
+        swivel, errors = arm["swivel_error_deg"], (arm["hand_error_everywhere_mm"], arm["hand_error_mm"])
         cells = [number(error[key], 1) if error else "" for error in errors for key in ("median", "p90")]
         rotation = number(arm["hand_error_deg"]["median"], 1)
-        reachable = number(100 * arm["reachability"]["reachable_share"], 0)
         swivel_deg = number(swivel["median"], 0) if swivel else ""
-        rows.append([side, f"{arm['scale']:.2f}", *cells, rotation, swivel_deg, reachable])
-    places = ("median", "90 %", "within reach: median", "90 %", "where reachable: median", "90 %")
+        rows.append([side, f"{arm['scale']:.2f}", *cells, rotation, swivel_deg])
+    places = ("median", "90 %", "within reach: median", "90 %")
     causes = [[cause, *(f"{100.0 * arm['error_attribution'][cause]:.1f}" for arm in arms.values())] for cause in CAUSES]
-    header = ["arm", "scale", *places, "orientation [deg]", "elbow swivel [deg]", "reachable [%]"]
+    header = ["arm", "scale", *places, "orientation [deg]", "elbow swivel [deg]"]
     title = f"Share of the time in which a hand is over {1e3 * FAR:g} mm off, by cause; the first that applies counts"
     return [
         Table("Distance of each hand from its target [mm]", header, rows),

@@ -66,7 +66,6 @@ class SelfCollisions(NamedTuple):
     samples: int
     first: str  # the first pair, and when; empty without a collision
     pairs: int  # of shapes that were checked
-    excluded: dict[str, list[str]]  # reason → pairs that were not
 
 
 def find_self_collisions(robot: Robot, time: np.ndarray, u: np.ndarray) -> SelfCollisions:
@@ -74,7 +73,7 @@ def find_self_collisions(robot: Robot, time: np.ndarray, u: np.ndarray) -> SelfC
 
     The pairs are those of `select_pairs`; what the controller leaves out of them has no part in it.
     """
-    pairs, excluded = select_pairs(robot)
+    pairs = select_pairs(robot)
     shapes = pin.GeometryModel(robot.geometry)
     for i, j in pairs:
         shapes.addCollisionPair(pin.CollisionPair(i, j))
@@ -89,4 +88,4 @@ def find_self_collisions(robot: Robot, time: np.ndarray, u: np.ndarray) -> SelfC
         pair = next(pairs[k] for k, result in enumerate(geometry.collisionResults) if result.isCollision())
         names = " and ".join(shapes.geometryObjects[i].name for i in pair)
         first = f"{names} at {float(time[hits[0]]):.2f} s"
-    return SelfCollisions(len(hits), first, len(pairs), excluded)
+    return SelfCollisions(len(hits), first, len(pairs))

@@ -24,7 +24,6 @@ OVERLAP = 0.005  # [m] by which hulls that overlap in the rest posture may overl
 # Relative, of Coal's search for the nearest points. With its own 1e-6 the distance to a cylinder jumps by a micrometre
 # from one posture to the next, however near, and its Jacobian by 0.002 m/rad. At 1e-12 the search fails now and then.
 GJK_TOLERANCE = 1e-10
-DISABLED, ADJACENT, AT_REST = "disabled in the SRDF", "adjacent", "in collision at rest"
 _SAMPLES = 1000  # random configurations that show which pairs collide always, or never; fewer where pairs are many
 _MAX_TESTS = 400_000
 _END_SHARE = 0.3  # of the joints in them that are at an end of their range: there links of one arm collide, if anywhere
@@ -56,7 +55,7 @@ class CollisionModel:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.hulls, hull_of = _build_hulls(robot)
-        pairs = _leave_out_always_and_never(robot, select_pairs(robot)[0])
+        pairs = _leave_out_always_and_never(robot, select_pairs(robot))
         self.pairs = sorted({tuple(sorted((hull_of[i], hull_of[j]))) for i, j in pairs})
         for i, j in self.pairs:
             self.hulls.addCollisionPair(pin.CollisionPair(i, j))
@@ -247,11 +246,11 @@ def list_corners(shape: Any) -> np.ndarray:
     return points @ shape.placement.rotation.T + shape.placement.translation
 
 
-def select_pairs(robot: Robot) -> tuple[list[tuple[int, int]], dict[str, list[str]]]:
-    """Return the pairs of the robot's shapes that must not collide, and reason → names of the pairs that are left out.
+def select_pairs(robot: Robot) -> list[tuple[int, int]]:
+    """Return the pairs of the robot's shapes that must not collide.
 
-    Left out are shapes of one part, and for a reason pairs that the SRDF disables, adjacent links, and what collides in
-    the rest posture.
+    Left out are shapes of one part, pairs that the SRDF disables, adjacent links, and what collides in the rest
+    posture.
 
     Raises
     ------
@@ -267,7 +266,6 @@ def select_pairs(robot: Robot) -> tuple[list[tuple[int, int]], dict[str, list[st
     data, q = shapes.createData(), robot.configuration(robot.rest)
     pin.computeCollisions(robot.model, robot.model.createData(), shapes, data, q, False)
     pairs = []
-    excluded: dict[str, list[str]] = {DISABLED: [], ADJACENT: [], AT_REST: []}
     for pair, result in zip(shapes.collisionPairs, data.collisionResults, strict=True):
         own = (names[pair.first], names[pair.second])
         ends = frozenset((links[pair.first], links[pair.second]))
@@ -276,12 +274,9 @@ def select_pairs(robot: Robot) -> tuple[list[tuple[int, int]], dict[str, list[st
                 f"{robot.map.where}: rest, table: {own[own[0] == TABLE_NAME]} is in the table in the rest posture; "
                 "give a rest above it, or another table"
             )
-        if ends in disabled or ends in adjacent or result.isCollision():
-            reason = DISABLED if ends in disabled else ADJACENT if ends in adjacent else AT_REST
-            excluded[reason].append(" - ".join(own))
-        else:
+        if ends not in disabled and ends not in adjacent and not result.isCollision():
             pairs.append((pair.first, pair.second))
-    return pairs, excluded
+    return pairs
 
 
 def _leave_out_always_and_never(robot: Robot, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:

@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from ..body.urdf import resolve_meshes
 from ..diagnostics import ERROR, INFO, WARNING, Diagnostic, as_json
-from ..recording import format_span, format_time
+from ..recording import format_span
 from ..writers.joint_motion import ROBOT_URDF, TRAJECTORY
 from ..writers.result import write_table
 from .checks import LimitCheck, SelfCollisions
-from .collision import AT_REST, CLEARANCE
-from .error_attribution import CLAMPED, FAR, MissedTarget, assess_reachability, attribute_errors, find_missed_targets
+from .collision import CLEARANCE
+from .error_attribution import CLAMPED, LOST_M, MissedTarget, attribute_errors, find_missed_targets
 from .placement import place_root
-from .reconfiguration import LOST_M
 from .targets import compute_target_reach
 from .trajectory import Trajectory
 from .visuals import find_missing_visuals
@@ -75,10 +74,7 @@ def _format_joint_trajectory(trajectory: Trajectory) -> str:
 def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollisions) -> dict[str, Any]:
     """Contents of ``summary.json``."""
     robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
-    frames, reached = assess_reachability(trajectory)
-    arms = {
-        arm.side: _summarize_arm(trajectory, i, frames - begin, 1e3 * reached[:, i]) for i, arm in enumerate(robot.arms)
-    }
+    arms = {arm.side: _summarize_arm(trajectory, i) for i, arm in enumerate(robot.arms)}
     ms, dt = 1e3 * run.solve_s, float(trajectory.time[1] - trajectory.time[0])
     recorded_time, limiting = trajectory.recorded_time, trajectory.limiting_joint
     recorded_s = float(recorded_time[-1] - recorded_time[begin])
@@ -103,7 +99,6 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         "slowdown": None if slowdown is None else round(slowdown, 3),
         "slowest": None if limiting is None else limiting._asdict(),
         "contact_times_s": trajectory.contact_times,
-        "posture_change_times_s": trajectory.change_times,
         "missed_targets": [target._asdict() for target in missed],
         "arms": arms,
         "within_limits": limits.passed,
@@ -120,8 +115,6 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
             "samples": collisions.samples,
             "first": collisions.first or None,
             "pairs": collisions.pairs,
-            "excluded_pairs": {reason: len(pairs) for reason, pairs in collisions.excluded.items()},
-            "pairs_in_collision_at_rest": collisions.excluded[AT_REST],
             "min_hull_distance_mm": round(1e3 * nearest, 1) if np.isfinite(nearest) else None,
             "clearance_mm": 1e3 * CLEARANCE,
         },
@@ -138,8 +131,8 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
     }
 
 
-def _summarize_arm(trajectory: Trajectory, i: int, frames: np.ndarray, reached: np.ndarray) -> dict[str, Any]:
-    """One arm's errors; `reached` (m,) [mm] is what unlimited time leaves of the hand's error at samples `frames`."""
+def _summarize_arm(trajectory: Trajectory, i: int) -> dict[str, Any]:
+    """One arm's errors."""
     robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
     arm, target = robot.arms[i], trajectory.targets[i]
     inside = np.linalg.norm(target.position - target.unclamped, axis=1)[begin:] < CLAMPED
@@ -156,7 +149,6 @@ def _summarize_arm(trajectory: Trajectory, i: int, frames: np.ndarray, reached: 
         "inside_reach_share": _share(inside),
         "hand_error_mm": _quantiles(far[inside]),
         "hand_error_everywhere_mm": _quantiles(far),
-        "reachability": _summarize_reachability(far[frames], reached),
         "error_attribution": attribute_errors(trajectory, i),
         "hand_error_deg": _quantiles(np.degrees(error.magnitude())),
         "swivel_error_deg": _quantiles(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
@@ -193,10 +185,7 @@ def diagnose_trajectory(
         spans = [format_span((target.begin, target.end)) for target in missed if target.side == side]
         error = max(target.error for target in missed if target.side == side)
         moments = ", ".join(spans[:MAX_MOMENTS])
-        diagnostics.append(Diagnostic("robot-hand-off-target", ERROR, side, error, LOST_M, {"moments": moments}))
-    if changes := trajectory.change_times:
-        facts = {"moments": f"{', '.join(map(format_time, changes[:MAX_MOMENTS]))} s"}
-        diagnostics.append(Diagnostic("robot-posture-changed", WARNING, name, len(changes), facts=facts))
+        diagnostics.append(Diagnostic("robot-hand-off-target", WARNING, side, error, LOST_M, {"moments": moments}))
     limiting = trajectory.limiting_joint
     if limiting is not None and slowdown is not None:
         moment: dict[str, float | str] = {
@@ -208,20 +197,6 @@ def diagnose_trajectory(
     if stopping := int(trajectory.run.report.stopping.sum()):
         diagnostics.append(Diagnostic("robot-stopped-for-clearance", WARNING, name, stopping))
     return diagnostics
-
-
-def _summarize_reachability(far: np.ndarray, reached: np.ndarray) -> dict[str, Any]:
-    """The hand's errors [mm] at some samples beside those of `assess_reachability`."""
-    known = np.isfinite(reached)
-    far, reached = far[known], reached[known]
-    within = reached < 1e3 * FAR
-    return {
-        "samples": len(far),
-        "hand_error_mm": _quantiles(reached),
-        "reachable_share": _share(within),
-        "hand_error_where_reachable_mm": _quantiles(far[within]),
-        "hand_error_above_mm": _quantiles(np.maximum(far - reached, 0.0)),
-    }
 
 
 def _quantiles(values: np.ndarray) -> dict[str, float] | None:

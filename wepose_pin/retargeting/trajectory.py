@@ -31,9 +31,8 @@ from .controller import ControllerParams, JointState, PostureReference, QpContro
 from .limits import MAX_STOP_S
 from .maps import find_map, list_sides
 from .placement import place_root
-from .reconfiguration import QUINTIC_PEAK_SPEED, Planner
 from .robot import LimitMargins, Robot, load_robot
-from .targets import SMOOTHING_HZ, WEIGHT_POOR, ArmTargets, HandPath, compute_arm_targets, compute_swivel
+from .targets import SMOOTHING_HZ, ArmTargets, HandPath, compute_arm_targets, compute_swivel
 
 RATE_HZ = 100.0
 MIN_RATE_HZ, MAX_RATE_HZ = 10.0, 2000.0
@@ -45,6 +44,7 @@ VELOCITY_FRACTION, ACCELERATION_FRACTION, JERK_FRACTION = 0.85, 0.6, 0.6
 SLOWDOWN_SPREAD_S = 0.15  # [s] by which a slowdown extends to both sides
 PATH_SMOOTHING_S = 0.03  # [s] of the first run's joint path
 APPROACH_SPEED, APPROACH_ANGULAR_SPEED = 0.25, 0.6  # [m/s], [rad/s] largest of the hands on their way from rest
+QUINTIC_PEAK_SPEED = 1.875  # of the approach, over distance and duration
 APPROACH_MIN_S = 2.0  # [s] of the approach at least
 SETTLE_S = 1.0  # [s] in which the targets rest, after the approach and at the end
 END_S = 0.5  # [s] at the end of the motion that are stretched to twice their duration, to end at rest
@@ -123,21 +123,8 @@ class Trajectory:
     @property
     def contact_times(self) -> list[float]:
         """[s] of the recording at which the robot braked, since no step kept all limits and left it a way to stop."""
-        return self._find_begins(self.run.report.stopping)
-
-    @property
-    def change_times(self) -> list[float]:
-        """[s] of the recording at which an arm leaves its path for another posture."""
-        after_approach = np.arange(len(self.time)) >= self.approach_samples
-        return self._find_begins(np.any(self.find_changes(), axis=1) & after_approach)
-
-    def find_changes(self) -> np.ndarray:
-        """Return (n, arms) bool: the arm is on its way to another posture, off the hand's path."""
-        return np.stack([target.weight < 0.5 * WEIGHT_POOR for target in self.targets], axis=1)
-
-    def _find_begins(self, states: np.ndarray) -> list[float]:
-        """[s] of the recording at which each run of true values (n,) begins."""
-        return np.round(self.recorded_time[states & ~np.roll(states, 1)], 2).tolist()
+        stopping = self.run.report.stopping
+        return np.round(self.recorded_time[stopping & ~np.roll(stopping, 1)], 2).tolist()
 
     def joint_motion(self) -> JointMotion:
         """Return the motion as `export` takes it, the robot standing on the floor."""
@@ -282,9 +269,7 @@ def _compute_trajectory(
     wide = QpController(robot, collision, step, params, WIDE_LIMIT_FACTOR, guarded=False)
     motion, approach_samples = _prepend_approach(wide, motion)
     run = _run_controller(wide, motion.hands, None, None, lambda fraction: progress(STAGES[0], fraction))
-    planner = Planner(wide, motion, approach_samples)
-    motion, path, approach_samples = planner.plan(run.joint_position, run.hand, run.rotation)
-    path = gaussian_filter1d(path, PATH_SMOOTHING_S / step, axis=0, mode="nearest")
+    path = gaussian_filter1d(run.joint_position, PATH_SMOOTHING_S / step, axis=0, mode="nearest")
     slowdown, limiting = _compute_slowdown(path, robot, step, motion, approach_samples)
     if strict and limiting is not None and limiting.factor > MAX_STRICT_RATIO:
         reason = f"{limiting.joint} would need {limiting.factor:.1f} times its {limiting.quantity} limit"
