@@ -296,7 +296,7 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     trajectory = retargeting.retarget(replace(pose, points=points), arm)
     is_sound(trajectory)
     assert error(trajectory)[-1] > 0.05  # it could not get there
-    assert trajectory.run.report.near_clearance.any()
+    assert trajectory.run.report.near_contact.any()
     why = retargeting.attribute_errors(trajectory, 0)
     assert why["self-collision"] > 0.2
     assert why["self-collision"] > 0.9 * sum(why.values())

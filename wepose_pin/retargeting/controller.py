@@ -35,7 +35,6 @@ from .targets import HandTarget
 
 HAND_POSE_DOF = 6  # an arm with no more joints has no redundancy for a swivel task
 HALVINGS = 6  # of the difference between a step that leaves no stop open and the open stop's next one
-NEAR_CLEARANCE_M = 0.01  # [m] to the clearance: pairs nearer than that are counted
 _MIN_DISTANCE_JACOBIAN = 1e-3  # [m/rad] below it a joint does not change a distance
 _DAQP_INFINITY = 1e30  # a bound that daqp ignores
 _DAQP_SOFT = 8  # a constraint that may be violated, by as little as possible
@@ -78,9 +77,7 @@ class StepReport(NamedTuple):
 
     hull_distance: Any  # (…) [m] between convex hulls; inf where none were near
     nearest_pair: Any  # (…) int, of `CollisionModel.pairs`, to which that belongs; -1: none
-    near_clearance: Any  # (…) bool: a pair was near its clearance
     stopping: Any  # (…) bool: no step kept all limits and left a stop open, the robot took one of its stop
-    singular: Any  # (…, arms) bool: the arm was near a singularity
     limited: Any  # (…, n) bool: the joint was at a bound of its own
     near_contact: Any  # (…, n) bool: the joint must not bring shapes nearer to each other
 
@@ -168,10 +165,8 @@ class QpController:
         self.update_kinematics(state.position)
         near = self.collision.find_near_pairs(self.data)
         H, f = np.zeros((n, n)), np.zeros(n)
-        singular = [
+        for arm, target in zip(self._arms, targets, strict=True):
             arm.add_to_objective(H, f, target, self._task_params, dt, state.velocity)
-            for arm, target in zip(self._arms, targets, strict=True)
-        ]
         reference = self.posture_reference or PostureReference(self.robot.rest, 0.0)
         velocity_mid = state.velocity + 0.5 * dt * state.acceleration  # half a step on, already determined
         H.flat[:: n + 1] += params.posture + params.joint_velocity + params.joint_velocity_change
@@ -190,14 +185,14 @@ class QpController:
             after = integrate(state, np.clip((w - velocity_mid) / dt, *self._bounds), dt)
         if self.guarded:
             after = self._find_guarded_step(state, after, near)
-        self._report_step(near, singular, stopping=after is None)
+        self._report_step(near, stopping=after is None)
         return self._take_stop(state) if after is None else after
 
     def brake(self, state: JointState) -> JointState:
         """Return the state one step later, on the stop that the last step has left open; at rest it stays."""
         self.update_kinematics(state.position)
         self._limited, self._active_rows = np.zeros_like(self._limited), self._active_rows[:0]
-        self._report_step(self.collision.find_near_pairs(self.data), [False] * len(self._arms), stopping=False)
+        self._report_step(self.collision.find_near_pairs(self.data), stopping=False)
         return self._take_stop(state)
 
     def _solve_qp(
@@ -254,15 +249,13 @@ class QpController:
         self._stop = self._stop[1:]
         return after
 
-    def _report_step(self, near: NearPairs, singular: list[bool], stopping: bool) -> None:
+    def _report_step(self, near: NearPairs, stopping: bool) -> None:
         k = int(np.argmin(near.distance)) if len(near.pairs) else -1
         moved = (np.abs(self._active_rows) > _MIN_DISTANCE_JACOBIAN).any(axis=0) | stopping
         self.report = StepReport(
             float(near.distance[k]) if k >= 0 else np.inf,
             int(near.pairs[k]) if k >= 0 else -1,
-            bool((near.distance - near.clearance < NEAR_CLEARANCE_M).any()),
             stopping,
-            np.array(singular),
             self._limited & (not stopping),
             moved,
         )
@@ -302,16 +295,14 @@ class _ArmTasks:
 
     def add_to_objective(
         self, H: np.ndarray, f: np.ndarray, target: HandTarget, params: np.ndarray, dt: float, v: np.ndarray
-    ) -> bool:
-        """Add the arm's tasks to H and f; return whether the arm is near a singularity."""
+    ) -> None:
+        """Add the arm's tasks to H and f."""
         J = np.ascontiguousarray(self._data.J)
         J_hand = J * self._frames[0][4]
         J_elbow = J * self._frames[1][4] if self._has_swivel else _NO_JACOBIAN
         rotation_error = pin.log3(target.rotation @ self.pose.rotation.T)
-        return bool(
-            add_arm_tasks(
-                H, f, J_hand, J_elbow, self.pose.hand, self.pose.elbow, self.arm.shoulder, rotation_error,
-                target.position, target.velocity, target.angular_velocity, target.swivel, float(target.weight), v, dt,
-                params, self.arm.joints,
-            )
+        add_arm_tasks(
+            H, f, J_hand, J_elbow, self.pose.hand, self.pose.elbow, self.arm.shoulder, rotation_error,
+            target.position, target.velocity, target.angular_velocity, target.swivel, float(target.weight), v, dt,
+            params, self.arm.joints,
         )  # fmt: skip

@@ -120,8 +120,6 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
         },
         "steps": {
             "all": len(trajectory.time),
-            "singular_share": _share(run.report.singular),
-            "near_clearance_share": _share(run.report.near_clearance),
             "stopping_share": _share(run.report.stopping),
         },
         "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},

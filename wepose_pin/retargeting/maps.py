@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -64,38 +65,52 @@ class LinkPoint(NamedTuple):
     offset: Annotated[tuple[float, float, float], Key("offset", "m")] = (0.0, 0.0, 0.0)
 
 
-class _Origin(NamedTuple):
+class HandPoint(NamedTuple):
+    """The hand, a point like any other, with the axes of its link along the fingers and to the side of the thumb."""
+
+    link: str
+    fingers: Annotated[str, Key(of="axes")]
+    thumb: Annotated[str, Key(of="axes")]
+    offset: Annotated[tuple[float, float, float], Key("offset", "m")] = (0.0, 0.0, 0.0)
+
+
+class Origin(NamedTuple):
     """Where the shape of a link is on it."""
 
     xyz: Annotated[tuple[float, float, float], Key("xyz", "m")] = (0.0, 0.0, 0.0)
     rpy: Annotated[tuple[float, float, float], Key("rpy", "rad")] = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class ArmMap:
+class ArmMap(NamedTuple):
     """One arm of the robot: the keys of ``arms.SIDE``."""
 
     joints: tuple[str, ...]
     shoulder: LinkPoint
-    elbow: LinkPoint | None
-    hand: LinkPoint
-    fingers: str
-    thumb: str
-    reach: float | None = None
+    hand: HandPoint
+    elbow: LinkPoint | None = None
+    reach: Annotated[float | None, Key("reach", "", 1e-3)] = None
 
-    @property
-    def points(self) -> dict[str, LinkPoint]:
-        """Key of the map → the point that it names."""
-        points = {"shoulder": self.shoulder, "elbow": self.elbow, "hand": self.hand}
-        return {key: point for key, point in points.items() if point is not None}
+
+class _Keys(NamedTuple):
+    """The keys of a map, but for its format and ``limits``."""
+
+    urdf: str
+    up: Annotated[str, Key(of="axes")]
+    forward: Annotated[str, Key(of="axes")]
+    arms: Mapping[str, ArmMap]
+    srdf: str = ""
+    base: str = ""
+    description: str = ""
+    table: float | None = None
+    rest: Mapping[str, float] = MappingProxyType({})
+    collision: Mapping[str, Origin] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
 class RobotMap:
     """What retargeting needs of a robot beyond its URDF: the keys of its map, as docs/robot-maps.md has them.
 
-    `where` is the file's name, for error messages; `description` has the source of the limits too; `collision` is x, y,
-    z [m], roll, pitch, yaw [rad] of a link's shape.
+    `where` is the file's name, for error messages; `description` has the source of the limits too.
     """
 
     name: str
@@ -113,7 +128,7 @@ class RobotMap:
     arms: Mapping[str, ArmMap]
     table: float | None = None
     description: str = ""
-    collision: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    collision: Mapping[str, Origin] = field(default_factory=dict)
 
     def read_joint_limits(self) -> dict[str, JointLimit]:
         """Return the limits of every movable joint: those of the map, else the URDF's.
@@ -174,39 +189,36 @@ def read_map(path: Path, urdf: Path | None = None) -> RobotMap:
         As `find_map`.
     """
     top = TomlTable(read_toml(path, "a robot's map (docs/robot-maps.md)", BadModel), path.name, error=BadModel)
-    top.allow(
-        *("format", "urdf", "srdf", "description", "base", "up", "forward", "table"),
-        *("rest", "limits", "collision", "arms"),
-    )
     if top.values.get("format") != 1:
         raise BadModel(f"{top.at('format')} = {top.values.get('format')!r}; this version reads format = 1")
-    up, forward = _read_axes(top, "up", "forward")
-    tables = top.table("arms").tables(SIDES, "side")
-    if not tables:
+    keys = read_record(_Keys, top, {"axes": AXES}, others=("format", "limits"))
+    _check_axes(top, "up", "forward")
+    sides = top.table("arms").tables(SIDES, "side")
+    if not keys.arms:
         raise BadModel(f"{top.at('arms')}: at least one of [arms.left] and [arms.right] is needed")
-    arms = {side: _read_arm(tables[side]) for side in SIDES if side in tables}
-    limits, origins = top.table("limits", {}), top.table("collision", {})
+    for side, arm in keys.arms.items():
+        _check_axes(sides[side].table("hand"), "fingers", "thumb")
+        if not arm.joints:
+            raise BadModel(f"{sides[side].at('joints')}: a list of joints from the shoulder to the hand is needed")
+    limits = top.table("limits", {})
     limits.allow("source", "acceleration", "jerk", "velocity", "position")
-    joints = [name for arm in arms.values() for name in arm.joints]
+    joints = [name for arm in keys.arms.values() for name in arm.joints]
     acceleration = _read_joint_values(limits, "acceleration", joints)
     jerk = {name: limit / RISE_S for name, limit in acceleration.items()}
     return RobotMap(
-        name=path.stem,
-        where=path.name,
-        urdf=urdf or _find_file(path, top, "urdf"),
-        srdf=_find_file(path, top, "srdf") if "srdf" in top else None,
-        base=_read_text(top, "base"),
-        up=up,
-        forward=forward,
-        rest=_read_numbers(top.table("rest", {})),
-        acceleration=acceleration,
-        jerk=jerk | _read_joint_values(limits, "jerk", joints),
-        velocity=_read_joint_values(limits, "velocity", joints),
-        position=_read_ranges(limits.table("position", {})),
-        arms=arms,
-        table=top.number("table", None),
-        description=" ".join(filter(None, (_read_text(top, "description"), _read_text(limits, "source")))),
-        collision={link: _read_origin(origins.table(link)) for link in origins.values},
+        **keys._asdict()
+        | {
+            "name": path.stem,
+            "where": path.name,
+            "urdf": urdf or _find_file(path, top, "urdf"),
+            "srdf": _find_file(path, top, "srdf") if keys.srdf else None,
+            "arms": {side: keys.arms[side] for side in SIDES if side in keys.arms},
+            "description": " ".join(filter(None, (keys.description, limits.text("source", None)))),
+            "acceleration": acceleration,
+            "jerk": jerk | _read_joint_values(limits, "jerk", joints),
+            "velocity": _read_joint_values(limits, "velocity", joints),
+            "position": _read_ranges(limits.table("position", {})),
+        }
     )
 
 
@@ -217,10 +229,7 @@ def list_sides(arm: str | None) -> tuple[str, ...] | None:
 
 def _find_file(path: Path, top: TomlTable, key: str) -> Path:
     """The file that a map names: beside the map, or in example-robot-data."""
-    name = top.text(key, None)
-    if name is None:
-        raise BadModel(f"{top.at(key)} is missing; the path of a file is needed")
-    data = find_example_data()
+    name, data = top.values[key], find_example_data()
     for folder in (path.parent, data):
         if folder is not None and (folder / name).is_file():
             return folder / name
@@ -232,39 +241,11 @@ def _find_file(path: Path, top: TomlTable, key: str) -> Path:
     raise MissingFile(f"{top.at(key)} = '{name}': no such file beside the map or in example-robot-data")
 
 
-def _read_text(table: TomlTable, key: str) -> str:
-    """A text, which may be empty or missing."""
-    return (table.text(key, None) or "") if table.values.get(key) else ""
-
-
-def _read_arm(table: TomlTable) -> ArmMap:
-    table.allow("joints", "shoulder", "elbow", "hand", "reach")
-    joints = table.values.get("joints")
-    if not isinstance(joints, list) or not joints or not all(isinstance(name, str) for name in joints):
-        raise BadModel(f"{table.at('joints')} = {joints!r}; a list of joints from the shoulder to the hand is needed")
-    fingers, thumb = _read_axes(table.table("hand"), "fingers", "thumb")
-    return ArmMap(
-        joints=tuple(joints),
-        shoulder=read_record(LinkPoint, table.table("shoulder")),
-        elbow=read_record(LinkPoint, table.table("elbow")) if "elbow" in table else None,
-        hand=read_record(LinkPoint, table.table("hand"), others=("fingers", "thumb")),
-        fingers=fingers,
-        thumb=thumb,
-        reach=table.number("reach", None, positive=True),
-    )
-
-
-def _read_origin(table: TomlTable) -> tuple[float, ...]:
-    xyz, rpy = read_record(_Origin, table)
-    return (*xyz, *rpy)
-
-
-def _read_axes(table: TomlTable, first: str, second: str) -> tuple[str, str]:
-    """Two axes at right angles."""
-    a, b = table.choice(first, AXES), table.choice(second, AXES)
+def _check_axes(table: TomlTable, first: str, second: str) -> None:
+    """Raise `BadModel` where two axes are not at right angles."""
+    a, b = table.values[first], table.values[second]
     if a[1] == b[1]:
         raise BadModel(f"{table.at(first)}, {second}: {a} and {b} lie on one line; axes at right angles are needed")
-    return a, b
 
 
 def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[str, float]:
@@ -276,7 +257,10 @@ def _read_joint_values(limits: TomlTable, key: str, joints: list[str]) -> dict[s
         raise BadModel(
             f"{limits.at(key)} = {value!r}; a number for all joints, or a table with one for each, is needed"
         )
-    return _read_numbers(limits.table(key, {}))
+    for name, number in value.items():
+        if not is_number(number, MAX_VALUE):
+            raise BadModel(f"{limits.at(key)}.{name} = {number!r}; a number is needed")
+    return {name: float(number) for name, number in value.items()}
 
 
 def _read_ranges(table: TomlTable) -> dict[str, tuple[float, ...]]:
@@ -286,11 +270,3 @@ def _read_ranges(table: TomlTable) -> dict[str, tuple[float, ...]]:
         if not is_pair or not value[0] < value[1]:
             raise BadModel(f"{table.at(name)} = {value!r}; [lower, upper] in rad or m is needed, the first smaller")
     return {name: tuple(map(float, value)) for name, value in table.values.items()}
-
-
-def _read_numbers(table: TomlTable) -> dict[str, float]:
-    """Name → number of a table whose keys are names of joints."""
-    for name, value in table.values.items():
-        if not is_number(value, MAX_VALUE):
-            raise BadModel(f"{table.at(name)} = {value!r}; a number is needed")
-    return {name: float(value) for name, value in table.values.items()}

@@ -19,7 +19,7 @@ def add_arm_tasks(  # type: ignore[no-untyped-def]
     H, f, J_hand, J_elbow, hand, elbow, shoulder, rotation_error, position, velocity, angular_velocity, swivel, weight,
     v, dt, tasks, joints,
 ):  # fmt: skip
-    """Add one arm's tasks to ½ wᵀ H w − fᵀ w; return whether the arm is close to a singularity.
+    """Add one arm's tasks to ½ wᵀ H w − fᵀ w.
 
     Parameters
     ----------
@@ -48,12 +48,11 @@ def add_arm_tasks(  # type: ignore[no-untyped-def]
         H[j, j] += tasks[CURVATURE] * curvature
     least = np.sqrt(max(np.linalg.eigvalsh(linear @ linear.T)[0], 0.0))
     if least >= tasks[SINGULAR_BELOW]:
-        return False
+        return
     damping = tasks[DAMPING] * (1.0 - least / tasks[SINGULAR_BELOW]) ** 2  # Nakamura and Hanafusa 1986
     for j in joints:
         H[j, j] += damping
         f[j] += 0.9 * damping * v[j]
-    return True
 
 
 @compiled

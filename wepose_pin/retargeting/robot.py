@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from ..body.urdf import package_folders
 from ..errors import BadModel, WrongOption, native_stderr_muted, one_of
-from .maps import AXES, ArmMap, JointLimit, LinkPoint, RobotMap
+from .maps import AXES, ArmMap, HandPoint, JointLimit, LinkPoint, RobotMap
 
 MIN_LIMIT_MARGIN = 1e-4  # [rad or m] inside every limit, so that a trajectory written with fewer digits keeps it too
 MAX_SPEED_SCALE = 0.999  # of velocity, acceleration and jerk limits, for the same reason
@@ -191,8 +191,9 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
     links = [frame.name for frame in full.frames if frame.type == pin.FrameType.BODY]
     for side, arm in arms.items():
         where = f"arms.{side}.joints"
-        for key, point in arm.points.items():
-            robot.check_name(f"arms.{side}.{key}", "link", point.link, links)
+        for key, point in (("shoulder", arm.shoulder), ("elbow", arm.elbow), ("hand", arm.hand)):
+            if point is not None:
+                robot.check_name(f"arms.{side}.{key}", "link", point.link, links)
         for name in arm.joints:
             robot.check_name(where, "moving joint", name, limits)
             if problem := _find_joint_problem(full, name, arm.hand.link, limits):
@@ -269,14 +270,14 @@ def _load_collision_geometry(robot: RobotMap, full: Any) -> Any:
         )
     except Exception as error:  # what C++ throws
         raise BadModel(f"{robot.urdf}: its collision shapes cannot be read: {_first_line(error)}") from error
-    for link, (x, y, z, *rpy) in robot.collision.items():
+    for link, (xyz, rpy) in robot.collision.items():
         own = [shape for shape in geometry.geometryObjects if shape.name.rpartition("_")[0] == link]
         if len(own) != 1:
             raise BadModel(
                 f"{robot.where}: collision.{link}: the link has {len(own)} collision shapes in {robot.urdf.name}, "
                 "one is needed"
             )
-        origin = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
+        origin = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(xyz))
         own[0].placement = find_link(full, link).placement * origin
     return geometry
 
@@ -306,7 +307,7 @@ def _build_arm(robot: Robot, side: str, arm: ArmMap) -> Arm:
     model = robot.model
     shoulder = _add_frame(model, arm.shoulder, f"shoulder {side}")
     # The hand's frame as a person's: x to the side of the thumb and -z along the fingers.
-    hand = _add_frame(model, arm.hand, f"hand {side}", _build_rotation(AXES[arm.thumb], -AXES[arm.fingers]))
+    hand = _add_frame(model, arm.hand, f"hand {side}", _build_rotation(AXES[arm.hand.thumb], -AXES[arm.hand.fingers]))
     elbow = _add_frame(model, arm.elbow, f"elbow {side}") if arm.elbow else -1
     joints = np.array([robot.names.index(name) for name in arm.joints])
     data = model.createData()
@@ -322,7 +323,7 @@ def _build_rotation(x: np.ndarray, z: np.ndarray) -> np.ndarray:
     return np.column_stack([x, np.cross(z, x), z])
 
 
-def _add_frame(model: Any, point: LinkPoint, name: str, R: np.ndarray | None = None) -> int:
+def _add_frame(model: Any, point: LinkPoint | HandPoint, name: str, R: np.ndarray | None = None) -> int:
     link = find_link(model, point.link)
     placement = link.placement * pin.SE3(np.eye(3) if R is None else R, np.array(point.offset))
     return int(model.addFrame(pin.Frame(f"wepose_{name}", link.parentJoint, placement, pin.FrameType.OP_FRAME)))
