@@ -168,8 +168,6 @@ def test_meshes_are_found_in_the_written_robot_and_a_missing_one_is_left_out_of_
     code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(out))
     assert code == 0, text
     assert (out / "view.html").is_file()
-    codes = [each["code"] for each in json.loads((out / "summary.json").read_text())["diagnostics"]]
-    assert "robot-shapes-missing" in codes
     wp.export(out, tmp_path / "robot.urdf")
     for file in (out / "robot.urdf", tmp_path / "robot.urdf"):
         meshes = re.findall('filename="(.*?)"', file.read_text())

@@ -302,7 +302,7 @@ def test_a_hand_that_goes_through_the_body_stops_before_it(arm) -> None:
     assert why["self-collision"] > 0.9 * sum(why.values())
 
 
-def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
+def test_too_fast_is_slowed(tmp_path: Path) -> None:
     slow = retargeting.load_robot(retargeting.find_map(str(write_arm(tmp_path, acceleration=2.0))))
     pose = person(4.0, swing=45.0)
     trajectory = retargeting.retarget(pose, slow)
@@ -310,8 +310,6 @@ def test_too_fast_is_slowed_or_refused(tmp_path: Path) -> None:
     assert trajectory.time[-1] - trajectory.time[trajectory.approach_samples] > 1.3 * 4.0
     assert trajectory.limiting_joint is not None
     assert trajectory.limiting_joint.joint in JOINTS
-    with pytest.raises(errors.NoSolution, match=r"too fast at \d.*s of the recording: \w+ would need"):
-        retargeting.retarget(pose, slow, strict=True)
 
 
 def test_the_same_motion_at_another_rate(arm) -> None:

@@ -47,7 +47,6 @@ def retarget(
     smoothing_hz: Annotated[Hz, MORE] = 6.0,
     speed_scale: Annotated[Share, MORE] = 0.9,
     limit_margin: Annotated[Radians, MORE] = 0.05,
-    strict: Annotated[bool, MORE] = False,
 ) -> Retargeted:
     """Retarget a person's arms to a robot: a joint trajectory within its limits, without self-collision.
 
@@ -90,8 +89,6 @@ def retarget(
     limit_margin
         Keep this distance from the position limits, in radians; from those of a prismatic joint a tenth of it,
         in metres.
-    strict
-        Refuse a motion that is too fast for the robot, instead of slowing it down.
     """
     options = dict(locals())
     import json
@@ -126,7 +123,6 @@ def retarget(
                 smoothing_hz=smoothing_hz,
                 speed_scale=speed_scale,
                 limit_margin=limit_margin,
-                strict=strict,
                 table=body.table,
                 progress=lambda text, fraction: progress(text, 0.48 * (fraction + STAGES.index(text))),
             )

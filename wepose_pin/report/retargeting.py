@@ -173,7 +173,6 @@ def tabulate_run(summary: Mapping[str, Any]) -> Table:
         ("rate", f"{summary['rate_hz']:g} Hz"),
         ("recorded", f"{summary['recorded_s']:.1f} s"),
         ("lasts", f"{summary['duration_s']:.1f} s, of which {summary['approach_s']:.1f} s are the approach{slowed}"),
-        ("a step", f"{summary['solve_ms']['p50']:.2f} ms (p50), {summary['solve_ms']['p99']:.2f} ms (p99)"),
     ]
     return Table("", (), rows)
 

@@ -21,7 +21,6 @@ from .error_attribution import CLAMPED, LOST_M, MissedTarget, attribute_errors, 
 from .placement import place_root
 from .targets import compute_target_reach
 from .trajectory import Trajectory
-from .visuals import find_missing_visuals
 
 DIGITS = 8  # of angles in text
 MAX_MOMENTS = 6  # that a diagnostic names
@@ -75,13 +74,12 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
     """Contents of ``summary.json``."""
     robot, begin, run = trajectory.robot, trajectory.approach_samples, trajectory.run
     arms = {arm.side: _summarize_arm(trajectory, i) for i, arm in enumerate(robot.arms)}
-    ms, dt = 1e3 * run.solve_s, float(trajectory.time[1] - trajectory.time[0])
+    dt = float(trajectory.time[1] - trajectory.time[0])
     recorded_time, limiting = trajectory.recorded_time, trajectory.limiting_joint
     recorded_s = float(recorded_time[-1] - recorded_time[begin])
     shown_s = float(trajectory.time[np.argmax(recorded_time)] - trajectory.time[begin])
     slowdown = shown_s / recorded_s if recorded_s else None
     nearest = float(run.report.hull_distance.min())
-    jerk = np.abs(np.diff(run.joint_acceleration, axis=0)) / dt
     missed = find_missed_targets(trajectory)
     R_WB, p_WB = place_root(robot)
     root = (*p_WB.tolist(), *Rotation.from_matrix(R_WB).as_quat().tolist())
@@ -110,7 +108,6 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
             "acceleration_share": limits.acceleration,
             "jerk_share": limits.jerk,
         },
-        "jerk_rad_s3": {"rms": round(float(np.sqrt(np.mean(jerk**2))), 2), "largest": round(float(jerk.max()), 1)},
         "self_collisions": {
             "samples": collisions.samples,
             "first": collisions.first or None,
@@ -122,7 +119,6 @@ def summarize(trajectory: Trajectory, limits: LimitCheck, collisions: SelfCollis
             "all": len(trajectory.time),
             "stopping_share": _share(run.report.stopping),
         },
-        "solve_ms": {f"p{q}": round(float(np.percentile(ms, q)), 3) for q in (50, 99)},
         "diagnostics": [
             as_json(diagnostic) for diagnostic in diagnose_trajectory(trajectory, limits, collisions, missed, slowdown)
         ],
@@ -176,9 +172,6 @@ def diagnose_trajectory(
         diagnostics.append(Diagnostic("robot-self-collision", ERROR, name, collisions.samples, 0.0, first))
     if not collisions.pairs:
         diagnostics.append(Diagnostic("robot-shapes-missing", WARNING, name))
-    if missing := find_missing_visuals(trajectory.robot):
-        facts = {"variant": "visual", "first": missing[0]}
-        diagnostics.append(Diagnostic("robot-shapes-missing", WARNING, name, len(missing), facts=facts))
     for side in dict.fromkeys(target.side for target in missed):
         spans = [format_span((target.begin, target.end)) for target in missed if target.side == side]
         error = max(target.error for target in missed if target.side == side)

@@ -194,9 +194,19 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
         for key, point in (("shoulder", arm.shoulder), ("elbow", arm.elbow), ("hand", arm.hand)):
             if point is not None:
                 robot.check_name(f"arms.{side}.{key}", "link", point.link, links)
+        joint, chain = find_link(full, arm.hand.link).parentJoint, set[str]()
+        while joint > 0:
+            chain.add(full.names[joint])
+            joint = full.parents[joint]
         for name in arm.joints:
             robot.check_name(where, "moving joint", name, limits)
-            if problem := _find_joint_problem(full, name, arm.hand.link, limits):
+            copies = [other for other, limit in limits.items() if limit.mimic is not None and limit.mimic[0] == name]
+            mimic, problem = limits[name].mimic, ""
+            if name not in chain:
+                problem = f"does not move the hand's link '{arm.hand.link}'"
+            elif mimic is not None or copies:
+                problem = f"copies '{mimic[0]}'" if mimic is not None else f"is copied by '{copies[0]}'"
+            if problem:
                 raise BadModel(
                     f"{robot.where}: {where}: '{name}' is no joint of the arm: it {problem}; leave it out, it stays "
                     "where `rest` has it"
@@ -210,37 +220,19 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
 
 def _check_limits(robot: RobotMap, name: str, limit: JointLimit) -> None:
     """Raise `BadModel` where the URDF or the map lacks a limit of a joint."""
+    lacking = ""
     if limit.kind != "continuous" and not limit.lower < limit.upper:
-        raise BadModel(
-            f"{robot.urdf}: joint '{name}' has no position limits (lower {limit.lower:g}, upper "
-            f'{limit.upper:g}); write <limit lower="…" upper="…" velocity="…"/>, or limits.position in the map'
-        )
-    if not 0.0 < limit.velocity < np.inf:
-        raise BadModel(
-            f"{robot.urdf}: joint '{name}' has no velocity limit ({limit.velocity:g}); write <limit velocity=\"…\"/>, "
-            "or limits.velocity in the map"
-        )
-    for key, values, unit in (("acceleration", robot.acceleration, "rad/s²"), ("jerk", robot.jerk, "rad/s³")):
-        value = values.get(name)
-        if value is None or not value > 0.0:
-            state = "has none" if value is None else f"is {value:g}"
+        lacking = f"position limits ({limit.lower:g} to {limit.upper:g})"
+    elif not 0.0 < limit.velocity < np.inf:
+        lacking = f"velocity limit ({limit.velocity:g})"
+    if lacking:
+        raise BadModel(f"{robot.urdf}: joint '{name}' has no {lacking}; write it into the map's [limits]")
+    for key, values in (("acceleration", robot.acceleration), ("jerk", robot.jerk)):
+        if not values.get(name, 0.0) > 0.0:
+            state = f"is {values[name]:g}" if name in values else "has none"
             raise BadModel(
-                f"{robot.where}: limits.{key}: joint '{name}' {state}; no URDF holds it, "
-                f"a number above 0 is needed [{unit}]"
+                f"{robot.where}: limits.{key}: joint '{name}' {state}; no URDF holds it, a number above 0 is needed"
             )
-
-
-def _find_joint_problem(full: Any, name: str, hand: str, limits: dict[str, JointLimit]) -> str:
-    """Why a joint cannot be one of the arm; empty where it can."""
-    joint, chain = full.getJointId(name), [find_link(full, hand).parentJoint]
-    while chain[-1] > 0:
-        chain.append(full.parents[chain[-1]])
-    if joint not in chain:
-        return f"does not move the hand's link '{hand}'"
-    for other, limit in limits.items():
-        if limit.mimic is not None and name in (other, limit.mimic[0]):
-            return f"copies '{limit.mimic[0]}'" if other == name else f"is copied by '{other}', as a gripper's are"
-    return ""
 
 
 def _build_rest_configuration(robot: RobotMap, full: Any, limits: dict[str, JointLimit]) -> np.ndarray:

@@ -7,7 +7,6 @@ motion within the true limits, with the joint path of the first run as posture r
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +21,7 @@ from ..arguments import check_arguments
 from ..body import BodyTable
 from ..body.kinematics import Pose, find_samples
 from ..body.urdf import read_urdf, resolve_meshes
-from ..errors import BadOption, NoSolution, WrongOption
+from ..errors import BadOption, WrongOption
 from ..recording import Intervals, select_interval
 from ..tracking import TrackResult
 from ..writers.joint_motion import JointMotion
@@ -51,11 +50,9 @@ END_S = 0.5  # [s] at the end of the motion that are stretched to twice their du
 SETTLED = 1e-3  # [rad/s or m/s] below it all joints have settled at the end, and brake to rest
 MAX_LAG_S = 5.0  # [s] for which the end waits until they have
 TRACKING_POSTURE_FACTOR, TRACKING_POSTURE_GAIN = 50.0, 8.0  # of the second run: weight, gain [1/s] of its posture
-MAX_STRICT_RATIO = 1.02  # of what a joint needs to its limit; above it `strict` refuses the motion
 PROGRESS_STEPS = 64  # steps between two calls of `progress`
 QUANTITIES = ("velocity", "acceleration", "jerk")
 STAGES = ("solving with wide limits", "solving with the robot's limits")  # of `progress`
-SELF_CONTACT = "the robot could not stop before its links touch"
 
 
 class LimitingJoint(NamedTuple):
@@ -77,7 +74,6 @@ class ControllerRun(NamedTuple):
     rotation: np.ndarray  # (arms, n, 3, 3) of the hand
     swivel: np.ndarray  # (arms, n, 3) [m] elbow swivel direction
     report: StepReport  # of the step from each sample
-    solve_s: np.ndarray  # (n,) [s] of each step
 
 
 @dataclass(frozen=True)
@@ -160,7 +156,6 @@ def retarget(
     limit_margin: float | None = None,
     interval: tuple[float, float] | None = None,
     phase: str | None = None,
-    strict: bool = False,
     params: ControllerParams | None = None,
     table: BodyTable | None = None,
     progress: Callable[[str, float], None] | None = None,
@@ -191,8 +186,6 @@ def retarget(
     interval, phase : optional
         Follow only this interval, from and to [s], or this phase of the recording; of a phase with several intervals
         "NAME:2" is the second.
-    strict : bool
-        Raise `NoSolution` for a motion that is too fast for the robot, instead of slowing it.
     params : ControllerParams, optional
         Weights and gains of the controller; None: the default ones.
     table : BodyTable, optional
@@ -209,8 +202,6 @@ def retarget(
     ------
     MissingFile, BadData, BadOption
         No result, no such robot, arm or phase; the pose lacks an arm; a number out of range.
-    NoSolution
-        `strict`, and the motion is too fast.
 
     Examples
     --------
@@ -233,7 +224,7 @@ def retarget(
     params = replace(params or ControllerParams(), **dict.fromkeys(left_out, 0.0))
     arm_targets = compute_arm_targets(pose, robot, table=table or body_table, scale=scale, smoothing_hz=smoothing_hz)
     report = progress or (lambda _text, _fraction: None)
-    return _compute_trajectory(arm_targets, robot, params, 1.0 / rate_hz, strict, report)
+    return _compute_trajectory(arm_targets, robot, params, 1.0 / rate_hz, report)
 
 
 def _select_pose(
@@ -258,7 +249,6 @@ def _compute_trajectory(
     robot: Robot,
     params: ControllerParams,
     dt: float,
-    strict: bool,
     progress: Callable[[str, float], None],
 ) -> Trajectory:
     """Solve the motion with wide limits, slow it, and solve it with the robot's."""
@@ -271,9 +261,6 @@ def _compute_trajectory(
     run = _run_controller(wide, motion.hands, None, None, lambda fraction: progress(STAGES[0], fraction))
     path = gaussian_filter1d(run.joint_position, PATH_SMOOTHING_S / step, axis=0, mode="nearest")
     slowdown, limiting = _compute_slowdown(path, robot, step, motion, approach_samples)
-    if strict and limiting is not None and limiting.factor > MAX_STRICT_RATIO:
-        reason = f"{limiting.joint} would need {limiting.factor:.1f} times its {limiting.quantity} limit"
-        raise _build_too_fast_error(robot, limiting.time, reason)
     # The motion's own time, its samples on the robot's time, and the moments of the motion at the robot's times.
     clock = np.arange(len(path)) * step
     sample_time = _stretch_end(np.concatenate([[0.0], np.cumsum(0.5 * (slowdown[1:] + slowdown[:-1])) * step]))
@@ -292,7 +279,7 @@ def _compute_trajectory(
         lambda fraction: progress(STAGES[1], fraction),
     )
     n = len(run.joint_position)
-    trajectory = Trajectory(
+    return Trajectory(
         robot=robot,
         collision=collision,
         params=params,
@@ -304,22 +291,12 @@ def _compute_trajectory(
         run=run,
         limiting_joint=limiting,
     )
-    if strict and trajectory.contact_times:
-        raise _build_too_fast_error(robot, trajectory.contact_times[0], SELF_CONTACT)
-    return trajectory
 
 
 def check_rate(rate_hz: float) -> None:
     """Raise `WrongOption` for a rate out of range."""
     if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
         raise WrongOption("rate-hz", f"{rate_hz:g}", f"from {MIN_RATE_HZ:g} to {MAX_RATE_HZ:g} samples a second")
-
-
-def _build_too_fast_error(robot: Robot, time_s: float, reason: str) -> NoSolution:
-    return NoSolution(
-        f"{robot.map.name}: too fast at {time_s:.2f} s of the recording: {reason}; "
-        "without --strict the motion is slowed, or brakes, there"
-    )
 
 
 def _run_controller(
@@ -337,12 +314,11 @@ def _run_controller(
     settle : sample from which on the robot comes to rest as soon as it has settled; None: it does not
     """
     robot, n, dt = controller.robot, len(hands[0].weight), controller.dt
-    state, states, poses, reports, solve_s = JointState.at_rest(robot.rest), [], [], [], []
+    state, states, poses, reports = JointState.at_rest(robot.rest), [], [], []
     rate = np.gradient(posture, dt, axis=0) if posture is not None else None
     targets = [hand.compute_step_targets(dt) for hand in hands]
     latest, brakes = n - round(MAX_STOP_S / dt), False
     for k in range(n):
-        begin = time.perf_counter()
         if posture is not None and rate is not None:
             controller.posture_reference = PostureReference(posture[k], rate[min(k + 1, n - 1)])
         brakes |= settle is not None and k >= settle and (k >= latest or np.abs(state.velocity).max() < SETTLED)
@@ -352,7 +328,6 @@ def _run_controller(
             state = controller.brake(state)
         else:
             state = controller.step(state, tuple(target.sample(k) for target in targets))
-        solve_s.append(time.perf_counter() - begin)
         reports.append(controller.report)
         poses.append([controller.get_arm_pose(i) for i in range(len(hands))])
         if ends:
@@ -366,7 +341,7 @@ def _run_controller(
     swivel = compute_swivel(elbow - shoulders, hand - shoulders)
     report = StepReport(*map(np.array, zip(*reports, strict=True)))
     position, velocity, acceleration = np.array(states).swapaxes(0, 1)
-    return ControllerRun(position, velocity, acceleration, hand, rotation, swivel, report, np.array(solve_s))
+    return ControllerRun(position, velocity, acceleration, hand, rotation, swivel, report)
 
 
 def _prepend_approach(controller: QpController, motion: ArmTargets) -> tuple[ArmTargets, int]:

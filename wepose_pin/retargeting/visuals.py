@@ -29,12 +29,11 @@ class MeshPart(NamedTuple):
 def build_parts(robot: Robot) -> list[MeshPart]:
     """Parts to draw; empty where the URDF has no visual shapes."""
     root = ElementTree.fromstring(robot.map.urdf.read_bytes())
-    missing = find_missing_visuals(robot)
     for link in root.iter("link"):
         for visual in link.findall("visual"):
             mesh = visual.find("geometry/mesh")
-            if mesh is not None and mesh.get("filename") in missing:
-                link.remove(visual)
+            if mesh is not None and find_mesh(mesh.get("filename", ""), robot.map.urdf) is None:
+                link.remove(visual)  # there is no such file
     text, folders = ElementTree.tostring(root, encoding="unicode"), package_folders(robot.map.urdf)
     whole = pin.buildGeomFromUrdfString(robot.full, text, pin.GeometryType.VISUAL, package_dirs=folders)
     locked = [robot.full.getJointId(name) for name in robot.full.names[1:] if name not in robot.names]
@@ -51,13 +50,6 @@ def build_parts(robot: Robot) -> list[MeshPart]:
         MeshPart(joint, *_join([reduced[k] for k in own]), _choose_colour(robot, joint))
         for joint, own in sorted(parts.items())
     ]
-
-
-def find_missing_visuals(robot: Robot) -> list[str]:
-    """The meshes of visual shapes of which there is no file, as the URDF names them: these shapes are not drawn."""
-    urdf = robot.map.urdf
-    meshes = ElementTree.fromstring(urdf.read_bytes()).iterfind("link/visual/geometry/mesh")
-    return list(dict.fromkeys(name for mesh in meshes if find_mesh(name := mesh.get("filename", ""), urdf) is None))
 
 
 def compute_placements(
