@@ -1,4 +1,4 @@
-"""Problems that explain a recording better than the stated one: without some mounts, with other labels, without a pose.
+"""Problems that explain a recording better than the stated one: without some mounts, or with other labels.
 
 Each function takes the solution of a problem. It returns that of a better problem where there is one, else the same.
 """
@@ -8,11 +8,9 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 
-from ..diagnostics import WARNING, Diagnostic
 from .anatomy import LEAST_ROTATION, measure_limbs, measure_rotation
 from .result import Calibration
 from .solution import solve_problem
-from .weights import CONTRADICTED, SUSPECT
 
 BETTER = 0.6  # times the doubt of the stated labels, below which another labelling is the true one
 
@@ -47,19 +45,3 @@ def exchange_labels(stated: Calibration) -> Calibration:
     note = "sensors sit elsewhere than labelled"
     subject = replace(stated.subject, note=note)
     return replace(stated, subject=subject, remarks=(), exchanged=exchanges[doubts.index(least)])
-
-
-def leave_out_poses(best: Calibration) -> Calibration:
-    """Return the full solution without the phases of poses that contradict all else, the worst first."""
-    problem = best.problem
-    posed = {phase: deviation for phase, deviation in best.posed.items() if phase not in problem.loose}
-    phase = max(posed, key=lambda name: posed[name], default="")
-    if not phase or posed[phase] <= SUSPECT or not problem.protocol.closures:
-        return best
-    # Where a pose is wrong all else fits worse: what it is compared with must be found without it.
-    loose = solve_problem(problem.loosen_phase(phase))
-    deviation = loose.posed[phase]
-    if deviation <= CONTRADICTED:
-        return best
-    unused = Diagnostic("pose-contradicted", WARNING, phase, deviation, CONTRADICTED, {"variant": "unused"})
-    return leave_out_poses(replace(loose, remarks=(unused, *loose.remarks)))

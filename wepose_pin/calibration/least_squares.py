@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 
 from ..errors import NoSolution
+from ..observations.directions import Level, Pointing
 from .conditions import Constraint, Loop
 from .equations import GAP_ROWS, Layout, sample_functions
 
@@ -42,6 +43,7 @@ class Observations:
     data: np.ndarray  # (rows, n): Q of each sensor xyzw, `Layout.place`, [s] since the start pose
     conditions: tuple[Constraint, ...]
     condition_index: np.ndarray  # (n,) number of each sample's condition, in ascending order
+    phases: tuple[str, ...] = ()  # of the conditions
 
     def __len__(self) -> int:
         return self.data.shape[1]
@@ -54,6 +56,14 @@ class Observations:
         """Return each condition with the slice of its samples."""
         edges = np.searchsorted(self.condition_index, np.arange(len(self.conditions) + 1))
         return [(c, slice(int(edges[i]), int(edges[i + 1]))) for i, c in enumerate(self.conditions)]
+
+    def poses(self) -> dict[str, list[tuple[Pointing | Level, slice]]]:
+        """Return phase → its stated poses, each with the slice of its samples."""
+        poses: dict[str, list[tuple[Pointing | Level, slice]]] = {}
+        for phase, (condition, span) in zip(self.phases, self.spans(), strict=False):
+            if isinstance(condition, Pointing | Level):
+                poses.setdefault(phase, []).append((condition, span))
+        return poses
 
     @property
     def closed(self) -> np.ndarray:

@@ -26,14 +26,13 @@ from .conditions import Constraint, Loop, Moving, group_lengths, resolve_conditi
 from .couplings import Coupling, estimate_couplings
 from .equations import Layout, find_twists
 from .least_squares import Observations
-from .protocols import Axis, Closure, Condition, Direction, FreeMotion, Protocol
+from .protocols import Closure, Condition, FreeMotion, Protocol
 from .samples import ConnectedSamples, find_connected, find_samples, mask_measured, read_recorded_places
 
 # Rate of the samples that the least squares takes [Hz]; errors of orientations are correlated over longer times.
 SAMPLE_RATE_HZ = 8.0
 MOST_SAMPLES = 2000  # of all conditions; longer ones are sampled at a lower rate
 LEAST_S = 1.25  # [s] of each condition, in which all sensors measure
-LOOSE = 100.0  # times the standard deviation of a pose that is not used
 FREE_S = 120.0  # [s] at most of free motion after the start pose, where no phase states it: headings drift
 USUAL_ELEVATION = np.deg2rad(60.0)  # [rad] of the arms off hanging, hands joined before the chest
 RIGID_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a link's orientation where nothing is soft; only ratios matter
@@ -51,7 +50,6 @@ class CalibrationProblem:
     prior : lengths with their covariance, and mounts
     measured : name of a length → value and standard deviation [m]
     model : the body
-    loose : phases whose poses are not used, as they contradict all else
     unused_mounts : diagnostics of mounts that are not used, as gravity or the motion contradicts them
     """
 
@@ -61,7 +59,6 @@ class CalibrationProblem:
     prior: Subject
     measured: Mapping[str, tuple[float, float]]
     model: BodyModel
-    loose: tuple[str, ...] = ()
     unused_mounts: tuple[Diagnostic, ...] = ()
 
     @cached_property
@@ -212,16 +209,6 @@ class CalibrationProblem:
         problem = self.remove_mounts([each.place for each in unused])
         return replace(problem, unused_mounts=(*self.unused_mounts, *unused))
 
-    def loosen_phase(self, phase: str) -> CalibrationProblem:
-        """Return the same problem with poses of this phase that tell next to nothing."""
-        conditions = tuple(
-            condition._replace(std=LOOSE * condition.std)
-            if isinstance(condition, Direction | Axis) and condition.phase == phase
-            else condition
-            for condition in self.protocol.conditions
-        )
-        return replace(self, protocol=replace(self.protocol, conditions=conditions), loose=(*self.loose, phase))
-
     def relabel(self, moved: Mapping[str, str]) -> CalibrationProblem:
         """Return the same problem with sensors exchanged between segments; a stated mount goes with its sensor.
 
@@ -294,7 +281,8 @@ class CalibrationProblem:
         condition_index = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         recorded = np.concatenate(places).T[: 3 * layout.recorded]
         data = np.vstack([*rotations_since_start, recorded, recording.time[samples] - filtered.start[1]])
-        return Observations(layout, data, self.conditions, condition_index), samples
+        names = tuple(condition.phase for condition in self.protocol.conditions)
+        return Observations(layout, data, self.conditions, condition_index, names), samples
 
     def _lay_out(self) -> Layout:
         segments, start, sensors = self.model.table.segments, self.start_pose, self.sensors

@@ -37,7 +37,7 @@ from ..errors import BadModel, BadOption, BadSession, NoSolution, one_of
 from ..filters import BEST, check_method
 from ..filters.sensors import filter_recording
 from ..recording import Recording
-from .alternatives import exchange_labels, leave_out_mounts, leave_out_poses
+from .alternatives import exchange_labels, leave_out_mounts
 from .fusion import fuse_calibrations, separate_mounts
 from .paper import Formulation, check_paper_formulation, solve_paper_calibration
 from .problem import CalibrationProblem
@@ -174,11 +174,11 @@ def _check_inputs(recording: Recording, protocol: Protocol, model: BodyModel, me
 
 
 def solve_plausible(problem: CalibrationProblem) -> Calibration:
-    """Return the solution without the mounts and poses that gravity or the motion contradicts, its labels checked."""
+    """Return the solution without the mounts that gravity or the motion contradicts, its labels checked."""
     problem = problem.leave_out_mounts()
     problem.observe()  # raises where a phase is too short, before anything is estimated
     quick = exchange_labels(leave_out_mounts(solve_problem(problem, quick=True)))
     try:
-        return quick if quick.exchanged else leave_out_poses(solve_problem(quick.problem))
+        return quick if quick.exchanged else solve_problem(quick.problem)
     except NoSolution as error:
         raise NoSolution(f"{problem.recording.where()}: {error}") from error

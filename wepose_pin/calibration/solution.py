@@ -19,13 +19,13 @@ from .equations import GAP_ROWS, HINGE_STD, Layout
 from .initial_headings import search_headings
 from .least_squares import MIN_LENGTH, Estimate, Gaussian
 from .priors import build_prior, place_points
-from .problem import LOOSE, SAMPLE_RATE_HZ, CalibrationProblem
+from .problem import SAMPLE_RATE_HZ, CalibrationProblem
 from .result import Calibration
 from .weights import (
+    CONTRADICTED,
     LEAST_LENGTH_STD,
     WeightedFit,
     compare_measured,
-    compare_posed,
     estimate_covariance,
     solve_reweighted,
 )
@@ -105,8 +105,12 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, result: Weighted
         if name not in subject.mounts:
             facts = {"protocol": problem.protocol.name}
             diagnostics.append(Diagnostic("mount-unknown", WARNING, name, facts=facts))
+    for phase, deviation in result.posed.items() if observations.closed.any() else ():
+        if deviation > CONTRADICTED:
+            variant: dict[str, float | str] = {"variant": "unused"}
+            unused = Diagnostic("pose-contradicted", WARNING, phase, deviation, CONTRADICTED, variant)
+            diagnostics.append(unused)
     least_std = 0.0 if problem.model.table.is_mechanism else LEAST_LENGTH_STD
-    phases, loose = [condition.phase for condition in problem.protocol.conditions], dict.fromkeys(problem.loose, LOOSE)
     return Calibration(
         problem=problem,
         subject=replace(
@@ -124,7 +128,7 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, result: Weighted
         quat_WL=problem.orient_segments(subject.mounts, samples),
         measured_lengths=compare_measured(fit, layout, problem.measured, least_std),
         hinge_rms={joint: rms for joint, (_, rms) in hinges.items()},
-        posed=compare_posed(fit, phases, loose),
+        posed=result.posed,
     )
 
 

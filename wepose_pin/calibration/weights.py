@@ -32,7 +32,7 @@ MIN_LATE_CONTACT = 0.4  # weight below which the palms are apart in the last rou
 ELBOW_STD = np.deg2rad(4.0)
 LEAST_BEND = 0.2  # sine of the angle by which a segment must bend to show its axis
 CONTRADICTED = 3.0  # standard deviations between a measured length, or a pose, and what is known without it
-SUSPECT = 1.5  # the same of a pose from which on it is compared with a solution without it
+POSED_ROUND = 1  # after which poses are used that do not contradict the closures
 # [m] rms error of the lengths of simulated people after a minute (docs/validation.md), from soft tissue and shoulders,
 # which the residuals show in part.
 LEAST_LENGTH_STD = 0.010
@@ -44,6 +44,7 @@ class WeightedFit(NamedTuple):
     fit: Estimate
     contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
     effective_sample_size: float  # of the gap
+    posed: Mapping[str, float]  # phase of poses → standard deviations from what is known without it
 
 
 class _Block(NamedTuple):
@@ -75,6 +76,8 @@ def solve_reweighted(
 ) -> WeightedFit:
     """Return the fit with gap and hinges weighted by their own residuals: variance, and how long it stays correlated.
 
+    Poses beside a closure are used where they do not contradict it. What they are compared with is found without them.
+
     Parameters
     ----------
     start, contact : x (m,) to begin with, and the weight (n,) of each sample's gap in it
@@ -82,10 +85,13 @@ def solve_reweighted(
     """
     rounds, steps = (QUICK_ROUNDS, QUICK_STEPS) if quick else (ROUNDS, STEPS)
     x, contact, correlation = start, contact.copy(), min_correlation(observations)
-    weights = _state_weights(observations, contact, correlation)
+    stated, poses, posed = _state_weights(observations, contact, correlation), observations.poses(), dict[str, float]()
     if quick:
-        weights[:, GAP_ROWS:] = 0.0
-    for k in range(rounds if observations.closed.any() else 0):
+        stated[:, GAP_ROWS:] = 0.0
+    weights, closed = stated.copy(), bool(observations.closed.any())
+    for span in [span for own in poses.values() for _, span in own] if closed else ():
+        weights[span] = 0.0
+    for k in range(rounds if closed else 0):
         fit = solve(LeastSquares(observations, prior, weights), x, steps if k == 0 else ROUND_STEPS, strict=False)
         x, weights = fit.x, weights.copy()
         for closure, span in observations.spans():
@@ -99,10 +105,17 @@ def solve_reweighted(
         for block in _list_blocks(observations, contact, hinges=not quick):
             variance, correlated = block.measure(fit.residuals, correlation)
             weights[block.span, block.columns] = block.contact[:, None] / (correlated * variance)
+        if k == min(POSED_ROUND, rounds - 1):
+            posed = {phase: _measure_pose(fit, own, stated, used=False) for phase, own in poses.items()}
+            used = [span for phase, own in poses.items() if posed[phase] <= CONTRADICTED for _, span in own]
+            for span in used:
+                weights[span] = stated[span]
     fit = solve(LeastSquares(observations, prior, weights), x, steps if quick else FINAL_STEPS, strict=not quick)
     gaps = _list_blocks(observations, contact, hinges=False)
-    sizes = [float(block.contact.sum()) / block.measure(fit.residuals, correlation)[1] for block in gaps]
-    return WeightedFit(fit, contact, sum(sizes))
+    counts = [float(block.contact.sum()) / block.measure(fit.residuals, correlation)[1] for block in gaps]
+    if not closed and not quick:
+        posed = {phase: _measure_pose(fit, own, stated, used=True) for phase, own in poses.items()}
+    return WeightedFit(fit, contact, sum(counts), posed)
 
 
 def _state_weights(observations: Observations, contact: np.ndarray, correlation: float) -> np.ndarray:
@@ -183,36 +196,27 @@ def compare_measured(
     return compared
 
 
-def compare_posed(fit: Estimate, phases: Sequence[str], loose: Mapping[str, float]) -> dict[str, float]:
-    """By how many standard deviations each phase of poses deviates from what is known without it.
+def _measure_pose(
+    fit: Estimate, poses: Sequence[tuple[Pointing | Level, slice]], stated: np.ndarray, used: bool
+) -> float:
+    """By how many standard deviations a phase of poses deviates from what is known without it.
 
     A pose has no residual that would show how it was held, as a closure has: only the other conditions can.
 
     Parameters
     ----------
-    phases : of the conditions, in their order
-    loose : phases that are not used → factor by which the standard deviations of their poses are too large
+    stated : (n, k) weights of the residuals where the poses are used
+    used : whether the fit uses these poses
     """
-    (observations, _, weights), deviations = fit.problem, {}
-    posed = [
-        (phase, condition, span)
-        for (condition, span), phase in zip(observations.spans(), phases, strict=True)
-        if isinstance(condition, Pointing | Level)
-    ]
-    for phase in dict.fromkeys(phase for phase, _, _ in posed):
-        information, pull, mean_r, mean_J, degrees = 0.0, 0.0, [], [], 0
-        for condition, span in ((condition, span) for name, condition, span in posed if name == phase):
-            r, J, w = fit.closure[span], fit.jacobian[span, :GAP_ROWS], weights[span, :GAP_ROWS]
-            information = information + np.einsum("nk,nki,nkj->ij", w, J, J)
-            pull = pull + np.einsum("nk,nki,nk->i", w, J, r)
-            whiten = loose.get(phase, 1.0) * np.sqrt(w.sum(axis=0))
-            mean_r.append(whiten * r.mean(axis=0))
-            mean_J.append(whiten[:, None] * J.mean(axis=0))
-            degrees += 2 if isinstance(condition, Pointing) else 1
-        rest, H = np.linalg.inv(fit.information - information), np.concatenate(mean_J)
-        z = np.concatenate(mean_r) + H @ rest @ pull  # at the solution without this phase
-        chi2 = float(z @ np.linalg.solve(np.eye(len(z)) + H @ rest @ H.T, z))
-        # The deviate of a normal variable that is as rare as chi² (Wilson and Hilferty 1931).
-        spread = 2.0 / (9.0 * degrees)
-        deviations[phase] = float((np.cbrt(chi2 / degrees) - (1.0 - spread)) / np.sqrt(spread))
-    return deviations
+    r, H, degrees = [], [], 0
+    for condition, span in poses:
+        whiten = np.sqrt(stated[span, :GAP_ROWS].sum(axis=0))
+        r.append(whiten * fit.closure[span].mean(axis=0))
+        H.append(whiten[:, None] * fit.jacobian[span, :GAP_ROWS].mean(axis=0))
+        degrees += 2 if isinstance(condition, Pointing) else 1
+    z, slope = np.concatenate(r), np.concatenate(H)
+    of_rest = slope @ fit.covariance @ slope.T
+    chi2 = float(z @ np.linalg.solve(np.eye(len(z)) + (-of_rest if used else of_rest), z))
+    # The deviate of a normal variable that is as rare as chi² (Wilson and Hilferty 1931).
+    spread = 2.0 / (9.0 * degrees)
+    return float((np.cbrt(chi2 / degrees) - (1.0 - spread)) / np.sqrt(spread))
