@@ -116,37 +116,6 @@ def test_without_a_gauge_the_proportions_are_right_and_the_scale_is_the_priors(e
         assert again.subject.lengths[name] == pytest.approx(1.1 * calibration.subject.lengths[name], rel=1e-3)
 
 
-@pytest.mark.slow
-def test_a_hand_with_a_sensor_is_seen_by_itself(exact: tuple[Person, Recording]) -> None:
-    """The wrists bend: forearm and hand then turn apart, and the closure tells one from the other."""
-    person, recording = exact
-    length = person.lengths
-    time = recording.time
-    sensors = dict(recording.sensors)
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        bend = Rotation.from_rotvec(np.outer(np.sin(2 * np.pi * 0.37 * sign * (time - 6.0).clip(0.0)), [0.0, 0.5, 0.0]))
-        quat = sensors[f"{side}_forearm"].quat_VS
-        assert quat is not None
-        # Turn the forearm such that wrist bend and all, the palm stays where it was: the chain stays closed.
-        forearm = Rotation.from_quat(quat)
-        together = forearm.apply([0, 0, -(length[f"{side}_forearm"] + length[f"{side}_hand"])])
-        bent = np.array([0, 0, -length[f"{side}_forearm"]]) + bend.apply([0, 0, -length[f"{side}_hand"]])
-        # The bend shortens the reach a little; the palm point of the model moves with it, so only open what is left.
-        turn, _ = zip(
-            *(Rotation.align_vectors(t[None], b[None]) for t, b in zip(together, bent, strict=True)), strict=True
-        )
-        turned = Rotation.concatenate(list(turn))
-        sensors[f"{side}_forearm"] = OrientationSensor(quat_VS=turned.as_quat())
-        sensors[f"{side}_hand"] = OrientationSensor(quat_VS=(turned * bend).as_quat())
-    clasp = [recording.phases["clasp"][0]]
-    bent_recording = replace(
-        recording, sensors=sensors, phases={"start": recording.phases["start"], "clasp": tuple(clasp)}
-    )
-    without = calibrate(recording, measured={"shoulder_width": length["shoulder_width"]})
-    calibration = calibrate(bent_recording, measured={"shoulder_width": length["shoulder_width"]})
-    assert calibration.subject.std("left_hand") < 0.5 * without.subject.std("left_hand")
-
-
 @pytest.mark.monte_carlo
 def test_the_standard_deviations_are_honest() -> None:
     """MTi-3 noise, real filtering, a measured shoulder width: errors over their standard deviations, 12 people."""
@@ -168,21 +137,6 @@ def test_the_standard_deviations_are_honest() -> None:
     # Jointly, narrow combinations such as left minus right included; 7 is right, 24 is passed by one in a thousand.
     assert 2.0 < np.mean(chi2) < 10.0
     assert np.max(chi2) < 24.0
-
-
-def test_hands_that_do_not_move_say_so(exact: tuple[Person, Recording]) -> None:
-    _, recording = exact
-    held = recording.span(recording.phases["clasp"][0]).start + 300
-    frozen = {}
-    for name, sensor in recording.sensors.items():
-        quat = sensor.quat_VS.copy()
-        quat[held:] = quat[held]
-        frozen[name] = OrientationSensor(quat_VS=quat)
-    clasp = ((float(recording.time[held]), recording.phases["clasp"][0][1]),)
-    still = replace(recording, sensors=frozen, phases={**recording.phases, "clasp": clasp})
-    measured = {"shoulder_width": 0.38}
-    assert "motion-too-small" in codes(calibrate(still, measured=measured))
-    assert "motion-too-small" not in codes(calibrate(recording, measured=measured))
 
 
 def test_the_trunk_is_not_seen(exact: tuple[Person, Recording]) -> None:

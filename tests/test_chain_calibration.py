@@ -81,27 +81,6 @@ def test_a_loop_closed_with_the_world(four_bar: BodyModel) -> None:
         assert calibration.subject.std(name) < 0.04 * moved.lengths[name]
 
 
-@pytest.mark.slow
-def test_a_known_point_two_points_and_stated_mounts(arm: BodyModel) -> None:
-    moved = move_arm(arm, 3)
-    known = calibrate_arm(arm, moved, on_point(at=moved.tip[0]))
-    unknown = calibrate_arm(arm, moved)
-    describe("known point", known, moved)
-    describe("unknown point", unknown, moved)
-    assert np.abs(deviations(known, moved)).max() < 3.0
-    for name in TRUE:
-        assert known.subject.std(name) < unknown.subject.std(name)
-    moved = move_arm(arm, 4, points=2, seconds=55.0)
-    both = calibrate_arm(arm, moved, on_point(), on_point("second"))
-    describe("two points", both, moved)
-    assert np.abs(deviations(both, moved)).max() < 3.0
-    moved = move_arm(arm, 5, stated=True)
-    stated = calibrate_arm(arm, moved)
-    describe("stated mounts", stated, moved)
-    assert np.abs(deviations(stated, moved)).max() < 3.0
-    assert not stated.problem.unused_mounts
-
-
 def test_recorded_places_of_the_tip_close_the_chain(arm: BodyModel, tmp_path: Path) -> None:
     moved = move_arm(arm, 6, points=0)
     time = np.arange(0.013, moved.recording.time[-1], 1.0 / 30.0)
@@ -130,14 +109,6 @@ def test_a_chain_whose_limb_is_drawn_is_assessed(urdf: Path) -> None:  # noqa: F
     assert "motion-too-small" in {diagnostic.code for diagnostic in reasons}
     words = " ".join(text.line() for _, text in render_all(reasons))
     assert not re.search("hand|palm|anatom|person", words)
-
-
-def test_a_closure_between_points_of_one_segment_is_refused(arm: BodyModel) -> None:
-    moved = move_arm(arm, 0, seconds=12.0)
-    rigid = Closure("tip", "coincide", ("base", "elbow"))
-    with pytest.raises(WeposeError, match="base and elbow both move with the sensor on upper_arm_link") as raised:
-        calibrate_arm(arm, moved, rigid)
-    assert "\n" not in str(raised.value)
 
 
 def test_what_a_truth_lacks_is_said_in_one_line(arm: BodyModel, tmp_path: Path) -> None:

@@ -249,7 +249,7 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
         (["simulate", "-o", "OUT", "--prset", "ideal"], "not an option of wepose simulate; did you mean '--preset'?"),
         (
             ["calibrate", "s.toml", "-o", "OUT", "--protocol", "poses"],
-            "protocol 'poses' is not known; there is: bow",
+            "protocol 'poses' is not known",
         ),
         (["calibrate", "a", "b", "-o", "OUT"], "'b' is one word too many for wepose calibrate"),
         (["track", "s.toml"], "parameter --out requires an argument"),

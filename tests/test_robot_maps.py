@@ -136,23 +136,6 @@ def test_a_map_that_is_wrong_says_where(tmp_path: Path, old: str, new: str, text
         load(urdf)
 
 
-def test_a_joint_that_fingers_copy_is_no_joint_of_the_arm(tmp_path: Path) -> None:
-    """A gripper of joints that rotate, one finger of which bears the hand."""
-    urdf = write_arm(tmp_path)
-    fingers = "".join(
-        f'<link name="finger_{k}"/><joint name="knuckle_{k}" type="revolute"><parent link="hand"/>'
-        f'<child link="finger_{k}"/><axis xyz="1 0 0"/><limit lower="0" upper="0.8" velocity="2" effort="1"/>'
-        + ('<mimic joint="knuckle_1" multiplier="-1"/></joint>' if k == 2 else "</joint>")
-        for k in (1, 2)
-    )
-    urdf.write_text(urdf.read_text().replace("</robot>", f"{fingers}</robot>"))
-    said = urdf.with_suffix(".toml").read_text().replace('"yaw"]', '"yaw", "knuckle_1"]')
-    said = said.replace("yaw = 12.0", "yaw = 12.0\nknuckle_1 = 1.0").replace('{ link = "hand"', '{ link = "finger_1"')
-    urdf.with_suffix(".toml").write_text(said)
-    with pytest.raises(errors.BadModel, match="'knuckle_1' is no joint of the arm: it is copied by 'knuckle_2'"):
-        load(urdf)
-
-
 @pytest.mark.parametrize(("up", "forward"), [("-z", "+x"), ("+z", "-x"), ("+x", "+y")])
 def test_a_rest_of_another_mount_is_refused(tmp_path: Path, up: str, forward: str) -> None:
     urdf = write_arm(tmp_path, up=up, forward=forward)

@@ -48,17 +48,6 @@ def test_a_segment_is_turned_by_its_own_twist_tilt_and_start() -> None:
     )
 
 
-def test_a_raised_arm_that_points_up_is_turned_smoothly() -> None:
-    means = {"right_upper_arm": TissueMean(1.0, 0.5)}
-    turns = [correct(means, right_upper_arm=(180.0 - step, step, 0.0))["right_upper_arm"] for step in (0.0, 0.1)]
-    assert np.linalg.norm(turns[1] - turns[0]) < 1.0
-
-
-def test_no_means_change_nothing() -> None:
-    quats = np.random.default_rng(0).normal(size=(5, 3, 4))
-    assert SoftTissueCorrection(TABLE, {}, SEGMENTS).correct(quats) is quats
-
-
 @pytest.mark.parametrize(("shown", "used"), [(7.0, 0.675), (0.4, 0.4), (-2.0, 0.0)])
 def test_a_lag_beyond_all_people_is_no_skin(shown: float, used: float) -> None:
     hinge = Hinge(np.array((0.0, 1.0, 0.0)), 0.05, shown)

@@ -191,8 +191,8 @@ def _check_map(robot: RobotMap, arms: dict[str, ArmMap], full: Any, limits: dict
     links = [frame.name for frame in full.frames if frame.type == pin.FrameType.BODY]
     for side, arm in arms.items():
         where = f"arms.{side}.joints"
-        for key, point in (("shoulder", arm.shoulder), ("elbow", arm.elbow), ("hand", arm.hand)):
-            if point is not None:
+        for key, point in arm._asdict().items():
+            if isinstance(point, LinkPoint | HandPoint):
                 robot.check_name(f"arms.{side}.{key}", "link", point.link, links)
         joint, chain = find_link(full, arm.hand.link).parentJoint, set[str]()
         while joint > 0:
