@@ -99,10 +99,13 @@ def test_every_text_is_filled_by_its_example_and_needs_all_of_it(code: str, vari
         assert "  " not in part
         assert "{" not in part.replace("{ up", "")
     assert text.line().startswith(text.what)
-    entry = catalogue()[code]
-    parts = [*entry.text, *(part for each in entry.variants.values() for part in each.values())]
+    table = catalogue()[code]
+    variants = table.get("variants", {})
+    tables = [table, *variants.values()]
+    parts = [each[part] for each in tables for part in Text._fields if part in each]
     fields = {name for part in parts for _, name, _, _ in string.Formatter().parse(part) if name}
-    replaced = entry.text._replace(**entry.variants.get(variant, {}))
+    whole = {**table, **variants.get(variant, {})}
+    replaced = [whole[part] for part in Text._fields]
     own = {name for part in replaced for _, name, _, _ in string.Formatter().parse(part)}
     assert all(getattr(example, name) not in ("", None) for name in own & {"place", "value", "limit"})
     facts = set(example.facts) - {"variant"}

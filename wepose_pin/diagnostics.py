@@ -30,6 +30,7 @@ class Severity(StrEnum):
 
 INFO, WARNING, ERROR = Severity.INFO, Severity.WARNING, Severity.ERROR
 _GRAVEST_FIRST = (ERROR, WARNING, INFO)
+_SAVED = ("code", "severity", "place", "value", "limit", "facts")  # keys of a file
 MOST_ALIKE = 3  # of diagnostics with the same reason and remedy that are shown in full
 
 
@@ -72,14 +73,6 @@ class Text(NamedTuple):
         return " ".join(part for part in (title, self.what, self.why, self.do) if part)
 
 
-class Entry(NamedTuple):
-    """A code of the catalogue."""
-
-    text: Text  # with fields in braces: place, value, limit and facts, each with its unit
-    variants: Mapping[str, Mapping[str, str]]  # word of the fact `variant` → the parts of the text that it replaces
-    follows: frozenset[str]  # codes of causes, beside which it is not shown
-
-
 def render(diagnostic: Diagnostic) -> Text:
     """The diagnostic in words.
 
@@ -88,12 +81,11 @@ def render(diagnostic: Diagnostic) -> Text:
     KeyError
         The catalogue has no such code, or the text needs a fact that is not there.
     """
-    entry = catalogue()[diagnostic.code]
-    template = entry.text
+    template = catalogue()[diagnostic.code]
     for word in str(diagnostic.facts.get("variant", "")).split():
-        template = template._replace(**entry.variants.get(word, {}))
+        template = {**template, **template.get("variants", {}).get(word, {})}
     known = {"place": diagnostic.place, "value": diagnostic.value, "limit": diagnostic.limit, **diagnostic.facts}
-    return Text(*(_fill(part, known) for part in template))
+    return Text(*(_fill(template[part], known) for part in Text._fields))
 
 
 def render_all(
@@ -144,7 +136,7 @@ def drop_consequences(diagnostics: Iterable[Diagnostic]) -> list[Diagnostic]:
     """The diagnostics without those that follow from another of them, as a tilted segment from a moved start pose."""
     diagnostics = list(diagnostics)
     codes = {diagnostic.code for diagnostic in diagnostics}
-    return [each for each in diagnostics if not codes & catalogue()[each.code].follows]
+    return [each for each in diagnostics if codes.isdisjoint(catalogue()[each.code].get("follows", ()))]
 
 
 def as_json(diagnostic: Diagnostic) -> dict[str, Any]:
@@ -168,14 +160,8 @@ def as_json(diagnostic: Diagnostic) -> dict[str, Any]:
 
 def from_json(content: Mapping[str, Any]) -> Diagnostic:
     """The diagnostic of `as_json`; its text is not read."""
-    return Diagnostic(
-        content["code"],
-        Severity(content["severity"]),
-        content["place"],
-        content["value"],
-        content["limit"],
-        dict(content["facts"]),
-    )
+    code, severity, place, value, limit, facts = (content[name] for name in _SAVED)
+    return Diagnostic(code, Severity(severity), place, value, limit, dict(facts))
 
 
 # Numbers --------------------------------------------------------------------------------------------------------------
@@ -237,17 +223,7 @@ def _fill(template: str, known: Mapping[str, Any]) -> str:
 
 
 @lru_cache(maxsize=1)
-def catalogue() -> Mapping[str, Entry]:
-    """Code → its texts."""
-    with Path(__file__).with_suffix(".toml").open("rb") as file:
-        groups = tomllib.load(file)
-    return {code: _parse_entry(table) for codes in groups.values() for code, table in codes.items()}
-
-
-def _parse_entry(table: Mapping[str, Any]) -> Entry:
-    parts = Text._fields
-    variants = {
-        name: {part: variant[part] for part in parts if part in variant}
-        for name, variant in table.get("variants", {}).items()
-    }
-    return Entry(Text(*(table[part] for part in parts)), variants, frozenset(table.get("follows", ())))
+def catalogue() -> Mapping[str, Mapping[str, Any]]:
+    """Code → its table in diagnostics.toml."""
+    groups = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    return {code: table for codes in groups.values() for code, table in codes.items()}
