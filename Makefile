@@ -61,7 +61,7 @@ package: $(READY)         ## wheel and sdist in dist/, checked
 OLDEST_TESTS ?= filters kinematics model readers calibration solver angles report tables export subject static writers evaluation
 oldest:                   ## tests with the oldest versions that pyproject.toml allows, in .venv-oldest
 	$(PYTHON) -m venv .venv-oldest
-	.venv-oldest/bin/python -m pip install --quiet -c tests/oldest.txt . pytest pytest-xdist hypothesis pillow
+	.venv-oldest/bin/python -m pip install --quiet -c tests/oldest.txt . pytest pytest-xdist pillow
 	.venv-oldest/bin/python -m pytest $(OLDEST_TESTS:%=tests/test_%.py)
 
 workflows: $(READY)       ## the workflows against their schema

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz import seeds
+from fuzz.targets import TARGETS, try_one
 from test_bad_input import Files, good_table, refused
 
 from wepose_pin.commands import main
@@ -26,10 +28,6 @@ from wepose_pin.errors import (
 )
 from wepose_pin.readers.arrays import ArrayFile
 from wepose_pin.recording.faults import check_sensors
-
-pytest.importorskip("hypothesis")
-from fuzz import seeds
-from fuzz.targets import TARGETS, try_one
 
 BY_NAME = {target.name: target for target in TARGETS}
 

@@ -49,13 +49,7 @@ class _C3d(NamedTuple):
 
 
 def read_c3d(path: Path, table: MarkerTable) -> Reference:
-    """Read the joints and segments that follow from the markers, or the segments that the file has.
-
-    Raises
-    ------
-    BadData
-        No C3D, or damaged; RATE 0; neither points nor rotations; an unknown unit; no marker that the table knows.
-    """
+    """Read the joints and segments that follow from the markers, or the segments that the file has."""
     file = _open(path)
     if not file.rotations.size:
         return locate(path, *_read_markers(file), table)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,6 @@ from ..data_tables import read_names
 from ..diagnostics import Diagnostic
 from ..documents import is_number, read_toml
 from ..errors import BadData, MissingFile
-from ..libraries import library_errors
 from ..recording import ImuSensor, Recording, format_span, format_time
 from ..recording.gaps import find_runs
 from ..recording.sensors import compute_rate
@@ -86,7 +84,7 @@ def describe_file(path: Path, folder: Path | None = None, wearer: Wearer | None 
     if not path.exists():
         raise MissingFile(f"{path}: no such file or folder")
     if path.is_dir() and (path / "pose.parquet").is_file():
-        return _describe_result(path)
+        return Description(f"{path}: a result of `wepose track`", (f"look at it: wepose view {path}",))
     if path.suffix.lower() == ".toml":
         return _describe_toml(path)
     if path.suffix.lower() in (".c3d", ".trc"):
@@ -122,18 +120,6 @@ def _describe_data(path: Path, folder: Path, proposal: Proposal, wearer: Wearer)
     read = (replace(each, place=each.place.removeprefix("?")) for each in recording.diagnostics)
     facts, rows = (*proposal.facts, *_list_facts(recording)), _list_sensors(recording, proposal.labels)
     return Description(what, facts, rows, session, advise(recording, wearer.table), (*diagnostics, *read))
-
-
-def _describe_result(path: Path) -> Description:
-    with library_errors(path / "summary.json", "the summary of a result"):
-        summary = json.loads((path / "summary.json").read_text(encoding="utf-8"))
-        facts = [
-            f"of {summary.get('recording')}, by {summary.get('method')}: {summary.get('samples')} samples, "
-            f"{summary.get('duration_s')} s at {summary.get('rate_hz')} Hz",
-            *(f"{name}: {', '.join(summary[name])}" for name in ("sensors", "points", "joints") if name in summary),
-            *(f"{each['severity']}: {each['text']['what']}" for each in summary.get("diagnostics", [])),
-        ]
-    return Description(f"{path}: a result of `wepose track`", (*facts, f"look at it: wepose view {path}"))
 
 
 def _describe_reference(path: Path) -> Description:

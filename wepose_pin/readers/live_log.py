@@ -161,13 +161,7 @@ def read_live_log(path: Path) -> LiveRecording:
 
 
 def read_live_device(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """Read a live recording as a device, for a session that names the file and adds phases; lost samples are NaN.
-
-    Raises
-    ------
-    MissingFile, BadData
-        As `read_live_log`; another rate is requested, or what the recording does not hold of all sensors.
-    """
+    """Read a live recording as `Format.read`, for a session that adds phases to it; lost samples are NaN."""
     if rate_hz is not None:
         raise BadData(f"{path}: rate_hz = {rate_hz:g}: a live recording has times of its own; leave it out")
     recording = read_live_log(path).recording

@@ -109,13 +109,7 @@ _FORMS: dict[str, tuple[str, Callable[[Any], bool]]] = {
 
 
 def locate(path: Path, time: np.ndarray, markers: Mapping[str, np.ndarray], table: MarkerTable) -> Reference:
-    """Locate the joints and orient the segments of a body by its markers, name → (n, 3) [m].
-
-    Raises
-    ------
-    BadData
-        The table knows none of the markers; the user's names others.
-    """
+    """Locate the joints and orient the segments of a body by its markers, name → (n, 3) [m]."""
     known = dict(markers)
     points: dict[str, np.ndarray] = {}
     for name, ways in table.points.items():

@@ -62,15 +62,7 @@ class Frames(NamedTuple):
 
 
 def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """Read the sensors' raw data where the file has them, else the segments' orientations; `use` selects one.
-
-    `rate_hz` goes before the file's frameRate.
-
-    Raises
-    ------
-    MissingFile, BadData
-        Not there; no MVNX, damaged, cut off, or without what `use` asks for.
-    """
+    """Read the sensors, or the segments' orientations, as `Format.read`; `rate_hz` goes before the file's frameRate."""
     frames = read_frames(path, rate_hz)
     raw = {"sensorAngularVelocity", "sensorAcceleration"} <= set(frames.values)
     if use == "raw" and not raw:
@@ -106,13 +98,7 @@ def read_mvnx_reference(path: Path) -> Reference:
 
 
 def read_mvnx_lengths(path: Path) -> dict[str, float]:
-    """Read the lengths [m] between the joints of MVN's body: shoulder width, trunk, upper arms and forearms.
-
-    Raises
-    ------
-    MissingFile, BadData
-        As `read_mvnx`; no positions of the arms in it.
-    """
+    """Read the lengths [m] between the joints of MVN's body: shoulder width, trunk, upper arms and forearms."""
     joints = _find_joints(read_frames(path))
     if set(HIPS) <= set(joints):
         joints[ROOT] = np.mean([joints[hip] for hip in HIPS], axis=0)

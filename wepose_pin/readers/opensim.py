@@ -38,13 +38,7 @@ def compute_n_pose(body: str) -> Rotation:
 
 
 def read_opensim(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """Read the orientations of all columns but time; `rate_hz` replaces the file's own times.
-
-    Raises
-    ------
-    MissingFile, BadData
-        Not there; no .sto of quaternions; raw data asked for, which it has not.
-    """
+    """Read the orientations of all columns but time, as `Format.read`."""
     lines = read_first_lines(path)
     end = next((k for k, line in enumerate(lines) if line.strip().lower() == "endheader"), None)
     if end is None:

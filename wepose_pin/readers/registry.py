@@ -17,10 +17,10 @@ from .live_log import is_live_log, read_live_device
 from .mvnx import read_mvnx
 from .opensim import read_opensim
 from .rosbag import SUFFIXES as ROSBAGS
-from .rosbag import is_rosbag, read_rosbag
+from .rosbag import read_rosbag
 from .sensor_logger import is_sensor_logger, read_sensor_logger
 from .table_format import TableFormat, load_format, load_formats
-from .xdf import is_xdf, read_xdf
+from .xdf import read_xdf
 
 
 class Format(NamedTuple):
@@ -30,7 +30,9 @@ class Format(NamedTuple):
     ----------
     title : what a file of it is called
     detects : path, which may be a folder, and the first lines of a text → whether it is of this format
-    read : path, "raw" or "orientation" or None, and a rate [Hz] or None → the contents
+    read : path, "raw" or "orientation" or None, and a rate [Hz] or None → the contents: raw data where a sensor has
+        them, else orientations, or only what is asked for; with a rate its times are replaced. It raises `BadData`
+        where the file is another, is damaged, lacks what is asked for, or needs a package that is not installed
     whole : all sensors of a recording are in one file
     folder : a recording may be a folder
     """
@@ -54,12 +56,12 @@ SENSOR_LOGGER = Format(
 )
 ROSBAG = Format(
     "ROS bag",
-    lambda path, _: (_has_suffix(path, *ROSBAGS) and not is_live_log(path)) or (path.is_dir() and is_rosbag(path)),
+    lambda path, _: (_has_suffix(path, *ROSBAGS) and not is_live_log(path)) or (path / "metadata.yaml").is_file(),
     read_rosbag,
     whole=True,
     folder=True,
 )
-XDF = Format("XDF", lambda path, _: is_xdf(path), read_xdf, whole=True)
+XDF = Format("XDF", lambda path, _: _has_suffix(path, ".xdf", ".xdfz"), read_xdf, whole=True)
 OPENSIM = Format(
     "OpenSim table of IMU orientations", lambda path, _: _has_suffix(path, ".sto"), read_opensim, whole=True
 )

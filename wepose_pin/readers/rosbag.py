@@ -24,21 +24,8 @@ NS = 1e-9
 NEEDS = "angular_velocity and linear_acceleration, nor orientation (a covariance of -1: not provided)"
 
 
-def is_rosbag(path: Path) -> bool:
-    """Return whether a file or folder is a ROS bag by its name."""
-    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix.lower() in SUFFIXES
-
-
 def read_rosbag(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """Read the sensors' raw data where they have them, else their orientations; `use` selects one of the two.
-
-    `rate_hz` replaces the stamps.
-
-    Raises
-    ------
-    BadData
-        No bag, or damaged; no messages of an IMU; not what `use` asks for; rosbags is not installed.
-    """
+    """Read a bag, as `Format.read`; `rate_hz` replaces the stamps."""
     frames = _read_messages(path)
     if not frames:
         raise BadData(f"{path}: no messages of type {MESSAGE} in it; record the topics of the IMUs")

@@ -42,15 +42,7 @@ def is_sensor_logger(path: Path) -> bool:
 
 
 def read_sensor_logger(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """Read a phone's rates and specific forces where they are there, else its orientation; `use` selects one.
-
-    `rate_hz` goes before the recording's own times.
-
-    Raises
-    ------
-    BadData
-        No recording of Sensor Logger; not what `use` asks for.
-    """
+    """Read a phone, as `Format.read`."""
     tables = _read_tables(path)
     signals = {name: _read_signal(path, name, tables[name]) for name in COLUMNS if name in tables}
     total = signals.get("TotalAcceleration")

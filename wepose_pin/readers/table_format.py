@@ -143,15 +143,7 @@ class TableFormat(NamedTuple):
         return bool(matches) and all(matches)
 
     def read(self, path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-        """Read the sensors' raw data where they are there, else their orientations; `use` selects one of the two.
-
-        `rate_hz` replaces the file's own times, or is the rate of its counter.
-
-        Raises
-        ------
-        BadData
-            No such table; no times; an unknown unit; not what `use` asks for.
-        """
+        """Read the tables, as `Format.read`; `rate_hz` may be the rate of a counter."""
         tables = _open_tables(self, path, use)
         sensors = _find_sensors(self, tables)
         kind = use or next((kind for kind in NEEDED if _has(sensors, kind)), "raw")
@@ -287,17 +279,15 @@ def _name_columns(format: TableFormat, lines: Sequence[str], k: int, separator: 
         begins = [column for column, name in enumerate(own) if name and _match(format.sensor_begins, name)]
     else:
         begins = [column for column, owner in enumerate(owners) if owner]
-    full, short, name = [""] * width, [""] * width, ""
+    titles, sensors, name = list[str](), [""] * width, ""
     for count, (first, last) in enumerate(zip(begins, [*begins, width][1:], strict=True), 1):
-        *numbers, title = [cell for cell in owners[first:last] if cell] or [f"sensor {count}"]
-        full[first:last] = [" ".join([title, *numbers])] * (last - first)
-        short[first:last] = [re.sub(r" *\(\d+\)$", "", title)] * (last - first)
-    titles = [title for _, title in set(zip(full, short, strict=True))]  # of different sensors
+        title = re.sub(r" *\(\d+\)$", "", ([cell for cell in owners[first:last] if cell] or [f"sensor {count}"])[-1])
+        titles.append(f"{title} {count}" if title in titles else title)
+        sensors[first:last] = titles[-1:] * (last - first)
     names = []
     for column in range(width):
         name = own[column] or (name if format.axes_line and axes[column] else "")
-        owner = short[column] if titles.count(short[column]) == 1 else full[column]
-        names.append("/".join(filter(None, (owner, name, axes[column]))))
+        names.append("/".join(filter(None, (sensors[column], name, axes[column]))))
     if format.units_before:
         stated = {match["name"]: match["unit"] for line in lines[:k] if (match := _match(format.units_before, line))}
         units = [stated.get(name, "") for name in own]
@@ -441,7 +431,7 @@ def _read_values(signal: str, source: _Source, time: np.ndarray) -> np.ndarray:
     if not step > 0.0:
         raise BadData(f"{table.path}: its time does not grow from row to row, so that increments give no rate")
     if signal == "gyro":
-        good = np.linalg.norm(np.nan_to_num(values), axis=1) > 0.5
+        good = np.isfinite(values).all(axis=1) & (np.linalg.norm(values, axis=1) > 0.5)
         quat, values = values[good][:, [1, 2, 3, 0]], np.full((len(values), 3), np.nan)
         values[good] = Rotation.from_quat(quat).as_rotvec()
     return values / step

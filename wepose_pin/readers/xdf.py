@@ -21,7 +21,7 @@ from ..diagnostics import WARNING, Diagnostic
 from ..errors import BadData
 from ..libraries import import_library, library_errors
 from ..recording.limits import STANDARD_GRAVITY
-from .device import ACCEL_UNITS, Device, Signal, convert, make_device
+from .device import ACCEL_UNITS, Device, Signal, check_measured, convert, make_device
 from .guess import group_columns
 
 NEEDS = "gyroscope and accelerometer, nor orientation, by the labels of its channels; they need labels as gyr_x"
@@ -29,21 +29,8 @@ MAGIC = b"XDF:", b"\x1f\x8b"  # the latter of gzip
 _SIGNAL_WORDS = re.compile("accelerometer|gyroscope|accel|gyro|acc|gyr")
 
 
-def is_xdf(path: Path) -> bool:
-    """Return whether a file is an XDF by its name."""
-    return path.suffix.lower() in (".xdf", ".xdfz")
-
-
 def read_xdf(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
-    """Read the sensors' raw data where they have them, else their orientations; `use` selects one of the two.
-
-    `rate_hz` replaces the streams' times.
-
-    Raises
-    ------
-    BadData
-        No XDF, or damaged; no stream of a sensor; an unknown unit; not what `use` asks for; pyxdf is not installed.
-    """
+    """Read the streams, as `Format.read`; `rate_hz` replaces their times."""
     pyxdf = import_library("pyxdf", path, "an XDF")
     with path.open("rb") as file:
         if not file.read(4).startswith(MAGIC):
@@ -65,6 +52,7 @@ def read_xdf(path: Path, use: str | None = None, rate_hz: float | None = None) -
             label = name if owner == f"?{name.lower()}" or len(groups) == 1 else owner.removeprefix("?")
             for signal, channels in signals.items():
                 read = values[:, [columns.index(channel) for channel in channels]].astype(float)
+                check_measured(path, read, f"{signal} of {label}")
                 if signal != "orientation":
                     unit = units[channels[0]] or _guess_unit(signal, read)
                     read = convert(path, signal, read, unit, channels[0])

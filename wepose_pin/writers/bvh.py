@@ -57,13 +57,7 @@ class Bone(NamedTuple):
 
 
 def write_bvh(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Write hierarchy and motion; angles are followed over time, so they may go beyond 180°.
-
-    Raises
-    ------
-    BadData
-        A segment to which the rest is tied is not known, or a sample has no orientation.
-    """
+    """Write hierarchy and motion; angles are followed over time, so they may go beyond 180°."""
     check_complete(motion, "a .bvh")
     motion = resample_evenly(motion)
     root = _build_skeleton(motion)

@@ -21,15 +21,7 @@ MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in sile
 
 
 def write_c3d(path: Path, motion: Motion) -> None:
-    """Write points in W (z up, x forward) and segments to W, single precision; NaN in a gap, with a residual of −1.
-
-    Raises
-    ------
-    BadOption
-        ezc3d is not installed.
-    BadData
-        No point is known, or there are more frames than the format counts.
-    """
+    """Write points in W (z up, x forward) and segments to W, single precision; NaN in a gap, with a residual of −1."""
     try:
         import ezc3d
     except ImportError:

@@ -51,7 +51,8 @@ class Format(NamedTuple):
     ----------
     of : what it holds: `PERSON`, `JOINTS`, `ROBOTS` or `BODY`
     write : path, motion and own options → what the file cannot hold, or None. A format of `ROBOTS` gets all motions,
-        one of `BODY` the result
+        one of `BODY` the result. It raises `BadData` where these lack what the file needs, `BadOption` where a package
+        is not installed
     options : that it has of those of `export`
     suffix : of the file; None: the name of the format. Empty: a folder
     earlier : patterns of the files of an earlier run in the folder, which `force` replaces

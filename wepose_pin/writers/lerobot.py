@@ -46,12 +46,6 @@ def write_lerobot(
     ----------
     episodes : "repetitions": each repetition of a movement is one; a phase: each of its intervals; None: each motion
     instruction : the task of all episodes; None: "follow NAME", and the name of the phase
-
-    Raises
-    ------
-    WrongOption, BadData
-        A recording has no repetitions, or no such phase. Motions of several robots, of other joints or rates; a rate
-        that is no whole number.
     """
     rate_hz = _check_alike(motions)
     listed, diagnostics = list[Episode](), list[Diagnostic]()

@@ -51,13 +51,6 @@ def write_mot(path: Path, motion: Motion, names: str | None = None) -> list[Diag
     Parameters
     ----------
     names : only these: "isb" or "opensim"
-
-    Raises
-    ------
-    BadData
-        No joint has both of its segments, or a sample has no orientation.
-    BadOption
-        `names` of a mechanism, whose joints have their own.
     """
     check_complete(motion, "a .mot")
     diagnostics = diagnose_gaps(motion)
@@ -102,13 +95,7 @@ def _write_coordinates(path: Path, motion: Motion, columns: Mapping[str, np.ndar
 
 
 def write_sto(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Orientations of the model's bodies in G, as sensors of OpenSense: ``<body>_imu``, cells ``w,x,y,z``.
-
-    Raises
-    ------
-    BadData
-        No segment is a body of the model, or a sample has no orientation.
-    """
+    """Orientations of the model's bodies in G, as sensors of OpenSense: ``<body>_imu``, cells ``w,x,y,z``."""
     check_complete(motion, "a .sto")
     _write_quaternions(path, motion, motion.pose.time, _bodies(motion))
     return diagnose_gaps(motion)
@@ -184,11 +171,6 @@ def write_scale(path: Path, motion: Motion, osim_model: str | Path = GENERIC_MOD
     Parameters
     ----------
     osim_model : name of the generic model
-
-    Raises
-    ------
-    BadData
-        The subject has no length that the model has.
     """
     factors: dict[str, dict[str, float]] = {}
     for length, span in SPANS.items():
@@ -236,13 +218,7 @@ def _write_quaternions(path: Path, motion: Motion, time: np.ndarray, quat_GB: Ma
 
 
 def write_trc(path: Path, motion: Motion) -> list[Diagnostic]:
-    """Points in G, in mm; a point in a gap has empty cells.
-
-    Raises
-    ------
-    BadData
-        No point is known.
-    """
+    """Points in G, in mm; a point in a gap has empty cells."""
     motion = resample_evenly(motion)
     points = find_measured_points(motion)
     n, rate = len(motion.pose.time), f"{motion.rate_hz:g}"

@@ -31,13 +31,7 @@ BAG_VERSION = 8
 
 
 def write_rosbag(folder: Path, motion: JointMotion) -> None:
-    """Write a bag into an existing folder: ``metadata.yaml`` and ``motion.db3``.
-
-    Raises
-    ------
-    BadOption
-        rosbags is not installed.
-    """
+    """Write a bag into an existing folder: ``metadata.yaml`` and ``motion.db3``."""
     _write_bag(folder / NAME, motion, "SQLITE3")
     for path in sorted((folder / NAME).iterdir()):
         path.replace(folder / path.name)
@@ -45,13 +39,7 @@ def write_rosbag(folder: Path, motion: JointMotion) -> None:
 
 
 def write_mcap(path: Path, motion: JointMotion) -> None:
-    """Write the messages of a bag as one MCAP file, its chunks compressed by zstd.
-
-    Raises
-    ------
-    BadOption
-        rosbags is not installed.
-    """
+    """Write the messages of a bag as one MCAP file, its chunks compressed by zstd."""
     with tempfile.TemporaryDirectory(prefix=path.name, dir=path.parent) as folder:
         _write_bag(Path(folder) / NAME, motion, "MCAP")
         (Path(folder) / NAME / f"{NAME}.mcap").replace(path)

@@ -25,13 +25,7 @@ APPLICATION = "wepose"
 
 
 def write_rrd(path: Path, motion: JointMotion) -> None:
-    """Write the recording.
-
-    Raises
-    ------
-    BadOption
-        rerun-sdk is not installed.
-    """
+    """Write the recording."""
     try:
         import rerun as rr
     except ImportError:
