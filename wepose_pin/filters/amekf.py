@@ -20,7 +20,7 @@ velocity is zero and the gyroscope measures its bias.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +38,7 @@ from .base import (
     FilterRun,
     add_correction,
     into_sensor,
+    make_record,
     make_run,
     prepare_samples,
     store_sample,
@@ -73,14 +74,8 @@ MAX_LOST_ROTATION_STD = 4.0  # [rad] beyond which the uncertainty of a lost rota
 OUTLIER_CHI2_2, OUTLIER_CHI2_3 = 11.83, 14.16
 
 # Records of the compiled steps.
-TRANSITION = [
-    ("R", float, (3, 3)),  # Σ R_VS dt [s]
-    ("R_rate", float, (3, 3, 3)),  # Σ R_VS ω_c dt [rad], for the axes c = x, y, z of S
-    ("R_moving", float, (3, 3)),  # Σ R_VS dt [s] over the samples that are not static
-]
 SUMS = np.dtype(
     [
-        *TRANSITION,  # before dt is applied
         ("gyro", float, 3),  # [rad/s]
         ("rate_squared", float),  # [rad²/s²]
         ("acceleration_sum", float),  # [m/s²] magnitude
@@ -94,7 +89,9 @@ SUMS = np.dtype(
 # A block's transition and corrections. The smoother keeps one of each block and goes through them backward.
 BLOCK = np.dtype(
     [
-        *TRANSITION,
+        ("R", float, (3, 3)),  # Σ R_VS dt [s]
+        ("R_rate", float, (3, 3, 3)),  # Σ R_VS ω_c dt [rad], for the axes c = x, y, z of S
+        ("R_moving", float, (3, 3)),  # Σ R_VS dt [s] over the samples that are not static
         ("length", float),  # [s]
         ("lost_rotation_var", float),  # [rad²] of the rotation lost in the block
         ("measurements", np.int64),  # number n of measurements; the next four have n rows
@@ -131,43 +128,12 @@ STATE = np.dtype(
     ],
     align=True,
 )
-MODEL = np.dtype(
-    [
-        ("dt", float),  # [s]
-        ("block_samples", np.int64),
-        ("gravity", float),  # [m/s²]
-        ("gyro_noise_psd", float),  # [rad²/s]
-        ("accel_noise_psd", float),  # [m²/s³]
-        ("velocity_var", float),  # [m²/s²] of a block's measurement, as the next three
-        ("position_var", float),  # [m²]
-        ("static_velocity_var", float),  # [m²/s²]
-        ("static_bias_var", float),  # [rad²/s²] of the mean of gyro about the bias
-        ("static_heading_psd", float),  # [rad²/s] of undetected rotation about the vertical in a static phase
-        ("rate_noise_psd", float),  # [1/Hz] of gyro, relative to |ω|
-        ("velocity_error_fraction_sq", float),  # [1] of the summed |acceleration| of a block
-        ("bias_walk", float),  # [rad²/s³]
-        ("matrix_walk", float),  # [1/s]
-        ("accel_bias_walk", float),  # [m²/s⁵]
-        ("motion_bias_walk", float),  # [rad²/s³]
-        ("lost_rate_std", float),  # [rad/s]
-        ("lost_accel_var", float),  # [m²/s⁴]
-        ("gyro_limit", float),  # [rad/s]
-        ("accel_limit", float),  # [m/s²]
-        ("impact_limit", float),  # [m/s²]
-        ("accel_correction", float, (3, 3)),  # (I + E)⁻¹, measured to true
-    ],
-    align=True,
-)
 _NO_BLOCKS = np.empty(0, BLOCK)
 
 
 @dataclass(frozen=True)
 class AmekfParams:
-    """How wrong a MEMS sensor and how bounded a person's motion is; standard deviations, the same for all recordings.
-
-    The gyroscope's and the accelerometer's known errors (`gyro_matrix`, `accel_matrix`, `accel_bias`, of a calibration)
-    are taken off; `gyro_matrix_std` and `accel_bias_std` say how well they are known.
-    """
+    """How wrong a MEMS sensor and how bounded a person's motion is; standard deviations for all recordings."""
 
     block_s: float = 0.25  # [s] between corrections; the covariance is propagated over it in one step
     speed_std: float = 1.0  # [m/s] of the sensor, horizontal, per axis; independent values every `motion_s`
@@ -188,21 +154,13 @@ class AmekfParams:
     accel_bias_std: float = 0.03  # [m/s²], 3 mg
     accel_bias_walk: float = 1e-4  # [m/s²/√s]
     gyro_range: float = np.inf  # [rad/s] full scale; a saturated sample's rotation is as uncertain as a lost one
-    accel_range: float = np.inf  # [m/s²]
     lost_rate_std: float = 2.0  # [rad/s] of the unknown rate while gyro is lost (NaN) or saturated
     lost_force_std: float = 5.0  # [m/s²] of the unknown acceleration while accel is lost or saturated
-    gyro_matrix: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))  # M: measured = (I + M) true
-    accel_matrix: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))  # measured = (I + this) true + bias
-    accel_bias: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [m/s²]
 
     def __post_init__(self) -> None:
         check_fields(self, "")
         for name, value in vars(self).items():
-            if name in ("gyro_matrix", "accel_matrix", "accel_bias"):
-                shape = (3,) if name == "accel_bias" else (3, 3)
-                if np.shape(value) != shape or not np.isfinite(value).all():
-                    raise BadOption(f"{name} must be finite numbers of shape {shape}")
-            elif not value >= 0.0 or (value == 0.0 and name in ("block_s", "speed_std", "position_std", "motion_s")):
+            if not value >= 0.0 or (value == 0.0 and name in ("block_s", "speed_std", "position_std", "motion_s")):
                 raise BadOption(f"{name} = {value}: a number above 0 is needed (0 switches off what is no bound)")
 
 
@@ -222,7 +180,7 @@ class Amekf:
 
     A NaN sample of gyro holds the last rate, which fades in `HELD_RATE_FADE_S`, and the attitude's covariance grows
     with the time squared. A NaN sample of accel counts as gravity alone, and the velocity's covariance grows. A sample
-    beyond the ranges in `params` is used, and the covariances grow as for a lost one. An impact (`AmekfParams.impact`)
+    beyond the range in `params` is used, and the covariance grows as for a lost one. An impact (`AmekfParams.impact`)
     increases the velocity's covariance. A jump of the bias is adopted in the next static phase; until then the tilt
     error reaches some degrees. Without a static phase everything is estimated in motion: the tilt in ten seconds, the
     other parameters in about a minute. Time is not an input: readers bridge gaps and remove duplicates.
@@ -244,8 +202,7 @@ class Amekf:
         self.state = AmekfState(np.zeros(1, STATE))
         self.state.quat_VS[:], self.state.gyro_bias[:] = quat_VS, noise.gyro_bias
         p, x, std = self.params, self.state.x, np.zeros(STATES)
-        x[ERROR.gyro_bias], x[ERROR.gyro_matrix] = noise.gyro_bias, p.gyro_matrix.ravel()
-        x[ERROR.accel_bias] = p.accel_bias
+        x[ERROR.gyro_bias] = noise.gyro_bias
         std[ERROR.attitude] = p.tilt_std, p.tilt_std, START_HEADING_STD
         std[ERROR.velocity], std[ERROR.position] = p.speed_std, p.position_std
         std[ERROR.gyro_matrix], std[ERROR.accel_bias] = p.gyro_matrix_std, p.accel_bias_std
@@ -271,39 +228,33 @@ class Amekf:
 
 
 def _build_model(noise: SensorNoise, rate_hz: float, block_samples: int, p: AmekfParams) -> np.ndarray:
-    """Build the coefficients of a block, (1,) of `MODEL`."""
+    """Build the coefficients of a block, a record (1,)."""
     length = block_samples / rate_hz
     # Errors of the mean of gyro over a static block: white noise, and the sway of a standing person.
     white, sway = float(np.trace(noise.gyro_cov)) / 3.0 / block_samples, noise.sway_density(rate_hz)
-    model = np.zeros(1, MODEL)
-    values = {
-        "dt": 1.0 / rate_hz,
-        "block_samples": block_samples,
-        "gravity": noise.gravity,
-        "gyro_noise_psd": float(np.trace(noise.gyro_cov)) / 3.0 / rate_hz,
-        "accel_noise_psd": float(np.trace(noise.accel_cov)) / 3.0 * noise.gravity**2 / rate_hz,
-        "velocity_var": p.speed_std**2 * p.motion_s / length,
-        "position_var": p.position_std**2 * p.motion_s / length,
-        "static_velocity_var": p.static_speed_std**2,
-        "static_bias_var": p.static_bias_std**2 + white + sway / length,
-        # A person who sways may also rotate slowly about the vertical: an eighth of the sway (assumption).
-        "static_heading_psd": p.static_turn_noise**2 + sway / 8.0,
-        "rate_noise_psd": p.rate_noise**2,
-        "velocity_error_fraction_sq": p.force_noise**2,
-        "bias_walk": p.gyro_bias_walk**2,
-        "matrix_walk": p.gyro_matrix_walk**2,
-        "accel_bias_walk": p.accel_bias_walk**2,
-        "motion_bias_walk": p.motion_bias_walk**2,
-        "lost_rate_std": p.lost_rate_std,
-        "lost_accel_var": p.lost_force_std**2,
-        "gyro_limit": p.gyro_range,
-        "accel_limit": p.accel_range,
-        "impact_limit": p.impact,
-        "accel_correction": np.linalg.inv(np.eye(3) + p.accel_matrix),
-    }
-    for name, value in values.items():
-        model[name] = value
-    return model
+    return make_record(
+        dt=1.0 / rate_hz,  # [s]
+        block_samples=block_samples,
+        gravity=noise.gravity,  # [m/s²]
+        gyro_noise_psd=float(np.trace(noise.gyro_cov)) / 3.0 / rate_hz,  # [rad²/s]
+        accel_noise_psd=float(np.trace(noise.accel_cov)) / 3.0 * noise.gravity**2 / rate_hz,  # [m²/s³]
+        velocity_var=p.speed_std**2 * p.motion_s / length,  # [m²/s²] of a block's measurement, as the next three
+        position_var=p.position_std**2 * p.motion_s / length,  # [m²]
+        static_velocity_var=p.static_speed_std**2,  # [m²/s²]
+        static_bias_var=p.static_bias_std**2 + white + sway / length,  # [rad²/s²] of the mean of gyro about the bias
+        # [rad²/s] A person who sways may also rotate slowly about the vertical: an eighth of the sway (assumption).
+        static_heading_psd=p.static_turn_noise**2 + sway / 8.0,
+        rate_noise_psd=p.rate_noise**2,  # [1/Hz] of gyro, relative to |ω|
+        velocity_error_fraction_sq=p.force_noise**2,  # [1] of the summed |acceleration| of a block
+        bias_walk=p.gyro_bias_walk**2,  # [rad²/s³]
+        matrix_walk=p.gyro_matrix_walk**2,  # [1/s]
+        accel_bias_walk=p.accel_bias_walk**2,  # [m²/s⁵]
+        motion_bias_walk=p.motion_bias_walk**2,  # [rad²/s³]
+        lost_rate_std=p.lost_rate_std,  # [rad/s]
+        lost_accel_var=p.lost_force_std**2,  # [m²/s⁴]
+        gyro_limit=p.gyro_range,  # [rad/s]
+        impact_limit=p.impact,  # [m/s²]
+    )
 
 
 @kernel
@@ -477,12 +428,6 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
     """Propagate P over the block, correct by the bounds of motion or by the static phase, and begin the next block."""
     x, P, sums, block = state.x, state.P, state.sums, state.block
     count = state.samples
-    for i in range(3):
-        for c in range(3):
-            block.R[i, c] = sums.R[i, c] * model.dt
-            block.R_moving[i, c] = sums.R_moving[i, c] * model.dt
-            for axis in range(3):
-                block.R_rate[axis, i, c] = sums.R_rate[axis, i, c] * model.dt
     block.length, block.lost_rotation_var, block.measurements = count * model.dt, sums.lost_rotation_var, 0
     for j in range(STATES):
         block.correction[j] = 0.0
@@ -513,7 +458,10 @@ def _finish_block(state, model):  # type: ignore[no-untyped-def]
         x[i] += block.correction[i]
     rotate_by_world_vector(state.quat_VS, block.correction[0], block.correction[1], block.correction[2])
     state.samples = 0
-    _reset_sums(sums)
+    sums.rate_squared = sums.acceleration_sum = sums.impact_excess = 0.0
+    sums.static_samples = sums.lost_rotation_var = sums.lost_accel_s = 0.0
+    for i in range(3):
+        sums.gyro[i] = 0.0
 
 
 @inlined
@@ -534,19 +482,6 @@ def compute_vertical_bias(x, R_VS):  # type: ignore[no-untyped-def]
     for c in range(3):
         bias += R_VS[2, c] * (x[GYRO_BIAS + c] + x[MOTION_BIAS + c])
     return bias
-
-
-@inlined
-def _reset_sums(sums):  # type: ignore[no-untyped-def]
-    """Set all sums to zero."""
-    for i in range(3):
-        sums.gyro[i] = 0.0
-        for c in range(3):
-            sums.R[i, c] = sums.R_moving[i, c] = 0.0
-            for axis in range(3):
-                sums.R_rate[axis, i, c] = 0.0
-    sums.rate_squared = sums.acceleration_sum = sums.impact_excess = 0.0
-    sums.static_samples = sums.lost_rotation_var = sums.lost_accel_s = 0.0
 
 
 @inlined
@@ -588,16 +523,11 @@ def _correct_rate(state, model, gx, gy, gz, static):  # type: ignore[no-untyped-
 @inlined
 def _compute_horizontal_acceleration(state, model, ax, ay, az):  # type: ignore[no-untyped-def]
     """Compute the sample's horizontal acceleration in V, two floats [m/s²]; zero for a lost sample."""
-    sums, bias, A, R = state.sums, state.x[ERROR.accel_bias], model.accel_correction, state.R_VS
+    sums, bias, R = state.sums, state.x[ERROR.accel_bias], state.R_VS
     if not ax * ax + ay * ay + az * az < HIGHEST_ACCEL_SQUARED:
         sums.lost_accel_s += model.dt
         return 0.0, 0.0
-    if max(abs(ax), abs(ay), abs(az)) >= model.accel_limit:
-        sums.lost_accel_s += model.dt
-    ax, ay, az = ax - bias[0], ay - bias[1], az - bias[2]
-    fx = A[0, 0] * ax + A[0, 1] * ay + A[0, 2] * az
-    fy = A[1, 0] * ax + A[1, 1] * ay + A[1, 2] * az
-    fz = A[2, 0] * ax + A[2, 1] * ay + A[2, 2] * az
+    fx, fy, fz = ax - bias[0], ay - bias[1], az - bias[2]
     ax = R[0, 0] * fx + R[0, 1] * fy + R[0, 2] * fz
     ay = R[1, 0] * fx + R[1, 1] * fy + R[1, 2] * fz
     az = R[2, 0] * fx + R[2, 1] * fy + R[2, 2] * fz - model.gravity
@@ -609,20 +539,21 @@ def _compute_horizontal_acceleration(state, model, ax, ay, az):  # type: ignore[
 
 @inlined
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
-    """Filter one sample, gyro [rad/s], accel [m/s²]; records of `STATE` and `MODEL`. Return whether a block ended."""
+    """Filter one sample, gyro [rad/s], accel [m/s²]; `state` of `STATE`. Return whether a block ended."""
     dt, x, sums, R = model.dt, state.x, state.sums, state.R_VS
     wx, wy, wz, ux, uy, uz = _correct_rate(state, model, gx, gy, gz, static)
     sums.rate_squared += wx * wx + wy * wy + wz * wz
     rotate_unit_by_rate(state.quat_VS, wx, wy, wz, dt)
     fill_matrix(state.quat_VS, R)
-    moving = 0.0 if static else 1.0
+    moving, block, kept = 0.0 if static else 1.0, state.block, 1.0 if state.samples else 0.0
     for i in range(3):
         for c in range(3):
-            sums.R[i, c] += R[i, c]
-            sums.R_rate[0, i, c] += R[i, c] * ux
-            sums.R_rate[1, i, c] += R[i, c] * uy
-            sums.R_rate[2, i, c] += R[i, c] * uz
-            sums.R_moving[i, c] += R[i, c] * moving
+            R_dt = R[i, c] * dt
+            block.R[i, c] = kept * block.R[i, c] + R_dt
+            block.R_rate[0, i, c] = kept * block.R_rate[0, i, c] + R_dt * ux
+            block.R_rate[1, i, c] = kept * block.R_rate[1, i, c] + R_dt * uy
+            block.R_rate[2, i, c] = kept * block.R_rate[2, i, c] + R_dt * uz
+            block.R_moving[i, c] = kept * block.R_moving[i, c] + R_dt * moving
     ax, ay = _compute_horizontal_acceleration(state, model, ax, ay, az)
     velocity, position = x[ERROR.velocity], x[ERROR.position]
     position[0] += dt * velocity[0]

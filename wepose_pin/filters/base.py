@@ -62,8 +62,8 @@ class FilterRun(NamedTuple):
     attitude_cov: np.ndarray | None  # (n, 3, 3) [rad²] of the error on the right, in S; None: the filter has none
     about_vertical: np.ndarray | None = None  # (n, 3) as `AboutVertical`; None: the filter has no covariance
 
-    def part(self, rows: slice) -> FilterRun:
-        """Return views of the samples `rows`."""
+    def part(self, rows: slice | np.ndarray) -> FilterRun:
+        """Return the samples `rows`, of a slice as views."""
         return FilterRun(*(None if values is None else values[rows] for values in self))  # type: ignore[arg-type]
 
     def extended(self, n: int) -> FilterRun:
@@ -83,6 +83,15 @@ def make_run(n: int, *, covariance: bool = True) -> FilterRun:
     memory = np.empty(ends[-1])
     arrays = [memory[ends[k] : ends[k + 1]].reshape(shape) for k, shape in enumerate(shapes)]
     return FilterRun(*arrays, *([] if covariance else [None]))
+
+
+def make_record(**values: Any) -> np.ndarray:
+    """Return a record (1,) with these fields, integers, floats or arrays of floats, for a compiled step."""
+    types = [(name, np.int64 if isinstance(value, int) else float, np.shape(value)) for name, value in values.items()]
+    record = np.zeros(1, np.dtype(types, align=True))
+    for name, value in values.items():
+        record[name] = value
+    return record
 
 
 @dataclass

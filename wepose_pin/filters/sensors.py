@@ -70,9 +70,8 @@ class Orientation(NamedTuple):
 
     def take(self, rows: slice | np.ndarray) -> Orientation:
         """Take the samples `rows`."""
-        values: dict[str, Any] = {name: getattr(self, name) for name in _OF_EACH_SAMPLE}
-        taken: dict[str, Any] = {name: None if each is None else each[rows] for name, each in values.items()}
-        return self._replace(**taken)
+        taken = dict(zip(FilterRun._fields, self.rows.part(rows), strict=True))
+        return self._replace(static=self.static[rows], **taken)  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
         bias = float(np.degrees(np.linalg.norm(self.gyro_bias[-1]))) if len(self.gyro_bias) else float("nan")
@@ -83,16 +82,12 @@ class Orientation(NamedTuple):
         return notebook_html(self, self.diagnostics)
 
 
-_OF_EACH_SAMPLE = ("quat_VS", "gyro_bias", "static", "attitude_cov", "about_vertical")
-
-
 def join_orientations(parts: Sequence[Orientation]) -> Orientation:
     """Join the samples of one sensor's orientations; what is not of each sample is that of the last part."""
-    joined: dict[str, Any] = {}
-    for name in _OF_EACH_SAMPLE:
-        values = [getattr(part, name) for part in parts]
-        joined[name] = None if any(value is None for value in values) else np.concatenate(values)
-    return parts[-1]._replace(**joined)
+    columns = zip(*(part.rows for part in parts), strict=True)
+    joined = [None if column[0] is None else np.concatenate(column) for column in columns]
+    static = np.concatenate([part.static for part in parts])
+    return parts[-1]._replace(static=static, **dict(zip(FilterRun._fields, joined, strict=True)))  # type: ignore[arg-type]
 
 
 def check_method(method: str) -> str:

@@ -34,6 +34,7 @@ from .base import (
     VERTICAL_COLUMNS,
     FilterRun,
     add_correction,
+    make_record,
     make_run,
     prepare_samples,
     store_sample,
@@ -63,7 +64,7 @@ class SmekfParams:
 HOLD_S = 0.1  # [s] about as long as the rate of an arm keeps its value
 LOST_RATE_STD = 2.5  # [rad/s] of an arm in motion (our assumption)
 
-# The state of a sensor is one record, its constants (the model) are another. Upper triangles are xx xy xz yy yz zz.
+# The state of a sensor is one record, its constants (`Smekf.model`) are another. Upper triangles are xx xy xz yy yz zz.
 STATE = np.dtype(
     [
         ("quat_VS", float, 4),  # xyzw
@@ -76,21 +77,6 @@ STATE = np.dtype(
         ("held_rate", float, 3),  # [rad/s] the last that was measured
         ("lost_s", float),  # [s] since then
         ("about_vertical", float, VERTICAL_COLUMNS),  # as `base.AboutVertical`
-    ],
-    align=True,
-)
-MODEL = np.dtype(
-    [
-        ("dt", float),  # [s]
-        ("inverse_gravity", float),  # [s²/m]
-        ("attitude_step", float, 6),  # [rad²] δt² Σ_ω
-        ("bias_step", float, 6),  # [rad²/s²] δt² Σ_b
-        ("static_gyro_cov", float, 6),  # [rad²/s²]
-        ("static_accel_cov", float, 6),  # of accel/g
-        ("fade", float),  # factor on a held rate at each missing sample
-        ("static_turn", float),  # [rad²] variance of an undetected turn in a static sample
-        ("scale_var", float),  # of the gyroscope's scale
-        ("gyro_range", float),  # [rad/s]
     ],
     align=True,
 )
@@ -128,26 +114,28 @@ class Smekf:
     ) -> None:
         self.params = p = params or SmekfParams()
         self.noise, self.rate_hz = noise, rate_hz
-        dt, model, record = 1.0 / rate_hz, np.zeros(1, MODEL), np.zeros(1, STATE)
+        dt, record = 1.0 / rate_hz, np.zeros(1, STATE)
         sway_cov = noise.sway_density(rate_hz) * rate_hz * np.eye(3)
         accel_bias_cov = ACCEL_BIAS_STD**2 * SWAY_CORRELATION_S * rate_hz * np.eye(3)
-        model["dt"], model["inverse_gravity"] = dt, 1.0 / noise.gravity
-        for name, cov in (
-            ("attitude_step", dt * dt * noise.gyro_cov),
-            ("bias_step", dt * dt * noise.bias_step_cov),
-            ("static_gyro_cov", noise.gyro_cov + sway_cov),
-            ("static_accel_cov", noise.accel_cov + accel_bias_cov),
-        ):
-            model[name] = cov[_UPPER]
-        model["fade"], model["gyro_range"] = np.exp(-dt / HOLD_S), p.gyro_range
-        model["static_turn"], model["scale_var"] = p.static_turn_noise**2 * dt, p.gyro_scale_std**2
+        self.model = make_record(
+            dt=dt,  # [s]
+            inverse_gravity=1.0 / noise.gravity,  # [s²/m]
+            attitude_step=(dt * dt * noise.gyro_cov)[_UPPER],  # [rad²] δt² Σ_ω
+            bias_step=(dt * dt * noise.bias_step_cov)[_UPPER],  # [rad²/s²] δt² Σ_b
+            static_gyro_cov=(noise.gyro_cov + sway_cov)[_UPPER],  # [rad²/s²]
+            static_accel_cov=(noise.accel_cov + accel_bias_cov)[_UPPER],  # of accel/g
+            fade=float(np.exp(-dt / HOLD_S)),  # factor on a held rate at each missing sample
+            static_turn=p.static_turn_noise**2 * dt,  # [rad²] variance of an undetected turn in a static sample
+            scale_var=p.gyro_scale_std**2,
+            gyro_range=p.gyro_range,  # [rad/s]
+        )
         record["quat_VS"], record["gyro_bias"] = quat_VS, noise.gyro_bias
         tilt_var, heading_var, up = p.tilt_std**2, START_HEADING_STD**2, np.array(up_in_sensor(record["quat_VS"][0]))
         record["P_aa"] = tilt_var + heading_var, 0.0, 0.0, tilt_var + heading_var, 0.0, heading_var
         record["attitude_cov"] = (tilt_var * (np.eye(3) - np.outer(up, up)) + heading_var * np.eye(3))[_UPPER]
         record["P_bb"] = noise.gyro_bias_cov[_UPPER]
         record["about_vertical"][0, RATE_VAR] = up @ noise.gyro_bias_cov @ up
-        self.model, self.state = model, SmekfState(record)
+        self.state = SmekfState(record)
 
     def run(
         self, gyro_S: np.ndarray, accel_S: np.ndarray, static: np.ndarray | bool, out: FilterRun | None = None
@@ -160,7 +148,7 @@ class Smekf:
 
 @inlined
 def step(state, model, gx, gy, gz, ax, ay, az, static):  # type: ignore[no-untyped-def]
-    """Take one sample of one sensor: records of `STATE` and `MODEL`, gyro [rad/s], accel [m/s²]."""
+    """Take one sample of one sensor: the records of state and constants, gyro [rad/s], accel [m/s²]."""
     dt, bias, held = model.dt, state.gyro_bias, state.held_rate
     is_measured = gx * gx + gy * gy + gz * gz < HIGHEST_RATE_SQUARED  # false for NaN
     lost_var = 0.0

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compilation import compiled, inlined
+from ..compilation import compiled
 from ..rotations import fill_matrix, rotate_by_world_vector
 from .amekf import BLOCK, ERROR, POSITION, SMOOTHED_STATES, STATES, VELOCITY, Amekf, AmekfParams
 from .base import RATE_VAR, VERTICAL_COLUMNS, FilterRun, fill_symmetric, into_sensor
@@ -82,82 +82,33 @@ def _backward(blocks, start_rows, gravity):  # type: ignore[no-untyped-def]
     start, whose rows of P are `start_rows`."""
     deviation = np.empty((len(blocks) + 1, COUNT))
     covs = np.empty((2, len(blocks) + 1, 3, 3))
-    lam = np.zeros((STATES, 1))
-    Lam = np.zeros((STATES, STATES))
-    swapped = np.empty((STATES, STATES))
-    rows = np.empty((COUNT, STATES))
-    u = np.empty(STATES)
+    lam, Lam, rows, cov = np.zeros((STATES, 1)), np.zeros((STATES, STATES)), start_rows.copy(), np.empty((COUNT, COUNT))
     for k in range(len(blocks), -1, -1):
+        rows[:] = start_rows
+        if k > 0:
+            rows[:] = blocks[k - 1].P_smoothed_rows
+        deviation[k] = -np.dot(rows, lam[:, 0].copy())
         for n in range(COUNT):
-            s = 0.0
-            for j in range(STATES):
-                rows[n, j] = start_rows[n, j] if k == 0 else blocks[k - 1].P_smoothed_rows[n, j]
-                s -= rows[n, j] * lam[j, 0]
-            deviation[k, n] = s
-        for n in range(3):  # rows of the bias in motion: bias and what is added in motion
-            for j in range(STATES):
-                rows[3 + n, j] += rows[6 + n, j]
-        for part in range(2):
-            first, columns = 3 * part, ERROR.gyro_bias.start * part
-            for i in range(3):
-                for j in range(STATES):
-                    u[j] = 0.0
-                for m in range(STATES):
-                    p = rows[first + i, m]
-                    for j in range(STATES):
-                        u[j] += p * Lam[m, j]
-                for j in range(i, 3):
-                    s = rows[first + i, columns + j]
-                    if part:
-                        s += rows[first + i, ERROR.motion_bias.start + j]
-                    for m in range(STATES):
-                        s -= u[m] * rows[first + j, m]
-                    covs[part, k, i, j] = s
-                    covs[part, k, j, i] = s
+            cov[:, n] = rows[:, SMOOTHED_STATES[n]]
+        cov -= np.dot(np.dot(rows, Lam), rows.T)
+        both = cov[3:6] + cov[6:9]  # the bias in motion: bias and what is added in motion
+        covs[0, k], covs[1, k] = cov[:3, :3], both[:, 3:6] + both[:, 6:9]
         if k == 0:
             break
         block = blocks[k - 1]
-        for n in range(block.measurements - 1, -1, -1):
-            _uncorrect(
-                lam,
-                Lam,
-                block.state_index[n],
-                block.inv_innovation_std[n],
-                block.normalized_innovation[n],
-                block.normalized_gain[n],
-                u,
-            )
+        for n in range(block.measurements - 1, -1, -1):  # λ and Λ before a measurement from those after it
+            at, root, gain = block.state_index[n], block.inv_innovation_std[n], block.normalized_gain[n].copy()
+            u = root * np.dot(Lam, gain)
+            lam[at, 0] -= root * (np.dot(gain, lam[:, 0].copy()) + block.normalized_innovation[n])
+            Lam[at] -= u
+            Lam[:, at] -= u
+            Lam[at, at] += root * (root + np.dot(gain, u))
         _transpose_transition(block, gravity, lam)
         _transpose_transition(block, gravity, Lam)
-        for i in range(STATES):
-            for j in range(STATES):
-                swapped[j, i] = Lam[i, j]
+        swapped = Lam.T.copy()
         _transpose_transition(block, gravity, swapped)
-        for i in range(STATES):
-            for j in range(STATES):
-                Lam[i, j] = 0.5 * (swapped[i, j] + swapped[j, i])
+        Lam[:] = 0.5 * (swapped + swapped.T)
     return deviation, covs[0], covs[1]
-
-
-@inlined
-def _uncorrect(lam, Lam, at, root, innovation, gain, u):  # type: ignore[no-untyped-def]
-    """λ and Λ before a measurement of state `at` from those after it; `gain` is √s K, `u` room for 25 numbers."""
-    s = 0.0
-    for j in range(STATES):
-        u[j] = 0.0
-        s += gain[j] * lam[j, 0]
-    lam[at, 0] -= root * (s + innovation)
-    for m in range(STATES):
-        k = root * gain[m]
-        for j in range(STATES):
-            u[j] += k * Lam[m, j]
-    s = root * root
-    for j in range(STATES):
-        s += root * gain[j] * u[j]
-    for j in range(STATES):
-        Lam[at, j] -= u[j]
-        Lam[j, at] -= u[j]
-    Lam[at, at] += s
 
 
 @compiled

@@ -159,8 +159,12 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
     distinct = list({id(clock): clock for clock in clocks.values()}.values())  # usually one for all sensors
     steps = [np.diff(clock.time) for clock in distinct]
     uneven = max(float(np.max(np.abs(each / clock.step - 1.0))) for clock, each in zip(distinct, steps, strict=True))
-    shared = all(_agree(clock, first) for clock in clocks.values())
-    drift = max(_compute_drift(clock) for clock in distinct)
+    drift = max(_compute_drift(clock.time) for clock in distinct)
+    shared = all(
+        len(clock.time) == len(first.time)
+        and np.max(np.abs(clock.time - first.time)) <= SAME * min(clock.step, first.step)
+        for clock in distinct
+    )
     if shared and uneven <= UNEVEN + 1e-9 and drift <= DRIFT:
         return first.time, ()
     begin = max(float(clock.time[0]) for clock in clocks.values())
@@ -180,19 +184,9 @@ def find_common_time(where: str, clocks: Mapping[str, Clock]) -> tuple[np.ndarra
     return time, (Diagnostic("time-stamps-uneven", INFO, value=off if shared else None, facts=facts),)
 
 
-def _agree(a: Clock, b: Clock) -> bool:
-    return a is b or (
-        len(a.time) == len(b.time) and bool(np.max(np.abs(a.time - b.time)) <= SAME * min(a.step, b.step))
-    )
-
-
-def _compute_drift(clock: Clock) -> float:
+def _compute_drift(time: np.ndarray) -> float:
     """Compute the largest relative deviation of the rate over 1 s or 10 s from its mean, less one step's jitter."""
-    time, n = clock.time, len(clock.time)
+    n = len(time)
     mean = (time[-1] - time[0]) / (n - 1)
-    drift = 0.0
-    for seconds in (1.0, 10.0):
-        size = min(n - 1, max(1, round(seconds / mean)))
-        spans = time[size:] - time[:-size]
-        drift = max(drift, float(np.max(np.abs(spans - size * mean)) - mean) / (size * mean))
-    return drift
+    sizes = [min(n - 1, max(1, round(seconds / mean))) for seconds in (1.0, 10.0)]
+    return max(0.0, *(float(np.abs(time[s:] - time[:-s] - s * mean).max() - mean) / (s * mean) for s in sizes))
