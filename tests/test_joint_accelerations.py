@@ -122,7 +122,7 @@ def test_a_forearm_that_drifts_is_corrected_without_calibration_and_clasp(moving
     assert rms[False][elbow] < 2.0
     correction = tracked.correction
     assert correction is not None
-    assert set(correction.joint_accelerations) == {
+    assert set(correction.summarize()["joint_accelerations"]) == {
         f"{side}_{part}" for side in ("left", "right") for part in ("upper_arm", "forearm")
     }
     rows = tracked.time[tracked.time > 30.0][::20]

@@ -48,11 +48,6 @@ class HeadingCorrection:
         return self.problem.names
 
     @property
-    def joint_accelerations(self) -> tuple[str, ...]:
-        """Segments whose joint to the one above has a sensor on either side."""
-        return tuple(pair.far for pair in self.problem.pairs)
-
-    @property
     def max_correction_deg(self) -> dict[str, float]:
         """Segment → largest rotation about the vertical."""
         largest = np.degrees(np.max(np.abs(self.errors), axis=0, initial=0.0))
@@ -61,7 +56,7 @@ class HeadingCorrection:
     def summarize(self) -> dict[str, Any]:
         """What was observed and the largest correction of each heading, as ``summary.json`` has it."""
         return {
-            "joint_accelerations": list(self.joint_accelerations),
+            "joint_accelerations": [pair.far for pair in self.problem.pairs],
             "hinges": [hinge.name for hinge in self.problem.hinges],
             "largest_correction_deg": {name: round(value, 3) for name, value in self.max_correction_deg.items()},
         }

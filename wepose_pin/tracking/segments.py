@@ -192,15 +192,12 @@ class SegmentEstimator:
 
     def _read_filters(self) -> FilterOutput:
         """Read what the filters state after the last step."""
-        k, filtered = len(self.names), ~self._measured
-        output = FilterOutput(
-            self._recent[self._oldest - 1][None].copy(), np.full((1, k, 3, 3), np.nan), np.full((1, k, 3), np.nan)
-        )
-        if self._filters.attitude_cov is not None:
-            output.attitude_cov[0, filtered], output.about_vertical[0, filtered] = (
-                self._filters.attitude_cov,
-                self._filters.about_vertical,
-            )
+        k, filters = len(self.names), self._filters
+        quat_VS = self._recent[self._oldest - 1][None].copy()
+        output = FilterOutput(quat_VS, np.full((1, k, 3, 3), np.nan), np.full((1, k, 3), np.nan))
+        if filters.attitude_cov is not None:
+            output.attitude_cov[0, ~self._measured] = filters.attitude_cov
+            output.about_vertical[0, ~self._measured] = filters.about_vertical
         return output
 
     def _stack(self, chunk: Recording, orientation: Mapping[str, Orientation]) -> FilterOutput:
@@ -231,7 +228,8 @@ class SegmentEstimator:
         history = np.concatenate([self._order_recent(), output.quat_VS])
         before = len(history) - n
         accel_S = np.stack([_find_specific_force(sensor) for sensor in chunk.sensors.values()], axis=1)
-        marks, resets = self._find_marks(chunk), {tick for tick in chunk.resets if 0 <= tick < n}
+        marks = self._find_marks(chunk)
+        resets = {tick for tick in chunk.resets if 0 <= tick < n and before}  # none before the start pose has ended
         for first, last in pairwise(sorted({0, *resets, *marks, min(begin, n), n})):
             if first in resets:
                 self._reset(history[max(0, before + first - size) : before + first])

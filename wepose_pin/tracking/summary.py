@@ -10,7 +10,6 @@ import numpy as np
 
 from ..body.kinematics import Pose, join_poses
 from ..diagnostics import INFO, WARNING, Diagnostic, as_json, drop_consequences, gravest_first, merge
-from ..errors import BadData
 from ..filters import STATIC_ONLY, Orientation, join_orientations
 from ..recording import Recording
 from ..recording.gaps import find_runs
@@ -80,11 +79,16 @@ class SummaryAccumulator:
     Parameters
     ----------
     recording : the whole one
+
+    Attributes
+    ----------
+    last : the last chunk
     """
+
+    last: TrackResult
 
     def __init__(self, recording: Recording) -> None:
         self._recording, self._every = recording, max(1, len(recording) // MOST_SAMPLES)
-        self._last: TrackResult | None = None
         self._samples = 0
         self._poses: list[Pose] = []  # decimated, as the orientations
         self._orientations: dict[str, list[Orientation]] = {}
@@ -93,19 +97,6 @@ class SummaryAccumulator:
         self._residual: dict[str, float] = {}  # segment → sum of squares [rad²]
         self._ranges: dict[str, tuple[float, float]] = {}  # joint of a mechanism → least and largest value [rad or m]
         self._error_budget = ErrorBudget()
-
-    @property
-    def last(self) -> TrackResult:
-        """The last chunk.
-
-        Raises
-        ------
-        BadData
-            No chunk was added.
-        """
-        if self._last is None:
-            raise BadData("no chunk was tracked: there is nothing to summarise")
-        return self._last
 
     def accumulate(self, chunks: Iterable[TrackResult]) -> Iterator[TrackResult]:
         """Iterate over chunks, and add each."""
@@ -122,9 +113,9 @@ class SummaryAccumulator:
             self._static.setdefault(segment, []).append(orientation.static)
             self._orientations.setdefault(segment, []).append(orientation.take(rows))
         rate_hz, poses = tracked.recording.rate_hz, [tracked.pose]
-        if self._last is not None:  # from the chunk before into this one
+        if self._samples:  # from the chunk before into this one
             size = max(1, round(PEAK_OVER_S * rate_hz))
-            poses.append(join_poses([self._last.pose.cut(slice(-size, None)), tracked.pose.cut(slice(size))]))
+            poses.append(join_poses([self.last.pose.cut(slice(-size, None)), tracked.pose.cut(slice(size))]))
         for pose in poses:
             for name, tip in measure_tips(pose, rate_hz, tracked.model.table).items():
                 self._peak_speed[name] = max(self._peak_speed.get(name, 0.0), tip.peak_speed)
@@ -135,16 +126,10 @@ class SummaryAccumulator:
             self._ranges[joint] = min(low, float(values.min())), max(high, float(values.max()))
         self._error_budget.add(tracked)
         self._samples += n
-        self._last = tracked
+        self.last = tracked
 
     def finish(self) -> TrackSummary:
-        """The summary, after the last chunk.
-
-        Raises
-        ------
-        BadData
-            No chunk was added.
-        """
+        """The summary, after the last chunk."""
         last, n, every = self.last, len(self._recording), self._every
         recording = self._recording.cut(slice(n - self._samples, n))
         orientation = {segment: join_orientations(parts) for segment, parts in self._orientations.items()}
