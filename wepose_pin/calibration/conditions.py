@@ -36,11 +36,6 @@ class Loop:
         return self.closure.kind
 
     @property
-    def rows(self) -> int:
-        """How many residuals a sample has."""
-        return self.closure.rows
-
-    @property
     def parts(self) -> tuple[SegmentVector, ...]:
         """Of all paths."""
         return tuple(part for path in self.paths for part in path.vectors)
@@ -51,7 +46,6 @@ class Moving:
     """Limbs with sensors on these segments move freely: only hinges hold."""
 
     segments: tuple[str, ...]
-    rows: int = 0
 
 
 Constraint = Loop | Pointing | Level | Moving

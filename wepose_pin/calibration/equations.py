@@ -72,31 +72,18 @@ def find_twists(table: BodyTable, hinges: Sequence[HingePlane], sensors: Sequenc
 
 @dataclass(frozen=True)
 class Layout:
-    """The unknowns, each with its places in x, and the data of a sample.
+    """The unknowns, each with its places in x, and the data of a sample."""
 
-    Parameters
-    ----------
-    lengths : names, in the order of the table
-    sensors : names of their segments, in the order of the table
-    hinges, girdles : between segments of these sensors
-    twists : of the segments above the hinges
-    fixed : number of unknown fixed points
-    planes : number of level planes of unknown height
-    recorded : the samples have a recorded place
-    attitude_std : [rad] of each sensor's orientation about an axis across its segment; only the ratios matter
-    soft : sensors on a foam
-    """
-
-    lengths: tuple[str, ...]
-    sensors: tuple[str, ...]
-    hinges: tuple[HingePlane, ...] = ()
+    lengths: tuple[str, ...]  # names, in the order of the table
+    sensors: tuple[str, ...]  # their segments, in the order of the table
+    hinges: tuple[HingePlane, ...] = ()  # between segments of these sensors
     girdles: tuple[GirdleTerm, ...] = ()
-    twists: tuple[Twist, ...] = ()
-    fixed: int = 0
-    planes: int = 0
-    recorded: bool = False
-    attitude_std: tuple[float, ...] = ()
-    soft: tuple[str, ...] = ()
+    twists: tuple[Twist, ...] = ()  # of the segments above the hinges
+    fixed: int = 0  # number of fixed points
+    planes: int = 0  # number of level planes of unknown height
+    recorded: bool = False  # the samples have a recorded place
+    attitude_std: tuple[float, ...] = ()  # [rad] of each orientation about an axis across its segment; ratios matter
+    soft: tuple[str, ...] = ()  # sensors on a foam
 
     length: np.ndarray = field(init=False, compare=False)  # (lengths,) [m]
     heading: np.ndarray = field(init=False, compare=False)  # (sensors,) ψ [rad]

@@ -20,7 +20,7 @@ not estimated: mounts, headings and their drift, soft tissue. `full` estimates t
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -29,15 +29,13 @@ import numpy as np
 from scipy.linalg import block_diag, null_space
 from scipy.spatial.transform import Rotation
 
-from ..body import BodyModel
 from ..body.mounts import PALM_SLIP_STD, align_sensors
-from ..body.start_pose import StartPose
 from ..body.table import NEUTRAL_POSE
 from ..errors import BadOption, NoSolution, one_of
-from .conditions import Loop, group_lengths, resolve_conditions
+from .conditions import Loop, group_lengths
 from .least_squares import MIN_LENGTH, Observations
 from .problem import CalibrationProblem
-from .protocols import Closure, Protocol
+from .protocols import Closure
 from .result import Calibration, MeasuredLength
 from .weights import LEAST_VARIANCE, count_correlated_samples, min_correlation
 
@@ -45,17 +43,9 @@ Formulation = Literal["full", "paper"]
 LEAST_EFFECT = 1e-6  # of a change of the lengths on the gaps, beside that of the change with the largest effect
 
 
-def check_paper_formulation(
-    protocol: Protocol, model: BodyModel, measured: Collection[str], sensors: Collection[str], start_pose: str
-) -> None:
-    """Check that the recording starts in the N-pose, the protocol has the paper's closure, and the scale is measured.
-
-    Raises
-    ------
-    BadOption
-        The start pose is another, some condition is none of points that coincide, or no measured length fixes the
-        scale.
-    """
+def _check_problem(problem: CalibrationProblem) -> None:
+    """Raise `BadOption` for another start pose, other conditions, or a scale that was not measured."""
+    protocol, start_pose = problem.protocol, problem.recording.start_pose
     if start_pose != NEUTRAL_POSE:
         raise BadOption(
             f"formulation 'paper' takes orientations from the N-pose on, and the recording has start_pose = "
@@ -66,9 +56,8 @@ def check_paper_formulation(
             f"formulation 'paper' needs a protocol in which points of the body coincide and nothing else is asked, "
             f"such as clasp; not '{protocol.name}'"
         )
-    neutral = StartPose(model.neutral_rotations)
-    groups = group_lengths(resolve_conditions(protocol, model, neutral, sensors), model.lengths).values()
-    if not any(set(group) <= set(measured) for group in groups):
+    groups = group_lengths(problem.conditions, problem.model.lengths).values()
+    if not any(set(group) <= set(problem.measured) for group in groups):
         names = [group[0] for group in groups if len(group) == 1]
         raise BadOption(
             f"formulation 'paper' needs one measured length that fixes the scale, as in --measured "
@@ -81,11 +70,14 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
 
     Raises
     ------
+    BadOption
+        What `_check_problem` refuses.
     BadSession
         A mount that is not known, or that gravity contradicts.
     NoSolution
         The gap does not determine the lengths.
     """
+    _check_problem(problem)
     recording, filtered, protocol, prior = problem.recording, problem.filtered, problem.protocol, problem.prior
     mounts, headings, mount_diagnostics = align_sensors(recording, prior, filtered.R_VS_start, filtered.start)
     observations, samples = problem.observe()

@@ -127,5 +127,5 @@ def place_points(x: np.ndarray, observations: Observations) -> np.ndarray:
         if isinstance(condition, Loop) and condition.kind == "fixed_point" and condition.closure.at is None:
             x[layout.point[condition.unknown]] += gaps[span].mean(axis=0)
         elif isinstance(condition, Loop) and condition.kind == "plane":
-            x[layout.height[condition.unknown]] += gaps[span, : condition.rows].mean()
+            x[layout.height[condition.unknown]] += gaps[span, : condition.closure.rows].mean()
     return x

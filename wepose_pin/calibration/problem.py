@@ -92,16 +92,6 @@ class CalibrationProblem:
         # A length outside the chain, such as the trunk where the hands are joined, does not fix its scale.
         return tuple(name for name in self.measured if name in (self.lengths_in_closures or self.model.lengths))
 
-    @property
-    def closure_kind(self) -> str:
-        """The kind of the protocol's closure, "coincide" for joined hands; empty where it has none."""
-        return next((closure.kind for closure in self.protocol.closures), "")
-
-    @property
-    def is_free_motion(self) -> bool:
-        """Whether limbs move and no closure holds."""
-        return bool(self.protocol.free_motions) and not self.protocol.closures
-
     @cached_property
     def couplings(self) -> list[Coupling]:
         """The relative headings of neighbours by the acceleration of the joint between them."""

@@ -39,7 +39,7 @@ from ..filters.sensors import filter_recording
 from ..recording import Recording
 from .alternatives import exchange_labels, leave_out_mounts
 from .fusion import fuse_calibrations, separate_mounts
-from .paper import Formulation, check_paper_formulation, solve_paper_calibration
+from .paper import Formulation, solve_paper_calibration
 from .problem import CalibrationProblem
 from .protocols import Protocol, choose_protocol, load_protocol
 from .quality import assess
@@ -135,8 +135,6 @@ def calibrate(
     prior = prior or population_subject(stature, sex, model)
     prior.check_body(model.table)
     lengths = convert_breadths(measured or {}, model.table, measured_std)
-    if formulation == "paper":
-        check_paper_formulation(protocol, model, lengths, recording.sensors, recording.start_pose)
     filtered = filter_recording(recording, method=method, sways=not model.table.is_mechanism)
     earlier = prior if prior.start_pose_offset and formulation == "full" else None
     if earlier is not None:  # the two calibrations are fused, each on the population prior

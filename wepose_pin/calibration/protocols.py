@@ -151,10 +151,6 @@ class Protocol:
     def closures(self) -> tuple[Closure, ...]:
         return tuple(c for c in self.conditions if isinstance(c, Closure))
 
-    @property
-    def free_motions(self) -> tuple[FreeMotion, ...]:
-        return tuple(c for c in self.conditions if isinstance(c, FreeMotion))
-
     def check_body(self, table: BodyTable) -> None:
         """Raise `BadOption` where the body lacks a point or a segment of the protocol."""
         where = f"protocol '{self.name}': "

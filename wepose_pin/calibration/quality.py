@@ -161,7 +161,7 @@ def _check_headings(calibration: Calibration, motion: Mapping[str, float]) -> li
             limits = TORSO_HEADING if spine else ARM_HEADING
             if table.segments[segment].rigid_without_sensor or len(calibration.hinge_rms) < 2:
                 limits = OTHER_HEADING
-            facts = {} if calibration.problem.closure_kind else {"variant": "poses"}
+            facts = {} if calibration.problem.protocol.closures else {"variant": "poses"}
             std = subject.std(f"mounts.{segment}.z")
             uncertain = Diagnostic("mount-heading-uncertain", INFO, segment, std, facts=facts)
             checks.append(_check(uncertain, limits, _find_cause(calibration, motion, spine)))
@@ -171,7 +171,7 @@ def _check_headings(calibration: Calibration, motion: Mapping[str, float]) -> li
 def _check_residuals(calibration: Calibration) -> list[Check]:
     """Checks of the closure and of the start pose."""
     checks, tilts = list[Check](), calibration.subject.start_pose_offset
-    if calibration.problem.closure_kind:
+    if calibration.problem.protocol.closures:
         share = float(np.mean(calibration.contact[calibration.closed] < MIN_CONTACT))
         facts = {"intervals": format_longest(find_open_intervals(calibration))}
         checks += [
@@ -187,7 +187,7 @@ def _check_residuals(calibration: Calibration) -> list[Check]:
 
 def _find_cause(calibration: Calibration, motion: Mapping[str, float], spine: bool) -> Diagnostic | None:
     """The cause of an uncertainty: the smallest of the motions that it needs, or too short a motion."""
-    if not calibration.problem.closure_kind:
+    if not calibration.problem.protocol.closures:
         return None
     parts = [name for name in (("lean", "twist") if spine else ("sideways", "elevation", "bend")) if name in motion]
     least = min(parts, key=lambda name: motion[name] / ENOUGH[name], default="")
@@ -214,26 +214,25 @@ def _measure_motion(calibration: Calibration, flexion: Mapping[str, np.ndarray])
             base = R[above].inv()
             along = (base * R[segment]).apply(table.segments[segment].along)
             sizes["elevation"].append(_range(np.arccos(np.clip(-along[:, 2], -1.0, 1.0))))
-            sizes["sideways"].append(_range(_azimuth(base.apply(reaches[last]))))
+            sizes["sideways"].append(_turn(base.apply(reaches[last])))
     sizes["bend"] = [_range(angle) for angle in flexion.values()]
     if table.reference in R:
         up = R[table.reference].apply([0.0, 0.0, 1.0])
         mean = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
         sizes["lean"].append(float(np.percentile(np.arccos(np.clip(up @ mean, -1.0, 1.0)), 98)))
-        sizes["twist"].append(_range(_azimuth(R[table.reference].apply([1.0, 0.0, 0.0]))))
+        sizes["twist"].append(_turn(R[table.reference].apply([1.0, 0.0, 0.0])))
     return {name: min(each) for name, each in sizes.items() if each}
 
 
-def _azimuth(v: np.ndarray) -> np.ndarray:
-    """Angles (n,) [rad] of v (n, 3) about z, from their mean."""
+def _turn(v: np.ndarray) -> float:
+    """Range [rad] of the angles of v (n, 3) about z."""
     turn = v[:, 0] + 1j * v[:, 1]
-    return np.angle(turn * np.conj(np.mean(turn)))
+    return _range(np.angle(turn * np.conj(np.mean(turn))))
 
 
 def _range(values: np.ndarray) -> float:
     """From the 2nd to the 98th percentile."""
-    low, high = np.percentile(values, (2, 98))
-    return float(high - low)
+    return float(np.ptp(np.percentile(values, (2, 98))))
 
 
 def find_open_intervals(calibration: Calibration) -> list[tuple[float, float]]:

@@ -97,41 +97,23 @@ class Calibration:
     It prints itself in one line, with what to do first where it does not pass. Most users need `subject`, `quality` and
     `diagnostics`; the rest is for reports. The least squares takes n samples of the recording, about 8 a second. The
     gap is the residual of the closure: the vector between the palms of joined hands, or what another protocol closes.
-
-    Parameters
-    ----------
-    problem : recording, protocol, body, prior and measured lengths, without the mounts and poses that are not used
-    subject : lengths and mounts with their joint covariance; its `quality` is that of the calibration
-    effective_sample_size : number of independent samples with as much information as the gaps
-    scale_std : relative standard deviation of the overall scale, with the proportions as estimated
-    remarks : diagnostics of the estimation, without those of its quality; `diagnostics` has both
-    time : (n,) [s] of the samples
-    gap, prior_gap : (n,) [m] length of the gap, as estimated and with the prior's lengths; NaN outside of closures
-    contact : (n,) weight of each sample's gap, near 0 where the palms are apart
-    quat_WL : segment → (n, 4) xyzw at each sample, as tracking gives it
-    measured_lengths : name → measured length beside the estimate without it
-    hinge_rms : joint → [rad] rms angle of the segment below to the plane across its axis
-    exchanged : segment → label of the sensor on it, where the sensors sit on other segments than the session states
-    posed : phase of poses → by how many standard deviations it deviates from what is known without it
-    formulation : "full" or "paper"
-    quality : of `quality.assess`
     """
 
-    problem: CalibrationProblem
-    subject: Subject
-    effective_sample_size: float
-    scale_std: float
-    remarks: tuple[Diagnostic, ...]
-    time: np.ndarray
-    gap: np.ndarray
-    prior_gap: np.ndarray
-    contact: np.ndarray
-    quat_WL: Mapping[str, np.ndarray]
-    measured_lengths: Mapping[str, MeasuredLength]
-    hinge_rms: Mapping[str, float] = field(default_factory=dict)
-    exchanged: Mapping[str, str] = field(default_factory=dict)
-    posed: Mapping[str, float] = field(default_factory=dict)
-    formulation: str = "full"
+    problem: CalibrationProblem  # that was solved, without what is not used
+    subject: Subject  # calibrated
+    effective_sample_size: float  # of the gap
+    scale_std: float  # relative standard deviation of the common scale of all lengths
+    remarks: tuple[Diagnostic, ...]  # what is worth knowing, without what the quality says
+    time: np.ndarray  # (n,) [s] of the samples
+    gap: np.ndarray  # (n,) [m] size of the gap as estimated; NaN outside of closures
+    prior_gap: np.ndarray  # (n,) [m] the same with the prior's lengths
+    contact: np.ndarray  # (n,) weight of each sample's gap, near 0 where the palms are apart
+    quat_WL: Mapping[str, np.ndarray]  # segment → (n, 4) xyzw at each sample, as tracking gives it
+    measured_lengths: Mapping[str, MeasuredLength]  # beside the estimates without them
+    hinge_rms: Mapping[str, float] = field(default_factory=dict)  # joint → [rad] of the segment below off its plane
+    exchanged: Mapping[str, str] = field(default_factory=dict)  # segment → label of the sensor on it, where they differ
+    posed: Mapping[str, float] = field(default_factory=dict)  # phase of poses → standard deviations off all else
+    formulation: str = "full"  # or "paper"
     quality: CalibrationQuality = field(default_factory=CalibrationQuality)
 
     @property

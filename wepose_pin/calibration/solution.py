@@ -49,7 +49,7 @@ def solve_problem(problem: CalibrationProblem, *, quick: bool = False) -> Calibr
     """
     observations, samples = problem.observe(QUICK_RATE_HZ if quick else SAMPLE_RATE_HZ)
     layout, prior = observations.layout, build_prior(problem, observations)
-    couplings = [] if quick and not problem.is_free_motion else problem.couplings
+    couplings = [] if quick and problem.protocol.closures else problem.couplings
     stated = problem.stated_headings(layout.sensors)
     is_free = np.array([name not in stated for name in layout.sensors])
 

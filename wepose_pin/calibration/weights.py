@@ -65,7 +65,7 @@ def _list_blocks(observations: Observations, contact: np.ndarray, hinges: bool =
     blocks = []
     for condition, span in observations.spans():
         if isinstance(condition, Loop):
-            blocks.append(_Block(span, slice(condition.rows), contact[span]))
+            blocks.append(_Block(span, slice(condition.closure.rows), contact[span]))
             if observations.layout.hinges and hinges:
                 blocks.append(_Block(span, slice(GAP_ROWS, None), np.ones(span.stop - span.start)))
     return [block for block in blocks if block.contact.sum() > 0.0]
@@ -96,11 +96,12 @@ def solve_reweighted(
         x, weights = fit.x, weights.copy()
         for closure, span in observations.spans():
             if isinstance(closure, Loop):
-                r, least = fit.closure[span, : closure.rows], MIN_LATE_CONTACT if k > 1 else MIN_CONTACT
+                rows = closure.closure.rows
+                r, least = fit.closure[span, :rows], MIN_LATE_CONTACT if k > 1 else MIN_CONTACT
                 # The lower third: the palms may be apart for half of the phase and more.
                 size = np.sum(r**2, axis=1)
-                usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[closure.rows], LEAST_VARIANCE)
-                weight = (1.0 + size / (usual * OUTLIER**2 * closure.rows)) ** -2
+                usual = max(float(np.quantile(size, 0.3)) / THIRD_CHI2[rows], LEAST_VARIANCE)
+                weight = (1.0 + size / (usual * OUTLIER**2 * rows)) ** -2
                 contact[span] = np.where(weight > least, weight, 0.0)
         for block in _list_blocks(observations, contact, hinges=not quick):
             variance, correlated = block.measure(fit.residuals, correlation)

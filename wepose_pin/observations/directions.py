@@ -20,7 +20,6 @@ class Pointing:
     along: Vector
     direction: Vector
     std: float
-    rows: int = 3
 
     def residual(self, quat_WL: Mapping[str, ca.SX]) -> ca.SX:
         """Return by how much the segment is off its direction (3,), in units of `std`."""
@@ -35,7 +34,6 @@ class Level:
     segment: str
     axis: Vector
     std: float
-    rows: int = 1
 
     def residual(self, quat_WL: Mapping[str, ca.SX], start: ca.SX) -> ca.SX:
         """Return how far the axis has risen since `start` (4,), its `quat_WL` before it bent, in units of `std`."""
