@@ -126,7 +126,8 @@ def _check_lengths(calibration: Calibration, motion: Mapping[str, float]) -> lis
         summed = [name for name in group if name in names]
         if summed:
             take = np.isin(names, summed).astype(float)
-            uncertain = Diagnostic("length-uncertain", INFO, " + ".join(summed), float(take @ shape @ take) ** 0.5)
+            std = float(np.sqrt(max(take @ shape @ take, 0.0)))
+            uncertain = Diagnostic("length-uncertain", INFO, " + ".join(summed), std)
             checks.append(_check(uncertain, LENGTH, _find_cause(calibration, motion, table.segments[sensor].spine)))
     if not scale_observed:
         facts = {"measured": problem.measured_example}
