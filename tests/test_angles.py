@@ -274,7 +274,7 @@ PLAIN = {
     "hand_to_its_palm": ({"hand": {"x": 30.0}}, {"wrist": {"flexion": 30.0, "ulnar_deviation": 0.0, "pronation": 0.0}}),
     "hand_to_the_thumb": ({"hand": {"y": -20.0}}, {"wrist": {"flexion": 0.0, "ulnar_deviation": -20.0}}),
     "hand_to_the_little_finger": ({"hand": {"y": 20.0}}, {"wrist": {"flexion": 0.0, "ulnar_deviation": 20.0}}),
-    "upright": ({}, {joint: dict.fromkeys(JOINTS[f"right_{joint}"].names, 0.0) for joint in ("hip", "knee", "ankle")}),
+    "upright": ({}, {joint: dict.fromkeys(JOINTS[f"right_{joint}"].angles, 0.0) for joint in ("hip", "knee", "ankle")}),
     "thigh_forward": ({"thigh": {"y": -90.0}}, {"hip": {"flexion": 90.0, "adduction": 0.0, "internal_rotation": 0.0}}),
     "thigh_outward": ({"thigh": {"x": -20.0}}, {"hip": {"flexion": 0.0, "adduction": -20.0}}),
     "thigh_turned_inward": ({"thigh": {"z": 15.0}}, {"hip": {"adduction": 0.0, "internal_rotation": 15.0}}),
@@ -323,7 +323,7 @@ def test_a_trunk_leans_back_and_right_and_turns_left_in_the_positive(
 
 @pytest.mark.parametrize("name", ["XZY", "ZXY"])
 def test_the_other_sequences_of_the_shoulder_name_what_they_turn(name: str) -> None:
-    names = SHOULDER_SEQUENCES[name]
+    names = tuple(SHOULDER_SEQUENCES[name])
     turns = {"flexion": turned(y=-30.0), "adduction": turned(x=30.0), "internal_rotation": turned(z=30.0)}
     for angle, turn in turns.items():
         shoulder = joint_angles(pose_with({"right_upper_arm": turn}), name)["right_shoulder"]
@@ -499,7 +499,7 @@ def test_the_table_is_in_degrees_and_keeps_the_rotation() -> None:
     assert table["right_shoulder_near_lock"].all()
     assert "left_elbow_flexion_std_deg" not in table.columns
     quat = table.select([f"right_elbow_{c}" for c in ("qx", "qy", "qz", "qw")]).to_numpy()
-    values = np.radians(table.select([f"right_elbow_{a}_deg" for a in JOINTS["right_elbow"].names]).to_numpy())
+    values = np.radians(table.select([f"right_elbow_{a}_deg" for a in JOINTS["right_elbow"].angles]).to_numpy())
     assert (Rotation.from_quat(quat).inv() * Rotation.from_euler("ZXY", values)).magnitude().max() < 1e-12
 
 

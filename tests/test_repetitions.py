@@ -29,7 +29,7 @@ def angles_of(flexion_deg: np.ndarray, rate_hz: float = RATE, **joints: np.ndarr
         {
             name: JointAngles(
                 "ZXY",
-                JOINTS[name].names,
+                tuple(JOINTS[name].angles),
                 np.radians(each),
                 np.ones(n),
                 never.copy(),

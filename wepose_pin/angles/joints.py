@@ -47,59 +47,100 @@ _MIRRORED_TURN = np.array([-1.0, 1.0, -1.0])
 NEAR_LOCK = float(np.radians(10.0))
 MAX_NEAR_LOCK = 0.01  # of the samples: of an angle that is read as a whole
 
-# The names say where an angle is positive. Elevation alone is negative where the arm is raised in the plane of
-# elevation, as the ISB has it.
-SHOULDER_SEQUENCES = {
-    "YXY": ("plane_of_elevation", "elevation", "internal_rotation"),  # Wu 2005, 2.4.7
-    "XZY": ("adduction", "flexion", "internal_rotation"),
-    "ZXY": ("flexion", "adduction", "internal_rotation"),
+# Sequence of a shoulder's angles → their names and where each is positive. Elevation alone is negative where the arm is
+# raised in the plane of elevation, as the ISB has it.
+_ROTATION = {"internal_rotation": "inward"}
+_ADDUCTION = {"adduction": "arm towards the body (abduction is negative)"}
+SHOULDER_SEQUENCES: dict[str, dict[str, str]] = {
+    "YXY": {  # Wu 2005, 2.4.7
+        "plane_of_elevation": "0° out to the side, 90° forward, −90° backward",
+        "elevation": "on the far side of the plane of elevation; −90° is horizontal in that plane",
+        **_ROTATION,
+    },
+    "XZY": {**_ADDUCTION, "flexion": "arm forward", **_ROTATION},
+    "ZXY": {"flexion": "arm forward", **_ADDUCTION, **_ROTATION},
 }
 AUTO = "auto"  # the sequence of `choose_shoulder_sequence`
 
 
 class Joint(NamedTuple):
-    """A joint's two segments and the names of its angles.
+    """A joint's two segments and its angles.
 
     Parameters
     ----------
     sequence : empty for the shoulder's choice
+    angles : name → where it is positive
     axes : where X, Y, Z of both segments point in our frame of them; None: as `ISB_AXES` has them
     """
 
     proximal: str
     distal: str
     sequence: str
-    names: tuple[str, ...]
+    angles: Mapping[str, str]
     axes: tuple[str, str, str] | None = None
+
+
+_ELBOW = {  # Wu 2005, 3.4.1
+    "flexion": "bent",
+    "carrying_angle": "forearm towards the body; the carrying angle of a straight arm is negative",
+    "pronation": "0° palm forward (supinated), 90° thumb forward, 180° palm back",
+}
+_WRIST = {  # 4.4.1
+    "flexion": "towards the palm",
+    "ulnar_deviation": "towards the little finger",
+    "pronation": "as in the forearm",
+}
+_HIP = {  # Wu 2002
+    "flexion": "thigh forward",
+    "adduction": "thigh towards the other (abduction is negative)",
+    "internal_rotation": "inward",
+}
+_KNEE = {  # Grood and Suntay 1983
+    "flexion": "bent",
+    "adduction": "ankle towards the other (bow legs, varus)",
+    "external_rotation": "toes outward",
+}
+_ANKLE = {  # Wu 2002
+    "dorsiflexion": "toes up (plantar flexion is negative)",
+    "inversion": "sole inward",
+    "internal_rotation": "toes inward",
+}
+_THORAX = {  # Wu 2005, 2.4.1
+    "extension": "leaning back (a bow is negative)",
+    "lateral_flexion_right": "leaning to the right",
+    "axial_rotation_left": "turned to the left",
+}
+_PELVIS = {
+    "posterior_tilt": "tilted back (an anterior tilt is negative)",
+    "obliquity_right_down": "the right side down",
+    "axial_rotation_left": "turned to the left",
+}
 
 
 def _arm(side: str) -> dict[str, Joint]:
     upper_arm, forearm, hand = f"{side}_upper_arm", f"{side}_forearm", f"{side}_hand"
     return {
-        f"{side}_shoulder": Joint("torso", upper_arm, "", ()),
-        f"{side}_elbow": Joint(upper_arm, forearm, "ZXY", ("flexion", "carrying_angle", "pronation")),  # 3.4.1
-        f"{side}_wrist": Joint(forearm, hand, "ZXY", ("flexion", "ulnar_deviation", "pronation")),  # 4.4.1
+        f"{side}_shoulder": Joint("torso", upper_arm, "", {}),
+        f"{side}_elbow": Joint(upper_arm, forearm, "ZXY", _ELBOW),
+        f"{side}_wrist": Joint(forearm, hand, "ZXY", _WRIST),
     }
 
 
 def _leg(side: str) -> dict[str, Joint]:
     thigh, shank, foot = f"{side}_thigh", f"{side}_shank", f"{side}_foot"
-    knee = ("flexion", "adduction", "external_rotation")  # Grood and Suntay 1983
     return {
-        f"{side}_hip": Joint("pelvis", thigh, "ZXY", ("flexion", "adduction", "internal_rotation")),  # Wu 2002
-        f"{side}_knee": Joint(thigh, shank, "ZXY", knee, KNEE_AXES),
-        f"{side}_ankle": Joint(shank, foot, "ZXY", ("dorsiflexion", "inversion", "internal_rotation")),  # Wu 2002
+        f"{side}_hip": Joint("pelvis", thigh, "ZXY", _HIP),
+        f"{side}_knee": Joint(thigh, shank, "ZXY", _KNEE, KNEE_AXES),
+        f"{side}_ankle": Joint(shank, foot, "ZXY", _ANKLE),
     }
 
 
 JOINTS = {
-    "thorax": Joint("world", "torso", "ZXY", ("extension", "lateral_flexion_right", "axial_rotation_left")),  # 2.4.1
+    "thorax": Joint("world", "torso", "ZXY", _THORAX),
     **_arm("left"),
     **_arm("right"),
     # In the axes of Wu 2002, who give no sequence in W: the thorax's. A table has the segment's columns as "pelvis".
-    "pelvis_in_world": Joint(
-        "world", "pelvis", "ZXY", ("posterior_tilt", "obliquity_right_down", "axial_rotation_left")
-    ),
+    "pelvis_in_world": Joint("world", "pelvis", "ZXY", _PELVIS),
     **_leg("left"),
     **_leg("right"),
 }
@@ -258,7 +299,7 @@ def joint_angles(pose: Pose | TrackResult, sequence: str = "YXY") -> Angles:
     for name, joint in JOINTS.items():
         if joint.distal in pose.quat_WL and (joint.proximal == "world" or joint.proximal in pose.quat_WL):
             if not joint.sequence:
-                joint = joint._replace(sequence=sequence, names=SHOULDER_SEQUENCES[sequence])
+                joint = joint._replace(sequence=sequence, angles=SHOULDER_SEQUENCES[sequence])
             joints[name] = _angles(pose, joint, name.startswith("left_"))
     if not joints:
         raise BadData(
@@ -277,9 +318,9 @@ def choose_shoulder_sequence(pose: Pose) -> str:
     arm that hangs is in its lock.
     """
     shares = dict.fromkeys(SHOULDER_SEQUENCES, 0.0)
-    for sequence, names in SHOULDER_SEQUENCES.items():
+    for sequence, named in SHOULDER_SEQUENCES.items():
         for side in ("left", "right"):
-            joint = JOINTS[f"{side}_shoulder"]._replace(sequence=sequence, names=names)
+            joint = JOINTS[f"{side}_shoulder"]._replace(sequence=sequence, angles=named)
             if {joint.proximal, joint.distal} <= set(pose.quat_WL):
                 near_lock = _angles(pose, joint, side == "left").near_lock
                 shares[sequence] = max(shares[sequence], float(np.mean(near_lock)))
@@ -303,7 +344,7 @@ def _angles(pose: Pose, joint: Joint, left: bool) -> JointAngles:
     gimbal = _expand(known, angles.gimbal)
     return JointAngles(
         joint.sequence,
-        joint.names,
+        tuple(joint.angles),
         _expand(known, values),
         gimbal,
         gimbal < NEAR_LOCK,

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import polars as pl
+from scipy.special import stdtrit
 
 from .curves import PERCENT
-from .joints import Angles, group_sides
-from .movement import MEASURES, JointMeasures, Movement, compare_measures, measure_spans
+from .joints import JOINTS, SHOULDER_SEQUENCES, group_sides
+from .movement import MEASURES, Movement, measure_spans
 from .tables import angle_table
 
 SOURCE = (
@@ -19,75 +20,27 @@ SOURCE = (
     "Grood and Suntay 1983 (J Biomech Eng 105:136-144) for the knee"
 )
 
-# Joint without its side → the distal segment in the proximal one.
-ROTATIONS = {
-    "thorax": "thorax in W",
-    "shoulder": "upper arm in thorax",
-    "elbow": "forearm in upper arm",
-    "wrist": "hand in forearm",
-    "pelvis_in_world": "pelvis in W",
-    "hip": "thigh in pelvis",
-    "knee": "shank in thigh",
-    "ankle": "foot in shank",
-}
-# Joint without its side and angle → where the angle is positive.
-POSITIVE = {
-    ("thorax", "extension"): "leaning back (a bow is negative)",
-    ("thorax", "lateral_flexion_right"): "leaning to the right",
-    ("thorax", "axial_rotation_left"): "turned to the left",
-    ("shoulder", "plane_of_elevation"): "0° out to the side, 90° forward, −90° backward",
-    ("shoulder", "elevation"): "on the far side of the plane of elevation; −90° is horizontal in that plane",
-    ("shoulder", "internal_rotation"): "inward",
-    ("shoulder", "adduction"): "arm towards the body (abduction is negative)",
-    ("shoulder", "flexion"): "arm forward",
-    ("elbow", "flexion"): "bent",
-    ("elbow", "carrying_angle"): "forearm towards the body; the carrying angle of a straight arm is negative",
-    ("elbow", "pronation"): "0° palm forward (supinated), 90° thumb forward, 180° palm back",
-    ("wrist", "flexion"): "towards the palm",
-    ("wrist", "ulnar_deviation"): "towards the little finger",
-    ("wrist", "pronation"): "as in the forearm",
-    ("pelvis_in_world", "posterior_tilt"): "tilted back (an anterior tilt is negative)",
-    ("pelvis_in_world", "obliquity_right_down"): "the right side down",
-    ("pelvis_in_world", "axial_rotation_left"): "turned to the left",
-    ("hip", "flexion"): "thigh forward",
-    ("hip", "adduction"): "thigh towards the other (abduction is negative)",
-    ("hip", "internal_rotation"): "inward",
-    ("knee", "flexion"): "bent",
-    ("knee", "adduction"): "ankle towards the other (bow legs, varus)",
-    ("knee", "external_rotation"): "toes outward",
-    ("ankle", "dorsiflexion"): "toes up (plantar flexion is negative)",
-    ("ankle", "inversion"): "sole inward",
-    ("ankle", "internal_rotation"): "toes inward",
-}
+_WORDS = {"torso": "thorax", "world": "W"}
 
 
-class Definition(NamedTuple):
-    """One angle of the joints of a group, left and right alike."""
-
-    group: str  # the joint without its side
-    rotation: str  # as "forearm in upper arm"
-    sequence: str
-    axis: str  # of the sequence
-    angle: str
-    positive: str
-
-
-def define_angles(sessions: Iterable[Angles]) -> list[Definition]:
-    """Return the definition of each angle that there is in a session, once."""
-    definitions: dict[Definition, None] = {}
-    for angles in sessions:
-        for group, members in group_sides(angles.joints).items():
-            joint = angles[next(iter(members.values()))]
-            for axis, name in zip(joint.sequence, joint.names, strict=True):
-                definition = Definition(group, ROTATIONS[group], joint.sequence, axis, name, POSITIVE[group, name])
-                definitions[definition] = None
-    return list(definitions)
+def describe_joint(name: str) -> str:
+    """Describe the rotation that a joint's angles are of, as "forearm in upper arm"."""
+    parts = [part.removeprefix("left_").removeprefix("right_") for part in (JOINTS[name].distal, JOINTS[name].proximal)]
+    return " in ".join(_WORDS.get(part, part.replace("_", " ")) for part in parts)
 
 
 def build_definition_table(movements: Sequence[Movement]) -> pl.DataFrame:
-    """What each angle is: sequence, axis, where it is positive, and the source."""
-    definitions = define_angles(movement.angles for movement in movements)
-    return pl.DataFrame([{**each._asdict(), "source": SOURCE} for each in definitions]).rename({"group": "joint"})
+    """What each angle is: sequence, axis, where it is positive, and the source; left and right alike."""
+    rows: dict[tuple[str, ...], None] = {}
+    for movement in movements:
+        for group, members in group_sides(movement.angles.joints).items():
+            name = next(iter(members.values()))
+            joint, rotation = movement.angles[name], describe_joint(name)
+            positive = JOINTS[name].angles or SHOULDER_SEQUENCES[joint.sequence]
+            for axis, angle in zip(joint.sequence, joint.names, strict=True):
+                rows[group, rotation, joint.sequence, axis, angle, positive[angle], SOURCE] = None
+    names = ["joint", "rotation", "sequence", "axis", "angle", "positive", "source"]
+    return pl.DataFrame(list(rows), schema=names, orient="row")
 
 
 def build_angle_table(movements: Sequence[Movement]) -> pl.DataFrame:
@@ -101,6 +54,7 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
     rows = []
     for movement in movements:
         time, repetitions = movement.angles.time, movement.repetitions
+        seconds = np.diff(repetitions.spans, axis=1)
         rows.append(
             {
                 "session": movement.name,
@@ -110,8 +64,8 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
                 "repetitions_by": repetitions.source,
                 "first": {None: "", True: "rising", False: "falling"}[repetitions.rising],
                 "n": len(repetitions.spans),
-                "duration_mean_s": movement.duration.mean,
-                "duration_sd_s": movement.duration.sd,
+                "duration_mean_s": float(seconds.mean()) if len(seconds) else float("nan"),
+                "duration_sd_s": float(seconds.std(ddof=1)) if len(seconds) > 1 else float("nan"),
                 "cmc": repetitions.cmc,
                 "left_out": repetitions.left_out,
                 "why_none": repetitions.reason,
@@ -122,54 +76,62 @@ def build_session_table(movements: Sequence[Movement]) -> pl.DataFrame:
 
 def build_phase_table(movements: Sequence[Movement]) -> pl.DataFrame:
     """A row an angle in all of the selected time, and in each interval of a phase that lies in it."""
-    rows: list[dict[str, Any]] = []
+    tables = []
     for movement in movements:
         time = movement.angles.time
         parts = [("all", 1, (float(time[0]), float(time[-1])))]
         parts += [(name, k, span) for name, spans in movement.phases.items() for k, span in enumerate(spans, 1)]
+        about = [
+            {"session": movement.name, "phase": name, "number": k, "from_s": begin, "to_s": end}
+            for name, k, (begin, end) in parts
+        ]
         measures = measure_spans(movement.pose, movement.angles, [span for _, _, span in parts])
-        for row, (name, k, (begin, end)) in enumerate(parts):
-            about = {"session": movement.name, "phase": name, "number": k, "from_s": begin, "to_s": end}
-            rows += [{**about, **angle} for angle in _list_measures(movement, measures, row)]
-    return pl.DataFrame(rows)
+        tables.append(_put_first(about, measures))
+    return pl.concat(tables)
 
 
 def build_repetition_table(movements: Sequence[Movement]) -> pl.DataFrame:
     """A row an angle in each repetition."""
-    rows: list[dict[str, Any]] = []
-    for movement in movements:
-        for row, (begin, end) in enumerate(movement.repetitions.spans.tolist()):
-            about = {"session": movement.name, "repetition": row + 1, "from_s": begin, "to_s": end}
-            about["duration_s"] = end - begin
-            rows += [{**about, **angle} for angle in _list_measures(movement, movement.measures, row)]
-    return pl.DataFrame(rows)
+    tables = []
+    for movement in (movement for movement in movements if len(movement.measures)):
+        about = [
+            {
+                **{"session": movement.name, "repetition": k, "from_s": begin, "to_s": end},
+                "duration_s": end - begin,
+            }
+            for k, (begin, end) in enumerate(movement.repetitions.spans.tolist(), 1)
+        ]
+        tables.append(_put_first(about, movement.measures))
+    return pl.concat(tables) if tables else pl.DataFrame()
 
 
-def _list_measures(movement: Movement, measures: Mapping[str, JointMeasures], row: int) -> Iterator[dict[str, Any]]:
-    for name, joint in movement.angles.joints.items():
-        joint_measures = measures[name]
-        for k, angle in enumerate(joint.names):
-            cells: dict[str, Any] = {"joint": name, "angle": angle, "sequence": joint.sequence}
-            values, stds = np.degrees(joint_measures.values[row, k]), np.degrees(joint_measures.std[row, k])
-            for (measure, unit), value, std in zip(MEASURES.items(), values.tolist(), stds.tolist(), strict=True):
-                cells |= {f"{measure}_{unit}": value, f"{measure}_std_{unit}": std}
-            yield {**cells, "near_lock": float(joint_measures.near_lock[row]), "gap": float(joint_measures.gap[row])}
+def _put_first(about: Sequence[Mapping[str, Any]], measures: pl.DataFrame) -> pl.DataFrame:
+    """Put what is known of each span before its measures."""
+    spans = pl.DataFrame(about).with_row_index("span").cast({"span": pl.Int64})
+    return spans.join(measures, on="span", maintain_order="left_right").drop("span")
 
 
 def build_summary_table(movements: Sequence[Movement]) -> pl.DataFrame:
     """A row an angle of each session: mean and standard deviation over repetitions, what is stated, and the CMC."""
-    rows = []
-    for movement in (movement for movement in movements if movement.curves):
-        for name, joint in movement.angles.joints.items():
-            for k, angle in enumerate(joint.names):
-                cells: dict[str, Any] = {"session": movement.name, "joint": name, "angle": angle}
-                cells |= {"sequence": joint.sequence, "repetitions": len(movement.repetitions.spans)}
-                for (measure, unit), each in zip(MEASURES.items(), movement.measures[name].statistics(k), strict=True):
-                    cells |= {f"{measure}_n": each.n} if measure in ("range", "peak_rate") else {}
-                    for part in ("mean", "sd", "std"):
-                        cells[f"{measure}_{part}_{unit}"] = float(np.degrees(getattr(each, part)))
-                rows.append({**cells, "cmc": movement.curves[name][k].cmc})
-    return pl.DataFrame(rows)
+    repetitions = build_repetition_table(movements)
+    if not len(repetitions):
+        return pl.DataFrame()
+    columns = [pl.len().alias("repetitions")]
+    for measure, unit in MEASURES.items():
+        value = pl.col(f"{measure}_{unit}").fill_nan(None)
+        std = pl.col(f"{measure}_std_{unit}").fill_nan(None).filter(value.is_not_null())
+        columns.append(value.count().alias(f"{measure}_n"))
+        columns += [value.mean().alias(f"{measure}_mean_{unit}"), value.std().alias(f"{measure}_sd_{unit}")]
+        columns.append(std.pow(2).mean().sqrt().alias(f"{measure}_std_{unit}"))
+    names = ("session", "joint", "angle", "sequence")
+    cmc = [
+        {"session": movement.name, "joint": joint, "angle": angle, "cmc": curve.cmc}
+        for movement in movements
+        for joint, curves in movement.curves.items()
+        for angle, curve in zip(movement.angles[joint].names, curves, strict=True)
+    ]
+    table = repetitions.group_by(*names, maintain_order=True).agg(columns).fill_null(float("nan"))
+    return table.join(pl.DataFrame(cmc), on=names[:3], maintain_order="left")
 
 
 def build_curve_table(movements: Sequence[Movement]) -> pl.DataFrame:
@@ -190,18 +152,44 @@ def build_curve_table(movements: Sequence[Movement]) -> pl.DataFrame:
 
 def build_comparison_table(movements: Sequence[Movement]) -> pl.DataFrame:
     """Each further session against the first, a row a measure of each angle that both have."""
+    summary = build_summary_table(movements)
+    sessions = summary["session"].unique(maintain_order=True).to_list() if len(summary) else []
     rows: list[dict[str, Any]] = []
-    repeated = [movement for movement in movements if movement.curves]
-    for movement in repeated[1:]:
-        first = repeated[0]
-        for name in (name for name in first.curves if name in movement.curves):
-            for k, angle in enumerate(first.angles[name].names):
-                about = {"session": movement.name, "against": first.name, "joint": name, "angle": angle}
-                compared = compare_measures(first.measures[name], movement.measures[name], k)
-                for (measure, unit), (one, two, difference) in zip(MEASURES.items(), compared, strict=True):
-                    numbers = {"first_mean": one.mean, "first_sd": one.sd, "mean": two.mean, "sd": two.sd}
-                    numbers |= {"difference": difference.value, "ci95_low": difference.low}
-                    numbers |= {"ci95_high": difference.high, "difference_std": difference.std}
-                    about_n = {"measure": measure, "unit": unit.replace("_", "/"), "first_n": one.n, "n": two.n}
-                    rows.append({**about, **about_n, **{key: float(np.degrees(v)) for key, v in numbers.items()}})
+    for session in sessions[1:]:
+        against, further = (summary.filter(pl.col("session") == each) for each in (sessions[0], session))
+        for row in against.join(further, on=("joint", "angle"), maintain_order="left").iter_rows(named=True):
+            # Angles of a session may be a full turn on.
+            shift = sum(row[f"{end}_mean_deg_right"] - row[f"{end}_mean_deg"] for end in ("lowest", "highest"))
+            turns = float(np.nan_to_num(360.0 * np.round(0.5 * shift / 360.0)))
+            for measure, unit in MEASURES.items():
+                parts = ("n", f"mean_{unit}", f"sd_{unit}", f"std_{unit}")
+                first = [row[f"{measure}_{part}"] for part in parts]
+                second = [row[f"{measure}_{part}_right"] for part in parts]
+                second[1] -= turns if measure in ("lowest", "highest") else 0.0
+                low, high = compute_interval((first[0], first[1], first[2]), (second[0], second[1], second[2]))
+                rows.append(
+                    {
+                        **{"session": session, "against": sessions[0], "joint": row["joint"], "angle": row["angle"]},
+                        **{"measure": measure, "unit": unit.replace("_", "/"), "first_n": first[0], "n": second[0]},
+                        **{"first_mean": first[1], "first_sd": first[2], "mean": second[1], "sd": second[2]},
+                        **{"difference": second[1] - first[1], "ci95_low": low, "ci95_high": high},
+                        "difference_std": float(np.hypot(first[3], second[3])),
+                    }
+                )
     return pl.DataFrame(rows)
+
+
+def compute_interval(first: tuple[int, float, float], second: tuple[int, float, float]) -> tuple[float, float]:
+    """Compute the 95 % interval (Welch 1947) of a difference of means, by n, mean and standard deviation of each.
+
+    It is from the spread of the values alone; NaN where there are fewer than two of either.
+    """
+    value = second[1] - first[1]
+    if min(first[0], second[0]) < 2:
+        return float("nan"), float("nan")
+    a, b = first[2] ** 2 / first[0], second[2] ** 2 / second[0]
+    half = 0.0
+    if a + b > 0.0:
+        freedom = (a + b) ** 2 / (a**2 / (first[0] - 1) + b**2 / (second[0] - 1))
+        half = float(stdtrit(freedom, 0.975) * np.sqrt(a + b))
+    return value - half, value + half
