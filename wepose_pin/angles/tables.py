@@ -9,7 +9,6 @@ import polars as pl
 from scipy.spatial.transform import Rotation
 
 from ..body.kinematics import Pose
-from ..rotations import conjugate, multiply
 from .joints import JOINTS, Angles, JointAngles, compute_gradients
 
 # Rates are means over this time [s], to the nearest whole number of samples: noise of the orientation is divided by it,
@@ -20,13 +19,12 @@ RATE_WINDOW_S = 0.05
 class JointSummary(NamedTuple):
     """One joint over a recording; the three angles in the order of its `names`. NaN where no sample is left.
 
-    Gaps count nowhere; what is near the lock counts in the lowest and highest of the second angle and in `peak_speed`.
+    Gaps count nowhere; what is near the lock counts in the lowest and highest of the second angle.
     """
 
     lowest: np.ndarray  # (3,) [rad]
     highest: np.ndarray  # (3,) [rad]
     peak_rate: np.ndarray  # (3,) [rad/s], the greatest absolute rate of the angle over `RATE_WINDOW_S`
-    peak_speed: float  # [rad/s], greatest length of the joint's angular velocity over `RATE_WINDOW_S`
     near_lock: float  # share of the samples
     gap: float  # share of the samples
     samples: np.ndarray  # (3, 4) int: of the lowest, the highest, begin and end of the fastest; −1 where there is none
@@ -44,8 +42,8 @@ def summary(angles: Angles) -> dict[str, JointSummary]:
 
 def summarize_joint(time: np.ndarray, joint: JointAngles, part: slice = slice(None)) -> JointSummary:
     """Range of motion and peak rates of one joint in a part of the samples; `time` (n,) [s]."""
-    time, values, quat, gap = time[part], joint.values[part], joint.quat[part], joint.gap[part]
-    near_lock, start = joint.near_lock[part], part.start or 0
+    time, values, gap, near_lock = time[part], joint.values[part], joint.gap[part], joint.near_lock[part]
+    start = part.start or 0
     m = _window(time)
     span = time[m:] - time[:-m]
     lowest, highest, peak_rate = (np.full(3, np.nan) for _ in range(3))
@@ -62,12 +60,7 @@ def summarize_joint(time: np.ndarray, joint: JointAngles, part: slice = slice(No
             first = start + sound[rates.argmax()]
             samples[k, 2:] = first, first + m
             peak_rate[k] = rates.max()
-    whole = _without_bad(gap, m)
-    turn = multiply(conjugate(quat[:-m][whole]), quat[m:][whole])
-    speed = 2.0 * np.arctan2(np.linalg.norm(turn[:, :3], axis=1), np.abs(turn[:, 3])) / span[whole]
-    peak_speed = float(speed.max()) if len(speed) else float("nan")
-    shares = float(np.mean(near_lock)), float(np.mean(gap))
-    return JointSummary(lowest, highest, peak_rate, peak_speed, *shares, samples)
+    return JointSummary(lowest, highest, peak_rate, float(np.mean(near_lock)), float(np.mean(gap)), samples)
 
 
 def _window(time: np.ndarray) -> int:
@@ -142,7 +135,6 @@ def summary_table(angles: Angles) -> pl.DataFrame:
                     "highest_deg": np.degrees(ranges.highest[k]),
                     "range_deg": np.degrees(ranges.range[k]),
                     "peak_rate_deg_s": np.degrees(ranges.peak_rate[k]),
-                    "joint_peak_speed_deg_s": np.degrees(ranges.peak_speed),
                     "joint_near_lock": ranges.near_lock,
                     "joint_gap": ranges.gap,
                 }

@@ -1,7 +1,7 @@
 """Registration of a reference to a pose: clock, world and frames, from seconds that are not scored.
 
 The first third of the pose's time is for that, the rest is scored. The offset of the clocks is where the speeds of what
-both have correlate best: rates of segments, or of points about one of them, which no choice of world or frame changes.
+both have correlate best: rates of segments, which no choice of world or frame changes.
 The reference's world is upright, so only its heading is fitted; which of its axes is up, where its format does not say
 so, is what the fit comes nearest to. Frames of segments are a constant rotation each, fitted where it is asked for:
 what is scored is then without any constant error of mounts and frames.
@@ -15,13 +15,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from ..body.kinematics import Pose
 from ..errors import BadData
 from ..recording import AXES, format_span
 from ..rotations import conjugate, multiply
-from .sampling import sample_orientations, sample_points
 
 FITTED = 1.0 / 3.0  # share of the time that is not scored
 SHORTEST_S = 2.0  # [s] of it
@@ -29,6 +28,8 @@ STEP_S = 0.02  # [s] of the speeds that are correlated
 TURN_S = 0.1  # [s] over which a speed is taken
 LEAST_CORRELATION = 0.5
 UPRIGHT = np.cos(np.radians(30.0))  # of the axis that is up to the vertical
+LONGEST_GAP_S = 0.1  # [s] between known samples, or twice their usual step, beyond which nothing is interpolated
+_ROUNDING_S = 1e-9  # [s] by which equal times may differ
 
 
 @dataclass(frozen=True)
@@ -74,13 +75,10 @@ def register(
     """
     segments = [name for name in pose.quat_WL if _is_known(truth.quat_WL.get(name))]
     names = [name for name in pose.points if _is_known(truth.points.get(name))]
-    if not segments and len(names) < 3:
-        raise BadData(
-            f"pose and reference have {', '.join(names) or 'nothing'} in common; a segment with its orientation, or "
-            f"three points, are needed to align them"
-        )
-    pose = Pose(pose.time, {s: pose.quat_WL[s] for s in segments}, {p: pose.points[p] for p in names})
-    common = Pose(truth.time, {s: truth.quat_WL[s] for s in segments}, {p: truth.points[p] for p in names})
+    if not segments:
+        raise BadData("pose and reference have no segment in common, whose orientation is needed to align them")
+    pose = replace(pose, quat_WL={segment: pose.quat_WL[segment] for segment in segments})
+    common = replace(truth, quat_WL={segment: truth.quat_WL[segment] for segment in segments})
     begin, end = float(pose.time[0]), float(pose.time[-1])
     fit_end = begin + FITTED * (end - begin)
     correlation = float("nan")
@@ -156,8 +154,13 @@ def _find_offset(pose: Pose, truth: Pose, fitted: tuple[float, float]) -> tuple[
 
     def compute_loss(offset: float) -> float:
         """1 less the mean correlation, without the samples' steps."""
-        shifted = _compute_speeds(truth, fitted[0] - offset, fitted[1] - offset)
-        return 1.0 - float(np.mean([_compare(a, b) for a, b in zip(ours, shifted[:, : ours.shape[1]], strict=True)]))
+        correlations = []
+        for a, b in zip(ours, _compute_speeds(truth, fitted[0] - offset, fitted[1] - offset), strict=True):
+            n = min(len(a), len(b))
+            both = np.isfinite(a[:n]) & np.isfinite(b[:n])
+            moved = both.sum() > 2 and min(a[:n][both].std(), b[:n][both].std()) > 0.0
+            correlations.append(np.corrcoef(a[:n][both], b[:n][both])[0, 1] if moved else 0.0)
+        return 1.0 - float(np.mean(correlations))
 
     minimum = minimize_scalar(
         compute_loss, bounds=(coarse - STEP_S, coarse + STEP_S), method="bounded", options={"xatol": 1e-4}
@@ -166,7 +169,7 @@ def _find_offset(pose: Pose, truth: Pose, fitted: tuple[float, float]) -> tuple[
 
 
 def _compute_speeds(pose: Pose, begin: float, end: float) -> np.ndarray:
-    """Compute speeds (k, n) every `STEP_S`: of segments [rad/s], or of points about the first [m/s]; NaN: unknown."""
+    """Compute the speeds (k, n) [rad/s] of segments every `STEP_S`; NaN: unknown."""
     grid = begin + STEP_S * np.arange(int((end - begin) / STEP_S) + 1)
     ends = grid - 0.5 * TURN_S, grid + 0.5 * TURN_S
     speeds = []
@@ -175,11 +178,6 @@ def _compute_speeds(pose: Pose, begin: float, end: float) -> np.ndarray:
         cos = np.abs(np.sum(before * after, axis=1))
         sin = np.linalg.norm(multiply(conjugate(before), after)[:, :3], axis=1)
         speeds.append(2.0 * np.arctan2(sin, cos) / TURN_S)
-    if not speeds:
-        first, *others = pose.points.values()
-        for point in others:
-            before, after = (sample_points(pose.time, point - first, time) for time in ends)
-            speeds.append(np.linalg.norm(after - before, axis=1) / TURN_S)
     return np.array(speeds)
 
 
@@ -194,15 +192,6 @@ def _correlate(a: np.ndarray, b: np.ndarray, least: float) -> np.ndarray:
     power = np.sqrt(np.maximum(at_lags(centred[0] ** 2, masks[1]) * at_lags(masks[0], centred[1] ** 2), 0.0))
     known = (at_lags(*masks) >= least - 0.5) & (power > max(1e-9 * float(power.max()), 1e-6))
     return np.where(known, at_lags(*centred) / np.where(known, power, 1.0), np.nan)
-
-
-def _compare(a: np.ndarray, b: np.ndarray) -> float:
-    """Correlate two series (n,) over what both know; 0 where that is too little."""
-    n = min(len(a), len(b))
-    both = np.isfinite(a[:n]) & np.isfinite(b[:n])
-    if both.sum() < 3 or a[:n][both].std() == 0.0 or b[:n][both].std() == 0.0:
-        return 0.0
-    return float(np.corrcoef(a[:n][both], b[:n][both])[0, 1])
 
 
 # World -------------------------------------------------------------------------------------------------------------
@@ -221,11 +210,6 @@ def _find_world(pose: Pose, truth: Pose, time: np.ndarray, up: str | None, frame
             cross += turns[0].T @ turns[1] / len(time)
         else:
             cross += np.einsum("nij,nkj->ik", R_WL.as_matrix(), R_VT.as_matrix()) / len(time)
-    if not pose.quat_WL:
-        sampled = [[sample_points(each.time, p, time) for p in each.points.values()] for each in (pose, truth)]
-        ours, theirs = (p - p.mean(axis=0) for p in np.array(sampled))  # about the middle of the points
-        known = np.isfinite(ours).all(axis=(0, 2)) & np.isfinite(theirs).all(axis=(0, 2))
-        cross = np.einsum("pni,pnj->ij", ours[:, known], theirs[:, known])
     left, sizes, right = np.linalg.svd(cross)
     if sizes[1] < 1e-6 * max(sizes[0], 1e-300):
         raise BadData(
@@ -247,3 +231,37 @@ def _find_world(pose: Pose, truth: Pose, time: np.ndarray, up: str | None, frame
     level = cross @ R_UV.as_matrix().T
     heading = float(np.arctan2(level[1, 0] - level[0, 1], level[0, 0] + level[1, 1]))
     return Rotation.from_euler("z", heading) * R_UV, up, float(np.degrees(heading))
+
+
+# Sampling --------------------------------------------------------------------------------------------------------
+
+
+def sample_orientations(time: np.ndarray, quat: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return orientations (m, 4) of times (m,) [s] at other times (n,), interpolated on the rotation: (n, 4)."""
+    good = np.isfinite(quat).all(axis=1)
+    known, spanned = time[good], _is_spanned(time[good], at)
+    sampled = np.full((len(at), 4), np.nan)
+    if spanned.any():
+        clipped = np.clip(at[spanned], known[0], known[-1])
+        sampled[spanned] = Slerp(known, Rotation.from_quat(quat[good]))(clipped).as_quat()
+    return sampled
+
+
+def sample_points(time: np.ndarray, points: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Return points (m, 3) of times (m,) [s] at other times (n,), linear between samples: (n, 3)."""
+    good = np.isfinite(points).all(axis=1)
+    known, spanned = time[good], _is_spanned(time[good], at)
+    sampled = np.full((len(at), 3), np.nan)
+    if spanned.any():
+        sampled[spanned] = np.column_stack([np.interp(at[spanned], known, axis) for axis in points[good].T])
+    return sampled
+
+
+def _is_spanned(known: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Mask of the times between two known ones that are not far apart, or on one."""
+    if len(known) < 2:
+        return np.zeros(len(at), dtype=bool)
+    after = np.clip(np.searchsorted(known, at - _ROUNDING_S), 0, len(known) - 1)
+    before = np.clip(np.searchsorted(known, at + _ROUNDING_S, side="right") - 1, 0, len(known) - 1)
+    spanned = (known[before] <= at + _ROUNDING_S) & (known[after] >= at - _ROUNDING_S)
+    return spanned & (known[after] - known[before] <= max(LONGEST_GAP_S, 2.0 * float(np.median(np.diff(known)))))

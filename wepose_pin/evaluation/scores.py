@@ -18,8 +18,7 @@ from ..diagnostics import notebook_html
 from ..errors import BadData, BadOption
 from ..recording import format_span
 from ..tracking import TrackResult
-from .registration import Registration
-from .sampling import sample_orientations, sample_points
+from .registration import Registration, sample_orientations, sample_points
 
 LIMITS = 1.96  # standard deviations of the differences, in which 95 % of them are where they are normal
 SINGULAR = 1e-12  # ratio of a covariance's least variance to its largest, below which it states no error in a direction

@@ -125,36 +125,25 @@ class Simulation:
         )
 
 
-class _Samples(NamedTuple):
-    """What one sensor measures without errors of its own, at n times."""
+def _sample_sensor(
+    motion: BodyMotion, segment: str, R_LS: Rotation, tissue: SoftTissue, t: np.ndarray, poses: Sequence[BodyPose] = ()
+) -> tuple[Rotation, np.ndarray, np.ndarray]:
+    """Sample a sensor on its segment at the times `t` (n,) [s], without errors of its own.
 
-    quat_WS: np.ndarray  # (n, 4) xyzw
-    force_S: np.ndarray  # (n, 3) [m/s^2], specific force
-    soft_L: np.ndarray  # (n, 3) [rad], rotation vector of the soft tissue
-
-
-@dataclass(frozen=True)
-class _Strapped:
-    """A sensor on a segment of a motion."""
-
-    motion: BodyMotion
-    segment: str
-    R_LS: Rotation
-    tissue: SoftTissue
-
-    def sample(self, t: np.ndarray, poses: Sequence[BodyPose] = ()) -> _Samples:
-        """Sample the sensor at the times `t` (n,) [s]; `poses`: of `_sample_poses` at these, where there are some."""
-        p_LS = self.motion.p_LS[self.segment]
-        pose, *around = poses or _sample_poses(self.motion, t, [self.segment])
-        p_W, *others_W = (each.R_WL[self.segment].apply(p_LS) + each.origins[self.segment] for each in (pose, *around))
-        # Differences to the middle first: for a static segment they are exactly zero.
-        far, near, near_after, far_after = (other_W - p_W for other_W in others_W)
-        accel_W = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
-        R_WL = pose.R_WL[self.segment]
-        moving_time = self.motion.moving_time(t, self.segment)
-        soft_L = self.tissue(t, moving_time, pose, R_WL.inv().apply(accel_W))
-        R_WS = compose(R_WL, Rotation.from_rotvec(soft_L), self.R_LS)
-        return _Samples(R_WS.as_quat(), R_WS.inv().apply(accel_W + GRAVITY * E_Z), soft_L)
+    Its orientations (n) in W, specific force (n, 3) [m/s^2] in S, and the soft tissue's rotation vectors (n, 3) [rad]
+    in L. `poses`: of `_sample_poses` at these times, where there are some.
+    """
+    pose, *around = poses or _sample_poses(motion, t, [segment])
+    p_W, *others_W = (
+        each.R_WL[segment].apply(motion.p_LS[segment]) + each.origins[segment] for each in (pose, *around)
+    )
+    # Differences to the middle first: for a static segment they are exactly zero.
+    far, near, near_after, far_after = (other_W - p_W for other_W in others_W)
+    accel_W = (16.0 * (near + near_after) - (far + far_after)) / (12.0 * _STENCIL_S**2)
+    R_WL = pose.R_WL[segment]
+    soft_L = tissue(t, motion.moving_time(t, segment), pose, R_WL.inv().apply(accel_W))
+    R_WS = compose(R_WL, Rotation.from_rotvec(soft_L), R_LS)
+    return R_WS, R_WS.inv().apply(accel_W + GRAVITY * E_Z), soft_L
 
 
 def _sample_poses(motion: BodyMotion, t: np.ndarray, segments: Sequence[str]) -> list[BodyPose]:
@@ -284,21 +273,20 @@ def measure_motion(
         own_time = own_time + 1e-6 * sizes.clock_drift_ppm * rngs["clock_drift"].standard_normal() * time
 
         place = -motion.p_LS[segment][2] / motion.lengths.get(segment, 1.0)
-        strapped = _Strapped(motion, segment, R_LS, SoftTissue(segment, place, sizes, rngs, motion.end, start))
+        worn = motion, segment, R_LS, SoftTissue(segment, place, sizes, rngs, motion.end, start)
         t = _add_first(own_time, rate_hz)
-        samples = strapped.sample(t, poses)
-        R_WS = Rotation.from_quat(samples.quat_WS)
+        R_WS, force_S, soft_L = _sample_sensor(*worn, t, poses)
         rate_S = log(compose(R_WS[:-1].inv(), R_WS[1:]).as_quat()) / np.diff(t)[:, None]
-        force_S = samples.force_S[1:]
+        force_S = force_S[1:]
         if sizes.accel_average:
             ages = sizes.accel_average / rate_hz * _MIDPOINTS
-            force_S = np.mean([strapped.sample(own_time - age).force_S for age in ages], axis=0)
+            force_S = np.mean([_sample_sensor(*worn, own_time - age)[1] for age in ages], axis=0)
 
         device = Device.sample(rngs["device"], sizes, rngs["gyro_warm_up"])
         readings = device.measure(rate_S, force_S, rate_hz, noise, sizes, rngs["noise"])
         dropped = draw_lost(rngs["dropped"], n, rate_hz, sizes.dropped)
         readings.gyro_S[dropped] = readings.accel_S[dropped] = np.nan
-        own = {"quat_LS": R_LS.as_quat(), "quat_WS": samples.quat_WS[1:], "soft_tissue": samples.soft_L[1:]}
+        own = {"quat_LS": R_LS.as_quat(), "quat_WS": R_WS[1:].as_quat(), "soft_tissue": soft_L[1:]}
         for name, value in {**own, **readings._asdict(), "device": device, "sample_time": own_time}.items():
             sensors[name][segment] = value
 
