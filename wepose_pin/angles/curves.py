@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .euler import round_to_turns, wrap
+from .euler import count_turns
 from .joints import Angles
 
 POINTS = 101  # 0, 1, … 100 %
@@ -66,8 +66,9 @@ def compute_mean_curves(angles: Angles, spans: np.ndarray) -> Mapping[str, tuple
 
 
 def _mean_curve(curves: np.ndarray, variances: np.ndarray) -> MeanCurve:
-    curves = _same_turn(curves)
     known = np.isfinite(curves)
+    means = np.where(known, curves, 0.0).sum(axis=1) / np.where(known.any(axis=1), known.sum(axis=1), np.nan)
+    curves = curves - count_turns(means)[:, None]
     n = known.sum(axis=0)
     enough = (n >= 2) & (2 * n >= len(curves))
     mean = np.where(known, curves, 0.0).sum(axis=0) / np.maximum(n, 1)
@@ -75,12 +76,3 @@ def _mean_curve(curves: np.ndarray, variances: np.ndarray) -> MeanCurve:
     std = np.sqrt(np.where(known, variances, 0.0).sum(axis=0) / np.maximum(n, 1))
     mean, sd, std = (np.where(enough, each, np.nan) for each in (mean, sd, std))
     return MeanCurve(curves, mean, sd, std, n, compute_cmc(curves))
-
-
-def _same_turn(curves: np.ndarray) -> np.ndarray:
-    """Curves (r, p) moved by full turns: the mean of the first one that has any to zero, the others' to that one's."""
-    means = np.array([curve[np.isfinite(curve)].mean() if np.isfinite(curve).any() else np.nan for curve in curves])
-    known = np.flatnonzero(np.isfinite(means))
-    if not len(known):
-        return curves
-    return curves - round_to_turns(np.nan_to_num(means - wrap(means[known[0]])))[:, None]

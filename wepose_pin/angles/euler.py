@@ -98,6 +98,16 @@ def round_to_turns(angle: ArrayLike) -> np.ndarray:
     return np.asarray(2.0 * np.pi * np.round(np.asarray(angle) / (2.0 * np.pi)))
 
 
+def count_turns(angles: np.ndarray) -> np.ndarray:
+    """The full turns [rad] by which angles (s, …) are off the first that is known, and this one off zero.
+
+    Angles are continuous in time: a motion about the lock may return to a posture a full turn later.
+    """
+    known = np.isfinite(angles)
+    first = np.take_along_axis(angles, np.argmax(known, axis=0)[None], axis=0) if len(angles) else angles
+    return round_to_turns(np.where(known, angles - wrap(np.nan_to_num(first)), 0.0))
+
+
 def follow(angles: Angles3, name: str, near_lock: float) -> np.ndarray:
     """The angles (n, 3) over time, unwrapped: of the two solutions of each sample the one that continues the last.
 

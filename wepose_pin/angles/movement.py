@@ -15,7 +15,7 @@ from ..recording import Intervals
 from ..recording.gaps import find_runs
 from ..rotations import unwrap_signs
 from .curves import MeanCurve, compute_mean_curves
-from .euler import round_to_turns, wrap
+from .euler import count_turns
 from .joints import AUTO, JOINTS, Angles, joint_angles
 from .repetitions import Repetitions, find_repetitions
 from .tables import compute_summary_std, summarize_joint
@@ -156,7 +156,7 @@ def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float
         values = np.array(
             [np.column_stack([each.lowest, each.highest, each.range, each.peak_rate]) for each in summaries]
         ).reshape(-1, 3, len(MEASURES))
-        values[:, :, :2] -= _count_turns(values)[:, :, None]
+        values[:, :, :2] -= count_turns(values[:, :, :2].mean(axis=2))[:, :, None]
         samples = np.array([each.samples for each in summaries], dtype=int).reshape(values.shape)
         stds = compute_summary_std(pose, name, joint, samples)
         for span, (each, value, std) in enumerate(zip(summaries, np.degrees(values), np.degrees(stds), strict=True)):
@@ -166,18 +166,3 @@ def measure_spans(pose: Pose, angles: Angles, spans: Sequence[tuple[float, float
                     row |= {f"{measure}_{unit}": value[k, m], f"{measure}_std_{unit}": std[k, m]}
                 rows.append({**row, "near_lock": each.near_lock, "gap": each.gap})
     return pl.DataFrame(rows).sort("span", "order", maintain_order=True).drop("order") if rows else pl.DataFrame()
-
-
-def _count_turns(values: np.ndarray) -> np.ndarray:
-    """Full turns [rad] (s, 3) by which spans are off the one that moves least, and this one off zero.
-
-    Angles are continuous in time: a motion about the lock may return to a posture a full turn later.
-    """
-    middle = values[:, :, :2].mean(axis=2)
-    turns = np.zeros_like(middle)
-    for k in range(3):
-        known = np.flatnonzero(np.isfinite(middle[:, k]))
-        if len(known):
-            least = middle[known[np.argmin(np.ptp(values[known, k, :2], axis=1))], k]
-            turns[known, k] = round_to_turns(middle[known, k] - wrap(least))
-    return turns

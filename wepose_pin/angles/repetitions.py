@@ -90,20 +90,12 @@ def find_repetitions(
 ) -> Repetitions:
     """Find the repetitions of a movement: excursions of one angle, out and back.
 
-    1. The angle is low-passed for this purpose alone. Below `MIN_RANGE` it has no repetitions.
-    2. A repetition begins where the angle rests: at that end of its range near which it spends clearly more time; if
-       there is no such end, at the one nearer to zero.
-    3. An excursion rises and falls by at least a quarter of the range; in a second pass by at least half and at most
-       twice the median excursion.
-    4. It begins with the last sample at which the angle has covered at most 20 % of its way and the rate is at most 5 %
-       of its peak, and ends likewise. A rest between two repetitions belongs to neither; a stop on the way belongs to
-       the repetition. An excursion that the recording cuts is left out.
-    5. Repetitions whose curve correlates little with the median curve, or that are in gaps, are left out. If these are
-       more than a quarter, if fewer than `MIN_REPETITIONS` are left, or if the coefficient of multiple correlation of
-       the rest is small, the movement does not repeat.
-
-    The onset at 5 % of the peak rate is usual in studies of reaching. The other numbers were chosen here, with noise,
-    rests, two speeds, cut ends and random motions, of which three in a hundred are taken for repetitions.
+    The angle is low-passed for this purpose alone. A repetition begins where it rests, at that end of its range near
+    which it spends clearly more time, else at the one nearer to zero; there the rate is at most 5 % of its peak, as is
+    usual in studies of reaching. A rest between two repetitions belongs to neither, a stop on the way belongs to the
+    repetition, and an excursion that the recording cuts is left out. So are those that are far larger or smaller than
+    the others, unlike them, or in gaps; if these are too many, the movement does not repeat. The numbers were chosen
+    with noise, rests, two speeds, cut ends and random motions, of which three in a hundred are taken for repetitions.
 
     Parameters
     ----------
@@ -142,8 +134,8 @@ def find_repetitions(
     if len(spans) < MIN_REPETITIONS:
         times = ("no time", "once", "twice")[len(spans)]
         return none._replace(reason=f"the angle goes out and back {times}, and {MIN_REPETITIONS} times are needed")
-    curves = normalize_time(angles.time, signal[:, None], spans)[:, :, 0]
-    alike = _are_alike(curves) & (_share_within(angles.time, hidden, spans) <= MAX_HIDDEN)
+    curves, lost = np.moveaxis(normalize_time(angles.time, np.column_stack([signal, hidden]), spans), 2, 0)
+    alike = _are_alike(curves) & (lost.mean(axis=1) <= MAX_HIDDEN)
     left_out, cmc = int(np.count_nonzero(~alike)), compute_cmc(curves[alike])
     none = none._replace(cmc=cmc, left_out=left_out)
     if left_out > MAX_LEFT_OUT * len(spans) or np.count_nonzero(alike) < MIN_REPETITIONS:
@@ -161,13 +153,6 @@ def _are_alike(curves: np.ndarray) -> np.ndarray:
     usual -= usual.mean()
     size = np.linalg.norm(centred, axis=1) * np.linalg.norm(usual)
     return np.asarray(centred @ usual >= MIN_CORRELATION * np.maximum(size, 1e-12))
-
-
-def _share_within(time: np.ndarray, which: np.ndarray, spans: np.ndarray) -> np.ndarray:
-    """(r,) share of the samples within each span (r, 2) [s] that are `which` (n,) bool."""
-    first, last = np.searchsorted(time, [spans[:, 0] - 1e-9, spans[:, 1] + 1e-9])
-    count = np.concatenate([[0], np.cumsum(which)])
-    return np.asarray((count[last] - count[first]) / (last - first))
 
 
 def find_movements(time: np.ndarray, *points: np.ndarray) -> np.ndarray:
@@ -238,11 +223,9 @@ def _close_cycles(spans: np.ndarray) -> np.ndarray:
 
 
 def _find_onset(signal: np.ndarray, rate: np.ndarray, *, cut: bool) -> int | None:
-    """The last sample of rest on the way from a valley to a peak (n,); None where the recording begins on the way.
+    """The last sample of rest on the way from a valley to a peak (n,); `cut`: the valley is an end of the recording.
 
-    Parameters
-    ----------
-    cut : the valley is the end of the recording, and may be none
+    None where the recording begins on the way.
     """
     rests = (signal <= signal[0] + LOW_SHARE * (signal[-1] - signal[0])) & (rate <= ONSET_SHARE * rate.max())
     if rests.any():
