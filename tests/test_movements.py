@@ -18,13 +18,13 @@ from scipy.stats import ttest_ind
 from test_export import LENGTHS, write_folder
 
 from wepose_pin.angles import SHOULDER_SEQUENCES, group_sides, joint_angles
-from wepose_pin.angles.joints import JOINTS
+from wepose_pin.angles.joints import JOINTS, describe_joint
 from wepose_pin.angles.movement import (
     MovementOptions,
     analyze_movement,
     smooth_pose,
 )
-from wepose_pin.angles.movement_tables import build_comparison_table, compute_interval, describe_joint
+from wepose_pin.angles.movement_tables import build_comparison_table, compute_interval
 from wepose_pin.angles.tables import compute_summary_std, summarize_joint
 from wepose_pin.body import load_model
 from wepose_pin.body.kinematics import Pose, compute_pose

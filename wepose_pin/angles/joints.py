@@ -144,6 +144,7 @@ JOINTS = {
     **_leg("left"),
     **_leg("right"),
 }
+_WORDS = {"torso": "thorax", "world": "W"}
 
 
 @dataclass(frozen=True)
@@ -238,6 +239,12 @@ def diagnose_lock(angles: Angles) -> list[Diagnostic]:
                 facts["variant"] = "hanging"
             diagnostics.append(Diagnostic("angles-near-lock", INFO, name, share, MAX_NEAR_LOCK, facts))
     return diagnostics
+
+
+def describe_joint(name: str) -> str:
+    """Describe the rotation that a joint's angles are of, as "forearm in upper arm"."""
+    parts = [part.removeprefix("left_").removeprefix("right_") for part in (JOINTS[name].distal, JOINTS[name].proximal)]
+    return " in ".join(_WORDS.get(part, part.replace("_", " ")) for part in parts)
 
 
 def group_sides(joints: Iterable[str]) -> dict[str, dict[str, str]]:

@@ -10,7 +10,7 @@ import polars as pl
 from scipy.special import stdtrit
 
 from .curves import PERCENT
-from .joints import JOINTS, SHOULDER_SEQUENCES, group_sides
+from .joints import JOINTS, SHOULDER_SEQUENCES, describe_joint, group_sides
 from .movement import MEASURES, Movement, measure_spans
 from .tables import angle_table
 
@@ -19,14 +19,6 @@ SOURCE = (
     "Wu et al. 2002 (J Biomech 35:543-548) for pelvis, hip and ankle, "
     "Grood and Suntay 1983 (J Biomech Eng 105:136-144) for the knee"
 )
-
-_WORDS = {"torso": "thorax", "world": "W"}
-
-
-def describe_joint(name: str) -> str:
-    """Describe the rotation that a joint's angles are of, as "forearm in upper arm"."""
-    parts = [part.removeprefix("left_").removeprefix("right_") for part in (JOINTS[name].distal, JOINTS[name].proximal)]
-    return " in ".join(_WORDS.get(part, part.replace("_", " ")) for part in parts)
 
 
 def build_definition_table(movements: Sequence[Movement]) -> pl.DataFrame:
