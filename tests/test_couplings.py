@@ -16,7 +16,7 @@ from wepose_pin.calibration.couplings import (
 )
 from wepose_pin.filters.sensors import FilteredRecording, filter_recording
 from wepose_pin.recording import Recording
-from wepose_pin.simulation import MILD_PRESET, NOISE_FREE, Simulation, simulate, simulate_person
+from wepose_pin.simulation import NOISE_FREE, PEOPLE_PRESET, Simulation, simulate, simulate_person
 
 PAIRS = [
     ("torso", "left_upper_arm"),
@@ -71,12 +71,13 @@ def test_too_little_motion_rate_or_time_tells_nothing(exact: tuple[Simulation, R
     assert estimate_couplings(replace(recording, sensors=still), filtered._replace(R_VS=R_VS), PAIRS, clasp) == []
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(6, marks=pytest.mark.monte_carlo)])
+@pytest.mark.parametrize("seed", [6, pytest.param(4, marks=pytest.mark.monte_carlo)])
 @pytest.mark.slow
 def test_soft_tissue_of_the_torso_is_no_heading(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The closure alone is off by 7 deg on these people, whose tissue turns the sensor as they lean."""
+    """The closure alone is off by 6 and 9 deg on these people, whose tissue turns the sensor as they lean."""
     person, off = simulate_person(seed), {}
-    simulation = simulate(person.lengths, seed=seed, imperfections=replace(MILD_PRESET, mount="any"), circles=0)
+    imperfections = replace(PEOPLE_PRESET, mount="any")
+    simulation = simulate(person.lengths, seed=seed, imperfections=imperfections, circles=0, rate_hz=50.0)
     measured = {"shoulder_width": person.measured["shoulder_width"]}
     for coupled in (True, False):
         with monkeypatch.context() as patch:

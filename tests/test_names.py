@@ -25,7 +25,6 @@ IDENTIFIER = re.compile(rf"(left|right)_({'|'.join(PARTS)})|\b({'|'.join(name fo
 
 # Files and folders that may name them, and why.
 ALLOWED = {
-    "angles/movement_tables.py": "definitions of joint angles",
     "angles/joints.py": "definitions of joint angles",
     "live/sources/udp.py": "the numbers of a format",
     "live/sources/slimevr.py": "the numbers of a format",
@@ -40,7 +39,6 @@ ALLOWED = {
 
 # Of these only the tables name them: no function does.
 TABLES_ALONE = (
-    "angles/movement_tables.py",
     "live/sources/udp.py",
     "live/sources/slimevr.py",
     "readers/mvnx.py",
