@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from wepose_pin.simulation.motion import Motion, aim_ray, place_shoulder
-from wepose_pin.simulation.people import SIDES
+from wepose_pin.simulation.motion import Motion, aim_ray
+from wepose_pin.simulation.people import SIDES, place_shoulder
 from wepose_pin.simulation.signals import Wander
 
 PAUSE_S = 20.0  # [s] from one pause to the next
@@ -34,5 +34,5 @@ class FreeMotion(Motion):
             )
             azimuth, elevation = y * np.deg2rad(azimuth), np.deg2rad(elevation)
             reach = (sum(self.arm[side]) * distance)[:, None]
-            palms[side] = place_shoulder(side, self.lengths) + reach * aim_ray(azimuth, elevation)
+            palms[side] = place_shoulder(y, self.lengths) + reach * aim_ray(azimuth, elevation)
         return palms

@@ -29,7 +29,7 @@ from wepose_pin.simulation.subject import spawn_streams
 
 URDF = Path(__file__).resolve().parent.parent / "urdf"
 SIDES = ("left", "right")
-IDEAL_MOTION = Flaws(IDEAL_PRESET, spawn_streams(0))
+IDEAL_MOTION = Flaws(IDEAL_PRESET, spawn_streams(0), load_model("whole_body").lengths)
 
 
 def parts(name: str) -> dict[tuple[str, str | None], ET.Element]:

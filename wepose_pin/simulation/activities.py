@@ -27,7 +27,7 @@ from ..rotations import compose, turn_about
 from .arm_tasks import Activity, ArmTasks
 from .imperfections import IDEAL_PRESET, Imperfections
 from .imu import MTI_3, ImuNoise
-from .motion import ARM, E_Z, STAND_S, BodyPose, place_arm, place_shoulder
+from .motion import ARM, E_Z, STAND_S, BodyPose, place_arm
 from .people import SIDES, Flaws
 from .signals import make_pulse, make_step
 from .subject import Simulation, measure_motion, spawn_streams
@@ -86,8 +86,7 @@ class WholeBodyActivity(Activity):
         for side in sides if girdle.size else ():  # on shoulders that move
             R_arm = tuple(R_WL[f"{side}_{part}"] for part in ARM)
             along_T = compose(R_WT.inv(), R_arm[0]).apply(-E_Z)
-            shoulder_T = place_shoulder(side, self.lengths) + girdle.place(SIDES[side], self.moving_time(t))
-            shoulder_T = shoulder_T + girdle.displace(along_T, SIDES[side])
+            shoulder_T = girdle.place(SIDES[side], self.moving_time(t)) + girdle.displace(along_T, SIDES[side])
             place_arm(pose, side, origins["torso"] + R_WT.apply(shoulder_T), R_arm, self.lengths)
         root = self.root(t)
         if root is not None:
@@ -380,5 +379,5 @@ def simulate_activity(
     # Shoulders that do not move: those of people that do are placed by their own girdle, not by the one tracked with.
     rigid = -np.eye(len(PARAMETERS))[PARAMETERS.index("law")]
     model = replace(model, girdles=dict.fromkeys(model.table.girdles, rigid))
-    flaws = Flaws(imperfections, rngs, model.lengths["shoulder_width"])
+    flaws = Flaws(imperfections, rngs, model.lengths)
     return measure_motion(ACTIVITIES[activity](model, rngs["motion"], seconds, flaws), rngs, rate_hz, noise)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body import DEFAULT_BODY, BodyModel
 from ..rotations import compose, turn_about
-from .motion import E_Z, MARGIN_S, RAMP_S, SEGMENTS, STAND_S, BodyMotion, BodyPose, place_arm, place_shoulder
+from .motion import E_Z, MARGIN_S, RAMP_S, SEGMENTS, STAND_S, BodyMotion, BodyPose, place_arm
 from .people import SIDES, Flaws
 from .signals import Process, make_pulse, make_step
 
@@ -179,8 +179,7 @@ class ArmTasks(Activity):
             R_WU = compose(R_WT, R_TU)
             R_WF = compose(R_WU, flaws.elbow_joint.rotate(y, angles[:, 3], angles[:, 4]))
             R_FH = flaws.wrists.rotate(y, t, self.activity(t), np.zeros_like(t), self._distance(t, side))
-            shoulder_T = place_shoulder(side, self.lengths)
-            shoulder_T = shoulder_T + flaws.girdle.place(y, self.moving_time(t, f"{side}_upper_arm"))
+            shoulder_T = flaws.girdle.place(y, self.moving_time(t, f"{side}_upper_arm"))
             shoulder_T = shoulder_T + flaws.girdle.displace(R_TU.apply(-E_Z), y)
             place_arm(pose, side, R_WT.apply(shoulder_T), (R_WU, R_WF, compose(R_WF, R_FH)), self.lengths)
         return pose

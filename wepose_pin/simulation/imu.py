@@ -66,29 +66,25 @@ class Device:
     accel_matrix: np.ndarray  # (3, 3)
     g_matrix: np.ndarray  # (3, 3) [rad/s per m/s^2]
     warm_up: np.ndarray  # (3,) [rad/s] by which the gyroscope's bias changes in the first 15 min
+    sizes: Imperfections  # range and bits
 
     @staticmethod
-    def sample(rng: np.random.Generator, imperfections: Imperfections, warm_up: np.random.Generator) -> Device:
+    def sample(rng: np.random.Generator, sizes: Imperfections, warm_up: np.random.Generator) -> Device:
         """Sample a sensor's errors; those of a gyroscope that warms up have their own stream."""
         direction = warm_up.standard_normal(3)
-        change = np.deg2rad(imperfections.gyro_warm_up_deg_s) * 10.0 ** warm_up.uniform(-1.0, 0.0)
+        change = np.deg2rad(sizes.gyro_warm_up_deg_s) * 10.0 ** warm_up.uniform(-1.0, 0.0)
         scale, tilt, g = rng.standard_normal((2, 3)), rng.standard_normal((2, 3, 3)), rng.standard_normal((3, 3))
-        tilt *= np.deg2rad(imperfections.misalignment_deg) * (1.0 - np.eye(3))
+        tilt *= np.deg2rad(sizes.misalignment_deg) * (1.0 - np.eye(3))
         return Device(
-            np.eye(3) + imperfections.gyro_scale * np.diag(scale[0]) + tilt[0],
-            np.eye(3) + imperfections.accel_scale * np.diag(scale[1]) + tilt[1],
-            np.deg2rad(imperfections.g_sensitivity_deg_s) / GRAVITY * g,
+            np.eye(3) + sizes.gyro_scale * np.diag(scale[0]) + tilt[0],
+            np.eye(3) + sizes.accel_scale * np.diag(scale[1]) + tilt[1],
+            np.deg2rad(sizes.g_sensitivity_deg_s) / GRAVITY * g,
             change / np.linalg.norm(direction) * direction,
+            sizes,
         )
 
     def measure(
-        self,
-        rate_S: np.ndarray,
-        force_S: np.ndarray,
-        rate_hz: float,
-        noise: ImuNoise,
-        imperfections: Imperfections,
-        rng: np.random.Generator,
+        self, rate_S: np.ndarray, force_S: np.ndarray, rate_hz: float, noise: ImuNoise, rng: np.random.Generator
     ) -> Readings:
         """Measure the true rate (n, 3) [rad/s] and specific force (n, 3) [m/s^2] with the sensor's errors."""
         n = len(rate_S)
@@ -99,12 +95,9 @@ class Device:
         gyro_bias += np.minimum(np.arange(n) / (rate_hz * _WARM_UP_S), 1.0)[:, None] * self.warm_up
         gyro_S = rate_S @ self.gyro_matrix.T + force_S @ self.g_matrix.T + gyro_bias + noise.gyro_density * white[0]
         accel_S = force_S @ self.accel_matrix.T + accel_bias + noise.accel_density * white[1]
-        return Readings(
-            _quantise(gyro_S, np.deg2rad(imperfections.gyro_range_deg_s), imperfections.bits),
-            _quantise(accel_S, imperfections.accel_range_g * GRAVITY, imperfections.bits),
-            gyro_bias,
-            accel_bias,
-        )
+        gyro_S = _quantise(gyro_S, np.deg2rad(self.sizes.gyro_range_deg_s), self.sizes.bits)
+        accel_S = _quantise(accel_S, self.sizes.accel_range_g * GRAVITY, self.sizes.bits)
+        return Readings(gyro_S, accel_S, gyro_bias, accel_bias)
 
 
 def _draw_bias(
@@ -144,13 +137,9 @@ def draw_lost(rng: np.random.Generator, n: int, rate_hz: float, share: float) ->
     # Draws do not depend on the share: another share gives the same runs at other distances.
     waits, lengths = rng.exponential(size=n), rng.exponential(size=n)
     runs = np.clip(np.round(lengths * _MEAN_RUN_S * rate_hz).astype(int), 1, longest)
-    if share <= 0.0:
-        return mask
-    first = 1
-    for wait, run in zip(waits * np.mean(runs) / share, runs, strict=True):
-        first += int(wait) + 1
-        if first + run >= n:
-            break
-        mask[first : first + run] = True
-        first += run
+    if share > 0.0:
+        gaps = (waits * np.mean(runs) / share).astype(int) + 1
+        ends = 1 + np.cumsum(gaps + runs)
+        for end, run in zip(ends[ends < n], runs, strict=False):
+            mask[end - run : end] = True
     return mask

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import BadOption, one_of
 from ..rotations import compose, log, quat_from_matrix, turn_about
 from .imperfections import IDEAL_PRESET, Imperfections
-from .people import SIDES, Flaws, Offset
+from .people import SIDES, Flaws, Offset, place_shoulder
 from .signals import Wander, integrate_pulse, make_pulse, make_step
 
 CIRCLING_POINT = "right_palm"  # draws the circles after the protocol
@@ -180,7 +180,7 @@ class Motion(BodyMotion):
         arm_names = (f"{side}_{angle}" for side in SIDES for angle in ("swivel", "pronation"))
         self.wander = {name: Wander(rng) for name in (*names, *arm_names)}
         # In units of the reach, from the right shoulder: table above the hips, circles before the chest.
-        shoulder_W = place_shoulder("right", lengths)
+        shoulder_W = place_shoulder(SIDES["right"], lengths)
         self.table_W = shoulder_W + self.reach * np.array((0.52, 0.03, -0.6))
         self.circles: list[_Circle] = []
         at = self.clasp[1] + _LEAD_S
@@ -319,10 +319,9 @@ class Motion(BodyMotion):
         """
         flaws, y = self.flaws, SIDES[side]
         upper, lower = self.lengths[f"{side}_upper_arm"], np.linalg.norm(hand.palm_F, axis=1)
-        shoulder_T = np.tile(place_shoulder(side, self.lengths), (len(t), 1))
+        centre_T = shoulder_T = flaws.girdle.place(y, self.moving_time(t))
         if not flaws.iterates:
             return shoulder_T, *self._arm(side, hand.palm_T - shoulder_T, hand.swivel)
-        centre_T = shoulder_T = shoulder_T + flaws.girdle.place(y, self.moving_time(t))
         down_U = hang.apply(-E_Z)
 
         def bend(flexion: np.ndarray) -> np.ndarray:
@@ -481,11 +480,6 @@ def _turn_to(vectors: np.ndarray, directions: np.ndarray) -> Rotation:
 def _scale(R: Rotation, share: np.ndarray) -> Rotation:
     """Return shares (n,) of rotations (n), about the same axes."""
     return Rotation.from_rotvec(share[:, None] * log(R.as_quat()))
-
-
-def place_shoulder(side: str, lengths: Mapping[str, float]) -> np.ndarray:
-    """Place a shoulder's centre (3,) [m] in the torso, by the lengths."""
-    return np.array((0.0, 0.5 * SIDES[side] * lengths["shoulder_width"], lengths["trunk"]))
 
 
 def place_arm(

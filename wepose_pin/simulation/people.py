@@ -78,10 +78,10 @@ class Flaws:
     """Random imperfections of one person's motion; the sizes scale draws that do not depend on them."""
 
     def __init__(
-        self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], shoulder_width: float = _WIDTH
+        self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], lengths: Mapping[str, float]
     ) -> None:
         self.sizes = sizes
-        self.girdle = SimulatedGirdle(sizes, rngs, shoulder_width)
+        self.girdle = SimulatedGirdle(sizes, rngs, lengths)
         self.elbow_joint = Elbow(sizes, rngs)
         self.wrists = Wrists(sizes, rngs)
         self.start_pose = StartPoseOffsets(sizes, rngs)
@@ -244,9 +244,11 @@ class SimulatedGirdle:
     left-right difference in z and a common shift in y.
     """
 
-    def __init__(self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], shoulder_width: float) -> None:
-        self.size = sizes.girdle
-        self.scale = shoulder_width / _WIDTH
+    def __init__(
+        self, sizes: Imperfections, rngs: Mapping[str, np.random.Generator], lengths: Mapping[str, float]
+    ) -> None:
+        self.size, self.lengths = sizes.girdle, lengths
+        self.scale = lengths["shoulder_width"] / _WIDTH
         draws = np.clip(rngs["girdle_person"].standard_normal((2, 3)), -2.5, 2.5)
         self.wander = Process(rngs["girdle_wander"], _WANDER_S, 6)
         common, left, right = np.clip(rngs["girdle_rest"].standard_normal((3, 3)), -2.5, 2.5)
@@ -267,6 +269,12 @@ class SimulatedGirdle:
         return np.asarray(self.size * (law + share[:, None] * _PERSON * self.person[side]))
 
     def place(self, side: float, moving_time: np.ndarray) -> np.ndarray:
-        """Displacement (n, 3) [m] in T of a shoulder whatever its arm does, after that time of motion (n,) [s]."""
+        """Place (n, 3) [m] in T of a shoulder whatever its arm does, after that time of motion (n,) [s]."""
         own = slice(0, 3) if side > 0.0 else slice(3, 6)
-        return np.asarray(self.size * (self.rest[side] + _WANDER * self.wander(moving_time, own)))
+        moved = self.size * (self.rest[side] + _WANDER * self.wander(moving_time, own))
+        return np.asarray(place_shoulder(side, self.lengths) + moved)
+
+
+def place_shoulder(side: float, lengths: Mapping[str, float]) -> np.ndarray:
+    """Place the centre (3,) [m] of the shoulder of the side y in the torso, by the lengths."""
+    return np.array((0.0, 0.5 * side * lengths["shoulder_width"], lengths["trunk"]))

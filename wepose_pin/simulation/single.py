@@ -115,7 +115,8 @@ def simulate_paper_dynamic(
     turned = (R_WS[:-1].inv() * R_WS[1:]).as_rotvec() / np.diff(own_time)[:, None]
     force_S = R_WS.inv().apply(motion.acceleration(own_time) + GRAVITY * E_Z)
     device = Device.sample(device_rng, imperfections, warm_up_rng)
-    readings = device.measure(np.vstack((np.zeros(3), turned)), force_S, rate_hz, noise, imperfections, noise_rng)
+    rate_S = np.vstack((np.zeros(3), turned))
+    readings = device.measure(rate_S, force_S, rate_hz, noise, noise_rng)
     quat_WS, p_WS = motion.orientation(time).as_quat(), motion.position(time)
     static = [(0.0, trial.moving[0]), (trial.moving[1], _DURATION_S)]
     measured = readings.gyro_S, readings.accel_S, readings.gyro_bias

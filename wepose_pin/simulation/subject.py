@@ -231,7 +231,7 @@ def simulate(
     task = find_task(protocol)
     lengths = {name: float(lengths[name]) for name in names}
     rngs = spawn_streams(seed, session)
-    flaws = Flaws(imperfections, rngs, lengths["shoulder_width"])
+    flaws = Flaws(imperfections, rngs, lengths)
     motion = task(lengths, rngs["motion"], protocol.split("+"), clasp_s, circles, flaws)
     motion.fit_to_person(rngs["task"])
     return measure_motion(motion, rngs, rate_hz, noise)
@@ -258,7 +258,7 @@ def measure_motion(
     own_clocks = any((sizes.clock_jitter, sizes.clock_offset, sizes.clock_drift_ppm))
     start = motion(np.array([0.5 * STAND_S]), SEGMENTS)
     # One sample more, before the first one, for the rate that ends there.
-    poses = [] if own_clocks else _sample_poses(motion, _add_first(time, rate_hz), list(motion.p_LS))
+    poses = [] if own_clocks else _sample_poses(motion, np.insert(time, 0, -1.0 / rate_hz), list(motion.p_LS))
     true = motion(time, list(motion.p_LS))
 
     sensors: defaultdict[str, dict] = defaultdict(dict)
@@ -274,7 +274,7 @@ def measure_motion(
 
         place = -motion.p_LS[segment][2] / motion.lengths.get(segment, 1.0)
         worn = motion, segment, R_LS, SoftTissue(segment, place, sizes, rngs, motion.end, start)
-        t = _add_first(own_time, rate_hz)
+        t = np.insert(own_time, 0, own_time[0] - 1.0 / rate_hz)
         R_WS, force_S, soft_L = _sample_sensor(*worn, t, poses)
         rate_S = log(compose(R_WS[:-1].inv(), R_WS[1:]).as_quat()) / np.diff(t)[:, None]
         force_S = force_S[1:]
@@ -283,7 +283,7 @@ def measure_motion(
             force_S = np.mean([_sample_sensor(*worn, own_time - age)[1] for age in ages], axis=0)
 
         device = Device.sample(rngs["device"], sizes, rngs["gyro_warm_up"])
-        readings = device.measure(rate_S, force_S, rate_hz, noise, sizes, rngs["noise"])
+        readings = device.measure(rate_S, force_S, rate_hz, noise, rngs["noise"])
         dropped = draw_lost(rngs["dropped"], n, rate_hz, sizes.dropped)
         readings.gyro_S[dropped] = readings.accel_S[dropped] = np.nan
         own = {"quat_LS": R_LS.as_quat(), "quat_WS": R_WS[1:].as_quat(), "soft_tissue": soft_L[1:]}
@@ -302,11 +302,6 @@ def measure_motion(
         imperfections=sizes,
         **sensors,
     )
-
-
-def _add_first(t: np.ndarray, rate_hz: float) -> np.ndarray:
-    """Add the time of a sample before the times (n,) [s]."""
-    return np.concatenate((t[:1] - 1.0 / rate_hz, t))
 
 
 class Person(NamedTuple):
