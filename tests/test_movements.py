@@ -150,14 +150,6 @@ def test_ranges_and_rates_are_as_uncertain_as_drawn_errors_make_them(side: str) 
     assert np.array_equal(stated[:, 0], [joint.std[s, k] for k, s in enumerate(summary.samples[:, 0])])
 
 
-def test_a_heading_that_is_off_for_all_of_the_time_changes_no_range_of_the_trunk() -> None:
-    pose = pose_about(np.radians(30.0) * np.sin(np.arange(200) / 30.0))
-    pose = replace(pose, segment_cov={"torso": np.tile(np.diag([0.0, 0.0, 0.01]), (200, 1, 1))})
-    joint = joint_angles(pose)["thorax"]
-    stated = compute_summary_std(pose, "thorax", joint, summarize_joint(pose.time, joint).samples[None])
-    np.testing.assert_allclose(stated[0, 2], [0.1, 0.1, 0.0, 0.0], atol=1e-9)
-
-
 # Comparison -------------------------------------------------------------------------------------------------------
 
 

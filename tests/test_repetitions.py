@@ -88,11 +88,6 @@ def test_rests_of_any_length_between_repetitions_do_not_count(noise_deg: float) 
     check_spans(repetitions, spans, 0.04 if noise_deg < 1.0 else 0.12)
 
 
-def test_two_speeds_are_one_movement() -> None:
-    signal, spans = chain(rest(1.0), *[reach(4.0)] * 4, *[reach(0.8)] * 5, rest(1.0))
-    check_spans(find(signal), spans)
-
-
 def test_half_repetitions_at_the_ends_are_left_out() -> None:
     whole, spans = chain(*[reach(2.0)] * 6)
     repetitions = find(whole[100:-60])  # from the peak of the first to shortly after that of the last

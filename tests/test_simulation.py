@@ -38,14 +38,6 @@ def test_accel_integrates_to_the_position(fast: Simulation, segment: str) -> Non
     assert moved.max() > 0.1
 
 
-def test_shoulders_are_carried_by_the_torso(perfect: Simulation) -> None:
-    left, right = perfect.points["left_shoulder"], perfect.points["right_shoulder"]
-    np.testing.assert_allclose(np.linalg.norm(left - right, axis=1), SUBJECT["shoulder_width"], atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(left + right, axis=1), 2 * SUBJECT["trunk"], atol=1e-12)
-    across = Rotation.from_quat(perfect.quat_WL["torso"]).apply([0.0, SUBJECT["shoulder_width"], 0.0])
-    np.testing.assert_allclose(left - right, across, atol=1e-12)
-
-
 @pytest.mark.parametrize("side", SIDES)
 def test_segments_keep_their_length(perfect: Simulation, side: str) -> None:
     for part, segment, a, b in (
@@ -95,18 +87,6 @@ def test_elbow_is_a_hinge_about_minus_y(perfect: Simulation, side: str) -> None:
     assert 40 < np.rad2deg(np.abs(pronation[:, 2])).max() < 60
 
 
-def test_elbows_point_down_and_outwards(perfect: Simulation) -> None:
-    clasp = within(perfect, "clasp")
-    R_TW = Rotation.from_quat(perfect.quat_WL["torso"][clasp]).inv()
-    for side, y in (("left", 1.0), ("right", -1.0)):
-        shoulder, elbow, hand = (perfect.points[f"{side}_{p}"][clasp] for p in ("shoulder", "elbow", "palm"))
-        line = hand - shoulder
-        along = np.sum((elbow - shoulder) * line, axis=1) / np.sum(line * line, axis=1)
-        off_T = R_TW.apply(elbow - shoulder - along[:, None] * line)
-        assert off_T[:, 2].max() < 0
-        assert (y * off_T[:, 1]).mean() > 0
-
-
 def test_rests_and_start_are_exactly_still(perfect: Simulation) -> None:
     still = within(perfect, "start", "rest")
     assert len(perfect.phases["rest"]) == 7
@@ -138,14 +118,6 @@ def test_stated_axes_and_gravity_give_the_mount(perfect: Simulation) -> None:
         error = swing * Rotation.from_matrix(N) * Rotation.from_quat(perfect.quat_LS[segment]).inv()
         assert error.magnitude() < 1e-7
         assert 1.9 < np.rad2deg(swing.magnitude()) < 10.1
-
-
-def test_motion_is_smooth(fast: Simulation) -> None:
-    for segment in SEGMENTS:
-        for signal, jump in ((fast.gyro_S[segment], 0.1), (fast.accel_S[segment], 0.3)):
-            assert np.abs(np.diff(signal, axis=0)).max() < jump  # in 1 ms
-        dots = np.sum(fast.quat_WL[segment][1:] * fast.quat_WL[segment][:-1], axis=1)
-        assert dots.min() > 0.999
 
 
 def test_same_seed_same_bits() -> None:
