@@ -239,8 +239,13 @@ def _size(signal: np.ndarray, before: int, peak: int, after: int) -> float:
 
 def _find_excursions(signal: np.ndarray, least: float) -> list[tuple[int, int, int]]:
     """Valley, peak and valley of each excursion that rises and falls by at least `least`."""
-    peaks, _ = find_peaks(signal, prominence=least)
-    ends = [0, *peaks.tolist(), len(signal) - 1]
+    peaks: list[int] = []
+    for peak in find_peaks(signal, prominence=least)[0].tolist():
+        if peaks and min(signal[peaks[-1]], signal[peak]) - signal[peaks[-1] : peak].min() < least:
+            peaks[-1] = max(peaks[-1], peak, key=signal.__getitem__)  # two of one height
+        else:
+            peaks.append(peak)
+    ends = [0, *peaks, len(signal) - 1]
     return [
         (first + int(np.argmin(signal[first : peak + 1])), peak, peak + int(np.argmin(signal[peak : last + 1])))
         for first, peak, last in zip(ends, ends[1:], ends[2:], strict=False)
