@@ -1,7 +1,7 @@
 """The recording of a live session: its inputs and its poses, as MCAP, which Foxglove and others open.
 
-The profile is `PROFILE`. Messages are JSON with JSON schemas (`SCHEMAS`); their log time is that of the newest sample,
-on the source's clock. The file is in chunks, so that what was written before a session was killed is readable.
+Messages are JSON with JSON schemas (`SCHEMAS`); their log time is that of the newest sample, on the source's clock. The
+file is in chunks, so that what was written before a session was killed is readable.
 
 - metadata ``wepose``: the settings before the first sample, as JSON: sensors, stated mounts, subject, method, and the
   sensors with measured `orientations`, each with whether it is the segment's own

@@ -2,16 +2,9 @@
 
 In OpenSim's ground G (x forward, y up, z right), the angles and the bodies those of Rajagopal's model (`rajagopal`).
 
-What OpenSim's readers demand (opensim-core, OpenSim/Common):
-
-- DelimFileAdapter.h, for .mot and .sto: lines ``key=value`` up to one that holds ``endheader`` alone, with ``DataType``
-  as that of the table; then the labels, the first of them ``time``; tabs between cells, commas within; rows as long as
-  the labels; an empty line ends the data.
-- Storage.cpp, for .mot: the first line is the name; ``nRows`` and ``nColumns`` (with time) are there and are not zero;
-  ``inDegrees=yes``.
-- TRCFileAdapter.cpp: ``PathFileType`` first; then the eight keys of `_TRC_KEYS` in this order, and their eight values;
-  ``Frame#``, ``Time`` and ``NumMarkers`` names, a name every third cell; ``X1 Y1 Z1 X2 …``; rows of 2 + 3 NumMarkers
-  cells, which are counted without an empty last one: a tab ends each row. A marker with an empty cell is missing.
+Sources: opensim-core, OpenSim/Common: DelimFileAdapter.h (.mot, .sto: ``endheader`` alone in a line, tabs, no empty
+line), Storage.cpp (.mot: the name first, ``nRows`` and ``nColumns``), TRCFileAdapter.cpp (.trc: the eight keys of
+`_TRC_KEYS`, a tab ends each row, a marker with an empty cell is missing).
 """
 
 from __future__ import annotations
