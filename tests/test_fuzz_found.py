@@ -118,7 +118,7 @@ REFUSED: list[tuple[str, Callable[[], bytes], str]] = [
     (
         "subject",
         lambda: change("subject", "matrix = [\n    [", f"matrix = [\n    [{MANY},"),
-        "covariance.matrix holds NaN",
+        "covariance.matrix: rows of numbers are needed",
     ),
     ("subject", lambda: change("subject", "qw = 1.0", f"qw = {MANY}"), "mounts.torso.qw = 9999"),
     ("subject", lambda: change("subject", "qw = 1.0", "qw = 1e200"), "mounts.torso.qw = 1e+200"),

@@ -9,9 +9,10 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
+from ..errors import BadModel
 from .body import BodyModel
 from .girdle import PARAMETERS
-from .lengths import UNIVERSE, LinkVector
+from .lengths import UNIVERSE
 from .links import find_carrier, find_known_points, move_girdles
 
 
@@ -40,31 +41,30 @@ def compute_point_covariances(
     q : (n, nq) of a mechanism; without it its points have none
     heading_cov : two segments → (n,) [rad²], the covariance of their headings; a pair left out: independent
     """
-    covariances: dict[str, np.ndarray] = {}
     points = find_known_points(model, quat_WL)
     if model.table.is_mechanism:
         if not points or q is None or not set(quat_WL) <= set(segment_cov):
-            return covariances
+            return {}
         return _propagate_through_joints(model, q, segment_cov, shape_cov, points, heading_cov or {})
-    find_parts = _WayParts(model, quat_WL)
-    rotated: dict[tuple[Any, ...], np.ndarray] = {}  # what points of a limb share is computed once
-    for point in points:
-        parts = find_parts(point)
-        if not parts or not all(part.segment is None or part.segment in segment_cov for part in parts.values()):
+    covariances: dict[str, np.ndarray] = {}
+    rotated: dict[tuple[int, ...], np.ndarray] = {}  # what points of a limb share is computed once
+    for point, parts in _find_ways(model, quat_WL, points).items():
+        segments = [part.segment for part in parts if part.segment is not None]
+        own = {segment: [part for part in parts if part.segment == segment] for segment in segments}
+        if not parts or not set(own) <= set(segment_cov):
             continue
-        columns = [column for part in parts.values() for column in part.columns]
-        J = np.concatenate([part.jacobian for part in parts.values()], axis=2)
+        columns = [column for part in parts for column in part.columns]
+        J = np.concatenate([part.jacobian for part in parts], axis=2)
         # Sample by sample: the bits of one large product would depend on the number of samples.
         cov = J @ shape_cov[np.ix_(columns, columns)] @ J.swapaxes(1, 2)
-        vectors: dict[str, np.ndarray] = {}
-        for segment in {part.segment: None for part in parts.values() if part.segment is not None}:
-            own = [key for key, part in parts.items() if part.segment == segment]
-            vectors[segment] = np.sum([parts[key].vector for key in own], axis=0)
-            if (segment, *own) not in rotated:
-                skew = _build_skew_matrices(vectors[segment])
-                rotated[segment, *own] = skew @ segment_cov[segment] @ skew.swapaxes(1, 2)
-            cov += rotated[segment, *own]
-        for part in parts.values():
+        vectors = {segment: np.sum([part.vector for part in each], axis=0) for segment, each in own.items()}
+        for segment, vector in vectors.items():
+            key = tuple(id(part) for part in own[segment])
+            if key not in rotated:
+                skew = _build_skew_matrices(vector)
+                rotated[key] = skew @ segment_cov[segment] @ skew.swapaxes(1, 2)
+            cov += rotated[key]
+        for part in parts:
             if part.residual is not None:
                 cov += part.residual
         for (near, far), shared in (heading_cov or {}).items():
@@ -84,51 +84,41 @@ class _Part(NamedTuple):
     residual: np.ndarray | None = None  # (n, 3, 3) [m²] in W by which it leaves what the shape says
 
 
-class _WayParts:
-    """The parts of the ways to a person's points; equal parts of several points are one."""
+def _find_ways(
+    model: BodyModel, quat_WL: Mapping[str, np.ndarray], points: Sequence[str]
+) -> dict[str, tuple[_Part, ...]]:
+    """Find the parts of the ways to a person's points; equal parts of several points are one.
 
-    def __init__(self, model: BodyModel, quat_WL: Mapping[str, np.ndarray]) -> None:
-        self._model, self._lengths = model, np.array(list(model.lengths.values()))
-        self._R_WL = {name: Rotation.from_quat(quat).as_matrix() for name, quat in quat_WL.items()}
-        self._motions = move_girdles(model, self._R_WL)
-        self._parts: dict[tuple[Any, ...], _Part] = {}
-
-    def __call__(self, point: str) -> dict[tuple[Any, ...], _Part]:
-        """Return the parts of the way to a point; empty where a link on it follows no measured segment."""
-        keys: list[tuple[Any, ...]] = []
-        for link, part in self._model.reaches[point].items():
-            carrier = None if link == UNIVERSE else find_carrier(self._model, link, self._R_WL)
-            if carrier is None and link != UNIVERSE:
-                return {}
-            keys.append((link, part.by_length.tobytes(), part.constant.tobytes()))
-            if keys[-1] not in self._parts:
-                self._parts[keys[-1]] = self._express_link(link, part, carrier)
-        for name in self._model.point_girdles[point]:
-            if name not in self._motions:
-                return {}
-            keys.append((name,))
-            if keys[-1] not in self._parts:
-                self._parts[keys[-1]] = self._express_girdle(name)
-        return {key: self._parts[key] for key in keys}
-
-    def _express_link(self, link: str, part: LinkVector, carrier: str | None) -> _Part:
-        columns = np.flatnonzero(part.by_length.any(axis=0))
-        R_WK = np.broadcast_to(np.eye(3), (len(next(iter(self._R_WL.values()))), 3, 3))
-        if carrier is not None:
-            R_WK = self._R_WL[carrier]
-            R_CK = self._model.neutral_rotations[carrier].T @ self._model.neutral_rotations[link]
-            if not np.allclose(R_CK, np.eye(3), atol=1e-12):
-                R_WK = R_WK @ R_CK
-        vector = R_WK @ (part.by_length @ self._lengths + part.constant)
-        return _Part(carrier, vector, columns.tolist(), R_WK @ part.by_length[:, columns])
-
-    def _express_girdle(self, name: str) -> _Part:
-        girdle, motion = self._model.table.girdles[name], self._motions[name]
-        first = len(self._lengths) + len(PARAMETERS) * list(self._model.table.girdles).index(name)
-        R_on = self._R_WL[girdle.on]
-        vector = np.einsum("nij,nj->ni", R_on, motion.displacement)
+    A point on whose way a link follows no measured segment has none.
+    """
+    R_WL = {name: Rotation.from_quat(quat).as_matrix() for name, quat in quat_WL.items()}
+    lengths, neutral = np.array(list(model.lengths.values())), model.neutral_rotations
+    n = len(next(iter(quat_WL.values())))
+    known: dict[Any, _Part] = {}
+    for name, motion in move_girdles(model, R_WL).items():
+        girdle = model.table.girdles[name]
+        first = len(lengths) + len(PARAMETERS) * list(model.table.girdles).index(name)
+        R_on = R_WL[girdle.on]
         residual = (R_on * motion.residual_covariance(girdle)[:, None, :]) @ R_on.swapaxes(1, 2)
-        return _Part(girdle.on, vector, range(first, first + len(PARAMETERS)), R_on @ motion.jacobian, residual)
+        vector = np.einsum("nij,nj->ni", R_on, motion.displacement)
+        known[name] = _Part(girdle.on, vector, range(first, first + len(PARAMETERS)), R_on @ motion.jacobian, residual)
+    ways: dict[str, tuple[_Part, ...]] = {}
+    for point in points:
+        keys: list[Any] = []
+        for link, (by_length, constant) in model.reaches[point].items():
+            keys.append((link, by_length.tobytes(), constant.tobytes()))
+            carrier = None if link == UNIVERSE else find_carrier(model, link, R_WL)
+            if keys[-1] in known or (carrier is None and link != UNIVERSE):
+                continue
+            R_WK = np.broadcast_to(np.eye(3), (n, 3, 3)) if carrier is None else R_WL[carrier]
+            if carrier is not None and carrier != link:
+                R_WK = R_WK @ (neutral[carrier].T @ neutral[link])
+            columns = np.flatnonzero(by_length.any(axis=0)).tolist()
+            vector = R_WK @ (by_length @ lengths + constant)
+            known[keys[-1]] = _Part(carrier, vector, columns, R_WK @ by_length[:, columns])
+        keys += model.point_girdles[point]
+        ways[point] = tuple(known[key] for key in keys) if set(keys) <= set(known) else ()
+    return ways
 
 
 def _propagate_through_joints(
@@ -144,15 +134,22 @@ def _propagate_through_joints(
     The fit turns errors δ of the orientations into errors J⁺ δ of the joints, with J the Jacobian of all orientations.
     """
     m, data, k = model.pin, model.pin.createData(), len(segment_cov)
-    if lengths_cov.any() and _slides(model):
-        return {}
     segments = [m.getFrameId(segment) for segment in segment_cov]
     frames = [m.getFrameId(model.point_frames[point]) for point in points]
     cov_W = np.stack(list(segment_cov.values()), axis=1)  # (n, k, 3, 3)
     shared, order = np.zeros((len(q), k, k)), list(segment_cov)
     for (near, far), cov in heading_cov.items():
         shared[:, order.index(near), order.index(far)] = shared[:, order.index(far), order.index(near)] = cov
-    by_length = [_find_length_vectors(model, data, point) if lengths_cov.any() else [] for point in points]
+    ways: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in points]  # views of R_WK, by the lengths
+    if lengths_cov.any():
+        try:
+            reaches = model.reaches
+        except BadModel:  # a joint slides: the way of a point has no constant parts link by link
+            return {}
+        for way, point in zip(ways, points, strict=True):
+            for link, part in reaches[point].items():
+                frame = data.oMf[m.getFrameId(link)] if m.existFrame(link) else data.oMi[m.getJointId(link)]
+                way.append((frame.rotation, part.by_length))
     out = np.empty((len(points), len(q), 3, 3))
     for row, values in enumerate(np.ascontiguousarray(q)):
         pin.computeJointJacobians(m, data, values)
@@ -164,30 +161,10 @@ def _propagate_through_joints(
             parts = gain.reshape(3, k, 3).swapaxes(0, 1)
             out[i, row] = np.sum(parts @ cov_W[row] @ parts.swapaxes(1, 2), axis=0)
             out[i, row] += parts[:, :, 2].T @ shared[row] @ parts[:, :, 2]
-            if by_length[i]:
-                along = sum(R_WK @ part for R_WK, part in by_length[i])
+            if ways[i]:
+                along = np.sum([R_WK @ by_length for R_WK, by_length in ways[i]], axis=0)
                 out[i, row] += along @ lengths_cov @ along.T
     return dict(zip(points, out, strict=True))
-
-
-def _slides(model: BodyModel) -> bool:
-    """Whether a joint that slides moves some point: its way has no constant parts link by link."""
-    frames = [model.pin.frames[model.pin.getFrameId(link)] for link in model.point_frames.values()]
-    above = {joint for frame in frames for joint in model.pin.supports[frame.parentJoint]}
-    return any(model.pin.joints[joint].shortname().startswith("JointModelP") for joint in above if joint)
-
-
-def _find_length_vectors(model: BodyModel, data: pin.Data, point: str) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Find the links whose part of the way to a point depends on lengths: a view of their rotation, and the part."""
-    m = model.pin
-    return [
-        (
-            data.oMf[m.getFrameId(link)].rotation if m.existFrame(link) else data.oMi[m.getJointId(link)].rotation,
-            part.by_length,
-        )
-        for link, part in model.reaches[point].items()
-        if part.by_length.any()
-    ]
 
 
 def _add_shared_heading(cov: np.ndarray, near: np.ndarray, far: np.ndarray, shared: np.ndarray) -> None:

@@ -26,7 +26,6 @@ from ..documents import (
     Key,
     TomlTable,
     format_record,
-    is_number,
     parse_toml,
     read_record,
     read_toml,
@@ -34,7 +33,7 @@ from ..documents import (
     toml_strings,
     whole_file,
 )
-from ..errors import BadData, BadModel, BadOption, BadSubject, one_of
+from ..errors import BadData, BadModel, BadOption, BadSubject
 from .anthropometry import compute_population_lengths
 from .body import BodyModel
 from .girdle import PARAMETERS
@@ -184,8 +183,8 @@ class Subject:
         """Whether it is the population prior, without any calibration."""
         return self.name == POPULATION
 
-    def check(self) -> Subject:
-        """Check all fields and return the subject.
+    def check(self, where: str = "") -> Subject:
+        """Check all fields and return the subject; `where` begins an error's text.
 
         Raises
         ------
@@ -193,26 +192,22 @@ class Subject:
             A field of a wrong type; a length, mount, hinge, offset or drift with an impossible value; a covariance
             whose size is not that of `order`.
         """
-        where = f"subject {self.name!r}: "
+        where = where or f"subject {self.name!r}: "
         check_fields(self, where)
+        arrays = [(f"mounts.{s}", quat, (4,)) for s, quat in self.mounts.items()]
+        arrays += [(f"hinges.{joint}.axis", hinge.axis, (3,)) for joint, hinge in self.hinges.items()]
+        arrays += [(f"start_pose_offset.{s}.tilt", start.tilt, (2,)) for s, start in self.start_pose_offset.items()]
+        arrays += [(f"girdles.{point}", values, (len(PARAMETERS),)) for point, values in self.girdles.items()]
         try:
             check_lengths(f"{where}lengths", self.lengths)
             named = [row for row in self.order if not _ROW.fullmatch(row)]
-            if named and not self.lengths:
-                raise BadData(f"{where}lengths is empty; it needs the lengths [m] that order names")
-            check_names(f"{where}order", named, self.lengths)
+            check_names(f"{where}covariance.order", named, self.lengths)
             if len(set(self.order)) < len(self.order):
-                raise BadData(f"{where}order = {self.order}: each name once")
-            check_array(f"{where}covariance", self.covariance, (len(self.order), len(self.order)))
-            check_finite(f"{where}covariance", self.covariance)
-            arrays = [(f"mounts.{s}", quat, (4,)) for s, quat in self.mounts.items()]
-            arrays += [(f"hinges.{joint}.axis", hinge.axis, (3,)) for joint, hinge in self.hinges.items()]
-            arrays += [(f"start_pose_offset.{s}.tilt", start.tilt, (2,)) for s, start in self.start_pose_offset.items()]
-            arrays += [(f"girdles.{point}", values, (len(PARAMETERS),)) for point, values in self.girdles.items()]
-            for name, values, shape in arrays:
+                raise BadData(f"{where}covariance.order = {self.order}: each name once")
+            for name, values, shape in [*arrays, ("covariance", self.covariance, (len(self.order),) * 2)]:
                 check_array(f"{where}{name}", values, shape)
                 check_finite(f"{where}{name}", values)
-                if shape in ((3,), (4,)):
+                if name.startswith(("mounts", "hinges")):
                     check_unit(f"{where}{name}", values, 1e-3)
         except (BadData, BadOption) as error:
             raise BadSubject(str(error)) from None
@@ -505,65 +500,34 @@ def parse_subject(text: str, path: Path) -> Subject:
 def _subject(values: Mapping[str, Any], path: Path) -> Subject:
     """Return the subject of the parsed file."""
     top = TomlTable(values, str(path), error=BadSubject)
-    if "sensors" in top:
-        raise BadSubject(f"{path}: is a session; a subject is needed here, as `wepose calibrate` writes one")
     if values.get("format") != FORMAT:
-        raise BadSubject(f"{path}: format = {values.get('format')!r}; this version reads format = {FORMAT}")
-    if "doubled" in top:
         raise BadSubject(
-            f"{path}: doubled is of second sensors, and a segment has one now; calibrate again with one sensor on each "
-            f"segment"
+            f"{path}: format = {values.get('format')!r}; a subject, as `wepose calibrate` writes one, has "
+            f"format = {FORMAT}"
         )
     if "lengths" not in top:
         raise BadSubject(f"{path}: lengths is missing; it needs the lengths of the body [m], none where it has none")
     base = Subject(path.parent.name, {}, (), np.zeros((0, 0)))
     subject = read_record(Subject, top, base=base, others=("format", "lengths_std", "covariance"))
-    order, covariance = _read_covariance(top.table("covariance", {}), top.table("lengths_std", {}), subject.lengths)
-    mounts = {
-        name: _scale_to_unit(quat, f"{top.at('mounts')}.{name}: qx, qy, qz, qw")
-        for name, quat in subject.mounts.items()
-    }
+    order, covariance = _read_covariance(top, subject.lengths)
+    subject = replace(subject, order=order, covariance=covariance).check(f"{path}: ")
+    # What the digits of the file leave of a unit vector's length.
+    mounts = {name: quat / np.linalg.norm(quat) for name, quat in subject.mounts.items()}
     hinges = {
-        name: hinge._replace(axis=_scale_to_unit(hinge.axis, f"{top.at('hinges')}.{name}: x, y, z"))
-        for name, hinge in subject.hinges.items()
+        name: hinge._replace(axis=hinge.axis / np.linalg.norm(hinge.axis)) for name, hinge in subject.hinges.items()
     }
-    return replace(subject, order=order, covariance=covariance, mounts=mounts, hinges=hinges)
+    return replace(subject, mounts=mounts, hinges=hinges)
 
 
-def _scale_to_unit(values: np.ndarray, where: str) -> np.ndarray:
-    """Return a vector or quaternion scaled to length 1, from which it may differ by the digits of a file."""
-    length = np.linalg.norm(values)
-    if not abs(length - 1.0) < 1e-3:
-        raise BadSubject(f"{where} must be of length 1; it is {length:.4g}")
-    return np.asarray(values / length)
-
-
-def _read_covariance(table: TomlTable, std: TomlTable, lengths: Collection[str]) -> tuple[tuple[str, ...], np.ndarray]:
+def _read_covariance(top: TomlTable, lengths: Collection[str]) -> tuple[tuple[str, ...], np.ndarray]:
     """Return the names of the rows, and the matrix; without [covariance] that of the standard deviations of lengths."""
+    table, std = top.table("covariance", {}), top.table("lengths_std", {})
     std.allow(*lengths)
-    for name, value in std.values.items():
-        if not is_number(value, LONGEST) or value < 0.0:
-            raise BadSubject(f"{std.at(name)} = {value!r}; a standard deviation in metres is needed")
     if not table.values:
-        order = tuple(name for name in lengths if name in std)
-        return order, np.diag([float(std.values[name]) ** 2 for name in order])
+        variances = {name: (std.number(name, None) or 0.0) ** 2 for name in lengths if name in std}
+        return tuple(variances), np.diag(list(variances.values()))
     table.allow("order", "matrix")
-    order = table.texts("order")
-    for name in order:
-        if (name not in lengths and not _ROW.fullmatch(name)) or order.count(name) > 1:
-            raise BadSubject(f"{table.at('order')}: {name!r} is not known, or twice; {one_of(lengths, name)}")
-    place = table.at("matrix")
     try:
-        matrix = np.array(table.values.get("matrix"), dtype=float)
+        return table.texts("order"), np.array(table.values.get("matrix"), dtype=float)
     except (TypeError, ValueError, OverflowError):
-        raise BadSubject(f"{place} holds NaN or text, or rows of different lengths") from None
-    if matrix.shape != (len(order), len(order)):
-        raise BadSubject(f"{place} is {matrix.shape}; {len(order)} names in order need as many rows")
-    least = -1e-9 * max(1.0, float(np.trace(matrix)))  # what rounding to the file's digits may do
-    if (
-        not (np.abs(matrix) < 1e6).all()
-        or not np.allclose(matrix, matrix.T, atol=1e-12)
-        or np.linalg.eigvalsh(matrix)[0] < least
-    ):
-        raise BadSubject(f"{place} is not symmetric and positive semidefinite")
-    return order, matrix
+        raise BadSubject(f"{table.at('matrix')}: rows of numbers are needed, of one length") from None
