@@ -9,7 +9,7 @@ person's segment frames L equal W in the N-pose; in another start pose R_LS = R_
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,7 +20,6 @@ from ..errors import BadSession
 from ..recording import OrientationSensor, Recording, format_span
 from .start_pose import N_POSE, StartPose
 from .subject import Subject
-from .table import BodyTable
 
 # Angles [deg] between a stated mount and gravity or motion. Above them the mount is an error or gets a warning.
 MAX_MOUNT_ERROR_DEG = 60.0
@@ -47,34 +46,24 @@ def collect_nominal_mounts(
         Neither the subject nor the session has the mount of a sensor.
     """
     nominal = {segment: find_nominal_mount(recording, segment, subject, start_pose) for segment in recording.sensors}
-    mounts = {segment: mount for segment, mount in nominal.items() if mount is not None}
-    missing = [segment for segment in nominal if segment not in mounts]
+    missing = [segment for segment, mount in nominal.items() if mount is None]
     if missing:
-        problem = f"sensors.{missing[0]}.mount is not known"
-        if len(missing) > 1:
-            problem += f", nor that of {', '.join(missing[1:])}"
-        if subject is not None and recording.remounted and set(missing) & set(subject.mounts):
-            problem += " (remounted = true: the subject's are of another mounting)"
-        elif subject is not None and subject.mounts:
-            problem += f"; the subject '{subject.name}' has none for it"
-        raise BadSession(f"{recording.where()}: {problem}: {suggest_mounts(missing, start_pose.table)}")
-    return mounts
-
-
-def suggest_mounts(segments: Sequence[str], table: BodyTable) -> str:
-    """Return what to do where the mounts of these segments' sensors are not known: state them or calibrate."""
-    remedy = 'state it, as in mount = { up = "+x", forward = "-z" }'
-    # Calibrations close chains of lengths: a segment on which no length lies is in none of them.
-    measured = {part.segment for length in table.lengths.values() for part in length.stretches}
-    calibrated = [segment for segment in segments if segment in measured]
-    others = [segment for segment in segments if segment not in measured]
-    if calibrated:
-        target = f"that of {', '.join(calibrated)}" if others else "it" if len(calibrated) == 1 else "them"
-        remedy += f"; or find {target} by `wepose calibrate` (without joined hands --protocol free), then track with "
-        remedy += "--subject"
-    if others:
-        remedy += f"; no calibration finds that of {', '.join(others)}"
-    return remedy
+        remounted = subject is not None and recording.remounted and set(missing) & set(subject.mounts)
+        reason = " (remounted = true: the subject's are of another mounting)" if remounted else ""
+        if subject is not None and subject.mounts and not remounted:
+            reason = f"; the subject '{subject.name}' has none for it"
+        others = f", nor that of {', '.join(missing[1:])}" if len(missing) > 1 else ""
+        # Calibrations close chains of lengths: a segment on which no length lies is in none of them.
+        measured = {part.segment for length in start_pose.table.lengths.values() for part in length.stretches}
+        unfound = [segment for segment in missing if segment not in measured]
+        remedy = "; or find it by `wepose calibrate` (without joined hands --protocol free), then track with --subject"
+        remedy = remedy if len(unfound) < len(missing) else ""
+        remedy += f"; no calibration finds that of {', '.join(unfound)}" if unfound else ""
+        raise BadSession(
+            f"{recording.where()}: sensors.{missing[0]}.mount is not known{others}{reason}: state it, as in "
+            f'mount = {{ up = "+x", forward = "-z" }}{remedy}'
+        )
+    return {segment: mount for segment, mount in nominal.items() if mount is not None}
 
 
 def align_sensors(
@@ -144,26 +133,19 @@ def align_sensors(
     return mounts, heading_offsets, diagnostics
 
 
-def _start_is_guessed(recording: Recording) -> bool:
-    """Whether the user has not stated the seconds of the start pose."""
-    return recording.start_is_guessed or not recording.phases.get("start")
-
-
 def _describe_mount_error(
     recording: Recording, segment: str, subject: Subject | None, tilt_error_deg: float, start: tuple[float, float]
 ) -> str:
     """Return the text of the error that gravity contradicts a mount in the start pose, and what to do."""
-    guessed = _start_is_guessed(recording)
     if subject is not None and segment in subject.mounts and not recording.remounted:
         name, remedy = ": its calibrated mount", "if the sensor was mounted again, state remounted = true and its mount"
-        remedy = f"state its seconds; {remedy}" if guessed else remedy
     else:
         name, remedy = ".mount", "check which sensor axis points up and which forward"
-        remedy = f"state its seconds, or {remedy}" if guessed else remedy
-    reason = ", which was only guessed: [phases] start = [[from, to]] is missing" if guessed else ""
+    if recording.start_is_guessed or not recording.phases.get("start"):
+        remedy = f"the interval was only guessed: state [phases] start = [[from, to]], or {remedy}"
     return (
         f"{recording.where()}: sensors.{segment}{name} is {tilt_error_deg:.0f} deg off gravity in the start pose "
-        f"({format_span(start)}){reason}; {remedy}"
+        f"({format_span(start)}); {remedy}"
     )
 
 
@@ -182,8 +164,8 @@ def find_nominal_mount(
     """
     if subject is not None and segment in subject.mounts and not recording.remounted:
         return subject.mounts[segment]
-    stated = recording.sensors[segment].stated_quat_LS
     sensor = recording.sensors[segment]
+    stated = sensor.stated_quat_LS
     if stated is None and isinstance(sensor, OrientationSensor) and (sensor.aligned or not recording.remounted):
         return np.array([0.0, 0.0, 0.0, 1.0])
     if stated is None or segment not in start_pose.R_WK:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -15,7 +14,7 @@ from ..recording import CONFIGURATION, Recording
 from .body import BodyModel
 from .table import NEUTRAL_POSE, BodyTable, Vector
 from .table_file import load_table
-from .tree import check_joint_values, joint_axis, joint_placement, parse_tree
+from .tree import check_joint_values, parse_tree
 
 
 def compute_start_configuration(
@@ -41,32 +40,16 @@ def compute_start_configuration(
         )
     values = joints if start_pose == CONFIGURATION else poses[start_pose]
     check_joint_values(model.robot, values, f"{where}: joints", BadSession)
-    q, m = pin.neutral(model.pin), model.pin
-    tree = parse_tree(model.robot, where)
-    spherical = {joint: link for link, joint in model.joints.items()}
+    q, m, tree = pin.neutral(model.pin), model.pin, parse_tree(model.robot, where)
     for joint in range(1, m.njoints):
-        first = m.idx_qs[joint]
-        if joint in spherical:
-            R = _rotate_triple(tree.path(spherical[joint])[-3:], values) if spherical[joint] in model.axes else None
-            if R is not None:
-                q[first : first + 4] = Rotation.from_matrix(R).as_quat()
-            continue
-        value = values.get(m.names[joint], 0.0)
         if m.nqs[joint] == 1:
-            q[first] = value
-        else:  # without limits: cosine and sine
-            q[first], q[first + 1] = np.cos(value), np.sin(value)
+            q[m.idx_qs[joint]] = values.get(m.names[joint], 0.0)
+    for link, axes in model.axes.items():  # three joints that are one spherical joint
+        angles = np.array([[values.get(joint.name, 0.0)] for joint in tree.path(link)[-3:]])
+        first, second, third = Rotation.from_rotvec(angles * axes)
+        at = m.idx_qs[model.joints[link]]
+        q[at : at + 4] = (first * second * third).as_quat()
     return q
-
-
-def _rotate_triple(joints: list[Any], values: Mapping[str, float]) -> np.ndarray:
-    """Rotation (3, 3) of three joints that are one spherical joint, out of zero."""
-    zero = turned = np.eye(3)
-    for k, joint in enumerate(joints):
-        placement = joint_placement(joint)[:3, :3] if k else np.eye(3)
-        axis = joint_axis(joint) * values.get(joint.name, 0.0)
-        zero, turned = zero @ placement, turned @ placement @ Rotation.from_rotvec(axis).as_matrix()
-    return zero.T @ turned
 
 
 @dataclass(frozen=True)
