@@ -198,7 +198,7 @@ def measure_ur5_links(seeds: Sequence[int], folder: Path) -> Table:
             before = body.lengths[name]
             table.rows[f"seed {seed} {name}"] = {
                 "before_mm": 1e3 * before,
-                "before_std_mm": 1e3 * body.table.lengths[name].relative_std * before,
+                "before_std_mm": 10.0 * body.table.lengths[name].std_percent * before,
                 "calibrated_mm": 1e3 * value,
                 "std_mm": 1e3 * std,
                 "true_mm": 1e3 * true,

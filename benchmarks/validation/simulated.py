@@ -318,7 +318,7 @@ def _rms(values: np.ndarray) -> float:
 
 def list_closed_lengths(table: BodyTable) -> list[str]:
     """List the lengths that joined hands observe: all but those from the root, as the trunk's."""
-    return [name for name, length in table.lengths.items() if all(ROOT not in part.start for part in length.stretches)]
+    return [name for name, length in table.lengths.items() if ROOT not in length.start]
 
 
 def set_exact_mounts(subject: Subject, simulation: Simulation) -> Subject:

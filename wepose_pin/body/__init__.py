@@ -10,16 +10,15 @@ pairs. In a `BodyModel` links bear the names of segments and points, in our fram
 for them, fixed to its own.
 
 `tree` reads the joints, `table` and `table_file` the table, `naming` gives links its names, `lengths` measures and
-stretches, `chains` finds the joints that set a segment, `reaches` the way from the root to each point, and `body` is
-what they make. A person's numbers stand in `subject`, those of all people in `anthropometry`.
+stretches and has the way from the root to each point, and `body` is what they make. A person's numbers stand in
+`subject`, those of all people in `anthropometry`.
 
 `configuration` solves for the joints from orientations of segments, `links` places links and points, `kinematics` does
 both (`Pose`), `covariance` says how well points are known.
 """
 
 from .anthropometry import SEXES, LengthPrior, compute_population_lengths, convert_breadths, list_breadths
-from .body import BodyModel, load_model
-from .chains import Chain
+from .body import BodyModel, Chain, load_model
 from .girdle import Girdle, GirdleMotion
 from .lengths import LinkVector
 from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, Segment

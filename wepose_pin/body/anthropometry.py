@@ -97,15 +97,7 @@ def convert_breadths(
 ) -> dict[str, tuple[float, float]]:
     """Measured lengths and distances with one standard deviation each [m], those given as a breadth converted.
 
-    Parameters
-    ----------
-    measured : length, breadth or distance → [m]
-    measured_std : of what was measured [m]
-
-    Raises
-    ------
-    BadOption
-        A breadth and the length that it gives are both measured.
+    Raise `BadOption` where a breadth and the length that it gives are both measured.
     """
     breadths, converted = list_breadths(table), {}
     for name, metres in measured.items():

@@ -141,28 +141,16 @@ def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.nd
 class KinematicsSolver(ConfigurationSolver):
     """Poses from orientations, chunk by chunk or one after another: each continues the motion of the last.
 
-    Parameters
-    ----------
-    model : the body
-    segments : the measured segments, in the order of the rows that `compute_points` takes
-    limits : keep the limits of joints with one axis
-    start : (nq,) the configuration of a mechanism before the first frame; None: all joints at zero
+    Parameters and errors as of `ConfigurationSolver`.
 
     Attributes
     ----------
     points : names of the known points
     data : Pinocchio's data of the last pose of `compute_points`
-
-    Raises
-    ------
-    BadData, BadModel
-        As `solve_configuration`.
     """
 
-    def __init__(
-        self, model: BodyModel, segments: Collection[str], *, limits: bool = True, start: np.ndarray | None = None
-    ) -> None:
-        super().__init__(model, segments, limits=limits, start=start)
+    def __init__(self, model: BodyModel, segments: Collection[str], **options: Any) -> None:
+        super().__init__(model, segments, **options)
         self.points, self.data = tuple(find_known_points(model, segments)), model.pin.createData()
         self._frames = [model.point_frames[point] for point in self.points]
         self._views = [self.data.oMf[model.pin.getFrameId(frame)].translation for frame in self._frames]

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from ..errors import BadModel
-from .table import ROOT, BodyTable, Stretch
+from .table import ROOT, BodyTable, Length
 from .tree import Tree, copy_robot, joint_placement, parse_tree
 
 UNIVERSE = "universe"  # the link of what is rigid with the root
@@ -24,12 +24,9 @@ _DECIMALS = 13  # of a vector [m] and of its change per metre of a length; what 
 
 
 def measure_lengths(robot: Any, table: BodyTable) -> dict[str, float]:
-    """The lengths [m] between the points of `robot` (yourdfpy), all joints at zero; the mean where parts share one."""
+    """The lengths [m] between the points of `robot` (yourdfpy), all joints at zero."""
     at = _find_points(parse_tree(robot, robot.name), table)
-    return {
-        name: float(np.mean([np.linalg.norm(_line(at, part)) for part in length.stretches]))
-        for name, length in table.lengths.items()
-    }
+    return {name: float(np.linalg.norm(_line(at, length))) for name, length in table.lengths.items()}
 
 
 def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> Any:
@@ -64,9 +61,9 @@ def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> 
     reached = measure_lengths(robot, table)
     for name, value in targets.items():
         if abs(reached[name] - value) > _TOLERANCE:
-            segments = " and ".join(part.segment for part in table.lengths[name].stretches)
+            segment = table.lengths[name].segment
             raise BadModel(
-                f"{table.where}: lengths.{name}: stretching {segments} does not move its points apart by as much; name "
+                f"{table.where}: lengths.{name}: stretching {segment} does not move its points apart by as much; name "
                 f"the segment between them"
             )
     return robot
@@ -76,9 +73,11 @@ def _find_points(tree: Tree, table: BodyTable) -> dict[str, np.ndarray]:
     return {ROOT: np.zeros(3)} | {name: tree.neutral(point.link)[:3, 3] for name, point in table.points.items()}
 
 
-def _line(at: Mapping[str, np.ndarray], part: Stretch) -> np.ndarray:
+def _line(at: Mapping[str, np.ndarray], length: Length) -> np.ndarray:
     """The line (3,) [m] that a length measures."""
-    first, last = (np.sum([at[point] for point in points], axis=0) / len(points) for points in (part.start, part.end))
+    first, last = (
+        np.sum([at[point] for point in points], axis=0) / len(points) for points in (length.start, length.end)
+    )
     return np.asarray(last - first)
 
 
@@ -87,12 +86,7 @@ def _find_projections(tree: Tree, table: BodyTable) -> dict[str, dict[str, np.nd
     at = _find_points(tree, table)
     projections: dict[str, dict[str, np.ndarray]] = {}
     for segment in table.segments:
-        lines = {
-            name: _line(at, part)
-            for name, length in table.lengths.items()
-            for part in length.stretches
-            if part.segment == segment
-        }
+        lines = {name: _line(at, each) for name, each in table.lengths.items() if each.segment == segment}
         if not lines:
             continue
         basis = np.array([line / max(np.linalg.norm(line), _LEAST) for line in lines.values()]).T  # (3, k)

@@ -54,7 +54,7 @@ def collect_nominal_mounts(
             reason = f"; the subject '{subject.name}' has none for it"
         others = f", nor that of {', '.join(missing[1:])}" if len(missing) > 1 else ""
         # Calibrations close chains of lengths: a segment on which no length lies is in none of them.
-        measured = {part.segment for length in start_pose.table.lengths.values() for part in length.stretches}
+        measured = {length.segment for length in start_pose.table.lengths.values()}
         unfound = [segment for segment in missing if segment not in measured]
         remedy = "; or find it by `wepose calibrate` (without joined hands --protocol free), then track with --subject"
         remedy = remedy if len(unfound) < len(missing) else ""

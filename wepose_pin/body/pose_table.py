@@ -11,7 +11,6 @@ from ..errors import BadData, one_of
 from .covariance import compute_axis_std
 from .kinematics import Pose
 
-_MAX_TABLE_VALUE = 1e12  # beyond this a number in a table is no time [s] and no position [m]
 MAX_TABLE_NORM_DEVIATION = 1e-2  # of a quaternion in a table from 1: a file may have few decimals
 
 
@@ -48,8 +47,8 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
     Raises
     ------
     BadData
-        No column of time; neither orientations nor points; a text; a quaternion that is not of unit norm; a number
-        beyond `_MAX_TABLE_VALUE`.
+        No column of time, or one that does not increase; neither orientations nor points; a text; a quaternion that is
+        not of unit norm.
     """
     if "time" not in table.columns:
         raise BadData(f"{file}: no column 'time'; a table as in pose.parquet is needed; {one_of(table.columns)}")
@@ -57,52 +56,35 @@ def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
         numbers = {name: table[name].cast(pl.Float64).to_numpy() for name in table.columns}
     except pl.exceptions.PolarsError as error:
         raise BadData(f"{file}: a column holds text: {str(error).splitlines()[0]}") from error
-    segments = [name for name in _stems(numbers, "_qx") if {f"{name}_{c}" for c in ("qy", "qz", "qw")} <= set(numbers)]
-    places = [name for name in _stems(numbers, "_x") if {f"{name}_{c}" for c in "yz"} <= set(numbers)]
-    _check_numbers(numbers, file, (*segments, *places))
+    time = numbers["time"]
+    if not (len(time) and np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
+        raise BadData(f"{file}: time does not increase from row to row; seconds that do are needed, in one row or more")
     quat_WL, points = {}, {}
-    for segment in segments:
-        quat = np.column_stack([numbers[f"{segment}_{c}"] for c in ("qx", "qy", "qz", "qw")])
+    for name in (name.removesuffix("_qx") for name in numbers if name.endswith("_qx")):
+        columns = [f"{name}_{c}" for c in ("qx", "qy", "qz", "qw")]
+        if not set(columns) <= set(numbers):
+            continue
+        quat = np.column_stack([numbers[column] for column in columns])
         norm = np.linalg.norm(quat, axis=1)
         if np.any(np.abs(norm - 1.0) > MAX_TABLE_NORM_DEVIATION):
-            raise BadData(f"{file}: {segment}_qx … _qw is no unit quaternion in row {np.argmax(abs(norm - 1)) + 1}")
-        quat_WL[segment] = quat / norm[:, None]
-    for point in places:
-        points[point] = np.column_stack([numbers[f"{point}_{c}"] for c in "xyz"])
+            raise BadData(f"{file}: {name}_qx … _qw is no unit quaternion in row {np.argmax(abs(norm - 1)) + 1}")
+        quat_WL[name] = quat / norm[:, None]
+    for name in (name.removesuffix("_x") for name in numbers if name.endswith("_x")):
+        if {f"{name}_y", f"{name}_z"} <= set(numbers):
+            points[name] = np.column_stack([numbers[f"{name}_{c}"] for c in "xyz"])
     if not quat_WL and not points:
         raise BadData(f"{file}: neither orientations nor points; columns as <segment>_qx … or <point>_x … are needed")
     segment_cov = {name: _parse_covariances(numbers, name) for name in quat_WL}
     point_cov = {name: _parse_covariances(numbers, name) for name in points}
     gap = {name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers}
     return Pose(
-        numbers["time"],
+        time,
         quat_WL,
         points,
         segment_cov={name: cov for name, cov in segment_cov.items() if cov is not None},
         point_cov={name: cov for name, cov in point_cov.items() if cov is not None},
         gap=gap,
     )
-
-
-def _stems(numbers: Mapping[str, np.ndarray], ending: str) -> list[str]:
-    """Return the beginnings of the columns that end so."""
-    return [name.removesuffix(ending) for name in numbers if name.endswith(ending)]
-
-
-def _check_numbers(numbers: Mapping[str, np.ndarray], file: str, names: tuple[str, ...]) -> None:
-    """Raise `BadData` where time does not increase or a number is beyond `_MAX_TABLE_VALUE`; NaN means not known."""
-    time = numbers["time"]
-    if not len(time):
-        raise BadData(f"{file}: no rows; a pose has at least one")
-    if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
-        raise BadData(f"{file}: time does not increase from row to row; seconds that do are needed")
-    for name, values in numbers.items():
-        if name != "time" and not name.startswith(names):
-            continue
-        too_large = np.abs(values) > _MAX_TABLE_VALUE
-        if too_large.any():
-            row = int(np.argmax(too_large))
-            raise BadData(f"{file}: {name} is {values[row]:g} in row {row + 1}; no pose has such a number")
 
 
 def _parse_covariances(numbers: Mapping[str, np.ndarray], name: str) -> np.ndarray | None:

@@ -424,7 +424,7 @@ def population_subject(
             if not isinstance(body, BodyModel):
                 raise BadModel(f"{table.where}: lengths.{name} is no share of stature; its model is needed")
             lengths[name] = body.lengths[name]
-            variances[name] = (length.relative_std * lengths[name]) ** 2
+            variances[name] = (0.01 * length.std_percent * lengths[name]) ** 2
     order = tuple(table.lengths)
     covariance = np.diag([variances.get(name, 0.0) for name in order])
     rows = [order.index(name) for name in people.names]

@@ -113,32 +113,23 @@ class Point(NamedTuple):
     at: Annotated[Vector, Key("at", "m", -10.0, 10.0, omit_zero=True)] = ZERO
 
 
-class Stretch(NamedTuple):
-    """A part of a length, which scales a segment along the line between two places."""
+class Length(NamedTuple):
+    """A length of a body, which scales a segment along the line between two places.
+
+    Parameters
+    ----------
+    segment : what it scales
+    start, end : a point, or two in whose middle the line begins or ends, with all joints at zero
+    share : its name among the ratios to stature in ``calibration/anthropometry.toml``; empty: it has none, and the
+        prior is the model's own value
+    std_percent : one standard deviation of the model's own value, as a share of it [%]
+    """
 
     segment: SegmentName
-    # A point, or two in whose middle the line begins or ends, with all joints at zero.
     start: Annotated[tuple[str, ...], Key("from", of="points")]
     end: Annotated[tuple[str, ...], Key("to", of="points")]
-    # Its name among the ratios to stature in calibration/anthropometry.toml; empty: it has none, and the prior is the
-    # model's own value
     share: str = ""
-    # One standard deviation of the model's own value [%].
     std_percent: Annotated[float, Key(least=1e-3)] = 10.0
-
-
-class Length(NamedTuple):
-    """A length of a body: what it scales, more than one where parts of the body share it."""
-
-    stretches: tuple[Stretch, ...]
-
-    @property
-    def share(self) -> str:
-        return next((part.share for part in self.stretches if part.share), "")
-
-    @property
-    def relative_std(self) -> float:
-        return 0.01 * self.stretches[0].std_percent
 
 
 class HingeJoint(NamedTuple):
@@ -267,16 +258,10 @@ class BodyTable:
         beginning = ends[0] if ends else ()
         return self.segments[segment].joint or (beginning[0] if len(beginning) == 1 else segment)
 
-    @cached_property
-    def _stretches(self) -> tuple[Stretch, ...]:
-        return tuple(part for length in self.lengths.values() for part in length.stretches)
-
     def find_length(self, *points: str) -> str | None:
         """Return the name of the length between these points, or their middles; None: there is none."""
-        for name, length in self.lengths.items():
-            if len(length.stretches) == 1 and {*length.stretches[0].start, *length.stretches[0].end} == set(points):
-                return name
-        return None
+        names = (name for name, length in self.lengths.items() if {*length.start, *length.end} == set(points))
+        return next(names, None)
 
     def find_limb(self, point: str) -> Limb | None:
         """Return the limb up to a point; None where the point is on none, or is the first one of its limb.
@@ -288,12 +273,13 @@ class BodyTable:
         if line is None:
             return None
         points = line[: line.index(point) + 1]
-        between = {(*part.start, *part.end): part.segment for part in self._stretches}
+        between = {(*length.start, *length.end): length.segment for length in self.lengths.values()}
         own = dict.fromkeys(between[ends] for ends in pairwise(points) if ends in between)
-        above = (part.segment for part in self._stretches if points[0] in part.start + part.end)
-        base = next((segment for segment in above if segment not in own), None)
+        above = (segment for ends, segment in between.items() if points[0] in ends and segment not in own)
         origin = [point for point in (points[0], self.counterpart(points[0])) if point is not None]
-        return Limb(points, tuple(own), base, tuple(sorted(origin, key=lambda point: point not in self.pairs)))
+        return Limb(
+            points, tuple(own), next(above, None), tuple(sorted(origin, key=lambda name: name not in self.pairs))
+        )
 
     @property
     def drawn_limbs(self) -> dict[str, Limb]:
@@ -302,8 +288,8 @@ class BodyTable:
 
     def ends(self, segment: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
         """Return the points at which the length of a segment begins and ends; None where not just one length is its."""
-        stretches = [part for part in self._stretches if part.segment == segment]
-        return (stretches[0].start, stretches[0].end) if len(stretches) == 1 else None
+        ends = [(length.start, length.end) for length in self.lengths.values() if length.segment == segment]
+        return ends[0] if len(ends) == 1 else None
 
     def guess_segment(self, label: str) -> str | None:
         """Guess the segment from a label or a file name, as ``humerus_r_imu`` or ``LeftForeArm``; None if unclear."""
@@ -335,7 +321,7 @@ def prune_table(table: BodyTable) -> BodyTable:
     lengths = {
         name: length
         for name, length in table.lengths.items()
-        if all(part.segment in segments and points.issuperset(part.start + part.end) for part in length.stretches)
+        if length.segment in segments and points.issuperset(length.start + length.end)
     }
     hinges = {name: hinge for name, hinge in table.hinges.items() if {hinge.on, hinge.moves} <= segments}
     girdles = {

@@ -27,7 +27,6 @@ from .table import (
     Length,
     Point,
     Segment,
-    Stretch,
     prune_table,
 )
 
@@ -110,10 +109,8 @@ def _parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
     if "like" in top:
         table = prune_table(table)
     known = {"segments": table.segments, "points": (*table.points, ROOT)}
-    lengths = {**table.lengths}
-    for length, value in top.table("lengths", {}).values.items():
-        parts = TomlTable({length: value if isinstance(value, list) else [value]}, where, "lengths.", BadModel)
-        lengths[length] = Length(tuple(read_record(Stretch, part, known) for part in parts.entries(length)))
+    lengths = {name: read_record(Length, entry, known) for name, entry in _read_tables(top, "lengths")}
+    lengths = {**table.lengths, **lengths}
     known |= {"lengths": tuple(lengths)}
     hinges = {**table.hinges}
     for joint, entry in _read_tables(top, "hinges"):
@@ -245,9 +242,7 @@ def format_table(table: BodyTable, urdf: str) -> str:
     lines += ["", "[points]"]
     lines += [f"{toml_key(name)} = {{ {', '.join(format_record(point))} }}" for name, point in table.points.items()]
     lines += ["", "[lengths]"]
-    for name, length in table.lengths.items():
-        parts = [f"{{ {', '.join(format_record(part))} }}" for part in length.stretches]
-        lines.append(f"{toml_key(name)} = [{', '.join(parts)}]")
+    lines += [f"{toml_key(name)} = {{ {', '.join(format_record(length))} }}" for name, length in table.lengths.items()]
     for name, joints in table.poses.items():
         if name != NEUTRAL_POSE or joints:  # reading adds the neutral one
             lines += ["", f"[poses.{toml_key(name)}]"]

@@ -32,26 +32,25 @@ def visuals(robot: Any) -> list[Visual]:
     for link in robot.links:
         for visual in link.visuals:
             geometry, origin = visual.geometry, np.eye(4) if visual.origin is None else visual.origin
-            size: tuple[float, ...]
-            file = None
             if geometry.box is not None:
-                kind, size = "box", tuple(float(v) for v in geometry.box.size)
+                kind, size = "box", geometry.box.size
             elif geometry.cylinder is not None:
-                kind, size = "cylinder", (float(geometry.cylinder.radius), float(geometry.cylinder.length))
+                kind, size = "cylinder", (geometry.cylinder.radius, geometry.cylinder.length)
             elif geometry.sphere is not None:
-                kind, size = "sphere", (float(geometry.sphere.radius),)
+                kind, size = "sphere", (geometry.sphere.radius,)
             elif geometry.mesh is not None:
-                scale = np.ones(3) if geometry.mesh.scale is None else np.asarray(geometry.mesh.scale) * np.ones(3)
-                kind, size, file = "mesh", tuple(float(v) for v in scale), geometry.mesh.filename
+                kind, size = "mesh", np.ones(3) if geometry.mesh.scale is None else geometry.mesh.scale * np.ones(3)
             else:
                 continue
+            file = geometry.mesh.filename if kind == "mesh" else None
             rgba = np.array([0.7, 0.7, 0.7, 1.0])
             if visual.material is not None:
                 own = visual.material.color
                 rgba = own.rgba if own is not None else colours.get(visual.material.name, rgba)
             r, g, b, a = (float(v) for v in rgba)
             quat = Rotation.from_matrix(origin[:3, :3]).as_quat()
-            shapes.append(Visual(link.name, kind, size, quat, origin[:3, 3].copy(), (r, g, b, a), file))
+            sizes = tuple(float(v) for v in size)
+            shapes.append(Visual(link.name, kind, sizes, quat, origin[:3, 3].copy(), (r, g, b, a), file))
     return shapes
 
 

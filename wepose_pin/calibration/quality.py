@@ -118,7 +118,7 @@ def _check_lengths(calibration: Calibration, motion: Mapping[str, float]) -> lis
     problem, subject, checks = calibration.problem, calibration.subject, list[Check]()
     table, scale_observed = problem.model.table, is_scale_observed(problem.conditions)
     # Lengths that begin at the root cancel in a closed chain, and are one with a point of W that is not known.
-    names = [name for name, length in table.lengths.items() if not any(ROOT in part.start for part in length.stretches)]
+    names = [name for name, length in table.lengths.items() if ROOT not in length.start]
     lengths, shape = np.array([subject.lengths[name] for name in names]), subject.lengths_covariance(names)
     if len(names) > 1 and not scale_observed:  # errors of the scale change all lengths together
         shape = shape - np.outer(lengths, lengths) / float(lengths @ np.linalg.solve(shape, lengths))

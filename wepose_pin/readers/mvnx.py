@@ -104,9 +104,9 @@ def read_mvnx_lengths(path: Path) -> dict[str, float]:
         joints[ROOT] = np.mean([joints[hip] for hip in HIPS], axis=0)
     known = {}
     for name, length in load_table().lengths.items():
-        (start, end), *others = ((part.start, part.end) for part in length.stretches)
-        if not others and {*start, *end} <= set(joints):
-            first, last = (np.mean([joints[point] for point in points], axis=0) for points in (start, end))
+        if {*length.start, *length.end} <= set(joints):
+            ends = (length.start, length.end)
+            first, last = (np.mean([joints[point] for point in points], axis=0) for points in ends)
             known[name] = float(np.nanmedian(np.linalg.norm(last - first, axis=1)))
     if not known:
         raise BadData(f"{path}: no positions of the arms' segments in it; export it with <position>")
