@@ -22,23 +22,17 @@ def build_pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
     A standard deviation is that of one axis, the mean over the three (`compute_axis_std`).
     """
     table = {"time": pose.time}
-    for segment, quat in pose.quat_WL.items():
-        table |= {f"{segment}_{c}": quat[:, k] for k, c in enumerate(("qx", "qy", "qz", "qw"))}
-        if segment in pose.segment_cov:
-            table |= _build_uncertainty_columns(segment, pose.segment_cov[segment], covariance)
-    for point, p in pose.points.items():
-        table |= {f"{point}_{c}": p[:, k] for k, c in enumerate("xyz")}
-        if point in pose.point_cov:
-            table |= _build_uncertainty_columns(point, pose.point_cov[point], covariance)
+    series = [(name, quat, ["qx", "qy", "qz", "qw"], pose.segment_cov) for name, quat in pose.quat_WL.items()]
+    series += [(name, p, ["x", "y", "z"], pose.point_cov) for name, p in pose.points.items()]
+    for name, values, components, covariances in series:
+        table |= {f"{name}_{c}": values[:, k] for k, c in enumerate(components)}
+        if name in covariances:
+            cov = covariances[name]
+            table[f"{name}_std"] = compute_axis_std(cov)
+            if covariance:
+                table |= {f"{name}_cov_{'xyz'[i]}{'xyz'[j]}": cov[:, i, j] for i in range(3) for j in range(i, 3)}
     table |= {f"{segment}_gap": gap for segment, gap in pose.gap.items()}
     return pl.DataFrame(table)
-
-
-def _build_uncertainty_columns(name: str, cov: np.ndarray, entries: bool) -> dict[str, np.ndarray]:
-    columns = {f"{name}_std": compute_axis_std(cov)}
-    if entries:
-        columns |= {f"{name}_cov_{'xyz'[i]}{'xyz'[j]}": cov[:, i, j] for i in range(3) for j in range(i, 3)}
-    return columns
 
 
 def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:

@@ -180,7 +180,7 @@ class Subject:
 
     @property
     def is_population(self) -> bool:
-        """Whether it is the population prior, without any calibration."""
+        """True of the population prior, without any calibration."""
         return self.name == POPULATION
 
     def check(self, where: str = "") -> Subject:
@@ -244,9 +244,9 @@ class Subject:
         """
         body = body.with_lengths({name: self.lengths[name] for name in body.lengths if name in self.lengths})
         girdles = {name: own for name, own in self.girdles.items() if name in body.table.girdles}
-        return replace(body, girdles=girdles, tissue_means={} if remounted else self.find_tissue_means(body))
+        return replace(body, girdles=girdles, tissue_means={} if remounted else self._find_tissue_means(body))
 
-    def find_tissue_means(self, body: BodyModel) -> dict[str, TissueMean]:
+    def _find_tissue_means(self, body: BodyModel) -> dict[str, TissueMean]:
         """Find segment → what it has turned beyond its sensor in this person's mean; nothing where no hinge shows it.
 
         A hinge shows how far the sensor above it lags behind a twist. The share of the usual lag that it has is
@@ -354,16 +354,12 @@ def girdle_rows(table: BodyTable) -> list[str]:
 
 def compute_girdle_prior(table: BodyTable) -> np.ndarray:
     """Compute the covariance (7 g, 7 g) of the parameters of a body's g girdles before a calibration."""
-    names = list(table.girdles)
-    std = np.array([table.girdles[name].parameter_std for name in names]).reshape(len(names), len(PARAMETERS))
-    correlation = np.eye(std.size)
-    for i, name in enumerate(names):
-        other = table.counterpart(name)
-        if other in names:
-            j = names.index(other)
-            for k in range(4):  # the law and the place at rest
-                correlation[len(PARAMETERS) * i + k, len(PARAMETERS) * j + k] = table.girdles[name].alike
-    return correlation * np.outer(std, std)
+    girdles = table.girdles
+    std = np.ravel([girdle.parameter_std for girdle in girdles.values()])
+    alike = [[girdles[a].alike if table.counterpart(a) == b else 0.0 for b in girdles] for a in girdles]
+    both_sides = np.diag([1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # the law and the place at rest
+    correlation = np.eye(std.size) + np.kron(np.reshape(alike, (len(girdles), len(girdles))), both_sides)
+    return np.asarray(correlation * np.outer(std, std))
 
 
 def check_lengths(place: str, lengths: Mapping[str, float]) -> None:
