@@ -9,7 +9,7 @@ What there is on a body stands in a table beside its URDF (`BodyTable`): segment
 pairs. In a `BodyModel` links bear the names of segments and points, in our frames; a body of others gets massless links
 for them, fixed to its own.
 
-`tree` reads the joints, `table` and `table_file` the table, `naming` gives links its names, `lengths` measures and
+`table` and `table_file` have the table, `tree` the joints and the links by the table's names, `lengths` measures and
 stretches and has the way from the root to each point, and `body` is what they make. A person's numbers stand in
 `subject`, those of all people in `anthropometry`.
 
@@ -17,12 +17,12 @@ stretches and has the way from the root to each point, and `body` is what they m
 both (`Pose`), `covariance` says how well points are known.
 """
 
-from .anthropometry import SEXES, LengthPrior, compute_population_lengths, convert_breadths, list_breadths
-from .body import BodyModel, Chain, load_model
-from .girdle import Girdle, GirdleMotion
+from .anthropometry import SEXES, convert_breadths, list_breadths
+from .body import BodyModel, load_model
+from .girdle import Girdle
 from .lengths import LinkVector
-from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb, Segment
-from .table_file import find_table, load_table, read_table
+from .table import DEFAULT_BODY, ROOT, BodyTable, HingeJoint, Limb
+from .table_file import load_table
 from .visuals import Visual
 
 __all__ = [
@@ -31,20 +31,13 @@ __all__ = [
     "SEXES",
     "BodyModel",
     "BodyTable",
-    "Chain",
     "Girdle",
-    "GirdleMotion",
     "HingeJoint",
-    "LengthPrior",
     "Limb",
     "LinkVector",
-    "Segment",
     "Visual",
-    "compute_population_lengths",
     "convert_breadths",
-    "find_table",
     "list_breadths",
     "load_model",
     "load_table",
-    "read_table",
 ]

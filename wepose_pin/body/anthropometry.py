@@ -40,13 +40,6 @@ def compute_population_lengths(table: BodyTable, stature: float | None = None, s
     ----------
     stature : body height [m]; None: 1.75 with the spread of adults
     sex : "f", "m", or None for the mean of both
-
-    Raises
-    ------
-    BadOption
-        A stature outside 1.0 to 2.5 m, or another sex.
-    BadModel
-        The table names a share that is not known.
     """
     check_stature(stature)
     if sex is not None and sex not in SEXES:

@@ -21,11 +21,10 @@ from . import visuals as _visuals
 from .anthropometry import compute_population_lengths
 from .girdle import PARAMETERS
 from .lengths import LinkVector, measure_reaches
-from .naming import MOST_LINKS, rename_links
 from .soft_tissue import TissueMean
 from .table import DEFAULT_BODY, BodyTable, Segment
 from .table_file import find_table, load_table, read_table
-from .tree import build, check_joint_values, parse_tree
+from .tree import MOST_LINKS, build, check_joint_values, parse_tree, rename_links
 from .urdf import import_yourdfpy, read_urdf
 from .visuals import Visual
 
@@ -84,14 +83,10 @@ class BodyModel:
     @cached_property
     def point_girdles(self) -> dict[str, tuple[str, ...]]:
         """Point → the girdles that move it."""
-        m = self.pin
-        joints = {name: m.getJointId(girdle.joints[-1]) for name, girdle in self.table.girdles.items()}
-        supports = {
-            point: m.supports[m.frames[m.getFrameId(at)].parentJoint] for point, at in self.point_frames.items()
-        }
-        return {
-            point: tuple(name for name, joint in joints.items() if joint in above) for point, above in supports.items()
-        }
+        m, girdles = self.pin, self.table.girdles
+        ends = {name: m.getJointId(girdle.joints[-1]) for name, girdle in girdles.items()}
+        above = {point: m.supports[m.frames[m.getFrameId(at)].parentJoint] for point, at in self.point_frames.items()}
+        return {point: tuple(name for name in ends if ends[name] in joints) for point, joints in above.items()}
 
     @cached_property
     def lengths(self) -> dict[str, float]:
@@ -135,12 +130,11 @@ class BodyModel:
     def diagnostics(self) -> tuple[Diagnostic, ...]:
         """Implausible lengths."""
         people, diagnostics = compute_population_lengths(self.table), []
-        for length, mean, std in zip(people.names, people.mean, np.sqrt(np.diag(people.covariance)), strict=True):
-            value = self.lengths[length]
-            if abs(value - mean) > FAR_OFF * std:
-                plausible = {"shortest": max(0.0, mean - FAR_OFF * std), "longest": mean + FAR_OFF * std}
-                facts: dict[str, float | str] = {"model": self.robot.name, "deviations": FAR_OFF, **plausible}
-                diagnostics.append(Diagnostic("model-implausible", WARNING, length, value, facts=facts))
+        margin = FAR_OFF * np.sqrt(np.diag(people.covariance))
+        for name, low, high in zip(people.names, people.mean - margin, people.mean + margin, strict=True):
+            if not low <= self.lengths[name] <= high:
+                limits = {"model": self.robot.name, "deviations": FAR_OFF, "shortest": max(0.0, low), "longest": high}
+                diagnostics.append(Diagnostic("model-implausible", WARNING, name, self.lengths[name], facts=limits))
         return tuple(diagnostics)
 
     @cached_property
@@ -284,7 +278,7 @@ def _load_body(path: Path) -> BodyModel:
         poses={name: pose for name, pose in table.poses.items() if joints.issuperset(pose)},
     )
     body = _body(*rename_links(robot, table), str(urdf))
-    _check_segments_move(body)
+    _check_segments_move(body, body.table)
     if is_table:
         longer = {name: 1.1 * value for name, value in body.lengths.items()}
         _lengths.with_lengths(body.robot, body.table, longer)  # raises where the table does not give them
@@ -310,11 +304,9 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: 
         return load_model(path)
     for name in sensors:
         if name not in tree.below:
-            raise BadSession(
-                f"{where}: sensors.{name} is no link of {robot.name}; {one_of(tree.below, name, MOST_LINKS)}"
-            )
-    links = sorted(sensors, key=lambda name: len(tree.path(name)))
-    segments = {name: Segment.of_mechanism(name) for name in links}
+            links = one_of(tree.below, name, MOST_LINKS)
+            raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {links}")
+    segments = {name: Segment.of_mechanism(name) for name in sorted(sensors, key=lambda name: len(tree.path(name)))}
     body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(file)), str(file))
     if not body.pin.nv:
         raise BadModel(f"{file}: no joint moves; a chain of revolute or prismatic joints is needed")
@@ -331,16 +323,12 @@ def _find_body(path: str | Path | None) -> Path:
     return asset("urdf", f"{load_table(path.name).name}.toml")
 
 
-def _check_segments_move(body: BodyModel) -> None:
+def _check_segments_move(body: BodyModel, table: BodyTable) -> None:
     """Raise `BadModel` on segments that no joint moves against the one above, and on hinges between no neighbours."""
-    table = body.table
     for segment in table.needed:
         above = body.parents[segment]
         if above is not None and not body.chains[segment].joints:
-            raise BadModel(
-                f"{table.where}: no joint moves {segment} against {above}: the body could not follow; it needs "
-                f"revolute joints there"
-            )
+            raise BadModel(f"{table.where}: no joint moves {segment} against {above}; revolute joints are needed there")
     for name, hinge in table.hinges.items():
         if body.parents[hinge.moves] != hinge.on:
             raise BadModel(f"{table.where}: hinges.{name} is none: {hinge.moves} does not hang on {hinge.on}")

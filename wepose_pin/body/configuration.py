@@ -12,6 +12,7 @@ follow the limbs.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -54,14 +55,8 @@ class ConfigurationSolver:
 
     Parameters
     ----------
-    segments : the measured ones, in the order in which `solve` takes them
-    limits : as of `solve_configuration`
+    segments, limits : the measured ones, in the order in which `solve` takes them; as of `solve_configuration`
     start : (nq,) the configuration of a mechanism before the first frame; None: all joints at zero
-
-    Raises
-    ------
-    BadData, BadModel
-        As `solve_configuration`.
     """
 
     def __init__(
@@ -93,7 +88,7 @@ class ConfigurationSolver:
         self._spherical = tuple(np.array(column) for column in zip(*spherical, strict=True))
         self._quaternions = np.array([m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4], dtype=int)
         self._girdles = [
-            _PlacedGirdle(model, name, self.segments)
+            _describe_girdle(model, name, self.segments)
             for name, girdle in model.table.girdles.items()
             if girdle.on in self.segments
         ]
@@ -110,7 +105,7 @@ class ConfigurationSolver:
         if self._fit is not None:
             self._fit.run(q, quat_WL, last)
         for girdle in self._girdles:
-            girdle.place(q, quat_WL)
+            _place_girdle(quat_WL, *girdle, q)
         _unwrap_signs(q, self._quaternions, q[0] if last is None else last)
         self._last = q[-1].copy()
         return q
@@ -196,9 +191,9 @@ def _unwrap_signs(q, at, before):  # type: ignore[no-untyped-def]
 
 
 class _BentSpine:
-    """Several joints between a segment L and the measured segment A above, or W, the last spherical one of them free.
+    """Several joints from the measured segment A, or W, to a segment L; the spherical one nearest to L is free.
 
-    Hinges in the place of a spherical joint rest. Joints with limits keep them.
+    Joints with limits keep them, and joints behind the free one rest.
     """
 
     def __init__(
@@ -206,43 +201,33 @@ class _BentSpine:
     ) -> None:
         m, chain, data = model.pin, model.chains[segment], _stand_at_zero(model.pin)
         self._row, self._above = segments.index(segment), -1 if above is None else segments.index(above)
-        R_AJ, R_AL = _compare_at_zero(model, segment, above, chain.joints)
+        joints = [joint for joint in chain.joints if joint <= (chain.spherical or 0)]
+        R_AJ, R_AL = _compare_at_zero(model, segment, above, joints)
         self._quat_LA, self._up_A = R_AL.inv().as_quat(), R_AL.apply([0.0, 0.0, 1.0])
-        places: list[list[int]] = []  # joints that meet in one point
-        for joint in chain.joints:
-            p = data.oMi[joint].translation
-            if not places or np.linalg.norm(p - data.oMi[places[-1][-1]].translation) > _MEET_TOLERANCE:
-                places.append([])
-            places[-1].append(joint)
-        self._share = 1.0 / len(places)
-        self._joints = []  # place in q, R_AJ, axis in A and limits of each that moves, from the root outwards
-        for place in places:
-            spherical = [joint for joint in place if m.nvs[joint] == 3]
-            for joint in spherical[-1:] or place:
-                R, at, ends = R_AJ[chain.joints.index(joint)], m.idx_qs[joint], (-np.inf, np.inf)
-                if limits and m.nqs[joint] == 1:
-                    ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at])
-                axis = None if spherical else R.apply(m.joints[joint].extract().axis)
-                self._joints.append((joint == chain.spherical, at, R.as_quat(), axis, ends))
+        steps = np.diff([data.oMi[joint].translation for joint in joints], axis=0)
+        places = 1 + np.count_nonzero(np.linalg.norm(steps, axis=1) > _MEET_TOLERANCE)  # where joints meet in a point
+        self._share = 1.0 / places
+        self._joints = []  # place in q, R_AJ, axis in A (None: spherical) and limits, from the root outwards
+        for joint, R in zip(joints, R_AJ, strict=True):
+            at, axis, ends = m.idx_qs[joint], None, (-np.inf, np.inf)
+            if m.nqs[joint] == 1:
+                axis = R.apply(m.joints[joint].extract().axis)
+                ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if limits else ends
+            self._joints.append((at, R.as_quat(), axis, ends))
 
     def bend(self, q: np.ndarray, quat_WL: np.ndarray) -> None:
         """Write the joints' values into `q` (n, nq); `quat_WL` (n, k, 4) xyzw."""
         R_WA = quat_WL[:, self._above] if self._above >= 0 else _IDENTITY
-        turned = multiply(multiply(conjugate(R_WA), quat_WL[:, self._row]), self._quat_LA)
-        share = self._share * log(_remove_turn(turned, self._up_A))  # (n, 3)
-        before, after, free = _IDENTITY, _IDENTITY, (0, _IDENTITY)
-        for is_free, at, quat_AJ, axis, ends in self._joints:
-            if is_free:
-                free, before, after = (at, quat_AJ), after, _IDENTITY
-            elif axis is None:
-                q[:, at : at + 4] = multiply(multiply(conjugate(quat_AJ), exp(share)), quat_AJ)
-                after = multiply(after, exp(share))
+        left = multiply(multiply(conjugate(R_WA), quat_WL[:, self._row]), self._quat_LA)
+        share = self._share * log(_remove_turn(left, self._up_A))  # (n, 3)
+        for k, (at, quat_AJ, axis, ends) in enumerate(self._joints, start=1):
+            if axis is None:
+                rotation = exp(share) if k < len(self._joints) else left
+                q[:, at : at + 4] = multiply(multiply(conjugate(quat_AJ), rotation), quat_AJ)
             else:
                 q[:, at] = np.clip(share @ axis, *ends)
-                after = multiply(after, rotation_about(axis, q[:, at]))
-        rotation = multiply(multiply(conjugate(before), turned), conjugate(after))
-        at, quat_AJ = free
-        q[:, at : at + 4] = multiply(multiply(conjugate(quat_AJ), rotation), quat_AJ)
+                rotation = rotation_about(axis, q[:, at])
+            left = multiply(conjugate(rotation), left)
 
 
 def _remove_turn(quat: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -371,19 +356,13 @@ def compute_orientation_residuals(
 # Girdles ----------------------------------------------------------------------------------------------------------
 
 
-class _PlacedGirdle:
-    """A girdle whose joints follow its limb, or rest where that is not known."""
-
-    def __init__(self, model: BodyModel, name: str, segments: Sequence[str]) -> None:
-        girdle = model.table.girdles[name]
-        moves = segments.index(girdle.moves) if girdle.moves in segments else -1
-        self._rows = segments.index(girdle.on), moves, np.array(model.table.segments[girdle.moves].along)
-        self._law = girdle.law, find_girdle_scale(girdle, model.lengths), model.girdle_parameters(name)
-        self._at = np.array([model.pin.idx_qs[model.pin.getJointId(joint)] for joint in girdle.joints])
-
-    def place(self, q: np.ndarray, quat_WL: np.ndarray) -> None:
-        """Write its joints into `q` (n, nq), from `quat_WL` (n, k, 4) xyzw."""
-        _place_girdle(quat_WL, *self._rows, *self._law, self._at, q)
+def _describe_girdle(model: BodyModel, name: str, segments: Sequence[str]) -> tuple[Any, ...]:
+    """Return what `_place_girdle` needs: its rows of orientations, its law and its place in `q`."""
+    girdle, m = model.table.girdles[name], model.pin
+    moves = segments.index(girdle.moves) if girdle.moves in segments else -1
+    along, at = model.table.segments[girdle.moves].along, [m.idx_qs[m.getJointId(joint)] for joint in girdle.joints]
+    law = girdle.law, find_girdle_scale(girdle, model.lengths), model.girdle_parameters(name)
+    return segments.index(girdle.on), moves, np.array(along), *law, np.array(at)
 
 
 @kernel

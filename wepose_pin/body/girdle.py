@@ -77,11 +77,6 @@ class Girdle(NamedTuple):
         """(10,) the numbers of the law: `outward`, `up`, `middle`, `back`, `back_angle`."""
         return (*self.outward, *self.up, *self.middle, *self.back, self.back_angle)
 
-    @property
-    def parameter_std(self) -> np.ndarray:
-        """(7,) of `PARAMETERS`, before a calibration."""
-        return np.array((self.law_std, *self.rest_std, *self.raised_std))
-
 
 def _make_law(sqrt: Any, arctan2: Any, fmin: Any, exp: Any) -> Any:
     """Make the law of these functions: displacement x, y, z [m] and s, by `Girdle.law`, a direction and the scale."""

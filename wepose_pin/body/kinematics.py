@@ -10,13 +10,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from ..arguments import (
-    check_array,
-    check_fields,
-    check_finite,
-    check_names,
-    check_unit,
-)
+from ..arguments import check_array, check_fields, check_finite, check_names, check_unit
 from ..errors import BadData
 from ..recording import EACH_TIME, check_time, format_span
 from ..rotations import unwrap_signs
@@ -66,38 +60,28 @@ class Pose:
         return replace(self, time=self.time[span], q=None if self.q is None else self.q[span], **parts)
 
     def check(self) -> Pose:
-        """Check all fields and return the pose. NaN stands for missing values.
-
-        Raises
-        ------
-        BadOption, BadData
-            A field of a wrong type; a wrong shape; time that does not increase; a
-            quaternion without unit norm.
-        """
-        where = "pose: "
+        """Check all fields and return the pose; NaN stands for missing values. Raise `BadOption` or `BadData`."""
+        where, n = "pose: ", np.size(self.time)
         check_fields(self, where, Pose)
-        n = np.size(self.time)
         check_array(f"{where}time", self.time, (n,))
         if not n:
             raise BadData(f"{where}time has no samples")
         check_time("pose", self.time)
-        for name, known, shape in (
-            ("quat_WL", self.quat_WL, (n, 4)),
-            ("points", self.points, (n, 3)),
-            ("segment_cov", self.quat_WL, (n, 3, 3)),
-            ("point_cov", self.points, (n, 3, 3)),
-            ("joints", self.joints, (n,)),
+        for name, known, shape, kinds in (
+            ("quat_WL", self.quat_WL, (n, 4), "fiu"),
+            ("points", self.points, (n, 3), "fiu"),
+            ("segment_cov", self.quat_WL, (n, 3, 3), "fiu"),
+            ("point_cov", self.points, (n, 3, 3), "fiu"),
+            ("gap", self.quat_WL, (n,), "b"),
+            ("joints", self.joints, (n,), "fiu"),
         ):
             check_names(f"{where}{name}", getattr(self, name), tuple(known))
             for key, values in getattr(self, name).items():
                 place = f"{where}{name}.{key}"
-                check_array(place, values, shape, rows=EACH_TIME)
+                check_array(place, values, shape, kinds, EACH_TIME)
                 check_finite(place, values, missing=True)
                 if name == "quat_WL":
                     check_unit(place, values, MAX_POSE_NORM_DEVIATION)
-        check_names(f"{where}gap", self.gap, tuple(self.quat_WL))
-        for segment, gap in self.gap.items():
-            check_array(f"{where}gap.{segment}", gap, (n,), "b", EACH_TIME)
         return self
 
 

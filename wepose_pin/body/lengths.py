@@ -33,11 +33,6 @@ def with_lengths(robot: Any, table: BodyTable, targets: Mapping[str, float]) -> 
     """A copy of the robot with these lengths [m], each of which it has.
 
     A segment stretches along the line of its length, all joints at zero; one of several lengths along each of them.
-
-    Raises
-    ------
-    BadModel
-        Stretching the segments does not give the lengths.
     """
     robot = copy_robot(robot)
     tree = parse_tree(robot, robot.name)
@@ -170,11 +165,6 @@ def measure_reaches(
     ----------
     robot, model : the body, in yourdfpy and in Pinocchio
     neutral : link → its R_WK (3, 3) with all joints at zero
-
-    Raises
-    ------
-    BadModel
-        A joint that slides: orientations do not tell where the point is.
     """
     tree = parse_tree(robot, robot.name)
     own = measure_lengths(robot, table)

@@ -112,10 +112,7 @@ def find_known_links(model: BodyModel, segments: Iterable[str]) -> list[str]:
 
 
 def find_undetermined_joints(model: BodyModel, segments: Iterable[str]) -> list[str]:
-    """Find the joints whose value the orientations of segments leave open, at least in part.
-
-    Joints that stand in line for a moment do not count.
-    """
+    """Find the joints whose value the orientations of segments leave open, at least in part."""
     m = model.pin
     share = np.linalg.norm(_find_open_motions(model, list(segments), [])[0], axis=1)
     return [m.names[j] for j in range(1, m.njoints) if np.any(share[m.idx_vs[j] : m.idx_vs[j] + m.nvs[j]] > _OPEN)]

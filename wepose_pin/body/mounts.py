@@ -94,9 +94,8 @@ def align_sensors(
     aligned = [segment for segment, sensor in recording.sensors.items() if sensor.aligned]
     if aligned:
         # The segment that faces x is the first of the table; without a sensor there the first one that has a sensor.
-        first = aligned[0]
-        R_WL_start = start_pose.to_world(first, Rotation.identity())
-        aligned_heading_offset = compute_heading_offset(R_VS_start[first], R_WL_start)
+        R_WL_start = start_pose.to_world(aligned[0], Rotation.identity())
+        aligned_heading_offset = compute_heading_offset(R_VS_start[aligned[0]], R_WL_start)
     for segment, R_VS in R_VS_start.items():
         if recording.sensors[segment].aligned:
             mounts[segment], heading_offsets[segment] = Rotation.identity(), aligned_heading_offset
@@ -178,9 +177,8 @@ def compute_start_heading_var(
 ) -> float:
     """Compute the variance [rad²] that an inexact start pose gives a segment's heading offset.
 
-    It is zero for the segment whose heading defines x. With a calibrated mount it is the variance between two start
-    poses of one person: the mount contains the heading error of the calibration's start pose. With a stated mount it is
-    the variance of people off the stated pose.
+    It is zero for the segment whose heading defines x. A calibrated mount contains the heading error of the
+    calibration's start pose, so that only the variance between two start poses of one person is left.
     """
     if segment == start_pose.table.reference:
         return 0.0

@@ -97,13 +97,7 @@ N_POSE = StartPose()
 
 
 def find_start_pose(body: BodyModel, recording: Recording) -> StartPose:
-    """Find the links of a body in the start pose of its recording.
-
-    Raises
-    ------
-    BadSession
-        A start pose or a joint that the body does not have.
-    """
+    """Find the links of a body in the start pose of its recording."""
     q = compute_start_configuration(body, recording.start_pose, recording.joints, recording.where())
     # A person's segment frames equal W in the N-pose, whatever the pose of a body whose joints are at zero.
     is_neutral = recording.start_pose == NEUTRAL_POSE and not body.table.is_mechanism

@@ -12,15 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arguments import (
-    NonNegative,
-    check_arguments,
-    check_array,
-    check_fields,
-    check_finite,
-    check_names,
-    check_unit,
-)
+from ..arguments import NonNegative, check_arguments, check_array, check_fields, check_finite, check_names, check_unit
 from ..diagnostics import notebook_html
 from ..documents import (
     Key,
@@ -141,11 +133,9 @@ class Subject:
 
     def lengths_html(self) -> str:
         """Return the lengths with their standard deviations as a table for a notebook."""
-        rows = "".join(
-            f"<tr><td>{escape(name)}</td><td>{1e3 * length:.0f} ± {1e3 * self.std(name):.0f} mm</td></tr>"
-            for name, length in self.lengths.items()
-        )
-        return f"<table>{rows}</table>"
+        cells = {name: f"{1e3 * length:.0f} ± {1e3 * self.std(name):.0f} mm" for name, length in self.lengths.items()}
+        rows = (f"<tr><td>{escape(name)}</td><td>{cell}</td></tr>" for name, cell in cells.items())
+        return f"<table>{''.join(rows)}</table>"
 
     def save(self, path: str | Path, force: bool = False) -> Path:
         """Write ``subject.toml``, which `load_subject` and ``wepose track --subject`` read.
@@ -217,9 +207,8 @@ class Subject:
         """Raise `BadSubject` where `quality` is "fail"."""
         if self.quality == "fail":
             raise BadSubject(
-                f"subject '{self.name}': its calibration failed (quality = \"fail\"), so that lengths and mounts are "
-                f"not to be relied on; calibrate again, or use it all the same by --accept-failed (in Python "
-                f"force=True)"
+                f"subject '{self.name}': its calibration failed (quality = \"fail\"); calibrate again, or use it all "
+                f"the same by --accept-failed (in Python accept_failed=True)"
             )
 
     def check_body(self, table: BodyTable) -> None:
@@ -229,11 +218,10 @@ class Subject:
             missing = [name for name in table.lengths if name not in self.lengths]
             if missing:
                 raise BadOption(f"{where}lengths: {', '.join(missing)} of the body {table.name} is missing")
-            for name in ("mounts", "start_pose_offset", "heading_drift"):
-                check_names(f"{where}{name}", getattr(self, name), table.segments)
-            check_names(f"{where}hinges", self.hinges, table.hinges)
-            if table.girdles:  # a body without any, as those of others, has its own shoulders
-                check_names(f"{where}girdles", self.girdles, table.girdles)
+            known = dict.fromkeys(("mounts", "start_pose_offset", "heading_drift"), table.segments)
+            # A body without girdles, as those of others, has its own shoulders.
+            for name, names in {**known, "hinges": table.hinges, "girdles": table.girdles or self.girdles}.items():
+                check_names(f"{where}{name}", getattr(self, name), names)
         except BadOption as error:
             raise BadSubject(str(error)) from None
 
@@ -329,9 +317,7 @@ class Subject:
     def sample(self, rng: np.random.Generator) -> Subject:
         """Return a random person from this one's distribution of lengths, for simulation."""
         mean = np.array(list(self.lengths.values()))
-        drawn = rng.multivariate_normal(mean, self.lengths_covariance())
-        # Guards the far tails of the distribution.
-        drawn = np.clip(drawn, 0.7 * mean, 1.3 * mean)
+        drawn = np.clip(rng.multivariate_normal(mean, self.lengths_covariance()), 0.7 * mean, 1.3 * mean)
         return replace(
             self,
             name="sampled",
@@ -355,7 +341,7 @@ def girdle_rows(table: BodyTable) -> list[str]:
 def compute_girdle_prior(table: BodyTable) -> np.ndarray:
     """Compute the covariance (7 g, 7 g) of the parameters of a body's g girdles before a calibration."""
     girdles = table.girdles
-    std = np.ravel([girdle.parameter_std for girdle in girdles.values()])
+    std = np.ravel([(each.law_std, *each.rest_std, *each.raised_std) for each in girdles.values()])
     alike = [[girdles[a].alike if table.counterpart(a) == b else 0.0 for b in girdles] for a in girdles]
     both_sides = np.diag([1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # the law and the place at rest
     correlation = np.eye(std.size) + np.kron(np.reshape(alike, (len(girdles), len(girdles))), both_sides)
@@ -408,35 +394,31 @@ def population_subject(
     >>> round(prior.lengths["left_forearm"], 2), round(prior.std("left_forearm"), 2)  # [m]
     (0.26, 0.01)
     """
-    arguments: dict[str, Any] = {"stature": stature, "sex": sex}
-    if not isinstance(body, BodyModel | BodyTable):  # which were checked when they were made
-        arguments["body"] = body
-    check_arguments(population_subject, arguments)
+    check_arguments(population_subject, {"stature": stature, "sex": sex})
     table = load_table() if body is None else body if isinstance(body, BodyTable) else body.table
     people = compute_population_lengths(table, stature, sex)
-    lengths, variances = dict(zip(people.names, people.mean.tolist(), strict=True)), {}
-    for name, length in table.lengths.items():
+    order = tuple(table.lengths)
+    lengths, covariance = dict(zip(people.names, people.mean.tolist(), strict=True)), np.zeros((len(order),) * 2)
+    for k, (name, length) in enumerate(table.lengths.items()):
         if name not in lengths:
             if not isinstance(body, BodyModel):
                 raise BadModel(f"{table.where}: lengths.{name} is no share of stature; its model is needed")
             lengths[name] = body.lengths[name]
-            variances[name] = (0.01 * length.std_percent * lengths[name]) ** 2
-    order = tuple(table.lengths)
-    covariance = np.diag([variances.get(name, 0.0) for name in order])
+            covariance[k, k] = (0.01 * length.std_percent * lengths[name]) ** 2
     rows = [order.index(name) for name in people.names]
-    covariance[np.ix_(rows, rows)] += people.covariance
+    covariance[np.ix_(rows, rows)] = people.covariance
     note = people.note if people.names else f"lengths of the model {table.name}"
     return Subject(POPULATION, {name: lengths[name] for name in order}, order, covariance, note=note)
 
 
 def subject_toml(subject: Subject) -> str:
     """Return the text of ``subject.toml``."""
-    stds = {}
-    for segment in subject.mounts:
-        covariance = subject.mount_covariance(segment)
-        if covariance is not None:
-            std = np.degrees(np.sqrt(np.trace(covariance) / 3.0))
-            stds[f"mounts.{toml_key(segment)}"] = [f"std_deg = {std:.3f}"]
+    covariances = {segment: subject.mount_covariance(segment) for segment in subject.mounts}
+    stds = {
+        f"mounts.{toml_key(segment)}": [f"std_deg = {np.degrees(np.sqrt(np.trace(cov) / 3.0)):.3f}"]
+        for segment, cov in covariances.items()
+        if cov is not None
+    }
     lines = [f"format = {FORMAT}", *format_record(subject, stds)]
     if subject.order:
         lines += ["", "[lengths_std]   # m, one standard deviation"]
@@ -480,13 +462,7 @@ def load_subject(path: str | Path) -> Subject:
 
 
 def parse_subject(text: str, path: Path) -> Subject:
-    """Return the subject of the text of ``subject.toml``; `path` is for messages.
-
-    Raises
-    ------
-    BadSubject
-        As `load_subject`.
-    """
+    """Return the subject of the text of ``subject.toml``; `path` is for messages."""
     try:
         return _subject(parse_toml(text), path)
     except ValueError as error:

@@ -36,13 +36,7 @@ _TABLES = ("segments", "points", "lengths", "hinges", "girdles", "poses", "pairs
 
 @lru_cache(maxsize=8)
 def load_table(name: str = DEFAULT_BODY) -> BodyTable:
-    """Return the table of a body that comes with the package.
-
-    Raises
-    ------
-    BadModel
-        There is none of that name.
-    """
+    """Return the table of a body that comes with the package."""
     if name not in _list_bodies():
         raise BadModel(f"no body '{name}' comes with the package; {one_of(_list_bodies(), name)}")
     return read_table(asset("urdf", f"{name}.toml"))[0]
@@ -65,13 +59,7 @@ def check_segments(table: BodyTable, names: Iterable[str], where: str, error: ty
 
 
 def read_table(path: Path) -> tuple[BodyTable, Path]:
-    """Read a table from a TOML file; return it and its URDF: the one that it names, else that of its name.
-
-    Raises
-    ------
-    MissingFile, BadModel
-        The file is not there, is not TOML, or is not the table of a body.
-    """
+    """Read a table from a TOML file; return it and its URDF: the one that it names, else that of its name."""
     values = read_toml(path, "the table of a body", BadModel)
     urdf = TomlTable(values, str(path), error=BadModel).text("urdf", path.with_suffix(".urdf").name) or ""
     return _parse_table(values, str(path), path.stem), path.parent / urdf
@@ -82,11 +70,6 @@ def _parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
 
     With the key ``like`` the table is that of another body, except for what `values` state. It then has the segments
     that `values` name, or all where they name none of them.
-
-    Raises
-    ------
-    BadModel
-        An unknown key, name or axis, or a value of the wrong type.
     """
     top = TomlTable(values, where, error=BadModel)
     top.allow("like", "urdf", "kind", "up", "forward", "root", *_TABLES)
@@ -94,12 +77,16 @@ def _parse_table(values: Mapping[str, Any], where: str, name: str) -> BodyTable:
     kind: Any = top.choice("kind", (PERSON, MECHANISM), base.kind)
     up, forward = read_axes(top, "+z", "+x")
     segments = _read_segments(top, base, kind)
+    poses = {
+        name: {joint: entry.number(joint, None) or 0.0 for joint in entry.values}
+        for name, entry in _read_tables(top, "poses")
+    }
     table = replace(
         base,
         name=name,
         segments=segments,
         points=_read_points(top, base, segments),
-        poses={NEUTRAL_POSE: {}, **_read_poses(top)},
+        poses={NEUTRAL_POSE: {}, **poses},
         kind=kind,
         up=up,
         forward=forward,
@@ -184,14 +171,6 @@ def _read_points(top: TomlTable, base: BodyTable, segments: Mapping[str, Segment
     for name, entry in _read_tables(top, "points", "link"):
         points[name] = read_record(Point, entry, base=Point(name))
     return {name: points[name] for name in (*base.points, *points) if name in points}
-
-
-def _read_poses(top: TomlTable) -> dict[str, dict[str, float]]:
-    """Return pose → joint → [rad or m]."""
-    return {
-        name: {joint: entry.number(joint, None) or 0.0 for joint in entry.values}
-        for name, entry in _read_tables(top, "poses")
-    }
 
 
 def _read_tables(top: TomlTable, key: str, short: str = "") -> list[tuple[str, TomlTable]]:

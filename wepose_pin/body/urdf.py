@@ -19,18 +19,11 @@ _TRIMESH = "trimesh"
 
 
 def read_urdf(path: Path) -> Any:
-    """The URDF as yourdfpy has it.
-
-    Raises
-    ------
-    MissingFile, BadModel
-        Not there; not a URDF.
-    """
+    """The URDF as yourdfpy has it."""
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; a URDF is wanted here")
     try:
-        # yourdfpy's parser mends broken XML in silence: half a body would be read as a body. And it reads what entities
-        # name, on disk too.
+        # yourdfpy's parser mends broken XML in silence, and reads what entities name, on disk too.
         _check_xml(path)
     except (expat.ExpatError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
         raise BadModel(f"{path}: is no complete XML file, as a URDF is: {error}") from error
@@ -43,8 +36,8 @@ def read_urdf(path: Path) -> Any:
         raise BadModel(f"{path}: cannot be read as a URDF: {reason}") from error
     for shape in (shape for link in robot.links for shape in (*link.visuals, *link.collisions)):
         mesh = None if shape.geometry is None else shape.geometry.mesh
-        if mesh is not None and mesh.filename and (file := find_mesh(mesh.filename, path)) is not None:
-            mesh.filename = str(file)
+        if mesh is not None and mesh.filename:
+            mesh.filename = str(find_mesh(mesh.filename, path) or mesh.filename)
     materials = [visual.material for link in robot.links for visual in link.visuals if visual.material is not None]
     for material in [*robot.materials, *materials]:
         if material.texture is not None and material.texture.filename is None:
