@@ -273,7 +273,7 @@ def test_objects_print_in_one_line(simulated: Simulation, result: wp.TrackResult
 
 def test_settings_print_what_differs_from_their_defaults() -> None:
     settings = [Imperfections(dropped=0.002, mount="any"), ImuNoise(correlation_s=10.0), wp.StaticTest(alpha=3.0)]
-    printed = ["Imperfections(dropped=0.002, mount='any')", "ImuNoise(correlation_s=10.0)", "StaticTest(alpha=3.0)"]
+    printed = ["Imperfections(mount='any', dropped=0.002)", "ImuNoise(correlation_s=10.0)", "StaticTest(alpha=3.0)"]
     assert [repr(each) for each in settings] == printed
     assert [repr(type(each)()) for each in settings] == ["Imperfections()", "ImuNoise()", "StaticTest()"]
 

@@ -134,14 +134,6 @@ def test_equal_arguments_give_equal_text_and_a_ready_view_is_taken(pose: TrackRe
     assert 'srcdoc="&lt;p&gt;mine&lt;/p&gt;"' in render_track_report(summarize(pose), view="<p>mine</p>")
 
 
-@pytest.mark.slow
-def test_it_does_not_grow_with_the_recording() -> None:
-    simulation = simulate(simulate_person(3).lengths, seed=3, rate_hz=20.0, clasp_s=600.0, circles=0)
-    page = render_track_report(summarize(track(simulation.recording("long"))))
-    assert len(page) < 5e6
-    assert re.search(r"at 8\.\d frames a second", page)
-
-
 # What is missing ------------------------------------------------------------------------------------------------------
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -197,11 +197,13 @@ def _list_drift(tracked: TrackResult, headings: Mapping[str, HeadingStd]) -> lis
     for name, std in [*stds.items(), *compute_joint_heading_stds(headings, tracked.model).items()]:
         ends = finite_median(std[after_start]), finite_max(std[after_start]), std[-1]
         rows.append([plain(name), *(number(float(np.degrees(each)), 1, "°") for each in ends)])
+    sides = {side: [name for name in headings if table.side(name) == side] for side in map(table.side, headings)}
+    styles = {name: line_style(name, side, rank) for side, own in sides.items() for rank, name in enumerate(own)}
     figure = draw_over_time(
         tracked.time,
         {"heading, ± [°]": {name: np.degrees(std) for name, std in stds.items()}},
         "Uncertainty of each heading: one standard deviation, with mounts, start pose and soft tissue.",
-        _style_segments(headings, table),
+        styles,
         spans=("clasp", tracked.recording.phases.get("clasp", ())),
     )
     header = ["segment or joint", "median ±", "largest ±", "± at the end"]
@@ -393,14 +395,6 @@ def draw_tips(time: np.ndarray, groups: Sequence[TipGroup], table: BodyTable) ->
     paths.add_legend()
     caption = "; ".join(f"the {group.nouns} from {group.start} along {group.frame}" for group in groups)
     return {"paths": paths, "reach": draw_over_time(time, panels, capital(f"{caption}, over time."), styles)}
-
-
-def _style_segments(names: Iterable[str], table: BodyTable) -> dict[str, dict[str, Any]]:
-    """Styles of the segments' lines: colour by side, dashes by the place among the segments of that side."""
-    ranks = {
-        name: [each for each in table.segments if table.side(each) == table.side(name)].index(name) for name in names
-    }
-    return {name: line_style(name, table.side(name), rank) for name, rank in ranks.items()}
 
 
 def _name_tips(table: BodyTable) -> str:
