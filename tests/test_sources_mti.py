@@ -200,6 +200,7 @@ def test_a_port_is_waited_for_and_what_is_wrong_is_said(
     tmp_path: Path, plugged: Plug, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(mti, "ANSWER_S", 0.05)
+    before = threading.active_count()
     source = open_source(f"mti:{tmp_path / 'one'}=torso@100")
     place = f"the MTi of torso at {tmp_path / 'one'}: "
     source.open()
@@ -213,7 +214,7 @@ def test_a_port_is_waited_for_and_what_is_wrong_is_said(
     for _ in range(2):  # the port is free again after that
         with connected(source):
             assert collect(source, 5)
-    assert not [thread for thread in threading.enumerate() if thread.name.startswith("mti ")]
+    assert threading.active_count() == before + 1  # the device
 
 
 # Frames and packets --------------------------------------------------------------------------------------------------

@@ -20,21 +20,6 @@ def parse_address(text: str, option: str, example_port: int) -> tuple[str, int]:
     return host.removeprefix("[").removesuffix("]") or LOOPBACK, int(port)
 
 
-def parse_listening_address(text: str, option: str, default_port: int) -> tuple[str, int]:
-    """Host and port of ``[HOST][:PORT]``: without a host this machine, without a port the usual one.
-
-    Raises
-    ------
-    BadOption
-        Anything else.
-    """
-    if not text:
-        return LOOPBACK, default_port
-    if text.isdigit() or ":" in text:
-        return parse_address(text, option, default_port)
-    return text, default_port
-
-
 def name_host(host: str) -> str:
     """The address under which others reach `host`, as a URL has it; of "any address" that of this machine's network."""
     if host in ("0.0.0.0", "::"):

@@ -22,15 +22,10 @@ SHAKE_RATIO = 1.6  # of the shaken sensor's rms to that of every other candidate
 
 
 class ShakeDetector:
-    """Detects which sensor is shaken; after one was found, all must come to rest before the next.
-
-    Attributes
-    ----------
-    is_calm : whether all have come to rest since the last shake: the next one counts
-    """
+    """Detects which sensor is shaken; after one was found, all must come to rest before the next."""
 
     def __init__(self) -> None:
-        self.is_calm = False
+        self.is_calm = False  # all have come to rest since the last shake: the next one counts
         self._recent: dict[str, deque[tuple[float, float]]] = {}  # sensor → time [s], squared rate [rad²/s²]
         self._last: dict[str, tuple[float, np.ndarray]] = {}  # sensor → time [s] and (4,) of its last orientation
 
@@ -67,7 +62,6 @@ class ShakeDetector:
         return ranked[-1][1]
 
     def list_moving(self) -> list[str]:
-        """The sensors that have not come to rest."""
         return [sensor for sensor, rate in self._find_rates().items() if rate > CALM_RATE]
 
     def _find_rates(self) -> dict[str, float]:
@@ -82,11 +76,7 @@ class ShakeDetector:
 class AssignedSource(Source):
     """A source whose sensors are named by the segments that they are assigned to.
 
-    Parameters
-    ----------
-    segments : sensor of the source → segment; other sensors are left out
-    order : of the segments
-    is_open : the source is open already
+    `segments` are sensor of the source → segment, in this `order`; other sensors are left out. The source may be open.
     """
 
     def __init__(
@@ -105,7 +95,6 @@ class AssignedSource(Source):
         return {self.segments[name]: charge for name, charge in self.source.batteries.items() if name in self.segments}
 
     def open(self) -> None:
-        """Open the source; of one that is open already, leave out what has come so far."""
         if self._is_open:
             while self.source.read(0.0):
                 pass
@@ -116,7 +105,6 @@ class AssignedSource(Source):
         return self._is_open or self.source.connect(timeout_s)
 
     def read(self, timeout_s: float) -> list[Samples] | None:
-        """Samples of the assigned sensors since the last call; None at the end."""
         samples = self.source.read(timeout_s)
         return None if samples is None else self.rename(samples)
 
@@ -138,13 +126,7 @@ class AssignedSource(Source):
 
 
 def read_segments(path: Path, known: Iterable[str]) -> dict[str, str]:
-    """Sensor → segment, of a setup file or the folder that holds it.
-
-    Raises
-    ------
-    BadSession
-        A segment is not among `known`, or is named twice.
-    """
+    """Sensor → segment, of a setup file or its folder; raises `BadSession` where one is not `known`, or named twice."""
     path = path / SETUP_FILE if path.is_dir() else path
     segments, names = read_toml(path, "a sensor setup", BadSession).get("sensors"), tuple(known)
     if not isinstance(segments, dict) or not segments:

@@ -30,18 +30,18 @@ class Demonstration:
     """
 
     def __init__(self, model: BodyModel, protocol: Protocol) -> None:
-        lengths = tuple(model.lengths.items()) if model.table.name == DEFAULT_BODY else ()
-        self._motion, self._phases = _simulate(lengths, protocol.name) if lengths else ({}, {})
-        if lengths and not self._motion:  # a protocol of one's own
-            self._motion, self._phases = _simulate(lengths, "clasp")
-        self.segments = tuple(name for name in model.table.needed)
+        shown, lengths = None, tuple(model.lengths.items())
+        if model.table.name == DEFAULT_BODY:  # a protocol of one's own is shown as a clasp
+            shown = _simulate(lengths, protocol.name) or _simulate(lengths, "clasp")
+        self._motion, self._phases = shown or ({}, {})
+        self.segments = tuple(model.table.needed)
         self._kinematics = KinematicsSolver(model, self.segments)
 
     def pose(self, view: GuideView, time: float) -> LivePose:
         """The figure at a time [s]: the start pose, the motion of a phase, or one segment that is shaken."""
         quat_WL = np.tile([0.0, 0.0, 0.0, 1.0], (len(self.segments), 1))
         dimmed = np.zeros(len(self.segments), dtype=bool)
-        if view.demonstration in self._phases and self._motion:
+        if view.demonstration in self._phases:
             first, last = self._phases[view.demonstration]
             row = round(RATE_HZ * (first - LEAD_S + time % (last - first + LEAD_S)))
             quat_WL = np.array([self._motion[name][row] for name in self.segments])
@@ -58,11 +58,11 @@ class Demonstration:
 @lru_cache(maxsize=4)
 def _simulate(
     lengths: tuple[tuple[str, float], ...], task: str
-) -> tuple[Mapping[str, np.ndarray], Mapping[str, tuple[float, float]]]:
-    """Segment → (n, 4) xyzw at `RATE_HZ`, and phase → its interval [s]; empty where that cannot be simulated."""
+) -> tuple[Mapping[str, np.ndarray], Mapping[str, tuple[float, float]]] | None:
+    """Segment → (n, 4) xyzw at `RATE_HZ`, and phase → its interval [s]; None where that cannot be simulated."""
     try:
         motion_s = MOTION_S * len(task.split("+"))
         motion = simulate(dict(lengths), seed=1, rate_hz=RATE_HZ, clasp_s=motion_s, circles=0, protocol=task)
     except BadOption:
-        return {}, {}
+        return None
     return motion.quat_WL, {name: spans[0] for name, spans in motion.phases.items() if spans}

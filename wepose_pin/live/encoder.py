@@ -29,16 +29,7 @@ MAX_CURVE_POSES = 200  # that wait for a browser
 
 
 class RobotFigure:
-    """A robot drawn beside the person.
-
-    Parameters
-    ----------
-    position : its joint positions now; None: those at rest
-
-    Attributes
-    ----------
-    links, meshes : a link and its mesh for each moving part
-    """
+    """A robot drawn beside the person, at the joint positions that `position` gives now; None: those at rest."""
 
     def __init__(self, robot: Robot, model: BodyModel, position: Callable[[], np.ndarray | None]) -> None:
         parts = build_parts(robot)
@@ -49,17 +40,15 @@ class RobotFigure:
         self._root = pin.SE3(*place_beside_person(robot, float(np.mean(heights)), find_floor(model)))
         self._joints = sorted({part.joint for part in parts})
         self._data = robot.model.createData()
-        self.links = tuple(f"robot {joint}" for joint in self._joints)
+        self.links = tuple(f"robot {joint}" for joint in self._joints)  # one for each moving part, and its mesh
         self.meshes = [Mesh(f"robot {part.joint}", part.vertices, part.triangles, part.rgba) for part in parts]
 
     def points(self) -> np.ndarray:
-        """Points (n, 3) [m] in W that it has now, for the camera."""
         placed = dict(zip(self.links, self.place(), strict=True))
         at = [(mesh.vertices, placed[mesh.link]) for mesh in self.meshes]
         return np.concatenate([vertices @ row[:9].reshape(3, 3).T + row[9:] for vertices, row in at])[::50]
 
     def place(self) -> np.ndarray:
-        """Placements (m, 12) of the links."""
         position = self._position()
         configuration = self._robot.configuration(self._robot.rest if position is None else position)
         pin.forwardKinematics(self._robot.model, self._data, configuration)
@@ -67,26 +56,14 @@ class RobotFigure:
 
 
 class PoseEncoder:
-    """Encodes poses for the page.
-
-    Parameters
-    ----------
-    robot : drawn beside the person; None: there is none
-
-    Attributes
-    ----------
-    links : visible links, in the order of the frames: `body_links`, then those of the robot
-    newest : the pose to draw; None: the N-pose
-    info : of the poses; None before the start
-    angles : joint angles of the poses
-    """
+    """Encodes poses for the page, with the robot beside the person if there is one."""
 
     def __init__(self, model: BodyModel, robot: RobotFigure | None = None) -> None:
         self.visuals, self.robot = visible(model.visuals), robot
         self.body_links = tuple(dict.fromkeys(visual.link for visual in self.visuals))
-        self.links = self.body_links + (() if robot is None else robot.links)
-        self.newest: LivePose | None = None
-        self.info: StreamInfo | None = None
+        self.links = self.body_links + (() if robot is None else robot.links)  # in the order of the frames
+        self.newest: LivePose | None = None  # to draw; None: the N-pose
+        self.info: StreamInfo | None = None  # of the poses; None before the start
         self.angles = AngleCurves()
         self._model, self._lock = model, threading.Lock()  # the page encodes in a thread of its own
         self._frames = [model.pin.getFrameId(link) for link in self.body_links]
@@ -95,11 +72,9 @@ class PoseEncoder:
         self._known = np.ones(len(self._frames), dtype=bool)
 
     def points(self, segments: tuple[str, ...]) -> tuple[str, ...]:
-        """The points that sensors on these segments determine."""
         return KinematicsSolver(self._model, segments).points
 
     def start(self, info: StreamInfo) -> None:
-        """From now on draw only what these segments determine."""
         model, kinematics = self._model, KinematicsSolver(self._model, info.segments)
         known = find_known_links(model, info.segments)
         moved = {chain.joints[-1]: segment for segment, chain in model.chains.items() if chain.joints}
@@ -137,12 +112,7 @@ class PoseEncoder:
 
 
 class AngleCurves:
-    """Joint angles of the poses since they were last taken, together: one by one they cost ten times as much.
-
-    Parameters
-    ----------
-    segments : of the poses
-    """
+    """Joint angles of the poses since they were last taken, together: one by one they cost ten times as much."""
 
     def __init__(self, segments: tuple[str, ...] = ()) -> None:
         self._segments = segments
@@ -185,7 +155,6 @@ def place_n_pose(model: BodyModel) -> pin.Data:
 
 
 def _stack(placements: Sequence[Any]) -> np.ndarray:
-    """(m, 12): R_WL row by row, p_WL."""
     rows = np.empty((len(placements), 12), dtype="<f4")
     for k, placement in enumerate(placements):
         rows[k, :9] = placement.rotation.ravel()

@@ -80,20 +80,7 @@ class Step(NamedTuple):
 class Guide(Stage):
     """Leads a person from sensors that send to an accepted calibration.
 
-    Parameters
-    ----------
-    source, outputs : open; they stay so
-    steps : the table; one of them is named "start"
-
-    Attributes
-    ----------
-    now : [s] on the source's clock
-    samples, ticks : that came since the step has last yielded; ticks are those of the attempt
-    text : that the person typed for the action
-    segments : sensor → segment that it is assigned to
-    attempt : the recording of the current attempt; None before
-    measured : lengths [m] that the person entered
-    accepted : the calibration that the person accepted; None before
+    The source and the outputs are open and stay so.
     """
 
     READ_TIMEOUT_S = 0.02  # [s]; the figure moves meanwhile
@@ -107,13 +94,13 @@ class Guide(Stage):
         self._figure, self._figure_due = Demonstration(options.model, options.protocol) if outputs else None, 0.0
         self.order = tuple(options.model.table.segments)  # segments in the order of the body
         self.needs = options.protocol.needs  # segments that must carry a sensor
-        self.now, self.text = 0.0, ""
-        self.samples: Sequence[Samples] = ()
-        self.ticks: list[Ticks] = []
-        self.segments: dict[str, str] = {}
-        self.attempt: Attempt | None = None
+        self.now, self.text = 0.0, ""  # [s] on the source's clock; what the person typed for the action
+        self.samples: Sequence[Samples] = ()  # that came since the step has last yielded
+        self.ticks: list[Ticks] = []  # those of the attempt
+        self.segments: dict[str, str] = {}  # sensor → segment that it is assigned to
+        self.attempt: Attempt | None = None  # the recording; None before it begins
         self.attempts = 0
-        self.measured: dict[str, float] = {}
+        self.measured: dict[str, float] = {}  # lengths [m] that the person entered
         self.accepted: Calibrated | None = None
         self._index, self._skipped = 0, set[str]()
         self._postponed: list[Sequence[Samples]] = []  # that came while an attempt is evaluated
@@ -127,12 +114,10 @@ class Guide(Stage):
 
     @property
     def sending(self) -> list[str]:
-        """Sensors that have sent something."""
         return self.monitor.sending
 
     @property
     def silent(self) -> list[str]:
-        """Sensors that have sent nothing for a while."""
         return self.monitor.list_silent(self.segments or self.sending, self.now, SILENCE_S)
 
     @property
@@ -152,7 +137,6 @@ class Guide(Stage):
         return self.accepted
 
     def process(self, samples: list[Samples]) -> None:
-        """Guide the person by what came since the last call, and move the figure."""
         self.now, self.samples, self.ticks = self.source.clock(), samples, []
         self.monitor.push(samples, self.source.orientations)
         if self.attempt is not None:
@@ -170,7 +154,6 @@ class Guide(Stage):
                 output.demonstrate(pose, self._figure.segments)
 
     def do(self, action: Action, text: str) -> None:
-        """Go back to an earlier step, or hand the action to the step of now."""
         self.samples, self.ticks, self.text = (), [], text
         if action in self._view.actions:
             self._go_on(action)
@@ -219,13 +202,11 @@ class Guide(Stage):
         return AssignedSource(self.source, self.segments, self.order, is_open=True)
 
     def close(self) -> None:
-        """End the recording; may be called twice."""
         if self.attempt is not None:
             self.attempt.log.close()
             self.attempt = None
 
     def view(self) -> GuideView:
-        """What to tell the person now."""
         steps = []
         for k, step in enumerate(self.steps):
             state = "ahead" if k > self._index else "now" if k == self._index else "done"
@@ -233,7 +214,6 @@ class Guide(Stage):
         return self._view._replace(steps=tuple(steps))
 
     def build_status(self) -> Status:
-        """The state of the guide and of each sensor now."""
         sensors = []
         for name, known in sorted(self.monitor.list_statuses(self.now, self.source.batteries).items()):
             segment = self.segments.get(name, name)
@@ -258,11 +238,6 @@ class Attempt:
     """The recording of one guided calibration, in its file and in memory: raw samples and the protocol's phases.
 
     The file gives the same samples and phases again, so that a calibration of it has the same numbers.
-
-    Parameters
-    ----------
-    source : names the sensors by their segments
-    header : of the recording, as `SensorSetup.header` with the method
     """
 
     def __init__(self, path: Path, source: AssignedSource, header: Mapping[str, Any]) -> None:
@@ -288,7 +263,6 @@ class Attempt:
         return ticks
 
     def mark(self, kind: str, **values: Any) -> None:
-        """Record an event of `Markers`."""
         self._markers.add(kind, values)
         self.log.event(kind, **values)
 

@@ -129,9 +129,11 @@ class LiveLoop(Stage):
         gc.freeze()
         try:
             self.loop(should_stop)
-            self._end("The session has ended.")
+            self._end_message = "The session has ended."
+            self.send_status()
         except WeposeError as error:
-            self._end(f"The session has ended: {error}")
+            self._end_message = f"The session has ended: {error}"
+            self.send_status()
             raise
         finally:
             gc.unfreeze()
@@ -146,14 +148,9 @@ class LiveLoop(Stage):
                 output.close()
         return self._summarize()
 
-    def _end(self, message: str) -> None:
-        self._end_message = message
-        self.send_status()
-
     # Samples to poses ------------------------------------------------------------------------------------------------
 
     def process(self, samples: list[Samples]) -> None:
-        """Record the samples of one read, track the ticks that they complete, and show the last pose."""
         pose = None
         self._monitor.push(samples, self.source.sensors if self._estimator else self.source.orientations)
         for ticks in self._stream.push(samples):
@@ -230,24 +227,21 @@ class LiveLoop(Stage):
 
     @property
     def actions(self) -> tuple[Action, ...]:
-        """Reset the headings; while tracking mark a take, a phase or a moment in the recording."""
         if self._end_message:
             return ()
         if self._estimator is None or self.log is None:
             return (RESET,)
-        begin_or_end = []
-        for action, is_take in ((BEGIN_TAKE, True), (BEGIN_PHASE, False)):
-            name = self._find_open(is_take)
-            end = action._replace(label=f"End {name.replace('_', ' ')}", entry="", is_on=True)
-            begin_or_end.append(end if name else action)
-        return (RESET, *begin_or_end, MARK, MARK_TEXT)
+        marks = [BEGIN_TAKE, BEGIN_PHASE]
+        for k, name in enumerate(map(self._find_open, (True, False))):
+            if name:
+                marks[k] = marks[k]._replace(label=f"End {name.replace('_', ' ')}", entry="", is_on=True)
+        return (RESET, *marks, MARK, MARK_TEXT)
 
     def _find_open(self, is_take: bool) -> str:
         """The phase that was begun and not ended, and is a take or none; empty: there is none."""
         return next((phase for phase in self._open_phases if phase.startswith(TAKE) == is_take), "")
 
     def do(self, action: Action, text: str) -> None:
-        """Reset the headings, or mark a take, a phase or a text in the recording."""
         text = text[:LONGEST_TEXT]
         if action.name == RESET.name:
             if self._estimator is not None:
@@ -276,7 +270,6 @@ class LiveLoop(Stage):
     # The state -------------------------------------------------------------------------------------------------------
 
     def build_status(self) -> Status:
-        """The state of the session and of each sensor now."""
         sensors, estimator, synchronizer = self.source.sensors, self._estimator, self._stream.synchronizer
         now, k = self.source.clock(), len(sensors)
         counts, frozen = np.zeros((k, len(COUNTS)), dtype=np.int64), np.zeros(k, dtype=bool)

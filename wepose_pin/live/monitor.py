@@ -49,7 +49,6 @@ class SensorMonitor:
 
     @property
     def sending(self) -> list[str]:
-        """Sensors that have sent something."""
         return list(self._counters)
 
     def list_silent(self, sensors: Iterable[str], now: float, silence_s: float) -> list[str]:
@@ -109,16 +108,10 @@ def check_units(recording: Recording, source: Source) -> tuple[Diagnostic, ...]:
 
 
 class SampleCounter:
-    """Counts the samples of one sensor, and by the steps between their times those that never came.
-
-    Attributes
-    ----------
-    total, missing : number of samples that came, and that did not
-    newest : time [s] of the newest one; −inf before the first
-    """
+    """Counts the samples of one sensor, and by the steps between their times those that never came."""
 
     def __init__(self) -> None:
-        self.total, self.missing, self.newest = 0, 0, -math.inf
+        self.total, self.missing, self.newest = 0, 0, -math.inf  # that came, and did not; time [s] of the newest
         self._first: list[float] = []  # times [s], until the step is known
         self._step = 0.0  # [s]
 

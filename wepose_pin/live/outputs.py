@@ -33,21 +33,9 @@ class RateLimiter:
 
 
 class UdpSender:
-    """Sends datagrams to one receiver without ever waiting.
+    """Sends datagrams to one receiver, ``PORT`` of this machine or ``HOST:PORT``, without ever waiting.
 
-    Parameters
-    ----------
-    to : ``PORT`` of this machine, or ``HOST:PORT``
-    option, example_port : for the error message
-
-    Attributes
-    ----------
-    dropped : datagrams that the system did not take at once; they are not sent again
-
-    Raises
-    ------
-    BadOption
-        No such host or port.
+    Raises `BadOption` where there is no such host or port, which names the `option` and an `example_port`.
     """
 
     def __init__(self, to: str, option: str, example_port: int) -> None:
@@ -59,7 +47,7 @@ class UdpSender:
         self._address: Any = address
         self._socket = socket.socket(family, kind)
         self._socket.setblocking(False)
-        self.dropped = 0
+        self.dropped = 0  # datagrams that the system did not take at once; they are not sent again
 
     def send(self, data: bytes) -> None:
         try:
@@ -72,17 +60,7 @@ class UdpSender:
 
 
 class UdpOutput(Output):
-    """Sends each pose as JSON in a datagram of its own, `RATE_HZ` a second at most.
-
-    Parameters
-    ----------
-    to : ``PORT`` of this machine, or ``HOST:PORT``
-
-    Raises
-    ------
-    BadOption
-        No such host or port.
-    """
+    """Sends each pose as JSON in a datagram of its own, `RATE_HZ` a second at most; parameter as of `UdpSender`."""
 
     def __init__(self, to: str) -> None:
         self._limiter, self._sender = RateLimiter(), UdpSender(to, "--udp", PORT)
@@ -141,7 +119,6 @@ class LslOutput(Output):
         self._outlet: Any = None
 
     def start(self, info: StreamInfo) -> None:
-        """Announce the stream, with a label for each channel."""
         channels = list_channels(info)
         rate = min(info.rate_hz, RATE_HZ)
         stream = self._lsl.StreamInfo(
@@ -155,7 +132,6 @@ class LslOutput(Output):
         self._outlet = self._lsl.StreamOutlet(stream, max_buffered=BUFFER_S)
 
     def show(self, pose: LivePose) -> None:
-        """Hand the pose to liblsl, which sends in a thread of its own; stamped with the time of its newest sample."""
         if self._outlet is None or not self._limiter.accepts(pose.time):
             return
         rows = np.column_stack([pose.quat_WL, pose.std, pose.lost]).ravel()

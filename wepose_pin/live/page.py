@@ -64,13 +64,7 @@ class LivePage(Output):
             self.start(info)
 
     def open(self) -> None:
-        """Serve the page from a thread of its own.
-
-        Raises
-        ------
-        BadOption
-            The address is not this machine's, or the port is taken.
-        """
+        """Serve the page from a thread of its own; raises `BadOption` where the address or port cannot be used."""
         if self._server is None:
             token = "" if self._host in (LOOPBACK, "localhost", "::1") else secrets.token_urlsafe(16)
             self._server = Server(self._content, self._host, self._port, token, self._requests)
@@ -84,13 +78,11 @@ class LivePage(Output):
             self._server.content = self._content
 
     def demonstrate(self, pose: LivePose, segments: tuple[str, ...]) -> None:
-        """Draw a pose of the guide."""
         if self._encoder.info is None or self._encoder.info.segments != segments:
             self.start(StreamInfo(segments, self._encoder.points(segments), 0.0))
         self._encoder.newest = pose
 
     def start(self, info: StreamInfo) -> None:
-        """From now on draw only what is measured."""
         self._encoder.start(info)
 
     def show(self, pose: LivePose) -> None:
@@ -103,11 +95,9 @@ class LivePage(Output):
             self._server.status = status
 
     def take_requests(self) -> list[Request]:
-        """What was asked for in the page since the last call."""
         return [self._requests.popleft() for _ in range(len(self._requests))]
 
     def close(self) -> None:
-        """Tell the browsers, and stop listening. May be called twice."""
         if self._server is not None:
             self._server.close()
             self._server = None

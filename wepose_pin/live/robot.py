@@ -55,14 +55,12 @@ class RobotSummary(NamedTuple):
     @property
     def diagnostics(self) -> list[Diagnostic]:
         """Commands that did not reach the robot, steps in which it braked to stay clear of itself, hands that stuck."""
+        unsent, stuck = {"variant": "unsent"}, {"variant": "live"}
         diagnostics = [
             Diagnostic("robot-commands-lost", WARNING, self.robot, self.skipped),
             Diagnostic("robot-stopped-for-clearance", WARNING, self.robot, self.stopping),
-            Diagnostic("robot-commands-lost", WARNING, self.robot, self.dropped, facts={"variant": "unsent"}),
-            *(
-                Diagnostic("robot-hand-off-target", WARNING, side, off, STUCK_M, {"variant": "live"})
-                for side, off in self.stuck.items()
-            ),
+            Diagnostic("robot-commands-lost", WARNING, self.robot, self.dropped, facts=unsent),
+            *(Diagnostic("robot-hand-off-target", WARNING, s, off, STUCK_M, stuck) for s, off in self.stuck.items()),
         ]
         return [diagnostic for diagnostic in diagnostics if diagnostic.value]
 
@@ -79,11 +77,6 @@ class RobotOutput(Output):
     lengths_cov : (k, k) [m²] of the person's lengths in the order of the table; None: exact
     speed : of a replay
     table : of the person's body; None: the upper body
-
-    Raises
-    ------
-    BadOption
-        `to` is neither.
     """
 
     def __init__(
@@ -113,13 +106,11 @@ class RobotOutput(Output):
         self._error: dict[str, deque[float]] = {arm.side: deque(maxlen=MAX_LATENCIES) for arm in self.robot.arms}
 
     def open(self) -> None:
-        """Begin to send: the robot keeps its rest posture until tracking starts."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
             self._thread.start()
 
     def start(self, info: StreamInfo) -> None:
-        """Tracking starts; raises `BadData` where an arm has no sensors."""
         self._observer = ArmObserver(self.robot, info.segments, info.points, self._lengths_cov, table=self._table)
         self.open()
 
@@ -131,7 +122,6 @@ class RobotOutput(Output):
             raise self._failure
 
     def describe(self) -> str:
-        """The robot's state and why, as a sentence."""
         command = self.newest
         if command is None:
             return ""
@@ -140,7 +130,6 @@ class RobotOutput(Output):
         return f"{self.robot.map.name}: {state}{hint}."
 
     def resume(self) -> None:
-        """Continue after a stop, by an approach."""
         self._resume = True
 
     def close(self) -> None:
@@ -191,7 +180,6 @@ class RobotOutput(Output):
             self._failure = error
 
     def _send_command(self) -> Command:
-        """Take the newest pose, and send the command that follows."""
         newest, begin = self._newest, time.monotonic()
         if newest is not None and newest[1] is not self._taken and self._observer is not None:
             came, self._taken = newest
@@ -264,19 +252,9 @@ def connect_robot(
     speed: float = 1.0,
     table: BodyTable | None = None,
 ) -> RobotOutput:
-    """The robot's output, not opened.
+    """The robot's output, not opened; raises `WeposeError` where an arm has no `sensors`, if these are known.
 
-    Parameters
-    ----------
-    sensors : of the source; empty: not known yet
-    subject : of the person; None: the population prior
-    speed : of a replay
-    table : of the person's body; None: the upper body
-
-    Raises
-    ------
-    WeposeError
-        What is wrong with the options; an arm without sensors.
+    `subject` None is the population prior, `table` None the upper body, `speed` that of a replay.
     """
     if math.isinf(speed):
         raise BadOption("--speed max: a robot follows a replay at its own speed, or a multiple of it")

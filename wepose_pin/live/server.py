@@ -50,20 +50,8 @@ class Content(NamedTuple):
 class Server:
     """HTTP and WebSocket in a thread with its own event loop.
 
-    Parameters
-    ----------
-    token : that the address must have; empty: none is needed
-    requests : receives what is asked for in the page
-
-    Attributes
-    ----------
-    content, status : shown now
-    clients : open WebSockets
-
-    Raises
-    ------
-    BadOption
-        The address is not this machine's, or the port is taken.
+    The address must have the `token`, unless that is empty; `requests` receives what is asked for in the page. Raises
+    `BadOption` where the address is not this machine's, or the port is taken.
     """
 
     def __init__(self, content: Content, host: str, port: int, token: str, requests: deque[Request]) -> None:
@@ -89,7 +77,6 @@ class Server:
         self._thread.start()
 
     def close(self) -> None:
-        """Tell the browsers, and free the port."""
         self._closing.set()
         self._thread.join()
 
@@ -191,18 +178,12 @@ class Page(Guarded):
 
 
 class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
-    """The connection to one browser.
-
-    Attributes
-    ----------
-    pending : messages that the browser has not drawn yet
-    content, status, drawn : what was sent last
-    """
+    """The connection to one browser."""
 
     def initialize(self, server: Server) -> None:
         super().initialize(server)
-        self.pending = 0
-        self.content: Content | None = None
+        self.pending = 0  # messages that the browser has not drawn yet
+        self.content: Content | None = None  # what was sent last, as the next two
         self.status: Status | None = None
         self.drawn: object = self  # nothing
 
@@ -211,7 +192,6 @@ class Stream(Guarded, WebSocketHandler):  # type: ignore[misc]
         self.greet()
 
     def greet(self) -> None:
-        """Say which page is shown."""
         self.content = self.server.content
         self.send(json.dumps({"id": self.content.identity}))
 

@@ -78,12 +78,7 @@ def run_session(
 def open_and_wait(source: Source, outputs: Sequence[Output], until: Callable[[], bool]) -> bool:
     """Open the source and show what it waits for; return False where the user ends that by a key.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        `until` returns True meanwhile.
-    WeposeError
-        There is no such source.
+    Raises `KeyboardInterrupt` where `until` returns True meanwhile, and `WeposeError` where there is no such source.
     """
     try:
         source.open()

@@ -38,7 +38,6 @@ class SensorSetup:
     def from_recording(
         cls, recording: Recording, subject: Subject | None = None, subject_text: str = ""
     ) -> SensorSetup:
-        """The setup of a recording that is replayed."""
         return cls(
             recording.name,
             subject,
@@ -81,13 +80,7 @@ class SensorSetup:
 
 
 def find_setup(source: Source | None, subject: str | Path | None, session: str | Path | None) -> SensorSetup:
-    """The sensor setup: of a replay that of its session, else as `session` states.
-
-    Raises
-    ------
-    WeposeError
-        What is wrong in either file.
-    """
+    """The sensor setup: of a replay that of its session, else as `session` states; raises `WeposeError`."""
     loaded, text = None, ""
     if subject is not None:
         loaded, path = load_subject(subject), Path(subject)
@@ -100,13 +93,7 @@ def find_setup(source: Source | None, subject: str | Path | None, session: str |
 
 
 def read_setup(path: Path, subject: Subject | None = None, subject_text: str = "") -> SensorSetup:
-    """The setup that a session file states; its data and phases belong to another recording and are ignored.
-
-    Raises
-    ------
-    MissingFile, BadSession
-        Not there, or a key in it that no session has.
-    """
+    """The setup that a session file states; its data and phases belong to another recording and are ignored."""
     top = read_session_file(path)
     read_phases(top.table("phases", {}))
     sensors = top.table("sensors")

@@ -12,19 +12,14 @@ from .state import QUIT, Action, Output, Request, Status
 
 
 class Stage(ABC):
-    """Reads an open source until it ends, and shows what comes of it.
-
-    Attributes
-    ----------
-    source, outputs : stay open
-    is_over : there is nothing more to do
-    """
+    """Reads an open source until it ends, and shows what comes of it; the outputs stay open."""
 
     READ_TIMEOUT_S = 0.05  # [s]; requests and the status wait for a read
     STATUS_PERIOD_S = 0.2  # [s]
 
     def __init__(self, source: Source, outputs: Sequence[Output]) -> None:
-        self.source, self.outputs, self.is_over = source, tuple(outputs), False
+        self.source, self.outputs = source, tuple(outputs)
+        self.is_over = False  # there is nothing more to do
 
     @property
     @abstractmethod
@@ -68,7 +63,6 @@ class Stage(ABC):
                 self.send_status()
 
     def send_status(self) -> None:
-        """Show the state now."""
         status = self.build_status()
         for output in self.outputs:
             output.status(status)

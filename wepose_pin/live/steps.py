@@ -76,7 +76,6 @@ def make_steps(protocol: Protocol) -> list[Step]:
 
 
 def find_sensors(guide: Guide, _: Turn) -> StepRun:
-    """See which sensors are there."""
     needed = len(guide.needs)
     while True:
         count = len(guide.sending) - len(guide.silent)
@@ -133,18 +132,12 @@ def assign_segments(guide: Guide, turn: Turn) -> StepRun:
 
 
 class Stillness:
-    """Waits in the ticks of the guide's attempt until no sensor has moved for some seconds.
-
-    Attributes
-    ----------
-    progress : 0 to 1
-    moving : a sentence on the segments that have just moved; empty: none
-    """
+    """Waits in the ticks of the guide's attempt until no sensor has moved for some seconds."""
 
     def __init__(self, guide: Guide, seconds: float) -> None:
         self._guide, self._attempt, self._seconds = guide, guide.begin_attempt(), seconds
         self._pose: StillPose | None = None  # from the first tick on
-        self.progress, self.moving = 0.0, ""
+        self.progress, self.moving = 0.0, ""  # 0 to 1; a sentence on segments that have just moved, empty: none
 
     def take(self) -> tuple[float, float] | None:
         """Take the newest ticks; return begin and end [s] of standing still once the seconds are full."""
@@ -161,28 +154,23 @@ class Stillness:
 
 
 def check_sensors(guide: Guide, _: Turn) -> StepRun:
-    """Check the units of the sensors while the person stands still."""
-    attempt, still = guide.begin_attempt(), Stillness(guide, STATIC_S)
-    faults, actions = list[str](), [SKIP]
+    """Check the units of the sensors while the person stands still, again and again until they are right."""
+    attempt, still, fault = guide.begin_attempt(), Stillness(guide, STATIC_S), ""
     while True:
-        held = None if faults else still.take()
+        held = still.take()
         if held is not None:
             recording = replace(attempt.recording(), phases={"static": ((held[1] - STATIC_S, held[1]),)})
             try:
-                diagnostics = check_units(recording, guide.source)
+                scales = [d for d in check_units(recording, guide.source) if d.code == "accel-scale"]
+                fault = " ".join(render(diagnostic).line() for diagnostic in scales)
             except BadData as error:
-                faults, actions = [str(error)], [AGAIN]
-            else:
-                faults, actions = [render(d).line() for d in diagnostics if d.code == "accel-scale"], [AGAIN, SKIP]
-                if not faults:
-                    return Turn()
-        note = guide.describe_problems() or still.moving
-        view = GuideView("Stand still for a moment.", note, progress=still.progress, actions=tuple(actions))
-        asked = yield view._replace(reasons=tuple(faults))
-        if asked is SKIP:
+                fault = str(error)
+            if not fault:
+                return Turn()
+            still = Stillness(guide, STATIC_S)
+        note = guide.describe_problems() or fault or still.moving
+        if (yield GuideView("Stand still for a moment.", note, progress=still.progress, actions=(SKIP,))) is SKIP:
             return Turn(skipped=True)
-        if asked is AGAIN:
-            still, faults, actions = Stillness(guide, STATIC_S), [], [SKIP]
 
 
 def hold_start_pose(guide: Guide, turn: Turn) -> StepRun:
@@ -336,7 +324,6 @@ def _add_lengths(view: GuideView, calibration: Calibration) -> GuideView:
 
 
 def show_result(guide: Guide, _: Turn) -> StepRun:
-    """Calibrate the recording, and ask whether the result is accepted."""
     attempt, options = guide.begin_attempt(), guide.options
     attempt.log.flush()
     entered = note = ""  # a length that was entered, and why it cannot be

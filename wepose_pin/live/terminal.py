@@ -25,13 +25,7 @@ CLEAR = "\r\x1b[K"  # to the begin of the line, and clear it
 class TerminalView(Output):
     """Prints a line for each change of a state; a terminal has the state of now in a last line as well.
 
-    Times are those since the view was made.
-
-    Parameters
-    ----------
-    file : where to write; None: standard output
-    keyboard : where keys come from; None: nowhere
-    clock : [s]
+    Times are those since the view was made, by `clock` [s]. `file` None is standard output; without `keyboard` no keys.
     """
 
     def __init__(
@@ -59,12 +53,10 @@ class TerminalView(Output):
         self._file.flush()
 
     def take_requests(self) -> list[Request]:
-        """What the keys since the last call ask for."""
         keys = [] if self._keyboard is None else self._keyboard.take()
         return [request for request in map(self._press, keys) if request is not None]
 
     def _press(self, key: str) -> Request | None:
-        """What a key asks for; None: nothing, or it is a letter that is typed."""
         action = self._typing
         if action is None:
             action = next((each for each in self._actions if each.key == key.lower()), None)
@@ -81,7 +73,6 @@ class TerminalView(Output):
         return None
 
     def close(self) -> None:
-        """Restore the terminal. May be called twice."""
         if self._keyboard is not None:
             self._keyboard.close()
 
@@ -153,7 +144,6 @@ class Keyboard:
         return list(pressed.decode("utf-8", "ignore"))
 
     def close(self) -> None:
-        """Restore the terminal."""
         fd, self._fd = self._fd, None
         if fd is not None:
             with contextlib.suppress(termios.error):

@@ -31,11 +31,6 @@ class TickStream:
     begin : time [s] of the first tick; None: when every sensor has sent a sample
     log : the recording; None: nothing is recorded
     orientations : sensors whose samples are measured orientations
-
-    Attributes
-    ----------
-    measured : (k,) bool: the sensors of `orientations`
-    synchronizer : what makes the ticks; None before they begin
     """
 
     def __init__(
@@ -48,7 +43,7 @@ class TickStream:
     ) -> None:
         self.sensors, self.log = tuple(sensors), log
         self.measured = np.array([name in orientations for name in self.sensors], dtype=np.bool_)
-        self.synchronizer: StreamSynchronizer | None = None
+        self.synchronizer: StreamSynchronizer | None = None  # makes the ticks, from when they begin
         self._orientations, self._rate_hz, self._begin = orientations, rate_hz, begin
         self._waiting: list[Arrivals] = []
 
@@ -61,7 +56,6 @@ class TickStream:
 
     @property
     def newest(self) -> float:
-        """Time [s] of the newest tick."""
         return self.clock.begin + (self.clock.next_tick - 1) / self.clock.rate_hz
 
     def push(self, samples: Sequence[Samples]) -> Iterator[Ticks]:
@@ -116,12 +110,7 @@ class StillPose(StartPoseDetector):
 
 
 class StartPoseSearch:
-    """Finds the start pose in the ticks before tracking: stated by the session, or held for `START_POSE_HOLD_S`.
-
-    Attributes
-    ----------
-    ticks : since before the start pose
-    """
+    """Finds the start pose in the ticks before tracking: stated by the session, or held for `START_POSE_HOLD_S`."""
 
     def __init__(self, stream: TickStream, setup: SensorSetup, table: BodyTable) -> None:
         self._stream, self._pose = stream, StillPose(stream)
@@ -132,7 +121,7 @@ class StartPoseSearch:
         elif setup.start_pose == NEUTRAL_POSE:
             self._instruction = "Stand upright and still, arms hanging, palms to the thighs"
         self._longest_s = 0.0  # [s] for which the person stood still
-        self.ticks: list[Ticks] = []
+        self.ticks: list[Ticks] = []  # since before the start pose
 
     def push(self, ticks: Ticks) -> tuple[int, int, int] | None:
         """Add ticks; return the start pose's first and last tick and the row in `ticks` after it; None: not yet."""
@@ -154,9 +143,7 @@ class StartPoseSearch:
     def describe(self, wrong_unit: str, frozen: str) -> tuple[str, str, float]:
         """Return the state, the message to the person, and the progress, 0 to 1.
 
-        Parameters
-        ----------
-        wrong_unit, frozen : sentences on sensors in another unit, and on frozen ones; empty where there are none
+        `wrong_unit` and `frozen` are sentences on sensors in another unit, and on frozen ones, or empty.
         """
         pose, sensors = self._pose, self._stream.sensors
         if self._stated is not None:

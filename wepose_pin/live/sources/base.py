@@ -34,7 +34,6 @@ class SourceOptions:
     baud: int = 115200  # of serial ports
 
     def error(self, reason: str) -> BadOption:
-        """The error that refuses the spec."""
         return BadOption(f"source '{self.spec}': {reason}")
 
     def read_pairs(self, text: str, example: str) -> dict[str, str]:
@@ -128,7 +127,6 @@ class Source(ABC):
     # For sources -----------------------------------------------------------------------------------------------------
 
     def count(self, problem: str, number: int = 1) -> None:
-        """Count a problem."""
         if problem not in self.problems and len(self.problems) >= MAX_PROBLEMS:
             problem = "other problems"
         self.problems[problem] += number

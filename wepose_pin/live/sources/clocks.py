@@ -50,7 +50,6 @@ class HostClock:
         return host
 
     def _find_smallest(self, delay: float, arrival: float) -> float:
-        """The smallest of the window, with this one."""
         buckets = self._buckets
         if buckets and arrival - buckets[-1][0] < BUCKET_S:
             buckets[-1] = (buckets[-1][0], min(delay, buckets[-1][1]))

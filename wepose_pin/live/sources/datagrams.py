@@ -28,14 +28,10 @@ class DatagramSource(Source):
     port : 0 for any free one; then see `address`
     sensors : to take; None: those that send while it connects
     segments : names that sensors may have; None: any, and `sensors` grows as new ones send
-
-    Attributes
-    ----------
-    kind, sender : of the source, and who sends to it, for messages
     """
 
-    kind: str
-    sender: str
+    kind: str  # of the source, for messages
+    sender: str  # who sends to it
 
     def __init__(
         self, host: str, port: int, sensors: Sequence[str] | None = None, segments: Collection[str] | None = None
@@ -94,12 +90,10 @@ class DatagramSource(Source):
         return where + (f"; dropped so far: {dropped}" if dropped else "")
 
     def read(self, timeout_s: float) -> list[Samples]:
-        """Samples since the last call, one `Samples` a sensor."""
         waiting, self._waiting = self._waiting, []
         return waiting or self._read_new(timeout_s)
 
     def _read_new(self, timeout_s: float) -> list[Samples]:
-        """Samples in the socket, or the first that come within `timeout_s`."""
         samples: list[Samples] = []
         deadline = time.monotonic() + timeout_s
         while not samples and self._socket is not None:
@@ -124,7 +118,6 @@ class DatagramSource(Source):
         return sensor in self.sensors
 
     def close(self) -> None:
-        """Free the port."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None

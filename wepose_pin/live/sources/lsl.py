@@ -96,12 +96,8 @@ def open_spec(rest: str, options: SourceOptions) -> LslSource:
 class LslSource(Source):
     """Streams called `name`, `name`-segment or `name`_segment, which liblsl finds again where they have a source_id.
 
-    Times are liblsl's `local_clock`, monotonic; of another machine it corrects them for the sender's clock.
-
-    Parameters
-    ----------
-    segments : names that sensors may have
-    sensors : to wait for; None: all that are found
+    Times are liblsl's `local_clock`, monotonic; of another machine it corrects them for the sender's clock. `segments`
+    are names that sensors may have, `sensors` those to wait for; None: all that are found.
     """
 
     def __init__(self, name: str, segments: Sequence[str], sensors: Sequence[str] | None = None) -> None:
@@ -114,7 +110,6 @@ class LslSource(Source):
         return f'State the unit "{unit}" of the channels {", ".join(channels)} in the stream\'s description'
 
     def open(self) -> None:
-        """Configure liblsl; raises `BadSource` where it is missing."""
         self._lsl = configure_pylsl()
 
     def connect(self, timeout_s: float) -> bool:
@@ -124,8 +119,8 @@ class LslSource(Source):
         for info in sorted(found, key=lambda info: info.created_at()):  # of two with one name the older
             if info.name() not in self._streams:
                 self._streams[info.name()] = self._subscribe(info)
-        present = self._present
-        if not present or self._missing:
+        present = [sensor for stream in self._streams.values() for sensor in stream.sensors]
+        if not present or not set(self.sensors) <= set(present):
             return False
         twice = {segment for segment in present if present.count(segment) > 1}
         if twice:
@@ -151,21 +146,13 @@ class LslSource(Source):
         sensors = find_channels(stream, self._name, labels, units, self._segments)
         return Stream(inlet, sensors, float(full.nominal_srate()))
 
-    @property
-    def _present(self) -> list[str]:
-        return [sensor for stream in self._streams.values() for sensor in stream.sensors]
-
-    @property
-    def _missing(self) -> list[str]:
-        return [segment for segment in self.sensors if segment not in self._present]
-
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        names = list(sensors) or (self._missing if self._present else [])
+        present = {sensor for stream in self._streams.values() for sensor in stream.sensors}
+        names = list(sensors) or [segment for segment in self.sensors if present and segment not in present]
         where = "where LSLAPICFG looks" if os.environ.get("LSLAPICFG") else "on this machine"
         return f"the LSL stream {self._name} {where}" + (f": {join_names(names)}" if names else "")
 
     def read(self, timeout_s: float) -> list[Samples]:
-        """Samples since the last call, one `Samples` a sensor."""
         samples: list[Samples] = []
         deadline = time.monotonic() + timeout_s
         while True:
@@ -187,11 +174,9 @@ class LslSource(Source):
             time.sleep(min(POLL_S, left))
 
     def clock(self) -> float:
-        """Now [s], liblsl's local clock."""
         return float(self._lsl.local_clock())
 
     def close(self) -> None:
-        """Unsubscribe."""
         self._streams.clear()
 
 

@@ -95,11 +95,8 @@ def open_spec(rest: str, options: SourceOptions) -> MTiSource:
 class MTiSource(Source):
     """Sensors on `devices` (segment → port), which are configured, lastingly, to send at `rate_hz`.
 
-    One thread a port reads and decodes, so that arrivals are stamped in time; a lost port is reopened when it is back.
-
-    Parameters
-    ----------
-    baud : of the ports; a device on USB takes any
+    One thread a port opens it, configures the device and listens, again and again, so that arrivals are stamped in time
+    and a lost port is taken up when it is back. A device on USB takes any `baud`.
     """
 
     def __init__(self, devices: Mapping[str, str], rate_hz: int = USUAL_HZ, baud: int = 115200) -> None:
@@ -108,92 +105,68 @@ class MTiSource(Source):
             import serial
         except ImportError:
             raise BadSource(f"mti: needs pyserial: {how_to_install('pyserial')}") from None
+        self._serial, self._devices, self._hz, self._baud = serial, dict(devices), rate_hz, baud
         self._inbox: SimpleQueue[Samples | str] = SimpleQueue()  # samples, and problems
-        self._ports = [Port(serial, segment, path, rate_hz, baud, self._inbox) for segment, path in devices.items()]
+        self._waits = dict.fromkeys(devices, "the port is being opened")  # segment → why nothing comes; empty: it does
+        self._refusal = ""  # why a device cannot be used at all
+        self._stop = threading.Event()
+        self._threads: list[threading.Thread] = []
 
     def open(self) -> None:
-        for port in self._ports:
-            port.start()
+        self._stop.clear()
+        for segment, path in self._devices.items():
+            self._threads.append(threading.Thread(target=self._run, args=(segment, path), daemon=True))
+            self._threads[-1].start()
 
     def connect(self, timeout_s: float) -> bool:
-        """Wait for the ports; raises `BadSource` where a device does not have the rate."""
         deadline = time.monotonic() + timeout_s
-        while any(port.problem for port in self._ports):
-            for port in self._ports:
-                if port.refusal:
-                    raise BadSource(port.refusal)
+        while any(self._waits.values()):
+            if self._refusal:
+                raise BadSource(self._refusal)
             if time.monotonic() > deadline:
                 return False
             time.sleep(WAIT_S)
         return True
 
     def read(self, timeout_s: float) -> list[Samples]:
-        """Samples since the last call, in the order of arrival."""
         samples: list[Samples] = []
-        deadline = time.monotonic() + timeout_s
         try:
+            came = self._inbox.get(timeout=timeout_s)
             while True:
-                left = 0.0 if samples else max(0.0, deadline - time.monotonic())
-                came = self._inbox.get(timeout=left) if left else self._inbox.get_nowait()
                 if isinstance(came, str):
                     self.count(came)
                 else:
                     samples += self.keep_plausible(came.sensor, came.time, np.hstack([came.gyro_S, came.accel_S]))
+                came = self._inbox.get_nowait()
         except Empty:
             return samples
 
     def close(self) -> None:
-        """Stop listening and free the ports."""
-        for port in self._ports:
-            port.stop()
+        self._stop.set()
+        while self._threads:
+            self._threads.pop().join()
 
     def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        ports = [port for port in self._ports if port.segment in sensors or not sensors]
-        waits = [f"the MTi of {port.place}: {port.problem}" for port in ports if port.problem]
-        return waits[0] if waits else f"MTi sensors: {', '.join(port.place for port in ports)}"
+        chosen = [name for name in self.sensors if name in sensors or not sensors]
+        places = {name: f"{join_names([name])} at {self._devices[name]}" for name in chosen}
+        waits = [f"the MTi of {place}: {self._waits[name]}" for name, place in places.items() if self._waits[name]]
+        return waits[0] if waits else f"MTi sensors: {', '.join(places.values())}"
 
+    # In the thread of a port -----------------------------------------------------------------------------------------
 
-class Port:
-    """One serial port, and the thread that opens it, configures the device and listens, again and again.
-
-    Attributes
-    ----------
-    problem : why nothing comes yet; empty: the device sends
-    refusal : why the device cannot be used at all; empty: it can
-    """
-
-    def __init__(
-        self, serial: Any, segment: str, path: str, rate_hz: int, baud: int, inbox: SimpleQueue[Samples | str]
-    ) -> None:
-        self.segment, self.place = segment, f"{join_names([segment])} at {path}"
-        self._serial, self._path, self._rate_hz, self._baud, self._inbox = serial, path, rate_hz, baud, inbox
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-        self.problem, self.refusal = "the port is being opened", ""
-
-    def start(self) -> None:
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._run, name=f"mti {self._path}", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-
-    def _run(self) -> None:
-        while not (self._stop.is_set() or self.refusal):
+    def _run(self, segment: str, path: str) -> None:
+        while not (self._stop.is_set() or self._refusal):
             try:
-                with self._serial.Serial(self._path, self._baud, write_timeout=1.0, exclusive=True) as port:
+                with self._serial.Serial(path, self._baud, write_timeout=1.0, exclusive=True) as port:
                     buffer = bytearray()
                     self._configure(port, buffer)
-                    self.problem = ""
-                    self._listen(port, buffer)
+                    self._waits[segment] = ""
+                    self._listen(segment, port, buffer)
             except (OSError, ValueError) as error:  # SerialException is an OSError
-                if not self.problem:
-                    self._inbox.put(f"connections lost to {self.segment}")
+                if not self._waits[segment]:
+                    self._inbox.put(f"connections lost to {segment}")
                 errno = getattr(error, "errno", None)
-                self.problem = f"cannot open the port ({os.strerror(errno)})" if errno else str(error)
+                self._waits[segment] = f"cannot open the port ({os.strerror(errno)})" if errno else str(error)
                 self._stop.wait(RETRY_S)
 
     def _configure(self, port: Any, buffer: bytearray) -> None:
@@ -201,64 +174,60 @@ class Port:
         self._ask(port, buffer, GO_TO_CONFIG)
         offers = []
         for name, gyro, accel in OUTPUTS:
-            items = struct.pack(">6H", SAMPLE_TIME, WITH_EVERY_PACKET, accel, self._rate_hz, gyro, self._rate_hz)
+            items = struct.pack(">6H", SAMPLE_TIME, WITH_EVERY_PACKET, accel, self._hz, gyro, self._hz)
             mid, answer = self._ask(port, buffer, SET_OUTPUT, items)
             rates = dict(struct.iter_unpack(">2H", answer[: len(answer) // 4 * 4])) if mid != ERROR else {}
-            if rates.get(gyro) == rates.get(accel) == self._rate_hz:
+            if rates.get(gyro) == rates.get(accel) == self._hz:
                 self._ask(port, buffer, GO_TO_MEASUREMENT)
                 return
-            offers += [
-                f"RateOfTurn{name} at {rates.get(gyro, 0)} Hz",
-                f"Acceleration{name} at {rates.get(accel, 0)} Hz",
-            ]
-        self.refusal = (
-            f"mti:{self._path}: does not send rate of turn and acceleration at {self._rate_hz} Hz; it offers "
+            own = rates.get(gyro, 0), rates.get(accel, 0)
+            offers.append(f"RateOfTurn{name} at {own[0]} Hz, Acceleration{name} at {own[1]} Hz")
+        self._refusal = (
+            f"mti:{port.name}: does not send rate of turn and acceleration at {self._hz} Hz; it offers "
             f"{', '.join(offers)}; choose a rate that it has"
         )
-        raise OSError(self.refusal)
+        raise OSError(self._refusal)
 
     def _ask(self, port: Any, buffer: bytearray, mid: int, data: bytes = b"") -> Frame:
-        """Send a message; return its acknowledgement, or an error."""
         for _ in range(TRIES):
             port.write(build_frame(mid, data))
             deadline = time.monotonic() + ANSWER_S
             while time.monotonic() < deadline and not self._stop.is_set():
-                buffer += self._read_bytes(port)
+                buffer += read_bytes(port)
                 for frame in take_frames(buffer)[0]:
                     if frame[0] in (mid + 1, ERROR):
                         return frame
         raise OSError(f"no MTi answers at {self._baud} baud; check the cable, the port and the baud rate")
 
-    def _read_bytes(self, port: Any) -> bytes:
-        """Bytes that came, none after a while; past pyserial, whose `read` costs twice as much."""
-        if not select.select([port.fileno()], [], [], WAIT_S)[0]:
-            return b""
-        data = os.read(port.fileno(), 4096)
-        if not data:
-            raise OSError("the port is gone")
-        return data
-
-    def _listen(self, port: Any, buffer: bytearray) -> None:
-        """Put what comes into the inbox."""
+    def _listen(self, segment: str, port: Any, buffer: bytearray) -> None:
         clock, last_byte = HostClock(), time.monotonic()
         while not self._stop.is_set():
-            data, now = self._read_bytes(port), time.monotonic()
-            if not data:
-                if now - last_byte > SILENT_S:
-                    raise OSError("nothing comes")
-                continue
-            last_byte = now
+            data, now = read_bytes(port), time.monotonic()
+            if data:
+                last_byte = now
+            elif now - last_byte > SILENT_S:
+                raise OSError("nothing comes")
             buffer += data
             frames, skipped = take_frames(buffer)
             packets = [parse_packet(content) for mid, content in frames if mid == DATA]
             samples = [packet for packet in packets if packet is not None]
-            if skipped or len(samples) < len(packets) or any(mid == ERROR for mid, _ in frames):
-                self._inbox.put(f"damaged packets and errors of {self.segment}")
+            if skipped or len(samples) < len(frames):
+                self._inbox.put(f"damaged packets and errors of {segment}")
             if samples:
                 values = np.array([values for _, values in samples])
                 time_s = clock.to_host(np.array([seconds for seconds, _ in samples]), now)
-                self._inbox.put(Samples(self.segment, time_s, values[:, :3], values[:, 3:]))
+                self._inbox.put(Samples(segment, time_s, values[:, :3], values[:, 3:]))
             time.sleep(PAUSE_S)
+
+
+def read_bytes(port: Any) -> bytes:
+    """Bytes that came, none after a while; past pyserial, whose `read` costs twice as much."""
+    if not select.select([port.fileno()], [], [], WAIT_S)[0]:
+        return b""
+    data = os.read(port.fileno(), 4096)
+    if not data:
+        raise OSError("the port is gone")
+    return data
 
 
 KIND = SourceKind("mti:DEVICE=SEGMENT,DEVICE=SEGMENT[@RATE]", open_spec)

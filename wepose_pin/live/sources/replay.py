@@ -35,16 +35,8 @@ def open_spec(rest: str, options: SourceOptions) -> ReplaySource:
 class ReplaySource(Source):
     """A recording at `speed` times its own pace.
 
-    Samples in marked gaps are left out, as of a silent sensor. Samples that become due between two reads come together.
-
-    Parameters
-    ----------
-    speed : 1.0 its own, ``math.inf`` as fast as possible
-    block : samples of every sensor at once, as fast as possible
-
-    Attributes
-    ----------
-    recording : that is replayed
+    Samples in marked gaps are left out, as of a silent sensor. Samples that become due between two reads come together;
+    as fast as possible, `speed` ``math.inf``, `block` of every sensor.
     """
 
     def __init__(self, recording: Recording, speed: float = 1.0, block: int = 64) -> None:
@@ -61,11 +53,9 @@ class ReplaySource(Source):
         return {name: each.aligned for name, each in sensors if isinstance(each, OrientationSensor)}
 
     def open(self) -> None:
-        """Start: the first sample is due now."""
         self._next, self._begin = 0, time.monotonic()
 
     def clock(self) -> float:
-        """Now [s] on the recording's time; as fast as possible, the time of the newest sample delivered."""
         if math.isinf(self._speed):
             return float(self._time[max(self._next - 1, 0)])
         return float(self._time[0]) + (time.monotonic() - self._begin) * self._speed
@@ -93,7 +83,6 @@ class ReplaySource(Source):
         return [each for each in samples if len(each.time)]
 
     def _count_due(self) -> int:
-        """One past the last sample that is due."""
         if math.isinf(self._speed):
             return min(self._next + self._block, len(self.recording))
         return int(np.searchsorted(self._time, self.clock(), side="right"))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ...recording.arrivals import Samples, pack_orientations
-from ..addresses import parse_listening_address
+from ..addresses import LOOPBACK, parse_address
 from .base import SourceKind, SourceOptions
 from .datagrams import DatagramSource
 
@@ -61,7 +61,9 @@ class Tracker:
 def open_spec(rest: str, options: SourceOptions) -> SlimeVrSource:
     """The source of ``slimevr:[HOST][:PORT][,TRACKER=SEGMENT…]``."""
     address, _, pairs = rest.partition(",")
-    host, port = parse_listening_address(address, f"source '{options.spec}':", PORT)
+    host, port = address or LOOPBACK, PORT
+    if address.isdigit() or ":" in address:
+        host, port = parse_address(address, f"source '{options.spec}':", PORT)
     devices = options.read_pairs(pairs, "4c:11:ae:00:00:01/0") if pairs else {}
     assigned = {tracker.lower(): segment for segment, tracker in devices.items()}
     segments = None if options.any_name else options.segments
@@ -73,13 +75,7 @@ class SlimeVrSource(DatagramSource):
 
     Where sensors may have any name, a tracker that states no place is ``MAC/SENSOR``.
 
-    Parameters
-    ----------
-    assigned : tracker, as ``MAC`` or ``MAC/SENSOR``, → segment; goes before the place that the tracker states
-
-    Attributes
-    ----------
-    trackers : address → tracker
+    `assigned` is tracker, as ``MAC`` or ``MAC/SENSOR``, → segment; it goes before the place that the tracker states.
     """
 
     kind, sender = "slimevr", "SlimeVR trackers"
@@ -87,7 +83,7 @@ class SlimeVrSource(DatagramSource):
 
     def __init__(self, *options: Any, assigned: Mapping[str, str] | None = None) -> None:
         super().__init__(*options)
-        self.trackers: dict[Any, Tracker] = {}
+        self.trackers: dict[Any, Tracker] = {}  # by address
         self._assigned, self._heartbeat = dict(assigned or {}), -math.inf
         self._last_times: dict[str, float] = {}
 
@@ -97,7 +93,6 @@ class SlimeVrSource(DatagramSource):
 
     @property
     def batteries(self) -> dict[str, float]:
-        """Segment → battery of its tracker, 0 to 1, where it is known."""
         batteries = {
             self._find_segment(tracker, sensor): tracker.battery
             for tracker in self.trackers.values()
@@ -143,7 +138,6 @@ class SlimeVrSource(DatagramSource):
         return samples
 
     def _send(self, data: bytes, to: Any) -> None:
-        """Send a datagram; one that cannot be sent is left out."""
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.sendto(data, to)

@@ -64,11 +64,8 @@ def open_spec(rest: str, options: SourceOptions) -> UdpSource:
 class UdpSource(DatagramSource):
     """Samples of raw sensors; other parameters and errors as `DatagramSource`.
 
-    Times of each sender, an address and port, are mapped to our clock (`HostClock`).
-
-    Parameters
-    ----------
-    units : ``gyro_unit`` and ``accel_unit`` of what does not state its own
+    Times of each sender, an address and port, are mapped to our clock (`HostClock`). `units` are ``gyro_unit`` and
+    ``accel_unit`` of what does not state its own.
     """
 
     kind, sender = "udp", "samples"
@@ -129,10 +126,7 @@ def decode(
 ) -> tuple[list[Batch], list[str]]:
     """The batches in a datagram, and a problem for each line that is dropped; raises nothing.
 
-    Parameters
-    ----------
-    segments : names of sensors in lines of JSON; None: any
-    units : as `SI`, of packets and of lines that do not state their own
+    `segments` are names of sensors in lines of JSON; None: any. `units` are of what does not state its own.
     """
     batches: list[Batch] = []
     problems: list[str] = []
