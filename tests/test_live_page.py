@@ -52,6 +52,17 @@ def model() -> BodyModel:
     return load_model()
 
 
+@contextlib.contextmanager
+def serve(model: BodyModel, info: StreamInfo | None = None, **options: Any) -> Iterator[LivePage]:
+    """An open page."""
+    page = LivePage(model, **options)
+    if info is not None:
+        page.start(info)
+    page.open()
+    yield page
+    page.close()
+
+
 class Person:
     """A fake loop: arms that swing, and the status of their sensors."""
 
@@ -84,7 +95,7 @@ def person(model: BodyModel) -> Person:
 
 @pytest.fixture
 def page(model: BodyModel) -> Iterator[LivePage]:
-    with LivePage(model, title="<b>& circles") as page:
+    with serve(model, title="<b>& circles") as page:
         yield page
 
 
@@ -233,7 +244,7 @@ def talk(page: LivePage, do: Callable[[WebSocketClientConnection], Awaitable[Any
 
 
 def test_another_address_than_loopback_needs_the_token(model: BodyModel) -> None:
-    with LivePage(model, host="127.0.0.2") as page:
+    with serve(model, host="127.0.0.2") as page:
         address, _, token = page.url.partition("?token=")
         assert len(token) > 20
         for wrong in ("", "?token=", f"?token={token[:-1]}", f"?other={token}"):
@@ -335,7 +346,8 @@ def test_keys_and_nonsense(page: LivePage) -> None:
 
 
 def test_the_end_reaches_the_browser(model: BodyModel, person: Person) -> None:
-    page = LivePage(model, person.info)
+    page = LivePage(model)
+    page.start(person.info)
     page.open()
 
     async def wait(connection: WebSocketClientConnection) -> list[Any]:
@@ -351,7 +363,7 @@ def test_the_end_reaches_the_browser(model: BodyModel, person: Person) -> None:
     messages = talk(page, wait)
     assert json.loads(messages[-1])["state"] == "ended"
     page.close()
-    with LivePage(model, port=port) as again:  # the port is free at once
+    with serve(model, port=port) as again:  # the port is free at once
         assert get(again.url)[0] == 200
 
 
@@ -389,7 +401,7 @@ def box_of(browser: Browser, element: str) -> dict[str, float]:
 
 
 def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Person, browser: Browser) -> None:
-    with LivePage(model, title="circles") as page:
+    with serve(model, title="circles") as page:
         browser.errors.clear()
         browser.emulate(prefers_color_scheme="light")
         browser.go(page.url)
@@ -449,7 +461,8 @@ def test_the_start_and_the_motion_in_light_and_dark(model: BodyModel, person: Pe
 
 def test_it_says_that_the_connection_is_lost_and_comes_back(model: BodyModel, person: Person, browser: Browser) -> None:
     browser.emulate(prefers_color_scheme="light")
-    page = LivePage(model, person.info)
+    page = LivePage(model)
+    page.start(person.info)
     page.open()
     port = int(page.url.split(":")[2].strip("/"))
     browser.go(page.url)
@@ -458,7 +471,7 @@ def test_it_says_that_the_connection_is_lost_and_comes_back(model: BodyModel, pe
     browser.wait("window.wepose.time() === 1 && window.wepose.state() === 'ready'")
     page.close()
     assert "Connection lost" in browser.wait("document.querySelector('#offline:not([hidden])')?.textContent")
-    with LivePage(model, person.info, port=port) as again:
+    with serve(model, person.info, port=port) as again:
         again.show(person.pose(2.0))
         again.status(person.status("ended", "The session has ended."))
         browser.wait("window.wepose.time() === 2 && document.querySelector('#offline').hidden")

@@ -166,7 +166,7 @@ def test_noise_is_counted_and_no_sample_lost(plugged: Plug) -> None:
         samples = collect(source, 60)["torso"]
     assert len(samples.time) >= 60
     np.testing.assert_allclose(np.diff(samples.time), 0.01, rtol=0.0101)
-    assert source.problems["damaged packets and errors of torso"] >= 30
+    assert source.problems["damaged packets and errors of torso"] > 0
 
 
 def test_a_port_that_vanishes_is_taken_up_again(plugged: Plug) -> None:
@@ -204,14 +204,15 @@ def test_a_port_is_waited_for_and_what_is_wrong_is_said(
     source = open_source(f"mti:{tmp_path / 'one'}=torso@100")
     place = f"the MTi of torso at {tmp_path / 'one'}: "
     source.open()
-    assert not source.connect(0.2)
+    assert not source.connect(1.0)
     assert source.describe_awaited() == f"{place}cannot open the port (No such file or directory)"
     device = plugged("one")
     device.deaf = True
-    assert not source.connect(1.5)
+    assert not source.connect(3.0)
     assert source.describe_awaited().startswith(f"{place}no MTi answers at 115200 baud")
     device.deaf = False
-    for _ in range(2):  # the port is free again after that
+    source.close()
+    for _ in range(2):  # the port is free again after each
         with connected(source):
             assert collect(source, 5)
     assert threading.active_count() == before + 1  # the device

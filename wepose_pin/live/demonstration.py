@@ -13,7 +13,7 @@ from ..body.kinematics import KinematicsSolver
 from ..calibration import Protocol
 from ..errors import BadOption
 from ..simulation import simulate
-from .state import GuideView, LivePose
+from .state import GuideView, LivePose, StreamInfo
 
 RATE_HZ = 30.0
 MOTION_S = 14.0  # [s] of the motion of a protocol's part; it is drawn again and again
@@ -22,12 +22,7 @@ SHAKE_HZ, SHAKE_ANGLE = 2.5, 0.45  # of a shaken segment; angle in rad
 
 
 class Demonstration:
-    """Poses of a figure for each view of the guide; those of a body without a simulated protocol stand still.
-
-    Attributes
-    ----------
-    segments : of the poses
-    """
+    """Poses of a figure for each view of the guide; those of a body without a simulated protocol stand still."""
 
     def __init__(self, model: BodyModel, protocol: Protocol) -> None:
         shown, lengths = None, tuple(model.lengths.items())
@@ -36,6 +31,7 @@ class Demonstration:
         self._motion, self._phases = shown or ({}, {})
         self.segments = tuple(model.table.needed)
         self._kinematics = KinematicsSolver(model, self.segments)
+        self.info = StreamInfo(self.segments, self._kinematics.points, RATE_HZ)  # of the poses
 
     def pose(self, view: GuideView, time: float) -> LivePose:
         """The figure at a time [s]: the start pose, the motion of a phase, or one segment that is shaken."""

@@ -71,9 +71,6 @@ class PoseEncoder:
         self._neutral = _stack([data.oMf[frame] for frame in self._frames])
         self._known = np.ones(len(self._frames), dtype=bool)
 
-    def points(self, segments: tuple[str, ...]) -> tuple[str, ...]:
-        return KinematicsSolver(self._model, segments).points
-
     def start(self, info: StreamInfo) -> None:
         model, kinematics = self._model, KinematicsSolver(self._model, info.segments)
         known = find_known_links(model, info.segments)

@@ -151,7 +151,7 @@ class Guide(Stage):
             self._figure_due = now + 1.0 / RATE_HZ
             pose = self._figure.pose(self._view, now)
             for output in self.outputs:
-                output.demonstrate(pose, self._figure.segments)
+                output.demonstrate(pose, self._figure.info)
 
     def do(self, action: Action, text: str) -> None:
         self.samples, self.ticks, self.text = (), [], text

@@ -42,26 +42,18 @@ class LivePage(Output):
     Parameters
     ----------
     model : the body, with its lengths
-    info : where it is known before the start: what no sensor determines is then hidden from the beginning
     host : address to listen on; another than loopback lets others in the network watch and press keys, who know the
         token in `url`
     port : 0 for any free one
     title : shown above the body
-
-    Attributes
-    ----------
-    url : of an open page
     """
 
-    def __init__(
-        self, model: BodyModel, info: StreamInfo | None = None, host: str = LOOPBACK, port: int = 0, title: str = ""
-    ) -> None:
-        self._host, self._port, self._title, self.url = host, port, title, ""
+    def __init__(self, model: BodyModel, host: str = LOOPBACK, port: int = 0, title: str = "") -> None:
+        self._host, self._port, self._title = host, port, title
+        self.url = ""  # of an open page
         self._server: Server | None = None
         self._requests: deque[Request] = deque(maxlen=MAX_REQUESTS)
         self.set_body(model)
-        if info is not None:
-            self.start(info)
 
     def open(self) -> None:
         """Serve the page from a thread of its own; raises `BadOption` where the address or port cannot be used."""
@@ -77,9 +69,9 @@ class LivePage(Output):
         if self._server is not None:
             self._server.content = self._content
 
-    def demonstrate(self, pose: LivePose, segments: tuple[str, ...]) -> None:
-        if self._encoder.info is None or self._encoder.info.segments != segments:
-            self.start(StreamInfo(segments, self._encoder.points(segments), 0.0))
+    def demonstrate(self, pose: LivePose, info: StreamInfo) -> None:
+        if self._encoder.info is not info:
+            self.start(info)
         self._encoder.newest = pose
 
     def start(self, info: StreamInfo) -> None:
@@ -101,13 +93,6 @@ class LivePage(Output):
         if self._server is not None:
             self._server.close()
             self._server = None
-
-    def __enter__(self) -> LivePage:
-        self.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str) -> str:

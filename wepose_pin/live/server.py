@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import contextlib
 import hashlib
 import hmac
 import json
@@ -132,12 +133,11 @@ class Server:
 
         The name of a foreign page may resolve to 127.0.0.1, and its scripts would then be of our origin.
         """
-        parts = re.fullmatch(r"(?:\[([0-9a-f:.]+)\]|([\w.-]+))(?::\d{1,5})?", host.lower(), flags=re.ASCII)
-        name = parts[1] or parts[2] if parts else ""
-        try:
+        parts = re.fullmatch(r"\[([0-9a-f:.]+)\]|([\w.-]+)", re.sub(r":\d{1,5}$", "", host.lower()), flags=re.ASCII)
+        name = (parts[1] or parts[2]) if parts else ""
+        with contextlib.suppress(ValueError):
             return name in ("localhost", self._host.lower()) or bool(ip_address(name))
-        except ValueError:
-            return False
+        return False
 
 
 class Guarded(RequestHandler):  # type: ignore[misc]

@@ -141,8 +141,8 @@ class Output:
     def status(self, status: Status) -> None:
         """Take the status, a few times a second from the first sample on."""
 
-    def demonstrate(self, pose: LivePose, segments: tuple[str, ...]) -> None:
-        """Draw a pose of these segments that nobody took: an instruction of the guide."""
+    def demonstrate(self, pose: LivePose, info: StreamInfo) -> None:
+        """Draw a pose that nobody took: an instruction of the guide."""
 
     def describe(self) -> str:
         """What to add to the message to the person while tracking; empty: nothing."""

@@ -14,7 +14,7 @@ import numpy as np
 from ..calibration import Calibration, Protocol
 from ..calibration.protocols import Step as ProtocolStep
 from ..calibration.quality import ENOUGH_SAMPLES, find_open_intervals, format_longest
-from ..diagnostics import Diagnostic, render, render_all
+from ..diagnostics import render, render_all
 from ..errors import BadData, WeposeError
 from .assignment import ShakeDetector
 from .guide import SILENCE_S, Calibrated, Guide, Step, StepRun, Turn
@@ -381,7 +381,9 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None) -> tuple
     else:
         sentence, actions = "This calibration must not be used.", [RESTART, MORE]
     diagnostics = [*quality.reasons, *(each for each in quality.further if each.code == "pose-contradicted")]
-    counted = [count_from_begin(each, calibration) for each in diagnostics]
+    begin = calibration.time[np.isfinite(calibration.gap)][:1].sum()  # of the motion: the person knows no other clock
+    open_s = format_longest([(first - begin, last - begin) for first, last in find_open_intervals(calibration)])
+    counted = [replace(d, facts={**d.facts, "intervals": open_s}) if "intervals" in d.facts else d for d in diagnostics]
     reasons = [text.line() for _, text in render_all(counted, REMEDIES)]
     if calibration.exchanged:  # all other reasons follow from this one
         sentence = "Some sensors sit on other segments than assigned. The same motion will do."
@@ -396,12 +398,3 @@ def _view_result(guide: Guide, result: Calibrated | WeposeError | None) -> tuple
         actions.append(MEASURE._replace(entry=f"{name} [cm]"))
     view = GuideView(sentence, progress=1.0, actions=tuple(actions), quality=quality.quality, reasons=tuple(reasons))
     return _add_lengths(view, calibration), length
-
-
-def count_from_begin(reason: Diagnostic, calibration: Calibration) -> Diagnostic:
-    """The reason with intervals counted from the begin of the motion: the person knows no clock of the source."""
-    if "intervals" not in reason.facts:
-        return reason
-    begin = calibration.time[np.isfinite(calibration.gap)][0]
-    intervals = [(first - begin, last - begin) for first, last in find_open_intervals(calibration)]
-    return replace(reason, facts={**reason.facts, "intervals": format_longest(intervals)})

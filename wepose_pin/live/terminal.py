@@ -81,7 +81,7 @@ class TerminalView(Output):
         sentence = describe_state(status)
         now = {"": re.sub(r"[0-9.]+", "", sentence)}
         for sensor in status.sensors:
-            now[f"{sensor.segment}: "] = "frozen" if sensor.frozen else "lost" if sensor.lost else "there"
+            now[f"{sensor.segment}: "] = "lost" if sensor.lost else "there"
         now |= {f"{problem}: ": "since now" for problem, count in status.problems.items() if count}
         if self._keyboard is not None and status.state != "ended":
             now["    keys: "] = ", ".join([*(f"{each.key} {each.label}" for each in status.actions), "q end"])

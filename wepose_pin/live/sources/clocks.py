@@ -39,7 +39,14 @@ class HostClock:
         if newest < self._newest - BACK_S or delay < self._offset - JUMP_S or not math.isfinite(self._newest):
             self._buckets.clear()
             self._newest, self._offset = newest, delay
-        estimate = self._find_smallest(delay, arrival)
+        buckets = self._buckets
+        if buckets and arrival - buckets[-1][0] < BUCKET_S:
+            buckets[-1] = (buckets[-1][0], min(delay, buckets[-1][1]))
+        else:
+            buckets.append((arrival, delay))
+        while arrival - buckets[0][0] > WINDOW_S:
+            buckets.popleft()
+        estimate = min(smallest for _, smallest in buckets)
         passed = newest - self._newest
         if passed <= 0.0:
             return time + self._offset
@@ -48,13 +55,3 @@ class HostClock:
         host = time + (offset if len(time) == 1 else np.interp(time, [self._newest, newest], [self._offset, offset]))
         self._newest, self._offset = newest, offset
         return host
-
-    def _find_smallest(self, delay: float, arrival: float) -> float:
-        buckets = self._buckets
-        if buckets and arrival - buckets[-1][0] < BUCKET_S:
-            buckets[-1] = (buckets[-1][0], min(delay, buckets[-1][1]))
-        else:
-            buckets.append((arrival, delay))
-        while arrival - buckets[0][0] > WINDOW_S:
-            buckets.popleft()
-        return min(smallest for _, smallest in buckets)

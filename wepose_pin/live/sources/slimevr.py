@@ -100,11 +100,6 @@ class SlimeVrSource(DatagramSource):
         }
         return {name: share for name, share in batteries.items() if name is not None and math.isfinite(share)}
 
-    def describe_awaited(self, sensors: Sequence[str] = ()) -> str:
-        known = ", ".join(tracker.mac or address[0] for address, tracker in self.trackers.items())
-        text = super().describe_awaited(sensors)
-        return f"{text}; connected: {known}" if known else text
-
     def _serve(self, now: float) -> None:
         if now - self._heartbeat >= HEARTBEAT_S:
             self._heartbeat = now
