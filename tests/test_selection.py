@@ -109,7 +109,10 @@ def test_each_command_takes_only_what_is_selected(result: Path, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("export {result} -o {out}/x.urdf --phase start", "--phase start: there is no motion in a file of format urdf"),
+        (
+            "export {result} -o {out}/x.urdf --phase start",
+            "--phase start: not of format urdf; there is no motion in it",
+        ),
         ("export {result} -o {out}/x.csv --phase clasp", "--phase clasp: the recording has no such phase"),
         ("view {result} --phase start", "--phase start: needs -o FILE"),
         ("view {result} --interval 9 11 -o {out}/x.html", "--interval 9 11: the recording runs from 2 to 5 s"),

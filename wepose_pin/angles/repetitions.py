@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import find_peaks
 
 from ..errors import WrongOption, one_of
 from ..filters.butterworth import low_pass
@@ -239,6 +238,8 @@ def _size(signal: np.ndarray, before: int, peak: int, after: int) -> float:
 
 def _find_excursions(signal: np.ndarray, least: float) -> list[tuple[int, int, int]]:
     """Valley, peak and valley of each excursion that rises and falls by at least `least`."""
+    from scipy.signal import find_peaks  # half a second to load
+
     peaks: list[int] = []
     for peak in find_peaks(signal, prominence=least)[0].tolist():
         if peaks and min(signal[peaks[-1]], signal[peak]) - signal[peaks[-1] : peak].min() < least:
