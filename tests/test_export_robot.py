@@ -300,7 +300,7 @@ def assert_refused(capsys: pytest.CaptureFixture[str], arguments: list[str], sai
         (["{arm}", "-o", "x.mcap"], "--format mcap: a file of 2 results; only lerobot takes several, as episodes"),
         (["{slow}", "-o", "d", "--format", "lerobot"], "robot arm, 25 Hz, joints"),
         (["{other}", "-o", "d", "--format", "lerobot"], "50 Hz, joints flexion; a data set has one robot"),
-        (["-o", "{arm}/summary.json", "--format", "lerobot", "--force"], "summary.json: is a file; a folder is wanted"),
+        (["-o", "{arm}/summary.json", "--format", "lerobot", "--force"], "summary.json is a file; a folder is wanted"),
     ],
 )
 def test_a_wrong_export_of_a_robot_takes_one_line(

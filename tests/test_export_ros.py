@@ -148,15 +148,6 @@ def test_a_rate_and_a_phase_of_a_trajectory(trajectory: Path, motion: JointMotio
         np.testing.assert_allclose(states[k][1].position, motion.position[100 + 2 * k], atol=1e-12)
 
 
-def test_a_fixed_frame_that_a_link_has_is_another(tmp_path: Path) -> None:
-    folder = write_trajectory_folder(tmp_path / "arm", seconds=0.2)
-    urdf = (folder / "robot.urdf").read_text().replace('"world"', '"map"')
-    (folder / "robot.urdf").write_text(urdf)
-    export(folder, tmp_path / "x.mcap")
-    static = read_bag(tmp_path / "x.mcap")["/tf_static"][0][1].transforms
-    assert [(each.header.frame_id, each.child_frame_id) for each in static][:2] == [("world", "map"), ("map", "base")]
-
-
 @pytest.mark.parametrize(
     ("module", "name", "package"), [("rosbags.interfaces", "x.mcap", "rosbags"), ("rerun", "x.rrd", "rerun-sdk")]
 )

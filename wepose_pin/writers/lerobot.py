@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -29,12 +29,8 @@ QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 FILE = Path("chunk-000", "file-000.parquet")
 
 
-class Episode(NamedTuple):
-    """A motion that is one episode, the state (joints,) that follows it, and what the robot does in it."""
-
-    motion: JointMotion
-    after: np.ndarray
-    task: str
+# A motion that is one episode, the state (joints,) that follows it, and what the robot does in it.
+Episode = tuple[JointMotion, np.ndarray, str]
 
 
 def write_lerobot(
@@ -51,19 +47,19 @@ def write_lerobot(
     listed, diagnostics = list[Episode](), list[Diagnostic]()
     for motion in motions:
         listed += _list_episodes(motion, episodes, instruction, diagnostics)
-    tasks = list(dict.fromkeys(episode.task for episode in listed))
-    tables, begins = [], np.cumsum([0, *(len(episode.motion.time) for episode in listed)])
-    for k, episode in enumerate(listed):
-        state = episode.motion.position
+    tasks = list(dict.fromkeys(task for _, _, task in listed))
+    tables, begins = [], np.cumsum([0, *(len(part.time) for part, _, _ in listed)])
+    for k, (part, after, task) in enumerate(listed):
+        state = part.position
         n = len(state)
         columns = {
             STATE: _to_lists(state),
-            ACTION: _to_lists(np.vstack([state[1:], episode.after])),
+            ACTION: _to_lists(np.vstack([state[1:], after])),
             "timestamp": (np.arange(n) / rate_hz).astype(np.float32),
             "frame_index": np.arange(n),
             "episode_index": np.full(n, k),
             "index": begins[k] + np.arange(n),
-            "task_index": np.full(n, tasks.index(episode.task)),
+            "task_index": np.full(n, tasks.index(task)),
         }
         tables.append(pl.DataFrame(columns))
     for name in ("data", "meta/episodes"):
@@ -71,7 +67,7 @@ def write_lerobot(
     write_table(folder / "data" / FILE, pl.concat(tables))
     about: dict[str, Any] = {
         "episode_index": np.arange(len(listed)),
-        "tasks": [[episode.task] for episode in listed],
+        "tasks": [[task] for _, _, task in listed],
         "length": np.diff(begins),
         "dataset_from_index": begins[:-1],
         "dataset_to_index": begins[1:],
@@ -115,7 +111,7 @@ def _list_episodes(
     """List the episodes of a motion; intervals that it does not follow become a diagnostic."""
     text = instruction or f"follow {motion.source or motion.name}"
     if by is None:
-        return [Episode(motion, motion.position[-1], text)]
+        return [(motion, motion.position[-1], text)]
     spans = motion.phases.get(by, ())
     if by != REPETITIONS and not instruction:
         text += f", {by}"
@@ -132,7 +128,7 @@ def _list_episodes(
         facts: dict[str, float | str] = {"count": float(len(spans)), "recorded": f"{first:g} to {last:g} s"}
         diagnostics.append(Diagnostic("episodes-cut", WARNING, by, float(len(spans) - len(parts)), facts=facts))
     last_row = len(motion.time) - 1
-    return [Episode(motion.cut(part), motion.position[min(part.stop, last_row)], text) for part in parts]
+    return [(motion.cut(part), motion.position[min(part.stop, last_row)], text) for part in parts]
 
 
 def _check_alike(motions: Sequence[JointMotion]) -> int:

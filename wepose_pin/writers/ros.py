@@ -18,7 +18,7 @@ import numpy as np
 from ..errors import BadOption, how_to_install
 from .joint_motion import JointMotion, LinkTransform, compute_link_transforms
 
-FIXED_FRAME, OTHER_FIXED_FRAME = "map", "world"  # the other one where a link has the name
+FIXED_FRAME = "map"
 TYPES = {
     "/robot_description": "std_msgs/msg/String",
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -77,8 +77,7 @@ def _list_messages(motion: JointMotion, types: Any) -> Iterator[tuple[str, int, 
     time = motion.time - min(0.0, motion.time[0])
     stamps = np.maximum(np.rint(1e9 * time), 1).astype(np.int64).tolist()
     transforms = compute_link_transforms(motion)
-    fixed_frame = OTHER_FIXED_FRAME if FIXED_FRAME in (motion.root, *transforms) else FIXED_FRAME
-    placed = {motion.root: LinkTransform(fixed_frame, motion.quat_WB[None], motion.p_WB[None])} | transforms
+    placed = {motion.root: LinkTransform(FIXED_FRAME, motion.quat_WB[None], motion.p_WB[None])} | transforms
     moving = {link: each for link, each in placed.items() if not each.fixed}
     still = {link: each for link, each in placed.items() if each.fixed}
     yield "/robot_description", stamps[0], types["std_msgs/msg/String"](data=motion.urdf)

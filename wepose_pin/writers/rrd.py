@@ -1,7 +1,6 @@
 """Recordings of rerun (.rrd), of a person or a robot: shapes on their links, and joints as curves.
 
-Entities: ``body/LINK`` with its transform in W and the link's shapes, or the bones to the next links where its meshes
-are not found; ``joints/JOINT`` [rad or m].
+Entities: ``body/LINK`` with its transform in W and the link's shapes; ``joints/JOINT`` [rad or m].
 
 Source: rerun-sdk 0.41.
 """
@@ -17,10 +16,9 @@ import pinocchio as pin
 from ..body.urdf import package_folders
 from ..body.visuals import Mesh, Visual, reduce_triangles, triangulate, visuals
 from ..errors import BadOption, how_to_install, native_stderr_muted
-from .joint_motion import ROBOT_URDF, JointMotion, compute_link_poses_W, compute_link_transforms
+from .joint_motion import ROBOT_URDF, JointMotion, compute_link_poses_W
 
 TIMELINE = "time"
-BONE_RADIUS_M = 0.012
 APPLICATION = "wepose"
 
 
@@ -46,16 +44,10 @@ def write_rrd(path: Path, motion: JointMotion) -> None:
             recording.log(entity, place, static=True)
         for k, shape in enumerate(each for each in shapes if each.link == link and each.kind != "mesh"):
             recording.log(f"{entity}/{k}", _draw(rr, shape), static=True)
-    with_mesh = {shape.link for shape in shapes if shape.kind == "mesh"}
-    meshes = _load_meshes(motion) if with_mesh else []
+    meshes = _load_meshes(motion) if any(shape.kind == "mesh" for shape in shapes) else []
     for k, (link, (vertices, triangles), rgba) in enumerate(meshes):
         mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, albedo_factor=rgba)
         recording.log(f"body/{rr.escape_entity_path_part(link)}/mesh_{k}", mesh, static=True)
-    for link, transform in compute_link_transforms(motion).items():
-        if not meshes and transform.parent in with_mesh and np.linalg.norm(transform.p[0]) > BONE_RADIUS_M:
-            entity = f"body/{rr.escape_entity_path_part(transform.parent)}/bone_to_{rr.escape_entity_path_part(link)}"
-            bone = rr.LineStrips3D([[np.zeros(3), transform.p[0]]], radii=BONE_RADIUS_M)
-            recording.log(entity, bone, static=True)
     for joint in motion.moving:
         entity = f"joints/{rr.escape_entity_path_part(joint)}"
         recording.send_columns(entity, indexes=index, columns=rr.Scalars.columns(scalars=motion.values(joint)))
