@@ -21,10 +21,9 @@ from wepose_pin.errors import BadData, BadPhase
 from wepose_pin.recording import ImuSensor, Recording, Sensor
 from wepose_pin.recording.clocks import build_clock
 from wepose_pin.recording.faults import find_saturation
-from wepose_pin.recording.gaps import bridge, mark_lost_samples
+from wepose_pin.recording.gaps import bridge, mark_lost_samples, resample
 from wepose_pin.recording.limits import GRAVITY_ERROR_NOTED
 from wepose_pin.recording.plausibility import check_signals
-from wepose_pin.recording.resampling import resample
 
 SIGNALS = {"gyro": ["gx", "gy", "gz"], "accel": ["ax", "ay", "az"], "orientation": ["qx", "qy", "qz", "qw"]}
 RAW = [*SIGNALS["gyro"], *SIGNALS["accel"]]

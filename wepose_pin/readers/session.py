@@ -26,9 +26,8 @@ from ..recording import (
 )
 from ..recording.clocks import LONGEST_GAP_S, TIME_UNITS, Clock, build_clock, find_common_time, measure_rate
 from ..recording.faults import SensorCheck, check_sensors
-from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples
+from ..recording.gaps import BRIDGED, GOOD, LONG, bridge, bridge_quat, find_runs, mark_lost_samples, resample
 from ..recording.plausibility import check_signals
-from ..recording.resampling import resample
 from .arrays import ArrayFile, is_array_file
 from .device import ACCEL_UNITS, GYRO_UNITS, Device, check_measured
 from .registry import detect_format, find_format, read_device

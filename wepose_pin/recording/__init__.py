@@ -1,7 +1,7 @@
 """What the sensors measured: SI units, one even time base, sensors named by the segment that they are on.
 
 `recording` holds the type and its checks. What a file or a live source gives becomes one in these steps: `clocks` (the
-sensors' own times), `gaps` (lost samples), `resampling` (one time base), of a file; `arrivals` of a live source;
+sensors' own times), `gaps` (lost samples, resampling), of a file; `arrivals` of a live source;
 `faults` and `plausibility` say whether the sensors measured, by the `limits` of what sensors can.
 """
 

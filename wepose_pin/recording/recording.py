@@ -220,12 +220,6 @@ class Recording:
             The recording does not have the phase.
         """
         intervals = self.phases.get(name, ())
-        if not intervals and self.source is not None and self.source.suffix == ".mcap":
-            raise BadPhase(
-                f"{self.where()}: phases.{name} is needed here, and was not marked in this live recording; `wepose "
-                f"info {self.source.name} --write` writes a session that names it: add {name} = [[from, to]] to its "
-                f"[phases]"
-            )
         if not intervals:
             raise BadPhase(
                 f"{self.where()}: phases.{name} is needed here and missing; add [phases] {name} = "
