@@ -102,14 +102,6 @@ def test_a_receiver_that_never_reads_holds_nobody_up(receiver: socket.socket) ->
     assert 0 < received < 20_000
 
 
-def test_nobody_listens_and_no_network() -> None:
-    out = UdpOutput(str(find_free_port()))
-    out.start(INFO)
-    for k in range(50):  # "connection refused" must not come back to the loop
-        out.show(pose(k * 0.01))
-    out.close()
-
-
 @pytest.mark.parametrize(("rate_hz", "share"), [(1000.0, 0.1), (60.0, 1.0), (120.0, 5 / 6)])
 def test_a_hundred_poses_a_second_on_average(receiver: socket.socket, rate_hz: float, share: float) -> None:
     out, one, received = UdpOutput(str(receiver.getsockname()[1])), pose(), 0

@@ -90,9 +90,7 @@ class PoseEncoder:
             self.angles, self.info = AngleCurves(info.segments), info
 
     def encode(self, pose: LivePose | None) -> bytes:
-        """Little endian: time (float64, NaN before the start), of each link R_WL row by row and p_WL (12 float32),
-        points whose paths are drawn (3 float32 each), of each link whether its sensor is lost (1 byte). NaN: not known.
-        """
+        """The frame of a pose, None: the N-pose, as `page` describes it; NaN is what is not known."""
         time, placements, lost = math.nan, self._neutral, np.zeros(len(self.links), dtype=bool)
         points = np.full((len(self._model.table.paths), 3), np.nan, "<f4")
         with self._lock:

@@ -103,11 +103,7 @@ class LslOutput(Output):
 
     It is announced on this machine only, or as far as the user's own ``LSLAPICFG`` says where that is set. liblsl has
     no setting for the address of its data ports: they listen on every interface for as long as the stream exists.
-
-    Raises
-    ------
-    WeposeError
-        pylsl is missing, or the name is empty.
+    Raises `WeposeError` where pylsl is missing, or the name is empty.
     """
 
     def __init__(self, name: str = "WeposePose") -> None:
