@@ -107,27 +107,16 @@ class PostureReference(NamedTuple):
 
 @dataclass
 class QpController:
-    """Steps the robot towards its targets, inside its limits.
-
-    Parameters
-    ----------
-    robot, collision : the robot and its pairs of shapes
-    dt : [s] of a step
-    params : weights, gains, damping
-    limit_factor : widens the limits of velocity, acceleration and jerk
-    guarded : takes only steps from which the robot can stop without self-contact; a search for postures needs none
-    posture_reference : replaces the rest posture
-    report : of the last step
-    """
+    """Steps the robot towards its targets, inside its limits."""
 
     robot: Robot
-    collision: CollisionModel
-    dt: float
-    params: ControllerParams = field(default_factory=ControllerParams)
-    limit_factor: float = 1.0
-    guarded: bool = True
-    posture_reference: PostureReference | None = None
-    report: StepReport = field(init=False)
+    collision: CollisionModel  # its pairs of shapes
+    dt: float  # [s] of a step
+    params: ControllerParams = field(default_factory=ControllerParams)  # weights, gains, damping
+    limit_factor: float = 1.0  # widens the limits of velocity, acceleration and jerk
+    guarded: bool = True  # takes only steps from which the robot can stop without self-contact
+    posture_reference: PostureReference | None = None  # replaces the rest posture
+    report: StepReport = field(init=False)  # of the last step
 
     def __post_init__(self) -> None:
         try:

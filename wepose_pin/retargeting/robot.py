@@ -27,16 +27,10 @@ _REACH_STARTS = 8
 
 @dataclass(frozen=True)
 class LimitMargins:
-    """What a robot leaves of its limits.
+    """What a robot leaves of its limits."""
 
-    Parameters
-    ----------
-    speed_scale : share of the limits of velocity, acceleration and jerk that is used, above 0, up to 1
-    limit_margin : [rad] to each position limit; of a joint that slides a tenth of it in metres
-    """
-
-    speed_scale: float = 0.9
-    limit_margin: float = 0.05
+    speed_scale: float = 0.9  # share of the limits of velocity, acceleration and jerk that is used, above 0, up to 1
+    limit_margin: float = 0.05  # [rad] to each position limit; of a joint that slides a tenth of it in metres
 
     def check(self) -> None:
         """Raise `WrongOption` for a value out of range."""
@@ -48,50 +42,33 @@ class LimitMargins:
 
 @dataclass(frozen=True)
 class Arm:
-    """One arm of the reduced model.
-
-    Parameters
-    ----------
-    joints : (n,) int, indices of its joints in `Robot.names`
-    shoulder : (3,) [m] in B
-    hand, elbow : frames of `Robot.model`; `elbow` is -1 for an arm without one
-    reach : [m] largest distance of the hand from the shoulder that the joints allow
-    """
+    """One arm of the reduced model."""
 
     side: str
-    joints: np.ndarray
-    shoulder: np.ndarray
-    hand: int
-    elbow: int
-    reach: float
+    joints: np.ndarray  # (n,) int, indices of its joints in `Robot.names`
+    shoulder: np.ndarray  # (3,) [m] in B
+    hand: int  # frame of `Robot.model`
+    elbow: int  # the same; -1 for an arm without one
+    reach: float  # [m] largest distance of the hand from the shoulder that the joints allow
 
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot as the controller needs it: values `u` (n,) of the joints of its arms, in the order of `names`.
-
-    Parameters
-    ----------
-    full, model : Pinocchio's model of the whole robot, and of its arms' joints only
-    geometry : collision geometry on `model`
-    lower, upper, v_max, a_max, j_max : (n,) limits [rad or m, s], inside those of URDF and map by `margins`
-    rest, rest_full : (n,) rest posture, and as a configuration of `full`
-    R_BT : maps coordinates in the person's torso to B
-    """
+    """A robot as the controller needs it: values `u` (n,) of the joints of its arms, in the order of `names`."""
 
     map: RobotMap
     names: tuple[str, ...]
-    full: Any
-    model: Any
-    geometry: Any
-    lower: np.ndarray
+    full: Any  # Pinocchio's model of the whole robot
+    model: Any  # and of its arms' joints only
+    geometry: Any  # collision geometry on `model`
+    lower: np.ndarray  # (n,) limits [rad or m, s], these five, inside those of URDF and map by `margins`
     upper: np.ndarray
     v_max: np.ndarray
     a_max: np.ndarray
     j_max: np.ndarray
-    rest: np.ndarray
-    rest_full: np.ndarray
-    R_BT: np.ndarray
+    rest: np.ndarray  # (n,) rest posture
+    rest_full: np.ndarray  # the same as a configuration of `full`
+    R_BT: np.ndarray  # maps coordinates in the person's torso to B
     arms: tuple[Arm, ...]
     margins: LimitMargins
 

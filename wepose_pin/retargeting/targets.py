@@ -78,20 +78,12 @@ class HandPath(NamedTuple):
 
 @dataclass(frozen=True)
 class ArmTargets:
-    """Motion of the person's arms in B.
+    """Motion of the person's arms in B."""
 
-    Parameters
-    ----------
-    time : (n,) [s] of the recording
-    hands : one path an arm, in the order of `Robot.arms`
-    slowdown : (n,) from 1: factor on the duration that poor tracking asks for
-    scale : side → metres of the robot for one metre of the person
-    """
-
-    time: np.ndarray
-    hands: tuple[HandPath, ...]
-    slowdown: np.ndarray
-    scale: dict[str, float]
+    time: np.ndarray  # (n,) [s] of the recording
+    hands: tuple[HandPath, ...]  # one path an arm, in the order of `Robot.arms`
+    slowdown: np.ndarray  # (n,) from 1: factor on the duration that poor tracking asks for
+    scale: dict[str, float]  # side → metres of the robot for one metre of the person
 
     def resample(self, moments: np.ndarray, clock: np.ndarray) -> ArmTargets:
         """Return the targets at times `moments` [s] of the recording, with velocities on the robot's time `clock`."""

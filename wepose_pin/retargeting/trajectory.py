@@ -78,30 +78,18 @@ class ControllerRun(NamedTuple):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A trajectory of the robot.
-
-    Parameters
-    ----------
-    params : of the controller
-    arm_targets : of the recording, on its own time
-    time : (n,) [s] from 0, at a constant rate
-    recorded_time : (n,) [s] of the recording at each sample; during the approach that of its first sample
-    approach_samples : number of samples from rest to the first pose of the recording
-    targets : (arms,) paths of the hands, at `time`
-    run : joints, hands and constraints at `time`; any denser rate keeps the same limits
-    limiting_joint : None where nothing had to be slowed for a limit
-    """
+    """A trajectory of the robot."""
 
     robot: Robot
     collision: CollisionModel
-    params: ControllerParams
-    arm_targets: ArmTargets
-    time: np.ndarray
-    recorded_time: np.ndarray
-    approach_samples: int
-    targets: tuple[HandPath, ...]
-    run: ControllerRun
-    limiting_joint: LimitingJoint | None
+    params: ControllerParams  # of the controller
+    arm_targets: ArmTargets  # of the recording, on its own time
+    time: np.ndarray  # (n,) [s] from 0, at a constant rate
+    recorded_time: np.ndarray  # (n,) [s] of the recording at each sample; during the approach that of its first sample
+    approach_samples: int  # number of samples from rest to the first pose of the recording
+    targets: tuple[HandPath, ...]  # (arms,) paths of the hands, at `time`
+    run: ControllerRun  # joints, hands and constraints at `time`; any denser rate keeps the same limits
+    limiting_joint: LimitingJoint | None  # None where nothing had to be slowed for a limit
 
     def __repr__(self) -> str:
         return f"Trajectory({self.robot.map.name!r}: {self.time[-1]:.1f} s, {len(self.robot.names)} joints)"
