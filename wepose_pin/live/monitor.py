@@ -118,7 +118,7 @@ class SampleCounter:
     def push(self, time_s: np.ndarray) -> None:
         """Take the times (m,) [s] of samples in their order of arrival."""
         self.total += len(time_s)
-        times = time_s[np.isfinite(time_s)].tolist()
+        times = [t for t in time_s.tolist() if math.isfinite(t)]
         if not self._step:
             self._first += times
             self.newest = max([self.newest, *times])
