@@ -19,17 +19,12 @@ from .protocols import Axis, Closure, Direction, Protocol
 
 @dataclass(frozen=True)
 class Loop:
-    """A closure of a protocol, resolved on a body.
-
-    Parameters
-    ----------
-    paths : from the root to a point, or from one point to another where the closure is between two
-    unknown : number of its unknown fixed point or plane among those of its kind
-    """
+    """A closure of a protocol, resolved on a body."""
 
     closure: Closure
+    # from the root to a point, or from one point to another where the closure is between two
     paths: tuple[PointPath, ...]
-    unknown: int = 0
+    unknown: int = 0  # number of its unknown fixed point or plane among those of its kind
 
     @property
     def kind(self) -> str:

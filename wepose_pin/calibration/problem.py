@@ -40,25 +40,15 @@ RIGID_ATTITUDE_STD = np.deg2rad(1.5)  # [rad] of a link's orientation where noth
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """The inputs of a calibration, and what follows from them before anything is estimated.
+    """The inputs of a calibration, and what follows from them before anything is estimated."""
 
-    Parameters
-    ----------
-    recording : the samples
-    filtered : the orientations of its sensors, each in its own world
-    protocol : what the person did in which phase
-    prior : lengths with their covariance, and mounts
-    measured : name of a length → value and standard deviation [m]
-    model : the body
-    unused_mounts : diagnostics of mounts that are not used, as gravity or the motion contradicts them
-    """
-
-    recording: Recording
-    filtered: FilteredRecording
-    protocol: Protocol
-    prior: Subject
-    measured: Mapping[str, tuple[float, float]]
-    model: BodyModel
+    recording: Recording  # the samples
+    filtered: FilteredRecording  # the orientations of its sensors, each in its own world
+    protocol: Protocol  # what the person did in which phase
+    prior: Subject  # lengths with their covariance, and mounts
+    measured: Mapping[str, tuple[float, float]]  # name of a length → value and standard deviation [m]
+    model: BodyModel  # the body
+    # diagnostics of mounts that are not used, as gravity or the motion contradicts them
     unused_mounts: tuple[Diagnostic, ...] = ()
 
     @cached_property

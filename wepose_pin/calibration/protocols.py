@@ -128,24 +128,14 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Protocol:
-    """A calibration session as data.
+    """A calibration session as data."""
 
-    Parameters
-    ----------
-    name : of the protocol, and of its file
-    title : in a few words, for the subject's note
-    needs : segments that must carry a sensor
-    steps : for the person
-    conditions : for the solver
-    measured_example : the length that fixes the scale best, as ``name=metres``; empty: any
-    """
-
-    name: str
-    title: str
-    needs: tuple[str, ...]
-    steps: tuple[Step, ...]
-    conditions: tuple[Condition, ...]
-    measured_example: str = ""
+    name: str  # of the protocol, and of its file
+    title: str  # in a few words, for the subject's note
+    needs: tuple[str, ...]  # segments that must carry a sensor
+    steps: tuple[Step, ...]  # for the person
+    conditions: tuple[Condition, ...]  # for the solver
+    measured_example: str = ""  # the length that fixes the scale best, as ``name=metres``; empty: any
 
     @property
     def closures(self) -> tuple[Closure, ...]:

@@ -65,20 +65,12 @@ class Check(NamedTuple):
 
 @dataclass(frozen=True)
 class CalibrationQuality:
-    """The quality of a calibration: its checks, and what the user should know.
+    """The quality of a calibration: its checks, and what the user should know."""
 
-    Parameters
-    ----------
-    quality : the worst of all checks
-    checks : all of them, in the order of the results
-    reasons : why it does not pass, the worst first, each followed by its cause
-    further : what else the user should know
-    """
-
-    quality: Quality = "fail"
-    checks: tuple[Check, ...] = ()
-    reasons: tuple[Diagnostic, ...] = ()
-    further: tuple[Diagnostic, ...] = ()
+    quality: Quality = "fail"  # the worst of all checks
+    checks: tuple[Check, ...] = ()  # all of them, in the order of the results
+    reasons: tuple[Diagnostic, ...] = ()  # why it does not pass, the worst first, each followed by its cause
+    further: tuple[Diagnostic, ...] = ()  # what else the user should know
 
     def __repr__(self) -> str:
         failing = sum(check.quality != "pass" for check in self.checks)
