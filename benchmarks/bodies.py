@@ -112,19 +112,19 @@ def measure_ring_links(data: Path, mounts: Sequence[str], folder: Path) -> Table
             Column("script_mm", "validation's script [mm]", 1),
             Column("optical_mm", "optical [mm]", 1),
         ),
-        notes=["seg2_and_seg3 is the length of each of the two in the table; here it is that of both."],
+        notes=["seg2 and seg3 lie in one line: the motion shows the sum of their lengths."],
     )
     for mount in mounts:
         ring = calibrate_ring(data, mount, folder)
         subject = load_subject(folder / "cal")
         by_script = {each.method: each.figures for each in real.compare_links(find_ring(data)[0], mount)}["amekf"]
-        for name, true in ring.true_lengths.items():
-            links = 2.0 if name == "seg2_and_seg3" else 1.0
+        for names in (["seg2", "seg3"], ["seg4"]):
+            name = " and ".join(names)
             table.rows[f"{mount} {name}"] = {
-                "calibrated_mm": 1e3 * links * subject.lengths[name],
-                "std_mm": 1e3 * links * subject.std(name),
-                "script_mm": by_script[f"{name.replace('_', ' ')} [mm]"],
-                "optical_mm": 1e3 * links * true,
+                "calibrated_mm": 1e3 * sum(subject.lengths[each] for each in names),
+                "std_mm": 1e3 * float(np.sqrt(subject.lengths_covariance(names).sum())),
+                "script_mm": by_script[f"{name} [mm]"],
+                "optical_mm": 1e3 * sum(ring.true_lengths[each] for each in names),
             }
     return table
 

@@ -51,10 +51,8 @@ bend = "seg4"
 tip = "seg5"
 end = {{ link = "seg5", at = {end} }}
 [lengths]
-seg2_and_seg3 = [
-    {{ segment = "seg2", from = "ball", to = "middle", std_percent = 50 }},
-    {{ segment = "seg3", from = "middle", to = "bend", std_percent = 50 }},
-]
+seg2 = {{ segment = "seg2", from = "ball", to = "middle", std_percent = 50 }}
+seg3 = {{ segment = "seg3", from = "middle", to = "bend", std_percent = 50 }}
 seg4 = {{ segment = "seg4", from = "bend", to = "tip", std_percent = 50 }}
 """
 
@@ -156,8 +154,6 @@ def write_ring_session(files: RingFiles, mount: str, folder: Path) -> RingSessio
     table = TABLE.format(segments=segments, head=head.tolist(), end=end.tolist())
     (folder / "ring.toml").write_text(table, encoding="utf-8")
     (folder / "optical.toml").write_text(PROTOCOL, encoding="utf-8")
-    both = 0.5 * (links.lengths["seg2"] + links.lengths["seg3"])  # the table's length is that of each of the two
-    lengths = {"seg2_and_seg3": both, "seg4": links.lengths["seg4"]}
     return RingSession(
-        folder / "session.toml", folder / "ring.toml", folder / "optical.toml", lengths, time, true, known
+        folder / "session.toml", folder / "ring.toml", folder / "optical.toml", links.lengths, time, true, known
     )

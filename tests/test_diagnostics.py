@@ -86,7 +86,7 @@ def test_facts_of_each_call_are_those_of_its_text() -> None:
             seen += 1
             known = {name for (other, _), example in EXAMPLES.items() if other == code.value for name in example.facts}
             assert keys <= known | {"variant"}, f"{place}: the catalogue's example has no {keys - known}"
-    assert seen > 10
+    assert seen
 
 
 @pytest.mark.parametrize(("code", "variant"), EXAMPLES)

@@ -514,7 +514,7 @@ def test_arrays_of_unlike_length_are_named(tmp_path: Path) -> None:
 
 def test_an_array_named_in_a_csv_is_an_error(tmp_path: Path) -> None:
     pl.DataFrame({"clock": TIME}).write_csv(tmp_path / "a.csv")
-    with pytest.raises(BadSession, match=r"sensors\.torso\.gyro is '/imu/torso/gyro'; a list of 3 column names"):
+    with pytest.raises(BadSession, match=r"sensors\.torso\.gyro = '/imu/torso/gyro'; a list of 3 different column"):
         load(tmp_path, ARRAYS.format(file="a.csv"))
 
 

@@ -266,7 +266,7 @@ def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tm
     with pytest.raises(BadSubject, match="hinges: 'middle_elbow' is not known; did you mean"):
         load_subject(path).check_body(TABLE)
     path.write_text(subject_toml(subject).replace("y = 1.0", "y = 0.5"))
-    with pytest.raises(BadSubject, match=r"hinges\.left_elbow: x, y, z must be of length 1"):
+    with pytest.raises(BadSubject, match=r"hinges\.left_elbow\.axis: no unit vector: length 0\.5"):
         load_subject(path)
 
 

@@ -15,7 +15,7 @@ MOUNTS = ["rigid", pytest.param("loose", marks=pytest.mark.slow)]
 @pytest.mark.parametrize("mount", MOUNTS)
 def test_lengths_of_links_are_the_optical_ones(data: Path, mount: str, tmp_path: Path) -> None:
     table = measure_ring_links(data, [mount], tmp_path)
-    assert set(table.rows) == {f"{mount} seg2_and_seg3", f"{mount} seg4"}
+    assert set(table.rows) == {f"{mount} seg2 and seg3", f"{mount} seg4"}
     for name, row in table.rows.items():
         off = abs(row["calibrated_mm"] - row["optical_mm"])
         assert off < 3.0 * row["std_mm"], name

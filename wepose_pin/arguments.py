@@ -166,12 +166,13 @@ def check_finite(place: str, values: np.ndarray, *, missing: bool = False) -> No
         raise BadData(f"{place}[{', '.join(map(str, k))}] = {values[k]:g}: a finite number is needed")
 
 
-def check_unit(place: str, quat: np.ndarray, tolerance: float) -> None:
-    """Check that quaternions (…, 4) have length 1; NaN, a missing one, is accepted."""
-    length = np.linalg.norm(quat, axis=-1)
+def check_unit(place: str, values: np.ndarray, tolerance: float) -> None:
+    """Check that quaternions (…, 4) or directions (…, 3) have length 1; NaN, a missing one, is accepted."""
+    length = np.linalg.norm(values, axis=-1)
     off = np.abs(np.nan_to_num(length, nan=1.0) - 1.0)
     if np.max(off, initial=0.0) > tolerance:
-        raise BadData(f"{place}: no unit quaternion x, y, z, w: length {length.flat[int(np.argmax(off))]:.6g}")
+        what = "unit quaternion x, y, z, w" if values.shape[-1] == 4 else "unit vector"
+        raise BadData(f"{place}: no {what}: length {length.flat[int(np.argmax(off))]:.6g}")
 
 
 def check_names(place: str, names: Collection[str], known: Collection[str], otherwise: str = "") -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
@@ -147,7 +148,8 @@ def calibrate(
     print_diagnostics([*quality.further, *failures])
     print_table(*report_room.tabulate_lengths(calibration))
     print_table(*report_room.tabulate_mounts(calibration))
-    say_paragraph(report_room.describe_gap(calibration))
+    if not math.isnan(calibration.rms_gap):  # a protocol without a closure
+        say_paragraph(report_room.describe_gap(calibration))
     say_pages(out, {"Report": "report.html"})
     say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}  {out / 'calibration.json'}")
     say(f"Quality: {quality.quality}")

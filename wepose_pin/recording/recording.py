@@ -221,8 +221,10 @@ class Recording:
         """
         intervals = self.phases.get(name, ())
         if not intervals:
+            live = bool(self.source) and str(self.source).endswith(".mcap")
+            add = f"write a session by `wepose info {Path(self.where()).name} --write` and add" if live else "add"
             raise BadPhase(
-                f"{self.where()}: phases.{name} is needed here and missing; add [phases] {name} = "
+                f"{self.where()}: phases.{name} is needed here and missing; {add} [phases] {name} = "
                 f"[[from, to]] in seconds; {one_of(self.phases, name)}"
                 f"{'; without joined hands: --protocol free' if name == 'clasp' else ''}"
             )
