@@ -504,11 +504,13 @@ def test_the_person_is_told_what_to_do(recording: Recording, tmp_path: Path) -> 
     assert all(np.array_equal(log.quat_WL[:, i], again.quat_WL[n]) for i, n in enumerate(recording.sensors))
 
 
-def test_a_full_disk_ends_the_recording_and_not_the_session(recording: Recording) -> None:
+@pytest.mark.parametrize("header_bytes", [0, 100_000])  # the disk is full after the header, or within it
+def test_a_full_disk_ends_the_recording_and_not_the_session(recording: Recording, header_bytes: int) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full on this system")
     setup = SensorSetup.from_recording(recording)
-    log = LiveLog(Path("/dev/full"), setup.header(tuple(recording.sensors)) | {"method": "amekf"}, force=True)
+    header = setup.header(tuple(recording.sensors)) | {"method": "amekf", "long": "x" * header_bytes}
+    log = LiveLog(Path("/dev/full"), header, force=True)
     source = ReplaySource(recording, math.inf)
     source.open()
     ended = LiveLoop(source, setup, log=log, begin=float(recording.time[0])).run()

@@ -118,9 +118,18 @@ def test_a_binary_packet(source: UdpSource, sender: socket.socket) -> None:
                 b"[1, 2]",
                 json.dumps({**GOOD, "t": "now"}).encode(),
                 json.dumps({**GOOD, "t": 10**400}).encode(),
-                json.dumps({**GOOD, "gyro": [0, 0]}).encode(),
-                json.dumps({**GOOD, "t": [1.0, 2.0]}).encode(),
+                json.dumps({**GOOD, "gyro": ["1", "2", "3"]}).encode(),
+                json.dumps({**GOOD, "accel": [True, False, 9.8]}).encode(),
+                json.dumps({**GOOD, "t": [1.0, [2.0]]}).encode(),
                 json.dumps({**GOOD, "battery": "full"}).encode(),
+            )
+        ),
+        *(
+            (json.dumps({**GOOD, **wrong}).encode(), "lines whose gyro or accel is not three numbers for each time")
+            for wrong in (
+                {"gyro": [0, 0]},
+                {"t": [1.0, 2.0]},
+                {"t": [1.0, 2.0], "gyro": [[0, 0]] * 3, "accel": [[0, 0]] * 3},  # by axis
             )
         ),
         (json.dumps({**GOOD, "sensor": "trunk"}).encode(), "samples of an unknown sensor: 'trunk'"),

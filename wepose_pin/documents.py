@@ -8,7 +8,9 @@ import math
 import os
 import re
 import shutil
+import signal
 import tempfile
+import threading
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -422,14 +424,18 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
         with _report_full_disk(out):
             yield partial
         _check_folder(out, force, prefix)  # again: another run may have written there meanwhile
-        if out.exists():
-            for path in sorted(partial.rglob("*")):
-                target = out / path.relative_to(partial)
-                target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
-        else:
-            out.parent.mkdir(parents=True, exist_ok=True)
-            partial.rename(out)
-        written.append(out)
+        targets = {path: out / path.relative_to(partial) for path in sorted(partial.rglob("*"))}
+        for path, target in targets.items():
+            if target.exists() and target.is_dir() != path.is_dir():
+                raise ExistingOutput(f"{target}: is in the way; nothing was written, move it or name another folder")
+        with _defer_signals():
+            if out.exists():
+                for path, target in targets.items():
+                    target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
+            else:
+                out.parent.mkdir(parents=True, exist_ok=True)
+                partial.rename(out)
+            written.append(out)
     finally:
         shutil.rmtree(own, ignore_errors=True)
 
@@ -440,6 +446,26 @@ def _check_folder(out: Path, force: bool, prefix: str) -> None:
         raise ExistingOutput(f"{out}: cannot be made: {existing} is a file; a folder is wanted for the output")
     if not force and out.is_dir() and any(not path.name.startswith(prefix) for path in out.iterdir()):
         raise ExistingOutput(f"{out}: exists and is not empty; --force replaces its files, -o names another folder")
+
+
+@contextmanager
+def _defer_signals() -> Iterator[None]:
+    """Hold back the signals that stop a command until the block has ended; only the main thread receives them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in handlers.items() if handler is not None}  # None: not of Python
+    try:
+        for number in handlers:
+            signal.signal(number, lambda number, _frame: came.append(number))
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for first in came[:1]:
+            signal.raise_signal(first)
 
 
 @contextmanager

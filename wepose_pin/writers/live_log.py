@@ -50,6 +50,8 @@ class LiveLog:
         self._measured = [name in header["orientations"] for name in self._sensors]
         self._time_ns = 0  # of the newest sample
         self._flushed = time.monotonic()
+        # Of a disk that is full before they are known.
+        self._channels, self._poses, self._events = [0] * len(self._sensors), 0, 0
         self._writer: Any = Writer(self._file, CHUNK_BYTES)
         self._write(lambda: self._begin(header))
 

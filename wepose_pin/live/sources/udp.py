@@ -170,20 +170,29 @@ def _decode_line(
         message = json.loads(line)
         sensor, battery = message["sensor"], float(message.get("battery", math.nan))
         stated = {key: str(message.get(key, unit)) for key, unit in units.items()}
-        time, gyro, accel = (np.array(message[key], dtype=float) for key in ("t", "gyro", "accel"))
-        values = np.concatenate([gyro.reshape(-1, 3), accel.reshape(-1, 3)], axis=1)
-        time = time.reshape(len(values))
+        time, gyro, accel = (_read_numbers(message[key]) for key in ("t", "gyro", "accel"))
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
         raise Malformed('lines that are not as {"sensor": "torso", "t": 0.1, "gyro": [0, 0, 0], "accel": …}') from None
     is_name = isinstance(sensor, str) and 0 < len(sensor) <= MAX_NAME
     if not is_name or (segments is not None and sensor not in segments):
         raise Malformed(f"samples of an unknown sensor: {str(sensor)[:MAX_NAME]!r}")
-    if not len(time) or battery < 0.0 or battery > 1.0:
+    if not time.size or battery < 0.0 or battery > 1.0:
         raise Malformed("lines without samples, or whose battery is not a share, 0 to 1")
+    if not gyro.shape == accel.shape == (*time.shape, 3):
+        raise Malformed("lines whose gyro or accel is not three numbers for each time")
     for key, known in UNITS.items():
         if stated[key] not in known:
             raise Malformed(f"JSON lines with {key} {stated[key][:MAX_NAME]!r}; {one_of(known)}")
-    return Batch(sensor, time, values, battery), stated
+    values = np.concatenate([gyro, accel], axis=-1).reshape(-1, 6)
+    return Batch(sensor, time.reshape(-1), values, battery), stated
+
+
+def _read_numbers(value: Any) -> np.ndarray:
+    """A number of JSON, or lists of them, as an array; texts and booleans, which NumPy would convert, are refused."""
+    array = np.array(value, dtype=object)
+    if not all(type(each) in (int, float) for each in array.flat):
+        raise ValueError("not all are numbers")
+    return array.astype(float)
 
 
 KIND = SourceKind("udp:[HOST:]PORT[,gyro_unit=deg/s][,accel_unit=g]", open_spec)
