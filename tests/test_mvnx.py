@@ -274,6 +274,22 @@ def test_real_arms_lie_along_their_frames(name: str, data: Path) -> None:
             np.testing.assert_allclose(Rotation.from_quat(quat).apply([0.0, 0.0, -1.0]), along_W, atol=1e-3)
 
 
+@pytest.mark.parametrize("name", ["Meri-020.mvnx", "test_mocap.mvnx"])
+def test_without_a_t_pose_the_positions_tell_the_frames(name: str, data: Path, tmp_path: Path) -> None:
+    text = (data / "mvnx" / name).read_text(encoding="utf-8")
+    (tmp_path / name).write_text(text.replace('type="tpose"', 'type="other"'), encoding="utf-8")
+    found, stated = (read_mvnx(path, "orientation") for path in (tmp_path / name, data / "mvnx" / name))
+    assert found.diagnostics == ()
+    for label, sensor in stated.sensors.items():
+        np.testing.assert_allclose(found.sensors[label].signals["orientation"], sensor.signals["orientation"])
+
+
+def test_a_t_pose_of_another_pose_is_refused(tmp_path: Path) -> None:
+    path = mvnx(tmp_path, turning(), t_pose="1 0 0 0  1 0 0 0  0.92388 0.38268 0 0" + 3 * "  1 0 0 0")
+    with pytest.raises(BadData, match="is no T-pose: LeftUpperArm is 45 deg off a quarter turn"):
+        read_mvnx(path)
+
+
 def test_raw_data_come_first_and_orientations_when_asked_for(tmp_path: Path) -> None:
     path = mvnx(tmp_path, turning(200), raw=True)
     raw = wp.load_session(session(tmp_path, path.name, ("torso", "left_forearm")))

@@ -111,7 +111,7 @@ def c3d(path: Path, pose: Pose, unit: str = "mm", **parameters: list[object]) ->
     return path
 
 
-def theia(path: Path, pose: Pose) -> Path:
+def theia(path: Path, pose: Pose, ratio: int = 1) -> Path:
     """Rotations without points, by ezc3d; frames as another model has them."""
     ezc3d = pytest.importorskip("ezc3d")
     _, quats, _ = in_laboratory(pose)
@@ -131,10 +131,11 @@ def theia(path: Path, pose: Pose) -> Path:
         other = Rotation.from_rotvec([0.3 * k, 1.0, -0.5 * k])
         transforms[:3, :3, k] = (Rotation.from_quat(quats[segment]) * other).as_matrix().transpose(1, 2, 0)
     file["parameters"]["POINT"]["RATE"]["value"] = [LAB_HZ]
-    file.add_parameter("ROTATION", "RATE", [LAB_HZ])
+    file.add_parameter("ROTATION", "RATE", [ratio * LAB_HZ])
+    file.add_parameter("ROTATION", "RATIO", [ratio])
     file.add_parameter("ROTATION", "LABELS", [f"{name}_4X4" for name in ("worldbody", *names.values())])
-    file["data"]["points"] = np.ones((4, 0, transforms.shape[3]))
-    file["data"]["rotations"] = transforms
+    file["data"]["points"] = np.ones((4, 0, len(quats["torso"]) // ratio))
+    file["data"]["rotations"] = transforms[..., : len(quats["torso"]) // ratio * ratio]
     file.write(str(path))
     return path
 
@@ -169,6 +170,14 @@ def test_wepose_info_says_what_joints_there_are(
     assert "markers, a reference for `wepose evaluate`" in out
     assert "at 60 Hz" in out
     assert "left_elbow" in out
+
+
+def test_rotations_without_a_rate_have_that_of_the_points_times_their_ratio(brief: Pose, tmp_path: Path) -> None:
+    raw = theia(tmp_path / "a.c3d", brief, ratio=2).read_bytes()
+    rate = raw.rindex(b"RATE")  # ezc3d always writes it
+    (tmp_path / "a.c3d").write_bytes(raw[:rate] + b"LATE" + raw[rate + 4 :])
+    time = read_reference(tmp_path / "a.c3d").time
+    np.testing.assert_allclose(np.diff(time), 0.5 / LAB_HZ)
 
 
 def test_a_header_may_count_more_frames_than_there_are(brief: Pose, tmp_path: Path) -> None:

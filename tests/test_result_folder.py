@@ -67,20 +67,21 @@ def test_the_body_of_an_earlier_result_does_not_stay(
     assert "left_thigh" not in load_model(tmp_path / "subject.urdf").table.segments
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        lambda out: (out / "summary.json").unlink(),
-        lambda out: (out / "session.toml").write_text('model = "model.toml"\n[data]\nfile = "joints.parquet"'),
-    ],
-)
-def test_what_is_of_no_result_is_the_users(spoil: Callable[[Path], None], tmp_path: Path) -> None:
+def test_what_a_session_in_the_folder_names_is_the_users(tmp_path: Path) -> None:
     put_earlier_result(tmp_path, "summary.json")
-    spoil(tmp_path)
+    (tmp_path / "session.toml").write_text('model = "model.toml"\n[data]\nfile = "joints.parquet"')
     before = contents(tmp_path)
     with result_folder(tmp_path, force=True):
         pass
     assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", ["model.toml", "joints.parquet"])
+def test_a_users_file_is_not_mixed_with_a_result(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("mine", encoding="utf-8")
+    with pytest.raises(ExistingOutput, match=f"{name}: is of no earlier result"), result_folder(tmp_path, force=True):
+        pass
+    assert contents(tmp_path) == {name: b"mine"}
 
 
 @WRITERS

@@ -91,7 +91,10 @@ def _read_rotations(file: _C3d, table: MarkerTable) -> Reference:
     """Read the segments' orientations among the rotations."""
     frames, used = file.rotations.shape[:2]
     labels = [label.strip().removesuffix("_4X4") for label in file.labels("ROTATION")][:used]
-    rate_hz = file.rate_hz("ROTATION" if file.values("ROTATION", "RATE") else "POINT")
+    if file.values("ROTATION", "RATE"):
+        rate_hz = file.rate_hz("ROTATION")
+    else:
+        rate_hz = file.rate_hz("POINT") * float([*file.values("ROTATION", "RATIO"), 1.0][0])
     quats = {}
     for segment, name in table.rotations.items():
         label = next((each for each in (name, segment) if each in labels), None)

@@ -3,7 +3,8 @@
 Each frame of type `normal` holds the segments' orientations (w x y z, to a world with z up) and, in exports before MVN
 2018, the sensors' `sensorAcceleration` [m/s²] and `sensorAngularVelocity` [rad/s]. An Xsens segment's frame is the
 world's (x forward, y left, z up) in the T-pose with palms down; ours is in the N-pose. MVN 4.2 exports the arms in the
-frames of the ISB. The file's frame of type `tpose` tells which; without it the former are assumed.
+frames of the ISB. The file's frame of type `tpose` tells which; without it the positions, as an arm lies along y of the
+former and along −z of the latter; without both the former are assumed.
 
 Source: MVN User Manual, MVNX structure; the frames `tpose` and `tpose-isb` of exported files.
 """
@@ -39,7 +40,15 @@ SEGMENT_OF = {
 }
 # In the T-pose each of Xsens's frames is one of these, but for the tilts of that pose: 13 deg at the head.
 _QUARTERS = Rotation.create_group("O")
+T_POSE_DEG = 30.0
+ALONG_DEG = 5.0  # MVN draws its joints on an arm's axis, to 0.03 deg
 WIDTH = {"orientation": 4, "position": 3, "sensorAngularVelocity": 3, "sensorAcceleration": 3}
+# An arm's segment and the one that begins at its other end.
+ARM = {
+    f"{side}{part}": f"{side}{end}"
+    for side in ("Left", "Right")
+    for part, end in (("UpperArm", "ForeArm"), ("ForeArm", "Hand"))
+}
 # The joint in which a segment begins.
 JOINT_OF = {
     f"{side}{part}": f"{side.lower()}_{joint}"
@@ -58,7 +67,7 @@ class Frames(NamedTuple):
     segments: list[str]
     sensors: list[str]
     values: dict[str, np.ndarray]  # element → (n, count, width)
-    t_pose: np.ndarray | None  # (count, 4) xyzw, the segments' orientations in the T-pose
+    t_pose: np.ndarray | None  # (count, 4) xyzw, the segments' orientations in the T-pose; None: not known
 
 
 def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) -> Device:
@@ -76,7 +85,10 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         kind, (gyro, accel) = "raw", (frames.values[f"sensor{name}"] for name in ("AngularVelocity", "Acceleration"))
         signals = {label: {"gyro": gyro[:, k], "accel": accel[:, k]} for k, label in enumerate(frames.sensors)}
     else:
-        kind, signals = "orientation", {label: {"orientation": quat} for label, quat in _read_quats(frames).items()}
+        kind, signals = (
+            "orientation",
+            {label: {"orientation": quat} for label, quat in _read_quats(path, frames).items()},
+        )
         if frames.t_pose is None:
             diagnostics = (Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "frames"}),)
     sensors = {
@@ -93,7 +105,7 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
 def read_mvnx_reference(path: Path) -> Reference:
     """Read the segments' orientations and joints as a reference; its world has z up. Errors as `read_mvnx`."""
     frames = read_frames(path)
-    quats = {SEGMENT_OF[label]: quat for label, quat in _read_quats(frames).items()}
+    quats = {SEGMENT_OF[label]: quat for label, quat in _read_quats(path, frames).items()}
     return Reference(frames.time, quats, _find_joints(frames), "+z")
 
 
@@ -120,23 +132,62 @@ def _find_joints(frames: Frames) -> dict[str, np.ndarray]:
     return {} if positions is None else {joint: positions[:, k] for joint, k in named.items()}
 
 
-def _read_quats(frames: Frames) -> dict[str, np.ndarray]:
+def _side(label: str) -> float:
+    return {"L": 1.0, "R": -1.0}.get(label[0], 0.0)
+
+
+def _raise(label: str) -> Rotation:
+    """Return R_WL in the T-pose: from the N-pose an arm rises by a quarter turn."""
+    return Rotation.from_rotvec([0.5 * np.pi * _side(label), 0.0, 0.0])
+
+
+def _read_quats(path: Path, frames: Frames) -> dict[str, np.ndarray]:
     """Read each label's `quat_WL` (n, 4) xyzw, of our frame; rows of zeros or NaN become NaN."""
     orientations = {}
     for k, label in enumerate(frames.segments):
         if label not in SEGMENT_OF:
             continue
-        # R_WL in the T-pose: from the N-pose an arm rises by a quarter turn.
-        side = {"L": 1.0, "R": -1.0}.get(label[0], 0.0)
-        R_BL = Rotation.from_rotvec([0.5 * np.pi * side, 0.0, 0.0])
+        R_BL = _raise(label)
         if frames.t_pose is not None:
             off = (_QUARTERS.inv() * Rotation.from_quat(frames.t_pose[k])).magnitude()
+            if off.min() > np.radians(T_POSE_DEG):
+                raise BadData(
+                    f"{path}: its frame of type tpose is no T-pose: {label} is {np.degrees(off.min()):.0f} deg off a "
+                    f"quarter turn there, up to {T_POSE_DEG:g} are taken; export the file again"
+                )
             R_BL = _QUARTERS[int(np.argmin(off))].inv() * R_BL
         quat = rotations.xyzw_from_wxyz(frames.values["orientation"][:, k])
         good = np.linalg.norm(np.nan_to_num(quat), axis=1) > 0.5
         orientations[label] = np.full(quat.shape, np.nan)
         orientations[label][good] = (Rotation.from_quat(quat[good]) * R_BL).as_quat()
     return orientations
+
+
+def _find_t_pose(path: Path, frames: Frames) -> np.ndarray | None:
+    """Find the T-pose (count, 4) xyzw of which the arms lie along −z of our frames, by their positions; None: none."""
+    positions = frames.values.get("position")
+    at = {} if positions is None else {label: positions[:, k] for k, label in enumerate(frames.segments)}
+    along_W = {label: at[end] - at[label] for label, end in ARM.items() if {label, end} <= set(at)}
+    # In the ISB's frames the palm of a hanging arm is forward.
+    turns = [0.5 * np.pi * _side(label) * label.endswith(("ForeArm", "Hand")) for label in frames.segments]
+    isb = [
+        _raise(label) * Rotation.from_rotvec([0.0, 0.0, -turn])
+        for label, turn in zip(frames.segments, turns, strict=True)
+    ]
+    for R_WB in ([Rotation.identity()] * len(isb), isb):
+        t_pose = np.array([each.as_quat() for each in R_WB])
+        quats = _read_quats(path, frames._replace(t_pose=t_pose))
+        if along_W and all(_lies_along(quats[label], along) for label, along in along_W.items()):
+            return t_pose
+    return None
+
+
+def _lies_along(quat_WL: np.ndarray, along_W: np.ndarray) -> bool:
+    """Return whether −z of a frame (n, 4) is along vectors (n, 3), to `ALONG_DEG`."""
+    good = np.isfinite(quat_WL).all(axis=1)
+    down_W = Rotation.from_quat(quat_WL[good]).apply([0.0, 0.0, -1.0])
+    length = np.nansum(np.linalg.norm(along_W[good], axis=1))
+    return bool(np.nansum(down_W * along_W[good]) > np.cos(np.radians(ALONG_DEG)) * length)
 
 
 def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
@@ -185,7 +236,8 @@ def read_frames(path: Path, rate_hz: float | None = None) -> Frames:
     quats = rotations.xyzw_from_wxyz(_read_values(path, "orientation", t_pose, len(labels["segment"])).reshape(-1, 4))
     has_t_pose = len(quats) > 0 and bool((np.linalg.norm(quats, axis=1) > 0.5).all())
     time = _read_times(path, times, rate_hz)
-    return Frames(time, labels["segment"], labels["sensor"], values, quats if has_t_pose else None)
+    frames = Frames(time, labels["segment"], labels["sensor"], values, quats if has_t_pose else None)
+    return frames if has_t_pose else frames._replace(t_pose=_find_t_pose(path, frames))
 
 
 def _read_values(path: Path, tag: str, rows: Sequence[str], count: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body.configuration import solve_configuration
 from ..body.links import compute_link_poses, find_known_links
-from ..errors import BadData, BadOption, how_to_install
+from ..errors import BadData, BadOption, ExistingOutput, how_to_install
 from .motion import Motion, find_measured_points, resample_evenly
 
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
@@ -53,8 +53,20 @@ def write_c3d(path: Path, motion: Motion) -> None:
         file.add_parameter("ROTATION", "LABELS", [f"{segment}_4X4" for segment in segments])
         file["data"]["rotations"] = np.stack(list(segments.values()), axis=-1).transpose(1, 2, 3, 0)
     named = path.with_name(f"{path.name}.c3d")  # ezc3d adds the suffix where it is missing
-    file.write(str(named))
-    named.replace(path)
+    try:
+        file.write(str(named))
+        _check_whole(named, 16 * p_W.shape[1] * n + 68 * len(segments) * n)
+        named.replace(path)
+    finally:
+        named.unlink(missing_ok=True)
+
+
+def _check_whole(file: Path, size: int) -> None:
+    """Refuse a file with fewer than `size` bytes of data: ezc3d does not report a full disk."""
+    with file.open("rb") as opened:
+        first_block = int.from_bytes(opened.read(18)[16:], "little")  # word 9 of the header, counted from 1
+    if file.stat().st_size < 512 * (first_block - 1) + size:
+        raise ExistingOutput(f"{file.name}: cannot be written whole; is the disk full? nothing was written")
 
 
 def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:

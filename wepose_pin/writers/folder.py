@@ -31,12 +31,19 @@ def result_folder(out: Path, force: bool) -> Iterator[Path]:
     Raises
     ------
     ExistingOutput
-        As `whole_folder`; a session in `out` needs a file that would be replaced.
+        As `whole_folder`; a session in `out` needs a file that would be replaced; a file of the user's would be read
+        with the result.
     """
     inputs = set()
     if (out / "session.toml").is_file():
         inputs = {file.resolve() for file in list_files(out, truth=True)}
     has_result = any((out / name).is_file() for name in INSIDE)
+    for name in (MODEL_TABLE, JOINTS):
+        if not has_result and (out / name).exists():
+            raise ExistingOutput(
+                f"{out / name}: is of no earlier result, and would be read with the new one; rename it, or name "
+                f"another folder by -o"
+            )
     stale = [name for name in (MODEL_TABLE, JOINTS) if has_result and (out / name).resolve() not in inputs]
     with data_folder(out, force, stale) as folder:
         yield folder
