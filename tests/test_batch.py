@@ -58,6 +58,9 @@ def test_a_study_is_made_once_and_what_fails_is_named(study: Path) -> None:
     os.utime(study / "data" / "one" / "recording.parquet")  # only touched
     again = run_batch(study / "plan.toml", str(study / "out"), workers=1)
     assert (again.reused, files(study / "out" / "items")) == (2, before)
+    (study / "out" / "items" / "data-one" / "done.json").write_text('{"key": ')
+    assert run_batch(study / "plan.toml", str(study / "out"), workers=1).reused == 1
+    assert run_batch(study / "plan.toml", str(study / "out"), workers=1).reused == 2
 
 
 @pytest.mark.parametrize(

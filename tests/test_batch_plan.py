@@ -107,7 +107,16 @@ def test_items_keep_their_names_when_others_join(folder: Path) -> None:
         ('[sessions]\nfiles = ["anna/*"]\n[steps.track]\n[steps.export]\n', "'' is no format"),
         (
             '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.export]\nformats = ["trx"]',
-            "'trx' is no format; did you mean 'trc'?",
+            "'trx' is no format of a person's motion; did you mean 'trc'?",
+        ),
+        (
+            '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.export]\nformats = ["lerobot"]',
+            "'lerobot' is no format of a person's motion; there is: ",
+        ),
+        (f'[sessions]\nfiles = ["anna/*", ""]\n{STEPS}', "'' is no glob"),
+        (
+            '[sessions]\nfiles = "anna/*"\nsubject = "a"\n[subjects.a]\nfile = "ben/one"\n[steps.calibrate]',
+            "nothing to do: its subject is calibrated elsewhere",
         ),
         (
             '[sessions]\nfiles = "anna/*"\n[steps.track]\n[steps.evaluate]\ninterval = [2, 1]',

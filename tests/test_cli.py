@@ -237,6 +237,9 @@ def test_an_interrupt_leaves_nothing(session: Path, tmp_path: Path, seconds: flo
     ("words", "says"),
     [
         (["trak"], "did you mean 'track'?"),
+        (["--nope"], "'--nope' is not a command; there is: demo, info, simulate, "),
+        (["--nope", "track"], "; see wepose --help"),
+        (["simulate", "-o", "OUT", "--seed", "1.5"], "'1.5' is not a whole number; see wepose simulate --help"),
         (["track"], 'Command "track" parameter SESSION requires an argument; see wepose track --help'),
         (["track", "s.toml", "-o"], 'Command "track" parameter -o requires an argument; see wepose track --help'),
         (["track", "s.toml", "-o", "OUT", "-o", "OUT"], "-o specified multiple times; see wepose track --help"),

@@ -103,9 +103,14 @@ def test_what_a_session_in_the_folder_needs_is_not_replaced(
     assert contents(tmp_path) == before
 
 
-def test_a_page_of_the_user_stays_where_none_is_wanted(session: Path, tmp_path: Path) -> None:
-    (tmp_path / "view.html").write_text("mine", encoding="utf-8")
+def test_a_page_of_the_user_stays_where_none_is_wanted(
+    session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("view.html", "report.html"):
+        (tmp_path / name).write_text("mine", encoding="utf-8")
+    calibrate(session, tmp_path)
     track(session, tmp_path)
+    assert ".html" not in capsys.readouterr().out
     assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"
     track_session(session, out=tmp_path, view=False, force=True)
     assert (tmp_path / "view.html").read_text(encoding="utf-8") == "mine"

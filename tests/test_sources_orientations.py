@@ -94,7 +94,9 @@ def test_trackers_without_a_place_are_named_and_can_be_assigned(sender: socket.s
     try:
         sender.sendto(HANDSHAKE, source.address)
         sender.sendto(ROTATION, source.address)
+        sender.sendto(b"\0\0\0\x17" + ROTATION[4:11] + b"\x2b" + ROTATION[12:], source.address)
         assert not read_all_for(source, 0.2)
+        assert "1 SlimeVR packets of type 23; orientations are read from type 17" in source.describe_awaited()
         assert "orientations of 4c:11:ae:00:00:a1/1, whose place on the body is not known" in source.problems
     finally:
         source.close()

@@ -68,7 +68,7 @@ def _run(item: Item, target: str, force: bool) -> Row:
         }
         key = {"code": code()["code"], "options": [list(item.steps.items()), item.person], **hashes}
         key = json.loads(json.dumps(key))
-        done = json.loads(read_bytes(f"{target}/{DONE_FILE}") or b"null")
+        done = _read_done(target)
         if done is not None:
             changed = [name for name in key if done["key"].get(name) != key[name]]
             if not changed:
@@ -83,6 +83,13 @@ def _run(item: Item, target: str, force: bool) -> Row:
             text = json.dumps({"key": key, "row": row}, indent=1, ensure_ascii=False)
             (folder / DONE_FILE).write_text(text, encoding="utf-8")
     return row | {"status": DONE, "reused": False}
+
+
+def _read_done(target: str) -> Any:
+    """Contents of `DONE_FILE`; None where it is missing or damaged."""
+    with contextlib.suppress(ValueError):
+        return json.loads(read_bytes(f"{target}/{DONE_FILE}") or b"null")
+    return None
 
 
 def run_steps(item: Item, session: Path, subject: Path | None, folder: Path) -> Row:

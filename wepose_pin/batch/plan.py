@@ -131,6 +131,8 @@ def read_plan(path: Path, items_folder: str) -> Plan:
             file = f"{items_folder}/{name}/calibrate/subject.toml"
         if file:
             own = {step: options for step, options in steps.items() if step != "calibrate"}
+        if not own:
+            raise BadPlan(f"{keys.where}: nothing to do: its subject is calibrated elsewhere; it needs another step")
         name = _sanitize(session.name) or _derive_name(session.session, path)
         if name in items or name in calibrations:
             raise BadPlan(f"{keys.where}: '{name}' names two items; the column 'name' of a table can name them")
@@ -156,8 +158,9 @@ def write_words(step: str, places: Sequence[str], options: Mapping[str, Any]) ->
 
 def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
     """Step → the options that are given, in the order in which the steps run; each is checked before any work."""
-    from ..writers.export import list_formats
+    from ..writers.export import ROBOTS, list_formats
 
+    formats = [name for name, format in list_formats().items() if format.of != ROBOTS]
     table.allow(*STEPS)
     steps: dict[str, dict[str, Any]] = {}
     for step in [step for step in STEPS if step in table]:
@@ -174,8 +177,10 @@ def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
         keys.allow(*known, *(["formats"] * (step == "export")))
         if step == "export":
             for each in keys.texts("formats") or ("",):
-                if each not in list_formats():
-                    raise BadPlan(f"{keys.at('formats')}: '{each}' is no format; {one_of(list_formats(), each)}")
+                if each not in formats:
+                    raise BadPlan(
+                        f"{keys.at('formats')}: '{each}' is no format of a person's motion; {one_of(formats, each)}"
+                    )
         given = {name: value for name, value in options.items() if name != "formats"}
         try:
             parse(write_words(step, STEPS[step], given | ({} if step == "evaluate" else {"out": "OUT"})))
@@ -212,6 +217,8 @@ def _list_sessions(keys: TomlTable, path: Path) -> list[TomlTable]:
     sessions = read_record(Sessions, keys)
     if bool(sessions.files) == bool(sessions.table):
         raise BadPlan(f"{keys.where}: either files (globs) or table is needed")
+    if "" in sessions.files:
+        raise BadPlan(f"{keys.at('files')}: '' is no glob; one from the plan's folder is needed, such as \"data/*\"")
     found: list[TomlTable] = []
     if sessions.files:
         urls: dict[str, None] = {}

@@ -150,7 +150,7 @@ def calibrate(
     print_table(*report_room.tabulate_mounts(calibration))
     if not math.isnan(calibration.rms_gap):  # a protocol without a closure
         say_paragraph(report_room.describe_gap(calibration))
-    say_pages(out, {"Report": "report.html"})
+    say_pages(out, {"Report": "report.html"} if report else {})
     say(f"Subject: {out / 'subject.toml'}  {out / 'subject.urdf'}  {out / 'calibration.json'}")
     say(f"Quality: {quality.quality}")
     for _, line in lines(quality.reasons):

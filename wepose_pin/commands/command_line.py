@@ -22,6 +22,7 @@ COMMANDS = {
     "live": "wepose_pin.commands.live:live",
     "batch": "wepose_pin.batch.command:batch",
 }
+HELP, VERSION = ("--help", "-h"), ("--version", "-V")
 WIDEST = 98  # columns of a help text
 _LABEL = 24  # columns of an option's name beside its text
 
@@ -35,9 +36,9 @@ def parse(words: Sequence[str]) -> tuple[Callable[..., Any], inspect.BoundArgume
         A command or an option that is not known, lacks its value or has one that is not possible, or is missing.
     """
     first = words[0] if words else ""
-    if first and not first.startswith("-") and first not in COMMANDS:
-        raise BadOption(f"'{first}' is not a command; {one_of(COMMANDS, first)}")
-    if first in ("", "--help", "-h"):
+    if first and first not in (*COMMANDS, *HELP, *VERSION):
+        raise BadOption(f"'{first}' is not a command; {one_of(COMMANDS, first)}; see wepose --help")
+    if first in ("", *HELP):
         for name in COMMANDS:
             APP[name]  # imported, for its line in the help
     try:
@@ -118,7 +119,8 @@ APP = App(
     "success; 2 invalid options or input; 3 or 4 where the output must be checked or must not be used, as the help of "
     "calibrate, retarget and batch says; 130 stopped. Terms: docs/glossary.md.",
     version=f"wepose-pin {__version__}",
-    version_flags=("--version", "-V"),
+    version_flags=VERSION,
+    help_flags=HELP,
     help_format="plaintext",
     help_formatter=PlainHelp(),
     group_arguments=Group("Arguments", sort_key=0),

@@ -20,6 +20,14 @@ Formulation = Literal["full", "paper"]
 Arms = Literal["left", "right", "both"]
 
 
+def _read_whole_number(_kind: type, tokens: Sequence[Token]) -> int:
+    """An int as it is written; cyclopts would round."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"'{tokens[0].value}' is not a whole number") from None
+
+
 # Validators: rooms load when an option is given ----------------------------------------------------------------------
 
 
@@ -110,7 +118,7 @@ Session = Annotated[Path, Parameter(metavar="SESSION")]
 Model = Annotated[str, Parameter(metavar="NAME|FILE", validator=_check_model)]
 File = Annotated[Path, Parameter(metavar="FILE")]
 Name = Annotated[str, Parameter(metavar="NAME")]
-Number = Annotated[int, Parameter(metavar="NUMBER")]
+Number = Annotated[int, Parameter(metavar="NUMBER", converter=_read_whole_number)]
 Hz = Annotated[float, Parameter(metavar="HZ")]
 Seconds = Annotated[float, Parameter(metavar="SECONDS")]
 Factor = Annotated[float, Parameter(metavar="FACTOR")]

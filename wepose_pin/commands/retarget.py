@@ -160,7 +160,7 @@ def retarget(
     say_paragraph(report_room.describe_reliance(trajectory, summary))
     say_paragraph(report_room.describe_limits(summary))
     say(f"Trajectory: {out / 'trajectory.parquet'}  {out / 'joint_trajectory.json'}  {out / 'summary.json'}")
-    say_pages(out, {"Report": "report.html", "Motion": "view.html"})
+    say_pages(out, ({"Report": "report.html"} if report else {}) | ({"Motion": "view.html"} if view else {}))
     return Retargeted(summary, failures, float(trajectory.time[-1]))
 
 

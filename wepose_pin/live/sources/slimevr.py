@@ -29,7 +29,9 @@ LONGEST_STEP_S = 0.02  # [s] between orientations that came together
 HEADER = struct.Struct(">IQ")
 HANDSHAKE_ANSWER = (b"\x03Hey OVR =D 5").ljust(64, b"\0")
 HEARTBEAT = HEADER.pack(1, 0)
-HANDSHAKE, PING, BATTERY, SENSOR_INFO, ROTATION = 3, 10, 12, 15, 17  # packets; others hold nothing for us
+HANDSHAKE, PING, BATTERY, SENSOR_INFO, ROTATION = 3, 10, 12, 15, 17
+# Packets that hold nothing for us: heartbeat, acceleration, tap, error, signal and others.
+UNUSED = frozenset({0, 2, 4, 11, 13, 14, 18, 19, 20, 21, 22, 26})
 NORMAL = 1  # kind of a rotation; 2 is a correction
 # Place on the body → segment.
 SEGMENT_OF = {
@@ -169,6 +171,8 @@ class SlimeVrSource(DatagramSource):
             if segment is not None:
                 return segment, np.array(struct.unpack_from(">4f", data, 2))
             self.count(f"orientations of {tracker.mac or 'a tracker'}/{sensor}, whose place on the body is not known")
+        elif kind not in UNUSED and kind != ROTATION:
+            self.count(f"SlimeVR packets of type {kind}; orientations are read from type {ROTATION}")
         return None
 
     def _find_segment(self, tracker: Tracker, sensor: int) -> str | None:
