@@ -116,6 +116,27 @@ def test_coarse_digits_that_repeat_are_measured(digit: float) -> None:
     assert synchronizer.counts[:, FROZEN].sum() == 0
 
 
+def test_a_coarse_sensor_that_comes_to_rest_is_measured() -> None:
+    """Digits of twenty times the noise: in motion hardly a sample repeats, at rest all of them do."""
+    rng, time = np.random.default_rng(0), np.arange(3000) / RATE
+    motion = (np.sin(2.0 * np.pi * time) * (time < 5.0))[None, :, None] * [3.0, 2.7, 2.4]
+    gyro, accel = (np.round((motion + 0.003 * rng.standard_normal((3, 3000, 3))) / 0.06) for _ in range(2))
+    synchronizer = StreamSynchronizer(NAMES, RATE, BEGIN)
+    assert np.isfinite(fed(synchronizer, in_order(gyro, accel)).gyro_S).all()
+    assert synchronizer.counts[:, FROZEN].sum() == 0
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_a_sensor_that_never_changes_is_frozen_where_another_one_is_noisy(noise: float) -> None:
+    gyro, accel = (noise * values for values in signals(600))
+    gyro[1], accel[1] = 0.01, [0.0, 0.0, 9.81]
+    known = np.isfinite(fed(StreamSynchronizer(NAMES, RATE, BEGIN), in_order(gyro, accel)).gyro_S).all(axis=2).T
+    assert known[[0, 2]].all()
+    assert known[1, :190].all()
+    assert known[1, 230:].all() == (noise == 0.0)
+    assert known[1, 230:].any() == (noise == 0.0)
+
+
 @pytest.mark.parametrize(("lost", "bridged"), [(1, True), (5, True), (6, False), (40, False)])
 def test_holes_are_bridged_up_to_a_limit_and_then_nan(lost: int, bridged: bool) -> None:
     assert round(LONGEST_GAP_S * RATE) == 5

@@ -346,6 +346,22 @@ def test_arms_that_swing_fast_are_measured_in_the_unit_that_is_stated(hertz: flo
         checked(np.pi / 180.0)
 
 
+@pytest.mark.parametrize("scale", [0.0, np.pi / 180.0, 0.5, 1.0])
+def test_slow_tilts_that_the_gyroscope_does_not_see_are_refused(scale: float) -> None:
+    """A quarter turn in six seconds and back, with forces near gravity throughout."""
+    time = np.arange(6000) / RATE
+    R = Rotation.from_rotvec(np.pi / 4.0 * (1.0 - np.cos(np.pi / 6.0 * time))[:, None] * [0.0, 1.0, 0.0])
+    rate = np.concatenate([np.zeros((1, 3)), (R[:-1].inv() * R[1:]).as_rotvec() * RATE])
+    noise = np.random.default_rng(0).standard_normal((2, len(time), 3))
+    sensor = ImuSensor(scale * rate + 0.002 * noise[0], R.inv().apply([0.0, 0.0, 9.81]) + 0.02 * noise[1])
+    recording = Recording("tilts", time, RATE, {"torso": sensor})
+    if scale >= 0.5:
+        assert check_signals(recording) == ()
+        return
+    with pytest.raises(BadData, match=r"tilt by \d+ deg .* gyro turns by .* \"rad/s\" would fit"):
+        check_signals(recording)
+
+
 @pytest.mark.parametrize("within", [0.0, 1e-4, 2e-3])
 @pytest.mark.parametrize("packet", [2, 4, 10])
 def test_time_stamps_of_packets_are_spread_over_their_samples(packet: int, within: float) -> None:

@@ -13,7 +13,17 @@ import numpy as np
 
 from ..compilation import kernel
 from .clocks import LONGEST_GAP_S
-from .faults import AT_RANGE, FROZEN_SAMPLES, PLATEAU, ROUNDING, SAME_RANGE, STEEP
+from .faults import (
+    AT_RANGE,
+    FROZEN_SAMPLES,
+    NOISY_S,
+    PLATEAU,
+    ROUNDING,
+    SAME_RANGE,
+    STEEP,
+    TURNS_BACK,
+    TURNS_BACK_HZ,
+)
 from .limits import HIGHEST_ACCEL_SQUARED, HIGHEST_RATE_SQUARED, NARROWEST_GYRO_RANGE
 from .sensors import ImuSensor, Sensor
 
@@ -25,7 +35,7 @@ REORDER_S = 0.02  # [s] a tick waits so long for a sample that a later one has o
 WAIT_S = 0.1  # [s] a tick waits so long for a silent sensor; then the sensor is lost until its next sample
 JUMP_S = 1.0  # [s] a time further ahead of all others is an error, unless the sensor continues from there
 
-# After so many samples a sensor is frozen when it repeats one for this many times as long as ever before.
+# After so many samples a noisy sensor is frozen when it repeats one for this many times as long as ever before.
 LEARNED, MOST_REPEATS = 100, 4.0
 
 MISSING, LATE, DUPLICATE, BAD, TAKEN, FROZEN, CUT_OFF = range(7)
@@ -49,6 +59,12 @@ SENSOR = np.dtype(
         ("since", float),  # [s] since when it repeats
         ("repeats", float),  # how often it does
         ("most_repeats", float),  # the most before; 0: it has never changed
+        # of each signal, over the samples that do not repeat
+        ("step", float, 6),  # to the newest value
+        ("turns", float, 6),  # reversals in this second
+        ("second", float),  # [s] start of this second
+        ("samples", float),  # in this second
+        ("noisy_s", np.int64),  # number of seconds in which all signals reversed as in noise
         # of each axis of gyro
         ("largest", float, 3),  # [rad/s] so far
         ("digit", float, 3),  # smallest step
@@ -129,11 +145,12 @@ class StreamSynchronizer:
     sensor have overtaken and `wait_s` for a silent sensor, both measured on the samples' times. Then the sensor is
     lost, and ticks do not wait for it until its next sample. A sample at a tick is used unchanged. Between ticks the
     rate is the mean over the step (a sample's rate holds for the interval that ends there) and the specific force is
-    interpolated. Gaps of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN. A sensor is frozen when it
-    repeats its values for longer than that and for much longer than ever before; its samples are lost until they
-    change. An axis of gyro that stays at its extreme after a steep rise is saturated: from then on, ticks with a rate
-    at that level are NaN, because the rotation is not known. Measured orientations between ticks are interpolated; they
-    may repeat, as a device's own filter lets them.
+    interpolated. Gaps of up to `LONGEST_GAP_S` are bridged linearly, longer ones are NaN. A noisy sensor is frozen when
+    it repeats its values for longer than that and for much longer than ever before, any sensor when it has never
+    changed while another one is noisy; its samples are lost until they change. An axis of gyro that stays at its
+    extreme after a steep rise is saturated: from then on, ticks with a rate at that level are NaN, because the rotation
+    is not known. Measured orientations between ticks are interpolated; they may repeat, as a device's own filter lets
+    them.
 
     Parameters
     ----------
@@ -220,7 +237,7 @@ def _take_samples(clocks, sensors, buffers, which, samples, next_sample, out, ou
         sensor, t = sensors[i], sample[_T]
         if _is_sound(clock, sensor, sample):
             if not sensor.is_orientation and t > sensor.newest:
-                _watch_values(sensor, sample)
+                _watch_values(sensors, sensor, sample)
             if sensor.frozen and t > sensor.since:
                 sensor.counts[FROZEN] += 1
                 clock.newest = max(clock.newest, t)
@@ -250,7 +267,7 @@ def _is_sound(clock, sensor, sample):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _watch_values(sensor, sample):  # type: ignore[no-untyped-def]
+def _watch_values(sensors, sensor, sample):  # type: ignore[no-untyped-def]
     """Find whether a sensor is frozen at this sample, its newest, and at which rates its gyroscope saturates."""
     t, value, same = sample[_T], sensor.value, sensor.newest > -np.inf
     for k in range(6):
@@ -259,11 +276,18 @@ def _watch_values(sensor, sample):  # type: ignore[no-untyped-def]
     if same:
         sensor.repeats += 1.0
         enough = sensor.repeats >= FROZEN_SAMPLES and t - sensor.since > LONGEST_GAP_S * (1.0 + 1e-6)
-        known = sensor.most_repeats > 0.0 and sensor.counts[TAKEN] >= LEARNED
-        sensor.frozen = enough and known and sensor.repeats > MOST_REPEATS * sensor.most_repeats
+        if not enough:
+            sensor.frozen = False
+        elif sensor.most_repeats > 0.0:
+            known = sensor.noisy_s >= NOISY_S and sensor.counts[TAKEN] >= LEARNED
+            sensor.frozen = known and sensor.repeats > MOST_REPEATS * sensor.most_repeats
+        elif not sensor.frozen and t - sensor.since >= NOISY_S:  # it shows no noise; the others are of its kind
+            for other in range(len(sensors)):
+                sensor.frozen = sensor.frozen or sensors[other].noisy_s >= NOISY_S
         return
     if sensor.repeats > 0.0 and not sensor.frozen:
         sensor.most_repeats = max(sensor.most_repeats, sensor.repeats)
+    _watch_noise(sensor, sample)
     sensor.frozen, sensor.since, sensor.repeats = False, t, 1.0
     largest, level = sensor.largest, sensor.level
     for k in range(3):  # as `faults.find_saturation`, of the samples so far
@@ -281,6 +305,26 @@ def _watch_values(sensor, sample):  # type: ignore[no-untyped-def]
             level[k] = rate
     for k in range(6):
         value[k] = sample[1 + k]
+
+
+@kernel
+def _watch_noise(sensor, sample):  # type: ignore[no-untyped-def]
+    """Count the seconds in which all signals reverse as in noise, at a sample that differs from the one before."""
+    for k in range(6):
+        step = sample[1 + k] - sensor.value[k]
+        if step * sensor.step[k] < 0.0:
+            sensor.turns[k] += 1.0
+        sensor.step[k] = step
+    sensor.samples += 1.0
+    seconds = sample[_T] - sensor.second
+    if seconds < 1.0:
+        return
+    noisy = sensor.samples >= 2.0 * FROZEN_SAMPLES
+    for k in range(6):
+        noisy = noisy and sensor.turns[k] > min(TURNS_BACK * sensor.samples, TURNS_BACK_HZ * seconds)
+        sensor.turns[k] = 0.0
+    sensor.noisy_s += noisy
+    sensor.second, sensor.samples = sample[_T], 0.0
 
 
 @kernel

@@ -35,6 +35,9 @@ TUMBLES, STIFF, COHERENT = 0.7, 0.95, 0.8
 # `TURNED` in both halves; both directions are averaged over `STEADY_MEAN_S`. In four seconds that is 6 deg/s, the
 # fastest sway of a start pose.
 TURNED, STEADY, STEADY_MEAN_S = np.deg2rad(10.0), np.deg2rad(5.0), 0.25  # [rad], [rad], [s]
+# Tilt by accel [rad] between two windows that the gyroscope must measure; the largest share of it in the gyroscope's
+# rotation where the unit is too small; and the relative difference of accel's mean from gravity in a steady window.
+TILTED, UNSEEN, STEADY_NORM = np.deg2rad(20.0), 0.25, 0.1
 
 
 def check_signals(recording: Recording) -> tuple[Diagnostic, ...]:
@@ -121,6 +124,7 @@ def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
     moving = np.argsort(-speed, kind="stable")[: min(WINDOWS, np.count_nonzero(speed >= 0.0))]
     if len(moving) < FEWEST_WINDOWS:
         return
+    _check_tilts(accel.mean(axis=1), speed * WINDOW_S, place)
 
     def average_coherence(scale: float) -> float:
         """0 to 1; the specific force of a swinging arm is several times gravity, its mean in the world is gravity."""
@@ -140,6 +144,29 @@ def _check_gyro_unit(sensor: ImuSensor, rate_hz: float, place: str) -> None:
     if measurable and stated < STIFF * larger and larger > COHERENT:
         text = f"{place}.gyro: with rates up to {peak:.3g} rad/s the sensor turns too little for what accel shows"
         raise WrongUnit(text, "gyro_unit", "rad/s", hint)
+
+
+def _check_tilts(means: np.ndarray, paths: np.ndarray, place: str) -> None:
+    """Raise `WrongUnit` where accel tilts from window to window and gyro does not turn.
+
+    `means` (n, 3) [m/s²] of accel; `paths` (n,) [rad] of gyro, negative in a window with a gap.
+    """
+    norms = np.linalg.norm(means, axis=1)
+    steady = (np.abs(norms / STANDARD_GRAVITY - 1.0) < STEADY_NORM) & (paths >= 0.0)
+    cosines = np.sum(means[1:] * means[:-1], axis=1) / np.maximum(norms[1:] * norms[:-1], 1e-9)
+    tilts = np.where(steady[1:] & steady[:-1], np.arccos(np.clip(cosines, -1.0, 1.0)), 0.0)
+    turns = paths[1:] + paths[:-1]
+    unseen = np.where((tilts > TILTED) & (turns < UNSEEN * tilts), tilts, 0.0)
+    if not unseen.any():
+        return
+    k = int(np.argmax(unseen))
+    raise WrongUnit(
+        f"{place}.gyro: accel shows a tilt by {np.degrees(tilts[k]):.0f} deg between {k * WINDOW_S:g} and "
+        f"{(k + 2) * WINDOW_S:g} s from the beginning, gyro turns by {np.degrees(turns[k]):.2g} deg",
+        "gyro_unit",
+        "rad/s",
+        ", or the gyroscope does not measure",
+    )
 
 
 def find_unseen_rate(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float) -> float:
