@@ -263,10 +263,11 @@ def _list_angles(tracked: TrackResult, angles: Angles) -> list[Item]:
             known = f"± {std:.1f}°" if np.isfinite(std) else "not known"
             rows.append([f"{plain(joint)}, {plain(name)}", *ends, rate, known, near_lock])
     stated = " The start pose counts as the exact N-pose: elbows that were bent by 10° in it read 10° too little."
+    elevation = any("elevation" in each.names for each in angles.values())
     return [
-        "After the International Society of Biomechanics (Wu 2005), left and right with the same signs. Elevation "
-        "is negative where the arm is raised, and pronation is 90° with the palms at the thighs."
-        f"{stated if has_stated_mounts(tracked) else ''}",
+        "After the International Society of Biomechanics (Wu 2005), left and right with the same signs. "
+        f"{'Elevation is negative where the arm is raised. ' if elevation else ''}"
+        f"Pronation is 90° with the palms at the thighs.{stated if has_stated_mounts(tracked) else ''}",
         draw_joint_angles(angles),
         Table("", ["angle", "lowest", "highest", "range", "peak rate", "median ±", "near gimbal lock"], rows),
         "Near gimbal lock (10°) the first and the third angle of a joint are not separable and are left out; the "
