@@ -254,6 +254,14 @@ def test_a_chunk_may_end_with_the_last_sample_of_the_start_pose(made: tuple[Simu
         assert np.array_equal(np.concatenate([chunk.quat_WL[name] for chunk in chunks]), quat_WL)
 
 
+def test_the_correction_lies_on_the_times_of_the_recording(made: tuple[Simulation, Subject]) -> None:
+    """A stated rate may be a little off: samples are where their times say."""
+    correction = track(replace(made[0].recording(), rate_hz=100.9)).correction  # it is 100 Hz
+    assert correction is not None
+    samples = 100.0 * np.diff(correction.time[:-1])
+    np.testing.assert_allclose(samples, np.round(samples), atol=0.01)
+
+
 def test_hinges_travel_in_the_subjects_file(made: tuple[Simulation, Subject], tmp_path: Path) -> None:
     _, subject = made
     path = tmp_path / "subject.toml"

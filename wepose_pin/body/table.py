@@ -1,7 +1,7 @@
 """The table of a body: names and properties of its segments, points and lengths; `table_file` reads and writes it.
 
-`BodyTable` names segments, points, lengths, hinges, poses, pairs, usual places of sensors and what to draw. No other
-module of the package names a segment, a point or a length. docs/models.md explains the file.
+`BodyTable` names segments, points, lengths, hinges, poses, pairs, usual places of sensors and what to draw. Outside
+simulation and joint angles no module names a segment, a point or a length. docs/models.md explains the file.
 """
 
 from __future__ import annotations

@@ -98,12 +98,13 @@ def solve_paper_calibration(problem: CalibrationProblem) -> Calibration:
     correlated = count_correlated_samples(gaps, min_correlation(observations))
     covariance = _estimate_covariance(A, gaps, constraints, correlated)
     gap, prior_gap = (np.linalg.norm(vectors, axis=1) for vectors in (gaps, prior_gaps))
+    names = tuple(problem.model.lengths)
     others = [k for k, name in enumerate(prior.order) if name not in prior.lengths]
     subject = replace(  # what the prior knows of mounts stays
         prior,
         name=recording.name,
-        lengths=dict(zip(prior.lengths, lengths.tolist(), strict=True)),
-        order=(*prior.lengths, *(prior.order[k] for k in others)),
+        lengths=dict(zip(names, lengths.tolist(), strict=True)),
+        order=(*names, *(prior.order[k] for k in others)),
         covariance=block_diag(covariance, prior.covariance[np.ix_(others, others)]),
         note=f"{protocol.title}, lengths alone as in the paper; scale measured: {', '.join(problem.scale_lengths)}",
     )

@@ -76,7 +76,10 @@ def register(
     segments = [name for name in pose.quat_WL if _is_known(truth.quat_WL.get(name))]
     names = [name for name in pose.points if _is_known(truth.points.get(name))]
     if not segments:
-        raise BadData("pose and reference have no segment in common, whose orientation is needed to align them")
+        raise BadData(
+            "pose and reference have no segment in common, whose orientation is needed to align them; give markers a "
+            "[segments] table (--markers), or take --no-align where the reference is on our clock and in our world"
+        )
     pose = replace(pose, quat_WL={segment: pose.quat_WL[segment] for segment in segments})
     common = replace(truth, quat_WL={segment: truth.quat_WL[segment] for segment in segments})
     begin, end = float(pose.time[0]), float(pose.time[-1])

@@ -263,7 +263,7 @@ def _list_angles(tracked: TrackResult, angles: Angles) -> list[Item]:
             known = f"± {std:.1f}°" if np.isfinite(std) else "not known"
             rows.append([f"{plain(joint)}, {plain(name)}", *ends, rate, known, near_lock])
     stated = " The start pose counts as the exact N-pose: elbows that were bent by 10° in it read 10° too little."
-    elevation = any("elevation" in each.names for each in angles.values())
+    elevation = any("elevation" in each.names for each in angles.joints.values())
     return [
         "After the International Society of Biomechanics (Wu 2005), left and right with the same signs. "
         f"{'Elevation is negative where the arm is raised. ' if elevation else ''}"

@@ -152,10 +152,7 @@ class HeadingCorrector:
         self._inside = {phase: np.zeros(self._size, dtype=bool) for phase in problem.closures}
         self._open = set[str]()  # phases that have begun
         self._count = self._knots = 0  # samples in the open knot, knots before it
-        self._knot_end, self._records = (
-            0.0,
-            False,
-        )  # of the last knot: its end [s] after `begin`, whether it is recorded
+        self._knot_end, self._records = begin, False  # of the last knot: its end [s], whether it is recorded
         self._solving: Iterator[None] | None = None  # the last knot, until it is done
         self._from, self._to, self._at_reset = np.zeros((3, k))
         self._corrects_measured = False  # since a correction exceeded its uncertainty, or a reset
@@ -201,18 +198,22 @@ class HeadingCorrector:
                 next(self._solving, None)
         return self._count == self._size
 
-    def close(self, filters: FilterHeadings, *, record: bool = False) -> None:
-        """Close the open knot; `filters` is after its last sample; `record`: keep its result for `collect`."""
+    def close(self, filters: FilterHeadings, *, end: float | None = None, record: bool = False) -> None:
+        """Close the open knot; `filters` is after its last sample.
+
+        `end` [s] is the time of that sample, None: by the number of samples; `record`: keep the result for `collect`.
+        """
+        samples = self._knots * self._size + self._count - 1
+        self._knot_end = self._begin_s + samples / self.problem.sensor_rate_hz if end is None else end
         quat_VS, accel_S = (values[: self._count].copy() for values in self._samples)
         inside = {phase: rows[: self._count : self.problem.stride].copy() for phase, rows in self._inside.items()}
-        self._solving = self._solve(self._knots * self._size, quat_VS, accel_S, inside, filters)
+        self._solving = self._solve(quat_VS, accel_S, inside, filters)
         self._count, self._knots, self._records = 0, self._knots + 1, record
         if not self._lead:
             self._apply()
 
     def _solve(
         self,
-        first: int,
         quat_VS: np.ndarray,
         accel_S: np.ndarray,
         inside: Mapping[str, np.ndarray],
@@ -220,7 +221,6 @@ class HeadingCorrector:
     ) -> Iterator[None]:
         """Estimate the heading errors of a knot, a part at each step of the iterator."""
         problem, rows = self.problem, slice(None, None, self.problem.stride)
-        time = (first + np.arange(len(quat_VS))) / problem.sensor_rate_hz
         quat_WS = rotations.multiply(self._quat_WV, quat_VS)
         sides = np.zeros((0, len(problem.names), 3, 8))
         if self._accelerations is not None:
@@ -234,10 +234,10 @@ class HeadingCorrector:
         if self._file is not None:
             x, P, process = self._filter.x, self._filter.P, self._filter.process
             self._file.write(np.concatenate([x, P.ravel(), *process]).tobytes())
-            self._times.append(self._begin_s + 0.5 * float(time[0] + time[-1]))
+            self._times.append(self._knot_end - 0.5 * (len(quat_VS) - 1) / problem.sensor_rate_hz)
             return
         self._update_estimate()
-        self._var_at_knot, self._knot_end = np.nan_to_num(filters.var), float(time[-1])
+        self._var_at_knot = np.nan_to_num(filters.var)
 
     def _apply(self) -> None:
         """Finish the last knot; causally its correction fades in from the next sample on."""
@@ -254,7 +254,7 @@ class HeadingCorrector:
             self._corrects_measured = exceed_uncertainty(self._to[None], self._estimate.covariance[None])
             self._to[measured] *= self._corrects_measured
         if self._records:
-            self._times.append(self._begin_s + self._knot_end)
+            self._times.append(self._knot_end)
             self._history.append((self._to, *self._estimate[1:]))
         self._update_variance()
 
@@ -288,11 +288,14 @@ class HeadingCorrector:
             np.array([cov for _, _, cov in history]).reshape(-1, k, k),
         )
 
-    def smooth(self, filters: FilterHeadings) -> HeadingCorrection | None:
-        """Smooth all knots (Rauch, Tung, Striebel 1965), `filters` after the last sample; None: there is no knot."""
+    def smooth(self, filters: FilterHeadings, end: float) -> HeadingCorrection | None:
+        """Smooth all knots (Rauch, Tung, Striebel 1965), `filters` after the last sample at `end` [s].
+
+        None: there is no knot.
+        """
         problem, forward = self.problem, self._filter
         if self._count:
-            self.close(filters)
+            self.close(filters, end=end)
         if not self._times:
             return None
         x, P, process = self._read(len(self._times) - 1)

@@ -128,6 +128,7 @@ class SegmentEstimator:
         self._recent = np.empty((0, k, 4))  # orientations of the last `RESET_S`
         self._oldest = 0  # row of `_recent` with the oldest sample
         self._filter_headings: FilterHeadings  # after the last chunk
+        self._end_s: float  # [s] the same
         self.quat_WL = np.zeros((k, 4))
         self._uncorrected = np.zeros(k)
         # [rad²] `HeadingCorrector.variance` at the last step; NaN: the heading's variance is that of its filter
@@ -245,11 +246,12 @@ class SegmentEstimator:
                 variance[rows], offset[rows] = self._variance, self._heading_offset
                 if self.headings is not None and first >= begin:
                     if self.headings.push(output.quat_VS[rows], accel_S[rows]):
-                        self.headings.close(output.at(stop - 1), record=True)
+                        self.headings.close(output.at(stop - 1), end=float(chunk.time[stop - 1]), record=True)
                     if self._options.causal:
                         self._variance = self.headings.variance
                 first = stop
         self._recent, self._oldest, self._filter_headings = history[-size:], 0, output.at(-1)
+        self._end_s = float(chunk.time[-1])
         return SegmentOrientations(
             recording=chunk,
             options=self._options,
@@ -265,7 +267,7 @@ class SegmentEstimator:
 
     def smooth_headings(self) -> HeadingCorrection | None:
         """Return the correction of the headings after the last chunk; None: nothing observes them."""
-        return None if self.headings is None else self.headings.smooth(self._filter_headings)
+        return None if self.headings is None else self.headings.smooth(self._filter_headings, self._end_s)
 
     def _find_marks(self, chunk: Recording) -> dict[int, list[tuple[str, bool]]]:
         """Find sample → phases that begin (True) or have ended with it, of those that headings are corrected by."""
