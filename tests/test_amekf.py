@@ -224,6 +224,13 @@ def test_wrong_parameters_are_named() -> None:
             AmekfParams(**wrong)
 
 
+def test_a_parameter_that_is_an_integer_compiles_nothing_anew() -> None:
+    of = case(1)
+    usual, stated = (Amekf(of.noise, RATE, of.start, AmekfParams(impact=impact)).model for impact in (100.0, 100))
+    assert stated.dtype == usual.dtype
+    assert stated == usual
+
+
 # Consistency and accuracy on simulated trials ----------------------------------------------------------------------
 
 

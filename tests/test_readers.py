@@ -377,6 +377,19 @@ def test_saturation_is_told_from_noise_of_any_size(noise: float) -> None:
     assert count == 50
 
 
+@pytest.mark.parametrize(("peak", "hertz"), [(9.0, 2.0), (10.0, 4.0)])
+def test_many_short_peaks_that_are_cut_off_are_saturated(peak: float, hertz: float) -> None:
+    """Four samples at 500 deg/s, twice in each swing, after five seconds at rest."""
+    time, limit = np.arange(3000) / 100.0, np.deg2rad(500.0)
+    gyro = 0.005 * np.random.default_rng(0).standard_normal((3000, 3))
+    gyro[:, 0] += (time > 5.0) * peak * np.sin(2.0 * np.pi * hertz * time)
+    whole, cut = (np.round(np.clip(gyro, -most, most) / 0.001) * 0.001 for most in (np.inf, limit))
+    assert not find_saturation(whole, 2.0).any()
+    saturated = find_saturation(cut, 2.0)
+    assert np.count_nonzero(saturated[:, 0]) > 0.8 * np.count_nonzero(np.abs(gyro[:, 0]) > limit)
+    assert not saturated[:, 1:].any()
+
+
 def test_a_scale_that_is_off_is_noted(tmp_path: Path) -> None:
     table = table_at(np.arange(1000) / 100.0).with_columns(pl.col(SIGNALS["accel"]) * 1.1)
     (scale,) = load_session(write(tmp_path, table)).diagnostics

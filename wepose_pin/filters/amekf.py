@@ -155,7 +155,7 @@ class AmekfParams:
     accel_bias_walk: float = 1e-4  # [m/s²/√s]
     gyro_range: float = np.inf  # [rad/s] full scale; a saturated sample's rotation is as uncertain as a lost one
     lost_rate_std: float = 2.0  # [rad/s] of the unknown rate while gyro is lost (NaN) or saturated
-    lost_force_std: float = 5.0  # [m/s²] of the unknown acceleration while accel is lost or saturated
+    lost_force_std: float = 5.0  # [m/s²] of the unknown acceleration while accel is lost (NaN)
 
     def __post_init__(self) -> None:
         check_fields(self, "")

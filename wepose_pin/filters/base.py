@@ -86,8 +86,11 @@ def make_run(n: int, *, covariance: bool = True) -> FilterRun:
 
 
 def make_record(**values: Any) -> np.ndarray:
-    """Return a record (1,) with these fields, integers, floats or arrays of floats, for a compiled step."""
-    types = [(name, np.int64 if isinstance(value, int) else float, np.shape(value)) for name, value in values.items()]
+    """Return a record (1,) with these fields, numbers or arrays, for a compiled step; all are floats.
+
+    A step is compiled for the types of the record, and a parameter may be stated as an integer.
+    """
+    types = [(name, float, np.shape(value)) for name, value in values.items()]
     record = np.zeros(1, np.dtype(types, align=True))
     for name, value in values.items():
         record[name] = value

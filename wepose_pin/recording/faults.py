@@ -31,9 +31,10 @@ COARSE = 1e-4  # share of runs of equal rows above twice the usual length from w
 # [rad] in some seconds, each averaged over `MEAN_S`; no bias of a gyroscope and no sway does that.
 PARTED, PARTED_S, MEAN_S = 0.3, 2.0, 0.25
 
-# An axis is saturated where it stands at its extreme for so many samples in a row, and comes to it or leaves it by a
-# step of so many digits: the top of a smooth peak has smaller steps. Then shorter plateaus count too.
-PLATEAU, SHORT_PLATEAU, STEEP = 5, 3, 4.0
+# An axis is saturated where it stands at its extreme for `PLATEAU` samples in a row, or `MANY` times for at least
+# `SHORT_PLATEAU`, and comes to it or leaves it by a step of so many digits: the top of a smooth peak has smaller steps.
+# Then all these plateaus count.
+PLATEAU, SHORT_PLATEAU, MANY, STEEP = 5, 3, 10, 4.0
 SAME_RANGE = 0.1  # relative difference between the ranges of a sensor's axes, which have different scales
 AT_RANGE = 0.02  # relative distance below the range at which a sample counts as saturated: resampling mixes samples
 ROUNDING = 1e-9  # steps below this share of the largest value are rounding
@@ -246,7 +247,8 @@ def find_saturation(values: np.ndarray, least: float) -> np.ndarray:
             plateaus = [(a, b) for a, b in find_runs(at) if SHORT_PLATEAU <= b - a < len(x)]
             steps = np.abs(np.diff(x))
             digit = steps[steps > same].min(initial=np.inf)
-            if any(b - a >= PLATEAU and steps[max(a - 1, 0) : b].max() > STEEP * digit for a, b in plateaus):
+            steep = [b - a for a, b in plateaus if steps[max(a - 1, 0) : b].max() > STEEP * digit]
+            if len(steep) >= MANY or max(steep, default=0) >= PLATEAU:
                 for a, b in plateaus:
                     saturated[a:b, axis] = True
     return saturated
