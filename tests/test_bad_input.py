@@ -148,6 +148,19 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
     "an infinite rate": (lambda f: f.say('time = "time"', "rate_hz = inf"), "data.rate_hz = inf; a number from"),
     "time and rate": (lambda f: f.say('time = "time"', 'time = "time"\nrate_hz = 100'), "one of the two, and both is"),
     "neither time nor rate": (lambda f: f.say('time = "time"\n', ""), "one of the two, and neither is there"),
+    "an offset beyond all clocks": (
+        lambda f: f.say('time = "time"', 'time = "time"\noffset_s = -2e12'),
+        "data.offset_s = -2000000000000.0; a number from -1e+12 to 1e+12 is needed",
+    ),
+    "columns of another sensor": (
+        lambda f: setattr(f, "session", f.session + f.session[f.session.index("[sensors") :].replace("torso", "head")),
+        "session.toml: sensors.head.gyro: 'gx' of arm.csv is a column of sensors.torso too; each sensor needs its own",
+    ),
+    "a format beside columns": (
+        lambda f: f.say("accel =", "format = 'dot'\naccel ="),
+        "sensors.torso.format has no effect, as the columns are named here; remove it",
+    ),
+    "use beside columns": (lambda f: f.say("[data]", "[data]\nuse = 'raw'"), "session.toml: data.use has no effect"),
     "parallel mount axes": (
         lambda f: f.say('forward = "+x"', 'forward = "-z"'),
         "mount.forward = '-z' is parallel to up = '+z'",
@@ -291,7 +304,7 @@ CASES: dict[str, tuple[Callable[[Files], object], str]] = {
         lambda f: setattr(
             f,
             "session",
-            f.session + f.session[f.session.index("[sensors") :].replace("torso", "head") + "offset_s = 99",
+            f.session + QUATS[QUATS.index("[sensors") :].replace("torso", "head") + "offset_s = 99",
         ),
         "session.toml: the sensors' clocks do not overlap (torso 0 to 8.99 s, head 99 to 107.99 s)",
     ),

@@ -603,6 +603,15 @@ def test_a_description_beside_the_session_is_read(stated: str, tmp_path: Path) -
         (('"mg"', '"furlong"'), r"'chest fx' is in 'furlong'; there is: m/s\^2, g, mg"),
         (('"t_ms"', '"t_s"'), r"walk\.csv: no line of names with 't_s' and columns of a signal"),
         (("title", "[title"), r"lab\.toml: not valid TOML"),
+        (("title", "units_before = '(?P<name>.*):'\ntitle"), r"lab\.toml: '.*' has no group 'unit'"),
+        (("title", "label_in_name = '.*_'\ntitle"), r"lab\.toml: '\.\*_' has no group 'label'"),
+        (("title", "units_line = 0.5\ntitle"), r"lab\.toml: units_line = 0\.5; a whole number of lines is needed"),
+        (("[[accel]]", "[[gyro]]\ncolumns = []\n[[accel]]"), r"gyro 2\.columns = \[\]; one pattern or 3 names are"),
+        (
+            ("[[accel]]", '[[gyro]]\ncolumns = ["GX", "GY"]\n[[accel]]'),
+            r"gyro 2\.columns = \['GX', 'GY'\]; one pattern",
+        ),
+        (("[[accel]]", "increments = true\n[[accel]]"), r"gyro 1\.columns = \['.*'\]; 4 names are needed"),
     ],
 )
 def test_a_description_that_is_wrong_is_one_line(change: tuple[str, str], says: str, tmp_path: Path) -> None:
@@ -610,6 +619,12 @@ def test_a_description_that_is_wrong_is_one_line(change: tuple[str, str], says: 
     with pytest.raises(WeposeError, match=says) as error:
         load(tmp_path, '[data]\nfile = "walk.csv"\nformat = "lab.toml"\n[sensors.torso]\nlabel = "chest"')
     assert "\n" not in str(error.value)
+
+
+def test_units_beside_a_format_have_no_effect(tmp_path: Path) -> None:
+    (tmp_path / "lab.toml").write_text(own_format(tmp_path))
+    with pytest.raises(WeposeError, match=r"data\.gyro_unit has no effect, as the format of the file defines it"):
+        load(tmp_path, '[data]\nfile = "walk.csv"\nformat = "lab.toml"\ngyro_unit = "deg/s"\n[sensors.torso]')
 
 
 def test_a_format_that_is_not_known_names_the_choices(tmp_path: Path) -> None:

@@ -281,8 +281,8 @@ def read_record(
     return kind(**values)
 
 
-def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]]) -> str:
-    """Describe what is right, with its verb, as "two numbers [mm] from 0 to 90 are"."""
+def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]], found: Any = None) -> str:
+    """Describe what is right in place of `found`, with its verb, as "two numbers [mm] from 0 to 90 are"."""
     parts = get_args(value_type) or (value_type,)
     if parts[0] is not float:
         choices = f" ({one_of(known.get(key.of, key.words))})" if key.of or key.words else ""
@@ -290,6 +290,9 @@ def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]]) -
         return "three names are" if len(parts) == 3 else f"{one}{choices} is"
     unit = f" [{key.unit.replace('_', '/')}]" if key.unit else ""
     limits = f" from {key.least:g}{f' to {key.most:g}' if key.most < 1e6 else ' on'}" if key.least > -1e6 else ""
+    numbers = [each for each in (found if isinstance(found, list | tuple) else (found,)) if is_number(each)]
+    if any(each > key.most or (each < key.least and not limits) for each in numbers):
+        limits = f" from {key.least:g} to {key.most:g}"
     return f"{_COUNTS[len(parts)]}{unit}{limits} {'are' if len(parts) > 1 else 'is'}"
 
 
@@ -332,7 +335,9 @@ def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str,
         each = [_to_si(key, number) for number in value if is_number(number) and key.least <= number <= key.most]
         if len(each) == len(parts):
             return tuple(each)
-    raise table.error(f"{table.at(key.name)} = {_format_value(value)}; {_describe(value_type, key, known)} needed")
+    raise table.error(
+        f"{table.at(key.name)} = {_format_value(value)}; {_describe(value_type, key, known, value)} needed"
+    )
 
 
 def _read_number(table: TomlTable, key: Key) -> float:
@@ -340,7 +345,7 @@ def _read_number(table: TomlTable, key: Key) -> float:
     if is_number(value) and key.least <= value <= key.most:
         return _to_si(key, value)
     found = f"= {_format_value(value)}" if key.name in table else "is missing"
-    raise table.error(f"{table.at(key.name)} {found}; {_describe(float, key, {})} needed")
+    raise table.error(f"{table.at(key.name)} {found}; {_describe(float, key, {}, value)} needed")
 
 
 def _to_si(key: Key, value: float) -> float:

@@ -85,10 +85,8 @@ def read_mvnx(path: Path, use: str | None = None, rate_hz: float | None = None) 
         kind, (gyro, accel) = "raw", (frames.values[f"sensor{name}"] for name in ("AngularVelocity", "Acceleration"))
         signals = {label: {"gyro": gyro[:, k], "accel": accel[:, k]} for k, label in enumerate(frames.sensors)}
     else:
-        kind, signals = (
-            "orientation",
-            {label: {"orientation": quat} for label, quat in _read_quats(path, frames).items()},
-        )
+        kind = "orientation"
+        signals = {label: {"orientation": quat} for label, quat in _read_quats(path, frames).items()}
         if frames.t_pose is None:
             diagnostics = (Diagnostic("file-assumption", WARNING, path.name, facts={"variant": "frames"}),)
     sensors = {

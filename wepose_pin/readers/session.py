@@ -34,6 +34,8 @@ from .registry import detect_format, find_format, read_device
 from .session_file import (
     WIDTHS,
     SensorKeys,
+    check_columns,
+    check_effect,
     find_model,
     find_truth,
     read_data_keys,
@@ -74,6 +76,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
     tables = {name: stated.table(name) for name in stated.values}
     keys = {name: read_sensor_keys(table, files.keys) for name, table in tables.items()}
     keys = {name: each for name, each in keys.items() if not each.ignore}
+    check_columns(tables, keys)
     if not keys:
         raise BadSession(f"{path}: no sensors; one [sensors.<segment>] table each, without # before its lines")
     head = Recording(
@@ -90,6 +93,7 @@ def read_session(path: Path, gaps: bool = False, values: Mapping[str, Any] | Non
         truth=find_truth(path, data),
     )
     devices = {name: files.open_device(tables[name], each) for name, each in keys.items() if not each.signals}
+    check_effect(data, tables, keys)  # of what is no device's file, other keys are said to be missing
     measured = {
         name: files.take_sensor(name, tables[name], each, devices)
         if name in devices

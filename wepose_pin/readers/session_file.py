@@ -26,6 +26,9 @@ SESSION_KEYS = ("name", "model", "start_pose", "remounted", "data", "phases", "s
 _RENAMED_PHASES = {
     "still": "is called static now: write static = [[from, to]], seconds in which the sensors lie on a table"
 }
+# Keys that have an effect only where a format reads the file, or only where the session names columns.
+_OF_FORMATS: tuple[str, ...] = ("format", "label", "use")
+_OF_COLUMNS: tuple[str, ...] = ("gyro_unit", "accel_unit", "time", "time_unit")
 WIDTHS = {"gyro": 3, "accel": 3, "orientation": 4}
 _CHOICES: dict[str, Collection[str]] = {
     "use": NEEDED,
@@ -44,7 +47,7 @@ class SensorKeys(NamedTuple):
     time: str = ""
     time_unit: Annotated[str, Key(of="time_unit")] = "s"
     rate_hz: Annotated[float | None, Key(least=1e-3)] = None
-    offset_s: float = 0.0
+    offset_s: Annotated[float, Key(least=-1e12, most=1e12)] = 0.0  # between a clock since 1970 and one since power-on
     gyro_unit: Annotated[str, Key(of="gyro_unit")] = ""
     accel_unit: Annotated[str, Key(of="accel_unit")] = ""
     label: str = ""
@@ -98,6 +101,35 @@ def read_sensor_keys(table: TomlTable, data: SensorKeys) -> SensorKeys:
         value = table.values.get(signal)
         signals[signal] = [value] if isinstance(value, str) and value else table.names(signal, WIDTHS[signal])
     return keys._replace(signals=signals)
+
+
+def check_columns(tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys]) -> None:
+    """Raise `BadSession` where two sensors name one column."""
+    owners: dict[tuple[Path, str], str] = {}
+    for name, each in keys.items():
+        for signal, columns in each.signals.items():
+            for column in columns:
+                owner = owners.setdefault((Path(each.file), column), name)
+                if owner != name:
+                    raise BadSession(
+                        f"{tables[name].at(signal)}: '{column}' of {each.file} is a column of sensors.{owner} too; "
+                        f"each sensor needs its own"
+                    )
+
+
+def check_effect(data: TomlTable, tables: Mapping[str, TomlTable], keys: Mapping[str, SensorKeys]) -> None:
+    """Raise `BadSession` where a key has no effect on its sensor, or one in [data] on none of the sensors."""
+    owners = [(tables[name], [each]) for name, each in keys.items()]
+    for table, sensors in [*owners, (data, list(keys.values()))]:
+        if all(each.signals for each in sensors):
+            unused, why = _OF_FORMATS, "the columns are named here"
+        elif not any(each.signals for each in sensors):
+            unused, why = _OF_COLUMNS, "the format of the file defines it"
+        else:
+            continue
+        for key in unused:
+            if key in table:
+                raise BadSession(f"{table.at(key)} has no effect, as {why}; remove it")
 
 
 def read_phases(keys: TomlTable) -> dict[str, Intervals]:

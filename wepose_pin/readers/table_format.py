@@ -41,6 +41,7 @@ SEPARATORS = "\t,; "
 MOST_LINES = 2000  # before the names; some exports have a line for each channel
 MOST_AFTER = 4  # lines of text between the names and the numbers
 AXES = {"gyro": "xyz", "accel": "xyz", "orientation": "wxyz"}
+_COUNTS = {"gyro": (1, 3), "accel": (1, 3), "orientation": (1, 3, 4, 9)}  # of columns; 1 is a pattern
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)(e[-+]?\d+)?|\d{4}[/-]\d.*", re.IGNORECASE)
 _STATED_RATE = re.compile(r"\d+(\.\d*)?(?![\d.])")
 _Line = Annotated[float, Key(least=-MOST_AFTER, most=MOST_AFTER)]  # counted from the line of names; 0: there is none
@@ -187,24 +188,30 @@ def load_format(path: Path) -> TableFormat:
     Raises
     ------
     WeposeError
-        The file is missing or no description: an unknown or wrong key, a pattern that is none.
+        The file is missing or no description: an unknown or wrong key, a pattern that is none or lacks a group.
     """
     table = TomlTable(read_toml(path, "a description of tables"), str(path))
     format = read_record(TableFormat, table, others=("files", "clock", *AXES))
-    signals = {signal: tuple(read_record(Columns, each) for each in table.entries(signal)) for signal in AXES}
+    for key in ("sensors_line", "axes_line", "units_line"):
+        if getattr(format, key) % 1:
+            raise BadSession(f"{table.at(key)} = {getattr(format, key):g}; a whole number of lines is needed")
+    signals = {signal: tuple(_read_columns(signal, each) for each in table.entries(signal)) for signal in AXES}
     clocks = tuple(read_record(ClockColumn, each) for each in table.entries("clock"))
     if not clocks or not (signals["orientation"] or (signals["gyro"] and signals["accel"])):
         raise BadSession(f"{path}: needs [[clock]], and [[gyro]] and [[accel]], or [[orientation]]")
     keys = table.table("files", {})
     keys.allow(*NEEDED)
-    patterns = [*format.detect, format.sensor_begins, format.units_before, format.label_in_name]
-    patterns += [text for clock in clocks for text in (clock.column, clock.rate)]
-    patterns += [each.columns[0] for of in signals.values() for each in of if len(each.columns) == 1]
-    for text in patterns:
+    groups: dict[str, tuple[str, ...]] = dict.fromkeys([*format.detect, format.sensor_begins], ())
+    groups |= {text: () for clock in clocks for text in (clock.column, clock.rate)}
+    groups |= {each.columns[0]: () for of in signals.values() for each in of if len(each.columns) == 1}
+    groups |= {format.units_before: ("name", "unit"), format.label_in_name: ("label",)}
+    for text, needed in groups.items():
         try:
-            re.compile(text)
+            known = re.compile(text).groupindex
         except (re.error, RecursionError, OverflowError) as error:
             raise BadSession(f"{path}: '{text}' is no regular expression: {error}") from None
+        if text and (missing := [group for group in needed if group not in known]):
+            raise BadSession(f"{path}: '{text}' has no group '{missing[0]}'; write (?P<{missing[0]}>...) around it")
     return format._replace(
         title=format.title or path.stem,
         needs=format.needs or " and ".join(signal for signal in AXES if signals[signal]),
@@ -212,6 +219,15 @@ def load_format(path: Path) -> TableFormat:
         clocks=clocks,
         signals=signals,
     )
+
+
+def _read_columns(signal: str, entry: TomlTable) -> Columns:
+    columns = read_record(Columns, entry)
+    counts = (4,) if signal == "gyro" and columns.increments else _COUNTS[signal]
+    if len(columns.columns) not in counts:
+        wanted = " or ".join("one pattern" if count == 1 else f"{count} names" for count in counts)
+        raise BadSession(f"{entry.at('columns')} = {list(columns.columns)}; {wanted} are needed")
+    return columns
 
 
 @cache

@@ -7,6 +7,7 @@ labelled ``…_4X4``, with the translation in the unit of the points.
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body.configuration import solve_configuration
 from ..body.links import compute_link_poses, find_known_links
-from ..errors import BadData, BadOption, ExistingOutput, how_to_install
+from ..errors import BadData, BadOption, how_to_install
 from .motion import Motion, find_measured_points, resample_evenly
 
 MOST_FRAMES = 65535  # of the header's 16 bits: readers cut the rest off in silence
@@ -62,11 +63,11 @@ def write_c3d(path: Path, motion: Motion) -> None:
 
 
 def _check_whole(file: Path, size: int) -> None:
-    """Refuse a file with fewer than `size` bytes of data: ezc3d does not report a full disk."""
+    """Raise the system's error of a full disk for a file with fewer than `size` bytes of data: ezc3d raises none."""
     with file.open("rb") as opened:
         first_block = int.from_bytes(opened.read(18)[16:], "little")  # word 9 of the header, counted from 1
     if file.stat().st_size < 512 * (first_block - 1) + size:
-        raise ExistingOutput(f"{file.name}: cannot be written whole; is the disk full? nothing was written")
+        raise OSError(errno.ENOSPC, "the disk seems to be full")
 
 
 def _compute_transforms(motion: Motion) -> dict[str, np.ndarray]:
