@@ -222,6 +222,9 @@ def test_two_sessions_become_tables_figures_and_a_page(
         "after less before",
     ):
         assert words in page
+    assert re.search(r"the range of [\w ]+, [\w ]+ \((before|after)\) varies most", page)
+    cells = [page.index(f"<td>{angle}</td>") for angle in ("thorax, extension", "right elbow, flexion")]
+    assert cells == sorted(cells), "in the order of the body"
     assert "cannot be made" not in page
     assert run("angles", *results, "-o", out) == 2  # nothing is overwritten
     assert "--force" in capsys.readouterr().err

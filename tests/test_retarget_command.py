@@ -97,6 +97,7 @@ def test_the_command(result: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert "cannot be made" not in report
     for joint in JOINTS:
         assert f"<td>{joint}</td>" in report
+    assert re.search(r"At worst, at [\d.]+ s of the trajectory \([\d.]+ s of the recording\), the", report)
     code, text = run(capsys, "retarget", str(result), "--robot", str(urdf), "-o", str(tmp_path / "out"))
     assert (code, "--force replaces" in text) == (2, True)
 

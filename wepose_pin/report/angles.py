@@ -100,10 +100,10 @@ def explain_missing(movements: Sequence[Movement]) -> list[str]:
 def _describe_reliance(summary: pl.DataFrame) -> str:
     """Two sentences: what the pose states of a range, and how far the repetitions differ."""
     stated, between = {}, {}
+    several = len(summary) and summary["session"].n_unique() > 1
     for row in summary.iter_rows(named=True):
-        angle = _name(row)
-        stated[angle] = row["range_std_deg"]
-        between[f"{angle} ({row['session']})"] = row["range_sd_deg"]
+        angle = _name(row) + (f" ({row['session']})" if several else "")
+        stated[angle], between[angle] = row["range_std_deg"], row["range_sd_deg"]
     stated, between = ({name: v for name, v in each.items() if np.isfinite(v)} for each in (stated, between))
     if not between:
         return "No repetitions were found, so this page has no mean curves. The table covers the whole recording."
@@ -156,7 +156,8 @@ def tabulate_sessions(sessions: pl.DataFrame) -> Table:
 def tabulate_means(summary: pl.DataFrame) -> Table:
     """Mean ± standard deviation between the repetitions of each angle, with what the pose states for one."""
     rows = []
-    for row in summary.sort("joint", "angle", maintain_order=True).iter_rows(named=True):
+    place = {name: k for k, name in reversed([*enumerate(map(_name, summary.iter_rows(named=True)))])}
+    for row in sorted(summary.iter_rows(named=True), key=lambda row: place[_name(row)]):
         cells = []
         for measure, unit in MEASURES.items():
             mean, sd, std = (row[f"{measure}_{part}_{unit}"] for part in ("mean", "sd", "std"))

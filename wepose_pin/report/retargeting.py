@@ -80,7 +80,8 @@ def describe_reliance(trajectory: Trajectory, summary: Mapping[str, Any]) -> str
     sample = int(np.argmax(errors[worst]))
     return (
         f"The trajectory {' and '.join(problems) or f'keeps all limits, and {checked}'}. At worst, at "
-        f"{trajectory.time[sample]:.1f} s, the {worst} hand is {errors[worst][sample]:.0f} mm off its target."
+        f"{trajectory.time[sample]:.1f} s of the trajectory ({trajectory.recorded_time[sample]:.1f} s of the "
+        f"recording), the {worst} hand is {errors[worst][sample]:.0f} mm off its target."
     )
 
 
