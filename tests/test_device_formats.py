@@ -413,6 +413,12 @@ def test_xdf(tmp_path: Path) -> None:
     assert not recording.diagnostics
 
 
+def test_an_xdf_that_was_cut_off_is_said_to_be(tmp_path: Path) -> None:
+    two_streams(tmp_path / "a.xdf", cut=100)
+    (diagnostic,) = load(tmp_path, '[data]\nfile = "a.xdf"\n[sensors.torso]\n[sensors.left_forearm]').diagnostics
+    assert (diagnostic.code, diagnostic.place) == ("file-incomplete", "a.xdf")
+
+
 def test_xdf_with_rates_and_forces_in_streams_of_their_own(tmp_path: Path) -> None:
     """And without units: gravity says that of the forces."""
     streams = {"torso Gyroscope": (["gyr_x", "gyr_y", "gyr_z"], [""] * 3, GYRO)}

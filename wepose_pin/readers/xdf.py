@@ -40,6 +40,8 @@ def read_xdf(path: Path, use: str | None = None, rate_hz: float | None = None) -
         streams, _ = pyxdf.load_xdf(str(path))
     sensors: dict[str, dict[str, Signal]] = {}
     diagnostics: list[Diagnostic] = []
+    if any(not stream.get("footer") for stream in streams):
+        diagnostics.append(Diagnostic("file-incomplete", WARNING, path.name, facts={"variant": "footer"}))
     for stream in streams:
         values = stream["time_series"]
         if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu" or len(values) < 2:
