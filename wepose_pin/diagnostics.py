@@ -199,7 +199,7 @@ def quantity(value: float | None, unit: str) -> str:
     if value is None or not math.isfinite(value):
         return "not known"
     shown = factor * value
-    decimals = 3 if unit == "time" else max(0, digits - 1 - math.floor(math.log10(abs(shown)))) if shown else 0
+    decimals = 3 if unit == "time" else max(0, min(6, digits - 1 - math.floor(math.log10(abs(shown))))) if shown else 0
     text = f"{shown:{sign}.{decimals}f}"
     return (text.rstrip("0").rstrip(".") if "." in text else text) + name
 
