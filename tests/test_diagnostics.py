@@ -172,7 +172,8 @@ def test_json_holds_data_and_text_and_comes_back() -> None:
     ("value", "unit", "text"),
     [
         (0.5, "deg", "29°"),
-        (0.0, "deg", "0°"), (1e-16, "deg", "0°"),
+        (0.0, "deg", "0°"),
+        (1e-16, "deg", "0°"),
         (-0.01, "deg", "-0.57°"),
         (0.0999999, "percent", "10 %"),
         (0.04, "+percent", "+4 %"),
