@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .. import rotations
+from ..compilation import compiled
 from ..errors import BadData, BadPhase
 from ..recording import ImuSensor, Recording
 
@@ -103,7 +104,7 @@ def estimate_noise(gyro_S: np.ndarray, accel_S: np.ndarray, rate_hz: float, worn
     else:  # the means of blocks average white noise out and keep sway
         bias_cov = _apply_floor(half_second_cov / (len(gyro_S) // max(1, round(BLOCK_S * rate_hz))), BIAS_FLOOR)
     return SensorNoise(
-        gyro_bias=gyro_S.mean(axis=0),
+        gyro_bias=average_blocks(gyro_S, len(gyro_S))[0],
         gyro_bias_cov=bias_cov,
         gyro_cov=_apply_floor(gyro_cov, GYRO_FLOOR),
         accel_cov=_apply_floor(_compute_cov(accel_S / gravity), ACCEL_FLOOR),
@@ -132,14 +133,23 @@ def _estimate_sway_cov(gyro_S: np.ndarray, rate_hz: float, measured: np.ndarray 
 
 def _compute_cov(values: np.ndarray) -> np.ndarray:
     """Compute the covariance (3, 3) of samples (n, 3) as `np.cov`, in a quarter of its time."""
-    off = values - values.mean(axis=0)
+    off = values - average_blocks(values, len(values))
     return np.asarray(off.T @ off * (1.0 / (len(values) - 1)))
 
 
 def average_blocks(values: np.ndarray, size: int) -> np.ndarray:
-    """Means (n // size, 3) of the complete blocks of `size` samples (n, 3)."""
-    count = len(values) // size
-    return np.asarray(values[: count * size].reshape(count, size, 3).mean(axis=1))
+    """Means (n // size, 3) of the complete blocks of `size` samples (n, 3), in a tenth of NumPy's time."""
+    return np.asarray(_average_blocks(np.ascontiguousarray(values, dtype=float), size))
+
+
+@compiled
+def _average_blocks(values, size):  # type: ignore[no-untyped-def]
+    means = np.zeros((len(values) // size, 3))
+    for block in range(len(means)):
+        for k in range(block * size, (block + 1) * size):
+            for axis in range(3):
+                means[block, axis] += values[k, axis]
+    return means / size
 
 
 def _compute_half_second_cov(gyro_S: np.ndarray, rate_hz: float) -> np.ndarray | None:
@@ -177,7 +187,7 @@ def estimate_start_tilt(gyro_S: np.ndarray, accel_S: np.ndarray, noise: SensorNo
     force = rotations.unroll((gyro_S - noise.gyro_bias) * (1.0 / rate_hz), np.ascontiguousarray(accel_S))
     if not np.isfinite(force).all():
         force = force[np.isfinite(force).all(axis=1)]
-    mean = force.mean(axis=0) if len(force) else np.zeros(3)
+    mean = average_blocks(force, len(force))[0] if len(force) else np.zeros(3)
     norm = float(np.linalg.norm(mean))
     if not norm > 0.0:
         raise BadData("accel is zero in the start phase; the filter starts from the direction of gravity")

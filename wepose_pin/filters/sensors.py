@@ -218,8 +218,9 @@ class SensorFilters:
 
         def create(method: str, noise: SensorNoise, start: StartTilt) -> Any:
             params = self._params
-            if method in _PARAMS:
-                params = params or _PARAMS[method](tilt_std=start.tilt_std)
+            if method in _PARAMS and params is None:
+                params = _PARAMS[method](tilt_std=start.tilt_std, gyro_range=gyro_range)
+            elif method in _PARAMS:
                 params = replace(params, gyro_range=min(gyro_range, params.gyro_range))
             return METHODS[method](noise, rate_hz, start.quat_VS, params)
 

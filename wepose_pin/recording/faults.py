@@ -234,13 +234,15 @@ def find_gyro_range(gyro_S: np.ndarray, accel_S: np.ndarray) -> float:
 def find_saturation(values: np.ndarray, least: float) -> np.ndarray:
     """Find the samples (n, 3) at which an axis of `values` (n, 3) is saturated at its extreme, `least` or more."""
     saturated = np.zeros(values.shape, dtype=bool)
-    extremes = [(float(x.max()), float(x.min())) for x in values.T] if len(values) else []
-    least = max(least, (1.0 - SAME_RANGE) * np.abs(extremes).max(initial=0.0))
-    for axis, pair in enumerate(extremes):
-        for extreme in pair:
+    largest = max(values.max(initial=0.0), -values.min(initial=0.0))
+    if largest < least:
+        return saturated
+    least = max(least, (1.0 - SAME_RANGE) * largest)
+    for axis, x in enumerate(np.ascontiguousarray(values.T)):  # of one piece: ten times faster
+        for extreme in (float(x.max()), float(x.min())):
             if abs(extreme) < least:
                 continue
-            x, same = values[:, axis], ROUNDING * abs(extreme)
+            same = ROUNDING * abs(extreme)
             at = np.abs(x - extreme) <= same
             if np.count_nonzero(at) < PLATEAU:
                 continue
