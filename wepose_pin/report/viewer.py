@@ -156,7 +156,7 @@ def retarget_html(model: BodyModel, pose: Pose, trajectory: Trajectory, *, title
     from ..retargeting.visuals import build_parts, compute_placements, compute_target_placements
 
     frames = frame_indices(trajectory.time, fps)
-    nearest = np.abs(pose.time[:, None] - trajectory.recorded_time[frames][None, :]).argmin(axis=0)
+    nearest = np.searchsorted(0.5 * (pose.time[:-1] + pose.time[1:]), trajectory.recorded_time[frames])
     visuals, placed = _place_body(model, pose, nearest)
     robot = trajectory.robot
     drawn = build_parts(robot)
