@@ -192,8 +192,8 @@ class RobotOutput(Output):
                     offset = self._clock_offset + (offset - self._clock_offset) * self.stream.dt / CLOCK_S
                 self._clock_offset = offset
         command = self.stream.step(begin + self._clock_offset, begin - self._came)
+        self.newest = command  # before it is sent: who hears of a command finds it described here
         self._sender.send(command_json(self.robot, command, self._speed))
-        self.newest = command
         if not math.isnan(command.time):
             self._step.append(time.monotonic() - begin)
             self._states[command.state] += 1
