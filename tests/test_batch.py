@@ -16,26 +16,51 @@ from pathlib import Path
 
 import polars as pl
 import pytest
-from studies import PLAN, files, sessions_and_plan, three_sessions  # noqa: F401
+from commands import run as command
 
 from wepose_pin.batch.study import run_batch
-from wepose_pin.commands import main
 from wepose_pin.errors import BadOption, ExistingOutput, LostWorker
+from wepose_pin.simulation import simulate, simulate_person
+from wepose_pin.writers import write_session
 
 WEPOSE = [sys.executable, "-m", "wepose_pin"]
 NAMES = ["data-one", "data-three", "data-two"]
+PLAN = """
+[sessions]
+files = ["data/*/session.toml"]
+[steps.track]
+view = false
+report = false
+[steps.evaluate]
+"""
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three short sessions, one/ to three/."""
+    folder = tmp_path_factory.mktemp("recorded")
+    for seed, name in enumerate(("one", "two", "three"), 1):
+        made_up = simulate(simulate_person(seed).lengths, seed=seed, clasp_s=8.0, circles=0)
+        (folder / name).mkdir()
+        write_session(folder / name, made_up.recording(name), made_up.truth())
+    return folder
+
+
+@pytest.fixture
+def study(recorded: Path, tmp_path: Path) -> Path:
+    shutil.copytree(recorded, tmp_path / "data")
+    (tmp_path / "plan.toml").write_text(PLAN)
+    return tmp_path
+
+
+def files(folder: Path) -> dict[str, int]:
+    return {str(path): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
 def run(study: Path, *, force: bool = False, plan: str | None = None, out: str = "out") -> pl.DataFrame:
     if plan is not None:
         (study / "plan.toml").write_text(plan)
     return run_batch(study / "plan.toml", str(study / out), workers=1, force=force).table
-
-
-def command(*words: object) -> int:
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    return int(stop.value.code or 0)
 
 
 def test_a_study_is_made_once_and_what_fails_is_named(study: Path) -> None:

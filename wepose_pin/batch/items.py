@@ -33,13 +33,13 @@ def run_item(item: Item, place: str, force: bool = False) -> Row:
     """
     begin = time.perf_counter()
     try:
-        row = _run(item, f"{place}/{item.name}", force)
+        row = describe(item) | _run(item, f"{place}/{item.name}", force)
     except WeposeError as error:
-        row = fail(type(error).__name__, str(error))
+        row = fail(item, type(error).__name__, str(error))
     except Exception as error:  # a bug of ours: other items continue, and the table says where it is
         last = traceback.extract_tb(error.__traceback__)[-1]
-        row = fail(type(error).__name__, f"{error} ({Path(last.filename).name}:{last.lineno})")
-    return {**describe(item), "seconds": time.perf_counter() - begin, **row}
+        row = fail(item, type(error).__name__, f"{error} ({Path(last.filename).name}:{last.lineno})")
+    return {"seconds": time.perf_counter() - begin} | row
 
 
 def describe(item: Item) -> Row:
@@ -47,79 +47,68 @@ def describe(item: Item) -> Row:
     return {"item": item.name, "session": item.session, "subject": item.subject}
 
 
-def fail(error: str, message: str) -> Row:
-    """The columns of an item that has failed."""
-    return {"status": FAILED, "error": error, "message": " ".join(message.split())}
+def fail(item: Item, error: str, message: str) -> Row:
+    """The row of an item that has failed."""
+    return describe(item) | {"status": FAILED, "error": error, "message": " ".join(message.split())}
 
 
 def _run(item: Item, target: str, force: bool) -> Row:
-    begin, evaluates = time.perf_counter(), "evaluate" in item.steps
-    inputs = {"session": item.session, "subject_file": item.subject_file}
+    begin = time.perf_counter()
+    inputs = {"session": item.session} | ({"subject_file": item.subject_file} if item.subject_file else {})
     for step, options in item.steps.items():
-        files = {name: options.get(name) for name in ("model", "prior", "protocol", "robot")}
-        inputs |= {f"{step}.{name}": str(file) for name, file in files.items() if file and Path(file).is_file()}
+        for name in ("model", "prior", "protocol", "robot"):
+            if Path(str(options.get(name, ""))).is_file():
+                inputs[f"{step}.{name}"] = str(options[name])
     with tempfile.TemporaryDirectory(prefix="wepose-") as fetched:
-        # With `evaluate`, a session includes the reference that it names.
-        local = {
-            name: fetch(url, Path(fetched), evaluates and name == "session") for name, url in inputs.items() if url
-        }
-        hashes = {
-            f"input {name}": file_hashes(path, evaluates and name == "session") for name, path in sorted(local.items())
-        }
+        local: dict[str, Path] = {}
+        hashes: dict[str, Mapping[str, str]] = {}
+        for name, url in sorted(inputs.items()):
+            with_truth = name == "session" and "evaluate" in item.steps  # the reference that it names
+            local[name] = fetch(url, Path(fetched), with_truth)
+            hashes[f"input {name}"] = file_hashes(local[name], with_truth)
         key = {"code": code()["code"], "options": [list(item.steps.items()), item.person], **hashes}
         key = json.loads(json.dumps(key))
-        done = _read_done(target)
-        if done is not None:
-            changed = [name for name in key if done["key"].get(name) != key[name]]
-            if not changed:
-                return done["row"] | {"status": DONE, "reused": True}
-            if not force:
-                message = f"{target}: has other {', '.join(changed)}; --force runs it again, -o names another folder"
-                status = {"status": CHANGED, "error": ExistingOutput.__name__, "message": message, "reused": True}
-                return done["row"] | status
+        done: Any = None
+        with contextlib.suppress(ValueError):  # a damaged file is none
+            done = json.loads(read_bytes(f"{target}/{DONE_FILE}") or b"null")
+        changed = [name for name in key if done and done["key"].get(name) != key[name]]
+        if done and not changed:
+            return done["row"] | {"status": DONE, "reused": True}
+        if changed and not force:
+            message = f"{target}: has other {', '.join(changed)}; --force runs it again, -o names another folder"
+            return done["row"] | {"status": CHANGED, "error": ExistingOutput.__name__, "message": message}
         with create_folder(target) as folder:
-            row = run_steps(item, local["session"], local.get("subject_file"), folder)
-            row |= {"seconds": time.perf_counter() - begin}
+            row = _run_steps(item, local["session"], local.get("subject_file"), folder)
+            row["seconds"] = time.perf_counter() - begin
             text = json.dumps({"key": key, "row": row}, indent=1, ensure_ascii=False)
             (folder / DONE_FILE).write_text(text, encoding="utf-8")
-    return row | {"status": DONE, "reused": False}
+    return row | {"status": DONE}
 
 
-def _read_done(target: str) -> Any:
-    """Contents of `DONE_FILE`; None where it is missing or damaged."""
-    with contextlib.suppress(ValueError):
-        return json.loads(read_bytes(f"{target}/{DONE_FILE}") or b"null")
-    return None
-
-
-def run_steps(item: Item, session: Path, subject: Path | None, folder: Path) -> Row:
-    """Run the steps by the commands of their names, each into a folder of its name; column → value.
-
-    `session`, `subject`: local copies of what the item names.
-    """
+def _run_steps(item: Item, session: Path, subject: Path | None, folder: Path) -> Row:
+    """Run the steps by the commands of their names, each into a folder of its name; column → value."""
     row: Row = {}
     places = {"session": str(session), "result": str(folder / "track"), "truth": str(session)}
     for step, options in item.steps.items():
-        out, given = folder / step, [places[name] for name in STEPS[step]]
+        out, inputs = folder / step, [places[name] for name in STEPS[step]]
         if step == "calibrate":
-            calibration = _run_command(step, given, {**options, **item.person, "out": out}).calibration
+            calibration = _run_command(step, inputs, {**options, **item.person, "out": out}).calibration
             row |= {"quality": calibration.quality.quality, "gap_mm": 1e3 * calibration.rms_gap}
             for name, value in calibration.subject.lengths.items():
                 row |= {f"{name}_mm": 1e3 * value, f"{name}_std_mm": 1e3 * calibration.subject.std(name)}
             subject = out
         elif step == "track":
-            known = {} if subject is None else {"subject": subject}
-            tracked = _run_command(step, given, {**options, **known, "out": out})
+            tracked = _run_command(step, inputs, {**options, "out": out} | ({"subject": subject} if subject else {}))
             row |= {name: tracked.summary[name] for name in ("samples", "rate_hz", "duration_s")}
             row["diagnostics"] = len(tracked.summary["diagnostics"]) + len(tracked.page_failures)
         elif step == "retarget":
-            summary = _run_command(step, given, {**options, "out": out}).summary
+            summary = _run_command(step, inputs, {**options, "out": out}).summary
             row["trajectory_within_limits"] = summary["within_limits"]
             row["trajectory_self_collisions"] = summary["self_collisions"]["samples"]
         elif step == "export":
-            row["export_diagnostics"] = _export(given, options, out)
+            row["export_diagnostics"] = _export(inputs, options, out)
         else:
-            errors = _run_command("evaluate", given, options)
+            errors = _run_command(step, inputs, options)
             out.mkdir()
             text = json.dumps(as_json(asdict(errors)), indent=2)
             (out / "errors.json").write_text(text + "\n", encoding="utf-8")
@@ -137,16 +126,14 @@ def _run_command(step: str, places: list[str], options: Mapping[str, Any]) -> An
 
 
 def _export(places: list[str], options: Mapping[str, Any], folder: Path) -> int:
-    """Write all formats; the number of their diagnostics."""
+    """Write all formats, each with those options that it has; the number of their diagnostics."""
     from ..writers.export import list_formats
 
     folder.mkdir()
-    count, formats = 0, options["formats"]
-    for format in [formats] if isinstance(formats, str) else formats:
+    count = 0
+    for format in options["formats"]:
         kind = list_formats()[format]
         file = folder / (f"motion.{format}" if kind.suffix is None else f"{format}{kind.suffix}")
-        # What is given for another of the formats is left out.
-        others = {"formats": True, **{name: name not in kind.options for name in ("names", "osim_model", "rate_hz")}}
-        own = {name: value for name, value in options.items() if not others.get(name)}
+        own = {name: value for name, value in options.items() if name in kind.options}
         count += len(_run_command("export", places, own | {"out": file, "format": format}).diagnostics)
     return count

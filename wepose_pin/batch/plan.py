@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple
 
 from ..body import load_table
-from ..commands.command_line import APP, parse
+from ..commands.command_line import parse
 from ..data_tables import read_table
 from ..documents import Key, TomlTable, read_record, read_toml
 from ..errors import BadPlan, WeposeError, one_of
@@ -25,44 +24,27 @@ STEPS = {
     "export": ("result",),
     "evaluate": ("result", "truth"),
 }
-_PERSON = ("stature", "sex", "measured")  # options of `calibrate` that belong to a person
-# Follow from an item's session and subject, or are not of one session.
-_ITEM_OPTIONS = ("out", "subject", "further", "format", "episodes", "instruction", *_PERSON, "force")
-_MEASURED = "measured."  # begins the columns of a table that are measured lengths
 _LONGEST_NAME = 100  # letters of an item's folder
-_Stature = Annotated[float | None, Key(least=1.0, most=2.5)]
 
 
-class Sessions(NamedTuple):
-    """``[sessions]``: globs, or a table with a row for each session."""
+class Person(NamedTuple):
+    """The options of `calibrate` that belong to a person, of ``[subjects.NAME]`` or a row of a table."""
 
-    files: tuple[str, ...] = ()
-    table: str = ""
-    subject: str = ""
-
-
-class Session(NamedTuple):
-    """A session, as a row of a table names it."""
-
-    session: str  # resolved path or URL
-    name: str = ""
-    subject: str = ""
-    stature: _Stature = None
+    stature: Annotated[float | None, Key(least=1.0, most=2.5)] = None
     sex: Literal["", "f", "m"] = ""
     measured: Mapping[str, float] = {}
+
+
+# Follow from an item's session and subject, or are not of one session.
+_ITEM_OPTIONS = ("out", "subject", "format", "episodes", "instruction", "force", *Person._fields)
 
 
 class Subject(NamedTuple):
-    """``[subjects.NAME]``."""
+    """``[subjects.NAME]``: calibrated by a session, before (`file`), or with each session (neither)."""
 
-    calibration: str = ""
+    person: Mapping[str, Any]
     file: str = ""
-    stature: _Stature = None
-    sex: Literal["", "f", "m"] = ""
-    measured: Mapping[str, float] = {}
-
-
-K = TypeVar("K", Session, Subject)
+    calibration: str = ""
 
 
 @dataclass(frozen=True)
@@ -75,7 +57,7 @@ class Item:
     session, subject_file : paths or URLs
     subject : a name of the plan
     steps : step → the options that the plan gives
-    person : the options of `calibrate` that are known of the person: "stature", "sex", "measured"
+    person : the options of `calibrate` that are known of the person
     """
 
     name: str
@@ -92,10 +74,6 @@ class Plan(NamedTuple):
     calibrations: tuple[Item, ...]
     items: tuple[Item, ...]
 
-    @property
-    def all_items(self) -> tuple[Item, ...]:
-        return (*self.calibrations, *self.items)
-
 
 def read_plan(path: Path, items_folder: str) -> Plan:
     """Read a plan and find its sessions; `items_folder` will hold the items' folders.
@@ -110,33 +88,33 @@ def read_plan(path: Path, items_folder: str) -> Plan:
     steps = _read_steps(top.table("steps"), path)
     tables = top.table("subjects", {})
     subjects = {name: _read_subject(tables.table(name), path) for name in tables.values}
+    without_calibration = {step: options for step, options in steps.items() if step != "calibrate"}
     calibrations: dict[str, Item] = {}
     items: dict[str, Item] = {}
     for keys in _list_sessions(top.table("sessions"), path):
-        session = _read_keys(Session, keys)
-        person, own, subject = _find_person(session), steps, Subject()
-        if session.subject and (subjects or "calibrate" not in steps):
-            if session.subject not in subjects:
+        person, session = _read_person(keys, "session", "name", "subject"), keys.values["session"]
+        subject_name, subject = keys.text("subject", None), Subject({})
+        if subject_name and (subjects or "calibrate" not in steps):
+            if subject_name not in subjects:
                 raise BadPlan(
-                    f"{keys.where}: subject '{session.subject}' is not in the plan; {one_of(subjects, session.subject)}"
+                    f"{keys.where}: subject '{subject_name}' is not in the plan; {one_of(subjects, subject_name)}"
                 )
-            subject = subjects[session.subject]
-            person = person or _find_person(subject)
+            subject = subjects[subject_name]
+            person = person or dict(subject.person)
         file = subject.file
         if subject.calibration:
             if "calibrate" not in steps:
-                raise BadPlan(f"{tables.at(session.subject)}.calibration: needs the step [steps.calibrate]")
-            name, only = f"subject-{_sanitize(session.subject)}", {"calibrate": steps["calibrate"]}
-            calibrations[name] = Item(name, subject.calibration, only, session.subject, person=person)
+                raise BadPlan(f"{tables.at(str(subject_name))}.calibration: needs the step [steps.calibrate]")
+            name, only = f"subject-{_sanitize(str(subject_name))}", {"calibrate": steps["calibrate"]}
+            calibrations[name] = Item(name, subject.calibration, only, subject_name, person=person)
             file = f"{items_folder}/{name}/calibrate/subject.toml"
-        if file:
-            own = {step: options for step, options in steps.items() if step != "calibrate"}
+        own = without_calibration if file else steps
         if not own:
             raise BadPlan(f"{keys.where}: nothing to do: its subject is calibrated elsewhere; it needs another step")
-        name = _sanitize(session.name) or _derive_name(session.session, path)
+        name = _sanitize(keys.text("name", None) or "") or _derive_name(session, path)
         if name in items or name in calibrations:
             raise BadPlan(f"{keys.where}: '{name}' names two items; the column 'name' of a table can name them")
-        items[name] = Item(name, session.session, own, session.subject or None, file or None, person)
+        items[name] = Item(name, session, own, subject_name, file or None, person)
     return Plan(tuple(calibrations.values()), tuple(items.values()))
 
 
@@ -166,24 +144,23 @@ def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
     for step in [step for step in STEPS if step in table]:
         keys = table.table(step)
         steps[step] = options = dict(keys.values)
-        for name, value in options.items():  # a file beside the plan, such as a protocol
-            if isinstance(value, str) and (path.parent / value).is_file():
+        for name, value in options.items():
+            if name in _ITEM_OPTIONS:
+                raise BadPlan(f"{keys.at(name)} is not a known key; it follows from the session or its subject")
+            if isinstance(value, str) and (path.parent / value).is_file():  # beside the plan, such as a protocol
                 options[name] = str((path.parent / value).absolute())
         if step not in ("calibrate", "track") and "track" not in steps:
             raise BadPlan(f"{keys.where}: needs the step [steps.track], which is missing")
-        command = APP[step].default_command
-        assert command is not None
-        known = [name for name in inspect.signature(command).parameters if name not in (*STEPS[step], *_ITEM_OPTIONS)]
-        keys.allow(*known, *(["formats"] * (step == "export")))
         if step == "export":
-            for each in keys.texts("formats") or ("",):
+            options["formats"] = list(keys.texts("formats") or ("",))
+            for each in options["formats"]:
                 if each not in formats:
                     raise BadPlan(
                         f"{keys.at('formats')}: '{each}' is no format of a person's motion; {one_of(formats, each)}"
                     )
-        given = {name: value for name, value in options.items() if name != "formats"}
+        of_command = {name: value for name, value in options.items() if (step, name) != ("export", "formats")}
         try:
-            parse(write_words(step, STEPS[step], given | ({} if step == "evaluate" else {"out": "OUT"})))
+            parse(write_words(step, STEPS[step], of_command | ({} if step == "evaluate" else {"out": "OUT"})))
         except WeposeError as error:
             raise BadPlan(f"{keys.where}: {error}") from None
     if not steps:
@@ -192,53 +169,49 @@ def _read_steps(table: TomlTable, path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _read_subject(keys: TomlTable, path: Path) -> Subject:
-    subject = _read_keys(Subject, keys)
-    if subject.calibration and subject.file:
+    person = _read_person(keys, "file", "calibration")
+    file, calibration = (_resolve(keys.text(name, None) or "", path) for name in ("file", "calibration"))
+    if calibration and file:
         raise BadPlan(f"{keys.at('file')}: a subject has a file or a calibration, not both")
-    calibration, file = (place and _resolve(place, path) for place in subject[:2])
     for place in (calibration, file):
         if place and not is_remote(place) and not Path(place).exists():
             raise BadPlan(f"{keys.where}: {place}: no such file; a path from the plan's folder, or a URL, is needed")
-    return subject._replace(calibration=calibration, file=file)
+    return Subject(person, file, calibration)
 
 
-def _read_keys(kind: type[K], keys: TomlTable) -> K:
+def _read_person(keys: TomlTable, *others: str) -> dict[str, Any]:
+    """The options of `calibrate` that are given of a person, in a table with these other keys."""
     keys.table("measured", {}).allow(*load_table().lengths)
-    return read_record(kind, keys)
+    person = read_record(Person, keys, others=others)
+    return {name: value for name, value in person._asdict().items() if value}
 
 
-def _find_person(record: Session | Subject) -> dict[str, Any]:
-    """The options of `calibrate` that are given of a person."""
-    return {name: value for name in _PERSON if (value := getattr(record, name))}
-
-
-def _list_sessions(keys: TomlTable, path: Path) -> list[TomlTable]:
-    """A table a session, with the keys of `Session`."""
-    sessions = read_record(Sessions, keys)
-    if bool(sessions.files) == bool(sessions.table):
+def _list_sessions(keys: TomlTable, path: Path) -> Iterator[TomlTable]:
+    """A table a session, with the keys "session", "name", "subject" and those of a person."""
+    keys.allow("files", "table", "subject")
+    if bool(keys.texts("files")) == ("table" in keys):
         raise BadPlan(f"{keys.where}: either files (globs) or table is needed")
-    if "" in sessions.files:
-        raise BadPlan(f"{keys.at('files')}: '' is no glob; one from the plan's folder is needed, such as \"data/*\"")
-    found: list[TomlTable] = []
-    if sessions.files:
-        urls: dict[str, None] = {}
-        for pattern in sessions.files:
-            matches = find_urls(_resolve(pattern, path))
-            if not matches:
-                raise BadPlan(f"{keys.at('files')}: '{pattern}' finds nothing; a glob from the plan's folder is needed")
-            urls |= dict.fromkeys(matches)
-        own = {"subject": sessions.subject} if sessions.subject else {}
-        return [TomlTable({"session": url, **own}, str(path), f"sessions: {url}.", BadPlan) for url in urls]
-    file = path.parent / sessions.table
+    own = {"subject": subject} if (subject := keys.text("subject", None)) else {}
+    urls: dict[str, None] = {}
+    for pattern in keys.texts("files"):
+        matches = find_urls(_resolve(pattern, path))
+        if not matches:
+            raise BadPlan(f"{keys.at('files')}: '{pattern}' finds nothing; a glob from the plan's folder is needed")
+        urls |= dict.fromkeys(matches)
+    for url in urls:
+        yield TomlTable({"session": url, **own}, str(path), f"sessions: {url}.", BadPlan)
+    if "table" not in keys:
+        return
+    file = path.parent / (keys.text("table", None) or "")
     for k, cells in enumerate(read_table(file).iter_rows(named=True), 1):
         row = {name: value for name, value in cells.items() if value is not None and value != ""}
         row |= {name: str(row[name]) for name in ("session", "name", "subject") if name in row}
         if "session" not in row:
             raise BadPlan(f"{file}: row {k}: session is empty; the columns are {', '.join(cells)}")
         row["session"] = _resolve(row["session"], file)
-        measured = {name.removeprefix(_MEASURED): row.pop(name) for name in list(row) if name.startswith(_MEASURED)}
-        found.append(TomlTable(row | ({"measured": measured} if measured else {}), str(file), f"row {k}.", BadPlan))
-    return found
+        lengths = [name for name in row if name.startswith("measured.")]
+        row |= {"measured": {name.removeprefix("measured."): row.pop(name) for name in lengths}}
+        yield TomlTable(own | row, str(file), f"row {k}.", BadPlan)
 
 
 def _derive_name(session: str, path: Path) -> str:
@@ -255,5 +228,5 @@ def _sanitize(text: str) -> str:
 
 
 def _resolve(text: str, path: Path) -> str:
-    """A path from the folder of the file that names it; URLs stay."""
-    return text if is_remote(text) else str((path.parent / text).absolute())
+    """A path from the folder of the file that names it; URLs and an empty text stay."""
+    return text if is_remote(text) or not text else str((path.parent / text).absolute())

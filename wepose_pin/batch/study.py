@@ -7,10 +7,8 @@ import io
 import os
 import signal
 import threading
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +17,7 @@ import polars as pl
 
 from ..errors import BadOption, LostWorker, how_to_install, reason
 from ..filters.base import count_processors
-from .items import DONE, Row, describe, fail, run_item
+from .items import DONE, Row, fail, run_item
 from .plan import Item, Plan, read_plan
 from .storage import is_remote, open_study, write_bytes
 
@@ -29,6 +27,7 @@ CONNECT_S = 10.0  # for which a scheduler is waited for
 _COMMON = dict.fromkeys(("item", "session", "subject", "status", "error", "message"), pl.String)
 # Processes share the machine: one thread each. The last bits of BLAS depend on its number of threads, too.
 _ONE_THREAD = "WEPOSE_THREADS NUMBA_NUM_THREADS POLARS_MAX_THREADS OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS"
+_DIED = "the process of this item, or of one beside it, died; it may lack memory"
 
 # Called with the number of items that have a row, of those that are not done, and of all.
 ItemProgress = Callable[[int, int, int], None]
@@ -70,10 +69,11 @@ def run_batch(
     out = out.rstrip("/")
     place = f"{out}/items" if is_remote(out) else str(Path(out).absolute() / "items")
     plan = read_plan(plan_file, place)
+    names = [item.name for items in plan for item in items]
     rows: dict[str, Row] = {}
     with open_study(out):
-        progress(0, 0, len(plan.all_items))
-        for items in (plan.calibrations, plan.items):  # sessions need the calibrations
+        progress(0, 0, len(names))
+        for items in plan:  # sessions need the calibrations
             if scheduler is None:
                 run = _run_here(items, workers or count_processors(), place, force)
             else:
@@ -81,10 +81,10 @@ def run_batch(
             with contextlib.closing(run) as done:
                 for row in done:
                     rows[row["item"]] = row
-                    progress(len(rows), sum(each["status"] != DONE for each in rows.values()), len(plan.all_items))
-        named = [dict.fromkeys(_COMMON) | rows[item.name] for item in plan.all_items]
-        reused = sum(bool(row.pop("reused", False)) and row["status"] == DONE for row in named)
-        table = pl.DataFrame(named, schema_overrides=_COMMON, infer_schema_length=None)
+                    progress(len(rows), sum(each["status"] != DONE for each in rows.values()), len(names))
+        reused = sum(row.pop("reused", False) for row in rows.values())
+        ordered = [dict.fromkeys(_COMMON) | rows[name] for name in names]
+        table = pl.DataFrame(ordered, schema_overrides=_COMMON, infer_schema_length=None)
         content = io.BytesIO()
         table.write_parquet(content)
         write_bytes(f"{out}/{RESULTS}", content.getvalue())
@@ -96,25 +96,28 @@ def _run_here(items: Sequence[Item], count: int, place: str, force: bool) -> Gen
 
     A process that dies takes those beside it along: their items fail, and the others go on in new processes.
     """
-    todo, count = deque(items), min(count, max(len(items), 1))
-    before = set(active_children())
-    with _one_thread():
-        while todo:
-            pool = ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_prepare_process)
-            try:
-                yield from _run_in_turn(pool, todo, count, place, force)
-            except BrokenProcessPool:
-                continue
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in set(active_children()) - before:  # when stopped, an item may have minutes to go
-                    process.terminate()
+    os.environ.update(dict.fromkeys(_ONE_THREAD.split(), "1"))
+    todo, before = list(items), set(active_children())
+    while todo:
+        pool = ProcessPoolExecutor(min(count, len(todo)), get_context("spawn"), _prepare_process)
+        try:
+            futures = {pool.submit(run_item, item, place, force): item for item in todo}
+            for future in as_completed(futures):
+                if future.exception() is None:
+                    todo.remove(futures[future])
+                    yield future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(active_children()) - before:  # when stopped, an item may have minutes to go
+                process.terminate()
+        lost, todo = todo[:count], todo[count:]  # items begin in their order: the first of those left were running
+        yield from (fail(item, LostWorker.__name__, f"{item.session}: {_DIED}") for item in lost)
 
 
 def _run_on_scheduler(items: Sequence[Item], address: str, place: str, force: bool) -> Generator[Row]:
     """The same by the workers of a running Dask scheduler; `LostWorker` where it goes meanwhile."""
     try:
-        from distributed import Client
+        from distributed import Client, KilledWorker
     except ImportError as error:
         remedy = how_to_install("dask", "distributed")
         raise BadOption(f"wepose batch --scheduler: {error}: {remedy}") from None
@@ -123,39 +126,17 @@ def _run_on_scheduler(items: Sequence[Item], address: str, place: str, force: bo
     except (OSError, ValueError, TypeError) as error:
         raise BadOption(f"--scheduler {address}: no scheduler there, as in tcp://HOST:8786: {reason(error)}") from None
     with client, client.get_executor(pure=False) as executor:
-        try:
-            yield from _run_in_turn(executor, deque(items), len(items), place, force)
-        except CancelledError:
-            raise LostWorker(f"{address}: the scheduler is gone; the same command goes on where it stopped") from None
-
-
-def _run_in_turn(executor: Executor, todo: deque[Item], most: int, place: str, force: bool) -> Iterator[Row]:
-    """Rows of the items, at most so many at a time; those whose process died are `LostWorker`.
-
-    Processes that die end it with `BrokenProcessPool`; `todo` has the items that were not begun.
-    """
-    running: dict[Future[Row], Item] = {}
-    broken: BrokenProcessPool | None = None
-    while running or (todo and broken is None):
-        while todo and len(running) < most and broken is None:
+        futures = {executor.submit(run_item, item, place, force): item for item in items}
+        for future in as_completed(futures):
             try:
-                running[executor.submit(run_item, todo[0], place, force)] = todo[0]
-                todo.popleft()
-            except BrokenProcessPool as died:
-                broken = died
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
-            item, error = running.pop(future), future.exception()
-            if error is None:
-                yield future.result()
-                continue
-            if isinstance(error, BrokenProcessPool):
-                broken = error
-            elif type(error).__name__ != "KilledWorker":  # Dask's, after several workers died at it
-                raise error
-            message = f"{item.session}: the process of this item, or of one beside it, died; it may lack memory"
-            yield describe(item) | fail(LostWorker.__name__, message)
-    if broken is not None:
-        raise broken
+                row = future.result()
+            except KilledWorker:  # after several workers died at it
+                row = fail(futures[future], LostWorker.__name__, f"{futures[future].session}: {_DIED}")
+            except CancelledError:
+                raise LostWorker(
+                    f"{address}: the scheduler is gone; the same command goes on where it stopped"
+                ) from None
+            yield row
 
 
 def _prepare_process() -> None:
@@ -169,16 +150,3 @@ def _prepare_process() -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=exit_with_parent, daemon=True).start()
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread a process, for those that are started meanwhile."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD.split()}
-    os.environ.update(dict.fromkeys(before, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name)
-            os.environ.update({} if value is None else {name: value})
