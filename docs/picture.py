@@ -25,7 +25,7 @@ CROP = (110, 30, 690, 553)  # [px] left, top, right, bottom: the person
 FPS = 12
 QUALITY = 60  # of WebP
 LEAD_S = 0.4  # [s] of rest shown before and after the circle
-HIDE = """for (const name of ['#bar', '#head']) document.querySelector(name).style.display = 'none';
+HIDE = """for (const name of ['#bar', '#head', '#angles']) document.querySelector(name).style.display = 'none';
 dispatchEvent(new Event('resize'));"""
 
 

@@ -22,6 +22,6 @@ else:
 result = wp.track(recording, subject)
 angles = wp.joint_angles(result)
 flexion = np.degrees(angles["right_elbow"]["flexion"])  # (n,)
-print(f"right elbow's flexion: {flexion.min():.1f} to {flexion.max():.1f} deg")
+print(f"right elbow's flexion: {flexion.min():.0f} to {flexion.max():.0f} deg")
 print(summary_table(angles).select("joint", "angle", "lowest_deg", "highest_deg", "range_deg"))
 result.plot().save("figures", force=True)

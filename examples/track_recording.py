@@ -26,6 +26,6 @@ reach = np.linalg.norm(result.points["right_palm"] - result.points["right_should
 print(f"segments: {', '.join(result.quat_WL)}")
 print(f"right hand from its shoulder: {reach.min():.3f} to {reach.max():.3f} m")
 flexion = np.degrees(wp.joint_angles(result)["right_elbow"]["flexion"])
-print(f"right elbow's flexion: {flexion.min():.1f} to {flexion.max():.1f} deg")
+print(f"right elbow's flexion: {flexion.min():.0f} to {flexion.max():.0f} deg")
 print(f"configuration of the Pinocchio model: {result.q.shape}, quaternions xyzw at the spherical joints")
 result.show(open=False).save("view.html", force=True)

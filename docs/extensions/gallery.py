@@ -19,9 +19,11 @@ from sphinx.errors import ExtensionError
 ROOT = Path(__file__).resolve().parents[2]
 LONGEST_S = 600
 WAITING = ("live_consumer.py", "robot_receiver.py")  # for ever, for a live session: their first line is shown
+PICTURES = {"move_robot": "robot.webp", "track_recording": "demo.webp"}  # of docs/, of what their pages show in 3D
 INDEX = """# Gallery
 
-Scripts of `examples/`, each run when this site was built, with what it printed and drew.
+Start from one of these scripts of `examples/`. Each was run when this site was built; its page has what it printed and
+drew.
 
 """
 
@@ -58,6 +60,8 @@ def write_page(script: Path, pages: Path, drawn: Path) -> str:
     parts = [f"# {first.rstrip('.')}", rest.strip("\n"), f"```python\n{body}\n```"]
     parts += [f"It prints:\n```text\n{printed.rstrip()}\n```"]
     line = f"- [{make_title(script)}]({script.stem}.md): {first}"
+    if script.stem in PICTURES:
+        line += f"\n\n  ![{first}](../../{PICTURES[script.stem]})"
     for file in sorted((drawn / script.stem).rglob("*.*")):
         address = f"../../{file.relative_to(drawn.parent).as_posix()}"
         if file.suffix == ".html":
