@@ -24,7 +24,12 @@ SAYS = {
     "track_recording.py": "right hand from its shoulder",
     "udp_sender.py": "sent 200 samples of each of 5 sensors to 127.0.0.1:9000",
 }
-WRITES = {"joint_angles.py": {"figures"}, "move_robot.py": {"view.html"}, "track_recording.py": {"view.html"}}
+WRITES = {
+    "estimate_orientation.py": {"errors.svg"},
+    "joint_angles.py": {"figures"},
+    "move_robot.py": {"view.html"},
+    "track_recording.py": {"view.html"},
+}
 LONGEST = ("calibrate_subject.py", "joint_angles.py", "move_robot.py", "track_recording.py")
 
 
