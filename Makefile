@@ -33,7 +33,7 @@ SEEDS ?= 0:1000
 recordings: $(READY)      ## random recordings of ordinary behaviour, SEEDS=0:1000; goes on where it was stopped
 	$(BIN)/python tests/random_recordings/run.py --seeds $(SEEDS) --jobs 2
 
-BENCH ?= filters calibration
+BENCH ?= filters
 bench: $(PEERS_READY)     ## speed and accuracy on this machine; BENCH="live" and others: python -m benchmarks --help
 	$(BIN)/python -m benchmarks $(BENCH)
 

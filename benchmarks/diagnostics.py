@@ -9,11 +9,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from wepose_pin.calibration import Calibration, calibrate
+from wepose_pin.calibration import calibrate
 from wepose_pin.diagnostics import INFO, Diagnostic, render_all
 from wepose_pin.errors import BadOption, WeposeError
 from wepose_pin.readers import load_session
@@ -37,30 +37,13 @@ class Shown(NamedTuple):
     good: bool  # recorded as the guide says, with a calibration that passes where there is one
 
 
-class Size(NamedTuple):
-    """What a user measures of a person who calibrates."""
-
-    measured: Mapping[str, float]  # [m], with the stature where it is known
-    sex: Literal["f", "m"]
-
-    def calibrate(self, recording: Recording) -> Calibration:
-        """Calibrate by the recording's joined hands."""
-        stature = self.measured.get("stature")
-        return calibrate(
-            recording,
-            measured={name: metres for name, metres in self.measured.items() if name != "stature"},
-            stature=stature,
-            sex=self.sex if stature else None,
-        )
+def sections(quick: bool) -> list[Section]:
+    """List the functions that measure."""
+    return [partial(measure_diagnostics, FEW_RECORDINGS if quick else RECORDINGS)]
 
 
-def sections(quick: bool) -> dict[str, Section]:
-    """Name → a function that measures it."""
-    return {"diagnostics": partial(measure, FEW_RECORDINGS if quick else RECORDINGS)}
-
-
-def measure(recordings: int) -> Table:
-    """Share of recordings in which each diagnostic appears."""
+def measure_diagnostics(recordings: int) -> Table:
+    """Measure the share of recordings in which each diagnostic appears."""
     half = recordings // 2
     shown = [*_show_random(recordings - half), *_show_people(half)]
     table = Table(
@@ -109,8 +92,7 @@ def _show_random(recordings: int) -> Iterator[Shown]:
             recording = load_session(adapter.write_session(Path(folder), record(case), case.layout, case.clock.unit))
         begin, end = case.stood
         is_good = not case.begins_in_motion and end - begin >= GOOD_START_S and set(case.worn) >= set(CORE)
-        size = Size(case.measured, case.person.sex)
-        yield from _show(recording, is_good, size if case.clasp else None)
+        yield from _show(recording, is_good, (case.measured, case.person.sex) if case.clasp else None)
 
 
 def _show_people(recordings: int) -> Iterator[Shown]:
@@ -127,17 +109,19 @@ def _show_people(recordings: int) -> Iterator[Shown]:
                 simulation = simulate_activity(activity, seed=seed, imperfections=sizes, seconds=ACTIVITY_S)
         except BadOption:  # arms that do not reach through the motion that was drawn
             continue
-        size = Size({**person.measured, "stature": person.stature}, "f" if person.sex == "f" else "m")
+        size = {**person.measured, "stature": person.stature}, person.sex
         recording = replace(simulation.recording(), model="" if calibrates else ACTIVITIES[activity].body)
         yield from _show(recording, True, size if calibrates else None)
 
 
-def _show(recording: Recording, is_good: bool, size: Size | None) -> Iterator[Shown]:
-    """Calibrate where the person's size is given, then track."""
+def _show(recording: Recording, is_good: bool, size: tuple[Mapping[str, float], Any] | None) -> Iterator[Shown]:
+    """Calibrate where the person's measured lengths [m], with the stature if it is known, and sex are given; track."""
     calibration = None
     try:
         if size is not None:
-            calibration = size.calibrate(recording)
+            measured, sex = dict(size[0]), size[1]
+            stature = measured.pop("stature", None)
+            calibration = calibrate(recording, measured=measured, stature=stature, sex=sex if stature else None)
             is_good = is_good and calibration.quality.quality == "pass"
             yield Shown("calibrate", calibration.diagnostics, is_good)
         yield Shown("track", track(recording, calibration, accept_failed=True).diagnostics, is_good)

@@ -43,8 +43,8 @@ class Case(NamedTuple):
         return f"{self.preset} {self.activity}, {self.gyroscope} gyroscopes, {accelerometer}, {self.rate_hz:g} Hz"
 
 
-def sections(quick: bool) -> dict[str, Section]:
-    """Name → a function that measures it; `quick`: one seed, 100 Hz, no ideal people, less sitting."""
+def sections(quick: bool) -> list[Section]:
+    """List the functions that measure; `quick`: one seed, 100 Hz, no ideal people, no sitting."""
     activities = ("walk", "run", "throw", "tasks", "clasp", *(() if quick else ("sit",)))
     cases = [
         Case(preset, activity, gyroscope, averaged, rate_hz)
@@ -55,11 +55,11 @@ def sections(quick: bool) -> dict[str, Section]:
         for rate_hz in ((100.0,) if quick else (50.0, 100.0, 400.0))
         if not quick or averaged == (activity in ("run", "throw"))
     ]
-    return {"harm": partial(measure_harm, cases, range(1, 2 if quick else 4))}
+    return [partial(measure_harm, cases, range(1, 2 if quick else 4))]
 
 
 def measure_harm(cases: list[Case], seeds: range) -> Table:
-    """Each case by each way of tracking."""
+    """Measure each case by each way of tracking."""
     table = Table(
         f"Headings with and without correction: {len(seeds)} people a row, {SECONDS:g} s each",
         (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import importlib
-import math
 import os
 import subprocess
 import sys
@@ -23,7 +22,6 @@ from wepose_pin.live.outputs import UdpOutput
 from wepose_pin.live.robot import RobotOptions, RobotOutput, connect_robot
 from wepose_pin.live.sources.replay import ReplaySource
 from wepose_pin.recording import Recording
-from wepose_pin.recording.arrivals import Samples
 from wepose_pin.retargeting import find_map, load_robot
 from wepose_pin.simulation import simulate, simulate_person
 
@@ -70,14 +68,13 @@ class _Meter(Output):
         self.after = now
 
 
-def sections(quick: bool) -> dict[str, Section]:
-    """Name → a function that measures it."""
-    seconds = 30.0 if quick else 300.0
-    return {"live session": partial(live_session, seconds), "live samples": partial(live_samples, seconds)}
+def sections(quick: bool) -> list[Section]:
+    """List the functions that measure."""
+    return [partial(measure_live_session, 30.0 if quick else 300.0)]
 
 
-def live_session(seconds: float) -> Table:
-    """Loop and file, page and robot for `seconds` each."""
+def measure_live_session(seconds: float) -> Table:
+    """Measure loop and file, page and robot for `seconds` each."""
     recording = _recording(seconds)
     table = Table(
         f"A live session: five sensors at {RATE_HZ:g} Hz for {seconds:g} s, replayed at their own pace",
@@ -116,45 +113,6 @@ def live_session(seconds: float) -> Table:
         "Other work on the machine shows in the 99th percentile first: after the measurement "
         f"{load:.1f} programs waited for each core. Processor time is that of all threads, robot and page included."
     )
-    return table
-
-
-class _OneByOne(ReplaySource):
-    """A replay, a sample of each sensor a read, that notes the processor time from one read to the next."""
-
-    def __init__(self, recording: Recording) -> None:
-        super().__init__(recording, math.inf, block=1)
-        self.busy_s: list[float] = []
-        self._since: float | None = None
-
-    def read(self, timeout_s: float) -> list[Samples] | None:
-        if self._since is not None:
-            self.busy_s.append(time.thread_time() - self._since)
-        samples = super().read(timeout_s)
-        self._since = time.thread_time()
-        return samples
-
-
-def live_samples(seconds: float) -> Table:
-    """Processor time that the loop takes for a sample of all sensors; other programs matter little."""
-    recording = _recording(seconds)
-    columns = (
-        *(Column(f"p{share:g}", f"{share:g} % of samples under [ms]", 3) for share in (50.0, 99.0, 99.9)),
-        Column("longest", "longest [ms]", 2),
-    )
-    table = Table(f"Processor time of the loop for a sample: five sensors at {RATE_HZ:g} Hz, {seconds:g} s", columns)
-    for row, outputs in (
-        ("poses and file", []),
-        ("and UDP", [UdpOutput("9")]),
-    ):
-        source = _OneByOne(recording)
-        with tempfile.TemporaryDirectory() as folder:
-            setup = SensorSetup.from_recording(recording)
-            run_session(source, setup, record=Path(folder) / "a.mcap", outputs=outputs)
-        busy_ms = 1e3 * np.array(source.busy_s[round(10.0 * RATE_HZ) :])  # after the start pose
-        table.rows[row] = {column.key: float(np.percentile(busy_ms, float(column.key[1:]))) for column in columns[:3]}
-        table.rows[row]["longest"] = float(busy_ms.max())
-    table.notes.append("A pose is late by what the samples before it take longer than the time between two samples.")
     return table
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from benchmarks.trials import RING_SEGMENTS, RingFiles
+from benchmarks.trials import RING_FILES, RING_SEGMENTS
 from benchmarks.validation import real
 
 START_S = 0.7  # until seg1 is taken up; nothing moves before
@@ -95,9 +95,9 @@ class RingSession(NamedTuple):
     known: np.ndarray  # (m,) bool
 
 
-def write_ring_session(files: RingFiles, mount: str, folder: Path) -> RingSession:
+def write_ring_session(trial: Path, mount: str, folder: Path) -> RingSession:
     """Write the trial as a session with a table and a protocol, the optical system's places as its truth."""
-    chain, registered = real.register_ring(files.folder)
+    chain, registered = real.register_ring(trial)
     links = real.fit_optical_links(chain)
     registration = registered[mount, "seg1"]
     known = np.isfinite(chain.quat_VB["seg1"]).all(axis=1)
@@ -134,7 +134,7 @@ def write_ring_session(files: RingFiles, mount: str, folder: Path) -> RingSessio
         angles = angles if len(axes) > 1 else [angles["xyz".index(axes)]]
         joints |= {f"{segment}_{axis}": float(angle) for axis, angle in zip(axes, angles, strict=True)}
         above = own
-    shutil.copyfile(files.imu[mount], folder / "imu.csv")
+    shutil.copyfile(trial / RING_FILES[mount], folder / "imu.csv")
     sensors = ""
     for segment in RING_SEGMENTS:
         sensors += f"[sensors.{segment}]\n"

@@ -54,16 +54,13 @@ NOTE = (
 )
 
 
-def sections(quick: bool, data: Path | None, robots: Sequence[str] = ()) -> dict[str, Section]:
-    """Name → a function that measures it; `robots`: those of the package without any."""
+def sections(quick: bool, data: Path | None, robots: Sequence[str] = ()) -> list[Section]:
+    """List the functions that measure; `robots`: those of the package without any."""
     if data is None or not (data / SESSION).is_file():
         raise BadOption(f"--data {data}: robots follow the recording {SESSION}, which is not there")
     interval = QUICK_INTERVAL if quick else None
     names = tuple(robots) or ROBOTS
-    return {
-        "robots": partial(measure_offline, data / SESSION, names, interval),
-        "robots live": partial(measure_live, data / SESSION, names, interval),
-    }
+    return [partial(measure, data / SESSION, names, interval) for measure in (measure_offline, measure_live)]
 
 
 def measure_offline(session: Path, robots: Sequence[str], interval: tuple[float, float] | None) -> Table:

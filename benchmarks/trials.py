@@ -21,7 +21,9 @@ from wepose_pin.errors import BadData, MissingFile
 from wepose_pin.readers.arrays import read_mat
 
 RING_SEGMENTS = ("seg1", "seg2", "seg3", "seg4", "seg5")
-RING_MOUNTS = ("rigid", "loose")
+RING = Path("ring") / "trial1"
+RING_FILES = {"rigid": "imu_rigid.csv", "loose": "imu_nonrigid.csv"}  # by mount
+RING_MOUNTS = tuple(RING_FILES)
 
 
 class Trial(NamedTuple):
@@ -117,85 +119,13 @@ class Chain(NamedTuple):
     quat_VB: dict[str, np.ndarray]  # segment → (m, 4) xyzw; NaN: missing
 
 
-class RingFiles(NamedTuple):
-    """The files of a trial of the RING chain."""
-
-    folder: Path
-    omc: Path
-    imu: dict[str, Path]  # by mount, of `RING_MOUNTS`
+def list_ur5(data: Path) -> list[tuple[str, str]]:
+    """List the recordings of a UR5 arm in ``ur5/``, recording and sensor: ``imu/RECORDING/SENSOR_adx.csv``."""
+    files = sorted((data / "ur5" / "imu").glob("*/*_adx.csv"))
+    return [(file.parent.name, file.stem.removesuffix("_adx")) for file in files]
 
 
-class Ur5Files(NamedTuple):
-    """The two files of an IMU on a UR5 arm."""
-
-    recording: str
-    sensor: str
-    imu: Path
-    encoder: Path
-
-
-def find_ring(data: Path) -> list[RingFiles]:
-    """Find trials of the RING chain below a folder by their columns: a folder with one optical file and IMU files.
-
-    Which of two IMU files is that of the loose mounts their names say (``nonrigid``, ``loose`` or ``foam``).
-    """
-    trials = []
-    for folder, files in _by_folder(data).items():
-        optical = [file for file, names in files.items() if {"seg1_quat_w", "seg1_marker1_x"} <= names]
-        imus = [file for file, names in files.items() if {"seg1_gyr_x", "seg1_acc_x"} <= names]
-        loose = [file for file in imus if any(word in file.stem.lower() for word in ("nonrigid", "loose", "foam"))]
-        rigid = [file for file in imus if file not in loose]
-        if len(optical) == 1 and len(rigid) <= 1 and len(loose) <= 1 and imus:
-            imu = dict(zip(RING_MOUNTS, ([*rigid, None][0], [*loose, None][0]), strict=True))
-            trials.append(
-                RingFiles(folder, optical[0], {mount: file for mount, file in imu.items() if file is not None})
-            )
-    return trials
-
-
-def find_ur5(data: Path) -> list[Ur5Files]:
-    """Find IMUs on a UR5 arm below a folder by their columns, each with the encoders' file of its sensor.
-
-    The pair shares the recording's folder name and how the sensor's name begins: ``…/circle-100/carpus_adx.csv`` and
-    ``…/circle-100/carpus.csv``, in one folder or in two of that name.
-    """
-    imus, encoders = [], []
-    for files in _by_folder(data).values():
-        imus += [f for f, names in files.items() if {"gyr_x", "gyr_y", "gyr_z", "acc_x", "acc_y", "acc_z"} <= names]
-        encoders += [f for f, names in files.items() if {"TIME", "QUATERNION_0", "QUATERNION_3"} <= names]
-    trials = []
-    for imu in imus:
-        same = [e for e in encoders if e.parent.name == imu.parent.name and imu.stem.startswith(e.stem)]
-        if same:  # the nearest of several data sets
-            nearest = max(same, key=lambda e: sum(a == b for a, b in zip(e.parts, imu.parts, strict=False)))
-            trials.append(Ur5Files(imu.parent.name, nearest.stem, imu, nearest))
-    return trials
-
-
-def _by_folder(data: Path) -> dict[Path, dict[Path, set[str]]]:
-    """List folder → CSV file → its columns, of all below a folder, in the order of their names."""
-    folders: dict[Path, dict[Path, set[str]]] = {}
-    for file in sorted(data.rglob("*.csv")):
-        folders.setdefault(file.parent, {})[file] = _column_names(file)
-    return folders
-
-
-def _column_names(path: Path) -> set[str]:
-    """Read the column names of a CSV; empty: it cannot be read."""
-    try:
-        if not path.is_file():  # a pipe would block
-            return set()
-        with path.open(encoding="utf-8", errors="replace") as lines:
-            for _ in range(5):
-                line = lines.readline(100_000)
-                if line and not line.startswith("#"):
-                    return {name.strip().strip('"') for name in line.split(",")}
-    except OSError:
-        pass
-    return set()
-
-
-def read_ring(files: RingFiles) -> Chain:
+def read_ring(folder: Path) -> Chain:
     """Read a trial of the RING chain: ``imu_rigid.csv``, ``imu_nonrigid.csv`` (40 Hz), ``omc.csv`` (30 Hz).
 
     The optical system lost all segments at once, some 0.35 s each two or three seconds. The file has straight lines in
@@ -208,7 +138,7 @@ def read_ring(files: RingFiles) -> Chain:
         A file is not there; is none of RING's.
     """
     quat_VB, origin_V = {}, {}
-    omc = files.omc
+    omc = folder / "omc.csv"
     table, rate_hz = read_table(omc), _stated_rate(omc)
     for segment, marker in zip(RING_SEGMENTS, (2, 2, 1, 2, 4), strict=True):  # the origins of arm.xml
         names = [f"{segment}_quat_{axis}" for axis in "wxyz"], [f"{segment}_marker{marker}_{axis}" for axis in "xyz"]
@@ -222,7 +152,8 @@ def read_ring(files: RingFiles) -> Chain:
         origin_V[segment][~seen] = np.nan
     time = np.arange(len(seen)) / rate_hz
     sensors = {}
-    for mount, path in files.imu.items():
+    for mount, file in RING_FILES.items():
+        path = folder / file
         table, imu_hz = read_table(path), _stated_rate(path)
         for segment in RING_SEGMENTS:
             gyro, accel = (
@@ -254,8 +185,8 @@ def _complete(samples: np.ndarray, path: Path) -> np.ndarray:
     return samples
 
 
-def read_ur5(files: Ur5Files) -> Referenced:
-    """Read an IMU on a UR5 arm, and the encoders' orientations of its link.
+def read_ur5(data: Path, recording: str, sensor: str) -> Referenced:
+    """Read an IMU on a UR5 arm, and the encoders' orientations of its link, of one of `list_ur5`.
 
     Line k of the one was taken with line k of the other, 125 times a second. The static phase ends 0.1 s before the
     body has turned by 0.3 deg (the encoders' own jitter is a tenth of that).
@@ -265,7 +196,8 @@ def read_ur5(files: Ur5Files) -> Referenced:
     MissingFile, UnknownColumn, BadData
         A file is not there; is none of this data set's.
     """
-    recording, sensor, imu, encoder = files
+    imu = data / "ur5" / "imu" / recording / f"{sensor}_adx.csv"
+    encoder = data / "ur5" / "encoder" / recording / f"{sensor}.csv"
     measured, true = read_table(imu), read_table(encoder)
     gyro, accel = (
         _complete(read_columns(measured, [f"{kind}_{axis}" for axis in "xyz"], str(imu), sensor), imu)

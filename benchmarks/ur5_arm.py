@@ -12,7 +12,7 @@ import pinocchio as pin
 import polars as pl
 from scipy.spatial.transform import Rotation
 
-from benchmarks.trials import find_ur5, read_ur5
+from benchmarks.trials import list_ur5, read_ur5
 from benchmarks.validation.real import UR5_EXCLUDED
 from wepose_pin.body import BodyModel
 from wepose_pin.recording import CONFIGURATION, ImuSensor, Recording
@@ -84,15 +84,14 @@ def write_ur5_session(data: Path, run: str, folder: Path) -> dict[str, Rotation]
     The encoders' frames equal each other at the start, where the arm stands upright; their x is W's y there. That their
     joint angles, taken so, have the tool drawn in a plane to 0.1 mm is what says that the start is `UPRIGHT`.
     """
-    files = [each for each in find_ur5(data) if each.recording == run and (run, each.sensor) not in UR5_EXCLUDED]
-    trials = {each.sensor: read_ur5(each) for each in files}
+    sensors = [sensor for of, sensor in list_ur5(data) if of == run and (run, sensor) not in UR5_EXCLUDED]
+    trials = {sensor: read_ur5(data, run, sensor) for sensor in sensors}
     table: dict[str, np.ndarray] = {}
     text, truth = "", {}
     for sensor, trial in trials.items():
         for kind, values in (("gyr", trial.gyro_S), ("acc", trial.accel_S)):
             table |= {f"{sensor}_{kind}_{axis}": values[:, k] for k, axis in enumerate("xyz")}
-        columns = ({kind: [f"{sensor}_{kind}_{axis}" for axis in "xyz"]} for kind in ("gyr", "acc"))
-        gyro, accel = (json.dumps(next(iter(each.values()))) for each in columns)
+        gyro, accel = (json.dumps([f"{sensor}_{kind}_{axis}" for axis in "xyz"]) for kind in ("gyr", "acc"))
         text += f'[sensors.{MARKED[sensor]}]\ngyro = {gyro}\naccel = {accel}\nmount = {{ up = "-y", forward = "-x" }}\n'
         R_WB = Rotation.from_euler("z", np.pi / 2.0) * Rotation.from_quat(trial.quat_VB)
         start = R_WB[trial.static].mean()

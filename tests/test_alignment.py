@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from simulated import estimate_segments
 
 import wepose_pin as wp
+from benchmarks.validation.single import simulate_paper_dynamic
 from wepose_pin.body.mounts import MOUNT_MOVED_STDS, collect_nominal_mounts, compute_heading_offset
 from wepose_pin.body.start_pose import N_POSE
 from wepose_pin.body.subject import StartPoseOffset, Subject, mount_rows, population_subject
@@ -18,7 +19,7 @@ from wepose_pin.errors import BadPhase, BadSession
 from wepose_pin.evaluation import uncertainty
 from wepose_pin.filters.phases import COMMON_RATE
 from wepose_pin.recording import ImuSensor, OrientationSensor, Recording, compute_mount, find_mount_axes
-from wepose_pin.simulation import Person, Simulation, simulate_paper_dynamic
+from wepose_pin.simulation import Person, Simulation
 from wepose_pin.tracking.segment_orientations import compute_soft_tissue_covariances
 
 

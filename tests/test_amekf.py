@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.trials import read_broad
+from benchmarks.validation.single import simulate_paper_dynamic
 from wepose_pin import rotations
 from wepose_pin.errors import BadOption, WeposeWarning
 from wepose_pin.evaluation import attitude_error, uncertainty
@@ -26,7 +27,7 @@ from wepose_pin.filters import (
 from wepose_pin.filters.amekf import BLOCK, ERROR, STATES, fill_transition_rows
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector
-from wepose_pin.simulation import IDEAL_PRESET, MILD_PRESET, simulate_paper_dynamic
+from wepose_pin.simulation import IDEAL_PRESET, MILD_PRESET
 
 RATE = 100.0
 GRAVITY = 9.81

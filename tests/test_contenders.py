@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validation import gains as tuning
 from benchmarks.validation.contenders import DEFAULT_GAINS, Contender, list_contenders
 from benchmarks.validation.experiment import align_rotation
-from benchmarks.validation.gains import STATED, compute_rmse, list_trials
+from benchmarks.validation.single import SingleSensor, simulate_paper_dynamic
 from wepose_pin.evaluation import attitude_error
-from wepose_pin.filters import GdcParams, NcfParams
 from wepose_pin.filters.noise import estimate_noise
-from wepose_pin.simulation import SingleSensor, simulate_paper_dynamic
 
 SETTING = "simulated 100 Hz"
 ALL = list_contenders(SETTING)
@@ -61,31 +56,3 @@ def test_the_bias_is_removed_for_all_but_as_it_comes(contender: Contender, senso
         assert apart > 20.0
     else:
         assert apart < (0.05 if contender.label == "imufusion" else 1e-4)  # that one counts in single precision
-
-
-@pytest.mark.peer
-@pytest.mark.parametrize("setting", STATED)
-def test_the_stated_gains_are_the_best_around(setting: str, request: pytest.FixtureRequest) -> None:
-    """No neighbour on the grid is better, and the grid goes on beyond them; "gains" searches all of it."""
-    folder: Path | None = None
-    if setting.startswith("BROAD"):
-        folder = request.getfixturevalue("data")
-        if not any((folder / "broad").glob("*.mat")):
-            pytest.skip(f"no real recordings at {folder / 'broad'}")
-    trials = list_trials(setting, folder)
-
-    def score(params: NcfParams | GdcParams) -> float:
-        return float(np.mean([compute_rmse(trial, params) for trial in trials]))
-
-    def around(axis: tuple[float, ...], value: float) -> list[float]:
-        at = axis.index(value)
-        assert at < len(axis) - 1, f"{value} is the end of the grid"
-        return [float(point) for point in axis[max(at - 1, 0) : at + 2]]
-
-    ncf, gdc = STATED[setting]
-    neighbours: list[NcfParams | GdcParams] = [
-        NcfParams(*point)
-        for point in product(around(tuning.PROPORTIONAL, ncf.proportional), around(tuning.INTEGRAL, ncf.integral))
-    ]
-    assert score(ncf) <= min(score(params) for params in neighbours) + 1e-6
-    assert score(gdc) <= min(score(GdcParams(gain)) for gain in around(tuning.DESCENT, gdc.gain)) + 1e-6

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.trials import read_authors_trial
+from benchmarks.validation.single import simulate_paper_dynamic
 from wepose_pin.errors import BadData, BadOption, BadPhase
 from wepose_pin.filters import (
     METHODS,
@@ -27,7 +28,6 @@ from wepose_pin.filters import (
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.recording import ImuSensor, Recording
 from wepose_pin.rotations import quat_from_gravity
-from wepose_pin.simulation import simulate_paper_dynamic
 
 RATE = 100.0
 GRAVITY = 9.81

@@ -12,6 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from simulated import SUBJECT, G, multiply
 
+from benchmarks.validation.single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
 from wepose_pin.readers import load_session
 from wepose_pin.recording import ImuSensor, Recording, compute_mount
 from wepose_pin.simulation import (
@@ -21,10 +22,7 @@ from wepose_pin.simulation import (
     SEGMENTS,
     Imperfections,
     Simulation,
-    SingleSensor,
     simulate,
-    simulate_paper_drift,
-    simulate_paper_dynamic,
 )
 from wepose_pin.writers import write_session
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +12,6 @@ from benchmarks.trials import (
     RING_MOUNTS,
     RING_SEGMENTS,
     Referenced,
-    RingFiles,
-    Ur5Files,
-    find_ring,
-    find_ur5,
     read_broad,
     read_ring,
     read_ur5,
@@ -24,25 +19,13 @@ from benchmarks.trials import (
 from benchmarks.validation import real
 from benchmarks.validation.experiment import run_experiment
 from benchmarks.validation.registration import register_sensors
+from benchmarks.validation.single import SingleSensor, simulate_paper_dynamic
 from wepose_pin.errors import BadData, MissingFile, UnknownColumn
-from wepose_pin.simulation import SingleSensor, simulate_paper_dynamic
 
 # What the simulated sensor and its reference lie apart by.
 OFFSET_S = -0.028
 R_BS = Rotation.from_rotvec([8.0, -3.0, 95.0], degrees=True)
 R_VW = Rotation.from_rotvec([0.0, 0.0, 130.0], degrees=True) * Rotation.from_rotvec([0.9, -0.5, 0.0], degrees=True)
-
-
-def ring_files(folder: Path) -> RingFiles:
-    """As the data set names them."""
-    imu = dict(zip(RING_MOUNTS, (folder / "imu_rigid.csv", folder / "imu_nonrigid.csv"), strict=True))
-    return RingFiles(folder, folder / "omc.csv", imu)
-
-
-def ur5_files(folder: Path, recording: str, sensor: str) -> Ur5Files:
-    """As the data set names them."""
-    imu, encoder = folder / "imu" / recording / f"{sensor}_adx.csv", folder / "encoder" / recording / f"{sensor}.csv"
-    return Ur5Files(recording, sensor, imu, encoder)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +72,7 @@ def test_what_cannot_be_registered_is_said(moving: SingleSensor) -> None:
 
 
 def test_ring_is_read_as_it_is(data: Path) -> None:
-    chain = read_ring(ring_files(data / "ring" / "trial1"))
+    chain = read_ring(data / "ring" / "trial1")
     assert set(chain.sensors) == {(mount, segment) for mount in RING_MOUNTS for segment in RING_SEGMENTS}
     lost = [np.isnan(quat).any(axis=1) for quat in chain.quat_VB.values()]
     assert all(np.array_equal(lost[0], each) for each in lost)
@@ -134,7 +117,7 @@ def test_link_lengths_from_orientations_and_tip(data: Path) -> None:
 
 def test_ur5_is_read_as_it_is(data: Path) -> None:
     for recording, sensor, begins_s in (("circle-100", "carpus", 0.9), ("triangle-250", "radius", 4.2)):
-        trial = read_ur5(ur5_files(data / "ur5", recording, sensor))
+        trial = read_ur5(data, recording, sensor)
         assert trial.rate_hz == pytest.approx(125.0)
         assert trial.static.stop / trial.rate_hz == pytest.approx(begins_s, abs=0.3)
         at_rest = np.linalg.norm(trial.accel_S[trial.static], axis=1).mean()
@@ -166,36 +149,12 @@ def test_broad_needs_no_registration(data: Path) -> None:
 
 def test_broken_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(MissingFile, match=r"omc\.csv"):
-        read_ring(ring_files(tmp_path))
+        read_ring(tmp_path)
     with pytest.raises(MissingFile, match=r"carpus_adx\.csv"):
-        read_ur5(ur5_files(tmp_path, "circle-250", "carpus"))
+        read_ur5(tmp_path, "circle-250", "carpus")
     (tmp_path / "omc.csv").write_text("a,b\n1,2\n")
     with pytest.raises(BadData, match=r"omc\.csv: begins with 'a,b'.*sampling frequency"):
-        read_ring(ring_files(tmp_path))
+        read_ring(tmp_path)
     (tmp_path / "omc.csv").write_text("# sampling frequency: 30\na,b\n1,2\n")
     with pytest.raises(UnknownColumn, match=r"no column 'seg1_quat_w' in .*omc\.csv"):
-        read_ring(ring_files(tmp_path))
-
-
-def test_files_are_found_by_their_columns_wherever_they_lie(data: Path, tmp_path: Path) -> None:
-    """Another folder's name, other files' names, all in one place, among what is none of them."""
-    assert find_ring(data) == [ring_files(data / "ring" / "trial1")]
-    known = {(files.recording, files.sensor): files for files in find_ur5(data)}
-    assert len(known) == 8
-    assert known["circle-250", "radius"] == ur5_files(data / "ur5", "circle-250", "radius")
-    place = tmp_path / "what the student" / "sent"
-    place.mkdir(parents=True)
-    for old, new in (("imu_rigid", "Rigid IMUs"), ("imu_nonrigid", "imu LOOSE"), ("omc", "optical")):
-        shutil.copyfile(data / "ring" / "trial1" / f"{old}.csv", place / f"{new}.csv")
-    run = tmp_path / "robot" / "monday"
-    run.mkdir(parents=True)
-    shutil.copyfile(data / "ur5" / "imu" / "circle-250" / "carpus_adx.csv", run / "carpus_adx.csv")
-    shutil.copyfile(data / "ur5" / "encoder" / "circle-250" / "carpus.csv", run / "carpus.csv")
-    (run / "notes.csv").write_text("a,b\n1,2\n")
-    (run / "damaged.csv").write_bytes(b"\xff\xfe\x00")
-    (run / "folder.csv").mkdir()
-    jobs = real.list_experiments(tmp_path)
-    assert [job.name for job in jobs["UR5"]] == ["monday carpus"]
-    assert [job.name for job in jobs["RING, loose mounts"]] == [f"sent {segment}" for segment in RING_SEGMENTS]
-    assert find_ring(tmp_path)[0].imu["loose"].name == "imu LOOSE.csv"
-    assert read_ur5(find_ur5(tmp_path)[0]).static.stop > 50
+        read_ring(tmp_path)

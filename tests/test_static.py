@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.validation.single import simulate_paper_dynamic
 from wepose_pin.errors import BadOption
 from wepose_pin.filters import run_filter
 from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.filters.static import StaticDetector, StaticTest
-from wepose_pin.simulation import simulate_paper_dynamic
 
 RATE = 100.0
 # The paper's conditions alone, without (5) and (6)

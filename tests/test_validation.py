@@ -15,8 +15,7 @@ from benchmarks.validation import PAGE, RESULTS, format_results, list_experiment
 from benchmarks.validation.contenders import list_contenders
 from benchmarks.validation.experiment import Job, Result, run_experiment, summarize
 from benchmarks.validation.page import render_page
-from benchmarks.validation.presets import PRESETS
-from benchmarks.validation.simulated import MEASURED, calibrate_person, set_exact_mounts, switch_off
+from benchmarks.validation.simulated import MEASURED, PRESETS, calibrate_person, set_exact_mounts, switch_off
 from wepose_pin.errors import BadData, MissingFile
 from wepose_pin.simulation import IDEAL_PRESET, simulate, simulate_person
 
@@ -73,7 +72,7 @@ def test_the_trunk_is_measured_where_a_row_says_so() -> None:
 
 
 def test_every_imperfection_of_a_preset_is_in_one_group_of_the_budget() -> None:
-    for imperfections, _ in PRESETS.values():
+    for imperfections in PRESETS.values():
         groups = switch_off(imperfections)
         for field in fields(imperfections):
             if getattr(imperfections, field.name) != getattr(IDEAL_PRESET, field.name) and field.name != "sensor_place":
@@ -133,22 +132,23 @@ def test_some_experiments_replace_their_part_of_the_results(
 
     monkeypatch.setattr(
         "benchmarks.validation.list_experiments",
-        lambda *_: {"drift": [Job("0", score, (1.0,)), Job("1", fail, ())], "gains": [Job("0", fail, ())]},
+        lambda *_: {"drift": [Job("0", score, (1.0,)), Job("1", fail, ())], "UR5": [Job("0", fail, ())]},
     )
     monkeypatch.setattr("os.cpu_count", lambda: 1)
     results, page = tmp_path / "results.json", tmp_path / "page.md"
+    monkeypatch.setattr("benchmarks.validation.RESULTS", results)
+    monkeypatch.setattr("benchmarks.validation.PAGE", page)
     kept = {"BROAD": {"trials": 1, "skipped": {}, "versions": {}, "rows": {"smekf": {"total [deg]": [1, None, None]}}}}
     kept["BROAD"]["rows"]["amekf"] = {"total [deg]": [2, None, None]}  # type: ignore[index]
     results.write_text(format_results(kept))
-    options = ["--results", str(results), "--page", str(page)]
-    assert main(["validation", "--only", "drift", *options]) == 0
+    assert main(["validation", "--only", "drift"]) == 0
     assert list(json.loads(results.read_text())) == ["BROAD", "drift"]
     assert "1: not scored: no trial" in capsys.readouterr().out
     assert "|smekf|1.00|" in page.read_text()
-    assert main(["validation", "--only", "gains", *options]) == 2
-    assert "gains: nothing could be scored; no trial" in capsys.readouterr().err
-    assert main(["validation", "--only", "nothing", *options]) == 2
-    assert "no experiment begins so; there are: drift, gains" in capsys.readouterr().err
+    assert main(["validation", "--only", "UR5"]) == 2
+    assert "UR5: nothing could be scored; no trial" in capsys.readouterr().err
+    assert main(["validation", "--only", "nothing"]) == 2
+    assert "no experiment begins so; there are: drift, UR5" in capsys.readouterr().err
 
 
 def test_trials_that_are_none_are_named(tmp_path: Path) -> None:

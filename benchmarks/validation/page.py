@@ -12,7 +12,6 @@ from jinja2 import Environment, StrictUndefined
 from .contenders import DEFAULT, OURS
 
 TEMPLATE = Path(__file__).with_name("validation.md.j2")
-PROTOCOLS = Path(__file__).with_name("protocols.md")  # written by `python -m benchmarks protocols --page`
 # Lisini Baldi 2019: roll, pitch, yaw [deg] as mean ± std by rate; right hand [mm].
 PAPER_DYNAMIC = {
     ("ncf", "100 Hz"): ((2.23, 2.25), (2.70, 2.90), (2.42, 2.62)),
@@ -94,8 +93,7 @@ def render_page(content: Content) -> str:
         for experiment in content.values()
     )
     template = environment.from_string(TEMPLATE.read_text(encoding="utf-8"))
-    protocols = PROTOCOLS.read_text(encoding="utf-8")
-    text = template.render(table=table, in_short=in_short, has=has, versions=list(versions), protocols=protocols)
+    text = template.render(table=table, in_short=in_short, has=has, versions=list(versions))
     return re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
 
 

@@ -25,14 +25,12 @@ from wepose_pin.filters.noise import SensorNoise, estimate_noise
 from wepose_pin.simulation.imu import GRAVITY, MTI_3
 
 from ..trials import (
+    RING,
     RING_MOUNTS,
     RING_SEGMENTS,
     Chain,
     Referenced,
-    RingFiles,
-    Ur5Files,
-    find_ring,
-    find_ur5,
+    list_ur5,
     read_authors_trial,
     read_broad,
     read_ring,
@@ -70,25 +68,20 @@ def list_experiments(data: Path, quick: bool = False) -> dict[str, list[Job]]:
             Job(f"{begin:g} to {end:g} s", _authors, (authors, (begin, end)))
             for begin, end in AUTHORS_HALVES[: 1 if quick else None]
         ]
-    rings = find_ring(data)[few]
-    for mount, bias in product(RING_MOUNTS, ("", ", bias unknown")):
-        experiments[f"RING, {mount} mounts{bias}"] = [
-            Job(f"{ring.folder.name} {segment}", _ring, (ring, segment, mount, not bias))
-            for ring in rings
-            if mount in ring.imu
-            for segment in RING_SEGMENTS[few]
-        ]
-    for mount in RING_MOUNTS:
-        experiments[f"RING, link lengths, {mount} mounts"] = [
-            Job(ring.folder.name, compare_links, (ring, mount)) for ring in rings if mount in ring.imu
-        ]
-    ur5 = [files for files in find_ur5(data) if (files.recording, files.sensor) not in UR5_EXCLUDED]
-    experiments["UR5"] = [Job(f"{files.recording} {files.sensor}", _ur5, (files,)) for files in ur5[few]]
+    ring = data / RING
+    if ring.is_dir():
+        for mount, bias in product(RING_MOUNTS, ("", ", bias unknown")):
+            experiments[f"RING, {mount} mounts{bias}"] = [
+                Job(f"trial1 {segment}", _ring, (ring, segment, mount, not bias)) for segment in RING_SEGMENTS[few]
+            ]
+        for mount in RING_MOUNTS:
+            experiments[f"RING, link lengths, {mount} mounts"] = [Job("trial1", compare_links, (ring, mount))]
+    ur5 = [each for each in list_ur5(data) if each not in UR5_EXCLUDED][few]
+    experiments["UR5"] = [Job(" ".join(each), _ur5, (data, *each)) for each in ur5]
     experiments = {name: jobs for name, jobs in experiments.items() if jobs}
     if not experiments:
         raise MissingFile(
-            f"{data}: neither broad/*.mat nor wepose_hr/prova_HR.txt, nor files with the columns of RING or UR5 in it; "
-            f"see docs/validation.md"
+            f"{data}: neither broad/*.mat, wepose_hr/prova_HR.txt, {RING} nor ur5/imu in it; see docs/validation.md"
         )
     return experiments
 
@@ -142,29 +135,29 @@ def compute_errors(estimated: Rotation, true: Rotation, time: np.ndarray) -> dic
     }
 
 
-def _ring(files: RingFiles, segment: str, mount: str, bias_known: bool) -> list[Result]:
+def _ring(trial: Path, segment: str, mount: str, bias_known: bool) -> list[Result]:
     """Compute errors of one segment from 10 s on."""
-    chain, registered = register_ring(files.folder)
+    chain, registered = register_ring(trial)
     sensor, registration = chain.sensors[mount, segment], registered[mount, segment]
     noise = assume_noise(sensor.rate_hz, registration.gyro_bias if bias_known else None)
     return _score_reference(sensor, registration, noise)
 
 
-def _ur5(files: Ur5Files) -> list[Result]:
+def _ur5(data: Path, recording: str, sensor: str) -> list[Result]:
     """Compute errors from 10 s on; noise and bias are from the 0.6 s to 4 s before the arm moves.
 
     The tilt of the world comes out as 1.0 to 2.6 deg where it is one robot on one base: some 20 mg of error of the
     accelerometers are in it, and in the inclinations.
     """
-    trial = read_ur5(files)
+    trial = read_ur5(data, recording, sensor)
     (registration,) = register_sensors([trial], (0.0, UNSCORED_S))
     noise = estimate_noise(trial.gyro_S[trial.static], trial.accel_S[trial.static], trial.rate_hz)
     return _score_reference(trial, registration, noise)
 
 
-def compare_links(files: RingFiles, mount: str) -> list[Result]:
+def compare_links(trial: Path, mount: str) -> list[Result]:
     """Compare lengths of the chain's links, from contenders' orientations and the optical tip, with optical ones."""
-    chain, registered = register_ring(files.folder)
+    chain, registered = register_ring(trial)
     links = fit_optical_links(chain)
     orientations = []
     for segment in ("seg2", "seg3", "seg4"):
@@ -231,8 +224,7 @@ def fit_links(tip_W: np.ndarray, R_W2: Rotation, R_W3: Rotation, R_W4: Rotation)
 @lru_cache(maxsize=1)
 def register_ring(folder: Path) -> tuple[Chain, dict[tuple[str, str], Registration]]:
     """Register all ten sensors of the chain together: one clock, one optical world."""
-    (files,) = [files for files in find_ring(folder) if files.folder == folder]
-    chain = read_ring(files)
+    chain = read_ring(folder)
     return chain, dict(
         zip(chain.sensors, register_sensors(list(chain.sensors.values()), (0.0, UNSCORED_S)), strict=True)
     )

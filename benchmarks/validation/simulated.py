@@ -25,21 +25,26 @@ from wepose_pin.simulation import (
     CIRCLING_POINT,
     IDEAL_PRESET,
     MEASURED_LENGTHS,
+    MEASURED_STD,
+    PEOPLE_MEASURED_STD,
+    PEOPLE_PRESET,
     Imperfections,
     Person,
     Simulation,
-    SingleSensor,
     simulate,
-    simulate_paper_drift,
-    simulate_paper_dynamic,
+    simulate_person,
 )
+from wepose_pin.simulation import PRESETS as SIZES
 from wepose_pin.tracking import track
 
 from .contenders import DEFAULT, OURS, Contender, list_contenders
 from .experiment import Job, Result, align_rotation
-from .presets import PRESETS, UPPER_BODY, Preset
+from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
 
+UPPER_BODY = "upper body"  # the experiment, one of each preset: "upper body, mild"
 ARBITRARY_MOUNTING, ERROR_BUDGET = "arbitrary sensor mounting", "error budget"
+# W's x is where the torso faces in the start pose: one who faces elsewhere than the feet turns W and nothing else.
+PRESETS = SIZES | {"people": replace(PEOPLE_PRESET, start_heading_deg=0.0)}
 # Rows of the upper body that are no filters of their own.
 WITH_TRUNK = ", trunk measured"  # beside the shoulder width
 AS_COMMANDED = f"{DEFAULT}, mounts as stated"  # by the session, to the next axis, and the start pose
@@ -84,13 +89,12 @@ def list_experiments(quick: bool = False) -> dict[str, list[Job]]:
     for rate, rate_hz in RATES.items():
         add(f"dynamic {rate}", "dynamic", _dynamic, rate, rate_hz)
     add("drift", "drift", _drift)
-    for label, preset in PRESETS.items():
-        add(f"{UPPER_BODY}, {label}", UPPER_BODY, _upper_body, label, preset)
-    for label, preset in PRESETS.items():
-        if preset.imperfections != IDEAL_PRESET:
-            add(f"{ARBITRARY_MOUNTING}, {label}", ARBITRARY_MOUNTING, _arbitrary_mounting, preset)
-            if not quick:
-                add(f"{ERROR_BUDGET}, {label}", ERROR_BUDGET, _error_budget, preset)
+    for preset in PRESETS:
+        add(f"{UPPER_BODY}, {preset}", UPPER_BODY, _upper_body, preset)
+    for preset in ("mild", "people"):
+        add(f"{ARBITRARY_MOUNTING}, {preset}", ARBITRARY_MOUNTING, _arbitrary_mounting, preset)
+        if not quick:
+            add(f"{ERROR_BUDGET}, {preset}", ERROR_BUDGET, _error_budget, preset)
     return experiments
 
 
@@ -154,19 +158,19 @@ def _run_single(sensor: SingleSensor, setting: str) -> Iterator[tuple[str, Attit
 
 
 @lru_cache(maxsize=1)
-def _simulate_person(seed: int, preset: Preset) -> tuple[Person, Simulation]:
-    person = preset.sample_person(seed)
-    return person, simulate(person.lengths, seed=seed, imperfections=preset.imperfections)
+def _simulate_person(seed: int, preset: str, imperfections: Imperfections) -> tuple[Person, Simulation]:
+    person = simulate_person(seed, PEOPLE_MEASURED_STD if preset == "people" else MEASURED_STD)
+    return person, simulate(person.lengths, seed=seed, imperfections=imperfections)
 
 
-def _upper_body(seed: int, label: str, preset: Preset) -> list[Result]:
+def _upper_body(seed: int, preset: str) -> list[Result]:
     """Calibrate by each filter with a measured shoulder width and known mounts, then track six circles.
 
     smekf has a row for each part of the paper's protocol, one for the whole of it, and one with a measured trunk;
     amekf, the default, has one with the mounts that a session states, one as live, and one that enters as the filters
     of other packages do.
     """
-    person, simulation = _simulate_person(seed, preset)
+    person, simulation = _simulate_person(seed, preset, PRESETS[preset])
     recorded, truth = simulation.recording(), simulation.truth()
     circles = simulation.phases["circles"][0]
     exact, stated = set_exact_mounts(person.prior, simulation), person.prior
@@ -185,7 +189,7 @@ def _upper_body(seed: int, label: str, preset: Preset) -> list[Result]:
         figures = collect_hand_errors(evaluate(pose, truth, circles)) | compare_lengths(subject, person)
         results.append(Result(label, figures))
 
-    for contender in list_contenders(f"{UPPER_BODY}, {label}"):
+    for contender in list_contenders(f"{UPPER_BODY}, {preset}"):
         recording, method = orient_recording(recorded, contender)
         subject = calibrate_person(recording, person, method, exact)
         score(contender.label, recording, subject, method)
@@ -205,10 +209,9 @@ def _upper_body(seed: int, label: str, preset: Preset) -> list[Result]:
     return results
 
 
-def _arbitrary_mounting(seed: int, preset: Preset) -> list[Result]:
+def _arbitrary_mounting(seed: int, preset: str) -> list[Result]:
     """Calibrate without stated mounts, then track six circles."""
-    person = preset.sample_person(seed)
-    simulation = simulate(person.lengths, seed=seed, imperfections=replace(preset.imperfections, mount="any"))
+    person, simulation = _simulate_person(seed, preset, replace(PRESETS[preset], mount="any"))
     recording, truth = simulation.recording(), simulation.truth()
     results = []
     for method, extra in ((DEFAULT, ""), (DEFAULT, WITH_TRUNK), (OURS, "")):
@@ -250,12 +253,12 @@ def compute_mount_errors(subject: Subject, simulation: Simulation) -> np.ndarray
     return np.array(errors)
 
 
-def _error_budget(seed: int, preset: Preset) -> list[Result]:
+def _error_budget(seed: int, preset: str) -> list[Result]:
     """Run smekf with one group of imperfections switched off, or one part known exactly, at a time."""
     results = []
-    full = preset.imperfections
+    full = PRESETS[preset]
     for label, imperfections in (dict.fromkeys(CHAIN_PARTS, full) | switch_off(full)).items():
-        person, simulation = _simulate_person(seed, preset._replace(imperfections=imperfections))
+        person, simulation = _simulate_person(seed, preset, imperfections)
         recording = simulation.recording()
         prior = person.prior if label == "mounts as stated" else set_exact_mounts(person.prior, simulation)
         if label == "orientations exact":

@@ -15,7 +15,6 @@ from .imperfections import IDEAL_PRESET, MILD_PRESET, PEOPLE_PRESET, PRESETS, Im
 from .imu import MTI_3, NOISE_FREE, ImuNoise
 from .motion import CIRCLING_POINT, SEGMENTS
 from .people import SIDES
-from .single import SingleSensor, simulate_paper_drift, simulate_paper_dynamic
 from .subject import (
     MEASURED_LENGTHS,
     MEASURED_STD,
@@ -44,10 +43,7 @@ __all__ = [
     "ImuNoise",
     "Person",
     "Simulation",
-    "SingleSensor",
     "simulate",
     "simulate_activity",
-    "simulate_paper_drift",
-    "simulate_paper_dynamic",
     "simulate_person",
 ]

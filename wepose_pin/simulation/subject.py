@@ -42,8 +42,6 @@ _STREAMS = (
     "tissue_random breath creep - girdle_person girdle_wander girdle_rest carrying_angle elbow_abduction start_pose "
     "start_heading sway_tilt wrist gyro_warm_up clock_drift"
 ).split()
-# What stays with a person from session to session.
-_PERSON_STREAMS = ("tissue_gain", "girdle_person", "girdle_rest", "carrying_angle", "elbow_abduction")
 
 
 @dataclass(frozen=True)
@@ -163,7 +161,6 @@ def simulate(
     clasp_s: Positive = 60.0,
     circles: Count = 6,
     protocol: str = "clasp",
-    session: Count = 0,
 ) -> Simulation:
     """Simulate a person with five sensors in the upper-body experiment of Lisini Baldi et al. 2019; the truth is known.
 
@@ -193,9 +190,6 @@ def simulate(
         Number of circles, 0 or more.
     protocol : str
         What the person does in the time of the clasp: "clasp", "t_pose", "bow", or several of them joined by "+".
-    session : int
-        Number of the person's session. Another number is another day: sensors are mounted again; motion, start pose and
-        noise are others.
 
     Returns
     -------
@@ -230,20 +224,16 @@ def simulate(
         raise BadOption(f"clasp_s {clasp_s} must be >= 5, circles {circles} >= 0, rate_hz {rate_hz} > 0")
     task = find_task(protocol)
     lengths = {name: float(lengths[name]) for name in names}
-    rngs = spawn_streams(seed, session)
+    rngs = spawn_streams(seed)
     flaws = Flaws(imperfections, rngs, lengths)
     motion = task(lengths, rngs["motion"], protocol.split("+"), clasp_s, circles, flaws)
     motion.fit_to_person(rngs["task"])
     return measure_motion(motion, rngs, rate_hz, noise)
 
 
-def spawn_streams(seed: int, session: int = 0) -> dict[str, np.random.Generator]:
-    """Spawn the streams of random numbers by their names; a later session of the person shares those of the person."""
-    streams = dict(zip(_STREAMS, np.random.default_rng(seed).spawn(len(_STREAMS)), strict=True))
-    if session:
-        again = zip(_STREAMS, np.random.default_rng([seed, session]).spawn(len(_STREAMS)), strict=True)
-        streams |= {name: stream for name, stream in again if name not in _PERSON_STREAMS}
-    return streams
+def spawn_streams(seed: int) -> dict[str, np.random.Generator]:
+    """Spawn the streams of random numbers by their names."""
+    return dict(zip(_STREAMS, np.random.default_rng(seed).spawn(len(_STREAMS)), strict=True))
 
 
 def measure_motion(

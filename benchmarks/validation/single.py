@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..rotations import compose, log, turn_about
-from .imperfections import IDEAL_PRESET, Imperfections
-from .imu import GRAVITY, MTI_3, Device, ImuNoise, jitter_time
-from .motion import E_Z
-from .signals import make_pulse
+from wepose_pin.rotations import compose, log, turn_about
+from wepose_pin.simulation import IDEAL_PRESET, MTI_3, Imperfections, ImuNoise
+from wepose_pin.simulation.imu import GRAVITY, Device, jitter_time
+from wepose_pin.simulation.motion import E_Z
+from wepose_pin.simulation.signals import make_pulse
 
 _DURATION_S = 60.0  # of a trial
 _STENCIL_S = 1e-3
