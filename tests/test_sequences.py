@@ -80,7 +80,7 @@ def test_free_motion_shows_headings_and_keeps_lengths() -> None:
 def test_an_earlier_calibration_adds_what_it_knows() -> None:
     person = simulate_person(11)
     options = {"circles": 0, "clasp_s": 20.0, "rate_hz": 50.0, "imperfections": replace(MILD_PRESET, mount="any")}
-    sessions = [simulate(person.lengths, seed=11, session=k, **options).recording() for k in range(2)]
+    sessions = [simulate(person.lengths, seed=seed, **options).recording() for seed in (11, 12)]
     first, second = (calibrate(each, measured=person.measured).subject for each in sessions)
     both = calibrate(replace(sessions[1], remounted=True), prior=first, measured=person.measured).subject
     names = tuple(person.lengths)
