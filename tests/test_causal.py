@@ -11,7 +11,7 @@ from bodies import LENGTHS
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body.pose_table import build_pose_table
+from wepose_pin.body.kinematics import build_pose_table
 from wepose_pin.body.subject import Subject, mount_rows, population_subject
 from wepose_pin.errors import BadOption, BadPhase
 from wepose_pin.recording import OrientationSensor, Recording

@@ -14,7 +14,7 @@ from reading import text_of
 
 from benchmarks.long_recordings import there_and_back
 from wepose_pin.body import load_model
-from wepose_pin.body.pose_table import build_pose_table
+from wepose_pin.body.kinematics import build_pose_table
 from wepose_pin.body.subject import Subject
 from wepose_pin.calibration import calibrate
 from wepose_pin.errors import BadOption

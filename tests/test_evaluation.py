@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wepose_pin.body.kinematics import Pose
-from wepose_pin.body.pose_table import build_pose_table, parse_pose_table
+from wepose_pin.body.kinematics import Pose, build_pose_table, parse_pose_table
 from wepose_pin.errors import BadData
 from wepose_pin.evaluation import evaluate, uncertainty
 

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from wepose_pin.angles import joint_angles
 from wepose_pin.body import load_model
-from wepose_pin.body.kinematics import Pose, compute_pose
-from wepose_pin.body.pose_table import build_pose_table, parse_pose_table
+from wepose_pin.body.kinematics import Pose, build_pose_table, compute_pose, parse_pose_table
 from wepose_pin.body.subject import population_subject, subject_toml
 from wepose_pin.commands import main
 from wepose_pin.errors import BadData, BadOption, ExistingOutput, MissingFile

@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 import wepose_pin as wp
 from wepose_pin.angles import joint_angles
 from wepose_pin.body import load_model
-from wepose_pin.body.kinematics import Pose
-from wepose_pin.body.pose_table import parse_pose_table
+from wepose_pin.body.kinematics import Pose, parse_pose_table
 from wepose_pin.commands.evaluate import evaluate as evaluate_result
 from wepose_pin.errors import BadOption
 from wepose_pin.evaluation import evaluate

@@ -191,7 +191,7 @@ def test_its_result_is_read_exported_and_evaluated(tracked: TrackResult, tmp_pat
     write_result(folder, tracked, summarize(tracked))
     (folder / "model.toml").write_text(format_table(tracked.model.table, "subject.urdf"), encoding="utf-8")
     pose, model, _ = read_result(folder)
-    assert model.table.paths == ("left_toe", "right_toe")
+    assert model.table.draw.paths == ("left_toe", "right_toe")
     for suffix in ("bvh", "csv", "trc"):
         export(folder, tmp_path / f"m.{suffix}")
     bvh = (tmp_path / "m.bvh").read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ from commands import run
 from scipy.spatial.transform import Rotation
 from simulated import SUBJECT, check_accel, check_gyro, in_torso, within
 
-from wepose_pin.body.pose_table import parse_pose_table
+from wepose_pin.body.kinematics import parse_pose_table
 from wepose_pin.commands.simulate import simulate as simulate_session
 from wepose_pin.errors import BadOption
 from wepose_pin.readers import load_session

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from test_info import info
 from test_mvnx import mvnx, turning
 
-from wepose_pin.body.kinematics import Pose
-from wepose_pin.body.pose_table import build_pose_table
+from wepose_pin.body.kinematics import Pose, build_pose_table
 from wepose_pin.errors import BadData, WeposeError
 from wepose_pin.evaluation import angle_error, compute_icc, evaluate, register
 from wepose_pin.readers.markers import read_marker_table

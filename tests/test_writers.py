@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import polars as pl
 import pytest
 
 from wepose_pin.body import load_model
-from wepose_pin.body.pose_table import build_pose_table, parse_pose_table
+from wepose_pin.body.kinematics import build_pose_table, parse_pose_table
 from wepose_pin.body.subject import population_subject
 from wepose_pin.documents import whole_folder
 from wepose_pin.errors import BadData, ExistingOutput, MissingFile
@@ -51,38 +50,6 @@ def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ExistingOutput, match="is a file"), whole_folder(tmp_path / "file" / "out"):
         pass
-
-
-@pytest.mark.parametrize("is_folder", [True, False])
-def test_what_is_in_the_way_is_named_before_anything_is_replaced(tmp_path: Path, is_folder: bool) -> None:
-    out = tmp_path / "out"
-    (out / "b").mkdir(parents=True) if is_folder else (out.mkdir(), (out / "b").write_text("old"))
-    (out / "a").write_text("old")
-    says = r"out/b: is in the way; nothing was written"
-    with pytest.raises(ExistingOutput, match=says), whole_folder(out, force=True) as folder:  # noqa: PT012
-        (folder / "a").write_text("new")
-        (folder / "b").write_text("new") if is_folder else (folder / "b").mkdir()
-    assert (out / "a").read_text() == "old"
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_waits_until_all_files_are_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
-) -> None:
-    def replace(path: Path, target: Path) -> None:
-        signal.raise_signal(number)
-        path.rename(target)
-
-    monkeypatch.setattr(Path, "replace", replace)
-    before = signal.signal(number, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt), whole_folder(tmp_path, force=True) as folder:  # noqa: PT012
-            for name in "abc":
-                (folder / name).write_text("new")
-        assert signal.getsignal(number) is signal.default_int_handler
-    finally:
-        signal.signal(number, before)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
 
 
 def test_two_runs_at_once_do_not_mix(tmp_path: Path) -> None:

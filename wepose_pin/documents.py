@@ -8,9 +8,7 @@ import math
 import os
 import re
 import shutil
-import signal
 import tempfile
-import threading
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -209,8 +207,8 @@ class Key:
     """How a field of a record is written in a TOML table, as in ``softness: Annotated[float, Key(unit="deg")]``.
 
     A field without it has a key of its own name; with None in its place the table has no such field. Fields are texts,
-    numbers, flags, tuples of texts or of up to three numbers, arrays (k,) with `each`, NamedTuples, and mappings of
-    names to numbers, arrays or NamedTuples, each a table.
+    numbers, flags, tuples of texts or of up to three numbers, arrays (k,) with `each`, NamedTuples, lists of those, and
+    mappings of names to any of them, each a table. In place of a NamedTuple's table its first field alone may stand.
 
     Parameters
     ----------
@@ -299,21 +297,23 @@ def _describe(value_type: Any, key: Key, known: Mapping[str, Collection[str]], f
 def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str, Collection[str]], base: Any) -> Any:
     value, parts = table.values.get(key.name), get_args(value_type)
     if hasattr(value_type, "_fields"):
+        if isinstance(value, str):
+            table = replace(table, values={key.name: {next(iter(_find_keys(value_type).values()))[1].name: value}})
         return read_record(value_type, table.table(key.name), known, base)
     if get_origin(value_type) is Mapping:
         entries = table.table(key.name)
-        if parts[1] is float:
-            return {name: _read_number(entries, replace(key, name=name)) for name in entries.values}
-        tables = {name: entries.table(name) for name in entries.values}
-        if hasattr(parts[1], "_fields"):
-            return {name: read_record(parts[1], entry, known) for name, entry in tables.items()}
-        for entry in tables.values():
-            entry.allow(*key.each, *key.unread)
-        return {name: _read_value(parts[1], entry, key, known, None) for name, entry in tables.items()}
+        if key.each:
+            for entry in map(entries.table, entries.values):
+                entry.allow(*key.each, *key.unread)
+            return {name: _read_value(parts[1], entries.table(name), key, known, None) for name in entries.values}
+        return {**(base or {})} | {
+            name: _read_value(parts[1], entries, replace(key, name=name), known, (base or {}).get(name))
+            for name in entries.values
+        }
     if key.each:
         import numpy as np  # not for whoever reads none
 
-        return np.array([_read_number(table, replace(key, name=part)) for part in key.each])
+        return np.array([_read_value(float, table, replace(key, name=part, each=()), {}, None) for part in key.each])
     if key.words:
         return key.words[table.choice(key.name, key.words)]
     if get_origin(value_type) is Literal:
@@ -322,8 +322,6 @@ def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str,
         return table.flag(key.name)
     if value_type is str:
         return table.choice(key.name, known[key.of]) if key.of else table.text(key.name, None)
-    if value_type is float:
-        return _read_number(table, key)
     if str in parts:
         texts = table.texts(key.name)
         for text in texts if key.of else ():
@@ -331,21 +329,16 @@ def _read_value(value_type: Any, table: TomlTable, key: Key, known: Mapping[str,
                 raise table.error(f"{table.at(key.name)}: '{text}' is not known; {one_of(known[key.of], text)}")
         if ... in parts or len(texts) == len(parts):
             return texts
-    elif isinstance(value, list | tuple) and len(value) == len(parts):
-        each = [_to_si(key, number) for number in value if is_number(number) and key.least <= number <= key.most]
-        if len(each) == len(parts):
-            return tuple(each)
-    raise table.error(
-        f"{table.at(key.name)} = {_format_value(value)}; {_describe(value_type, key, known, value)} needed"
-    )
-
-
-def _read_number(table: TomlTable, key: Key) -> float:
-    value = table.values.get(key.name)
-    if is_number(value) and key.least <= value <= key.most:
-        return _to_si(key, value)
-    found = f"= {_format_value(value)}" if key.name in table else "is missing"
-    raise table.error(f"{table.at(key.name)} {found}; {_describe(float, key, {}, value)} needed")
+    elif ... in parts and isinstance(value, list):  # of lists
+        rows = (replace(table, values={key.name: row}) for row in value)
+        return tuple(_read_value(parts[0], row, key, known, None) for row in rows)
+    elif parts or value_type is float:
+        numbers = value if parts and isinstance(value, list | tuple) else [value]
+        each = [_to_si(key, number) for number in numbers if is_number(number) and key.least <= number <= key.most]
+        if len(each) == len(numbers) == max(len(parts), 1):
+            return tuple(each) if parts else each[0]
+    found = f" = {_format_value(value)};" if key.name in table else " is missing;"
+    raise table.error(f"{table.at(key.name)}{found} {_describe(value_type, key, known, value)} needed")
 
 
 def _to_si(key: Key, value: float) -> float:
@@ -359,16 +352,10 @@ def format_record(record: Any, unread: Mapping[str, Sequence[str]] | None = None
     """
     lines, tables = [], []
     for name, (value_type, key) in _find_keys(record.__class__).items():
-        value = getattr(record, name)
-        comment = f"   # {key.comment}" if key.comment else ""
-        if get_args(value_type)[1:] == (float,) and isinstance(value, Mapping):
-            tables += ["", f"[{key.name}]{comment}"]
-            tables += [f"{toml_key(entry)} = {_format_field(key, number)}" for entry, number in value.items()]
-        elif isinstance(value, Mapping):
-            for entry, part in value.items():
-                heading = f"{key.name}.{toml_key(entry)}"
-                tables += ["", f"[{heading}]{comment}", *(_format_each(key, part) if key.each else format_record(part))]
-                tables += (unread or {}).get(heading, ())
+        value, comment = getattr(record, name), f"   # {key.comment}" if key.comment else ""
+        if isinstance(value, Mapping):
+            if value or float in get_args(value_type):
+                tables += _format_mapping(key, value, comment, unread or {})
         elif key.each:
             lines += _format_each(key, value)
         elif not (value is None or value is False or (isinstance(value, str | tuple) and not value)) and (
@@ -376,6 +363,23 @@ def format_record(record: Any, unread: Mapping[str, Sequence[str]] | None = None
         ):
             lines.append(f"{key.name} = {_format_field(key, value)}{comment}")
     return lines + tables
+
+
+def _format_mapping(
+    key: Key, values: Mapping[str, Any], comment: str, unread: Mapping[str, Sequence[str]]
+) -> list[str]:
+    if all(isinstance(value, float | str) for value in values.values()):
+        own = [f"{toml_key(name)} = {_format_field(key, value)}" for name, value in values.items()]
+        return ["", f"[{key.name}]{comment}", *own]
+    lines = []
+    for name, value in values.items():
+        heading = f"{key.name}.{toml_key(name)}"
+        if isinstance(value, Mapping):
+            lines += _format_mapping(replace(key, name=heading), value, comment, unread)
+        else:
+            own = _format_each(key, value) if key.each else format_record(value)
+            lines += ["", f"[{heading}]{comment}", *own, *unread.get(heading, ())]
+    return lines
 
 
 def _format_each(key: Key, values: Iterable[float]) -> list[str]:
@@ -429,18 +433,14 @@ def whole_folder(out: Path, force: bool = False) -> Iterator[Path]:
         with _report_full_disk(out):
             yield partial
         _check_folder(out, force, prefix)  # again: another run may have written there meanwhile
-        targets = {path: out / path.relative_to(partial) for path in sorted(partial.rglob("*"))}
-        for path, target in targets.items():
-            if target.exists() and target.is_dir() != path.is_dir():
-                raise ExistingOutput(f"{target}: is in the way; nothing was written, move it or name another folder")
-        with _defer_signals():
-            if out.exists():
-                for path, target in targets.items():
-                    target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
-            else:
-                out.parent.mkdir(parents=True, exist_ok=True)
-                partial.rename(out)
-            written.append(out)
+        if out.exists():
+            for path in sorted(partial.rglob("*")):
+                target = out / path.relative_to(partial)
+                target.mkdir(exist_ok=True) if path.is_dir() else path.replace(target)
+        else:
+            out.parent.mkdir(parents=True, exist_ok=True)
+            partial.rename(out)
+        written.append(out)
     finally:
         shutil.rmtree(own, ignore_errors=True)
 
@@ -451,26 +451,6 @@ def _check_folder(out: Path, force: bool, prefix: str) -> None:
         raise ExistingOutput(f"{out}: cannot be made: {existing} is a file; a folder is wanted for the output")
     if not force and out.is_dir() and any(not path.name.startswith(prefix) for path in out.iterdir()):
         raise ExistingOutput(f"{out}: exists and is not empty; --force replaces its files, -o names another folder")
-
-
-@contextmanager
-def _defer_signals() -> Iterator[None]:
-    """Hold back the signals that stop a command until the block has ended; only the main thread receives them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    handlers = {number: handler for number, handler in handlers.items() if handler is not None}  # None: not of Python
-    try:
-        for number in handlers:
-            signal.signal(number, lambda number, _frame: came.append(number))
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        for first in came[:1]:
-            signal.raise_signal(first)
 
 
 @contextmanager

@@ -348,7 +348,7 @@ def calibration_values(session: Path, measured: Mapping[str, float]) -> dict[str
 def errors_of(result: Path, truth: Path) -> object:
     """What `evaluate` gives."""
     import wepose_pin as wp
-    from wepose_pin.body.pose_table import parse_pose_table
+    from wepose_pin.body.kinematics import parse_pose_table
     from wepose_pin.writers import read_result
 
     return wp.evaluate(read_result(result)[0], parse_pose_table(pl.read_parquet(truth), str(truth)))

@@ -211,7 +211,7 @@ def _live(path: Path) -> object:
 
 
 def _pose(path: Path) -> object:
-    from wepose_pin.body.pose_table import parse_pose_table
+    from wepose_pin.body.kinematics import parse_pose_table
     from wepose_pin.data_tables import read_table
 
     return parse_pose_table(read_table(path), str(path))

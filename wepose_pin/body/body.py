@@ -257,7 +257,8 @@ def _load_body(path: Path) -> BodyModel:
     table: BodyTable | None = None
     urdf, is_table = path, path.suffix.lower() == ".toml"
     if is_table:
-        table, urdf = read_table(path)
+        table = read_table(path)
+        urdf = path.parent / table.urdf
     robot = read_urdf(urdf)
     links = parse_tree(robot, str(urdf)).below
     table = table or find_table(urdf, links)
@@ -304,9 +305,11 @@ def load_sensed_model(path: str | Path | None, sensors: Collection[str], where: 
         return load_model(path)
     for name in sensors:
         if name not in tree.below:
-            links = one_of(tree.below, name, MOST_LINKS)
-            raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {links}")
-    segments = {name: Segment.of_mechanism(name) for name in sorted(sensors, key=lambda name: len(tree.path(name)))}
+            choices = one_of(tree.below, name, MOST_LINKS)
+            raise BadSession(f"{where}: sensors.{name} is no link of {robot.name}; {choices}")
+    segments = {
+        name: Segment.of_mechanism(name, rigid=True) for name in sorted(sensors, key=lambda name: len(tree.path(name)))
+    }
     body = _body(robot, BodyTable(robot.name, segments, kind="mechanism", where=str(file)), str(file))
     if not body.pin.nv:
         raise BadModel(f"{file}: no joint moves; a chain of revolute or prismatic joints is needed")

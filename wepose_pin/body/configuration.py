@@ -65,26 +65,21 @@ class ConfigurationSolver:
         if not segments:
             raise BadData("no segment has an orientation: a pose needs one")
         check_segments(model.table, segments, f"{model.pin.name}: ", BadModel)
-        m = model.pin
+        m, is_mechanism = model.pin, model.table.is_mechanism
         self._model, self.segments, self._neutral = model, tuple(segments), pin.neutral(m)
         self._last: np.ndarray | None = None  # (nq,) of the frame before
         fitted = _find_fitted(model, segments)
         joints = sorted({joint for name in fitted for joint in model.chains[name].joints})
-        if model.table.is_mechanism:
+        if is_mechanism:
             self._last, joints = self._neutral if start is None else start, list(range(1, m.njoints))
         self._fit = _Fit(model, fitted, self.segments, joints, limits) if fitted else None
-        self._bent: list[_BentSpine] = []
-        spherical = []
-        for name in self.segments:
-            if model.table.is_mechanism or not model.chains[name].exact:
-                continue
-            above = model.parents[name]
-            while above is not None and not (above in segments and model.chains[above].joints):
-                above = model.parents[above]
-            if len(model.chains[name].joints) == 1:
-                spherical.append(_join_spherical(model, name, above, self.segments))
-            else:
-                self._bent.append(_BentSpine(model, name, above, self.segments, limits))
+        chains = (
+            []
+            if is_mechanism
+            else [_ExactChain(model, name, self.segments, limits) for name in self.segments if model.chains[name].exact]
+        )
+        self._bent = [chain for chain in chains if len(chain.joints) > 1]
+        spherical = [chain.describe_spherical() for chain in chains if len(chain.joints) == 1]
         self._spherical = tuple(np.array(column) for column in zip(*spherical, strict=True))
         self._quaternions = np.array([m.idx_qs[joint] for joint in range(1, m.njoints) if m.nqs[joint] == 4], dtype=int)
         self._girdles = [
@@ -100,8 +95,8 @@ class ConfigurationSolver:
         q[:] = self._neutral
         if self._spherical:
             _set_relative_rotations(quat_WL, *self._spherical, q)
-        for spine in self._bent:
-            spine.bend(q, quat_WL)
+        for chain in self._bent:
+            chain.bend(q, quat_WL)
         if self._fit is not None:
             self._fit.run(q, quat_WL, last)
         for girdle in self._girdles:
@@ -132,39 +127,62 @@ def _find_fitted(model: BodyModel, measured: Collection[str]) -> list[str]:
 # Exactly ----------------------------------------------------------------------------------------------------------
 
 
-def _join_spherical(
-    model: BodyModel, segment: str, above: str | None, segments: Sequence[str]
-) -> tuple[int, int, np.ndarray, np.ndarray, int]:
-    """Join a segment L to the measured segment A above, or W, by a spherical joint J, which takes its rotation.
+class _ExactChain:
+    """The joints from the measured segment A above, or W, to a segment L; the spherical one nearest to L is free.
 
-    Returns the rows of L and A (-1: W), R_JA and R_LJ (4,) with all joints at zero, and the joint's place in `q`.
+    Joints with limits keep them, and joints behind the free one rest.
     """
-    joint = model.chains[segment].spherical
-    R_AJ, R_AL = _compare_at_zero(model, segment, above, [joint])
-    left, right = R_AJ[0].inv(), R_AL.inv() * R_AJ[0]
-    row = -1 if above is None else segments.index(above)
-    return segments.index(segment), row, left.as_quat(), right.as_quat(), model.pin.idx_qs[joint]
 
+    def __init__(self, model: BodyModel, segment: str, segments: Sequence[str], limits: bool) -> None:
+        m, chain, data = model.pin, model.chains[segment], model.pin.createData()
+        above = chain.above
+        while above is not None and not (above in segments and model.chains[above].joints):
+            above = model.parents[above]
+        self._row, self._above = segments.index(segment), -1 if above is None else segments.index(above)
+        pin.forwardKinematics(m, data, pin.neutral(m))
+        R_AW = np.eye(3) if above is None else model.neutral_rotations[above].T
+        self._R_AL = Rotation.from_matrix(R_AW @ model.neutral_rotations[segment])  # with all joints at zero
+        joints = [joint for joint in chain.joints if joint <= (chain.spherical or 0)]
+        steps = np.diff([data.oMi[joint].translation for joint in joints], axis=0)
+        # Joints that meet in a point share a part of the bend.
+        self._share = 1.0 / (1 + np.count_nonzero(np.linalg.norm(steps, axis=1) > _MEET_TOLERANCE))
+        self.joints = []  # place in q, R_AJ, axis in A (None: spherical) and limits, from the root outwards
+        for joint in joints:
+            R_AJ, at = Rotation.from_matrix(R_AW @ data.oMi[joint].rotation), m.idx_qs[joint]
+            axis, ends = None, (-np.inf, np.inf)
+            if m.nqs[joint] == 1:
+                axis = R_AJ.apply(m.joints[joint].extract().axis)
+                ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if limits else ends
+            self.joints.append((at, R_AJ, axis, ends))
 
-def _compare_at_zero(
-    model: BodyModel, segment: str, above: str | None, joints: Sequence[int | None]
-) -> tuple[Rotation, Rotation]:
-    """Find R_AJ of joints' moving frames and R_AL of a segment with all joints at zero, A the segment above or W."""
-    R_AW = np.eye(3) if above is None else model.neutral_rotations[above].T
-    data = _stand_at_zero(model.pin)
-    R_AJ = [R_AW @ data.oMi[joint].rotation for joint in joints]
-    return Rotation.from_matrix(R_AJ), Rotation.from_matrix(R_AW @ model.neutral_rotations[segment])
+    def describe_spherical(self) -> tuple[int, int, np.ndarray, np.ndarray, int]:
+        """Return rows of L and A (-1: W), R_JA and R_LJ (4,) at zero, and place in `q` of one joint, J."""
+        at, R_AJ, _, _ = self.joints[0]
+        return self._row, self._above, R_AJ.inv().as_quat(), (self._R_AL.inv() * R_AJ).as_quat(), at
 
-
-def _stand_at_zero(m: pin.Model) -> pin.Data:
-    data = m.createData()
-    pin.forwardKinematics(m, data, pin.neutral(m))
-    return data
+    def bend(self, q: np.ndarray, quat_WL: np.ndarray) -> None:
+        """Write the joints' values into `q` (n, nq): an equal share of the tilt in each place, the rest in the last."""
+        R_WA = quat_WL[:, self._above] if self._above >= 0 else _IDENTITY
+        left = multiply(multiply(conjugate(R_WA), quat_WL[:, self._row]), self._R_AL.inv().as_quat())
+        # The turn about the vertical before the tilt is taken off; upside down no turn is better than another.
+        up = self._R_AL.apply([0.0, 0.0, 1.0])
+        turn = np.column_stack([np.outer(left[:, :3] @ up, up), left[:, 3]])
+        turn[np.linalg.norm(turn, axis=1) < 1e-9] = _IDENTITY
+        turn /= np.linalg.norm(turn, axis=1)[:, None]
+        share = self._share * log(multiply(left, conjugate(turn)))  # (n, 3)
+        for k, (at, R_AJ, axis, ends) in enumerate(self.joints, start=1):
+            if axis is None:
+                rotation = exp(share) if k < len(self.joints) else left
+                q[:, at : at + 4] = multiply(multiply(R_AJ.inv().as_quat(), rotation), R_AJ.as_quat())
+            else:
+                q[:, at] = np.clip(share @ axis, *ends)
+                rotation = rotation_about(axis, q[:, at])
+            left = multiply(conjugate(rotation), left)
 
 
 @kernel
 def _set_relative_rotations(quat, rows, above, left, right, at, q):  # type: ignore[no-untyped-def]
-    """Write R_JA R_AW R_WL R_LJ of each row of `_join_spherical` into `q` (n, nq), from `quat` (n, k, 4) xyzw."""
+    """Write R_JA R_AW R_WL R_LJ of each `describe_spherical` into `q` (n, nq), from `quat` (n, k, 4) xyzw."""
     for j in range(len(rows)):
         for i in range(len(quat)):
             x, y, z, w = left[j, 0], left[j, 1], left[j, 2], left[j, 3]
@@ -190,54 +208,6 @@ def _unwrap_signs(q, at, before):  # type: ignore[no-untyped-def]
             a, b, c, d = q[i, k], q[i, k + 1], q[i, k + 2], q[i, k + 3]
 
 
-class _BentSpine:
-    """Several joints from the measured segment A, or W, to a segment L; the spherical one nearest to L is free.
-
-    Joints with limits keep them, and joints behind the free one rest.
-    """
-
-    def __init__(
-        self, model: BodyModel, segment: str, above: str | None, segments: Sequence[str], limits: bool
-    ) -> None:
-        m, chain, data = model.pin, model.chains[segment], _stand_at_zero(model.pin)
-        self._row, self._above = segments.index(segment), -1 if above is None else segments.index(above)
-        joints = [joint for joint in chain.joints if joint <= (chain.spherical or 0)]
-        R_AJ, R_AL = _compare_at_zero(model, segment, above, joints)
-        self._quat_LA, self._up_A = R_AL.inv().as_quat(), R_AL.apply([0.0, 0.0, 1.0])
-        steps = np.diff([data.oMi[joint].translation for joint in joints], axis=0)
-        places = 1 + np.count_nonzero(np.linalg.norm(steps, axis=1) > _MEET_TOLERANCE)  # where joints meet in a point
-        self._share = 1.0 / places
-        self._joints = []  # place in q, R_AJ, axis in A (None: spherical) and limits, from the root outwards
-        for joint, R in zip(joints, R_AJ, strict=True):
-            at, axis, ends = m.idx_qs[joint], None, (-np.inf, np.inf)
-            if m.nqs[joint] == 1:
-                axis = R.apply(m.joints[joint].extract().axis)
-                ends = (m.lowerPositionLimit[at], m.upperPositionLimit[at]) if limits else ends
-            self._joints.append((at, R.as_quat(), axis, ends))
-
-    def bend(self, q: np.ndarray, quat_WL: np.ndarray) -> None:
-        """Write the joints' values into `q` (n, nq); `quat_WL` (n, k, 4) xyzw."""
-        R_WA = quat_WL[:, self._above] if self._above >= 0 else _IDENTITY
-        left = multiply(multiply(conjugate(R_WA), quat_WL[:, self._row]), self._quat_LA)
-        share = self._share * log(_remove_turn(left, self._up_A))  # (n, 3)
-        for k, (at, quat_AJ, axis, ends) in enumerate(self._joints, start=1):
-            if axis is None:
-                rotation = exp(share) if k < len(self._joints) else left
-                q[:, at : at + 4] = multiply(multiply(conjugate(quat_AJ), rotation), quat_AJ)
-            else:
-                q[:, at] = np.clip(share @ axis, *ends)
-                rotation = rotation_about(axis, q[:, at])
-            left = multiply(conjugate(rotation), left)
-
-
-def _remove_turn(quat: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return what is left of rotations (n, 4) when the turn about `up` (3,), that came before, is taken off."""
-    turn = np.column_stack([np.outer(quat[:, :3] @ up, up), quat[:, 3]])
-    norm = np.linalg.norm(turn, axis=1)
-    turn[norm < 1e-9] = _IDENTITY  # upside down: no turn is better than another
-    return multiply(quat, conjugate(turn / np.maximum(norm, 1e-9)[:, None]))
-
-
 # As near as they come ---------------------------------------------------------------------------------------------
 
 
@@ -245,18 +215,13 @@ class _Fit:
     """Configurations in which links come nearest to orientations: the sum over the links of angle² is least.
 
     Gauss-Newton with Levenberg's damping on Pinocchio's Jacobian, each frame from the solution of the one before;
-    spherical joints of a person begin where they follow exactly.
-
-    Limits are kept by projection: a joint at its limit that the gradient pushes outward takes no part in the step, and
-    what a step carries over a limit ends on it (Bertsekas 1982, "Projected Newton methods for optimization problems
-    with simple constraints", SIAM J. Control 20:221). Joints that the links do not determine move as little as possible
-    from frame to frame.
+    spherical joints of a person begin where they follow exactly. Limits are kept by projection (Bertsekas 1982,
+    "Projected Newton methods for optimization problems with simple constraints", SIAM J. Control 20:221). Joints that
+    the links do not determine move as little as possible from frame to frame.
 
     Parameters
     ----------
-    links : the fitted ones of the measured `segments`
-    joints : those that may move
-    limits : keep the limits of joints with one axis
+    links, joints : the fitted ones of the measured `segments`; those that may move
     """
 
     def __init__(
@@ -283,13 +248,7 @@ class _Fit:
         self._bounded = np.searchsorted(self._columns, find_columns(model, bounded))
 
     def run(self, q: np.ndarray, quat_WL: np.ndarray, last: np.ndarray | None) -> None:
-        """Write the joints that may move into `q` (n, nq), where the others have their values.
-
-        Parameters
-        ----------
-        quat_WL : (n, k, 4) xyzw of the segments
-        last : (nq,) the frame before the first; None: there is none
-        """
+        """Write the joints that may move into `q` (n, nq), from `quat_WL` (n, k, 4) xyzw and the `last` frame (nq,)."""
         quat = quat_WL[:, self._rows].reshape(-1, 4)
         targets = Rotation.from_quat(quat).as_matrix().reshape(len(q), -1, 3, 3) @ self._R_LJ
         for k, R in enumerate(targets):
@@ -308,10 +267,8 @@ class _Fit:
         return float(np.sum(e * e)), e
 
     def _solve(self, q: np.ndarray, R_target: np.ndarray) -> np.ndarray:
-        """Return the configuration (nq,) that is nearest from the start `q`."""
         left, e = self._compare(q, R_target)
-        damping = _DAMPING
-        step = np.zeros(self._model.nv)
+        damping, step = _DAMPING, np.zeros(self._model.nv)
         for _ in range(_ROUNDS):
             J = self._data.J.reshape(6, -1)[3:, self._columns]
             g = np.einsum("if,fi->f", J, self._pull @ e)  # downhill; exact, as log(R)ᵀ is its own under its Jacobian
@@ -346,18 +303,17 @@ def compute_orientation_residuals(
     """
     fitted = _find_fitted(model, quat_WL)
     limited = [name for name, chain in model.chains.items() if name in quat_WL and (name in fitted or not chain.exact)]
-    if not limited:
-        return {}
     R_WL, _ = compute_link_poses(model, q, limited)
-    R_model = {segment: Rotation.from_matrix(R_WL[:, k]) for k, segment in enumerate(limited)}
-    return {segment: (R_model[segment].inv() * Rotation.from_quat(quat_WL[segment])).magnitude() for segment in limited}
+    return {
+        segment: (Rotation.from_matrix(R_WL[:, k]).inv() * Rotation.from_quat(quat_WL[segment])).magnitude()
+        for k, segment in enumerate(limited)
+    }
 
 
 # Girdles ----------------------------------------------------------------------------------------------------------
 
 
 def _describe_girdle(model: BodyModel, name: str, segments: Sequence[str]) -> tuple[Any, ...]:
-    """Return what `_place_girdle` needs: its rows of orientations, its law and its place in `q`."""
     girdle, m = model.table.girdles[name], model.pin
     moves = segments.index(girdle.moves) if girdle.moves in segments else -1
     along, at = model.table.segments[girdle.moves].along, [m.idx_qs[m.getJointId(joint)] for joint in girdle.joints]

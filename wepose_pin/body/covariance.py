@@ -41,16 +41,18 @@ def compute_point_covariances(
     q : (n, nq) of a mechanism; without it its points have none
     heading_cov : two segments → (n,) [rad²], the covariance of their headings; a pair left out: independent
     """
-    points = find_known_points(model, quat_WL)
+    points, heading_cov = find_known_points(model, quat_WL), heading_cov or {}
     if model.table.is_mechanism:
         if not points or q is None or not set(quat_WL) <= set(segment_cov):
             return {}
-        return _propagate_through_joints(model, q, segment_cov, shape_cov, points, heading_cov or {})
+        return _propagate_through_joints(model, q, segment_cov, shape_cov, points, heading_cov)
     covariances: dict[str, np.ndarray] = {}
     rotated: dict[tuple[int, ...], np.ndarray] = {}  # what points of a limb share is computed once
     for point, parts in _find_ways(model, quat_WL, points).items():
-        segments = [part.segment for part in parts if part.segment is not None]
-        own = {segment: [part for part in parts if part.segment == segment] for segment in segments}
+        own: dict[str, list[_Part]] = {}  # segment → the parts that rotate with it
+        for part in parts:
+            if part.segment is not None:
+                own.setdefault(part.segment, []).append(part)
         if not parts or not set(own) <= set(segment_cov):
             continue
         columns = [column for part in parts for column in part.columns]
@@ -61,15 +63,24 @@ def compute_point_covariances(
         for segment, vector in vectors.items():
             key = tuple(id(part) for part in own[segment])
             if key not in rotated:
-                skew = _build_skew_matrices(vector)
+                skew = np.zeros((len(vector), 3, 3))  # [v]×
+                skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0] = vector.T
+                skew -= skew.swapaxes(1, 2).copy()
                 rotated[key] = skew @ segment_cov[segment] @ skew.swapaxes(1, 2)
             cov += rotated[key]
         for part in parts:
             if part.residual is not None:
                 cov += part.residual
-        for (near, far), shared in (heading_cov or {}).items():
+        for (near, far), shared in heading_cov.items():
             if near in vectors and far in vectors:
-                _add_shared_heading(cov, vectors[near], vectors[far], shared)
+                # A heading error ε moves the end of a vector by ε e_z × v.
+                x, y, _ = vectors[near].T
+                u, v, _ = vectors[far].T
+                cross = -shared * (x * v + y * u)
+                cov[:, 0, 0] += 2.0 * shared * y * v
+                cov[:, 1, 1] += 2.0 * shared * x * u
+                cov[:, 0, 1] += cross
+                cov[:, 1, 0] += cross
         covariances[point] = cov
     return covariances
 
@@ -87,10 +98,7 @@ class _Part(NamedTuple):
 def _find_ways(
     model: BodyModel, quat_WL: Mapping[str, np.ndarray], points: Sequence[str]
 ) -> dict[str, tuple[_Part, ...]]:
-    """Find the parts of the ways to a person's points; equal parts of several points are one.
-
-    A point on whose way a link follows no measured segment has none.
-    """
+    """Find the parts of the ways to a person's points; none where one follows no measured segment."""
     R_WL = {name: Rotation.from_quat(quat).as_matrix() for name, quat in quat_WL.items()}
     lengths, neutral = np.array(list(model.lengths.values())), model.neutral_rotations
     n = len(next(iter(quat_WL.values())))
@@ -129,10 +137,7 @@ def _propagate_through_joints(
     points: Sequence[str],
     heading_cov: Mapping[tuple[str, str], np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """Compute the covariances of a mechanism's points in `q` (n, nq), as `compute_point_covariances`.
-
-    The fit turns errors δ of the orientations into errors J⁺ δ of the joints, with J the Jacobian of all orientations.
-    """
+    """Compute the covariances of a mechanism's points: errors δ of the orientations are errors J⁺ δ of the joints."""
     m, data, k = model.pin, model.pin.createData(), len(segment_cov)
     segments = [m.getFrameId(segment) for segment in segment_cov]
     frames = [m.getFrameId(model.point_frames[point]) for point in points]
@@ -141,15 +146,14 @@ def _propagate_through_joints(
     for (near, far), cov in heading_cov.items():
         shared[:, order.index(near), order.index(far)] = shared[:, order.index(far), order.index(near)] = cov
     ways: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in points]  # views of R_WK, by the lengths
-    if lengths_cov.any():
-        try:
-            reaches = model.reaches
-        except BadModel:  # a joint slides: the way of a point has no constant parts link by link
-            return {}
-        for way, point in zip(ways, points, strict=True):
-            for link, part in reaches[point].items():
-                frame = data.oMf[m.getFrameId(link)] if m.existFrame(link) else data.oMi[m.getJointId(link)]
-                way.append((frame.rotation, part.by_length))
+    try:
+        reaches = model.reaches if lengths_cov.any() else {}
+    except BadModel:  # a joint slides: the way of a point has no constant parts link by link
+        return {}
+    for way, point in zip(ways, points, strict=True):
+        for link, part in reaches.get(point, {}).items():
+            frame = data.oMf[m.getFrameId(link)] if m.existFrame(link) else data.oMi[m.getJointId(link)]
+            way.append((frame.rotation, part.by_length))
     out = np.empty((len(points), len(q), 3, 3))
     for row, values in enumerate(np.ascontiguousarray(q)):
         pin.computeJointJacobians(m, data, values)
@@ -165,25 +169,6 @@ def _propagate_through_joints(
                 along = np.sum([R_WK @ by_length for R_WK, by_length in ways[i]], axis=0)
                 out[i, row] += along @ lengths_cov @ along.T
     return dict(zip(points, out, strict=True))
-
-
-def _add_shared_heading(cov: np.ndarray, near: np.ndarray, far: np.ndarray, shared: np.ndarray) -> None:
-    """Add to `cov` (n, 3, 3) [m²] that the headings of two vectors (n, 3) [m] in W covary by `shared` (n,) [rad²].
-
-    A heading error ε moves the end of a vector by ε e_z × v.
-    """
-    cross = -shared * (near[:, 1] * far[:, 0] + near[:, 0] * far[:, 1])
-    cov[:, 0, 0] += 2.0 * shared * near[:, 1] * far[:, 1]
-    cov[:, 1, 1] += 2.0 * shared * near[:, 0] * far[:, 0]
-    cov[:, 0, 1] += cross
-    cov[:, 1, 0] += cross
-
-
-def _build_skew_matrices(v: np.ndarray) -> np.ndarray:
-    """Build the matrices [v]× (n, 3, 3) of vectors (n, 3)."""
-    out = np.zeros((len(v), 3, 3))
-    out[:, 2, 1], out[:, 0, 2], out[:, 1, 0] = v.T
-    return out - out.swapaxes(1, 2)
 
 
 def compute_axis_std(cov: np.ndarray) -> np.ndarray:

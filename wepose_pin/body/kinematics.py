@@ -1,4 +1,4 @@
-"""`Pose`: the segments and points of a body over time, and the solver that computes it from orientations."""
+"""`Pose`: the segments and points of a body over time, its table, and the solver that computes it from orientations."""
 
 from __future__ import annotations
 
@@ -8,17 +8,22 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+import polars as pl
 from scipy.spatial.transform import Rotation
 
 from ..arguments import check_array, check_fields, check_finite, check_names, check_unit
-from ..errors import BadData
+from ..errors import BadData, one_of
 from ..recording import EACH_TIME, check_time, format_span
 from ..rotations import unwrap_signs
 from .body import BodyModel
 from .configuration import ConfigurationSolver
+from .covariance import compute_axis_std
 from .links import compute_joint_values, compute_link_poses, find_known_points
 
 MAX_POSE_NORM_DEVIATION = 1e-3  # of a quaternion in a `Pose` from 1
+MAX_TABLE_NORM_DEVIATION = 1e-2  # the same in a table: a file may have few decimals
+# Of a covariance in a table.
+_ENTRIES = {f"cov_{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}
 
 
 @dataclass(frozen=True)
@@ -115,6 +120,85 @@ def find_samples(time: np.ndarray, interval: tuple[float, float]) -> slice:
     if first == last:
         raise BadData(f"the interval {format_span(interval)} has no sample")
     return slice(first, last)
+
+
+# The table of a pose -----------------------------------------------------------------------------------------------
+
+
+def build_pose_table(pose: Pose, covariance: bool = False) -> pl.DataFrame:
+    """Build the table of ``pose.parquet``.
+
+    ``time``; ``<segment>_qx,_qy,_qz,_qw`` (`quat_WL`) and ``<segment>_std`` [rad]; ``<point>_x,_y,_z`` [m] in W and
+    ``<point>_std`` [m]; with `covariance` ``<name>_cov_xx,_xy,_xz,_yy,_yz,_zz`` of each as well; ``<segment>_gap``.
+    A standard deviation is that of one axis, the mean over the three (`compute_axis_std`).
+    """
+    table = {"time": pose.time}
+    for series, components, covariances in (
+        (pose.quat_WL, ("qx", "qy", "qz", "qw"), pose.segment_cov),
+        (pose.points, ("x", "y", "z"), pose.point_cov),
+    ):
+        for name, values in series.items():
+            table |= {f"{name}_{component}": values[:, k] for k, component in enumerate(components)}
+            if name in covariances:
+                table[f"{name}_std"] = compute_axis_std(covariances[name])
+                if covariance:
+                    table |= {f"{name}_{entry}": covariances[name][:, i, j] for entry, (i, j) in _ENTRIES.items()}
+    return pl.DataFrame(table | {f"{segment}_gap": gap for segment, gap in pose.gap.items()})
+
+
+def parse_pose_table(table: pl.DataFrame, file: str) -> Pose:
+    """Parse a `Pose` from a table as of `build_pose_table`; segments and points may be missing.
+
+    Raises
+    ------
+    BadData
+        No column of time, or one that does not increase; neither orientations nor points; a text; a quaternion that is
+        not of unit norm.
+    """
+    if "time" not in table.columns:
+        raise BadData(f"{file}: no column 'time'; a table as in pose.parquet is needed; {one_of(table.columns)}")
+    try:
+        numbers = {name: table[name].cast(pl.Float64).to_numpy() for name in table.columns}
+    except pl.exceptions.PolarsError as error:
+        raise BadData(f"{file}: a column holds text: {str(error).splitlines()[0]}") from error
+    time = numbers["time"]
+    if not (len(time) and np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
+        raise BadData(f"{file}: time does not increase from row to row; seconds that do are needed, in one row or more")
+
+    def collect(*components: str) -> dict[str, np.ndarray]:
+        """Collect name → its columns (n, k), where all of them are there."""
+        names = [name.removesuffix(f"_{components[0]}") for name in numbers if name.endswith(f"_{components[0]}")]
+        columns = {name: [f"{name}_{component}" for component in components] for name in names}
+        return {
+            name: np.column_stack([numbers[column] for column in own])
+            for name, own in columns.items()
+            if set(own) <= set(numbers)
+        }
+
+    quat_WL, points = collect("qx", "qy", "qz", "qw"), collect("x", "y", "z")
+    for name, quat in quat_WL.items():
+        norm = np.linalg.norm(quat, axis=1)
+        if np.any(np.abs(norm - 1.0) > MAX_TABLE_NORM_DEVIATION):
+            raise BadData(f"{file}: {name}_qx … _qw is no unit quaternion in row {np.argmax(abs(norm - 1)) + 1}")
+        quat_WL[name] = quat / norm[:, None]
+    if not quat_WL and not points:
+        raise BadData(f"{file}: neither orientations nor points; columns as <segment>_qx … or <point>_x … are needed")
+    covariances = {name: std[:, :, None] ** 2 * np.eye(3) for name, std in collect("std").items()}
+    for name, entries in collect(*_ENTRIES).items():
+        cov = covariances[name] = np.empty((len(time), 3, 3))
+        for column, (i, j) in zip(entries.T, _ENTRIES.values(), strict=True):
+            cov[:, i, j] = cov[:, j, i] = column
+    return Pose(
+        time,
+        quat_WL,
+        points,
+        segment_cov={name: covariances[name] for name in quat_WL if name in covariances},
+        point_cov={name: covariances[name] for name in points if name in covariances},
+        gap={name: numbers[f"{name}_gap"] > 0.0 for name in quat_WL if f"{name}_gap" in numbers},
+    )
+
+
+# From orientations --------------------------------------------------------------------------------------------------
 
 
 def compute_pose(model: BodyModel, time: np.ndarray, quat_WL: Mapping[str, np.ndarray], *, limits: bool = True) -> Pose:

@@ -59,10 +59,9 @@ def move_girdles(
     """
     motions = {}
     for name in model.table.girdles if names is None else names:
-        girdle = model.table.girdles[name]
+        girdle, parameters = model.table.girdles[name], model.girdle_parameters(name)
         if girdle.on not in R_WL:
             continue
-        parameters = model.girdle_parameters(name)
         n = len(R_WL[girdle.on])
         if girdle.moves not in R_WL:
             raised = np.full(n, MEAN_RAISED)
@@ -126,15 +125,19 @@ def _find_open_motions(
     Of a person a segment without a sensor is rigid with the one above where the table says so, else its joints are
     open, and joints that set no segment rest. In the configuration no joints stand in line by chance.
     """
-    m, rng = model.pin, np.random.default_rng(0)
-    free = set(range(1, m.njoints))
+    m, rng, free = model.pin, np.random.default_rng(0), set(range(1, model.pin.njoints))
     if not model.table.is_mechanism:
-        free = set()
-        for segment, chain in model.chains.items():
-            if segment in segments:
-                free.update(chain.joints if chain.spherical is None else (chain.spherical,))
-            elif not model.table.segments[segment].rigid_without_sensor:
-                free.update(chain.joints)
+        chains = {
+            name: chain
+            for name, chain in model.chains.items()
+            if name in segments or not model.table.segments[name].rigid_without_sensor
+        }
+        free = {
+            j
+            for name, chain in chains.items()
+            for j in chain.joints
+            if name not in segments or chain.spherical in (None, j)
+        }
     columns = find_columns(m, sorted(free))
     q = pin.integrate(m, pin.neutral(m), rng.uniform(0.2, 0.9, m.nv) * rng.choice([-1.0, 1.0], m.nv))
     data = m.createData()

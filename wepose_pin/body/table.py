@@ -1,13 +1,12 @@
 """The table of a body: names and properties of its segments, points and lengths; `table_file` reads and writes it.
 
-`BodyTable` names segments, points, lengths, hinges, poses, pairs, usual places of sensors and what to draw. Outside
-simulation and joint angles no module names a segment, a point or a length. docs/models.md explains the file.
+Outside simulation and joint angles no module names a segment, a point or a length. docs/models.md explains the file.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -20,8 +19,8 @@ from .girdle import Direction, Girdle, SegmentName
 
 DEFAULT_BODY = "upper_body"
 ROOT = "root"  # the origin of W, as the end of a length
-PERSON, MECHANISM = "person", "mechanism"
 NEUTRAL_POSE = "n_pose"
+KINDS = ("person", "mechanism")
 # Regular expressions of the side in a sensor's name, in English and German.
 _SIDES = {"left": "left|lt?|link(s|e[rsmn]?)", "right": "right|rt?|recht(s|e[rsmn]?)"}
 
@@ -71,8 +70,7 @@ class Segment(NamedTuple):
     Parameters
     ----------
     link : its link in the URDF
-    up, forward : the link's axes that point up and forward in the N-pose; None: found from the URDF with all joints at
-        zero
+    up, forward : the link's axes that point up and forward in the N-pose; None: found with all joints at zero
     along : (3,) unit, its long axis in its own frame, away from the joint to the segment above
     spine : its rotation is shared by all joints between it and the root
     rigid_without_sensor : without a sensor it is rigid with the segment above; False: it is unknown then
@@ -86,8 +84,8 @@ class Segment(NamedTuple):
     """
 
     link: str
-    up: str | None = None
-    forward: str | None = None
+    up: Annotated[str | None, Key(of="axes")] = None
+    forward: Annotated[str | None, Key(of="axes")] = None
     along: Direction = (0.0, 0.0, -1.0)
     spine: bool = False
     rigid_without_sensor: Annotated[bool, Key("without_sensor", words={"rigid": True, "unknown": False})] = False
@@ -100,10 +98,11 @@ class Segment(NamedTuple):
     repeat_std: Angles = _same(2.0)
 
     @classmethod
-    def of_mechanism(cls, link: str) -> Segment:
+    def of_mechanism(cls, link: str, *, rigid: bool) -> Segment:
         """Return a segment of a mechanism: no soft tissue, and a start configuration to 0.5° (assumption)."""
-        half = _same(0.5)
-        return cls(link, rigid_without_sensor=True, soft_tissue=SoftTissue(), start_std=half, repeat_std=half)
+        return cls(
+            link, rigid_without_sensor=rigid, soft_tissue=SoftTissue(), start_std=_same(0.5), repeat_std=_same(0.5)
+        )
 
 
 class Point(NamedTuple):
@@ -156,6 +155,19 @@ class HingeJoint(NamedTuple):
     tilt_std: Angle = float(np.deg2rad(5.0))
 
 
+class Place(NamedTuple):
+    """Where a sensor usually sits, in words."""
+
+    place: str
+
+
+class Drawing(NamedTuple):
+    """What is drawn of a body: lines through points, limb by limb, and the points whose path is drawn."""
+
+    limbs: Annotated[tuple[tuple[str, ...], ...], Key(of="points")] = ()
+    paths: Annotated[tuple[str, ...], Key(of="points")] = ()
+
+
 class Limb(NamedTuple):
     """An arm, a leg or another line of points from the body to a tip.
 
@@ -180,48 +192,48 @@ class Limb(NamedTuple):
 
 @dataclass(frozen=True)
 class BodyTable:
-    """The names and properties of what a body has.
+    """The names and properties of what a body has: the content of its file.
 
     Parameters
     ----------
     name : of the body, for messages and files
     segments : name → segment; the first one faces x of W in the start pose
+    urdf : the file beside the table; empty: that of the table's name
+    kind : "person": three revolute joints in a row are one spherical joint, segment frames equal W in the N-pose;
+        "mechanism": joints and frames are those of the URDF
+    up, forward : the root link's axes that point up and forward while all joints are at zero
+    root : the link whose origin is that of W, or links midway between which it is; empty: the root link
     points : name → its link, and its place in it
     lengths : name → what it scales
     hinges : name → joint of nearly one axis
     girdles : shoulder point → the law by which it moves on the trunk as the arm is raised
     poses : name → joint of the URDF → value [rad or m]
     pairs : name on the left → name on the right, of segments, points, lengths and hinges
-    sensors : segment → where its sensor usually sits, in words
-    limbs : the points of each line that is drawn
-    paths : points whose path is drawn
-    kind : "person": three revolute joints in a row are one spherical joint, segment frames equal W in the N-pose;
-        "mechanism": joints and frames are those of the URDF
-    up, forward : the root link's axes that point up and forward while all joints are at zero
-    root : the link whose origin is that of W, or links midway between which it is; empty: the root link
+    sensors : segment → where its sensor usually sits
+    draw : its lines and paths
     where : the table's file, for messages
     """
 
-    name: str
+    name: Annotated[str, None]
     segments: Mapping[str, Segment]
+    urdf: str = ""
+    kind: Literal["person", "mechanism"] = "person"
+    up: Annotated[str, Key(of="axes")] = "+z"
+    forward: Annotated[str, Key(of="axes")] = "+x"
+    root: tuple[str, ...] = ()
     points: Mapping[str, Point] = field(default_factory=dict)
     lengths: Mapping[str, Length] = field(default_factory=dict)
     hinges: Mapping[str, HingeJoint] = field(default_factory=dict)
     girdles: Mapping[str, Girdle] = field(default_factory=dict)
-    poses: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    pairs: Mapping[str, str] = field(default_factory=dict)
-    sensors: Mapping[str, str] = field(default_factory=dict)
-    limbs: tuple[tuple[str, ...], ...] = ()
-    paths: tuple[str, ...] = ()
-    kind: Literal["person", "mechanism"] = "person"
-    up: str = "+z"
-    forward: str = "+x"
-    root: tuple[str, ...] = ()
-    where: str = "segments"
+    poses: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: {NEUTRAL_POSE: {}})
+    pairs: Annotated[Mapping[str, str], Key(of="names")] = field(default_factory=dict)
+    sensors: Mapping[str, Place] = field(default_factory=dict)
+    draw: Drawing = field(default_factory=Drawing)
+    where: Annotated[str, None] = "segments"
 
     @property
     def is_mechanism(self) -> bool:
-        return self.kind == MECHANISM
+        return self.kind == "mechanism"
 
     @property
     def reference(self) -> str:
@@ -268,7 +280,7 @@ class BodyTable:
 
         A line between a point and its counterpart, as between the shoulders, is no limb.
         """
-        lines = (line for line in self.limbs if point in line[1:] and self.counterpart(line[0]) not in line)
+        lines = (line for line in self.draw.limbs if point in line[1:] and self.counterpart(line[0]) not in line)
         line = next(lines, None)
         if line is None:
             return None
@@ -284,7 +296,7 @@ class BodyTable:
     @property
     def drawn_limbs(self) -> dict[str, Limb]:
         """Point whose path is drawn → its limb."""
-        return {point: limb for point in self.paths if (limb := self.find_limb(point)) is not None}
+        return {point: limb for point in self.draw.paths if (limb := self.find_limb(point)) is not None}
 
     def ends(self, segment: str) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
         """Return the points at which the length of a segment begins and ends; None where not just one length is its."""
@@ -306,13 +318,6 @@ class BodyTable:
             if segment.labels and (not side or side in sides) and re.search(pattern, words):
                 matches.add(name)
         return matches.pop() if len(matches) == 1 else None
-
-    def drop(self, segments: Collection[str]) -> BodyTable:
-        """Return the table without these segments, and without points, lengths and hinges that need them."""
-        kept = {name: segment for name, segment in self.segments.items() if name not in segments}
-        links = {self.segments[name].link for name in segments} - {segment.link for segment in kept.values()}
-        points = {name: point for name, point in self.points.items() if point.link not in links}
-        return prune_table(replace(self, segments=kept, points=points))
 
 
 def prune_table(table: BodyTable) -> BodyTable:
@@ -345,6 +350,8 @@ def prune_table(table: BodyTable) -> BodyTable:
         girdles=girdles,
         pairs={left: right for left, right in table.pairs.items() if {left, right} <= names},
         sensors={name: place for name, place in table.sensors.items() if name in segments},
-        limbs=tuple(limb for limb in table.limbs if points.issuperset(limb)),
-        paths=tuple(point for point in table.paths if point in points),
+        draw=Drawing(
+            tuple(limb for limb in table.draw.limbs if points.issuperset(limb)),
+            tuple(point for point in table.draw.paths if point in points),
+        ),
     )

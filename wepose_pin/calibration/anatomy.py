@@ -85,7 +85,7 @@ def reach_limbs(calibration: Calibration, R: Mapping[str, Rotation]) -> dict[str
     """
     problem, reaches = calibration.problem, {}
     lengths = np.array([calibration.subject.lengths[name] for name in problem.model.lengths])
-    for first, *_, last in problem.model.table.limbs:
+    for first, *_, last in problem.model.table.draw.limbs:
         try:
             vectors = find_path(problem.model, problem.start_pose, R, [(last, 1.0), (first, -1.0)]).vectors
         except BadSession:  # the limb's end is not known

@@ -208,7 +208,7 @@ def _measure_motion(calibration: Calibration, flexion: Mapping[str, np.ndarray])
     R = {name: Rotation.from_quat(quat[rows]) for name, quat in calibration.quat_WL.items()}
     sizes: dict[str, list[float]] = {name: [] for name in ENOUGH}
     reaches = reach_limbs(calibration, R)
-    for first, *_, last in table.limbs:
+    for first, *_, last in table.draw.limbs:
         segment = table.points[first].link
         above = model.parents.get(segment)
         if above in R and segment in R and last in reaches:

@@ -81,8 +81,7 @@ def _compare(
     markers: Path | None,
 ) -> Evaluation:
     """The errors of a result; the reference is brought to its clock and world where that is needed."""
-    from ..body.kinematics import Pose
-    from ..body.pose_table import parse_pose_table
+    from ..body.kinematics import Pose, parse_pose_table
     from ..data_tables import read_table
     from ..evaluation import evaluate, register
     from ..readers import load_session

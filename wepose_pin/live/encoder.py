@@ -85,14 +85,14 @@ class PoseEncoder:
             self._kinematics, self._placed = kinematics, [kinematics.data.oMf[frame] for frame in self._frames]
             self._known = np.array([link in known for link in self.body_links], dtype=bool)
             self._sensors = np.array(sensors, dtype=int)
-            self._paths = [info.points.index(point) if point in info.points else -1 for point in model.table.paths]
+            self._paths = [info.points.index(point) if point in info.points else -1 for point in model.table.draw.paths]
             self.newest = None  # it may be of another stream
             self.angles, self.info = AngleCurves(info.segments), info
 
     def encode(self, pose: LivePose | None) -> bytes:
         """The frame of a pose, None: the N-pose, as `page` describes it; NaN is what is not known."""
         time, placements, lost = math.nan, self._neutral, np.zeros(len(self.links), dtype=bool)
-        points = np.full((len(self._model.table.paths), 3), np.nan, "<f4")
+        points = np.full((len(self._model.table.draw.paths), 3), np.nan, "<f4")
         with self._lock:
             if pose is not None and self.info is not None and len(pose.quat_WL) == len(self.info.segments):
                 self._kinematics.compute_points(pose.quat_WL)

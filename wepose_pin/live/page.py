@@ -110,7 +110,7 @@ def _fill_page(model: BodyModel, encoder: PoseEncoder, title: str, identity: str
         "scene": scene(encoder.visuals, links, () if robot is None else robot.meshes),
         "backdrops": {name: backdrop(colours, floor) for name, colours in (("light", LIGHT), ("dark", DARK))},
         "view": view(encoder.visuals, body, motion, reach),
-        "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.paths],
+        "trails": [{"name": hand, "colour": choose_trail_colour(hand, model)} for hand in model.table.draw.paths],
     }
     return filled("live/templates/live.html.j2", data, title or "wepose live")
 
@@ -121,8 +121,8 @@ def _find_reach(model: BodyModel) -> np.ndarray:
     known = find_known_points(model, model.chains)
     p_W = {point: data.oMf[model.pin.getFrameId(model.point_frames[point])].translation for point in known}
     points = [np.zeros(3)]
-    for first, *_, last in model.table.limbs:
-        if last in model.table.paths and first in p_W and last in p_W:
+    for first, *_, last in model.table.draw.limbs:
+        if last in model.table.draw.paths and first in p_W and last in p_W:
             reach = np.linalg.norm(p_W[last] - p_W[first]) + FINGERS
             sides = {"left": (1.0,), "right": (-1.0,)}.get(model.table.side(last), (1.0, -1.0))
             ways = [[1.0, 0.0, 0.0], *([0.0, side, 0.0] for side in sides), *([0.0, 0.6 * side, 0.8] for side in sides)]

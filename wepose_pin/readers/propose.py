@@ -317,13 +317,13 @@ def format_session(proposal: Proposal, path: Path, folder: Path, wearer: Wearer,
         elif end - begin > 2.0:
             example = _format_example(begin + 0.5, min(begin + 4.5, end))
             lines.append(f"# start = {example}   # name the seconds in which the person stands still in the start pose")
-        if not lacking and end - begin > 2.0 and body.paths:
+        if not lacking and end - begin > 2.0 and body.draw.paths:
             example = _format_example(begin + min(10.0, (end - begin) / 4.0), begin + min(70.0, 0.75 * (end - begin)))
             lines.append(
                 f"# clasp = {example}   # for wepose calibrate: the seconds in which the palms are held together"
             )
     for segment in sorted(proposal.sensors, key=lambda name: segments.index(name) if name in segments else 99):
-        place = body.sensors.get(segment, "")
+        place = body.sensors[segment].place if segment in body.sensors else ""
         name = segment if segment in segments else "SEGMENT"
         table = [f"[sensors.{name}]{f'   # usually {place}' if place else ''}"]
         table += _format_keys(proposal, segment, proposal.sensors[segment])

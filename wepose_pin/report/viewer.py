@@ -88,7 +88,7 @@ def pose_html(
     """
     frames = frame_indices(pose.time, fps)
     visuals, placed = _place_body(model, pose, frames)
-    paths = [name for name in model.table.paths if name in pose.points]
+    paths = [name for name in model.table.draw.paths if name in pose.points]
     return view_html(
         visuals,
         pose.time[frames],

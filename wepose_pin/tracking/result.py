@@ -13,9 +13,8 @@ import polars as pl
 
 from ..body import BodyModel
 from ..body.configuration import compute_orientation_residuals, solve_configuration
-from ..body.kinematics import Pose
+from ..body.kinematics import Pose, build_pose_table
 from ..body.links import find_undetermined_joints
-from ..body.pose_table import build_pose_table
 from ..body.subject import Subject
 from ..diagnostics import WARNING, Diagnostic, notebook_html
 from ..errors import BadData, Named, WeposeError, how_to_install

@@ -23,8 +23,7 @@ from .. import __version__
 from ..angles.torques import Torques, torque_table
 from ..arguments import check_arguments
 from ..body import BodyModel, load_model, load_table
-from ..body.kinematics import Pose, find_samples
-from ..body.pose_table import build_pose_table, parse_pose_table
+from ..body.kinematics import Pose, build_pose_table, find_samples, parse_pose_table
 from ..body.subject import Subject, load_subject, subject_toml
 from ..body.table_file import MODEL_TABLE, format_table
 from ..data_tables import open_source, read_columns, read_table

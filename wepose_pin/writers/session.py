@@ -6,8 +6,7 @@ from pathlib import Path
 
 import polars as pl
 
-from ..body.kinematics import Pose
-from ..body.pose_table import build_pose_table
+from ..body.kinematics import Pose, build_pose_table
 from ..documents import toml_key, toml_string, toml_strings
 from ..recording import ImuSensor, Recording, find_mount_axes
 from .result import write_table

@@ -7,7 +7,7 @@ from pathlib import Path
 import polars as pl
 
 from ..angles import angle_table, diagnose_lock, joint_angles
-from ..body.pose_table import build_pose_table
+from ..body.kinematics import build_pose_table
 from ..diagnostics import Diagnostic
 from ..errors import BadData
 from .motion import Motion
