@@ -16,6 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.simulated import compute_mount_errors
+from wepose_pin.angles import joint_angles
+from wepose_pin.angles.euler import wrap
 from wepose_pin.body.covariance import compute_axis_std
 from wepose_pin.body.subject import Subject, mount_rows
 from wepose_pin.calibration import assess, calibrate
@@ -35,6 +37,7 @@ from wepose_pin.tracking import TrackResult, track
 FIRST_SEED = 5000  # of persons that no other measurement or test draws
 CLOSED = ("left_upper_arm", "left_forearm", "left_hand", "right_upper_arm", "right_forearm", "right_hand")
 SCORED_POINTS = ("left_shoulder", "right_shoulder", "right_elbow", "right_palm")
+SCORED_JOINTS, SHOULDER_SEQUENCE = ("right_shoulder", "right_elbow"), "XZY"  # whose lock a working arm is far from
 FREE = "free"  # no closure: reaches, rests and typing
 
 
@@ -106,7 +109,15 @@ def compare_pose(tracked: TrackResult, simulation: Simulation) -> dict[str, Any]
     from_shoulders = errors["right_palm"] - 0.5 * (errors["left_shoulder"] + errors["right_shoulder"])
     palm = [(float(error), np.nan) for error in np.sqrt(np.mean(from_shoulders**2, axis=1))]
     whole = [each for pairs in segments.values() for each in pairs]
-    return {"segments": whole, **points, **segments, "palm from shoulders": palm}
+    angles = {}
+    estimated, true = (joint_angles(pose, SHOULDER_SEQUENCE) for pose in (tracked.pose, truth))
+    for joint in SCORED_JOINTS:
+        std = estimated[joint].std
+        assert std is not None  # the filter has a covariance
+        for k, angle in enumerate(estimated[joint]):
+            off = wrap(estimated[joint][angle] - true[joint][angle])[rows]
+            angles[f"{joint} {angle}"] = list(zip(off, std[rows, k], strict=True))
+    return {"segments": whole, **points, **segments, "palm from shoulders": palm, **angles}
 
 
 def summarize(results: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
@@ -134,12 +145,12 @@ def print_summary(preset: str, results: list[dict[str, Any]]) -> None:
     grades = [result["quality"] for result in results if "quality" in result]
     counts = ", ".join(f"{grades.count(grade)} {grade}" for grade in sorted(set(grades)))
     print(f"\n{preset}: {len(results)} persons; {counts}; {len(failed)} without a result")
-    print(f"{'':24}{'error rms':>12}{'std rms':>12}{'error/std':>12}{'worst person':>14}")
+    print(f"{'':32}{'error rms':>12}{'std rms':>12}{'error/std':>12}{'worst person':>14}")
     for quantity, row in summarize(results).items():
         length = quantity.startswith(("lengths", "whole", "point", "palm"))
         factor, unit = (1e3, "mm") if length else (float(np.degrees(1.0)), "deg")
         print(
-            f"{quantity:24}{factor * row['error']:9.2f} {unit:3}{factor * row['std']:8.2f} {unit:3}"
+            f"{quantity:32}{factor * row['error']:9.2f} {unit:3}{factor * row['std']:8.2f} {unit:3}"
             f"{row['by_std']:12.2f}{row['largest']:14.2f}"
         )
 

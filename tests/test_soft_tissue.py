@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wepose_pin.body import load_model
-from wepose_pin.body.soft_tissue import SoftTissueCorrection, TissueMean
+from wepose_pin.body.soft_tissue import SoftTissueCorrection, TissueMean, correct_table
 from wepose_pin.body.subject import Hinge, population_subject
 from wepose_pin.body.table_file import load_table
 from wepose_pin.calibration import calibrate
@@ -53,6 +53,21 @@ def test_a_lag_beyond_all_people_is_no_skin(shown: float, used: float) -> None:
     hinge = Hinge(np.array((0.0, 1.0, 0.0)), 0.05, shown)
     subject = replace(population_subject(), hinges={"right_elbow": hinge})
     assert subject.shape(load_model()).tissue_means["right_upper_arm"].lag == pytest.approx(used)
+
+
+@pytest.mark.parametrize(("hinge_deg", "size"), [(5.3, 1.0), (2.0, 0.46), (8.0, 1.39)])
+def test_elbows_that_hold_show_that_soft_tissue_is_firm(hinge_deg: float, size: float) -> None:
+    hinge = Hinge(np.array((0.0, 1.0, 0.0)), np.radians(hinge_deg), 0.45)
+    subject = replace(population_subject(), hinges={"left_elbow": hinge, "right_elbow": hinge})
+    table = correct_table(TABLE, subject.shape(load_model()).tissue_means)
+    torso, arm, forearm = (table.segments[name] for name in ("torso", "right_upper_arm", "right_forearm"))
+    np.testing.assert_allclose(np.degrees(torso.soft_tissue.std), 1.5 * size, rtol=0.01)
+    assert torso.soft_tissue.per_tilt[1] == pytest.approx(size * np.sqrt(0.12**2 - 0.107**2), rel=0.01)
+    assert arm.soft_tissue.per_twist == pytest.approx(size * np.sqrt(0.48**2 - 0.45**2), rel=0.01)
+    # The twist in the start pose: 13 deg among people, of which the axis of the hinge leaves 10 deg times the size.
+    twist = 1.0 / np.hypot(1.0 / 13.0, 1.0 / (10.0 * size))
+    assert np.degrees(arm.start_std[2]) == pytest.approx(twist, rel=0.01)
+    assert np.degrees(forearm.start_std[2]) == pytest.approx(np.sqrt(20.0**2 - 5.0**2 - 13.0**2 + twist**2), rel=0.01)
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0])

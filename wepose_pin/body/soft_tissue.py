@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ..compilation import kernel
 from ..rotations import product, rotate_by_vector
-from .table import BodyTable
+from .table import ZERO, BodyTable
 
 # Least squared cosine of half the angle between long axes at which the twist between them counts in full.
 LEAST_TWIST_COSINE = 0.1
+# Of simulated people: the angle [rad] by which a forearm leaves the plane of its elbow, geometric mean, and how far its
+# logarithm scatters. The logarithm of a person's size of soft tissue has a standard deviation among people, assumption.
+USUAL_HINGE_STD, HINGE_LOG_STD = np.deg2rad(5.3), 0.25
+SCATTER_LOG_STD = 0.5
 
 
 class TissueMean(NamedTuple):
@@ -23,11 +28,43 @@ class TissueMean(NamedTuple):
     share : of the means that the table states for tilt and raised arms
     lag : [rad/rad] per angle of twist that the sensor shows
     start : [rad] about z in the start pose
+    start_std : [rad] one standard deviation of `start`
+    scatter : size of what varies beyond the means, as a share of that among all people
     """
 
     share: float
     lag: float
     start: float = 0.0
+    start_std: float = 0.0
+    scatter: float = 1.0
+
+
+def estimate_scatter(hinge_stds: Collection[float]) -> float:
+    """Estimate `TissueMean.scatter` by empirical Bayes.
+
+    `hinge_stds` [rad] are the angles by which a person's segments leave the planes of their hinges.
+    """
+    if not hinge_stds:
+        return 1.0
+    weight = SCATTER_LOG_STD**2 / (SCATTER_LOG_STD**2 + HINGE_LOG_STD**2)
+    return float(np.exp(weight * np.mean(np.log(np.array([*hinge_stds]) / USUAL_HINGE_STD))))
+
+
+def correct_table(table: BodyTable, means: Mapping[str, TissueMean]) -> BodyTable:
+    """Return the table with the standard deviations of soft tissue that remain beyond a person's means."""
+    segments = dict(table.segments)
+    for name, mean in means.items():
+        segment, tissue = segments[name], segments[name].soft_tissue
+        terms = (tissue.std, ZERO), (tissue.per_tilt, tissue.mean_per_tilt), (tissue.per_raised, tissue.mean_per_raised)
+        std, per_tilt, per_raised = (
+            tuple(mean.scatter * np.sqrt(np.maximum(np.square(std) - np.square(own), 0.0))) for std, own in terms
+        )
+        per_twist = mean.scatter * np.sqrt(max(tissue.per_twist**2 - tissue.mean_per_twist**2, 0.0))
+        segments[name] = segment._replace(
+            soft_tissue=tissue._replace(std=std, per_tilt=per_tilt, per_twist=per_twist, per_raised=per_raised),
+            start_std=(*segment.start_std[:2], mean.start_std),
+        )
+    return replace(table, segments=segments)
 
 
 class SoftTissueCorrection:

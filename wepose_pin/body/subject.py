@@ -29,7 +29,7 @@ from ..errors import BadData, BadModel, BadOption, BadSubject
 from .anthropometry import compute_population_lengths
 from .body import BodyModel
 from .girdle import PARAMETERS
-from .soft_tissue import TissueMean
+from .soft_tissue import TissueMean, estimate_scatter
 from .table import BodyTable
 from .table_file import load_table
 
@@ -239,7 +239,7 @@ class Subject:
 
         A hinge shows how far the sensor above it lags behind a twist. The share of the usual lag that it has is
         assumed for all soft tissue. The axis of a hinge also shows how far the person twists the segment above it, and
-        what hangs on that, in the start pose.
+        what hangs on that, in the start pose. How well the hinges hold shows how far all of this varies.
         """
         segments, hinges, means = body.table.segments, body.table.hinges, dict[str, TissueMean]()
         shown = {hinges[joint].on: joint for joint, hinge in self.hinges.items() if hinge.twist_lag is not None}
@@ -248,19 +248,24 @@ class Subject:
             return {}
         share = sum(self.hinges[joint].twist_lag or 0.0 for joint in shown.values()) / usual
         share = min(max(share, 0.0), MOST_TISSUE_SHARE)
+        scatter = estimate_scatter([hinge.std for hinge in self.hinges.values()])
         for name, segment in segments.items():
             lag, start = share * segment.soft_tissue.mean_per_twist, share * segment.start_mean[2]
+            start_var = segment.start_std[2] ** 2 - segment.start_mean[2] ** 2
             carrier = body.parents.get(name)
             if carrier in means:
                 start += means[carrier].start
+                start_var += means[carrier].start_std ** 2 - segments[carrier].start_std[2] ** 2
+            start_var = max(start_var, 0.0)
             if name in shown:
                 usual_axis, hinge = np.array(hinges[shown[name]].axis), self.hinges[shown[name]]
-                start_var = segment.start_std[2] ** 2
                 angle = np.arctan2(np.cross(usual_axis, hinge.axis)[2], usual_axis @ hinge.axis)
                 # What a hinge shows beyond all people is no skin: a wrong axis, or a sensor that slides.
                 lag = min(max(hinge.twist_lag or 0.0, 0.0), MOST_TISSUE_SHARE * segment.soft_tissue.mean_per_twist)
-                start = float(start_var / (start_var + HINGE_PLANE_STD**2) * angle)
-            means[name] = TissueMean(share, lag, start)
+                plane_var = (scatter * HINGE_PLANE_STD) ** 2
+                weight = start_var / (start_var + plane_var)
+                start, start_var = float(weight * angle), weight * plane_var
+            means[name] = TissueMean(share, lag, start, float(np.sqrt(start_var)), scatter)
         return means
 
     def turn_hinges(self, body: BodyModel) -> dict[str, Hinge]:

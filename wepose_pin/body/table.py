@@ -150,7 +150,7 @@ class HingeJoint(NamedTuple):
     axis: Vector
     range: Annotated[tuple[float, float], Key(unit="deg")] = (-np.pi, np.pi)
     softness: Angle = float(np.deg2rad(2.0))
-    common_std: Angle = float(np.deg2rad(5.0))
+    common_std: Angle = float(np.deg2rad(6.5))
     mirror_std: Angle = float(np.deg2rad(20.0))
     tilt_std: Angle = float(np.deg2rad(5.0))
 

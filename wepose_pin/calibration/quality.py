@@ -30,11 +30,11 @@ MOST_INTERVALS = 3  # of an open closure that are named, the longest
 # One standard deviation of each result. A hand is off by about as much as its arm's lengths, and by up to 6 mm a
 # degree of an arm's heading; the torso's heading moves it only as the torso leans. Soft tissue and the shoulder girdle
 # move it by 30 mm an axis whatever the calibration (docs/people.md): a calibration passes that adds less than
-# that, as one minute of a careful person's joined hands does on simulated people (lengths 9 to 12 mm, headings 3.0 to
-# 3.6 deg).
+# that, as one minute of a careful person's joined hands does on simulated people (lengths 9 to 12 mm, headings 3.4 to
+# 4.1 deg).
 LENGTH = QualityLimits(0.012, 0.020)  # [m] of an upper arm, of forearm + hand, of the shoulder width, the scale apart
-ARM_HEADING = QualityLimits(np.deg2rad(4.0), np.deg2rad(7.0))  # [rad]
-TORSO_HEADING = QualityLimits(np.deg2rad(5.0), np.deg2rad(7.0))  # [rad] beyond, tissue adds to it
+ARM_HEADING = QualityLimits(np.deg2rad(4.5), np.deg2rad(7.0))  # [rad]
+TORSO_HEADING = QualityLimits(np.deg2rad(5.5), np.deg2rad(7.0))  # [rad] beyond, tissue adds to it
 OTHER_HEADING = QualityLimits(np.deg2rad(8.0), np.deg2rad(15.0))  # [rad] of a hand, or by poses, or by one arm
 # Relative. It may move a hand, 0.62 m from its shoulder, by half of what tissue and girdle do, 15 mm: 2.4 %. A taped
 # arm gives 1.2 %, shoulder breadth with stature and sex 2.1 %, stature and sex alone 2.6 %, the population prior 5 %.

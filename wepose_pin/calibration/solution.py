@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..body.girdle import PARAMETERS
+from ..body.soft_tissue import estimate_scatter
 from ..body.subject import HeadingDrift, Hinge, StartPoseOffset, Subject, mount_rows
 from ..diagnostics import INFO, WARNING, Diagnostic
 from ..errors import NoSolution
@@ -89,7 +90,8 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, result: Weighted
     if problem.scale_lengths or scale_observed:
         scale = f"measured: {', '.join(problem.scale_lengths)}" if problem.scale_lengths else "of the closure"
     hinges = _estimate_hinges(problem, fit, x_cov)
-    subject = _make_subject(problem, fit, x_cov)
+    scatter = estimate_scatter([hinge.std for hinge, _ in hinges.values()])
+    subject = _make_subject(problem, fit, x_cov, scatter)
 
     prior_x = fit.x.copy()
     prior_x[layout.length] = [problem.prior.lengths[name] for name in layout.lengths]
@@ -132,8 +134,8 @@ def _describe(problem: CalibrationProblem, samples: np.ndarray, result: Weighted
     )
 
 
-def _make_subject(problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray) -> Subject:
-    """Return the subject of a solution, without hinges."""
+def _make_subject(problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray, scatter: float) -> Subject:
+    """Return the subject of a solution, without hinges; `scatter` is that of its soft tissue (`TissueMean`)."""
     filtered, layout, x = problem.filtered, fit.problem.observations.layout, fit.x
     mounts, offsets, drifts = {}, {}, {}
     std = np.sqrt(np.diag(x_cov))
@@ -147,7 +149,7 @@ def _make_subject(problem: CalibrationProblem, fit: Estimate, x_cov: np.ndarray)
     for name, psi in problem.stated_headings([name for name in filtered.R_VS if name not in mounts]).items():
         start_W = Rotation.from_rotvec([0.0, 0.0, psi]) * filtered.R_VS_start[name]
         mounts[name] = (problem.start_rotation(name).inv() * start_W).as_quat()
-    order, covariance = _project_to_subject(problem, layout, x_cov)
+    order, covariance = _project_to_subject(problem, layout, x_cov, scatter)
     return replace(
         problem.prior,
         name=problem.recording.name,
@@ -186,13 +188,14 @@ def _estimate_hinges(
 
 
 def _project_to_subject(
-    problem: CalibrationProblem, layout: Layout, covariance: np.ndarray
+    problem: CalibrationProblem, layout: Layout, covariance: np.ndarray, scatter: float
 ) -> tuple[tuple[str, ...], np.ndarray]:
     """Return names and covariance of the lengths, mount errors and girdles, from that of x.
 
     Mounts are R_LS = exp(−ε) Rz(ψ) R_VS(start). Their errors are turned from the frames that equal W in the start pose
     to those of the segments. The tilt of a new mount is that of one recording: soft tissue in any pose is added to it.
-    By how much a person turns a segment about the vertical in the start pose is not in them: no closure shows it.
+    That of the segment that faces x in the start pose turns the headings of all mounts alike. By how much a person
+    turns a segment about the vertical in the start pose is not in them: no closure shows it.
     """
     K, rows = len(layout.lengths), [row for name in layout.sensors for row in mount_rows(name)]
     of_girdles = [f"girdles.{term.name}.{parameter}" for term in layout.girdles for parameter in PARAMETERS]
@@ -206,8 +209,11 @@ def _project_to_subject(
         T[K + 3 * i : K + 3 * i + 3] = problem.start_pose.rotation(name).T @ own
     projected = T @ covariance @ T.T
     known = {} if problem.recording.remounted else problem.prior.mounts
-    for i, name in enumerate(layout.sensors):
-        if name not in known:
-            tilts = K + 3 * i + np.arange(2)
-            projected[tilts, tilts] += np.square(problem.model.table.segments[name].soft_tissue.std[:2])
+    segments = problem.model.table.segments
+    tissue = {name: scatter * np.array(segment.soft_tissue.std) for name, segment in segments.items()}
+    headings = K + 3 * np.array([i for i, name in enumerate(layout.sensors) if name not in known], dtype=int) + 2
+    projected[np.ix_(headings, headings)] += tissue[problem.model.table.reference][2] ** 2
+    for i in (headings - K) // 3:
+        tilts = K + 3 * i + np.arange(2)
+        projected[tilts, tilts] += np.square(tissue[layout.sensors[i]][:2])
     return (*layout.lengths, *rows, *of_girdles), projected

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..body.covariance import compute_point_covariances
+from ..body.soft_tissue import correct_table
 from .result import TrackResult
 from .segment_orientations import compute_soft_tissue_covariances
 
@@ -52,7 +53,7 @@ class ErrorBudget:
         exact = variances(zero, 0.0 * shape_cov)  # what leaves the law of the girdles
         with_girdles = variances(zero, of_girdles)
         parts = {GIRDLES: with_girdles, LENGTHS: _subtract(variances(zero, shape_cov), with_girdles)}
-        soft = compute_soft_tissue_covariances(body.table, quat_WL)
+        soft = compute_soft_tissue_covariances(correct_table(body.table, body.tissue_means), quat_WL)
         for name in total:
             own_soft = variances({**zero, name: soft[name]}, 0.0 * shape_cov)
             both = variances({**zero, name: total[name]}, 0.0 * shape_cov)

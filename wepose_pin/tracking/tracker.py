@@ -12,7 +12,7 @@ from ..body import BodyModel
 from ..body.body import load_sensed_model
 from ..body.covariance import compute_point_covariances
 from ..body.kinematics import KinematicsSolver
-from ..body.soft_tissue import SoftTissueCorrection
+from ..body.soft_tissue import SoftTissueCorrection, correct_table
 from ..body.start_pose import StartPose, find_start_pose
 from ..body.subject import Subject, population_subject
 from ..body.table_file import check_segments
@@ -220,4 +220,5 @@ def _fit_body(
     person.check_body(body.table)
     if subject is None and chosen is not None:  # a chosen model has its person's lengths
         person = replace(person, name=body.robot.name, lengths=body.lengths, note="lengths of the model")
-    return person, person.shape(body, remounted=recording.remounted), start_pose
+    body = person.shape(body, remounted=recording.remounted)
+    return person, body, replace(start_pose, table=correct_table(body.table, body.tissue_means))
